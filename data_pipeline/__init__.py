@@ -1,0 +1,1 @@
+"""Meshes become captures, captures become shards, shards become batches."""

@@ -1,0 +1,83 @@
+"""Changes to training inputs that leave the answer the same, on the device, for one cloud or one image each.
+
+The six of the thesis for clouds (§5.1). Five of them are on by default; the full turn about the vertical contradicts targets
+that stay in the object's own order of views, and is off.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+
+@dataclass(frozen=True)
+class CloudAugmentation:
+    """Which changes a training cloud goes through, in the thesis's order."""
+
+    scale: bool = True
+    """all coordinates by U[0.8, 1.25]"""
+    turn: bool = False
+    """about z by U[0, 2π]: contradicts canonical targets"""
+    tilt: bool = True
+    """about each axis by N(0, 0.06), at most 0.18 radians"""
+    translate: bool = True
+    """by U[−0.1, 0.1] along each axis"""
+    jitter: bool = True
+    """each coordinate by N(0, 0.01), at most 0.05"""
+    drop: bool = True
+    """a share U[0, 0.875] of the points, each replaced by the first"""
+
+
+@dataclass(frozen=True)
+class ImageAugmentation:
+    """Which changes a training image goes through."""
+
+    mirror: bool = True
+    """left to right, half of the time: an object and its mirror image are of one class"""
+    shift: int = 4
+    """by up to this many pixels in each direction"""
+
+
+def _rotation(axis: int, angle: Array) -> Float[Array, "3 3"]:
+    c, s = jnp.cos(angle), jnp.sin(angle)
+    i, j = (axis + 1) % 3, (axis + 2) % 3
+    return jnp.eye(3).at[i, i].set(c).at[j, j].set(c).at[i, j].set(-s).at[j, i].set(s)
+
+
+def augment_cloud(key: Array, points: Float[Array, "points 3"], config: CloudAugmentation) -> Float[Array, "points 3"]:
+    """One cloud in the unit sphere, changed by what `config` switches on."""
+    scale, turn, tilt, translate, jitter, share, drop = jax.random.split(key, 7)
+    if config.scale:
+        points = points * jax.random.uniform(scale, (), minval=0.8, maxval=1.25)
+    if config.turn:
+        points = points @ _rotation(2, jax.random.uniform(turn, (), maxval=2 * jnp.pi)).T
+    if config.tilt:
+        angles = jnp.clip(0.06 * jax.random.normal(tilt, (3,)), -0.18, 0.18)
+        for axis in range(3):
+            points = points @ _rotation(axis, angles[axis]).T
+    if config.translate:
+        points = points + jax.random.uniform(translate, (3,), minval=-0.1, maxval=0.1)
+    if config.jitter:
+        points = points + jnp.clip(0.01 * jax.random.normal(jitter, points.shape), -0.05, 0.05)
+    if config.drop:
+        gone = jax.random.uniform(drop, (len(points), 1)) < jax.random.uniform(share, (), maxval=0.875)
+        points = jnp.where(gone, points[0], points)
+    return points
+
+
+def augment_image(
+    key: Array, image: Float[Array, "height width channels"], config: ImageAugmentation
+) -> Float[Array, "height width channels"]:
+    """One image with a background of 0, changed by what `config` switches on."""
+    mirror, shift = jax.random.split(key)
+    if config.mirror:
+        image = jnp.where(jax.random.bernoulli(mirror), image[:, ::-1], image)
+    if config.shift:
+        pad = config.shift
+        padded = jnp.pad(image, ((pad, pad), (pad, pad), (0, 0)))
+        row, column = jax.random.randint(shift, (2,), 0, 2 * pad + 1)
+        image = jax.lax.dynamic_slice(padded, (row, column, 0), image.shape)
+    return image

@@ -1,0 +1,342 @@
+"""Captures become a TFDS data set: one example is one object with all its views, in ArrayRecord shards.
+
+An object is never on both sides of a split, whatever a later reader draws. Writing and reading need no TensorFlow. Beside
+the shards lie the statistics of the data set (`DatasetStatistics`), which everything that follows reads from there.
+"""
+
+from __future__ import annotations
+
+import functools
+import io
+import os
+import shutil
+import struct
+from collections.abc import Iterator, Sequence
+from contextlib import redirect_stdout
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from data_pipeline.capture import DEPTH_SCALE, Capture, CaptureConfig, capture_all, capture_path, load_capture, rig_for
+from data_pipeline.files import read_json, write_json
+from data_pipeline.meshes import DataError, ObjectEntry, ObjectSource, open_source
+from data_pipeline.progress import console, progress_bar
+from mevs_jax.entropy import level_entropy
+from mevs_jax.viewpoints import fibonacci_sphere
+
+SPLITS = ("train", "val", "test")
+_SUMMARY = "summary.json"
+
+
+@dataclass(frozen=True)
+class DataConfig:
+    """Which objects, and how they are looked at."""
+
+    source: str = "furniture10"
+    """furniture10, a folder of <class>/{train,test}/ meshes, a ModelNet zip, or an .npz of voxel grids"""
+    train_per_class: int = 60
+    """training objects a class, for furniture10 (validation is taken from them)"""
+    test_per_class: int = 20
+    """test objects a class, for furniture10"""
+    validation_share: float = 0.2
+    """of the training objects, taken by class"""
+    seed: int = 0
+    """of the split into training and validation"""
+    skip_damaged: bool = False
+    """leave damaged files out instead of stopping at the first"""
+    capture: CaptureConfig = CaptureConfig()
+
+
+@dataclass(frozen=True)
+class DatasetStatistics:
+    """What is known of a data set once it is made; everything is over the training split unless said otherwise.
+
+    Attributes:
+        classes: names, by label.
+        counts: objects by split and class.
+        left_out: name and reason of every object that could not be captured, all splits.
+        entropy_max: the largest depth entropy in bits: the normaliser of the network's targets (5.46 in the thesis).
+        entropy_mean, entropy_std: of the normalised entropies (0.329 and 0.156 in the thesis).
+        entropy_histogram: counts of normalised entropies in 50 bins over [0, 1].
+        mean_map: (views,) mean normalised entropy of each view.
+        class_mean_maps: (classes, views) the same by class.
+        points_mean, points_std: points seen per view.
+        viewpoints: (views, 3) unit vectors.
+        capture: the `CaptureConfig`, as a dictionary.
+        source: what the objects are.
+    """
+
+    classes: list[str]
+    counts: dict[str, dict[str, int]]
+    left_out: dict[str, str]
+    entropy_max: float
+    entropy_mean: float
+    entropy_std: float
+    entropy_histogram: list[int]
+    mean_map: list[float]
+    class_mean_maps: list[list[float]]
+    points_mean: float
+    points_std: float
+    viewpoints: list[list[float]]
+    capture: dict[str, Any]
+    source: str
+
+    @property
+    def views(self) -> int:
+        return len(self.viewpoints)
+
+    @property
+    def camera(self) -> CaptureConfig:
+        return CaptureConfig(**self.capture)
+
+
+def split_objects(
+    entries: Sequence[ObjectEntry], validation_share: float, seed: int
+) -> dict[str, list[ObjectEntry]]:
+    """Objects by split: the source's test objects, and its training objects with a share of each class put aside.
+
+    Every class keeps at least one object for training and, where it has two, one for validation.
+    """
+    random = np.random.default_rng(seed)
+    split: dict[str, list[ObjectEntry]] = {"train": [], "val": [], "test": [e for e in entries if e.split == "test"]}
+    for label in sorted({entry.label for entry in entries}):
+        members = [entry for entry in entries if entry.split == "train" and entry.label == label]
+        aside = max(min(1, len(members) - 1), round(validation_share * len(members)))
+        chosen = set(random.permutation(len(members))[:aside].tolist())
+        for index, entry in enumerate(members):
+            split["val" if index in chosen else "train"].append(entry)
+    return split
+
+
+@jax.jit
+def _entropies(levels: jax.Array) -> jax.Array:
+    return jax.vmap(level_entropy)(levels)
+
+
+def view_entropies(capture: Capture) -> np.ndarray:
+    """Thesis-exact depth entropy of each view in bits, (views,)."""
+    return np.asarray(_entropies(jnp.asarray(capture.depth // 256, jnp.int32)))
+
+
+class _Statistics:
+    """Sums over the training split while it is being written."""
+
+    def __init__(self, classes: int, views: int):
+        self.sums = np.zeros((classes, views))
+        self.counts = np.zeros(classes, int)
+        self.entropies: list[np.ndarray] = []
+        self.points: list[np.ndarray] = []
+
+    def add(self, label: int, entropies: np.ndarray, depth: np.ndarray) -> None:
+        self.sums[label] += entropies
+        self.counts[label] += 1
+        self.entropies.append(entropies)
+        self.points.append(np.count_nonzero(depth, axis=(1, 2)))
+
+    def finish(self, **rest: Any) -> DatasetStatistics:
+        entropies, points = np.stack(self.entropies), np.stack(self.points)
+        largest = float(entropies.max()) or 1.0
+        normalised = entropies / largest
+        class_means = self.sums / np.maximum(self.counts, 1)[:, None] / largest
+        return DatasetStatistics(
+            entropy_max=largest,
+            entropy_mean=float(normalised.mean()),
+            entropy_std=float(normalised.std()),
+            entropy_histogram=np.histogram(normalised, 50, (0, 1))[0].tolist(),
+            mean_map=normalised.mean(axis=0).tolist(),
+            class_mean_maps=class_means.tolist(),
+            points_mean=float(points.mean()),
+            points_std=float(points.std()),
+            **rest,
+        )
+
+
+def _features(classes: Sequence[str], config: CaptureConfig) -> dict[str, Any]:
+    import tensorflow_datasets as tfds
+
+    views, side = config.views, config.resolution
+    tensor = tfds.features.Tensor
+    return {
+        "name": tfds.features.Text(),
+        "label": tfds.features.ClassLabel(names=list(classes)),
+        "depth": tensor(shape=(views, side, side), dtype=np.uint16, encoding="bytes"),
+        "image": tensor(shape=(views, side, side), dtype=np.uint8, encoding="bytes"),
+        "pose": tensor(shape=(views, 4, 4), dtype=np.float32),
+        "entropy": tensor(shape=(views,), dtype=np.float32),
+        "extent": tensor(shape=(3,), dtype=np.float32),
+    }
+
+
+def _spill_without_tensorflow() -> None:
+    """Lets TFDS sort more than its 1 GiB of records without TensorFlow, which it uses there only to open files."""
+    from tensorflow_datasets.core import shuffle
+
+    class Bucket(shuffle._Bucket):
+        """Opened for each record, so that TFDS's thousand buckets need no thousand open files."""
+
+        def add(self, key: int, data: bytes) -> None:
+            path = Path(self._path)
+            path.parent.mkdir(parents=True, exist_ok=True)
+            with path.open("ab") as file:
+                file.write(shuffle._hkey_to_bytes(key) + struct.pack("=Q", len(data)) + data)
+            self._length += 1
+            self._size += len(data)
+
+        def read_values(self) -> Iterator[tuple[int, bytes]]:
+            if self._length:
+                with Path(self._path).open("rb") as file:
+                    while key := file.read(shuffle.HKEY_SIZE_BYTES):
+                        yield shuffle._read_hkey(key), file.read(struct.unpack("=Q", file.read(8))[0])
+
+        def del_file(self) -> None:
+            Path(self._path).unlink(missing_ok=True)
+
+    shuffle._Bucket = Bucket
+
+
+@functools.cache
+def _builder_class() -> type:
+    """The TFDS builder; made on first use, so that importing this module stays quick."""
+    import tensorflow_datasets as tfds
+
+    tfds.disable_progress_bar()
+    _spill_without_tensorflow()
+
+    class MultiViewObjects(tfds.core.GeneratorBasedBuilder):
+        """Objects captured from a lattice of viewpoints: depth, shaded image, pose and depth entropy of each view."""
+
+        VERSION = tfds.core.Version("1.0.0")
+
+        def __init__(self, *, source: ObjectSource, split, config_data: DataConfig, captures: Path, on_object, **rest):
+            self._source, self._split, self._data, self._captures = source, split, config_data, captures
+            self._on_object = on_object
+            self._poses = rig_for(config_data.capture).poses
+            super().__init__(file_format="array_record", **rest)
+
+        def _info(self):
+            features = tfds.features.FeaturesDict(_features(self._source.classes, self._data.capture))
+            return tfds.core.DatasetInfo(builder=self, description=self.__doc__, features=features)
+
+        def _split_generators(self, dl_manager):
+            del dl_manager  # the captures are on disk already
+            return {name: self._generate_examples(name) for name in SPLITS}
+
+        def _generate_examples(self, split: str) -> Iterator[tuple[str, dict[str, Any]]]:
+            for entry in self._split[split]:
+                capture = load_capture(capture_path(self._captures, entry))
+                entropies = view_entropies(capture)
+                self._on_object(split, entry, capture, entropies)
+                yield entry.name, {
+                    "name": entry.name,
+                    "label": entry.label,
+                    "depth": capture.depth,
+                    "image": capture.image,
+                    "pose": self._poses,
+                    "entropy": entropies,
+                    "extent": capture.extent,
+                }
+
+    return MultiViewObjects
+
+
+def _write_shards(
+    source: ObjectSource, split: dict[str, list[ObjectEntry]], left_out: dict[str, str], config: DataConfig, captures: Path, folder: Path
+) -> DatasetStatistics:
+    statistics = _Statistics(len(source.classes), config.capture.views)
+    with progress_bar("objects") as bar:
+        task = bar.add_task("Writing shards", total=sum(map(len, split.values())), note="")
+
+        def on_object(name: str, entry: ObjectEntry, capture: Capture, entropies: np.ndarray) -> None:
+            bar.advance(task)
+            if name == "train":
+                statistics.add(entry.label, entropies, capture.depth)
+
+        builder = _builder_class()(
+            source=source, split=split, config_data=config, captures=captures, on_object=on_object, data_dir=str(folder)
+        )
+        with redirect_stdout(io.StringIO()):  # TFDS prints where it writes, twice
+            builder.download_and_prepare()
+    counts = {
+        name: {c: sum(entry.label == i for entry in members) for i, c in enumerate(source.classes)}
+        for name, members in split.items()
+    }
+    return statistics.finish(
+        classes=list(source.classes),
+        counts=counts,
+        left_out=left_out,
+        viewpoints=fibonacci_sphere(config.capture.views, config.capture.lattice).tolist(),
+        capture=asdict(config.capture),
+        source=source.identity,
+    )
+
+
+def prepare(config: DataConfig, folder: Path) -> DatasetStatistics:
+    """Makes the data set in `folder`, or finds it there.
+
+    The steps leave their results behind (captures, then shards, then the summary), so an interrupted run goes on.
+
+    Raises:
+        DataError: unusable source, or a folder that holds a data set made otherwise.
+    """
+    identity = asdict(config)
+    made_with = folder / "config.json"
+    if made_with.exists() and read_json(made_with) != identity:
+        was = read_json(made_with)
+        differs = ", ".join(sorted(key for key in identity if was.get(key) != identity[key]))
+        raise DataError(f"{folder} holds a data set made with other settings ({differs}); choose another --out, or delete it")
+    if (folder / _SUMMARY).exists():
+        return load_statistics(folder)
+    if config.capture.views < 4:
+        raise DataError(f"--views {config.capture.views} is too few: the view graph needs at least 4 viewpoints")
+    source = open_source(config.source, train_per_class=config.train_per_class, test_per_class=config.test_per_class)
+    folder.mkdir(parents=True, exist_ok=True)
+    write_json(made_with, identity)
+    captures = folder / "captures"
+    left_out = capture_all(source.entries, config.capture, captures, skip_damaged=config.skip_damaged)
+    kept = [entry for entry in source.entries if entry.name not in left_out]
+    split = split_objects(kept, config.validation_share, config.seed)
+    for name, members in split.items():
+        if not members:
+            raise DataError(f"{config.source} leaves no objects for {name}; add some (left out: {len(left_out)})")
+    shards = folder / "shards"
+    shutil.rmtree(shards, ignore_errors=True)  # half-written ones
+    statistics = _write_shards(source, split, left_out, config, captures, shards)
+    write_json(folder / _SUMMARY, asdict(statistics))
+    shutil.rmtree(captures, ignore_errors=True)
+    return statistics
+
+
+def load_statistics(folder: Path) -> DatasetStatistics:
+    """The summary of a data set; raises `DataError` where there is none."""
+    path = folder / _SUMMARY
+    if not path.exists():
+        raise DataError(f"no data set in {folder}; make one with: mevs data --out {os.path.dirname(folder) or '.'}")
+    return DatasetStatistics(**read_json(path))
+
+
+def open_split(folder: Path, split: str) -> Any:
+    """Random access to the objects of one split: `source[i]` is a dictionary of NumPy arrays."""
+    import tensorflow_datasets as tfds
+
+    found = sorted((folder / "shards").glob("*/*/features.json"))
+    if not found:
+        raise DataError(f"no shards in {folder}; make them with: mevs data --out {os.path.dirname(folder) or '.'}")
+    return tfds.builder_from_directory(str(found[-1].parent)).as_data_source(split=split)
+
+
+def report_left_out(statistics: DatasetStatistics) -> None:
+    """Says which objects are missing and why; silence would be a lie about the data."""
+    objects = sum(sum(by_class.values()) for by_class in statistics.counts.values())
+    sizes = ", ".join(f"{sum(by_class.values())} {split}" for split, by_class in statistics.counts.items())
+    console.print(f"Data set: {objects} objects ({sizes}), {statistics.views} views each, {len(statistics.left_out)} left out")
+    for name, reason in statistics.left_out.items():
+        console.print(f"  left out: {name}: {reason}", style="dim")
+
+
+def metric_depth(stored: jax.Array | np.ndarray) -> jax.Array:
+    """Stored depth to metric depth; 0 stays 0."""
+    return jnp.asarray(stored, jnp.float32) / DEPTH_SCALE

@@ -1,0 +1,253 @@
+"""Capture: a mesh seen from every viewpoint, by casting one ray through the centre of each pixel.
+
+Two casters give the same picture. Open3D's `RaycastingScene` is the default; it needs system libraries (libGL, libX11,
+libgomp), and where they are missing trimesh's Embree binding does the same work. Both stand on Embree and see a surface
+from either side, so holes and flipped triangles of CAD models do no harm.
+
+What is kept of each view: depth as 16-bit integers of 1/10,000 unit (the thesis's own format), a shaded image, and the pose.
+The partial cloud of a view is its depth unprojected by its pose (`mevs_jax.cameras.unproject`), so it needs no room of its own.
+"""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+import signal
+import zlib
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from functools import cache
+from pathlib import Path
+from typing import Literal, Protocol
+
+import numpy as np
+
+from data_pipeline.files import write_bytes, write_text
+from data_pipeline.meshes import DamagedMesh, EmptyMesh, Mesh, ObjectEntry, load_object
+from data_pipeline.progress import progress_bar
+
+DEPTH_SCALE = 10_000  # as in mevs_jax.entropy, which capture workers do without; a test holds the two together
+_AMBIENT = 0.25
+
+
+@dataclass(frozen=True)
+class CaptureConfig:
+    """How objects are looked at."""
+
+    views: int = 40
+    """number of candidate viewpoints, at least 2"""
+    lattice: Literal["golden_angle", "equation8"] = "golden_angle"
+    """which Fibonacci lattice they form: the thesis's published code, or its eq. (8)"""
+    resolution: int = 224
+    """pixels along each side of a view"""
+    distance: float = 2.0
+    """of the camera from the object's centre, in radii of the object"""
+    field_of_view: float = 60.0
+    """in degrees"""
+
+
+@dataclass(frozen=True)
+class Rig:
+    """All cameras around an object, as plain arrays that travel to worker processes.
+
+    Attributes:
+        poses: (views, 4, 4) camera to world, float32.
+        directions: (views, resolution, resolution, 3) ray directions of unit length along the optical axis, float32.
+    """
+
+    poses: np.ndarray
+    directions: np.ndarray
+
+
+@dataclass(frozen=True)
+class Capture:
+    """One object from every viewpoint.
+
+    Attributes:
+        depth: (views, resolution, resolution) uint16, 1/10,000 unit, 0 where nothing is hit.
+        image: (views, resolution, resolution) uint8, lit from the camera, 0 where nothing is hit.
+        extent: (3,) float32, the object's size before normalisation.
+    """
+
+    depth: np.ndarray
+    image: np.ndarray
+    extent: np.ndarray
+
+
+def rig_for(config: CaptureConfig) -> Rig:
+    """The cameras that `config` describes."""
+    import jax
+
+    from mevs_jax.cameras import cameras_at, pixel_directions
+    from mevs_jax.viewpoints import fibonacci_sphere
+
+    cameras = cameras_at(
+        fibonacci_sphere(config.views, config.lattice).astype(np.float32),
+        distance=config.distance,
+        resolution=config.resolution,
+        field_of_view=np.deg2rad(config.field_of_view),
+    )
+    directions = jax.vmap(pixel_directions)(cameras)
+    return Rig(np.asarray(cameras.pose, np.float32), np.asarray(directions, np.float32))
+
+
+# ---------------------------------------------------------------------------------------------------------------- casters
+
+
+class Caster(Protocol):
+    """Casts rays at a mesh: (rays, 3) origins and directions to depth (rays,), inf for a miss, and the triangle hit."""
+
+    def __call__(self, mesh: Mesh, origins: np.ndarray, directions: np.ndarray) -> tuple[np.ndarray, np.ndarray]: ...
+
+
+def cast_open3d(mesh: Mesh, origins: np.ndarray, directions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    import open3d
+
+    scene = open3d.t.geometry.RaycastingScene(nthreads=1)
+    scene.add_triangles(open3d.core.Tensor(mesh.vertices), open3d.core.Tensor(mesh.faces.astype(np.uint32)))
+    hits = scene.cast_rays(open3d.core.Tensor(np.concatenate([origins, directions], axis=1)), nthreads=1)
+    return hits["t_hit"].numpy(), hits["primitive_ids"].numpy().astype(np.int64)
+
+
+def cast_embree(mesh: Mesh, origins: np.ndarray, directions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    from embreex.mesh_construction import TriangleMesh
+    from embreex.rtcore_scene import EmbreeScene
+
+    scene = EmbreeScene()
+    TriangleMesh(scene, np.ascontiguousarray(mesh.vertices), np.ascontiguousarray(mesh.faces))
+    hits = scene.run(np.ascontiguousarray(origins), np.ascontiguousarray(directions), output=1)
+    missed = hits["primID"] < 0
+    return np.where(missed, np.inf, hits["tfar"]).astype(np.float32), hits["primID"].astype(np.int64)
+
+
+@cache
+def default_caster() -> Caster:
+    """Open3D where its system libraries are there, else Embree alone."""
+    try:
+        import open3d  # noqa: F401
+    except (ImportError, OSError):
+        return cast_embree
+    return cast_open3d
+
+
+# ---------------------------------------------------------------------------------------------------------------- capture
+
+
+def capture(mesh: Mesh, rig: Rig, caster: Caster | None = None) -> Capture:
+    """Depth and shaded image of `mesh` from every camera of `rig`."""
+    caster = caster or default_caster()
+    views, resolution = rig.directions.shape[:2]
+    directions = rig.directions.reshape(-1, 3)
+    origins = np.repeat(rig.poses[:, :3, 3], resolution * resolution, axis=0)
+    depth, triangle = caster(mesh, origins, directions)
+    hit = np.isfinite(depth)
+
+    corners = mesh.vertices[mesh.faces]
+    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
+    towards = directions[hit] / np.linalg.norm(directions[hit], axis=1, keepdims=True)
+    facing = np.abs(np.sum(normals[triangle[hit]] * towards, axis=1))
+    image = np.zeros(len(depth), np.uint8)
+    image[hit] = np.round(255 * (_AMBIENT + (1 - _AMBIENT) * np.clip(facing, 0, 1)))
+
+    stored = np.zeros(len(depth), np.uint16)
+    stored[hit] = np.clip(depth[hit] * np.float32(DEPTH_SCALE), 1, 65535).astype(np.uint16)
+    shape = (views, resolution, resolution)
+    return Capture(stored.reshape(shape), image.reshape(shape), mesh.extent)
+
+
+def save_capture(path: Path, capture: Capture) -> None:
+    """Fast compression: most of a view is background."""
+    import io
+
+    buffer = io.BytesIO()
+    packed = {
+        name: np.frombuffer(zlib.compress(array.tobytes(), 1), np.uint8)
+        for name, array in (("depth", capture.depth), ("image", capture.image))
+    }
+    np.savez(buffer, shape=np.array(capture.depth.shape), extent=capture.extent, **packed)
+    write_bytes(path, buffer.getvalue())
+
+
+def load_capture(path: Path) -> Capture:
+    with np.load(path) as stored:
+        shape = tuple(stored["shape"])
+        depth = np.frombuffer(zlib.decompress(stored["depth"].tobytes()), np.uint16).reshape(shape)
+        image = np.frombuffer(zlib.decompress(stored["image"].tobytes()), np.uint8).reshape(shape)
+        return Capture(depth, image, stored["extent"])
+
+
+# ------------------------------------------------------------------------------------------------------------ many objects
+
+
+def capture_path(folder: Path, entry: ObjectEntry) -> Path:
+    return folder / (entry.name.replace("/", "__") + ".npz")
+
+
+def _left_out_path(folder: Path, entry: ObjectEntry) -> Path:
+    return capture_path(folder, entry).with_suffix(".left_out")
+
+
+_rig: Rig | None = None
+_folder: Path | None = None
+
+
+def _start_worker(rig: Rig, folder: Path) -> None:
+    global _rig, _folder
+    _rig, _folder = rig, folder
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent answers Ctrl-C and ends its workers
+
+
+def _capture_entry(entry: ObjectEntry) -> str | None:
+    """Captures one object into the folder; returns what is wrong with a damaged one."""
+    assert _rig is not None
+    assert _folder is not None
+    try:
+        save_capture(capture_path(_folder, entry), capture(load_object(entry), _rig))
+    except EmptyMesh as reason:
+        write_text(_left_out_path(_folder, entry), str(reason))
+    except DamagedMesh as reason:
+        return str(reason)
+    return None
+
+
+def capture_all(
+    entries: Sequence[ObjectEntry], config: CaptureConfig, folder: Path, *, skip_damaged: bool = False, workers: int | None = None
+) -> dict[str, str]:
+    """Captures every object into `folder`, several at a time, and returns the objects left out with the reason.
+
+    Objects whose capture is there already are not captured again, so an interrupted run goes on where it stopped.
+
+    Raises:
+        DamagedMesh: at the first damaged mesh, unless `skip_damaged`, which leaves them out like empty ones.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    there = {path.name for path in folder.iterdir()}
+    todo = [
+        entry
+        for entry in entries
+        if capture_path(folder, entry).name not in there and _left_out_path(folder, entry).name not in there
+    ]
+    if todo:
+        workers = workers or os.cpu_count() or 1
+        context = multiprocessing.get_context("spawn")
+        with (
+            progress_bar("objects") as bar,
+            context.Pool(min(workers, len(todo)), _start_worker, (rig_for(config), folder)) as pool,
+        ):
+            task = bar.add_task("Capturing", total=len(entries), completed=len(entries) - len(todo), note="")
+            for entry, damage in zip(todo, pool.imap(_capture_entry, todo, chunksize=4), strict=True):
+                if damage and not skip_damaged:
+                    raise DamagedMesh(f"{damage}, or leave such objects out with --data.skip-damaged")
+                if damage:
+                    write_text(_left_out_path(folder, entry), damage)
+                bar.advance(task)
+    return {
+        entry.name: _left_out_path(folder, entry).read_text()
+        for entry in entries
+        if _left_out_path(folder, entry).exists()
+    }
+
+
+def describe(config: CaptureConfig) -> dict:
+    return asdict(config)

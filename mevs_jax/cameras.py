@@ -1,0 +1,89 @@
+"""One pinhole camera, one convention, written down here and nowhere else.
+
+World: right-handed, z up, object centred in the unit sphere. Camera: x right, y down, z forward (OpenCV). A pose is the
+(4, 4) matrix from camera to world. Pixel (row, column) has its centre at (row + ½, column + ½). Depth is metric distance
+along the camera's z axis, and 0 where nothing is hit.
+
+At distance 2 with a field of view of 60° the unit sphere touches the border of the image from inside (sin 30° = ½), so an
+object is never cut off; 60° is the field of view of the viewer that the thesis captured with.
+"""
+
+from __future__ import annotations
+
+import math
+
+import flax.struct
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+
+@flax.struct.dataclass
+class Camera:
+    """Square pinhole camera: `pose` (4, 4) camera to world, `field_of_view` in radians, `resolution` in pixels."""
+
+    pose: Float[Array, "4 4"]
+    field_of_view: float = flax.struct.field(pytree_node=False, default=math.pi / 3)
+    resolution: int = flax.struct.field(pytree_node=False, default=224)
+
+    @property
+    def focal_length(self) -> float:
+        """In pixels."""
+        return self.resolution / 2 / math.tan(self.field_of_view / 2)
+
+
+def look_at_origin(position: Float[Array, "3"]) -> Float[Array, "4 4"]:
+    """Pose of a camera at `position` looking at the origin with world z upwards in the image.
+
+    Straight above or below, where "up" is undefined, world y takes its place.
+    """
+    forward = -position / jnp.linalg.norm(position)
+    polar = jnp.abs(forward[2]) > 1 - 1e-6
+    up = jnp.where(polar, jnp.array([0.0, 1.0, 0.0]), jnp.array([0.0, 0.0, 1.0]))
+    right = jnp.cross(forward, up)
+    right = right / jnp.linalg.norm(right)
+    down = jnp.cross(forward, right)
+    rotation = jnp.stack([right, down, forward], axis=1)
+    return jnp.eye(4).at[:3, :3].set(rotation).at[:3, 3].set(position)
+
+
+def pixel_directions(camera: Camera) -> Float[Array, "resolution resolution 3"]:
+    """World direction through each pixel centre, with length one *along the optical axis*: a hit at `t` has depth `t`."""
+    offset = (jnp.arange(camera.resolution) + 0.5 - camera.resolution / 2) / camera.focal_length
+    x, y = jnp.meshgrid(offset, offset)
+    return jnp.stack([x, y, jnp.ones_like(x)], axis=-1) @ camera.pose[:3, :3].T
+
+
+def unproject(
+    pixels: Int[Array, "points"], depth: Float[Array, "points"], camera: Camera, *, frame: str = "world"
+) -> Float[Array, "points 3"]:
+    """Points seen at flat pixel indices (row · resolution + column).
+
+    Args:
+        depth: metric, positive.
+        frame: `world`, or `camera` (the thesis's clouds, whose pose is lost), there centred two units before the lens.
+    """
+    row, column = pixels // camera.resolution, pixels % camera.resolution
+    half, focal = camera.resolution / 2, camera.focal_length
+    local = jnp.stack([(column + 0.5 - half) / focal * depth, (row + 0.5 - half) / focal * depth, depth], axis=-1)
+    if frame == "world":
+        return local @ camera.pose[:3, :3].T + camera.pose[:3, 3]
+    if frame == "camera":
+        return local - jnp.array([0.0, 0.0, 1.0]) * jnp.linalg.norm(camera.pose[:3, 3])
+    raise ValueError(f"unknown frame {frame!r}: it is 'world' or 'camera'")
+
+
+def partial_cloud(
+    depth: Float[Array, "resolution resolution"], camera: Camera
+) -> tuple[Float[Array, "pixels 3"], Bool[Array, "pixels"]]:
+    """The world point behind every pixel, and which of them are real (something was hit)."""
+    flat = depth.reshape(-1)
+    pixels = jnp.arange(flat.shape[0])
+    return unproject(pixels, flat, camera), flat > 0
+
+
+def cameras_at(
+    points: Float[Array, "views 3"], *, distance: float = 2.0, resolution: int = 224, field_of_view: float = math.pi / 3
+) -> Camera:
+    """Cameras on a sphere of radius `distance`, one per unit vector, as one `Camera` with a leading axis on `pose`."""
+    return Camera(jax.vmap(look_at_origin)(jnp.asarray(points) * distance), float(field_of_view), resolution)

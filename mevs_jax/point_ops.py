@@ -1,0 +1,125 @@
+"""Sampling and grouping of points: the two operations every PointNet++ is built on.
+
+Both follow the index rules of the reference CUDA operations (Qi et al., PointNet++, 2017; the `pointnet2_ops` package), so
+that weights trained there mean the same thing here:
+
+* farthest-point sampling starts at point 0, and a tie goes to the smallest index;
+* ball query takes the first `k` points, in index order, that lie strictly within the radius, and fills what is missing
+  with the first of them (with point 0 where there is none).
+
+Equal indices need equal distances to the last bit. A compiler may fuse `x*x + y*y` into one rounding instead of two, which
+moves a squared distance by one unit in the last place and, now and then, an index. `_squared_distance` keeps the roundings
+apart, so a plain NumPy loop, a CPU and an accelerator agree.
+"""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int, UInt32
+
+_WORD = 32  # hits of 32 points are packed into one machine word
+
+
+def _square(x: Array) -> Array:
+    """x², rounded on its own: the comparison stops the compiler from fusing the product into a following addition."""
+    product = x * x
+    return jnp.where(product > 0, product, 0.0)
+
+
+def _squared_distance(dx: Array, dy: Array, dz: Array) -> Array:
+    return (_square(dx) + _square(dy)) + _square(dz)
+
+
+def farthest_point_sample(points: Float[Array, "points 3"], k: int) -> Int[Array, "{k}"]:
+    """Indices of `k` points, each the farthest from those taken before it; the first is point 0.
+
+    Args:
+        points: coordinates, any unit. Duplicates are allowed.
+        k: how many to take, at least 1. Where `k` exceeds the number of distinct points, the rest are 0.
+
+    Returns:
+        (k,) int32 indices.
+
+    Source: PointNet++ §3.3; reference rule of `pointnet2_ops` without its exception for points near the origin.
+    """
+    if k < 1:
+        raise ValueError(f"farthest_point_sample needs k >= 1, got {k}")
+    count = points.shape[0]
+    if count < 1:
+        raise ValueError("farthest_point_sample needs at least one point")
+    # Three contiguous arrays, and max followed by "smallest index equal to it": XLA vectorises both on CPU, not argmax.
+    x, y, z = points[:, 0], points[:, 1], points[:, 2]
+    index = jnp.arange(count, dtype=jnp.int32)
+
+    def step(i: Array, carry: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
+        chosen, nearest, last = carry
+        nearest = jnp.minimum(nearest, _squared_distance(x - x[last], y - y[last], z - z[last]))
+        last = jnp.min(jnp.where(nearest == jnp.max(nearest), index, count - 1))
+        return chosen.at[i].set(last), nearest, last
+
+    chosen = jnp.zeros(k, jnp.int32)
+    nearest = jnp.full(count, jnp.inf, points.dtype)
+    return jax.lax.fori_loop(1, k, step, (chosen, nearest, jnp.int32(0)))[0]
+
+
+def ball_query(
+    points: Float[Array, "points 3"], centres: Float[Array, "centres 3"], radius: float | Float[Array, ""], k: int
+) -> Int[Array, "centres {k}"]:
+    """For each centre, the first `k` points in index order strictly within `radius`.
+
+    Args:
+        points, centres: coordinates in one unit.
+        radius: in that unit; compared as `d² < radius·radius` in float32, as the reference does.
+        k: slots per centre, at least 1. Missing ones repeat the first hit; a centre without any hit gets point 0.
+
+    Returns:
+        (centres, k) int32 indices.
+
+    Source: PointNet++ §3.2; reference rule of `pointnet2_ops`.
+
+    The hits of 32 points become the bits of one word. A prefix sum of popcounts then says which word holds the s-th hit,
+    and five halvings find the bit inside it: an eighth of the time of a cumulative sum over the points.
+    """
+    if k < 1:
+        raise ValueError(f"ball_query needs k >= 1, got {k}")
+    count = points.shape[0]
+    padded = jnp.pad(points, ((0, -count % _WORD), (0, 0)), constant_values=jnp.inf)
+    squared_radius = _square(jnp.asarray(radius, points.dtype))
+    x, y, z = (padded[:, axis].reshape(-1, _WORD) for axis in range(3))
+    hit = _squared_distance(
+        centres[:, 0, None, None] - x, centres[:, 1, None, None] - y, centres[:, 2, None, None] - z
+    ) < squared_radius
+    words = _pack(hit)
+    return jax.vmap(_first_set_bits, in_axes=(0, None))(words, k)
+
+
+def _pack(hit: Bool[Array, "centres words 32"]) -> UInt32[Array, "centres words"]:
+    bit = jnp.uint32(1) << jnp.arange(_WORD, dtype=jnp.uint32)
+    return jnp.sum(jnp.where(hit, bit, jnp.uint32(0)), axis=-1, dtype=jnp.uint32)
+
+
+def _first_set_bits(words: UInt32[Array, "words"], k: int) -> Int[Array, "{k}"]:
+    """Positions of the first `k` set bits of a long bit string, the first one repeated where there are fewer."""
+    ones = jax.lax.population_count(words).astype(jnp.int32)
+    until = jnp.cumsum(ones)
+    slot = jnp.arange(k, dtype=jnp.int32)
+    slot = jnp.where(slot < until[-1], slot, 0)
+    word = jnp.sum(until[None, :] <= slot[:, None], axis=1, dtype=jnp.int32)
+    word = jnp.minimum(word, words.shape[0] - 1)  # reached only where nothing is hit
+    rank = slot - (until[word] - ones[word])
+    position = word * _WORD + _select_bit(words[word], rank)
+    return jnp.where(until[-1] > 0, position, 0)
+
+
+def _select_bit(word: UInt32[Array, "k"], rank: Int[Array, "k"]) -> Int[Array, "k"]:
+    """Position of the set bit number `rank` (from 0) of each word, by halving."""
+    position = jnp.zeros_like(rank)
+    for width in (16, 8, 4, 2, 1):
+        low = word & jnp.uint32((1 << width) - 1)
+        ones = jax.lax.population_count(low).astype(jnp.int32)
+        above = rank >= ones
+        rank = jnp.where(above, rank - ones, rank)
+        position = jnp.where(above, position + width, position)
+        word = jnp.where(above, word >> width, low)
+    return position

@@ -1,0 +1,1 @@
+"""Shards train networks."""

@@ -1,0 +1,47 @@
+"""What a training run leaves on disk: its latest state, its best one, and how far it got. Orbax does the writing.
+
+Each save appears whole under its step, or not at all; older ones are removed after.
+"""
+
+from __future__ import annotations
+
+import logging
+from pathlib import Path
+from typing import Any
+
+import jax
+import orbax.checkpoint as ocp
+
+logging.getLogger("absl").setLevel(logging.ERROR)  # Orbax tells every step of every save
+
+
+class Checkpoints:
+    """Two slots, `latest` and `best`, each holding one (state, progress): a tree of arrays, and plain numbers."""
+
+    def __init__(self, folder: Path):
+        options = ocp.CheckpointManagerOptions(max_to_keep=1, create=True, enable_async_checkpointing=False)
+        self._slots = {
+            name: ocp.CheckpointManager((folder / name).absolute(), options=options) for name in ("latest", "best")
+        }
+
+    def save(self, slot: str, step: int, state: Any, progress: dict[str, Any]) -> None:
+        manager = self._slots[slot]
+        if manager.latest_step() == step:
+            return
+        manager.save(step, args=ocp.args.Composite(state=ocp.args.StandardSave(state), progress=ocp.args.JsonSave(progress)))
+
+    def restore(self, slot: str, like: Any) -> tuple[Any, dict[str, Any]] | None:
+        """The newest of a slot, shaped and placed as `like`; None where nothing was saved."""
+        manager = self._slots[slot]
+        step = manager.latest_step()
+        if step is None:
+            return None
+        abstract = jax.tree.map(ocp.utils.to_shape_dtype_struct, like)
+        restored = manager.restore(
+            step, args=ocp.args.Composite(state=ocp.args.StandardRestore(abstract), progress=ocp.args.JsonRestore())
+        )
+        return restored["state"], restored["progress"]
+
+    def close(self) -> None:
+        for manager in self._slots.values():
+            manager.close()

@@ -1,0 +1,89 @@
+"""The classifier: one view to the logits of its class (thesis §5.2)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import partial
+from typing import Literal
+
+import jax
+import jax.numpy as jnp
+import optax
+from flax import nnx
+
+from data_pipeline.augment import ImageAugmentation, augment_image
+from data_pipeline.batches import ViewBatches
+from data_pipeline.capture import CaptureConfig
+from data_pipeline.inputs import image_input
+from mevs_jax.models import ResNet
+from train.loop import Batch, OptimiserConfig
+
+
+@dataclass(frozen=True)
+class ResNetConfig:
+    """Shape of the network."""
+
+    depth: Literal[18, 34] = 18
+    """18 or 34"""
+    width: int = 64
+    """channels of the first stage"""
+    channels: int = 3
+    """channels of the input; depth and grey images are replicated"""
+
+
+@dataclass(frozen=True)
+class ClassifierConfig:
+    """The classifier and its training."""
+
+    network: ResNetConfig = ResNetConfig()
+    images: Literal["depth", "image"] = "depth"
+    """what it looks at: depth, or the shaded image"""
+    augmentation: ImageAugmentation = ImageAugmentation()
+    optimiser: OptimiserConfig = OptimiserConfig(weight_decay=1e-4)
+
+
+@dataclass(frozen=True)
+class ClassifierTask:
+    """Cross entropy on single views."""
+
+    network_config: ResNetConfig
+    classes: int
+    images: Literal["depth", "image"]
+    camera: CaptureConfig
+    augmentation: ImageAugmentation
+    optimiser: OptimiserConfig
+    name: str = "classifier"
+
+    @classmethod
+    def of(cls, config: ClassifierConfig, classes: int, camera: CaptureConfig) -> ClassifierTask:
+        return cls(config.network, classes, config.images, camera, config.augmentation, config.optimiser)
+
+    @property
+    def batches(self) -> ViewBatches:
+        config = self.optimiser
+        return ViewBatches(config.batch_size, config.views_per_object, images=self.images, seed=config.seed)
+
+    def network(self, rngs: nnx.Rngs) -> ResNet:
+        shape = self.network_config
+        return ResNet(depth=shape.depth, classes=self.classes, channels=shape.channels, width=shape.width, rngs=rngs)
+
+    def inputs(self, batch: Batch) -> jax.Array:
+        """Images (views, height, width, channels) of a batch."""
+        convert = partial(image_input, images=self.images, channels=self.network_config.channels, camera=self.camera)
+        return jax.vmap(convert)(batch[self.images])
+
+    def loss(self, network: ResNet, batch: Batch, key: jax.Array, samples: jax.Array) -> tuple[jax.Array, dict[str, jax.Array]]:
+        del samples
+        images = self.inputs(batch)
+        keys = jax.random.split(key, len(images))
+        images = jax.vmap(augment_image, in_axes=(0, 0, None))(keys, images, self.augmentation)
+        logits = network(images, train=True)
+        loss = jnp.mean(optax.softmax_cross_entropy_with_integer_labels(logits, batch["label"]))
+        return loss, {"loss": loss, "accuracy": jnp.mean(jnp.argmax(logits, -1) == batch["label"])}
+
+    def evaluate(self, network: ResNet, batch: Batch) -> dict[str, jax.Array]:
+        logits = network(self.inputs(batch))
+        return {
+            "loss": optax.softmax_cross_entropy_with_integer_labels(logits, batch["label"]),
+            "accuracy": (jnp.argmax(logits, -1) == batch["label"]).astype(jnp.float32),
+        }

@@ -1,0 +1,100 @@
+"""The entropy predictor: one partial cloud to the depth entropy of every candidate view (thesis §4.3.2 and §5.1)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import partial
+from typing import Literal
+
+import jax
+import jax.numpy as jnp
+from flax import nnx
+
+from data_pipeline.augment import CloudAugmentation, augment_cloud
+from data_pipeline.batches import ViewBatches
+from data_pipeline.capture import CaptureConfig
+from data_pipeline.inputs import cloud_input
+from mevs_jax.models import THESIS_ABSTRACTIONS, Abstraction, PointNet2
+from train.loop import Batch, OptimiserConfig
+
+
+@dataclass(frozen=True)
+class PointNet2Config:
+    """Shape of the network and of the clouds it reads."""
+
+    points: int = 4096
+    """points of a cloud"""
+    frame: Literal["world", "camera"] = "world"
+    """the frame of the clouds: world (the camera's pose is known) or camera (the thesis, whose clouds lose it)"""
+    abstractions: tuple[Abstraction, ...] = THESIS_ABSTRACTIONS
+    """the set-abstraction levels"""
+    global_layers: tuple[int, ...] = (256, 512, 1024)
+    """layers over all centres"""
+    head_layers: tuple[int, ...] = (512, 256)
+    """layers before the output"""
+    dropout: float = 0.5
+    """before the output"""
+
+
+@dataclass(frozen=True)
+class EntropyConfig:
+    """The entropy predictor and its training."""
+
+    network: PointNet2Config = PointNet2Config()
+    augmentation: CloudAugmentation = CloudAugmentation()
+    optimiser: OptimiserConfig = OptimiserConfig(epochs=200, batch_size=32, schedule="steps")
+
+
+@dataclass(frozen=True)
+class EntropyTask:
+    """Mean squared error on normalised entropies."""
+
+    network_config: PointNet2Config
+    views: int
+    entropy_max: float
+    camera: CaptureConfig
+    augmentation: CloudAugmentation
+    optimiser: OptimiserConfig
+    name: str = "entropy predictor"
+
+    @classmethod
+    def of(cls, config: EntropyConfig, views: int, entropy_max: float, camera: CaptureConfig) -> EntropyTask:
+        return cls(config.network, views, entropy_max, camera, config.augmentation, config.optimiser)
+
+    @property
+    def batches(self) -> ViewBatches:
+        config = self.optimiser
+        return ViewBatches(config.batch_size, config.views_per_object, points=self.network_config.points, seed=config.seed)
+
+    def network(self, rngs: nnx.Rngs) -> PointNet2:
+        shape = self.network_config
+        return PointNet2(
+            views=self.views,
+            abstractions=shape.abstractions,
+            global_layers=shape.global_layers,
+            head_layers=shape.head_layers,
+            dropout=shape.dropout,
+            rngs=rngs,
+        )
+
+    def inputs(self, batch: Batch) -> jax.Array:
+        """Clouds (views, points, 3) of a batch."""
+        convert = partial(cloud_input, camera=self.camera, frame=self.network_config.frame)
+        return jax.vmap(convert)(batch["pixels"], batch["pixel_depth"], batch["pose"])
+
+    def momentum(self, samples: jax.Array) -> jax.Array:
+        """Batch-norm momentum after so many samples: 0.5, halved every 20,000, not below 0.01 (thesis code)."""
+        return jnp.maximum(0.5 * 0.5 ** (samples // 20_000), 0.01)
+
+    def loss(self, network: PointNet2, batch: Batch, key: jax.Array, samples: jax.Array) -> tuple[jax.Array, dict[str, jax.Array]]:
+        augment, drop = jax.random.split(key)
+        clouds = self.inputs(batch)
+        keys = jax.random.split(augment, len(clouds))
+        clouds = jax.vmap(augment_cloud, in_axes=(0, 0, None))(keys, clouds, self.augmentation)
+        predicted = network(clouds, train=True, key=drop, momentum=self.momentum(samples))
+        loss = jnp.mean(jnp.square(predicted - batch["entropy"] / self.entropy_max))
+        return loss, {"loss": loss}
+
+    def evaluate(self, network: PointNet2, batch: Batch) -> dict[str, jax.Array]:
+        predicted = network(self.inputs(batch))
+        return {"loss": jnp.mean(jnp.square(predicted - batch["entropy"] / self.entropy_max), axis=-1)}
