@@ -23,7 +23,7 @@ import numpy as np
 
 from data_pipeline.capture import DEPTH_SCALE, Capture, CaptureConfig, capture_all, capture_path, load_capture, rig_for
 from data_pipeline.files import read_json, write_json
-from data_pipeline.meshes import DataError, ObjectEntry, ObjectSource, open_source
+from data_pipeline.meshes import SOURCE_SPLITS, DataError, ObjectEntry, ObjectSource, open_source
 from data_pipeline.progress import console, progress_bar
 from mevs_jax.entropy import level_entropy
 from mevs_jax.viewpoints import fibonacci_sphere
@@ -58,7 +58,7 @@ class DatasetStatistics:
     Attributes:
         classes: names, by label.
         counts: objects by split and class.
-        left_out: name and reason of every object that could not be captured, all splits.
+        left_out: name and reason of every object that could not be captured, by the source's split.
         entropy_max: the largest depth entropy in bits: the normaliser of the network's targets (5.46 in the thesis).
         entropy_mean, entropy_std: of the normalised entropies (0.329 and 0.156 in the thesis).
         entropy_histogram: counts of normalised entropies in 50 bins over [0, 1].
@@ -72,7 +72,7 @@ class DatasetStatistics:
 
     classes: list[str]
     counts: dict[str, dict[str, int]]
-    left_out: dict[str, str]
+    left_out: dict[str, dict[str, str]]
     entropy_max: float
     entropy_mean: float
     entropy_std: float
@@ -88,6 +88,10 @@ class DatasetStatistics:
     @property
     def views(self) -> int:
         return len(self.viewpoints)
+
+    @property
+    def left_out_count(self) -> int:
+        return sum(map(len, self.left_out.values()))
 
     @property
     def camera(self) -> CaptureConfig:
@@ -244,7 +248,7 @@ def _builder_class() -> type:
 
 
 def _write_shards(
-    source: ObjectSource, split: dict[str, list[ObjectEntry]], left_out: dict[str, str], config: DataConfig, captures: Path, folder: Path
+    source: ObjectSource, split: dict[str, list[ObjectEntry]], left_out: dict[str, dict[str, str]], config: DataConfig, captures: Path, folder: Path
 ) -> DatasetStatistics:
     statistics = _Statistics(len(source.classes), config.capture.views)
     with progress_bar("objects") as bar:
@@ -282,6 +286,8 @@ def prepare(config: DataConfig, folder: Path) -> DatasetStatistics:
     Raises:
         DataError: unusable source, or a folder that holds a data set made otherwise.
     """
+    if config.capture.views < 2:
+        raise DataError(f"--views {config.capture.views} is too few: choosing a next view takes at least 2 viewpoints")
     identity = asdict(config)
     made_with = folder / "config.json"
     if made_with.exists() and read_json(made_with) != identity:
@@ -290,8 +296,6 @@ def prepare(config: DataConfig, folder: Path) -> DatasetStatistics:
         raise DataError(f"{folder} holds a data set made with other settings ({differs}); choose another --out, or delete it")
     if (folder / _SUMMARY).exists():
         return load_statistics(folder)
-    if config.capture.views < 4:
-        raise DataError(f"--views {config.capture.views} is too few: the view graph needs at least 4 viewpoints")
     source = open_source(config.source, train_per_class=config.train_per_class, test_per_class=config.test_per_class)
     folder.mkdir(parents=True, exist_ok=True)
     write_json(made_with, identity)
@@ -302,9 +306,13 @@ def prepare(config: DataConfig, folder: Path) -> DatasetStatistics:
     for name, members in split.items():
         if not members:
             raise DataError(f"{config.source} leaves no objects for {name}; add some (left out: {len(left_out)})")
+    reasons = {
+        name: {entry.name: left_out[entry.name] for entry in source.entries if entry.split == name and entry.name in left_out}
+        for name in SOURCE_SPLITS
+    }
     shards = folder / "shards"
     shutil.rmtree(shards, ignore_errors=True)  # half-written ones
-    statistics = _write_shards(source, split, left_out, config, captures, shards)
+    statistics = _write_shards(source, split, reasons, config, captures, shards)
     write_json(folder / _SUMMARY, asdict(statistics))
     shutil.rmtree(captures, ignore_errors=True)
     return statistics
@@ -332,9 +340,13 @@ def report_left_out(statistics: DatasetStatistics) -> None:
     """Says which objects are missing and why; silence would be a lie about the data."""
     objects = sum(sum(by_class.values()) for by_class in statistics.counts.values())
     sizes = ", ".join(f"{sum(by_class.values())} {split}" for split, by_class in statistics.counts.items())
-    console.print(f"Data set: {objects} objects ({sizes}), {statistics.views} views each, {len(statistics.left_out)} left out")
-    for name, reason in statistics.left_out.items():
-        console.print(f"  left out: {name}: {reason}", style="dim")
+    console.print(
+        f"Data set: {objects} objects ({sizes}), {statistics.views} views each, "
+        f"{statistics.left_out_count} left out"
+    )
+    for by_name in statistics.left_out.values():
+        for name, reason in by_name.items():
+            console.print(f"  left out: {name}: {reason}", style="dim", soft_wrap=True)
 
 
 def metric_depth(stored: jax.Array | np.ndarray) -> jax.Array:

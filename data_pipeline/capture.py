@@ -238,7 +238,7 @@ def capture_all(
             task = bar.add_task("Capturing", total=len(entries), completed=len(entries) - len(todo), note="")
             for entry, damage in zip(todo, pool.imap(_capture_entry, todo, chunksize=4), strict=True):
                 if damage and not skip_damaged:
-                    raise DamagedMesh(f"{damage}, or leave such objects out with --data.skip-damaged")
+                    raise DamagedMesh(f"{damage}, or leave such objects out with --dataset.skip-damaged")
                 if damage:
                     write_text(_left_out_path(folder, entry), damage)
                 bar.advance(task)

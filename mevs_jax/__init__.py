@@ -1,1 +1,81 @@
+"""mevs_jax: where should a camera look next?
 
+Everything takes *one* object, cloud or view; put `jax.vmap` on for many. No files, no printing, no globals.
+"""
+
+from mevs_jax.cameras import Camera, cameras_at, look_at_origin, partial_cloud, pixel_directions, unproject
+from mevs_jax.entropy import depth_entropy, depth_levels, level_entropy, quantise_depth, shannon_entropy
+from mevs_jax.fusion import confidence, sum_of_logits
+from mevs_jax.metrics import accuracy, bootstrap_interval, class_accuracy, confusion_matrix, mean_squared_error
+from mevs_jax.models import Abstraction, PointNet2, ResNet, count_parameters
+from mevs_jax.point_ops import ball_query, farthest_point_sample
+from mevs_jax.policies import (
+    POLICIES,
+    Policy,
+    Scene,
+    SelectionState,
+    maxima_first,
+    oracle_entropy,
+    predicted_entropy,
+    random_view,
+)
+from mevs_jax.pretrained import pointnet2_from_torch, resnet_from_torch
+from mevs_jax.selection import (
+    NEVER_STOP,
+    Episode,
+    Observation,
+    ViewTable,
+    select_from_table,
+    select_views,
+    stop_at,
+)
+from mevs_jax.viewpoints import ViewGraph, fibonacci_sphere, local_maxima
+
+__version__ = "0.1.0"
+
+__all__ = [
+    "NEVER_STOP",
+    "POLICIES",
+    "Abstraction",
+    "Camera",
+    "Episode",
+    "Observation",
+    "PointNet2",
+    "Policy",
+    "ResNet",
+    "Scene",
+    "SelectionState",
+    "ViewGraph",
+    "ViewTable",
+    "accuracy",
+    "ball_query",
+    "bootstrap_interval",
+    "cameras_at",
+    "class_accuracy",
+    "confidence",
+    "confusion_matrix",
+    "count_parameters",
+    "depth_entropy",
+    "depth_levels",
+    "farthest_point_sample",
+    "fibonacci_sphere",
+    "level_entropy",
+    "local_maxima",
+    "look_at_origin",
+    "maxima_first",
+    "mean_squared_error",
+    "oracle_entropy",
+    "partial_cloud",
+    "pixel_directions",
+    "pointnet2_from_torch",
+    "predicted_entropy",
+    "quantise_depth",
+    "random_view",
+    "resnet_from_torch",
+    "select_from_table",
+    "select_views",
+    "shannon_entropy",
+    "stop_at",
+    "sum_of_logits",
+    "unproject",
+]

@@ -84,6 +84,7 @@ class ResNet(nnx.Module):
         if depth not in _BLOCKS:
             raise ValueError(f"ResNet has depth 18 or 34, got {depth}")
         self.depth, self.classes, self.channels, self.width = depth, classes, channels, width
+        self.stages = _BLOCKS[depth]
         self.convolution = Convolution(channels, width, 7, 2, rngs=rngs)
         self.norm = BatchNorm(width)
         blocks = []

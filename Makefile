@@ -1,0 +1,31 @@
+# Needs python3 (3.11 or 3.12) with venv, and make. Everything else is installed into .venv, pinned.
+PYTHON ?= python3
+BIN := .venv/bin
+READY := .venv/.ready
+OUT ?= runs/demo
+
+.PHONY: demo test lint bench clean
+
+demo: $(READY)  ## environment, data, networks, evaluation, report
+	$(BIN)/mevs run --preset small --out $(OUT)
+
+test: lint  ## format, lint, types and tests
+	$(BIN)/python -m pytest -n 2 --dist loadfile
+
+lint: $(READY)
+	$(BIN)/ruff format --check .
+	$(BIN)/ruff check .
+	$(BIN)/mypy
+
+bench: $(READY)  ## what is fast, beside its peers, in one run
+	$(BIN)/python benchmarks/point_ops.py
+
+$(READY): requirements.lock pyproject.toml
+	$(PYTHON) -c 'import sys; sys.exit(not (3, 11) <= sys.version_info < (3, 13) and "mevs_jax needs Python 3.11 or 3.12, this is " + sys.version.split()[0] + "; set PYTHON=python3.12, say")'
+	$(PYTHON) -m venv .venv
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -r requirements.lock
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-deps --editable .
+	touch $@
+
+clean:
+	rm -rf .venv runs dist

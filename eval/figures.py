@@ -1,0 +1,170 @@
+"""The report's figures, each a function of numbers to a matplotlib figure; the report decides where they go."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import matplotlib
+
+matplotlib.use("Agg")
+import matplotlib.pyplot as plt
+import numpy as np
+from matplotlib.figure import Figure
+
+NAMES = {"random": "random", "predicted_entropy": "PointNet++ entropy", "oracle_entropy": "entropy oracle"}
+COLOURS = {"random": "#6b7280", "predicted_entropy": "#2563eb", "oracle_entropy": "#d97706"}
+
+plt.rcParams.update(
+    {
+        "figure.dpi": 110,
+        "font.size": 9,
+        "axes.spines.top": False,
+        "axes.spines.right": False,
+        "axes.titlesize": 10,
+        "axes.titleweight": "bold",
+        "svg.fonttype": "path",
+        "svg.hashsalt": "mevs",
+    }
+)
+
+
+def accuracy_after_views(policies: dict[str, dict[str, Any]], all_views: float) -> Figure:
+    """Accuracy after exactly n views, all starts, with 95 % bands over objects."""
+    figure, axis = plt.subplots(figsize=(6.2, 3.6), layout="constrained")
+    for name, result in policies.items():
+        values = 100 * np.array(result["after_views"])
+        low, high = 100 * np.array(result["after_views_interval"]).T
+        steps = np.arange(1, len(values) + 1)
+        axis.plot(steps, values, "o-", color=COLOURS[name], label=NAMES[name], markersize=4)
+        axis.fill_between(steps, low, high, color=COLOURS[name], alpha=0.10, linewidth=0)
+    axis.axhline(100 * all_views, color="#111827", linestyle=":", linewidth=1, label="all views")
+    axis.set(xlabel="views looked at", ylabel="test accuracy (%)", title="Accuracy by number of views")
+    axis.legend(frameon=False)
+    return figure
+
+
+def difference_after_views(against_random: dict[str, dict[str, Any]]) -> Figure:
+    """Accuracy minus random's after n views, paired, with 95 % intervals."""
+    figure, axis = plt.subplots(figsize=(6.2, 3.0), layout="constrained")
+    for offset, (name, result) in zip((-0.08, 0.08), against_random.items(), strict=False):
+        values = 100 * np.array(result["after_views_difference"])
+        low, high = 100 * np.array(result["after_views_interval"]).T
+        steps = np.arange(1, len(values) + 1) + offset
+        errors = [np.maximum(values - low, 0), np.maximum(high - values, 0)]
+        axis.errorbar(steps, values, errors, fmt="o", color=COLOURS[name], label=NAMES[name], markersize=4, capsize=2)
+    axis.axhline(0, color="#111827", linewidth=1)
+    axis.set(xlabel="views looked at", ylabel="points above random", title="Gain over random, paired by object and start")
+    axis.legend(frameon=False)
+    return figure
+
+
+def difference_grid(difference: Sequence[Sequence[float]], thresholds: Sequence[float], max_views: Sequence[int], title: str) -> Figure:
+    """The thesis's Table 7 as a picture: points above random in each (MV, CT) cell."""
+    values = 100 * np.array(difference)
+    largest = max(0.5, np.abs(values).max())
+    figure, axis = plt.subplots(figsize=(5.4, 3.6), layout="constrained")
+    axis.imshow(values, cmap="RdBu", vmin=-largest, vmax=largest, aspect="auto")
+    for (row, column), value in np.ndenumerate(values):
+        axis.text(column, row, f"{value:+.1f}", ha="center", va="center", fontsize=8, color="white" if abs(value) > 0.65 * largest else "black")
+    axis.set_xticks(range(len(thresholds)), [f"{ct:g}" for ct in thresholds])
+    axis.set_yticks(range(len(max_views)), [str(mv) for mv in max_views])
+    axis.set(xlabel="confidence threshold", ylabel="most views", title=title)
+    axis.spines[:].set_visible(False)
+    return figure
+
+
+def confusions(matrices: dict[str, np.ndarray], classes: Sequence[str]) -> Figure:
+    """Confusion in percent of the true class, a panel per policy."""
+    figure, axes = plt.subplots(1, len(matrices), figsize=(4.6 * len(matrices), 4.4), layout="constrained", sharey=True, squeeze=False)
+    for axis, (title, matrix) in zip(axes[0], matrices.items(), strict=True):
+        share = 100 * matrix / np.maximum(matrix.sum(axis=1, keepdims=True), 1e-9)
+        axis.imshow(share, cmap="Blues", vmin=0, vmax=100)
+        for (row, column), value in np.ndenumerate(share):
+            if value >= 0.5:
+                axis.text(column, row, f"{value:.0f}", ha="center", va="center", fontsize=7, color="white" if value > 60 else "black")
+        axis.set_xticks(range(len(classes)), classes, rotation=60, ha="right")
+        axis.set_yticks(range(len(classes)), classes)
+        axis.set(xlabel="predicted", title=title)
+    axes[0][0].set_ylabel("true")
+    return figure
+
+
+def entropy_histogram(counts: Sequence[int], mean: float, std: float) -> Figure:
+    """Normalised depth entropies of the training views."""
+    figure, axis = plt.subplots(figsize=(4.6, 2.8), layout="constrained")
+    edges = np.linspace(0, 1, len(counts) + 1)
+    axis.bar(edges[:-1], counts, width=np.diff(edges), align="edge", color="#93c5fd")
+    axis.axvline(mean, color="#1d4ed8", label=f"mean {mean:.3f}, sd {std:.3f}")
+    axis.set(xlabel="normalised depth entropy", ylabel="views", title="Depth entropies (training)")
+    axis.legend(frameon=False)
+    return figure
+
+
+def entropy_errors(entropy: dict[str, Any]) -> Figure:
+    """Error of the network beside two predictors that look at nothing."""
+    rows = [("mean map", "mean_map", "#9ca3af"), ("class-mean map\n(told the class)", "class_mean_map", "#d1d5db"), ("PointNet++", "pointnet2", "#2563eb")]
+    figure, axis = plt.subplots(figsize=(4.6, 2.6), layout="constrained")
+    for position, (label, name, colour) in enumerate(rows):
+        low, high = entropy[f"{name}_interval"]
+        axis.barh(position, entropy[name], color=colour, xerr=[[max(0, entropy[name] - low)], [max(0, high - entropy[name])]], capsize=3)
+        axis.text(high, position, f"  {entropy[name]:.4f}", va="center")
+    axis.set_yticks(range(len(rows)), [label for label, _, _ in rows])
+    axis.set(xlabel="mean squared error on test objects", title="Predicting depth entropy")
+    axis.margins(x=0.2)
+    return figure
+
+
+def view_map(
+    points: np.ndarray, neighbours: np.ndarray, weights: np.ndarray, maxima: np.ndarray, title: str, limits: tuple[float, float]
+) -> Figure:
+    """Views in a Mercator-like chart (thesis Figs. 7 and 11), coloured by entropy; local maxima are ringed."""
+    longitude, latitude = np.degrees(np.arctan2(points[:, 1], points[:, 0])), np.degrees(np.arcsin(np.clip(points[:, 2], -1, 1)))
+    figure, axis = plt.subplots(figsize=(4.8, 2.8), layout="constrained")
+    for i, j in np.argwhere(np.triu(neighbours)):
+        if abs(longitude[i] - longitude[j]) < 180:
+            axis.plot(longitude[[i, j]], latitude[[i, j]], color="#d1d5db", linewidth=0.7, zorder=1)
+    dots = axis.scatter(longitude, latitude, c=weights, s=70, cmap="viridis", vmin=limits[0], vmax=limits[1], zorder=2)
+    axis.scatter(longitude[maxima], latitude[maxima], s=150, facecolors="none", edgecolors="#dc2626", linewidths=1.5, zorder=3)
+    figure.colorbar(dots, ax=axis, label="normalised entropy")
+    axis.set(xlabel="longitude (°)", ylabel="latitude (°)", title=title)
+    return figure
+
+
+def contact_sheet(images: np.ndarray, labels: Sequence[str]) -> Figure:
+    """Rows of views, (rows, columns, height, width) uint8, a name beside each row."""
+    rows, columns, height, width = images.shape
+    sheet = images.transpose(0, 2, 1, 3).reshape(rows * height, columns * width)
+    figure, axis = plt.subplots(figsize=(8, 8 * rows / columns), layout="constrained")
+    axis.imshow(sheet, cmap="gray", vmin=0, vmax=255)
+    axis.set_yticks(height * (np.arange(rows) + 0.5), labels)
+    axis.set_xticks([])
+    axis.tick_params(length=0)
+    axis.spines[:].set_visible(False)
+    return figure
+
+
+def episode_strip(images: Sequence[np.ndarray], captions: Sequence[str], title: str) -> Figure:
+    """The views of one walk in their order, a caption under each."""
+    figure, axes = plt.subplots(1, len(images), figsize=(1.7 * len(images), 2.3), layout="constrained", squeeze=False)
+    for axis, image, caption in zip(axes[0], images, captions, strict=True):
+        axis.imshow(image, cmap="gray", vmin=0, vmax=255)
+        axis.set_xlabel(caption, fontsize=8)
+        axis.set(xticks=[], yticks=[])
+        axis.spines[:].set_visible(False)
+    figure.suptitle(title, fontsize=10, fontweight="bold")
+    return figure
+
+
+def losses(histories: dict[str, list[dict[str, float]]]) -> Figure:
+    """Training and validation loss by epoch, a panel per network."""
+    figure, axes = plt.subplots(1, len(histories), figsize=(4.4 * len(histories), 2.8), layout="constrained", squeeze=False)
+    for axis, (name, history) in zip(axes[0], histories.items(), strict=True):
+        epochs = [entry["epoch"] for entry in history]
+        axis.plot(epochs, [entry["train/loss"] for entry in history], "o-", color="#9ca3af", markersize=3, label="training")
+        axis.plot(epochs, [entry["val/loss"] for entry in history], "o-", color="#2563eb", markersize=3, label="validation")
+        axis.set(xlabel="epoch", ylabel="loss", title=name)
+        if len(epochs) > 1 and max(entry["train/loss"] for entry in history) > 5 * min(entry["val/loss"] for entry in history):
+            axis.set_yscale("log")
+        axis.legend(frameon=False)
+    return figure

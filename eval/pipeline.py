@@ -1,0 +1,212 @@
+"""The whole job, stage by stage: data → networks → tables and metrics → report. Each stage skips what is done.
+
+A run directory holds `data/`, `classifier/`, `entropy/`, `tables/`, `metrics.json` and `report/index.html`.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import tyro
+
+from data_pipeline.builder import DataConfig, DatasetStatistics, load_statistics, prepare, report_left_out
+from data_pipeline.capture import CaptureConfig
+from data_pipeline.files import read_json, write_json
+from data_pipeline.meshes import DataError
+from data_pipeline.progress import console
+from eval.grid import GridConfig
+from eval.report import ReportInputs, load_summary, read_history, write_report
+from eval.study import run_study
+from eval.view_tables import ViewTables, compute_view_tables, load_view_tables, save_view_tables
+from mevs_jax.models import Abstraction
+from train.classifier import ClassifierConfig, ClassifierTask, ResNetConfig
+from train.entropy import EntropyConfig, EntropyTask, PointNet2Config
+from train.loop import OptimiserConfig, fit, load_best
+
+
+@dataclass(frozen=True)
+class Settings:
+    """Everything that can be set; the defaults are the thesis's."""
+
+    dataset: DataConfig = DataConfig()
+    classifier: ClassifierConfig = ClassifierConfig()
+    entropy: EntropyConfig = EntropyConfig()
+    evaluation: GridConfig = GridConfig()
+
+
+THESIS = Settings()
+"""The thesis's sizes: 224×224, 40 views, ResNet-18 on depth, PointNet++ on 4,096 points. For an accelerator: on two CPU cores one
+epoch of ModelNet10 takes about a day."""
+
+SMALL = Settings(
+    dataset=DataConfig(capture=CaptureConfig(resolution=64)),
+    classifier=ClassifierConfig(
+        network=ResNetConfig(width=32, channels=1),
+        optimiser=OptimiserConfig(
+            epochs=10,
+            batch_size=64,
+            epoch_views=8,
+            validation_views=4,
+            weight_decay=0.02,
+            schedule="cosine",
+        ),
+    ),
+    entropy=EntropyConfig(
+        network=PointNet2Config(
+            points=1024,
+            abstractions=(
+                Abstraction(centres=128, radius=0.25, samples=32, layers=(32, 32, 64)),
+                Abstraction(centres=32, radius=0.5, samples=32, layers=(64, 64, 128)),
+            ),
+            global_layers=(128, 256, 512),
+            head_layers=(256, 128),
+            dropout=0.3,
+        ),
+        optimiser=OptimiserConfig(
+            epochs=8, batch_size=32, epoch_views=4, validation_views=2, learning_rate=2e-3, schedule="cosine"
+        ),
+    ),
+)
+"""The same study at 64×64 with narrower networks. Two CPU cores: furniture10 in minutes, ModelNet10 in about 45."""
+
+TINY = Settings(
+    dataset=DataConfig(train_per_class=4, test_per_class=2, capture=CaptureConfig(views=6, resolution=32)),
+    classifier=ClassifierConfig(
+        network=ResNetConfig(width=8, channels=1),
+        optimiser=OptimiserConfig(epochs=2, batch_size=16, views_per_object=2, epoch_views=4, schedule="cosine"),
+    ),
+    entropy=EntropyConfig(
+        network=PointNet2Config(
+            points=64,
+            abstractions=(
+                Abstraction(centres=16, radius=0.4, samples=8, layers=(8, 16)),
+                Abstraction(centres=8, radius=0.8, samples=8, layers=(16, 32)),
+            ),
+            global_layers=(32, 64),
+            head_layers=(32,),
+        ),
+        optimiser=OptimiserConfig(epochs=2, batch_size=16, views_per_object=2, epoch_views=4, schedule="cosine"),
+    ),
+    evaluation=GridConfig(draws=2),
+)
+"""Seconds, and no use but to see that everything runs."""
+
+PRESETS = {"small": SMALL, "thesis": THESIS, "tiny": TINY}
+
+
+@dataclass(frozen=True)
+class Options(Settings):
+    """What the command line takes: all settings, and short names for the common ones."""
+
+    preset: Literal["small", "thesis", "tiny"] = "small"
+    """which defaults all other settings have"""
+    data: str | None = None
+    """furniture10, a folder of meshes, a ModelNet zip, or an .npz of voxel grids; overrides dataset.source"""
+    views: Annotated[int | None, tyro.conf.arg(metavar="N")] = None
+    """candidate viewpoints around an object; overrides dataset.capture.views"""
+    out: Path | None = None
+    """where everything is written; runs/<preset> unless given"""
+
+    def settings(self) -> Settings:
+        """The settings with the short names applied."""
+        dataset = self.dataset
+        if self.data is not None:
+            dataset = replace(dataset, source=self.data)
+        if self.views is not None:
+            dataset = replace(dataset, capture=replace(dataset.capture, views=self.views))
+        return Settings(dataset, self.classifier, self.entropy, self.evaluation)
+
+
+def options_from(preset: Literal["small", "thesis", "tiny"]) -> Options:
+    """The defaults of all options under a preset."""
+    chosen = PRESETS[preset]
+    return Options(chosen.dataset, chosen.classifier, chosen.entropy, chosen.evaluation, preset=preset)
+
+
+def check_output(out: Path) -> None:
+    """Raises `DataError` where nothing can be written to `out`."""
+    probe = out / f".probe.{os.getpid()}"
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+        probe.touch()
+        probe.unlink()
+    except OSError as error:
+        raise DataError(f"cannot write to {out} ({error.strerror}); choose another --out") from error
+
+
+def make_data(settings: Settings, out: Path) -> DatasetStatistics:
+    statistics = prepare(settings.dataset, out / "data")
+    report_left_out(statistics)
+    return statistics
+
+
+def tasks(settings: Settings, statistics: DatasetStatistics) -> tuple[ClassifierTask, EntropyTask]:
+    """What is trained on a data set."""
+    camera = statistics.camera
+    return (
+        ClassifierTask.of(settings.classifier, len(statistics.classes), camera),
+        EntropyTask.of(settings.entropy, statistics.views, statistics.entropy_max, camera),
+    )
+
+
+def train(settings: Settings, out: Path) -> None:
+    statistics = load_statistics(out / "data")
+    for task, name in zip(tasks(settings, statistics), ("classifier", "entropy"), strict=True):
+        summary = fit(task, out / "data", statistics, out / name)
+        console.print(
+            f"{task.name}: best epoch {summary['best_epoch']} of {summary['epoch']}, validation "
+            + ", ".join(f"{key} {value:.4f}" for key, value in summary["best"].items())
+            + f", {summary['seconds'] / 60:.1f} min"
+        )
+
+
+def _tables(settings: Settings, out: Path, statistics: DatasetStatistics) -> ViewTables:
+    path = out / "tables" / "test.npz"
+    classify, predict = tasks(settings, statistics)
+    classifier, predictor = load_best(classify, out / "classifier"), load_best(predict, out / "entropy")
+    if path.exists():
+        return load_view_tables(path)
+    tables = compute_view_tables(out / "data", "test", statistics, classify, classifier, predict, predictor)
+    save_view_tables(path, tables)
+    return tables
+
+
+def evaluate(settings: Settings, out: Path) -> dict[str, Any]:
+    """Metrics of the test split, as written to `metrics.json`."""
+    statistics = load_statistics(out / "data")
+    path = out / "metrics.json"
+    identity = json.loads(json.dumps({"evaluation": asdict(settings.evaluation), "source": statistics.source}))
+    if path.exists() and (metrics := read_json(path))["identity"] == identity:
+        return metrics
+    tables = _tables(settings, out, statistics)
+    metrics = run_study(tables, statistics, settings.evaluation) | {"identity": identity}
+    write_json(path, metrics)
+    return metrics
+
+
+def report(settings: Settings, preset: str, out: Path) -> Path:
+    """Writes the page and returns where it is; one that is newer than its metrics is left as it is."""
+    page, metrics = out / "report" / "index.html", out / "metrics.json"
+    if not metrics.exists():
+        raise DataError(f"no metrics in {out}; make them with: mevs eval --out {out}")
+    if not page.exists() or page.stat().st_mtime < metrics.stat().st_mtime:
+        statistics = load_statistics(out / "data")
+        networks = {"classifier": out / "classifier", "entropy predictor": out / "entropy"}
+        write_report(
+            ReportInputs(
+                statistics=statistics,
+                metrics=read_json(metrics),
+                tables=load_view_tables(out / "tables" / "test.npz"),
+                data=out / "data",
+                histories={name: read_history(folder) for name, folder in networks.items()},
+                summaries={name: load_summary(folder) for name, folder in networks.items()},
+                preset=preset,
+                settings=asdict(settings),
+            ),
+            page,
+        )
+    return page

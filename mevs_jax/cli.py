@@ -1,0 +1,120 @@
+"""The command line `mevs`. It is the one place that knows the library, the data pipeline, the training and the evaluation.
+
+Heavy imports wait until a command needs them, so that `mevs --help` answers at once.
+"""
+
+from __future__ import annotations
+
+import os
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from eval.pipeline import Settings
+
+COMMANDS = {
+    "run": "everything below, in order, skipping what is done",
+    "data": "capture objects from every viewpoint, write them as a sharded TFDS data set",
+    "train": "train the classifier and the entropy predictor on it",
+    "eval": "walk every test object from every start view; write metrics.json",
+    "report": "write report/index.html",
+}
+
+_HELP = """usage: mevs COMMAND [--preset small|thesis] [--data PATH] [--views N] [--out DIR] [SETTINGS]
+
+Where should a camera look next? Trains the networks of maximum entropy viewpoint selection and
+measures how much choosing the next view helps.
+
+commands:
+{commands}
+
+common options:
+  --preset small|thesis   small (default): 64×64 views and narrow networks, minutes on a CPU;
+                          thesis: the thesis's sizes, for an accelerator; tiny: seconds, to see it run
+  --data PATH             furniture10 (default, built in), a folder <class>/{{train,test}}/*.off|obj|stl|ply|glb,
+                          a ModelNet zip, or an .npz of voxel grids
+  --views N               candidate viewpoints around an object (default 40)
+  --out DIR               where everything is written (default runs/<preset>); the same command resumes there
+
+`mevs COMMAND --help` lists every setting. Examples:
+  mevs run
+  mevs run --data ModelNet10.zip --out runs/modelnet10
+  mevs train --out runs/modelnet10 --classifier.optimiser.epochs 20
+"""
+
+
+def _preset_of(arguments: list[str]) -> str:
+    """The preset named on the command line; it decides the defaults of all other settings."""
+    for position, argument in enumerate(arguments):
+        if argument.startswith("--preset="):
+            return argument.split("=", 1)[1]
+        if argument == "--preset" and position + 1 < len(arguments):
+            return arguments[position + 1]
+    return "small"
+
+
+def _parse(command: str, arguments: list[str]) -> tuple[str, Path, Settings]:
+    import tyro
+
+    from data_pipeline.meshes import DataError
+    from eval.pipeline import PRESETS, Options, options_from
+
+    preset = _preset_of(arguments)
+    if preset not in PRESETS:
+        raise DataError(f"unknown preset {preset!r}; it is one of {', '.join(PRESETS)}")
+
+    options = tyro.cli(
+        Options, prog=f"mevs {command}", description=COMMANDS[command], args=arguments, default=options_from(preset)  # type: ignore[arg-type]
+    )
+    return preset, options.out or Path("runs") / preset, options.settings()
+
+
+def _run(command: str, arguments: list[str]) -> None:
+    preset, out, settings = _parse(command, arguments)
+    from data_pipeline.progress import console
+    from eval import pipeline
+
+    pipeline.check_output(out)
+    if command in ("run", "data"):
+        pipeline.make_data(settings, out)
+    if command in ("run", "train"):
+        pipeline.train(settings, out)
+    if command in ("run", "eval"):
+        metrics = pipeline.evaluate(settings, out)
+        console.print(f"Single views: {100 * metrics['single_view']['accuracy']:.1f} % of {metrics['objects']} test objects right")
+    if command in ("run", "eval"):
+        console.print(f"Metrics: {out / 'metrics.json'}")
+    if command in ("run", "report"):
+        console.print(f"Report: {pipeline.report(settings, preset, out).absolute()}")
+
+
+def main() -> None:
+    """Entry point of `mevs`: exit code 0, 2 for input that cannot be used, 130 when interrupted."""
+    arguments = sys.argv[1:]
+    if not arguments or arguments[0] in ("-h", "--help"):
+        print(_HELP.format(commands="\n".join(f"  {name:<8}{what}" for name, what in COMMANDS.items())))
+        sys.exit(0 if arguments else 2)
+    if arguments[0] == "--version":
+        from importlib.metadata import version
+
+        print(version("mevs-jax"))
+        return
+    if arguments[0] not in COMMANDS:
+        print(f"mevs: unknown command {arguments[0]!r}; it is one of {', '.join(COMMANDS)}", file=sys.stderr)
+        sys.exit(2)
+    os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "2")
+    from data_pipeline.meshes import DataError
+
+    try:
+        _run(arguments[0], arguments[1:])
+    except DataError as error:
+        print(f"mevs: {error}", file=sys.stderr)
+        sys.exit(2)
+    except KeyboardInterrupt:
+        print("mevs: interrupted; the same command goes on where it stopped", file=sys.stderr)
+        sys.exit(130)
+
+
+if __name__ == "__main__":
+    main()

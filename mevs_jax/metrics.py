@@ -1,0 +1,52 @@
+"""How good a system is, and how sure one may be of that.
+
+The thesis's eqs. (10) and (11), as printed, are one-vs-rest; its code and tables are what is here: accuracy is the trace of
+the confusion matrix over its sum, class accuracy the mean recall.
+"""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Int
+
+
+def confusion_matrix(
+    labels: Int[Array, "n"], predictions: Int[Array, "n"], classes: int, weights: Float[Array, "n"] | None = None
+) -> Float[Array, "{classes} {classes}"]:
+    """Weight by (true class, predicted class); every weight 1 unless given."""
+    weights = jnp.ones(labels.shape) if weights is None else weights
+    return jnp.zeros((classes, classes)).at[labels, predictions].add(weights)
+
+
+def accuracy(confusion: Float[Array, "classes classes"]) -> Float[Array, ""]:
+    """Share of the right answers, in [0, 1]; 0 for an empty matrix."""
+    return jnp.trace(confusion) / jnp.maximum(jnp.sum(confusion), 1e-12)
+
+
+def class_accuracy(confusion: Float[Array, "classes classes"]) -> Float[Array, ""]:
+    """Mean recall over the classes that occur, in [0, 1]."""
+    total = jnp.sum(confusion, axis=1)
+    recall = jnp.diag(confusion) / jnp.maximum(total, 1e-12)
+    return jnp.sum(jnp.where(total > 0, recall, 0)) / jnp.maximum(jnp.sum(total > 0), 1)
+
+
+def bootstrap_interval(
+    key: Array, values: Float[Array, "objects"], *, level: float = 0.95, resamples: int = 2000
+) -> Float[Array, "2"]:
+    """Percentile interval of the mean over objects, drawn with replacement.
+
+    For a paired comparison pass the differences, one per object; several measurements of an object (start views, draws) are
+    to be averaged first, since only objects are independent.
+    """
+    count = values.shape[0]
+
+    def resample(key: Array) -> Array:
+        return jnp.mean(values[jax.random.randint(key, (count,), 0, count)])
+
+    means = jax.lax.map(resample, jax.random.split(key, resamples), batch_size=64)
+    return jnp.quantile(means, jnp.array([(1 - level) / 2, (1 + level) / 2]))
+
+
+def mean_squared_error(predicted: Float[Array, "*shape"], true: Float[Array, "*shape"]) -> Float[Array, ""]:
+    return jnp.mean(jnp.square(predicted - true))

@@ -1,0 +1,96 @@
+"""Weights trained with PyTorch, put into our networks: same numbers, other names and layouts.
+
+A state dict is a mapping from torch's names to NumPy arrays; reading one from a file is not this module's business. Names are
+torchvision's for ResNet, and those of the usual PyTorch PointNet++ (`pointnet2_ops`' `PointnetSAModule`) for PointNet2.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import jax.numpy as jnp
+import numpy as np
+from flax import nnx
+
+from mevs_jax.models import BatchNorm, PointNet2, ResNet
+from mevs_jax.models.pointnet2 import Perceptron
+
+StateDict = Mapping[str, np.ndarray]
+
+
+class _Reader:
+    """Takes arrays out of a state dict by name, checks their shape, and knows which are left."""
+
+    def __init__(self, state: StateDict):
+        self.state = state
+        self.left = set(state)
+
+    def put(self, variable: nnx.Variable, name: str, *axes: int) -> None:
+        if name not in self.state:
+            raise ValueError(f"the state dict has no {name!r}; is it of this network?")
+        array = np.asarray(self.state[name])
+        array = array.transpose(axes) if axes else array
+        if array.shape[:2] == (1, 1) and variable[...].ndim == 2:  # a 1×1 convolution over points is a linear layer
+            array = array[0, 0]
+        if array.shape != variable[...].shape:
+            raise ValueError(f"{name} has shape {array.shape} in the state dict, the network has {variable[...].shape}")
+        self.left.discard(name)
+        variable[...] = jnp.asarray(array, variable[...].dtype)
+
+    def norm(self, norm: BatchNorm, name: str) -> None:
+        self.put(norm.scale, f"{name}.weight")
+        self.put(norm.bias, f"{name}.bias")
+        self.put(norm.mean, f"{name}.running_mean")
+        self.put(norm.variance, f"{name}.running_var")
+        self.put(norm.batches, f"{name}.num_batches_tracked")
+
+    def finish(self) -> None:
+        if self.left:
+            raise ValueError(f"the state dict has entries this network lacks: {', '.join(sorted(self.left)[:4])}")
+
+
+def resnet_from_torch(network: ResNet, state: StateDict) -> None:
+    """Fills `network` with a torchvision `resnet18` or `resnet34` state dict.
+
+    Raises:
+        ValueError: for a missing or superfluous entry, or another shape.
+    """
+    reader = _Reader(state)
+    reader.put(network.convolution.kernel, "conv1.weight", 2, 3, 1, 0)
+    reader.norm(network.norm, "bn1")
+    names = [f"layer{stage + 1}.{block}" for stage, blocks in enumerate(network.stages) for block in range(blocks)]
+    for block, name in zip(network.blocks, names, strict=True):
+        reader.put(block.convolution1.kernel, f"{name}.conv1.weight", 2, 3, 1, 0)
+        reader.norm(block.norm1, f"{name}.bn1")
+        reader.put(block.convolution2.kernel, f"{name}.conv2.weight", 2, 3, 1, 0)
+        reader.norm(block.norm2, f"{name}.bn2")
+        if block.projects:
+            reader.put(block.shortcut.kernel, f"{name}.downsample.0.weight", 2, 3, 1, 0)
+            reader.norm(block.shortcut_norm, f"{name}.downsample.1")
+    reader.put(network.head.kernel, "fc.weight", 1, 0)
+    reader.put(network.head.bias, "fc.bias")
+    reader.finish()
+
+
+def pointnet2_from_torch(network: PointNet2, state: StateDict) -> None:
+    """Fills `network` with the state dict of a PointNet++ SSG: `SA_modules.i.mlps.0.*` and `fc_layer.*`.
+
+    Raises:
+        ValueError: for a missing or superfluous entry, or another shape.
+    """
+    reader = _Reader(state)
+    for level, perceptron in enumerate([*network.perceptrons, network.whole]):
+        _shared_layers(reader, perceptron, f"SA_modules.{level}.mlps.0")
+    for index in range(len(network.head.linear)):  # linear, norm, ReLU: three entries each
+        reader.put(network.head.linear[index].kernel, f"fc_layer.{3 * index}.weight", 1, 0)
+        reader.norm(network.head.norm[index], f"fc_layer.{3 * index + 1}")
+    last = 3 * len(network.head.linear) + 1  # after the dropout
+    reader.put(network.out.kernel, f"fc_layer.{last}.weight", 1, 0)
+    reader.put(network.out.bias, f"fc_layer.{last}.bias")
+    reader.finish()
+
+
+def _shared_layers(reader: _Reader, perceptron: Perceptron, name: str) -> None:
+    for index in range(len(perceptron.linear)):  # 1×1 convolution, norm, ReLU
+        reader.put(perceptron.linear[index].kernel, f"{name}.{3 * index}.weight", 2, 3, 1, 0)
+        reader.norm(perceptron.norm[index], f"{name}.{3 * index + 1}")
