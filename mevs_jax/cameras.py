@@ -17,12 +17,14 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
+from mevs_jax.arrays import AnyArray
+
 
 @flax.struct.dataclass
 class Camera:
     """Square pinhole camera: `pose` (4, 4) camera to world, `field_of_view` in radians, `resolution` in pixels."""
 
-    pose: Float[Array, "4 4"]
+    pose: Float[AnyArray, "*batch 4 4"]
     field_of_view: float = flax.struct.field(pytree_node=False, default=math.pi / 3)
     resolution: int = flax.struct.field(pytree_node=False, default=224)
 
@@ -83,7 +85,7 @@ def partial_cloud(
 
 
 def cameras_at(
-    points: Float[Array, "views 3"], *, distance: float = 2.0, resolution: int = 224, field_of_view: float = math.pi / 3
+    points: Float[AnyArray, "views 3"], *, distance: float = 2.0, resolution: int = 224, field_of_view: float = math.pi / 3
 ) -> Camera:
     """Cameras on a sphere of radius `distance`, one per unit vector, as one `Camera` with a leading axis on `pose`."""
     return Camera(jax.vmap(look_at_origin)(jnp.asarray(points) * distance), float(field_of_view), resolution)

@@ -12,23 +12,25 @@ from typing import Literal
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
+from mevs_jax.arrays import AnyArray
+
 DEPTH_SCALE = 10_000  # units of the stored 16-bit depth per metric unit
 _LEVELS = 256
 
 EntropyVariant = Literal["thesis", "foreground"]
 
 
-def quantise_depth(depth: Float[Array, "*shape"]) -> Int[Array, "*shape"]:
+def quantise_depth(depth: Float[AnyArray, "*shape"]) -> Int[Array, "*shape"]:
     """Metric depth as the thesis's 16-bit image: ⌊10,000 d⌋, 0 where nothing is hit (0 or +inf), at most 65,535."""
     return jnp.floor(jnp.clip(jnp.where(jnp.isfinite(depth), depth, 0.0) * DEPTH_SCALE, 0, 65535)).astype(jnp.int32)
 
 
-def depth_levels(depth: Float[Array, "*shape"]) -> Int[Array, "*shape"]:
+def depth_levels(depth: Float[AnyArray, "*shape"]) -> Int[Array, "*shape"]:
     """The 8-bit levels, 0..255, over which the thesis's entropy is taken."""
     return quantise_depth(depth) // _LEVELS
 
 
-def shannon_entropy(counts: Float[Array, "levels"] | Int[Array, "levels"]) -> Float[Array, ""]:
+def shannon_entropy(counts: Float[AnyArray, "levels"] | Int[AnyArray, "levels"]) -> Float[Array, ""]:
     """Entropy in bits of a histogram; 0 for an empty one."""
     total = jnp.sum(counts)
     p = counts / jnp.maximum(total, 1)
@@ -36,14 +38,14 @@ def shannon_entropy(counts: Float[Array, "levels"] | Int[Array, "levels"]) -> Fl
 
 
 def level_entropy(
-    levels: Int[Array, "height width"], variant: EntropyVariant = "thesis"
+    levels: Int[AnyArray, "height width"], variant: EntropyVariant = "thesis"
 ) -> Float[Array, ""]:
     """Entropy in bits of an image of levels 0..255; `foreground` leaves level 0 out.
 
     Raises:
         ValueError: for an unknown variant.
     """
-    counts = jnp.bincount(levels.reshape(-1), length=_LEVELS)
+    counts = jnp.bincount(jnp.asarray(levels).reshape(-1), length=_LEVELS)
     if variant == "foreground":
         counts = counts.at[0].set(0)
     elif variant != "thesis":
@@ -51,7 +53,7 @@ def level_entropy(
     return shannon_entropy(counts)
 
 
-def depth_entropy(depth: Float[Array, "height width"], variant: EntropyVariant = "thesis") -> Float[Array, ""]:
+def depth_entropy(depth: Float[AnyArray, "height width"], variant: EntropyVariant = "thesis") -> Float[Array, ""]:
     """Depth entropy of one view, in bits: 0 for an empty or flat view, at most 8.
 
     Args:

@@ -10,21 +10,23 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
+from mevs_jax.arrays import AnyArray
+
 
 def confusion_matrix(
-    labels: Int[Array, "n"], predictions: Int[Array, "n"], classes: int, weights: Float[Array, "n"] | None = None
+    labels: Int[AnyArray, "n"], predictions: Int[AnyArray, "n"], classes: int, weights: Float[AnyArray, "n"] | None = None
 ) -> Float[Array, "{classes} {classes}"]:
     """Weight by (true class, predicted class); every weight 1 unless given."""
     weights = jnp.ones(labels.shape) if weights is None else weights
     return jnp.zeros((classes, classes)).at[labels, predictions].add(weights)
 
 
-def accuracy(confusion: Float[Array, "classes classes"]) -> Float[Array, ""]:
+def accuracy(confusion: Float[AnyArray, "classes classes"]) -> Float[Array, ""]:
     """Share of the right answers, in [0, 1]; 0 for an empty matrix."""
     return jnp.trace(confusion) / jnp.maximum(jnp.sum(confusion), 1e-12)
 
 
-def class_accuracy(confusion: Float[Array, "classes classes"]) -> Float[Array, ""]:
+def class_accuracy(confusion: Float[AnyArray, "classes classes"]) -> Float[Array, ""]:
     """Mean recall over the classes that occur, in [0, 1]."""
     total = jnp.sum(confusion, axis=1)
     recall = jnp.diag(confusion) / jnp.maximum(total, 1e-12)
@@ -32,7 +34,7 @@ def class_accuracy(confusion: Float[Array, "classes classes"]) -> Float[Array, "
 
 
 def bootstrap_interval(
-    key: Array, values: Float[Array, "objects"], *, level: float = 0.95, resamples: int = 2000
+    key: Array, values: Float[AnyArray, "objects"], *, level: float = 0.95, resamples: int = 2000
 ) -> Float[Array, "2"]:
     """Percentile interval of the mean over objects, drawn with replacement.
 
@@ -48,5 +50,5 @@ def bootstrap_interval(
     return jnp.quantile(means, jnp.array([(1 - level) / 2, (1 + level) / 2]))
 
 
-def mean_squared_error(predicted: Float[Array, "*shape"], true: Float[Array, "*shape"]) -> Float[Array, ""]:
+def mean_squared_error(predicted: Float[AnyArray, "*shape"], true: Float[AnyArray, "*shape"]) -> Float[Array, ""]:
     return jnp.mean(jnp.square(predicted - true))

@@ -18,6 +18,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, UInt32
 
+from mevs_jax.arrays import AnyArray
+
 _WORD = 32  # hits of 32 points are packed into one machine word
 
 
@@ -31,7 +33,7 @@ def _squared_distance(dx: Array, dy: Array, dz: Array) -> Array:
     return (_square(dx) + _square(dy)) + _square(dz)
 
 
-def farthest_point_sample(points: Float[Array, "points 3"], k: int) -> Int[Array, "{k}"]:
+def farthest_point_sample(points: Float[AnyArray, "points 3"], k: int) -> Int[Array, "{k}"]:
     """Indices of `k` points, each the farthest from those taken before it; the first is point 0.
 
     Args:
@@ -49,6 +51,7 @@ def farthest_point_sample(points: Float[Array, "points 3"], k: int) -> Int[Array
     if count < 1:
         raise ValueError("farthest_point_sample needs at least one point")
     # Three contiguous arrays, and max followed by "smallest index equal to it": XLA vectorises both on CPU, not argmax.
+    points = jnp.asarray(points)
     x, y, z = points[:, 0], points[:, 1], points[:, 2]
     index = jnp.arange(count, dtype=jnp.int32)
 
@@ -64,7 +67,10 @@ def farthest_point_sample(points: Float[Array, "points 3"], k: int) -> Int[Array
 
 
 def ball_query(
-    points: Float[Array, "points 3"], centres: Float[Array, "centres 3"], radius: float | Float[Array, ""], k: int
+    points: Float[AnyArray, "points 3"],
+    centres: Float[AnyArray, "centres 3"],
+    radius: float | Float[Array, ""],
+    k: int
 ) -> Int[Array, "centres {k}"]:
     """For each centre, the first `k` points in index order strictly within `radius`.
 
@@ -83,8 +89,8 @@ def ball_query(
     """
     if k < 1:
         raise ValueError(f"ball_query needs k >= 1, got {k}")
-    count = points.shape[0]
-    padded = jnp.pad(points, ((0, -count % _WORD), (0, 0)), constant_values=jnp.inf)
+    points, centres = jnp.asarray(points), jnp.asarray(centres)
+    padded = jnp.pad(points, ((0, -points.shape[0] % _WORD), (0, 0)), constant_values=jnp.inf)
     squared_radius = _square(jnp.asarray(radius, points.dtype))
     x, y, z = (padded[:, axis].reshape(-1, _WORD) for axis in range(3))
     hit = _squared_distance(

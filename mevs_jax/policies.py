@@ -13,6 +13,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
+from mevs_jax.arrays import AnyArray
+
 from mevs_jax.viewpoints import ViewGraph, local_maxima
 
 
@@ -28,11 +30,11 @@ class SelectionState:
         utility: (views,) what the policy's network says about every view, having seen the latest.
     """
 
-    count: Int[Array, ""]
-    view: Int[Array, ""]
-    attempted: Bool[Array, "views"]
-    belief: Float[Array, "classes"]
-    utility: Float[Array, "views"]
+    count: Int[AnyArray, "*batch"]
+    view: Int[AnyArray, "*batch"]
+    attempted: Bool[AnyArray, "*batch views"]
+    belief: Float[AnyArray, "*batch classes"]
+    utility: Float[AnyArray, "*batch views"]
 
 
 @flax.struct.dataclass
@@ -45,7 +47,7 @@ class Scene:
     """
 
     graph: ViewGraph
-    entropy: Float[Array, "views"]
+    entropy: Float[AnyArray, "*batch views"]
 
 
 Policy = Callable[[Array, SelectionState, Scene], Float[Array, "views"]]

@@ -16,6 +16,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
+from mevs_jax.arrays import AnyArray
+
 from mevs_jax.fusion import confidence, sum_of_logits
 from mevs_jax.policies import Policy, Scene, SelectionState
 
@@ -27,8 +29,8 @@ NEVER_STOP = 2.0
 class Observation:
     """What one look gives: logits (classes,), and the policy network's word on every view (views,)."""
 
-    logits: Float[Array, "classes"]
-    utility: Float[Array, "views"]
+    logits: Float[AnyArray, "*batch classes"]
+    utility: Float[AnyArray, "*batch views"]
 
 
 @flax.struct.dataclass
@@ -42,10 +44,10 @@ class ViewTable:
         label: the true class.
     """
 
-    logits: Float[Array, "views classes"]
-    utility: Float[Array, "views views"]
-    entropy: Float[Array, "views"]
-    label: Int[Array, ""]
+    logits: Float[AnyArray, "*batch views classes"]
+    utility: Float[AnyArray, "*batch views views"]
+    entropy: Float[AnyArray, "*batch views"]
+    label: Int[AnyArray, "*batch"]
 
     def observe(self, view: Int[Array, ""]) -> Observation:
         return Observation(self.logits[view], self.utility[view])
@@ -62,10 +64,10 @@ class Episode:
         count: how many views were looked at.
     """
 
-    views: Int[Array, "max_views"]
-    predictions: Int[Array, "max_views"]
-    confidences: Float[Array, "max_views"]
-    count: Int[Array, ""]
+    views: Int[AnyArray, "*batch max_views"]
+    predictions: Int[AnyArray, "*batch max_views"]
+    confidences: Float[AnyArray, "*batch max_views"]
+    count: Int[AnyArray, "*batch"]
 
 
 def best_unattempted(scores: Float[Array, "views"], attempted: Bool[Array, "views"]) -> Int[Array, ""]:

@@ -14,6 +14,8 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 from scipy.spatial import ConvexHull
 
+from mevs_jax.arrays import AnyArray
+
 Lattice = Literal["golden_angle", "equation8"]
 
 
@@ -54,12 +56,12 @@ class ViewGraph:
         distances: (views, views) great-circle distances in radians.
     """
 
-    points: Float[Array, "views 3"]
-    neighbours: Bool[Array, "views views"]
-    distances: Float[Array, "views views"]
+    points: Float[AnyArray, "*batch views 3"]
+    neighbours: Bool[AnyArray, "*batch views views"]
+    distances: Float[AnyArray, "*batch views views"]
 
     @classmethod
-    def from_points(cls, points: Float[Array, "views 3"] | Float[np.ndarray, "views 3"]) -> ViewGraph:
+    def from_points(cls, points: AnyArray) -> ViewGraph:
         """The spherical Delaunay graph, which is the convex hull's edges (3n − 6 of them; thesis §4.1).
 
         Up to three points are all neighbours of each other. Points of a hull with larger flat faces (a cube's corners)
@@ -93,10 +95,13 @@ class ViewGraph:
         )
 
 
-def local_maxima(weights: Float[Array, "views"], neighbours: Bool[Array, "views views"]) -> Bool[Array, "views"]:
+def local_maxima(
+    weights: Float[AnyArray, "views"], neighbours: Bool[AnyArray, "views views"]
+) -> Bool[Array, "views"]:
     """Which views weigh strictly more than every neighbour (thesis Algorithm 1).
 
     Two equal neighbours exclude each other; a view without neighbours is a maximum. At least one view is a maximum
     unless the largest weight is shared by neighbours.
     """
+    weights, neighbours = jnp.asarray(weights), jnp.asarray(neighbours)
     return jnp.all(~neighbours | (weights[None, :] < weights[:, None]), axis=1)

@@ -15,6 +15,7 @@ import jax.numpy as jnp
 from flax import nnx
 from jaxtyping import Array, Float
 
+from mevs_jax.arrays import AnyArray
 from mevs_jax.models.batch_norm import BatchNorm
 from mevs_jax.point_ops import ball_query, farthest_point_sample
 
@@ -104,7 +105,7 @@ class PointNet2(nnx.Module):
 
     def __call__(
         self,
-        points: Float[Array, "*batch points 3"],
+        points: Float[AnyArray, "*batch points 3"],
         *,
         train: bool = False,
         key: Array | None = None,
@@ -120,6 +121,7 @@ class PointNet2(nnx.Module):
         """
         if train and key is None:
             raise ValueError("PointNet2 in training needs a key for its dropout")
+        points = jnp.asarray(points)
         batch = points.shape[:-2]
         centres = points.reshape(-1, *points.shape[-2:])
         features = jnp.zeros_like(centres)

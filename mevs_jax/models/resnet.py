@@ -11,6 +11,7 @@ import jax.numpy as jnp
 from flax import nnx
 from jaxtyping import Array, Float
 
+from mevs_jax.arrays import AnyArray
 from mevs_jax.models.batch_norm import BatchNorm
 
 _BLOCKS = {18: (2, 2, 2, 2), 34: (3, 4, 6, 3)}
@@ -98,9 +99,10 @@ class ResNet(nnx.Module):
         self.head = nnx.Linear(inputs, classes, rngs=rngs)
 
     def features(
-        self, images: Float[Array, "*batch height width channels"], *, train: bool = False, momentum: float | Array = 0.1
+        self, images: Float[AnyArray, "*batch height width channels"], *, train: bool = False, momentum: float | Array = 0.1
     ) -> Float[Array, "*batch features"]:
         """The vector before the last layer, `8 * width` long."""
+        images = jnp.asarray(images)
         batch = images.shape[:-3]
         x = images.reshape(-1, *images.shape[-3:])
         x = jax.nn.relu(self.norm(self.convolution(x), train=train, momentum=momentum))
@@ -110,7 +112,7 @@ class ResNet(nnx.Module):
         return jnp.mean(x, axis=(1, 2)).reshape(*batch, -1)
 
     def __call__(
-        self, images: Float[Array, "*batch height width channels"], *, train: bool = False, momentum: float | Array = 0.1
+        self, images: Float[AnyArray, "*batch height width channels"], *, train: bool = False, momentum: float | Array = 0.1
     ) -> Float[Array, "*batch classes"]:
         """Logits of one image (height, width, channels) or of a batch; `train` normalises over the batch."""
         return self.head(self.features(images, train=train, momentum=momentum))

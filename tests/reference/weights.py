@@ -1,0 +1,39 @@
+"""Weights made from names and shapes alone, so that PyTorch and JAX can be given the same without storing them."""
+
+from __future__ import annotations
+
+import zlib
+
+import numpy as np
+
+
+def made_up_weights(shapes: dict[str, tuple[int, ...]]) -> dict[str, np.ndarray]:
+    """A state dict of plausible numbers: kernels of unit gain, scales about 1, positive variances."""
+    state = {}
+    for name, shape in shapes.items():
+        random = np.random.Generator(np.random.PCG64(zlib.crc32(name.encode())))
+        if name.endswith("num_batches_tracked"):
+            state[name] = np.array(0)
+        elif name.endswith("running_var"):
+            state[name] = random.uniform(0.5, 1.5, shape).astype(np.float32)
+        elif name.endswith("running_mean"):
+            state[name] = random.uniform(-0.1, 0.1, shape).astype(np.float32)
+        elif name.endswith("bn2.weight"):  # small residual branches keep the logits of a deep network near one
+            state[name] = random.uniform(0.1, 0.3, shape).astype(np.float32)
+        elif len(shape) == 1 and name.endswith("weight"):
+            state[name] = random.uniform(0.8, 1.2, shape).astype(np.float32)
+        elif len(shape) == 1:
+            state[name] = random.uniform(-0.1, 0.1, shape).astype(np.float32)
+        else:
+            spread = np.sqrt(3 * 2.0 / np.prod(shape[1:]))
+            state[name] = random.uniform(-spread, spread, shape).astype(np.float32)
+    return state
+
+
+def made_up_inputs(kind: str) -> np.ndarray:
+    """Images (4, 64, 64, 3), or clouds (3, 600, 3) in the unit sphere."""
+    random = np.random.Generator(np.random.PCG64(7))
+    if kind == "resnet":
+        return random.uniform(-1, 1, (4, 64, 64, 3)).astype(np.float32)
+    cloud = random.uniform(-1, 1, (3, 600, 3))
+    return (cloud / np.maximum(np.linalg.norm(cloud, axis=2, keepdims=True), 1) * 0.9).astype(np.float32)

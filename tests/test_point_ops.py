@@ -1,0 +1,80 @@
+"""Indices equal to an obvious loop, on clouds of every awkward kind."""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from mevs_jax import ball_query, farthest_point_sample
+from tests.reference import numpy_rules
+
+
+def clouds_of(kind: str, random: np.random.Generator, count: int, points: int) -> np.ndarray:
+    if kind == "lattice":  # ties everywhere
+        return random.integers(-3, 4, (count, points, 3)).astype(np.float32) / 4
+    clouds = random.uniform(-1, 1, (count, points, 3)).astype(np.float32)
+    if kind == "duplicates":
+        clouds[:, points // 3 :] = clouds[:, : points - points // 3]
+    if kind == "one_point":
+        clouds[:] = clouds[:, :1]
+    return clouds
+
+
+# 1,000 clouds in all: 8 shapes of 125.
+CASES = [
+    ("random", 97, 24, 0.4, 16),
+    ("random", 256, 40, 0.15, 8),
+    ("random", 64, 33, 0.7, 64),
+    ("random", 33, 8, 0.01, 4),  # mostly no neighbour but the centre itself
+    ("duplicates", 90, 24, 0.3, 16),
+    ("lattice", 120, 32, 0.5, 12),
+    ("random", 12, 20, 0.5, 32),  # fewer points than samples
+    ("one_point", 7, 10, 0.2, 9),
+]
+
+
+@pytest.mark.parametrize(("kind", "points", "k", "radius", "samples"), CASES)
+def test_indices_equal_an_obvious_loop(kind, points, k, radius, samples, random):
+    clouds = clouds_of(kind, random, 125, points)
+    ours = np.asarray(jax.jit(jax.vmap(lambda cloud: farthest_point_sample(cloud, k)))(clouds))
+    for cloud, chosen in zip(clouds, ours, strict=True):
+        np.testing.assert_array_equal(chosen, numpy_rules.farthest_point_sample(cloud, k))
+
+    centres = clouds[:, :6] + (random.normal(0, 0.2, (125, 6, 3)).astype(np.float32) if kind == "random" else 0)
+    groups = np.asarray(jax.jit(jax.vmap(lambda p, c: ball_query(p, c, radius, samples)))(clouds, centres))
+    for cloud, centre, group in zip(clouds, centres, groups, strict=True):
+        np.testing.assert_array_equal(group, numpy_rules.ball_query(cloud, centre, radius, samples))
+
+
+def test_indices_at_the_thesis_sizes(random):
+    cloud = clouds_of("random", random, 1, 4096)[0]
+    chosen = np.asarray(farthest_point_sample(cloud, 512))
+    np.testing.assert_array_equal(chosen, numpy_rules.farthest_point_sample(cloud, 512))
+    groups = np.asarray(ball_query(cloud, cloud[chosen[:40]], 0.2, 64))
+    np.testing.assert_array_equal(groups, numpy_rules.ball_query(cloud, cloud[chosen[:40]], 0.2, 64))
+
+
+def test_no_neighbour_gives_point_zero():
+    points = np.ones((40, 3), np.float32)
+    np.testing.assert_array_equal(ball_query(points, np.zeros((2, 3), np.float32), 0.5, 5), np.zeros((2, 5)))
+
+
+def test_the_radius_is_strict():
+    points = np.array([[1, 0, 0], [0.5, 0, 0]], np.float32)
+    np.testing.assert_array_equal(ball_query(points, np.zeros((1, 3), np.float32), 1.0, 3), [[1, 1, 1]])
+
+
+def test_indices_are_int32_and_sampling_starts_at_point_zero(random):
+    cloud = clouds_of("random", random, 1, 50)[0]
+    chosen = farthest_point_sample(cloud, 5)
+    assert chosen.dtype == jnp.int32
+    assert chosen[0] == 0
+    assert ball_query(cloud, cloud[:2], 0.1, 3).dtype == jnp.int32
+
+
+@pytest.mark.parametrize("call", [lambda p: farthest_point_sample(p, 0), lambda p: ball_query(p, p, 0.1, 0)])
+def test_zero_samples_are_refused(call):
+    with pytest.raises(ValueError, match="k >= 1"):
+        call(np.zeros((4, 3), np.float32))
