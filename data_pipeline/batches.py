@@ -69,7 +69,11 @@ def select_views(
     if points:
         pixels = np.stack([sample_pixels(example["depth"][view], points, random) for view in views])
         flat = example["depth"][views].reshape(len(views), -1)
-        out |= {"pixels": pixels, "pixel_depth": np.take_along_axis(flat, pixels, axis=1), "pose": example["pose"][views]}
+        out |= {
+            "pixels": pixels,
+            "pixel_depth": np.take_along_axis(flat, pixels, axis=1),
+            "pose": example["pose"][views],
+        }
     return out
 
 

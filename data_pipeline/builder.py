@@ -7,7 +7,9 @@ the shards lie the statistics of the data set (`DatasetStatistics`), which every
 from __future__ import annotations
 
 import functools
+import hashlib
 import io
+import json
 import os
 import shutil
 import struct
@@ -90,6 +92,11 @@ class DatasetStatistics:
         return len(self.viewpoints)
 
     @property
+    def fingerprint(self) -> str:
+        """Changes with the objects, the views or their order."""
+        return hashlib.sha256(json.dumps(asdict(self), sort_keys=True).encode()).hexdigest()[:16]
+
+    @property
     def left_out_count(self) -> int:
         return sum(map(len, self.left_out.values()))
 
@@ -98,9 +105,7 @@ class DatasetStatistics:
         return CaptureConfig(**self.capture)
 
 
-def split_objects(
-    entries: Sequence[ObjectEntry], validation_share: float, seed: int
-) -> dict[str, list[ObjectEntry]]:
+def split_objects(entries: Sequence[ObjectEntry], validation_share: float, seed: int) -> dict[str, list[ObjectEntry]]:
     """Objects by split: the source's test objects, and its training objects with a share of each class put aside.
 
     Every class keeps at least one object for training and, where it has two, one for validation.
@@ -234,21 +239,29 @@ def _builder_class() -> type:
                 capture = load_capture(capture_path(self._captures, entry))
                 entropies = view_entropies(capture)
                 self._on_object(split, entry, capture, entropies)
-                yield entry.name, {
-                    "name": entry.name,
-                    "label": entry.label,
-                    "depth": capture.depth,
-                    "image": capture.image,
-                    "pose": self._poses,
-                    "entropy": entropies,
-                    "extent": capture.extent,
-                }
+                yield (
+                    entry.name,
+                    {
+                        "name": entry.name,
+                        "label": entry.label,
+                        "depth": capture.depth,
+                        "image": capture.image,
+                        "pose": self._poses,
+                        "entropy": entropies,
+                        "extent": capture.extent,
+                    },
+                )
 
     return MultiViewObjects
 
 
 def _write_shards(
-    source: ObjectSource, split: dict[str, list[ObjectEntry]], left_out: dict[str, dict[str, str]], config: DataConfig, captures: Path, folder: Path
+    source: ObjectSource,
+    split: dict[str, list[ObjectEntry]],
+    left_out: dict[str, dict[str, str]],
+    config: DataConfig,
+    captures: Path,
+    folder: Path,
 ) -> DatasetStatistics:
     statistics = _Statistics(len(source.classes), config.capture.views)
     with progress_bar("objects") as bar:
@@ -274,7 +287,7 @@ def _write_shards(
         left_out=left_out,
         viewpoints=fibonacci_sphere(config.capture.views, config.capture.lattice).tolist(),
         capture=asdict(config.capture),
-        source=source.identity,
+        source=source.name,
     )
 
 
@@ -293,7 +306,9 @@ def prepare(config: DataConfig, folder: Path) -> DatasetStatistics:
     if made_with.exists() and read_json(made_with) != identity:
         was = read_json(made_with)
         differs = ", ".join(sorted(key for key in identity if was.get(key) != identity[key]))
-        raise DataError(f"{folder} holds a data set made with other settings ({differs}); choose another --out, or delete it")
+        raise DataError(
+            f"{folder} holds a data set made with other settings ({differs}); choose another --out, or delete it"
+        )
     if (folder / _SUMMARY).exists():
         return load_statistics(folder)
     source = open_source(config.source, train_per_class=config.train_per_class, test_per_class=config.test_per_class)
@@ -307,7 +322,11 @@ def prepare(config: DataConfig, folder: Path) -> DatasetStatistics:
         if not members:
             raise DataError(f"{config.source} leaves no objects for {name}; add some (left out: {len(left_out)})")
     reasons = {
-        name: {entry.name: left_out[entry.name] for entry in source.entries if entry.split == name and entry.name in left_out}
+        name: {
+            entry.name: left_out[entry.name]
+            for entry in source.entries
+            if entry.split == name and entry.name in left_out
+        }
         for name in SOURCE_SPLITS
     }
     shards = folder / "shards"
@@ -341,8 +360,7 @@ def report_left_out(statistics: DatasetStatistics) -> None:
     objects = sum(sum(by_class.values()) for by_class in statistics.counts.values())
     sizes = ", ".join(f"{sum(by_class.values())} {split}" for split, by_class in statistics.counts.items())
     console.print(
-        f"Data set: {objects} objects ({sizes}), {statistics.views} views each, "
-        f"{statistics.left_out_count} left out"
+        f"Data set: {objects} objects ({sizes}), {statistics.views} views each, {statistics.left_out_count} left out"
     )
     for by_name in statistics.left_out.values():
         for name, reason in by_name.items():

@@ -10,6 +10,7 @@ The partial cloud of a view is its depth unprojected by its pose (`mevs_jax.came
 
 from __future__ import annotations
 
+import io
 import multiprocessing
 import os
 import signal
@@ -158,14 +159,9 @@ def capture(mesh: Mesh, rig: Rig, caster: Caster | None = None) -> Capture:
 
 def save_capture(path: Path, capture: Capture) -> None:
     """Fast compression: most of a view is background."""
-    import io
-
     buffer = io.BytesIO()
-    packed = {
-        name: np.frombuffer(zlib.compress(array.tobytes(), 1), np.uint8)
-        for name, array in (("depth", capture.depth), ("image", capture.image))
-    }
-    np.savez(buffer, shape=np.array(capture.depth.shape), extent=capture.extent, **packed)
+    depth, image = (np.frombuffer(zlib.compress(a.tobytes(), 1), np.uint8) for a in (capture.depth, capture.image))
+    np.savez(buffer, shape=np.array(capture.depth.shape), extent=capture.extent, depth=depth, image=image)
     write_bytes(path, buffer.getvalue())
 
 
@@ -212,7 +208,12 @@ def _capture_entry(entry: ObjectEntry) -> str | None:
 
 
 def capture_all(
-    entries: Sequence[ObjectEntry], config: CaptureConfig, folder: Path, *, skip_damaged: bool = False, workers: int | None = None
+    entries: Sequence[ObjectEntry],
+    config: CaptureConfig,
+    folder: Path,
+    *,
+    skip_damaged: bool = False,
+    workers: int | None = None,
 ) -> dict[str, str]:
     """Captures every object into `folder`, several at a time, and returns the objects left out with the reason.
 

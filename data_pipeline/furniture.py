@@ -32,7 +32,14 @@ def furniture(class_name: str, seed: int) -> Solid:
         raise ValueError(f"furniture10 has no class {class_name!r}; it has {', '.join(CLASSES)}")
     random = np.random.default_rng([CLASSES.index(class_name), seed])
     variants = VARIANTS[class_name]
-    return trimesh.util.concatenate(variants[random.integers(len(variants))](random))
+    return joined(variants[random.integers(len(variants))](random))
+
+
+def joined(parts: Parts) -> Solid:
+    """All parts as one mesh."""
+    whole = trimesh.util.concatenate(parts)
+    assert isinstance(whole, trimesh.Trimesh)
+    return whole
 
 
 # ---------------------------------------------------------------------------------------------------------------- solids
@@ -72,7 +79,13 @@ def _tilt(parts: Parts, angle: float, pivot: Sequence[float]) -> Parts:
 
 
 def _four_legs(
-    width: float, depth: float, height: float, thickness: float, inset: float = 0, round_legs: bool = False, splay: float = 0
+    width: float,
+    depth: float,
+    height: float,
+    thickness: float,
+    inset: float = 0,
+    round_legs: bool = False,
+    splay: float = 0,
 ) -> Parts:
     legs: Parts = []
     for sx in (-1, 1):
@@ -97,7 +110,15 @@ def _handle(random: Random, kind: int, width: float, x: float, y: float, z: floa
 
 
 def _drawers(
-    random: Random, width: float, height: float, rows: int, columns: int, x: float, front: float, z: float, relief: float = 0.03
+    random: Random,
+    width: float,
+    height: float,
+    rows: int,
+    columns: int,
+    x: float,
+    front: float,
+    z: float,
+    relief: float = 0.03,
 ) -> Parts:
     """Drawer fronts standing `relief` before the plane y = front, with gaps between them and handles on them."""
     kind = int(random.integers(3))
@@ -124,7 +145,9 @@ def _doors(random: Random, width: float, height: float, doors: int, x: float, fr
         centre = x - width / 2 + cell * (door + 0.5)
         parts.append(_box(cell - gap, relief, height - gap, centre, front - relief / 2, z + gap / 2))
         side = 1 if door < doors / 2 else -1
-        parts.append(_box(0.02, 0.03, height * 0.2, centre + side * cell * 0.36, front - relief - 0.015, z + height * 0.45))
+        parts.append(
+            _box(0.02, 0.03, height * 0.2, centre + side * cell * 0.36, front - relief - 0.015, z + height * 0.45)
+        )
     return parts
 
 
@@ -223,7 +246,10 @@ def _bed_size(random: Random) -> tuple[float, float, float, float]:
 def _bed_platform(random: Random) -> Parts:
     width, length, base, thickness = _bed_size(random)
     head = random.uniform(0.0, 0.6)
-    parts = [_box(width + 0.1, length + 0.1, base * 0.6, 0, 0, base * 0.4), *_mattress(random, width, length, base, thickness)]
+    parts = [
+        _box(width + 0.1, length + 0.1, base * 0.6, 0, 0, base * 0.4),
+        *_mattress(random, width, length, base, thickness),
+    ]
     parts += _four_legs(width, length, base * 0.4, 0.1, 0.05)
     if head > 0.15:
         parts.append(_box(width + 0.1, 0.07, base + thickness + head, 0, length / 2 + 0.06))
@@ -332,8 +358,14 @@ def _chair_office(random: Random) -> Parts:
     for arm in range(arms):
         angle = 2 * np.pi * arm / arms
         tip = (0.3 * np.cos(angle), 0.3 * np.sin(angle))
-        parts += [_rod((0, 0, 0.11), (*tip, 0.07), 0.025), trimesh.creation.icosphere(1, 0.035).apply_translation((*tip, 0.035))]
-    backrest = [_box(width * 0.9, 0.06, back * 0.8, 0, depth / 2, seat + back * 0.2), _box(0.06, 0.03, back * 0.3, 0, depth / 2, seat)]
+        parts += [
+            _rod((0, 0, 0.11), (*tip, 0.07), 0.025),
+            trimesh.creation.icosphere(1, 0.035).apply_translation((*tip, 0.035)),
+        ]
+    backrest = [
+        _box(width * 0.9, 0.06, back * 0.8, 0, depth / 2, seat + back * 0.2),
+        _box(0.06, 0.03, back * 0.3, 0, depth / 2, seat),
+    ]
     parts += _tilt(backrest, random.uniform(0, 0.2), (0, depth / 2, seat))
     return parts + (_chair_arms(width * 1.15, depth, seat, 0.2) if random.random() < 0.6 else [])
 
@@ -345,7 +377,10 @@ def _chair_cantilever(random: Random) -> Parts:
     for side in (-1, 1):
         x = side * width / 2
         parts += [_rod((x, depth / 2, r), (x, -depth / 2, r), r), _rod((x, -depth / 2, r), (x, -depth / 2, seat), r)]
-        parts += [_rod((x, -depth / 2, seat), (x, depth / 2, seat), r), _rod((x, depth / 2, seat), (x, depth / 2 + 0.06, seat + back), r)]
+        parts += [
+            _rod((x, -depth / 2, seat), (x, depth / 2, seat), r),
+            _rod((x, depth / 2, seat), (x, depth / 2 + 0.06, seat + back), r),
+        ]
     parts.append(_rod((-width / 2, depth / 2, r), (width / 2, depth / 2, r), r))
     parts.append(_box(width, 0.03, back * 0.55, 0, depth / 2 + 0.04, seat + back * 0.42))
     return parts
@@ -368,7 +403,9 @@ def _chair_stool_back(random: Random) -> Parts:
     z = seat * 0.35
     corners = [(-1, -1), (1, -1), (1, 1), (-1, 1)]
     for (ax, ay), (bx, by) in zip(corners, corners[1:] + corners[:1], strict=True):
-        parts.append(_rod((ax * radius * 0.85, ay * radius * 0.85, z), (bx * radius * 0.85, by * radius * 0.85, z), 0.012))
+        parts.append(
+            _rod((ax * radius * 0.85, ay * radius * 0.85, z), (bx * radius * 0.85, by * radius * 0.85, z), 0.012)
+        )
     y = radius * 0.8
     parts += [_rod((sx * radius * 0.5, y, seat), (sx * radius * 0.6, y + 0.05, seat + back), 0.014) for sx in (-1, 1)]
     return [*parts, _box(radius * 1.7, 0.03, 0.1, 0, y + 0.05, seat + back - 0.06)]
@@ -389,12 +426,19 @@ def _top(width: float, depth: float, height: float, thickness: float) -> Solid:
 def _table_four_legs(random: Random) -> Parts:
     width, depth, height, thick = _board(random)
     leg, inset = random.uniform(0.04, 0.09), random.uniform(0, 0.08)
-    parts = [_top(width, depth, height, thick), *_four_legs(width, depth, height - thick, leg, inset, random.random() < 0.4)]
+    parts = [
+        _top(width, depth, height, thick),
+        *_four_legs(width, depth, height - thick, leg, inset, random.random() < 0.4),
+    ]
     if random.random() < 0.6:  # apron all round
         drop = random.uniform(0.06, 0.13)
         for side in (-1, 1):
-            parts.append(_box(width - 2 * inset, 0.025, drop, 0, side * (depth / 2 - inset - leg / 2), height - thick - drop))
-            parts.append(_box(0.025, depth - 2 * inset, drop, side * (width / 2 - inset - leg / 2), 0, height - thick - drop))
+            parts.append(
+                _box(width - 2 * inset, 0.025, drop, 0, side * (depth / 2 - inset - leg / 2), height - thick - drop)
+            )
+            parts.append(
+                _box(0.025, depth - 2 * inset, drop, side * (width / 2 - inset - leg / 2), 0, height - thick - drop)
+            )
     return parts
 
 
@@ -457,7 +501,9 @@ def _desk_one_pedestal(random: Random) -> Parts:
     if random.random() < 0.5:
         parts.append(_box(0.04, depth * 0.95, height - thick, -side * (width / 2 - 0.02)))
     else:
-        parts += [_box(0.05, 0.05, height - thick, -side * (width / 2 - 0.04), sy * (depth / 2 - 0.05)) for sy in (-1, 1)]
+        parts += [
+            _box(0.05, 0.05, height - thick, -side * (width / 2 - 0.04), sy * (depth / 2 - 0.05)) for sy in (-1, 1)
+        ]
     return parts + (_modesty(random, width, depth, height, thick) if random.random() < 0.5 else [])
 
 
@@ -491,7 +537,10 @@ def _desk_writing(random: Random) -> Parts:
     """A table but for the drawers under its top, which show only from the front."""
     width, depth, height, thick = _board(random)
     drop, leg = random.uniform(0.1, 0.16), random.uniform(0.04, 0.07)
-    parts = [_top(width, depth, height, thick), *_four_legs(width, depth, height - thick, leg, round_legs=random.random() < 0.3)]
+    parts = [
+        _top(width, depth, height, thick),
+        *_four_legs(width, depth, height - thick, leg, round_legs=random.random() < 0.3),
+    ]
     parts.append(_box(width - leg, depth - leg, drop, 0, 0.01, height - thick - drop))
     front = -depth / 2 + leg / 2 + 0.01
     parts += _drawers(random, width - leg * 2, drop, 1, int(random.integers(1, 4)), 0, front, height - thick - drop)
@@ -500,7 +549,7 @@ def _desk_writing(random: Random) -> Parts:
 
 def _desk_hutch(random: Random) -> Parts:
     parts = (_desk_writing if random.random() < 0.4 else _desk_one_pedestal)(random)
-    low, high = trimesh.util.concatenate(parts).bounds
+    low, high = joined(parts).bounds
     width, rise, depth = high[0] - low[0], random.uniform(0.25, 0.6), random.uniform(0.2, 0.3)
     y, z = high[1] - depth / 2, high[2]
     parts += [_box(0.03, depth, rise, side * (width / 2 - 0.015), y, z) for side in (-1, 1)]
@@ -539,7 +588,7 @@ def _dresser_chest(random: Random) -> Parts:
 
 def _dresser_mirror(random: Random) -> Parts:
     parts = _dresser_wide(random)
-    low, high = trimesh.util.concatenate(parts).bounds
+    low, high = joined(parts).bounds
     width, rise = (high[0] - low[0]) * random.uniform(0.5, 0.9), random.uniform(0.5, 0.9)
     y = high[1] - 0.06
     parts += [_box(width, 0.03, rise, 0, y, high[2] + 0.04), _box(width * 0.6, 0.06, 0.05, 0, y, high[2])]
@@ -555,7 +604,9 @@ def _dresser_doors(random: Random) -> Parts:
     share = random.uniform(0.35, 0.6) * width
     parts += _doors(random, share, inside, 1 if share < 0.55 else 2, -width * 0.48 + share / 2, -depth / 2, bottom)
     rest = width * 0.96 - share
-    return parts + _drawers(random, rest, inside, int(random.integers(2, 5)), 1, width * 0.48 - rest / 2, -depth / 2, bottom)
+    return parts + _drawers(
+        random, rest, inside, int(random.integers(2, 5)), 1, width * 0.48 - rest / 2, -depth / 2, bottom
+    )
 
 
 def _stand_size(random: Random) -> tuple[float, float, float, float]:
@@ -627,7 +678,9 @@ def _monitor_flat(random: Random, round_base: bool | None = None) -> Parts:
     parts = _tilt(_screen(random, width, height, thick, lift), random.uniform(-0.02, 0.15), (0, 0, lift))
     parts.append(_box(random.uniform(0.04, 0.12), 0.03, lift + height * 0.4, 0, thick + 0.015))
     size = width * random.uniform(0.35, 0.6)
-    parts.append(_cylinder(size / 2, 0.02, 0, 0.03, sections=28) if round_base else _box(size, size * 0.7, 0.02, 0, 0.03))
+    parts.append(
+        _cylinder(size / 2, 0.02, 0, 0.03, sections=28) if round_base else _box(size, size * 0.7, 0.02, 0, 0.03)
+    )
     return parts
 
 
@@ -668,7 +721,10 @@ def _monitor_wide(random: Random) -> Parts:
                 part.apply_transform(turn)
                 part.apply_translation((side * width * 0.51, -0.05, 0))
             parts += panel
-    parts += [_box(width * 0.9, 0.03, 0.05, 0, 0.06, lift + height * 0.45), _box(0.06, 0.04, lift + height * 0.5, 0, 0.07)]
+    parts += [
+        _box(width * 0.9, 0.03, 0.05, 0, 0.06, lift + height * 0.45),
+        _box(0.06, 0.04, lift + height * 0.5, 0, 0.07),
+    ]
     return [*parts, _box(random.uniform(0.25, 0.4), 0.22, 0.02, 0, 0.05)]
 
 
@@ -691,7 +747,11 @@ def _sofa_body(
         x = -width / 2 + cushion * (index + 0.5)
         parts.append(_box(cushion - 0.02, depth - thick, 0.14, x, -thick / 2, seat - 0.12))
         if random.random() < 0.9:
-            parts += _tilt([_box(cushion - 0.03, 0.14, back * 0.85, x, depth / 2 - thick, seat)], 0.15, (x, depth / 2 - thick, seat))
+            parts += _tilt(
+                [_box(cushion - 0.03, 0.14, back * 0.85, x, depth / 2 - thick, seat)],
+                0.15,
+                (x, depth / 2 - thick, seat),
+            )
     parts.append(_box(width, thick, seat + back - feet, 0, depth / 2 - thick / 2, feet))
     if arms:
         rise = back * random.uniform(0.35, 0.7) if arm_rise is None else arm_rise * back
@@ -741,13 +801,25 @@ def _bowl(random: Random, height: float, foot: float) -> tuple[Parts, float, flo
     profile += [(r * 0.72, height), (r * 0.55, height * 0.7), (r * 0.25, height * 0.5), (0, height * 0.48)]
     parts = [_lathe(profile, 1, stretch)]
     angles = np.linspace(0, 2 * np.pi, 29)
-    ring = [(r * 0.72, height), (r * 1.04, height), (r * 1.04, height + 0.025), (r * 0.72, height + 0.025), (r * 0.72, height)]
+    ring = [
+        (r * 0.72, height),
+        (r * 1.04, height),
+        (r * 1.04, height + 0.025),
+        (r * 0.72, height + 0.025),
+        (r * 0.72, height),
+    ]
     if random.random() < 0.5:  # lid down
-        parts.append(_lathe([(0, height + 0.02), (r * 1.04, height + 0.02), (r * 1.04, height + 0.05), (0, height + 0.055)], 1, stretch))
+        parts.append(
+            _lathe(
+                [(0, height + 0.02), (r * 1.04, height + 0.02), (r * 1.04, height + 0.05), (0, height + 0.055)],
+                1,
+                stretch,
+            )
+        )
     else:  # seat with a hole, lid up
         parts.append(_lathe(ring, 1, stretch))
         lid = np.stack([r * np.cos(angles), np.zeros(29), r * stretch * np.sin(angles)], axis=1)
-        vertices = np.concatenate([[(0, 0, 0)], lid, [(0, 0.02, 0)], lid + (0, 0.02, 0)])
+        vertices = np.concatenate([[(0, 0, 0)], lid, [(0, 0.02, 0)], lid + np.array([0, 0.02, 0])])
         i = np.arange(1, 29)
         faces = np.concatenate([np.c_[np.zeros(28, int), i, i + 1], np.c_[np.full(28, 30), i + 31, i + 30]])
         up = trimesh.Trimesh(vertices, faces, process=False)

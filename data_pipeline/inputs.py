@@ -29,7 +29,11 @@ def image_input(
 
 
 def cloud_input(
-    pixels: Int[Array, "points"], pixel_depth: Int[Array, "points"], pose: Float[Array, "4 4"], camera: CaptureConfig, frame: str
+    pixels: Int[Array, points],
+    pixel_depth: Int[Array, points],
+    pose: Float[Array, "4 4"],
+    camera: CaptureConfig,
+    frame: str,
 ) -> Float[Array, "points 3"]:
     """The partial cloud behind the sampled pixels of one view, in the `world` or the `camera` frame."""
     pinhole = Camera(pose, math.radians(camera.field_of_view), camera.resolution)

@@ -73,9 +73,9 @@ class ObjectEntry:
 
 @dataclass(frozen=True)
 class ObjectSource:
-    """A list of objects and the names of their classes; `identity` changes whenever the objects do."""
+    """A list of objects, their `name` together, and the names of their classes."""
 
-    identity: str
+    name: str
     classes: tuple[str, ...]
     entries: tuple[ObjectEntry, ...]
 
@@ -155,11 +155,15 @@ def parse_mesh(content: bytes, suffix: str, where: str) -> tuple[np.ndarray, np.
     if suffix == ".off":
         return parse_off(content, where)
     try:
-        mesh = trimesh.load(io.BytesIO(content), file_type=suffix[1:], force="mesh", process=False)
+        mesh = trimesh.load_mesh(io.BytesIO(content), file_type=suffix[1:], process=False)
         vertices, faces = np.asarray(mesh.vertices, np.float64), np.asarray(mesh.faces, np.int64)
     except Exception as error:  # trimesh raises whatever its parsers raise
         reason = f"{type(error).__name__}: {error}".splitlines()[0]
         raise DamagedMesh(f"{where} is not a readable {suffix} mesh ({reason}); repair it or take it away") from error
+    if len(vertices) == 0:
+        raise DamagedMesh(
+            f"{where} is not a readable {suffix} mesh (nothing was found in it); repair it or take it away"
+        )
     return vertices.reshape(-1, 3), faces.reshape(-1, 3)
 
 
@@ -168,54 +172,45 @@ def parse_off(content: bytes, where: str) -> tuple[np.ndarray, np.ndarray]:
     try:
         text = content.decode("ascii")
     except UnicodeDecodeError as error:
-        raise DamagedMesh(f"{where} is not an OFF mesh: it holds bytes that are not text; repair it or take it away") from error
-    tokens = " ".join(line.split("#", 1)[0] for line in text.splitlines())
-    head = tokens.lstrip()
-    if not head[:3].upper() == "OFF":
+        raise DamagedMesh(
+            f"{where} is not an OFF mesh: it holds bytes that are not text; repair it or take it away"
+        ) from error
+    lines = [line.split("#", 1)[0].split() for line in text.splitlines()]
+    lines = [line for line in lines if line]
+    if not lines or lines[0][0][:3].upper() != "OFF":
         raise DamagedMesh(f"{where} is not an OFF mesh: it does not begin with 'OFF'; repair it or take it away")
-    words = head[3:].split()
+    lines[0] = ([lines[0][0][3:]] if lines[0][0][3:] else []) + lines[0][1:]
+    counts = [word for line in lines[:2] for word in line][:3]
     try:
-        vertex_count, face_count = int(words[0]), int(words[1])
-        if vertex_count < 0 or face_count < 0 or len(words) < 3:
+        vertex_count, face_count = int(counts[0]), int(counts[1])
+        if vertex_count < 0 or face_count < 0 or len(counts) < 3:
             raise ValueError
     except (IndexError, ValueError) as error:
         raise DamagedMesh(f"{where} is not an OFF mesh: its counts are missing; repair it or take it away") from error
-    body = words[3:]
-    if len(body) < 3 * vertex_count:
+    body = lines[1 if lines[0] else 2 :]
+    vertex_lines, face_lines = body[:vertex_count], body[vertex_count : vertex_count + face_count]
+    whole = [line for line in vertex_lines if len(line) >= 3]
+    if len(whole) < vertex_count:
         raise DamagedMesh(
-            f"{where} is cut short: {len(body) // 3} of {vertex_count} vertices are there; fetch or export it again"
+            f"{where} is cut short: {len(whole)} of {vertex_count} vertices are there; fetch or export it again"
         )
     try:
-        vertices = np.array(body[: 3 * vertex_count], np.float64).reshape(-1, 3)
-        triangles, read = _off_faces(text, body[3 * vertex_count :], face_count)
+        vertices = np.array([line[:3] for line in vertex_lines], np.float64).reshape(-1, 3)
+        triangles: list[tuple[int, int, int]] = []
+        for number, line in enumerate(face_lines):  # colours may follow a face's corners
+            corners = int(line[0])
+            if len(line) < corners + 1:
+                face_lines = face_lines[:number]
+                break
+            face = [int(word) for word in line[1 : corners + 1]]
+            triangles += [(face[0], face[i], face[i + 1]) for i in range(1, corners - 1)]
     except ValueError as error:
         raise DamagedMesh(f"{where} is not an OFF mesh: {error}; repair it or take it away") from error
-    if read < face_count:
-        raise DamagedMesh(f"{where} is cut short: {read} of {face_count} faces are there; fetch or export it again")
-    return vertices, triangles
-
-
-def _off_faces(text: str, words: list[str], face_count: int) -> tuple[np.ndarray, int]:
-    """Triangles of the faces, polygons as fans, and how many faces were read."""
-    numbers = np.array(words, np.float64) if words else np.zeros(0)
-    if len(numbers) == 4 * face_count and np.all(numbers[::4] == 3):  # triangles and nothing else: nearly every file
-        return numbers.reshape(-1, 4)[:, 1:].astype(np.int64), face_count
-    # Colours may follow a face up to the end of its line, so lines matter here.
-    lines = [line.split("#", 1)[0].split() for line in text.splitlines()]
-    rows = [row for row in lines if row][-face_count:] if face_count else []
-    triangles, read = [], 0
-    for row in rows:
-        corners = int(row[0])
-        if corners < 0 or len(row) < corners + 1:
-            break
-        face = [int(word) for word in row[1 : corners + 1]]
-        triangles += [(face[0], face[i], face[i + 1]) for i in range(1, corners - 1)]
-        read += 1
-    if sum(int(row[0]) + 1 for row in rows[:read]) > len(words):  # those rows were vertices: faces are missing
-        read = min(read, len(words) // 4)
-        if read == face_count:
-            read -= 1
-    return np.array(triangles, np.int64).reshape(-1, 3), read
+    if len(face_lines) < face_count:
+        raise DamagedMesh(
+            f"{where} is cut short: {len(face_lines)} of {face_count} faces are there; fetch or export it again"
+        )
+    return vertices, np.array(triangles, np.int64).reshape(-1, 3)
 
 
 def normalise(vertices: np.ndarray, faces: np.ndarray, where: str) -> Mesh:
@@ -228,7 +223,9 @@ def normalise(vertices: np.ndarray, faces: np.ndarray, where: str) -> Mesh:
     vertices, faces = np.asarray(vertices, np.float64), np.asarray(faces, np.int64)
     if not np.isfinite(vertices).all():
         bad = int((~np.isfinite(vertices).all(axis=1)).sum())
-        raise DamagedMesh(f"{where} has {bad} vertices that are not finite (NaN or infinite); repair it or take it away")
+        raise DamagedMesh(
+            f"{where} has {bad} vertices that are not finite (NaN or infinite); repair it or take it away"
+        )
     if len(faces) == 0 or len(vertices) == 0:
         raise EmptyMesh("mesh has no faces")
     if faces.min() < 0 or faces.max() >= len(vertices):
@@ -267,8 +264,10 @@ def furniture10(train_per_class: int, test_per_class: int) -> ObjectSource:
     for label, name in enumerate(FURNITURE_CLASSES):
         for split, count, first in (("train", train_per_class, 0), ("test", test_per_class, 1_000_000)):
             for seed in range(first, first + count):
-                entries.append(ObjectEntry(f"{name}_{split}_{seed - first:04d}", label, split, FurniturePiece(name, seed)))
-    return ObjectSource(f"furniture10-{train_per_class}-{test_per_class}", FURNITURE_CLASSES, tuple(entries))
+                entries.append(
+                    ObjectEntry(f"{name}_{split}_{seed - first:04d}", label, split, FurniturePiece(name, seed))
+                )
+    return ObjectSource("furniture10", FURNITURE_CLASSES, tuple(entries))
 
 
 def _layout(files: list[PurePosixPath], where: str) -> dict[tuple[str, str], list[PurePosixPath]]:
@@ -285,7 +284,9 @@ def _layout(files: list[PurePosixPath], where: str) -> dict[tuple[str, str], lis
     return found
 
 
-def _entries(found: dict[tuple[str, str], list[PurePosixPath]], recipe_of, where: str) -> tuple[tuple[str, ...], list[ObjectEntry]]:
+def _entries(
+    found: dict[tuple[str, str], list[PurePosixPath]], recipe_of, where: str
+) -> tuple[tuple[str, ...], list[ObjectEntry]]:
     classes = tuple(sorted({name for name, _ in found}))
     if len(classes) < 2:
         raise DataError(f"{where} has one class only ({classes[0]}); a classifier needs at least two class folders")
@@ -306,14 +307,15 @@ def mesh_folder(folder: Path) -> ObjectSource:
     for child in sorted(folder.iterdir()):
         splits = [child / split for split in SOURCE_SPLITS if (child / split).is_dir()]
         if child.is_dir() and not child.name.startswith(".") and not any(child.iterdir()):
-            raise DataError(f"class folder {child} is empty; put meshes into its train and test folders, or take it away")
+            raise DataError(
+                f"class folder {child} is empty; put meshes into its train and test folders, or take it away"
+            )
         for part in splits:
             if not any(path.suffix.lower() in MESH_SUFFIXES for path in part.iterdir()):
                 raise DataError(f"class folder {part} is empty; put meshes there, or take the class folder away")
     found = _layout(files, str(folder))
     classes, entries = _entries(found, lambda path: MeshFile(str(folder / path)), str(folder))
-    sizes = sum((folder / path).stat().st_size for paths in found.values() for path in paths)
-    return ObjectSource(f"{folder.name}-{len(entries)}-{sizes}", classes, tuple(entries))
+    return ObjectSource(folder.name, classes, tuple(entries))
 
 
 def mesh_zip(archive: Path) -> ObjectSource:
@@ -326,11 +328,13 @@ def mesh_zip(archive: Path) -> ObjectSource:
     for info in infos:
         path = PurePosixPath(info.filename.replace("\\", "/"))
         if path.is_absolute() or ".." in path.parts or (path.parts and ":" in path.parts[0]):
-            raise DataError(f"{archive} holds {info.filename!r}, a path that leaves its folder; do not trust this archive")
+            raise DataError(
+                f"{archive} holds {info.filename!r}, a path that leaves its folder; do not trust this archive"
+            )
     usable = [info for info in infos if "__MACOSX" not in info.filename]
     found = _layout([PurePosixPath(info.filename) for info in usable], str(archive))
     classes, entries = _entries(found, lambda path: ZipMember(str(archive), str(path)), str(archive))
-    return ObjectSource(f"{archive.stem}-{len(entries)}-{sum(info.file_size for info in usable)}", classes, tuple(entries))
+    return ObjectSource(archive.stem, classes, tuple(entries))
 
 
 def voxel_archive(path: Path) -> ObjectSource:
@@ -342,7 +346,9 @@ def voxel_archive(path: Path) -> ObjectSource:
         with np.load(path) as archive:
             missing = [key for key in ("X_train", "y_train", "X_test", "y_test") if key not in archive.files]
             if missing:
-                raise DataError(f"{path} lacks {', '.join(missing)}; a voxel archive holds X_train, y_train, X_test and y_test")
+                raise DataError(
+                    f"{path} lacks {', '.join(missing)}; a voxel archive holds X_train, y_train, X_test and y_test"
+                )
             grids = {split: archive[f"X_{split}"] for split in SOURCE_SPLITS}
             labels = {split: archive[f"y_{split}"].astype(int).reshape(-1) for split in SOURCE_SPLITS}
     except (zipfile.BadZipFile, OSError, EOFError, ValueError) as error:
@@ -361,7 +367,7 @@ def voxel_archive(path: Path) -> ObjectSource:
         for index, (bits, label) in enumerate(zip(packed, labels[split], strict=True)):
             recipe = VoxelGrid(bits.tobytes(), grids[split].shape[1])
             entries.append(ObjectEntry(f"{classes[label]}_{split}_{index:04d}", int(label), split, recipe))
-    return ObjectSource(f"{path.stem}-{len(entries)}-{path.stat().st_size}", classes, tuple(entries))
+    return ObjectSource(path.stem, classes, tuple(entries))
 
 
 def open_source(data: str, *, train_per_class: int, test_per_class: int) -> ObjectSource:
@@ -374,7 +380,9 @@ def open_source(data: str, *, train_per_class: int, test_per_class: int) -> Obje
         return furniture10(train_per_class, test_per_class)
     path = Path(os.path.expanduser(data))
     if not path.exists():
-        raise DataError(f"no such file or folder: {data}; --data takes furniture10, a folder of class folders, a .zip or a .npz")
+        raise DataError(
+            f"no such file or folder: {data}; --data takes furniture10, a folder of class folders, a .zip or a .npz"
+        )
     if path.is_dir():
         return mesh_folder(path.resolve())
     if path.suffix.lower() == ".zip":
@@ -384,5 +392,7 @@ def open_source(data: str, *, train_per_class: int, test_per_class: int) -> Obje
     if path.suffix.lower() in MESH_SUFFIXES:
         vertices, faces = MeshFile(str(path)).load()  # says so if it is damaged
         normalise(vertices, faces, str(path))
-        raise DataError(f"{data} is a single mesh; --data takes a folder laid out as <class>/train/*.off and <class>/test/*.off")
+        raise DataError(
+            f"{data} is a single mesh; --data takes a folder laid out as <class>/train/*.off and <class>/test/*.off"
+        )
     raise DataError(f"{data} is not a data set: not a mesh folder, a .zip or a .npz")

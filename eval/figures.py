@@ -54,19 +54,31 @@ def difference_after_views(against_random: dict[str, dict[str, Any]]) -> Figure:
         errors = [np.maximum(values - low, 0), np.maximum(high - values, 0)]
         axis.errorbar(steps, values, errors, fmt="o", color=COLOURS[name], label=NAMES[name], markersize=4, capsize=2)
     axis.axhline(0, color="#111827", linewidth=1)
-    axis.set(xlabel="views looked at", ylabel="points above random", title="Gain over random, paired by object and start")
+    axis.set(
+        xlabel="views looked at", ylabel="points above random", title="Gain over random, paired by object and start"
+    )
     axis.legend(frameon=False)
     return figure
 
 
-def difference_grid(difference: Sequence[Sequence[float]], thresholds: Sequence[float], max_views: Sequence[int], title: str) -> Figure:
+def difference_grid(
+    difference: Sequence[Sequence[float]], thresholds: Sequence[float], max_views: Sequence[int], title: str
+) -> Figure:
     """The thesis's Table 7 as a picture: points above random in each (MV, CT) cell."""
     values = 100 * np.array(difference)
     largest = max(0.5, np.abs(values).max())
     figure, axis = plt.subplots(figsize=(5.4, 3.6), layout="constrained")
     axis.imshow(values, cmap="RdBu", vmin=-largest, vmax=largest, aspect="auto")
     for (row, column), value in np.ndenumerate(values):
-        axis.text(column, row, f"{value:+.1f}", ha="center", va="center", fontsize=8, color="white" if abs(value) > 0.65 * largest else "black")
+        axis.text(
+            column,
+            row,
+            f"{value:+.1f}",
+            ha="center",
+            va="center",
+            fontsize=8,
+            color="white" if abs(value) > 0.65 * largest else "black",
+        )
     axis.set_xticks(range(len(thresholds)), [f"{ct:g}" for ct in thresholds])
     axis.set_yticks(range(len(max_views)), [str(mv) for mv in max_views])
     axis.set(xlabel="confidence threshold", ylabel="most views", title=title)
@@ -76,13 +88,23 @@ def difference_grid(difference: Sequence[Sequence[float]], thresholds: Sequence[
 
 def confusions(matrices: dict[str, np.ndarray], classes: Sequence[str]) -> Figure:
     """Confusion in percent of the true class, a panel per policy."""
-    figure, axes = plt.subplots(1, len(matrices), figsize=(4.6 * len(matrices), 4.4), layout="constrained", sharey=True, squeeze=False)
+    figure, axes = plt.subplots(
+        1, len(matrices), figsize=(4.6 * len(matrices), 4.4), layout="constrained", sharey=True, squeeze=False
+    )
     for axis, (title, matrix) in zip(axes[0], matrices.items(), strict=True):
         share = 100 * matrix / np.maximum(matrix.sum(axis=1, keepdims=True), 1e-9)
         axis.imshow(share, cmap="Blues", vmin=0, vmax=100)
         for (row, column), value in np.ndenumerate(share):
             if value >= 0.5:
-                axis.text(column, row, f"{value:.0f}", ha="center", va="center", fontsize=7, color="white" if value > 60 else "black")
+                axis.text(
+                    column,
+                    row,
+                    f"{value:.0f}",
+                    ha="center",
+                    va="center",
+                    fontsize=7,
+                    color="white" if value > 60 else "black",
+                )
         axis.set_xticks(range(len(classes)), classes, rotation=60, ha="right")
         axis.set_yticks(range(len(classes)), classes)
         axis.set(xlabel="predicted", title=title)
@@ -103,11 +125,21 @@ def entropy_histogram(counts: Sequence[int], mean: float, std: float) -> Figure:
 
 def entropy_errors(entropy: dict[str, Any]) -> Figure:
     """Error of the network beside two predictors that look at nothing."""
-    rows = [("mean map", "mean_map", "#9ca3af"), ("class-mean map\n(told the class)", "class_mean_map", "#d1d5db"), ("PointNet++", "pointnet2", "#2563eb")]
+    rows = [
+        ("mean map", "mean_map", "#9ca3af"),
+        ("class-mean map\n(told the class)", "class_mean_map", "#d1d5db"),
+        ("PointNet++", "pointnet2", "#2563eb"),
+    ]
     figure, axis = plt.subplots(figsize=(4.6, 2.6), layout="constrained")
-    for position, (label, name, colour) in enumerate(rows):
+    for position, (_, name, colour) in enumerate(rows):
         low, high = entropy[f"{name}_interval"]
-        axis.barh(position, entropy[name], color=colour, xerr=[[max(0, entropy[name] - low)], [max(0, high - entropy[name])]], capsize=3)
+        axis.barh(
+            position,
+            entropy[name],
+            color=colour,
+            xerr=[[max(0, entropy[name] - low)], [max(0, high - entropy[name])]],
+            capsize=3,
+        )
         axis.text(high, position, f"  {entropy[name]:.4f}", va="center")
     axis.set_yticks(range(len(rows)), [label for label, _, _ in rows])
     axis.set(xlabel="mean squared error on test objects", title="Predicting depth entropy")
@@ -116,16 +148,26 @@ def entropy_errors(entropy: dict[str, Any]) -> Figure:
 
 
 def view_map(
-    points: np.ndarray, neighbours: np.ndarray, weights: np.ndarray, maxima: np.ndarray, title: str, limits: tuple[float, float]
+    points: np.ndarray,
+    neighbours: np.ndarray,
+    weights: np.ndarray,
+    maxima: np.ndarray,
+    title: str,
+    limits: tuple[float, float],
 ) -> Figure:
     """Views in a Mercator-like chart (thesis Figs. 7 and 11), coloured by entropy; local maxima are ringed."""
-    longitude, latitude = np.degrees(np.arctan2(points[:, 1], points[:, 0])), np.degrees(np.arcsin(np.clip(points[:, 2], -1, 1)))
+    longitude, latitude = (
+        np.degrees(np.arctan2(points[:, 1], points[:, 0])),
+        np.degrees(np.arcsin(np.clip(points[:, 2], -1, 1))),
+    )
     figure, axis = plt.subplots(figsize=(4.8, 2.8), layout="constrained")
     for i, j in np.argwhere(np.triu(neighbours)):
         if abs(longitude[i] - longitude[j]) < 180:
             axis.plot(longitude[[i, j]], latitude[[i, j]], color="#d1d5db", linewidth=0.7, zorder=1)
     dots = axis.scatter(longitude, latitude, c=weights, s=70, cmap="viridis", vmin=limits[0], vmax=limits[1], zorder=2)
-    axis.scatter(longitude[maxima], latitude[maxima], s=150, facecolors="none", edgecolors="#dc2626", linewidths=1.5, zorder=3)
+    axis.scatter(
+        longitude[maxima], latitude[maxima], s=150, facecolors="none", edgecolors="#dc2626", linewidths=1.5, zorder=3
+    )
     figure.colorbar(dots, ax=axis, label="normalised entropy")
     axis.set(xlabel="longitude (°)", ylabel="latitude (°)", title=title)
     return figure
@@ -158,13 +200,21 @@ def episode_strip(images: Sequence[np.ndarray], captions: Sequence[str], title: 
 
 def losses(histories: dict[str, list[dict[str, float]]]) -> Figure:
     """Training and validation loss by epoch, a panel per network."""
-    figure, axes = plt.subplots(1, len(histories), figsize=(4.4 * len(histories), 2.8), layout="constrained", squeeze=False)
+    figure, axes = plt.subplots(
+        1, len(histories), figsize=(4.4 * len(histories), 2.8), layout="constrained", squeeze=False
+    )
     for axis, (name, history) in zip(axes[0], histories.items(), strict=True):
         epochs = [entry["epoch"] for entry in history]
-        axis.plot(epochs, [entry["train/loss"] for entry in history], "o-", color="#9ca3af", markersize=3, label="training")
-        axis.plot(epochs, [entry["val/loss"] for entry in history], "o-", color="#2563eb", markersize=3, label="validation")
+        axis.plot(
+            epochs, [entry["train/loss"] for entry in history], "o-", color="#9ca3af", markersize=3, label="training"
+        )
+        axis.plot(
+            epochs, [entry["val/loss"] for entry in history], "o-", color="#2563eb", markersize=3, label="validation"
+        )
         axis.set(xlabel="epoch", ylabel="loss", title=name)
-        if len(epochs) > 1 and max(entry["train/loss"] for entry in history) > 5 * min(entry["val/loss"] for entry in history):
+        if len(epochs) > 1 and max(entry["train/loss"] for entry in history) > 5 * min(
+            entry["val/loss"] for entry in history
+        ):
             axis.set_yscale("log")
         axis.legend(frameon=False)
     return figure

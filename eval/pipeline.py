@@ -25,7 +25,7 @@ from eval.view_tables import ViewTables, compute_view_tables, load_view_tables, 
 from mevs_jax.models import Abstraction
 from train.classifier import ClassifierConfig, ClassifierTask, ResNetConfig
 from train.entropy import EntropyConfig, EntropyTask, PointNet2Config
-from train.loop import OptimiserConfig, fit, load_best
+from train.loop import OptimiserConfig, Task, fit, load_best
 
 
 @dataclass(frozen=True)
@@ -47,7 +47,7 @@ SMALL = Settings(
     classifier=ClassifierConfig(
         network=ResNetConfig(width=32, channels=1),
         optimiser=OptimiserConfig(
-            epochs=10,
+            epochs=8,
             batch_size=64,
             epoch_views=8,
             validation_views=4,
@@ -67,7 +67,7 @@ SMALL = Settings(
             dropout=0.3,
         ),
         optimiser=OptimiserConfig(
-            epochs=8, batch_size=32, epoch_views=4, validation_views=2, learning_rate=2e-3, schedule="cosine"
+            epochs=6, batch_size=32, epoch_views=4, validation_views=2, learning_rate=2e-3, schedule="cosine"
         ),
     ),
 )
@@ -155,7 +155,9 @@ def tasks(settings: Settings, statistics: DatasetStatistics) -> tuple[Classifier
 
 def train(settings: Settings, out: Path) -> None:
     statistics = load_statistics(out / "data")
-    for task, name in zip(tasks(settings, statistics), ("classifier", "entropy"), strict=True):
+    classify, predict = tasks(settings, statistics)
+    pairs: list[tuple[Task, str]] = [(classify, "classifier"), (predict, "entropy")]
+    for task, name in pairs:
         summary = fit(task, out / "data", statistics, out / name)
         console.print(
             f"{task.name}: best epoch {summary['best_epoch']} of {summary['epoch']}, validation "
@@ -179,7 +181,7 @@ def evaluate(settings: Settings, out: Path) -> dict[str, Any]:
     """Metrics of the test split, as written to `metrics.json`."""
     statistics = load_statistics(out / "data")
     path = out / "metrics.json"
-    identity = json.loads(json.dumps({"evaluation": asdict(settings.evaluation), "source": statistics.source}))
+    identity = json.loads(json.dumps({"evaluation": asdict(settings.evaluation), "data": statistics.fingerprint}))
     if path.exists() and (metrics := read_json(path))["identity"] == identity:
         return metrics
     tables = _tables(settings, out, statistics)

@@ -28,11 +28,14 @@ from mevs_jax.viewpoints import ViewGraph, local_maxima
 
 _STYLE = """
 body{font:15px/1.55 system-ui,sans-serif;color:#111827;max-width:60rem;margin:2rem auto;padding:0 1rem}
-h1{font-size:1.7rem;margin-bottom:.2rem}h2{margin-top:2.4rem;border-bottom:1px solid #e5e7eb;padding-bottom:.2rem}
+h1{font-size:1.7rem;margin-bottom:.2rem}h2{margin-top:2.4rem;
+border-bottom:1px solid #e5e7eb;padding-bottom:.2rem}
 table{border-collapse:collapse;margin:1rem 0;font-variant-numeric:tabular-nums}th,td{padding:.25rem .6rem;text-align:right}
-th{border-bottom:2px solid #d1d5db;font-weight:600}td{border-bottom:1px solid #f3f4f6}th:first-child,td:first-child{text-align:left}
+th{border-bottom:2px solid #d1d5db;font-weight:600}td{border-bottom:1px solid #f3f4f6}
+th:first-child,td:first-child{text-align:left}
 .lead{font-size:1.1rem}.note{color:#6b7280;font-size:.9rem}.faint{color:#9ca3af}.figures{display:flex;flex-wrap:wrap;gap:1rem}
-figure{margin:1rem 0}figcaption{color:#6b7280;font-size:.85rem}img{max-width:100%;height:auto}code{background:#f3f4f6;padding:.1rem .3rem}
+figure{margin:1rem 0}figcaption{color:#6b7280;font-size:.85rem}img{max-width:100%;height:auto}
+code{background:#f3f4f6;padding:.1rem .3rem}
 details{margin:1rem 0}summary{cursor:pointer}
 """
 
@@ -104,8 +107,8 @@ def _lead(inputs: ReportInputs) -> str:
         cell = result["difference"][row][column], result["interval"][row][column]
         sentences.append(f"Choosing by {figures.NAMES[name]} is {_verdict(*cell)}.")
     return (
-        f'<p class="lead">{" ".join(sentences)}</p><p class="note">With up to {headline["max_views"]} views and a confidence '
-        f"threshold of {headline['threshold']}, over {metrics['objects']} test objects and all {metrics['starts']} start views of "
+        f'<p class="lead">{" ".join(sentences)}</p><p class="note">With up to {headline["max_views"]} views and a '
+        f"confidence threshold of {headline['threshold']}, over {metrics['objects']} test objects and all {metrics['starts']} start views of "
         f"each; random draws without repetition; a difference is called so when its 95 % interval, paired by object, leaves "
         f"out zero.</p>"
     )
@@ -131,8 +134,8 @@ def _data_section(inputs: ReportInputs) -> str:
         for name, why in by_name.items()
     ]
     return (
-        f"<h2>Data</h2><p>{html.escape(statistics.source)}: {statistics.views} views of each object on a Fibonacci sphere "
-        f"({camera.lattice}), {camera.resolution}×{camera.resolution} pixels, {camera.field_of_view:g}° field of view from "
+        f"<h2>Data</h2><p>{html.escape(statistics.source)}: {statistics.views} views of each object on a Fibonacci "
+        f"sphere ({camera.lattice}), {camera.resolution}×{camera.resolution} pixels, {camera.field_of_view:g}° field of view from "
         f"{camera.distance:g} radii away. Mean points seen per view: {statistics.points_mean:,.0f} ± {statistics.points_std:,.0f}. "
         f"Entropies are normalised by the training split's largest, {statistics.entropy_max:.2f} bits.</p>"
         + _table(["class", "train", "val", "test"], [*rows, ["<b>all</b>", *totals]])
@@ -179,7 +182,9 @@ def _entropy_section(inputs: ReportInputs) -> str:
         f"nothing (difference in error {low:+.4f} to {high:+.4f}). The class-mean map is told the true class.</p>"
         + _image(figures.entropy_errors(entropy), "Test objects, all views as input; 95 % intervals over objects.")
         + '<div class="figures">'
-        + "".join(_image(m, f"{tables.names[example]}, an object of median error. Red rings: local maxima.") for m in maps)
+        + "".join(
+            _image(m, f"{tables.names[example]}, an object of median error. Red rings: local maxima.") for m in maps
+        )
         + f"</div><details><summary>Error by class</summary>{_table(['class', 'MSE'], rows)}</details>"
     )
 
@@ -192,25 +197,38 @@ def _selection_section(inputs: ReportInputs) -> str:
     for name, result in policies.items():
         row = [figures.NAMES[name]]
         for step in steps:
-            row.append(f"{_percent(result['after_views'][step - 1])} <span class='note'>{_range(result['after_views_interval'][step - 1])}</span>")
+            low_high = _range(result["after_views_interval"][step - 1])
+            row.append(f"{_percent(result['after_views'][step - 1])} <span class='note'>{low_high}</span>")
         ladder.append(row)
     for name, result in against.items():
         row = [f"{figures.NAMES[name]} − random"]
         for step in steps:
-            row.append(_difference(result["after_views_difference"][step - 1], result["after_views_interval"][step - 1]))
+            row.append(
+                _difference(result["after_views_difference"][step - 1], result["after_views_interval"][step - 1])
+            )
         ladder.append(row)
     parts = [
         "<h2>Choosing the next view</h2><p>Accuracy (%) after exactly so many views, without early stopping, with 95 % "
         "intervals over objects. Grey: not distinguishable from zero.</p>",
         _table(["policy", *(f"{step} view{'s' if step > 1 else ''}" for step in steps)], ladder),
-        _image(figures.accuracy_after_views(policies, metrics["single_view"]["all_views"]), "Bands: 95 % intervals over objects."),
-        _image(figures.difference_after_views(against), "All policies share their start views; intervals over objects."),
+        _image(
+            figures.accuracy_after_views(policies, metrics["single_view"]["all_views"]),
+            "Bands: 95 % intervals over objects.",
+        ),
+        _image(
+            figures.difference_after_views(against), "All policies share their start views; intervals over objects."
+        ),
         "<h2>The thesis's grid</h2><p>Stop at a confidence threshold (CT, columns) or after the most views (MV, rows).</p>",
         '<div class="figures">',
     ]
     for name, result in against.items():
         title = f"{figures.NAMES[name]} − random"
-        parts.append(_image(figures.difference_grid(result["difference"], metrics["thresholds"], metrics["max_views"], title), "Percentage points (thesis Tables 7 and 12)."))
+        parts.append(
+            _image(
+                figures.difference_grid(result["difference"], metrics["thresholds"], metrics["max_views"], title),
+                "Percentage points (thesis Tables 7 and 12).",
+            )
+        )
     parts.append("</div>")
     for name, result in policies.items():
         for key, label, show in (
@@ -218,7 +236,10 @@ def _selection_section(inputs: ReportInputs) -> str:
             ("class_accuracy", "class accuracy (%)", _percent),
             ("views_used", "views used", lambda value: f"{value:.2f}"),
         ):
-            rows = [[str(mv), *(show(v) for v in values)] for mv, values in zip(metrics["max_views"], result[key], strict=True)]
+            rows = [
+                [str(mv), *(show(v) for v in values)]
+                for mv, values in zip(metrics["max_views"], result[key], strict=True)
+            ]
             table = _table(["MV \\ CT", *(f"{ct:g}" for ct in metrics["thresholds"])], rows)
             parts.append(f"<details><summary>{figures.NAMES[name]}: {label}</summary>{table}</details>")
     matrices = {
@@ -261,12 +282,22 @@ def _example_walk(inputs: ReportInputs) -> str:
         for view, p, c in zip(views, episode.predictions, episode.confidences, strict=True)
     ]
     title = f"{tables.names[index]}: what the policy looked at, and what it believed"
-    return _image(figures.episode_strip([images[view] for view in views], captions, title), "One walk of the PointNet++ policy.", "png")
+    return _image(
+        figures.episode_strip([images[view] for view in views], captions, title),
+        "One walk of the PointNet++ policy.",
+        "png",
+    )
 
 
 def _training_section(inputs: ReportInputs) -> str:
     rows = [
-        [html.escape(name), str(s["best_epoch"]), str(s["epoch"]), f"{s['best_loss']:.4f}", f"{s['seconds'] / 60:.1f} min"]
+        [
+            html.escape(name),
+            str(s["best_epoch"]),
+            str(s["epoch"]),
+            f"{s['best_loss']:.4f}",
+            f"{s['seconds'] / 60:.1f} min",
+        ]
         for name, s in inputs.summaries.items()
     ]
     by_view = inputs.metrics["single_view"]["by_view"]
@@ -283,8 +314,8 @@ def _methods_section(inputs: ReportInputs) -> str:
     settings = html.escape(json.dumps(inputs.settings, indent=1, default=str))
     device = jax.devices()[0]
     return (
-        "<h2>How this was made</h2><p>Splits are by object; nothing was chosen on test objects. Every object is walked from every "
-        f"start view; the random policy is averaged over {inputs.metrics['random_draws_per_start']} draws a start. Preset "
+        "<h2>How this was made</h2><p>Splits are by object; nothing was chosen on test objects. Every object is walked from "
+        f"every start view; the random policy is averaged over {inputs.metrics['random_draws_per_start']} draws a start. Preset "
         f"<code>{html.escape(inputs.preset)}</code>, JAX {jax.__version__} on {html.escape(device.device_kind)} "
         f"({html.escape(platform.machine())}, Python {platform.python_version()}).</p>"
         f"<details><summary>All settings</summary><pre>{settings}</pre></details>"
@@ -298,7 +329,8 @@ def read_history(folder: Path) -> list[dict[str, float]]:
 def write_report(inputs: ReportInputs, path: Path) -> None:
     """Writes the page; it needs no other file."""
     body = "".join(
-        section(inputs) for section in (_lead, _selection_section, _entropy_section, _training_section, _data_section, _methods_section)
+        section(inputs)
+        for section in (_lead, _selection_section, _entropy_section, _training_section, _data_section, _methods_section)
     )
     title = f"Where to look next: {html.escape(inputs.statistics.source)}"
     write_text(

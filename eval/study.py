@@ -25,7 +25,9 @@ def single_view(tables: ViewTables, classes: int) -> dict[str, Any]:
     predictions = tables.logits.argmax(-1)
     right = predictions == tables.labels[:, None]
     views = predictions.shape[1]
-    confusion = confusion_matrix(jnp.repeat(jnp.asarray(tables.labels), views), jnp.asarray(predictions.reshape(-1)), classes)
+    confusion = confusion_matrix(
+        jnp.repeat(jnp.asarray(tables.labels), views), jnp.asarray(predictions.reshape(-1)), classes
+    )
     return {
         "accuracy": float(accuracy(confusion)),
         "interval": interval_of(jax.random.key(0), right.mean(axis=1)),
@@ -112,4 +114,3 @@ def run_study(tables: ViewTables, statistics: DatasetStatistics, config: GridCon
         "against_random": compare(grids),
         "headline": {"threshold": HEADLINE_CT, "max_views": mv + FIRST_MV},
     }
-

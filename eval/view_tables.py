@@ -44,7 +44,13 @@ class ViewTables:
 
 
 def compute_view_tables(
-    data: Path, split: str, statistics: DatasetStatistics, classify: ClassifierTask, classifier: nnx.Module, predict: EntropyTask, predictor: nnx.Module
+    data: Path,
+    split: str,
+    statistics: DatasetStatistics,
+    classify: ClassifierTask,
+    classifier: nnx.Module,
+    predict: EntropyTask,
+    predictor: nnx.Module,
 ) -> ViewTables:
     """Runs both networks on every view of every object of a split."""
     classifier_graph, classifier_state = nnx.split(classifier)

@@ -24,7 +24,7 @@ from mevs_jax.arrays import AnyArray
 class Camera:
     """Square pinhole camera: `pose` (4, 4) camera to world, `field_of_view` in radians, `resolution` in pixels."""
 
-    pose: Float[AnyArray, "*batch 4 4"]
+    pose: Float[Array, "*batch 4 4"]
     field_of_view: float = flax.struct.field(pytree_node=False, default=math.pi / 3)
     resolution: int = flax.struct.field(pytree_node=False, default=224)
 
@@ -34,11 +34,12 @@ class Camera:
         return self.resolution / 2 / math.tan(self.field_of_view / 2)
 
 
-def look_at_origin(position: Float[Array, "3"]) -> Float[Array, "4 4"]:
+def look_at_origin(position: Float[AnyArray, 3]) -> Float[Array, "4 4"]:
     """Pose of a camera at `position` looking at the origin with world z upwards in the image.
 
     Straight above or below, where "up" is undefined, world y takes its place.
     """
+    position = jnp.asarray(position)
     forward = -position / jnp.linalg.norm(position)
     polar = jnp.abs(forward[2]) > 1 - 1e-6
     up = jnp.where(polar, jnp.array([0.0, 1.0, 0.0]), jnp.array([0.0, 0.0, 1.0]))
@@ -57,7 +58,7 @@ def pixel_directions(camera: Camera) -> Float[Array, "resolution resolution 3"]:
 
 
 def unproject(
-    pixels: Int[Array, "points"], depth: Float[Array, "points"], camera: Camera, *, frame: str = "world"
+    pixels: Int[AnyArray, points], depth: Float[AnyArray, points], camera: Camera, *, frame: str = "world"
 ) -> Float[Array, "points 3"]:
     """Points seen at flat pixel indices (row · resolution + column).
 
@@ -76,16 +77,20 @@ def unproject(
 
 
 def partial_cloud(
-    depth: Float[Array, "resolution resolution"], camera: Camera
-) -> tuple[Float[Array, "pixels 3"], Bool[Array, "pixels"]]:
+    depth: Float[AnyArray, "resolution resolution"], camera: Camera
+) -> tuple[Float[Array, "pixels 3"], Bool[Array, pixels]]:
     """The world point behind every pixel, and which of them are real (something was hit)."""
-    flat = depth.reshape(-1)
+    flat = jnp.asarray(depth).reshape(-1)
     pixels = jnp.arange(flat.shape[0])
     return unproject(pixels, flat, camera), flat > 0
 
 
 def cameras_at(
-    points: Float[AnyArray, "views 3"], *, distance: float = 2.0, resolution: int = 224, field_of_view: float = math.pi / 3
+    points: Float[AnyArray, "views 3"],
+    *,
+    distance: float = 2.0,
+    resolution: int = 224,
+    field_of_view: float = math.pi / 3,
 ) -> Camera:
     """Cameras on a sphere of radius `distance`, one per unit vector, as one `Camera` with a leading axis on `pose`."""
     return Camera(jax.vmap(look_at_origin)(jnp.asarray(points) * distance), float(field_of_view), resolution)

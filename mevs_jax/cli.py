@@ -65,7 +65,11 @@ def _parse(command: str, arguments: list[str]) -> tuple[str, Path, Settings]:
         raise DataError(f"unknown preset {preset!r}; it is one of {', '.join(PRESETS)}")
 
     options = tyro.cli(
-        Options, prog=f"mevs {command}", description=COMMANDS[command], args=arguments, default=options_from(preset)  # type: ignore[arg-type]
+        Options,
+        prog=f"mevs {command}",
+        description=COMMANDS[command],
+        args=arguments,
+        default=options_from(preset),  # type: ignore[arg-type]
     )
     return preset, options.out or Path("runs") / preset, options.settings()
 
@@ -82,7 +86,9 @@ def _run(command: str, arguments: list[str]) -> None:
         pipeline.train(settings, out)
     if command in ("run", "eval"):
         metrics = pipeline.evaluate(settings, out)
-        console.print(f"Single views: {100 * metrics['single_view']['accuracy']:.1f} % of {metrics['objects']} test objects right")
+        console.print(
+            f"Single views: {100 * metrics['single_view']['accuracy']:.1f} % of {metrics['objects']} test objects right"
+        )
     if command in ("run", "eval"):
         console.print(f"Metrics: {out / 'metrics.json'}")
     if command in ("run", "report"):

@@ -30,16 +30,14 @@ def depth_levels(depth: Float[AnyArray, "*shape"]) -> Int[Array, "*shape"]:
     return quantise_depth(depth) // _LEVELS
 
 
-def shannon_entropy(counts: Float[AnyArray, "levels"] | Int[AnyArray, "levels"]) -> Float[Array, ""]:
+def shannon_entropy(counts: Float[AnyArray, levels] | Int[AnyArray, levels]) -> Float[Array, ""]:
     """Entropy in bits of a histogram; 0 for an empty one."""
     total = jnp.sum(counts)
     p = counts / jnp.maximum(total, 1)
     return -jnp.sum(jnp.where(p > 0, p * jnp.log2(jnp.where(p > 0, p, 1.0)), 0.0))
 
 
-def level_entropy(
-    levels: Int[AnyArray, "height width"], variant: EntropyVariant = "thesis"
-) -> Float[Array, ""]:
+def level_entropy(levels: Int[AnyArray, "height width"], variant: EntropyVariant = "thesis") -> Float[Array, ""]:
     """Entropy in bits of an image of levels 0..255; `foreground` leaves level 0 out.
 
     Raises:

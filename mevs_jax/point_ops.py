@@ -33,7 +33,7 @@ def _squared_distance(dx: Array, dy: Array, dz: Array) -> Array:
     return (_square(dx) + _square(dy)) + _square(dz)
 
 
-def farthest_point_sample(points: Float[AnyArray, "points 3"], k: int) -> Int[Array, "{k}"]:
+def farthest_point_sample(points: Float[AnyArray, "points 3"], k: int) -> Int[Array, {k}]:
     """Indices of `k` points, each the farthest from those taken before it; the first is point 0.
 
     Args:
@@ -67,10 +67,7 @@ def farthest_point_sample(points: Float[AnyArray, "points 3"], k: int) -> Int[Ar
 
 
 def ball_query(
-    points: Float[AnyArray, "points 3"],
-    centres: Float[AnyArray, "centres 3"],
-    radius: float | Float[Array, ""],
-    k: int
+    points: Float[AnyArray, "points 3"], centres: Float[AnyArray, "centres 3"], radius: float | Float[Array, ""], k: int
 ) -> Int[Array, "centres {k}"]:
     """For each centre, the first `k` points in index order strictly within `radius`.
 
@@ -93,9 +90,10 @@ def ball_query(
     padded = jnp.pad(points, ((0, -points.shape[0] % _WORD), (0, 0)), constant_values=jnp.inf)
     squared_radius = _square(jnp.asarray(radius, points.dtype))
     x, y, z = (padded[:, axis].reshape(-1, _WORD) for axis in range(3))
-    hit = _squared_distance(
-        centres[:, 0, None, None] - x, centres[:, 1, None, None] - y, centres[:, 2, None, None] - z
-    ) < squared_radius
+    hit = (
+        _squared_distance(centres[:, 0, None, None] - x, centres[:, 1, None, None] - y, centres[:, 2, None, None] - z)
+        < squared_radius
+    )
     words = _pack(hit)
     return jax.vmap(_first_set_bits, in_axes=(0, None))(words, k)
 
@@ -105,7 +103,7 @@ def _pack(hit: Bool[Array, "centres words 32"]) -> UInt32[Array, "centres words"
     return jnp.sum(jnp.where(hit, bit, jnp.uint32(0)), axis=-1, dtype=jnp.uint32)
 
 
-def _first_set_bits(words: UInt32[Array, "words"], k: int) -> Int[Array, "{k}"]:
+def _first_set_bits(words: UInt32[Array, words], k: int) -> Int[Array, {k}]:
     """Positions of the first `k` set bits of a long bit string, the first one repeated where there are fewer."""
     ones = jax.lax.population_count(words).astype(jnp.int32)
     until = jnp.cumsum(ones)
@@ -118,7 +116,7 @@ def _first_set_bits(words: UInt32[Array, "words"], k: int) -> Int[Array, "{k}"]:
     return jnp.where(until[-1] > 0, position, 0)
 
 
-def _select_bit(word: UInt32[Array, "k"], rank: Int[Array, "k"]) -> Int[Array, "k"]:
+def _select_bit(word: UInt32[Array, k], rank: Int[Array, k]) -> Int[Array, k]:
     """Position of the set bit number `rank` (from 0) of each word, by halving."""
     position = jnp.zeros_like(rank)
     for width in (16, 8, 4, 2, 1):

@@ -25,7 +25,8 @@ class _Reader:
         self.state = state
         self.left = set(state)
 
-    def put(self, variable: nnx.Variable, name: str, *axes: int) -> None:
+    def put(self, variable: nnx.Variable | None, name: str, *axes: int) -> None:
+        assert variable is not None  # biases are there where the names say so
         if name not in self.state:
             raise ValueError(f"the state dict has no {name!r}; is it of this network?")
         array = np.asarray(self.state[name])

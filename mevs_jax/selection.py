@@ -10,13 +10,12 @@ stops early, holds the answer for every threshold and every limit on views at on
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 
 import flax.struct
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
-
-from mevs_jax.arrays import AnyArray
 
 from mevs_jax.fusion import confidence, sum_of_logits
 from mevs_jax.policies import Policy, Scene, SelectionState
@@ -29,8 +28,8 @@ NEVER_STOP = 2.0
 class Observation:
     """What one look gives: logits (classes,), and the policy network's word on every view (views,)."""
 
-    logits: Float[AnyArray, "*batch classes"]
-    utility: Float[AnyArray, "*batch views"]
+    logits: Float[Array, "*batch classes"]
+    utility: Float[Array, "*batch views"]
 
 
 @flax.struct.dataclass
@@ -44,10 +43,10 @@ class ViewTable:
         label: the true class.
     """
 
-    logits: Float[AnyArray, "*batch views classes"]
-    utility: Float[AnyArray, "*batch views views"]
-    entropy: Float[AnyArray, "*batch views"]
-    label: Int[AnyArray, "*batch"]
+    logits: Float[Array, "*batch views classes"]
+    utility: Float[Array, "*batch views views"]
+    entropy: Float[Array, "*batch views"]
+    label: Int[Array, "*batch"]
 
     def observe(self, view: Int[Array, ""]) -> Observation:
         return Observation(self.logits[view], self.utility[view])
@@ -64,13 +63,13 @@ class Episode:
         count: how many views were looked at.
     """
 
-    views: Int[AnyArray, "*batch max_views"]
-    predictions: Int[AnyArray, "*batch max_views"]
-    confidences: Float[AnyArray, "*batch max_views"]
-    count: Int[AnyArray, "*batch"]
+    views: Int[Array, "*batch max_views"]
+    predictions: Int[Array, "*batch max_views"]
+    confidences: Float[Array, "*batch max_views"]
+    count: Int[Array, "*batch"]
 
 
-def best_unattempted(scores: Float[Array, "views"], attempted: Bool[Array, "views"]) -> Int[Array, ""]:
+def best_unattempted(scores: Float[Array, views], attempted: Bool[Array, views]) -> Int[Array, ""]:
     """The unattempted view of highest score, the lowest index among equals; −inf and NaN come last."""
     scores = jnp.where(jnp.isnan(scores), -jnp.inf, scores)
     best = jnp.max(jnp.where(attempted, -jnp.inf, scores))
@@ -115,7 +114,8 @@ def select_views(
     def look(carry: tuple[SelectionState, Episode]) -> tuple[SelectionState, Episode]:
         state, episode = carry
         seen = observe(state.view)
-        state = state.replace(
+        state = replace(
+            state,
             count=state.count + 1,
             attempted=state.attempted.at[state.view].set(True),
             belief=sum_of_logits(state.belief, seen.logits),
@@ -128,7 +128,7 @@ def select_views(
             count=state.count,
         )
         scores = policy(jax.random.fold_in(key, state.count), state, scene)
-        return state.replace(view=best_unattempted(scores, state.attempted)), episode
+        return replace(state, view=best_unattempted(scores, state.attempted)), episode
 
     state = SelectionState(
         count=jnp.int32(0),
@@ -154,12 +154,19 @@ def select_from_table(
 ) -> Episode:
     """`select_views` where a look is a row of `table`."""
     return select_views(
-        key, table.observe, scene, policy, start, classes=table.logits.shape[1], threshold=threshold, max_views=max_views
+        key,
+        table.observe,
+        scene,
+        policy,
+        start,
+        classes=table.logits.shape[1],
+        threshold=threshold,
+        max_views=max_views,
     )
 
 
 def stop_at(
-    confidences: Float[Array, "steps"], threshold: float | Float[Array, ""], max_views: int | Int[Array, ""]
+    confidences: Float[Array, steps], threshold: float | Float[Array, ""], max_views: int | Int[Array, ""]
 ) -> Int[Array, ""]:
     """How many views a full walk would have used: up to the first confidence ≥ `threshold`, at most `max_views`."""
     sure = confidences >= threshold

@@ -56,9 +56,9 @@ class ViewGraph:
         distances: (views, views) great-circle distances in radians.
     """
 
-    points: Float[AnyArray, "*batch views 3"]
-    neighbours: Bool[AnyArray, "*batch views views"]
-    distances: Float[AnyArray, "*batch views views"]
+    points: Float[Array, "*batch views 3"]
+    neighbours: Bool[Array, "*batch views views"]
+    distances: Float[Array, "*batch views views"]
 
     @classmethod
     def from_points(cls, points: AnyArray) -> ViewGraph:
@@ -95,9 +95,7 @@ class ViewGraph:
         )
 
 
-def local_maxima(
-    weights: Float[AnyArray, "views"], neighbours: Bool[AnyArray, "views views"]
-) -> Bool[Array, "views"]:
+def local_maxima(weights: Float[AnyArray, views], neighbours: Bool[AnyArray, "views views"]) -> Bool[Array, views]:
     """Which views weigh strictly more than every neighbour (thesis Algorithm 1).
 
     Two equal neighbours exclude each other; a view without neighbours is a maximum. At least one view is a maximum

@@ -5,7 +5,8 @@ from __future__ import annotations
 import jax
 import numpy as np
 import pytest
-from sklearn.metrics import accuracy_score, balanced_accuracy_score, confusion_matrix as sklearn_confusion
+from sklearn.metrics import accuracy_score, balanced_accuracy_score
+from sklearn.metrics import confusion_matrix as sklearn_confusion
 
 from mevs_jax import accuracy, bootstrap_interval, class_accuracy, confusion_matrix, mean_squared_error
 

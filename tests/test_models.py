@@ -83,7 +83,8 @@ def train_ours(kind: str) -> tuple[dict[str, np.ndarray], nnx.Module]:
     inputs = made_up_inputs("pointnet2" if kind == "pointnet2" else "resnet")
     with jax.enable_x64(True):
         structure, parameters, rest = jax.tree.map(
-            lambda leaf: leaf.astype(jnp.float64) if leaf.dtype == jnp.float32 else leaf, nnx.split(network, nnx.Param, ...)
+            lambda leaf: leaf.astype(jnp.float64) if leaf.dtype == jnp.float32 else leaf,
+            nnx.split(network, nnx.Param, ...),
         )
 
         @jax.jit
@@ -122,10 +123,14 @@ def test_forward_and_gradients_equal_stored_pytorch(kind):
     with np.load(GOLDEN) as golden:
         np.testing.assert_allclose(forward_ours(kind), golden[f"{kind}/outputs"], atol=1e-4, rtol=0)
         for name, stored in zip(golden[f"{kind}/gradient_names"], golden[f"{kind}/gradients"], strict=True):
-            np.testing.assert_allclose(fingerprint(gradients[str(name)]), stored, atol=1e-4, rtol=1e-4, err_msg=str(name))
+            np.testing.assert_allclose(
+                fingerprint(gradients[str(name)]), stored, atol=1e-4, rtol=1e-4, err_msg=str(name)
+            )
 
 
-@pytest.mark.skipif(importlib.util.find_spec("torch") is None, reason="PyTorch is not installed; stored outputs are compared")
+@pytest.mark.skipif(
+    importlib.util.find_spec("torch") is None, reason="PyTorch is not installed; stored outputs are compared"
+)
 @pytest.mark.parametrize("kind", KINDS)
 def test_forward_gradients_and_running_statistics_equal_live_pytorch(kind):
     from tests.reference.torch_networks import run
@@ -185,7 +190,7 @@ def test_wrong_state_dicts_are_refused():
     shapes = golden_shapes("resnet18")
     state = made_up_weights(shapes)
     network = ResNet(depth=18, rngs=nnx.Rngs(0))
-    with pytest.raises(ValueError, match="no 'fc.bias'"):
+    with pytest.raises(ValueError, match=r"no 'fc\.bias'"):
         resnet_from_torch(network, {name: value for name, value in state.items() if name != "fc.bias"})
     with pytest.raises(ValueError, match="lacks"):
         resnet_from_torch(network, state | {"extra.weight": np.zeros(3)})

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from functools import partial
+from types import SimpleNamespace
 
 import jax
 import jax.numpy as jnp
@@ -43,9 +44,7 @@ def random_tables(views: int, classes: int, count: int, seed: int) -> ViewTable:
 def walk_jitted(keys, tables, graph, starts, thresholds, policy, max_views):
     def one(key, table, start, threshold):
         scene = Scene(graph, table.entropy)
-        return select_from_table(
-            key, table, scene, POLICIES[policy], start, threshold=threshold, max_views=max_views
-        )
+        return select_from_table(key, table, scene, POLICIES[policy], start, threshold=threshold, max_views=max_views)
 
     over_thresholds = jax.vmap(one, in_axes=(None, None, None, 0))
     return jax.vmap(over_thresholds, in_axes=(0, 0, 0, None))(keys, tables, starts, thresholds)
@@ -58,11 +57,14 @@ def test_the_jitted_loop_walks_the_views_of_a_plain_loop(policy):
     tables = random_tables(views, classes, TABLES, seed=3)
     starts = jnp.arange(TABLES, dtype=jnp.int32) % views
     keys = jax.random.split(jax.random.key(1), TABLES)
-    episodes = jax.device_get(
-        walk_jitted(keys, tables, graph, starts, jnp.array(THRESHOLDS), policy=policy, max_views=max_views)
-    )
+    walked = walk_jitted(keys, tables, graph, starts, jnp.array(THRESHOLDS), policy=policy, max_views=max_views)
+    episodes = SimpleNamespace(**{name: np.asarray(leaf) for name, leaf in vars(walked).items()})
     draws = np.asarray(
-        jax.vmap(lambda key: jax.vmap(lambda step: jax.random.uniform(jax.random.fold_in(key, step), (views,)))(jnp.arange(max_views)))(keys)
+        jax.vmap(
+            lambda key: jax.vmap(lambda step: jax.random.uniform(jax.random.fold_in(key, step), (views,)))(
+                jnp.arange(max_views)
+            )
+        )(keys)
     )
     neighbours = np.asarray(graph.neighbours)
     logits, utility, entropy = map(np.asarray, (tables.logits, tables.utility, tables.entropy))
@@ -98,7 +100,13 @@ def test_a_full_walk_holds_the_answer_for_every_threshold_and_limit():
         for threshold in (0.6, 0.9):
             for limit in (1, 3, 9):
                 stopped = select_from_table(
-                    jax.random.key(0), table, scene, POLICIES["predicted_entropy"], 2, threshold=threshold, max_views=limit
+                    jax.random.key(0),
+                    table,
+                    scene,
+                    POLICIES["predicted_entropy"],
+                    2,
+                    threshold=threshold,
+                    max_views=limit,
                 )
                 used = int(stop_at(full.confidences, threshold, limit))
                 assert used == int(stopped.count)
@@ -118,7 +126,9 @@ def test_observing_may_be_anything():
     live = select_views(
         jax.random.key(0), look, scene, POLICIES["predicted_entropy"], 4, classes=4, threshold=0.9, max_views=8
     )
-    stored = select_from_table(jax.random.key(0), table, scene, POLICIES["predicted_entropy"], 4, threshold=0.9, max_views=8)
+    stored = select_from_table(
+        jax.random.key(0), table, scene, POLICIES["predicted_entropy"], 4, threshold=0.9, max_views=8
+    )
     np.testing.assert_array_equal(live.views, stored.views)
 
 

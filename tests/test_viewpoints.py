@@ -11,9 +11,7 @@ from mevs_jax import ViewGraph, fibonacci_sphere, local_maxima
 from tests.reference import numpy_rules
 
 # The spherical Delaunay graph of the published 10-view lattice, checked by hand against the hull's 3n − 6 = 24 edges.
-EDGES_10 = (
-    "0-1 0-2 0-3 0-4 0-5 1-3 1-4 1-6 2-4 2-5 2-7 3-5 3-6 3-8 4-6 4-7 4-9 5-7 5-8 5-9 6-8 6-9 7-9 8-9"
-)
+EDGES_10 = "0-1 0-2 0-3 0-4 0-5 1-3 1-4 1-6 2-4 2-5 2-7 3-5 3-6 3-8 4-6 4-7 4-9 5-7 5-8 5-9 6-8 6-9 7-9 8-9"
 # Thesis Fig. 21: nodes A..J with these weights and edges has the maxima E, D, C and I.
 FIGURE_21_WEIGHTS = dict(zip("ABCDEFGHIJ", (5, 8, 31, 7, 35, 6, 4, 24, 11, 10), strict=True))
 FIGURE_21_EDGES = "AB AC AD BC BE CF CG DG EF EH EJ FI GJ"
@@ -138,5 +136,7 @@ def test_local_maxima_of_both_of_the_authors_maps(thesis_files):
 
 def test_equal_neighbours_exclude_each_other():
     neighbours = np.array([[0, 1, 0], [1, 0, 1], [0, 1, 0]], bool)
-    np.testing.assert_array_equal(local_maxima(np.array([2.0, 2.0, 1.0], np.float32), neighbours), [False, False, False])
+    np.testing.assert_array_equal(
+        local_maxima(np.array([2.0, 2.0, 1.0], np.float32), neighbours), [False, False, False]
+    )
     np.testing.assert_array_equal(local_maxima(np.array([2.0, 1.0, 2.0], np.float32), neighbours), [True, False, True])

@@ -28,7 +28,9 @@ class Checkpoints:
         manager = self._slots[slot]
         if manager.latest_step() == step:
             return
-        manager.save(step, args=ocp.args.Composite(state=ocp.args.StandardSave(state), progress=ocp.args.JsonSave(progress)))
+        manager.save(
+            step, args=ocp.args.Composite(state=ocp.args.StandardSave(state), progress=ocp.args.JsonSave(progress))
+        )
 
     def restore(self, slot: str, like: Any) -> tuple[Any, dict[str, Any]] | None:
         """The newest of a slot, shaped and placed as `like`; None where nothing was saved."""

@@ -72,7 +72,9 @@ class ClassifierTask:
         convert = partial(image_input, images=self.images, channels=self.network_config.channels, camera=self.camera)
         return jax.vmap(convert)(batch[self.images])
 
-    def loss(self, network: ResNet, batch: Batch, key: jax.Array, samples: jax.Array) -> tuple[jax.Array, dict[str, jax.Array]]:
+    def loss(
+        self, network: ResNet, batch: Batch, key: jax.Array, samples: jax.Array
+    ) -> tuple[jax.Array, dict[str, jax.Array]]:
         del samples
         images = self.inputs(batch)
         keys = jax.random.split(key, len(images))

@@ -64,7 +64,9 @@ class EntropyTask:
     @property
     def batches(self) -> ViewBatches:
         config = self.optimiser
-        return ViewBatches(config.batch_size, config.views_per_object, points=self.network_config.points, seed=config.seed)
+        return ViewBatches(
+            config.batch_size, config.views_per_object, points=self.network_config.points, seed=config.seed
+        )
 
     def network(self, rngs: nnx.Rngs) -> PointNet2:
         shape = self.network_config
@@ -86,7 +88,9 @@ class EntropyTask:
         """Batch-norm momentum after so many samples: 0.5, halved every 20,000, not below 0.01 (thesis code)."""
         return jnp.maximum(0.5 * 0.5 ** (samples // 20_000), 0.01)
 
-    def loss(self, network: PointNet2, batch: Batch, key: jax.Array, samples: jax.Array) -> tuple[jax.Array, dict[str, jax.Array]]:
+    def loss(
+        self, network: PointNet2, batch: Batch, key: jax.Array, samples: jax.Array
+    ) -> tuple[jax.Array, dict[str, jax.Array]]:
         augment, drop = jax.random.split(key)
         clouds = self.inputs(batch)
         keys = jax.random.split(augment, len(clouds))

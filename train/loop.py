@@ -7,7 +7,6 @@ with the same weights, because a batch and a key depend on the seed and the step
 
 from __future__ import annotations
 
-import dataclasses
 import json
 import time
 from collections.abc import Callable
@@ -62,17 +61,24 @@ class OptimiserConfig:
 class Task(Protocol):
     """What one network adds to the loop."""
 
-    name: str
-    optimiser: OptimiserConfig
-    batches: ViewBatches
+    @property
+    def name(self) -> str: ...
 
-    def network(self, rngs: nnx.Rngs) -> nnx.Module:
+    @property
+    def optimiser(self) -> OptimiserConfig: ...
+
+    @property
+    def batches(self) -> ViewBatches: ...
+
+    def network(self, rngs: nnx.Rngs) -> Any:
         """A new network."""
 
-    def loss(self, network: nnx.Module, batch: Batch, key: jax.Array, samples: jax.Array) -> tuple[jax.Array, dict[str, jax.Array]]:
+    def loss(
+        self, network: Any, batch: Batch, key: jax.Array, samples: jax.Array
+    ) -> tuple[jax.Array, dict[str, jax.Array]]:
         """Mean training loss and metrics of a batch, `samples` views into the training."""
 
-    def evaluate(self, network: nnx.Module, batch: Batch) -> dict[str, jax.Array]:
+    def evaluate(self, network: Any, batch: Batch) -> dict[str, jax.Array]:
         """Metrics of every view of a batch, each (views,), `loss` among them; no augmentation, no dropout."""
 
 
@@ -99,7 +105,8 @@ def learning_rate_schedule(config: OptimiserConfig, steps: int) -> Callable[[jax
 
 def build_network(task: Task) -> tuple[nnx.GraphDef, nnx.State, nnx.State]:
     """Structure, parameters and the rest (batch-norm statistics) of a new network."""
-    return nnx.split(task.network(nnx.Rngs(task.optimiser.seed)), nnx.Param, ...)
+    structure, parameters, *rest = nnx.split(task.network(nnx.Rngs(task.optimiser.seed)), nnx.Param, ...)
+    return structure, parameters, rest[0]
 
 
 def _make_steps(task: Task, structure: nnx.GraphDef, optimiser: optax.GradientTransformation):
@@ -131,10 +138,16 @@ def validation_set(task: Task, data: Path) -> list[dict[str, np.ndarray]]:
     wanted = task.optimiser.validation_views
     chosen: list[dict[str, np.ndarray]] = []
     for number, batch in enumerate(
-        evaluation_batches(data, "val", points=task.batches.points, images=task.batches.images, seed=task.optimiser.seed)
+        evaluation_batches(
+            data, "val", points=task.batches.points, images=task.batches.images, seed=task.optimiser.seed
+        )
     ):
         views = len(batch["label"])
-        keep = np.arange(views) if not wanted else (np.arange(min(wanted, views)) * views // min(wanted, views) + number) % views
+        keep = (
+            np.arange(views)
+            if not wanted
+            else (np.arange(min(wanted, views)) * views // min(wanted, views) + number) % views
+        )
         chosen.append({name: array[keep] for name, array in batch.items()})
     whole = {name: np.concatenate([batch[name] for batch in chosen]) for name in chosen[0]}
     size = min(256, len(whole["label"]))
@@ -180,16 +193,20 @@ def fit(task: Task, data: Path, statistics: DatasetStatistics, folder: Path) -> 
     configuration.
     """
     config = task.optimiser
-    identity = json.loads(json.dumps({"task": asdict(task), "data": statistics.source, "views": statistics.views}))  # type: ignore[call-overload]
+    identity = json.loads(json.dumps({"task": asdict(task), "data": statistics.fingerprint}))  # type: ignore[call-overload]
     if (folder / "config.json").exists() and read_json(folder / "config.json") != identity:
-        raise DataError(f"{folder} holds a network trained with other settings; choose another --out, or delete that folder")
+        raise DataError(
+            f"{folder} holds a network trained with other settings; choose another --out, or delete that folder"
+        )
     if (folder / "summary.json").exists():
         return read_json(folder / "summary.json")
     write_json(folder / "config.json", identity)
 
     objects = sum(statistics.counts["train"].values())
     # An epoch is a whole number of passes over the objects' views.
-    epoch_steps = steps_per_epoch(objects * (config.epoch_views or statistics.views) // config.views_per_object, task.batches)
+    epoch_steps = steps_per_epoch(
+        objects * (config.epoch_views or statistics.views) // config.views_per_object, task.batches
+    )
     total_steps = epoch_steps * config.epochs
 
     structure, parameters, rest = build_network(task)
@@ -209,7 +226,10 @@ def fit(task: Task, data: Path, statistics: DatasetStatistics, folder: Path) -> 
 
     with progress_bar("views") as bar:
         line = bar.add_task(
-            f"Training {task.name}", total=total_steps * config.batch_size, completed=int(state.step) * config.batch_size, note=""
+            f"Training {task.name}",
+            total=total_steps * config.batch_size,
+            completed=int(state.step) * config.batch_size,
+            note="",
         )
         while progress["epoch"] < config.epochs and progress["epoch"] - progress["best_epoch"] < config.patience:
             started = time.perf_counter()
@@ -222,7 +242,9 @@ def fit(task: Task, data: Path, statistics: DatasetStatistics, folder: Path) -> 
             means = {name: float(jnp.mean(jnp.stack([m[name] for m in collected]))) for name in collected[0]}
             checked = validate(evaluate_step, state, validation)
             if not np.isfinite(means["loss"]):
-                raise FloatingPointError(f"{task.name}: the training loss is no longer finite at step {step}; lower the learning rate")
+                raise FloatingPointError(
+                    f"{task.name}: the training loss is no longer finite at step {step}; lower the learning rate"
+                )
 
             progress["epoch"] += 1
             progress["seconds"] += time.perf_counter() - started
@@ -231,11 +253,19 @@ def fit(task: Task, data: Path, statistics: DatasetStatistics, folder: Path) -> 
                 progress |= {"best_loss": checked["loss"], "best_epoch": progress["epoch"], "best": checked}
                 checkpoints.save("best", step, state, progress)
             checkpoints.save("latest", step, state, progress)
-            rates = {"epoch": progress["epoch"], "learning_rate": float(schedule(state.step)), "seconds": progress["seconds"]}
-            log.write(step, rates | {f"train/{k}": v for k, v in means.items()} | {f"val/{k}": v for k, v in checked.items()})
+            rates = {
+                "epoch": progress["epoch"],
+                "learning_rate": float(schedule(state.step)),
+                "seconds": progress["seconds"],
+            }
+            log.write(
+                step, rates | {f"train/{k}": v for k, v in means.items()} | {f"val/{k}": v for k, v in checked.items()}
+            )
             note = ", ".join(f"{name} {value:.4f}" for name, value in checked.items())
             bar.update(line, note=f"val {note}")
-            console.print(f"{task.name} epoch {progress['epoch']}/{config.epochs}: train loss {means['loss']:.4f}, val {note}")
+            console.print(
+                f"{task.name} epoch {progress['epoch']}/{config.epochs}: train loss {means['loss']:.4f}, val {note}"
+            )
 
     log.close()
     checkpoints.close()
@@ -262,7 +292,9 @@ def load_best(task: Task, folder: Path) -> nnx.Module:
                 f"train another in another --out, or evaluate it on its own data set"
             )
     if saved["network_config"] != wanted["network_config"]:
-        raise DataError(f"the {task.name} in {folder} has other layers than asked for; use the settings it was trained with")
+        raise DataError(
+            f"the {task.name} in {folder} has other layers than asked for; use the settings it was trained with"
+        )
     optimiser = optax.adamw(learning_rate_schedule(task.optimiser, 10))
     like = TrainState(jnp.zeros((), jnp.int32), parameters, rest, optimiser.init(parameters))
     checkpoints = Checkpoints(folder)
@@ -271,7 +303,3 @@ def load_best(task: Task, folder: Path) -> nnx.Module:
     if restored is None:
         raise DataError(f"no trained {task.name} in {folder}; train one with: mevs train")
     return nnx.merge(structure, restored[0].parameters, restored[0].statistics)
-
-
-def with_seed(config: OptimiserConfig, seed: int) -> OptimiserConfig:
-    return dataclasses.replace(config, seed=seed)

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 
 import jax
 import jax.numpy as jnp
@@ -45,7 +46,7 @@ class Perceptron(nnx.Module):
         sizes = [inputs, *layers]
         self.linear = nnx.List(
             nnx.Linear(a, b, use_bias=False, kernel_init=nnx.initializers.he_normal(), rngs=rngs)
-            for a, b in zip(sizes, sizes[1:], strict=False)
+            for a, b in pairwise(sizes)
         )
         self.norm = nnx.List(BatchNorm(size) for size in layers)
 
@@ -130,7 +131,5 @@ class PointNet2(nnx.Module):
             features = jnp.max(perceptron(grouped, train=train, momentum=momentum), axis=2)
         everything = jnp.concatenate([centres, features], axis=-1)
         features = jnp.max(self.whole(everything, train=train, momentum=momentum), axis=1)
-        hidden = self.dropout(
-            self.head(features, train=train, momentum=momentum), deterministic=not train, rngs=key
-        )
+        hidden = self.dropout(self.head(features, train=train, momentum=momentum), deterministic=not train, rngs=key)
         return self.out(hidden).reshape(*batch, self.views)

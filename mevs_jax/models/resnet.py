@@ -99,7 +99,11 @@ class ResNet(nnx.Module):
         self.head = nnx.Linear(inputs, classes, rngs=rngs)
 
     def features(
-        self, images: Float[AnyArray, "*batch height width channels"], *, train: bool = False, momentum: float | Array = 0.1
+        self,
+        images: Float[AnyArray, "*batch height width channels"],
+        *,
+        train: bool = False,
+        momentum: float | Array = 0.1,
     ) -> Float[Array, "*batch features"]:
         """The vector before the last layer, `8 * width` long."""
         images = jnp.asarray(images)
@@ -112,7 +116,11 @@ class ResNet(nnx.Module):
         return jnp.mean(x, axis=(1, 2)).reshape(*batch, -1)
 
     def __call__(
-        self, images: Float[AnyArray, "*batch height width channels"], *, train: bool = False, momentum: float | Array = 0.1
+        self,
+        images: Float[AnyArray, "*batch height width channels"],
+        *,
+        train: bool = False,
+        momentum: float | Array = 0.1,
     ) -> Float[Array, "*batch classes"]:
         """Logits of one image (height, width, channels) or of a batch; `train` normalises over the batch."""
         return self.head(self.features(images, train=train, momentum=momentum))

@@ -7,6 +7,7 @@ not installed too.
 from __future__ import annotations
 
 import sys
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -43,7 +44,9 @@ class ResNet(nn.Module):
         inputs = 64
         for stage, repeats in enumerate({18: (2, 2, 2, 2), 34: (3, 4, 6, 3)}[depth]):
             outputs = 64 * 2**stage
-            blocks = [Block(inputs if i == 0 else outputs, outputs, 2 if stage and i == 0 else 1) for i in range(repeats)]
+            blocks = [
+                Block(inputs if i == 0 else outputs, outputs, 2 if stage and i == 0 else 1) for i in range(repeats)
+            ]
             setattr(self, f"layer{stage + 1}", nn.Sequential(*blocks))
             inputs = outputs
         self.fc = nn.Linear(512, classes)
@@ -66,7 +69,9 @@ def farthest_point_sample(points: torch.Tensor, k: int) -> torch.Tensor:
 
 def ball_query(points: torch.Tensor, centres: torch.Tensor, radius: float, k: int) -> torch.Tensor:
     offset = centres[:, None] - points[None]
-    inside = offset[..., 0] ** 2 + offset[..., 1] ** 2 + offset[..., 2] ** 2 < torch.tensor(radius, dtype=points.dtype) ** 2
+    inside = (
+        offset[..., 0] ** 2 + offset[..., 1] ** 2 + offset[..., 2] ** 2 < torch.tensor(radius, dtype=points.dtype) ** 2
+    )
     rows = torch.zeros(len(centres), k, dtype=torch.long)
     for row, hits in enumerate(inside):
         found = torch.nonzero(hits)[:k, 0]
@@ -81,7 +86,7 @@ class Abstraction(nn.Module):
         super().__init__()
         self.centres, self.radius, self.samples = centres, radius, samples
         parts: list[nn.Module] = []
-        for a, b in zip(layers, layers[1:], strict=False):
+        for a, b in pairwise(layers):
             parts += [nn.Conv2d(a, b, 1, bias=False), nn.BatchNorm2d(b), nn.ReLU()]
         self.mlps = nn.ModuleList([nn.Sequential(*parts)])
 

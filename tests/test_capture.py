@@ -1,0 +1,137 @@
+"""Captures: two casters that agree, depth that is right, and work that is not done twice."""
+
+from __future__ import annotations
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import trimesh
+
+from data_pipeline.capture import (
+    CaptureConfig,
+    Rig,
+    capture,
+    capture_all,
+    capture_path,
+    cast_embree,
+    cast_open3d,
+    default_caster,
+    load_capture,
+    rig_for,
+    save_capture,
+)
+from data_pipeline.meshes import DamagedMesh, FurniturePiece, MeshFile, ObjectEntry, VoxelGrid, load_object, normalise
+from mevs_jax import Camera, partial_cloud
+
+CONFIG = CaptureConfig(views=6, resolution=48)
+
+
+def entry(name: str, recipe) -> ObjectEntry:
+    return ObjectEntry(name, 0, "train", recipe)
+
+
+@pytest.fixture(scope="module")
+def rig() -> Rig:
+    return rig_for(CONFIG)
+
+
+def open3d_or_skip():
+    try:
+        import open3d  # noqa: F401
+    except (ImportError, OSError) as error:
+        pytest.skip(f"Open3D cannot be loaded here: {error}")
+
+
+@pytest.mark.parametrize("name", ["chair", "bathtub", "desk", "toilet"])
+def test_both_casters_see_the_same(name, rig):
+    open3d_or_skip()
+    mesh = load_object(entry(name, FurniturePiece(name, 5)))
+    a, b = capture(mesh, rig, cast_open3d), capture(mesh, rig, cast_embree)
+    both = (a.depth > 0) & (b.depth > 0)
+    assert ((a.depth > 0) == (b.depth > 0)).mean() > 0.9995
+    close = np.abs(a.depth[both].astype(int) - b.depth[both]) <= 2  # of 1/10,000 unit
+    assert close.mean() > 0.9995
+    assert (np.abs(a.image[both].astype(int) - b.image[both]) <= 1).mean() > 0.998
+
+
+def test_a_sphere_is_seen_as_a_sphere(rig):
+    ball = trimesh.creation.icosphere(5)
+    mesh = normalise(ball.vertices, ball.faces, "ball")
+    seen = capture(mesh, rig)
+    for view in range(CONFIG.views):
+        origin, directions = rig.poses[view, :3, 3].astype(float), rig.directions[view].reshape(-1, 3).astype(float)
+        # |o + t d|² = 1 for the nearer t, which is the depth.
+        a, b, c = (directions**2).sum(1), directions @ origin, origin @ origin - 1
+        discriminant = b**2 - a * c
+        expected = np.where(discriminant > 0, (-b - np.sqrt(np.maximum(discriminant, 0))) / a, 0)
+        depth = seen.depth[view].reshape(-1) / 10_000
+        inner = discriminant > 0.02
+        np.testing.assert_allclose(depth[inner], expected[inner], atol=2e-3)
+        assert (depth[discriminant < -0.02] == 0).all()
+    assert seen.image.max() == 255  # facing the camera
+    assert (seen.image[seen.depth == 0] == 0).all()
+
+
+def test_the_partial_cloud_lies_on_the_surface(rig):
+    mesh = load_object(entry("box", FurniturePiece("dresser", 1)))
+    triangles = mesh.vertices[mesh.faces]
+    seen = capture(mesh, rig)
+    for view in (0, 3):
+        camera = Camera(jnp.asarray(rig.poses[view]), np.pi / 3, CONFIG.resolution)
+        points, real = partial_cloud(seen.depth[view].astype(np.float32) / 10_000, camera)
+        cloud = np.asarray(points)[np.asarray(real)]
+        pairs = np.repeat(cloud, len(triangles), axis=0)
+        nearest = trimesh.triangles.closest_point(np.tile(triangles, (len(cloud), 1, 1)), pairs)
+        distance = np.linalg.norm(nearest - pairs, axis=1).reshape(len(cloud), -1).min(axis=1)
+        assert len(cloud) > 100
+        assert distance.max() < 1e-3
+
+
+def test_a_capture_is_saved_whole(tmp_path, rig):
+    seen = capture(load_object(entry("c", FurniturePiece("chair", 0))), rig)
+    save_capture(tmp_path / "c.npz", seen)
+    again = load_capture(tmp_path / "c.npz")
+    np.testing.assert_array_equal(again.depth, seen.depth)
+    np.testing.assert_array_equal(again.image, seen.image)
+    np.testing.assert_array_equal(again.extent, seen.extent)
+    assert [path.name for path in tmp_path.iterdir()] == ["c.npz"]
+
+
+def test_captured_objects_are_not_captured_again_and_empty_ones_are_named(tmp_path):
+    entries = [entry(f"chair_{i}", FurniturePiece("chair", i)) for i in range(3)]
+    entries.append(entry("nothing", VoxelGrid(bytes(64), 8)))
+    left_out = capture_all(entries, CONFIG, tmp_path, workers=2)
+    assert left_out == {"nothing": "voxel grid has 0 of 512 cells filled, fewer than 5"}
+    kept = {path.name: path.stat().st_mtime_ns for path in tmp_path.iterdir()}
+    capture_path(tmp_path, entries[1]).unlink()  # as if interrupted before it
+    assert capture_all(entries, CONFIG, tmp_path, workers=1) == left_out
+    now = {path.name: path.stat().st_mtime_ns for path in tmp_path.iterdir()}
+    assert kept.keys() == now.keys()
+    assert [name for name in kept if kept[name] != now[name]] == ["chair_1.npz"]
+
+
+def test_a_damaged_mesh_stops_the_capture_unless_told_to_skip(tmp_path):
+    bad = tmp_path / "bad.off"
+    bad.write_text("OFF\n3 1 0\n0 0 0\n")
+    entries = [entry("good", FurniturePiece("chair", 0)), entry("bad", MeshFile(str(bad)))]
+    with pytest.raises(DamagedMesh, match=r"bad.off is cut short.*skip-damaged"):
+        capture_all(entries, CONFIG, tmp_path / "a", workers=1)
+    left_out = capture_all(entries, CONFIG, tmp_path / "b", skip_damaged=True, workers=1)
+    assert list(left_out) == ["bad"]
+
+
+def test_without_system_libraries_embree_takes_over(monkeypatch):
+    import builtins
+
+    real_import = builtins.__import__
+
+    def no_open3d(name, *args, **kwargs):
+        if name == "open3d":
+            raise OSError("libGL.so.1: cannot open shared object file")
+        return real_import(name, *args, **kwargs)
+
+    default_caster.cache_clear()
+    monkeypatch.setattr(builtins, "__import__", no_open3d)
+    assert default_caster() is cast_embree
+    monkeypatch.undo()
+    default_caster.cache_clear()

@@ -1,0 +1,208 @@
+"""The command line as a user meets it: one sentence for bad input, and a job that survives being killed."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+
+MEVS = [sys.executable, "-m", "mevs_jax"]
+
+
+def mevs(*arguments: str | Path, cwd: Path | None = None) -> subprocess.CompletedProcess:
+    return subprocess.run([*MEVS, *map(str, arguments)], capture_output=True, text=True, cwd=cwd, timeout=600)
+
+
+def cube_off() -> str:
+    cube = trimesh.creation.box((1, 2, 3))
+    rows = [f"OFF\n{len(cube.vertices)} {len(cube.faces)} 0"]
+    rows += [" ".join(map(str, vertex)) for vertex in cube.vertices] + [
+        "3 " + " ".join(map(str, face)) for face in cube.faces
+    ]
+    return "\n".join(rows) + "\n"
+
+
+def folder_with(root: Path, bad: str) -> Path:
+    """Two classes of cubes, one of them with a file of the content `bad`."""
+    for name in ("cup", "jug"):
+        for split in ("train", "test"):
+            (root / name / split).mkdir(parents=True)
+            for index in range(3):
+                (root / name / split / f"{index}.off").write_text(cube_off())
+    (root / "jug" / "train" / "1.off").write_text(bad)
+    return root
+
+
+def refused(result: subprocess.CompletedProcess) -> str:
+    assert result.returncode == 2, result.stderr
+    assert "Traceback" not in result.stderr
+    message = [line for line in result.stderr.splitlines() if line.startswith("mevs: ")]
+    assert len(message) == 1
+    assert result.stderr.strip().splitlines()[-1] == message[0]
+    return message[0]
+
+
+def no_such_file(root: Path) -> list:
+    return ["--data", root / "nowhere"]
+
+
+def not_a_mesh(root: Path) -> list:
+    return ["--data", folder_with(root / "set", "hello")]
+
+
+def truncated(root: Path) -> list:
+    return ["--data", folder_with(root / "set", cube_off()[:80])]
+
+
+def not_finite(root: Path) -> list:
+    return ["--data", folder_with(root / "set", cube_off().replace("0.5", "nan", 1))]
+
+
+def empty_class(root: Path) -> list:
+    folder = folder_with(root / "set", cube_off())
+    (folder / "vase" / "train").mkdir(parents=True)
+    return ["--data", folder]
+
+
+def zip_that_leaves(root: Path) -> list:
+    import zipfile
+
+    with zipfile.ZipFile(root / "a.zip", "w") as archive:
+        archive.writestr("../cup/train/a.off", cube_off())
+    return ["--data", root / "a.zip"]
+
+
+def one_view(root: Path) -> list:
+    return ["--views", "1"]
+
+
+def unwritable(root: Path) -> list:
+    (root / "file").write_text("in the way")
+    return ["--out", root / "file" / "run"]
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (no_such_file, "no such file or folder: .*nowhere"),
+        (not_a_mesh, r"jug/train/1.off is not an OFF mesh"),
+        (truncated, r"jug/train/1.off is cut short"),
+        (not_finite, r"jug/train/1.off has \d vertices that are not finite"),
+        (empty_class, "class folder .*vase.train is empty"),
+        (zip_that_leaves, "a path that leaves its folder"),
+        (one_view, "--views 1 is too few"),
+        (unwritable, "cannot write to"),
+    ],
+    ids=lambda value: getattr(value, "__name__", ""),
+)
+def test_bad_input_gets_one_sentence_and_exit_code_2(tmp_path, make, message):
+    arguments = make(tmp_path)
+    if "--out" not in arguments:
+        arguments += ["--out", tmp_path / "run"]
+    import re
+
+    assert re.search(message, refused(mevs("run", "--preset", "tiny", *arguments)))
+
+
+def test_unknown_words_are_refused_and_help_reads_well(tmp_path):
+    assert "unknown command 'fly'" in refused(mevs("fly"))
+    assert "unknown preset 'huge'" in refused(mevs("run", "--preset", "huge"))
+    assert mevs("run", "--no-such-option").returncode == 2
+    assert "no data set in" in refused(mevs("train", "--out", tmp_path))
+    shown = mevs("--help")
+    assert shown.returncode == 0
+    for word in ("run", "data", "train", "eval", "report", "--preset", "--data", "--views", "--out"):
+        assert word in shown.stdout
+    assert max(map(len, shown.stdout.splitlines())) <= 110
+    assert "--classifier.optimiser.epochs" in mevs("run", "--help").stdout
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory) -> Path:
+    """One run of the whole job, undisturbed."""
+    out = tmp_path_factory.mktemp("whole")
+    result = mevs("run", "--preset", "tiny", "--out", out)
+    assert result.returncode == 0, result.stderr
+    assert "Report:" in result.stderr
+    return out
+
+
+def test_the_job_leaves_a_report_and_metrics(whole):
+    metrics = json.loads((whole / "metrics.json").read_text())
+    assert metrics["objects"] == 20
+    assert metrics["views"] == 6
+    page = (whole / "report" / "index.html").read_text()
+    assert "http" not in page.replace("http://www.w3.org", "").replace("https://www.w3.org", "")  # needs no other file
+    for heading in ("Choosing the next view", "Predicting depth entropy", "Training", "Data"):
+        assert f"<h2>{heading}</h2>" in page
+    assert "0 objects were left out" in page
+
+
+def test_a_second_run_redoes_nothing(whole):
+    before = {path: path.stat().st_mtime_ns for path in whole.rglob("*") if path.is_file()}
+    result = mevs("run", "--preset", "tiny", "--out", whole)
+    assert result.returncode == 0
+    assert before == {path: path.stat().st_mtime_ns for path in whole.rglob("*") if path.is_file()}
+
+
+def test_networks_for_another_number_of_views_are_refused(whole, tmp_path):
+    import shutil
+
+    assert mevs("data", "--preset", "tiny", "--views", "8", "--out", tmp_path).returncode == 0
+    for name in ("classifier", "entropy"):
+        shutil.copytree(whole / name, tmp_path / name)
+    assert "was trained for 6 views, the data set has 8" in refused(mevs("eval", "--preset", "tiny", "--out", tmp_path))
+
+
+def kill_when(out: Path, ready, sign: int) -> int:
+    """Starts the job, ends it once `ready(out)`, and returns its exit code."""
+    process = subprocess.Popen(
+        [*MEVS, "run", "--preset", "tiny", "--out", str(out)],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        start_new_session=True,
+    )
+    deadline = time.monotonic() + 300
+    while process.poll() is None and not ready(out) and time.monotonic() < deadline:
+        time.sleep(0.02)
+    assert process.poll() is None, "the job ended before it could be interrupted"
+    os.kill(process.pid, sign)
+    process.wait(60)
+    return process.returncode
+
+
+def test_a_job_that_is_killed_again_and_again_ends_with_the_same_metrics(whole, tmp_path):
+    assert (
+        kill_when(tmp_path, lambda out: len(list((out / "data" / "captures").glob("*.npz"))) > 5, signal.SIGKILL)
+        == -signal.SIGKILL
+    )
+    assert kill_when(tmp_path, lambda out: (out / "data" / "shards").exists(), signal.SIGKILL) == -signal.SIGKILL
+    assert (
+        kill_when(
+            tmp_path,
+            lambda out: (
+                (out / "classifier" / "metrics.jsonl").exists()
+                and (out / "classifier" / "metrics.jsonl").stat().st_size
+            ),
+            signal.SIGINT,
+        )
+        == 130
+    )
+    assert (
+        kill_when(tmp_path, lambda out: (out / "entropy" / "config.json").exists(), signal.SIGKILL) == -signal.SIGKILL
+    )
+    result = mevs("run", "--preset", "tiny", "--out", tmp_path)
+    assert result.returncode == 0, result.stderr
+    assert json.loads((tmp_path / "metrics.json").read_text()) == json.loads((whole / "metrics.json").read_text())
+    with np.load(tmp_path / "tables" / "test.npz") as a, np.load(whole / "tables" / "test.npz") as b:
+        np.testing.assert_array_equal(a["logits"], b["logits"])
+    leftovers = [path for path in tmp_path.rglob("*.partial*")]
+    assert leftovers == []

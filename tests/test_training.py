@@ -1,0 +1,163 @@
+"""Training learns, stops early, and goes on exactly where it was stopped."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from flax import nnx
+
+import train.loop
+from data_pipeline.builder import load_statistics, prepare
+from data_pipeline.meshes import DataError
+from eval.pipeline import TINY, tasks
+from train.loop import OptimiserConfig, fit, learning_rate_schedule, load_best
+
+SETTINGS = replace(
+    TINY,
+    classifier=replace(
+        TINY.classifier,
+        optimiser=OptimiserConfig(
+            epochs=6, batch_size=16, views_per_object=2, epoch_views=6, learning_rate=3e-3, schedule="cosine"
+        ),
+    ),
+)
+
+
+@pytest.fixture(scope="module")
+def data(tmp_path_factory) -> Path:
+    folder = tmp_path_factory.mktemp("run") / "data"
+    prepare(SETTINGS.dataset, folder)
+    return folder
+
+
+def lines(folder: Path) -> list[dict]:
+    return [json.loads(line) for line in (folder / "metrics.jsonl").read_text().splitlines()]
+
+
+@pytest.fixture(scope="module")
+def trained(data, tmp_path_factory) -> Path:
+    """A whole run, never stopped."""
+    folder = tmp_path_factory.mktemp("whole")
+    statistics = load_statistics(data)
+    for task, name in zip(tasks(SETTINGS, statistics), ("classifier", "entropy"), strict=True):
+        fit(task, data, statistics, folder / name)
+    return folder
+
+
+def test_training_learns(trained):
+    history = lines(trained / "classifier")
+    assert [entry["epoch"] for entry in history] == [1, 2, 3, 4, 5, 6]
+    assert history[-1]["train/loss"] < 0.8 * history[0]["train/loss"]
+    assert history[-1]["train/accuracy"] > 0.2  # chance is 0.1
+    entropy = lines(trained / "entropy")
+    assert entropy[-1]["train/loss"] < entropy[0]["train/loss"]
+    assert list((trained / "classifier" / "tensorboard").iterdir())
+
+
+@pytest.mark.parametrize("name", ["classifier", "entropy"])
+def test_a_stopped_run_ends_as_if_it_had_not_been(name, trained, data, tmp_path, monkeypatch):
+    statistics = load_statistics(data)
+    task = dict(zip(("classifier", "entropy"), tasks(SETTINGS, statistics), strict=True))[name]
+
+    class Stopped(Exception):
+        pass
+
+    real_validate, calls = train.loop.validate, 0
+
+    def stop_in_the_second_epoch(*args):
+        nonlocal calls
+        calls += 1
+        if calls == 2:
+            raise Stopped
+        return real_validate(*args)
+
+    monkeypatch.setattr(train.loop, "validate", stop_in_the_second_epoch)
+    with pytest.raises(Stopped):
+        fit(task, data, statistics, tmp_path)
+    monkeypatch.undo()
+    with (tmp_path / "metrics.jsonl").open("a") as file:
+        file.write('{"step": 99999, "half a line')  # killed while writing
+    summary = fit(task, data, statistics, tmp_path)
+
+    whole = json.loads((trained / name / "summary.json").read_text())
+    for key in ("epoch", "best_epoch", "best_loss", "steps", "best"):
+        assert summary[key] == whole[key], key
+    a, b = nnx.state(load_best(task, tmp_path)), nnx.state(load_best(task, trained / name))
+    for mine, theirs in zip(jax.tree.leaves(a), jax.tree.leaves(b), strict=True):
+        np.testing.assert_array_equal(mine, theirs)
+    timeless = [{key: value for key, value in entry.items() if key != "seconds"} for entry in lines(tmp_path)]
+    assert timeless == [{k: v for k, v in entry.items() if k != "seconds"} for entry in lines(trained / name)]
+
+
+def test_a_finished_run_is_not_repeated_nor_mixed(trained, data):
+    statistics = load_statistics(data)
+    task = tasks(SETTINGS, statistics)[0]
+    before = (trained / "classifier" / "metrics.jsonl").stat().st_mtime_ns
+    assert fit(task, data, statistics, trained / "classifier")["epoch"] == 6
+    assert (trained / "classifier" / "metrics.jsonl").stat().st_mtime_ns == before
+    other = replace(task, optimiser=replace(task.optimiser, learning_rate=1e-4))
+    with pytest.raises(DataError, match="other settings"):
+        fit(other, data, statistics, trained / "classifier")
+
+
+def test_training_stops_when_validation_gets_no_better(data, tmp_path, monkeypatch):
+    statistics = load_statistics(data)
+    task = tasks(SETTINGS, statistics)[0]
+    task = replace(task, optimiser=replace(task.optimiser, epochs=9, patience=2, epoch_views=2))
+    losses = iter([1.0, 0.9, 0.95, 0.92, 0.1])
+    monkeypatch.setattr(train.loop, "validate", lambda *_: {"loss": next(losses)})
+    summary = fit(task, data, statistics, tmp_path)
+    assert summary["epoch"] == 4
+    assert summary["best_epoch"] == 2
+    assert summary["stopped_early"]
+
+
+def test_networks_of_another_size_are_described(trained, data):
+    statistics = load_statistics(data)
+    classify, predict = tasks(SETTINGS, statistics)
+    with pytest.raises(DataError, match="trained for 6 views, the data set has 40"):
+        load_best(replace(predict, views=40), trained / "entropy")
+    with pytest.raises(DataError, match="trained for 10 classes, the data set has 4"):
+        load_best(replace(classify, classes=4), trained / "classifier")
+    with pytest.raises(DataError, match="other layers"):
+        load_best(replace(classify, network_config=replace(classify.network_config, width=16)), trained / "classifier")
+    with pytest.raises(DataError, match="no trained classifier in"):
+        load_best(classify, trained / "nothing")
+
+
+def test_schedules():
+    steps = learning_rate_schedule(OptimiserConfig(batch_size=32, schedule="steps"), 0)
+    assert float(steps(jnp.int32(0))) == pytest.approx(1e-3)
+    assert float(steps(jnp.int32(20_000 // 32 - 1))) == pytest.approx(1e-3)
+    assert float(steps(jnp.int32(20_000 // 32 + 1))) == pytest.approx(0.7e-3)
+    assert float(steps(jnp.int32(10**6))) == pytest.approx(1e-5)
+    cosine = learning_rate_schedule(OptimiserConfig(schedule="cosine"), 1000)
+    assert float(cosine(1000)) == pytest.approx(0, abs=1e-9)
+    assert float(cosine(100)) == pytest.approx(1e-3)
+    statistics_like = tasks(SETTINGS, _Like())[1]
+    assert float(statistics_like.momentum(jnp.int32(0))) == 0.5
+    assert float(statistics_like.momentum(jnp.int32(45_000))) == 0.125
+    assert float(statistics_like.momentum(jnp.int32(10**6))) == pytest.approx(0.01)
+
+
+class _Like:
+    """As much of a data set's statistics as tasks need."""
+
+    camera = TINY.dataset.capture
+    classes = tuple("abcdefghij")
+    views = 6
+    entropy_max = 4.0
+
+
+def test_a_loss_that_is_no_number_stops_the_run(data, tmp_path):
+    statistics = load_statistics(data)
+    task = tasks(SETTINGS, statistics)[0]
+    task = replace(task, optimiser=replace(task.optimiser, learning_rate=1e30, schedule="constant", epochs=1))
+    with pytest.raises(FloatingPointError, match="no longer finite"):
+        fit(task, data, statistics, tmp_path)
