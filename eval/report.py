@@ -108,9 +108,9 @@ def _lead(inputs: ReportInputs) -> str:
         sentences.append(f"Choosing by {figures.NAMES[name]} is {_verdict(*cell)}.")
     return (
         f'<p class="lead">{" ".join(sentences)}</p><p class="note">With up to {headline["max_views"]} views and a '
-        f"confidence threshold of {headline['threshold']}, over {metrics['objects']} test objects and all {metrics['starts']} start views of "
-        f"each; random draws without repetition; a difference is called so when its 95 % interval, paired by object, leaves "
-        f"out zero.</p>"
+        f"confidence threshold of {headline['threshold']}, over {metrics['objects']} test objects and all "
+        f"{metrics['starts']} start views of each; random draws without repetition; a difference is called so when its "
+        f"95 % interval, paired by object, leaves out zero.</p>"
     )
 
 
@@ -135,8 +135,9 @@ def _data_section(inputs: ReportInputs) -> str:
     ]
     return (
         f"<h2>Data</h2><p>{html.escape(statistics.source)}: {statistics.views} views of each object on a Fibonacci "
-        f"sphere ({camera.lattice}), {camera.resolution}×{camera.resolution} pixels, {camera.field_of_view:g}° field of view from "
-        f"{camera.distance:g} radii away. Mean points seen per view: {statistics.points_mean:,.0f} ± {statistics.points_std:,.0f}. "
+        f"sphere ({camera.lattice}), {camera.resolution}×{camera.resolution} pixels, {camera.field_of_view:g}° field of view "
+        f"from {camera.distance:g} radii away. Points seen per view: {statistics.points_mean:,.0f} ± "
+        f"{statistics.points_std:,.0f}. "
         f"Entropies are normalised by the training split's largest, {statistics.entropy_max:.2f} bits.</p>"
         + _table(["class", "train", "val", "test"], [*rows, ["<b>all</b>", *totals]])
         + f"<p>{statistics.left_out_count} objects were left out "
