@@ -309,12 +309,13 @@ def prepare(config: DataConfig, folder: Path) -> DatasetStatistics:
         raise DataError(
             f"{folder} holds a data set made with other settings ({differs}); choose another --out, or delete it"
         )
+    captures = folder / "captures"
     if (folder / _SUMMARY).exists():
+        shutil.rmtree(captures, ignore_errors=True)  # of a run that was stopped between the two
         return load_statistics(folder)
     source = open_source(config.source, train_per_class=config.train_per_class, test_per_class=config.test_per_class)
     folder.mkdir(parents=True, exist_ok=True)
     write_json(made_with, identity)
-    captures = folder / "captures"
     left_out = capture_all(source.entries, config.capture, captures, skip_damaged=config.skip_damaged)
     kept = [entry for entry in source.entries if entry.name not in left_out]
     split = split_objects(kept, config.validation_share, config.seed)

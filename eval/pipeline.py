@@ -5,6 +5,7 @@ A run directory holds `data/`, `classifier/`, `entropy/`, `tables/`, `metrics.js
 
 from __future__ import annotations
 
+import hashlib
 import json
 import os
 from dataclasses import asdict, dataclass, replace
@@ -166,13 +167,25 @@ def train(settings: Settings, out: Path) -> None:
         )
 
 
-def _tables(settings: Settings, out: Path, statistics: DatasetStatistics) -> ViewTables:
+def _made_by(out: Path, statistics: DatasetStatistics) -> str:
+    """Names the data set and both trained networks; changes when either is made anew, but not with the time it took."""
+    content: list[Any] = [statistics.fingerprint]
+    for name in ("classifier", "entropy"):
+        if not (out / name / "summary.json").exists():
+            raise DataError(f"the {name} network in {out} is not fully trained; finish it with: mevs train --out {out}")
+        summary = read_json(out / name / "summary.json")
+        content += [read_json(out / name / "config.json"), summary["best_epoch"], summary["best"]]
+    return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()[:16]
+
+
+def _tables(settings: Settings, out: Path, statistics: DatasetStatistics, made_by: str) -> ViewTables:
     path = out / "tables" / "test.npz"
+    if path.exists() and (tables := load_view_tables(path)).made_by == made_by:
+        return tables
     classify, predict = tasks(settings, statistics)
     classifier, predictor = load_best(classify, out / "classifier"), load_best(predict, out / "entropy")
-    if path.exists():
-        return load_view_tables(path)
     tables = compute_view_tables(out / "data", "test", statistics, classify, classifier, predict, predictor)
+    tables = replace(tables, made_by=made_by)
     save_view_tables(path, tables)
     return tables
 
@@ -180,12 +193,13 @@ def _tables(settings: Settings, out: Path, statistics: DatasetStatistics) -> Vie
 def evaluate(settings: Settings, out: Path) -> dict[str, Any]:
     """Metrics of the test split, as written to `metrics.json`."""
     statistics = load_statistics(out / "data")
+    made_by = _made_by(out, statistics)
+    identity = json.loads(json.dumps({"evaluation": asdict(settings.evaluation), "made_by": made_by}))
     path = out / "metrics.json"
-    identity = json.loads(json.dumps({"evaluation": asdict(settings.evaluation), "data": statistics.fingerprint}))
     if path.exists() and (metrics := read_json(path))["identity"] == identity:
         return metrics
-    tables = _tables(settings, out, statistics)
-    metrics = run_study(tables, statistics, settings.evaluation) | {"identity": identity}
+    metrics = run_study(_tables(settings, out, statistics, made_by), statistics, settings.evaluation)
+    metrics["identity"] = identity
     write_json(path, metrics)
     return metrics
 

@@ -30,6 +30,7 @@ class ViewTables:
         logits: (objects, views, classes).
         utility: (objects, views, views) predicted normalised entropies; row i after seeing view i.
         entropy: (objects, views) true normalised entropies.
+        made_by: names the data set and the networks; tables made by others are stale.
     """
 
     names: list[str]
@@ -37,6 +38,7 @@ class ViewTables:
     logits: np.ndarray
     utility: np.ndarray
     entropy: np.ndarray
+    made_by: str = ""
 
     def stacked(self) -> ViewTable:
         """As one `ViewTable` with a leading axis of objects, to be vmapped over."""
@@ -87,6 +89,7 @@ def save_view_tables(path: Path, tables: ViewTables) -> None:
         logits=tables.logits,
         utility=tables.utility,
         entropy=tables.entropy,
+        made_by=np.array(tables.made_by),
     )
     write_bytes(path, buffer.getvalue())
 
@@ -94,4 +97,4 @@ def save_view_tables(path: Path, tables: ViewTables) -> None:
 def load_view_tables(path: Path) -> ViewTables:
     with np.load(path) as stored:
         arrays = {name: stored[name] for name in ("labels", "logits", "utility", "entropy")}
-        return ViewTables(names=[str(name) for name in stored["names"]], **arrays)
+        return ViewTables(names=[str(name) for name in stored["names"]], **arrays, made_by=str(stored["made_by"]))

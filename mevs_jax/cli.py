@@ -30,12 +30,12 @@ commands:
 {commands}
 
 common options:
-  --preset small|thesis   small (default): 64×64 views and narrow networks, minutes on a CPU;
-                          thesis: the thesis's sizes, for an accelerator; tiny: seconds, to see it run
-  --data PATH             furniture10 (default, built in), a folder <class>/{{train,test}}/*.off|obj|stl|ply|glb,
-                          a ModelNet zip, or an .npz of voxel grids
+  --preset small|thesis   small (default): 64×64 views, narrow networks, for a CPU; thesis: the
+                          thesis's sizes, for an accelerator; tiny: to see everything run in a minute
+  --data PATH             furniture10 (default, built in), a folder <class>/{{train,test}}/ of
+                          .off, .obj, .stl, .ply or .glb, a ModelNet zip, or an .npz of voxel grids
   --views N               candidate viewpoints around an object (default 40)
-  --out DIR               where everything is written (default runs/<preset>); the same command resumes there
+  --out DIR               where everything is written (default runs/<preset>); a run goes on there
 
 `mevs COMMAND --help` lists every setting. Examples:
   mevs run
@@ -96,7 +96,7 @@ def _run(command: str, arguments: list[str]) -> None:
 
 
 def main() -> None:
-    """Entry point of `mevs`: exit code 0, 2 for input that cannot be used, 130 when interrupted."""
+    """The program `mevs`: exit code 0, 2 for input that cannot be used, 130 when interrupted."""
     arguments = sys.argv[1:]
     if not arguments or arguments[0] in ("-h", "--help"):
         print(_HELP.format(commands="\n".join(f"  {name:<8}{what}" for name, what in COMMANDS.items())))

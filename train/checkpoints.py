@@ -19,7 +19,9 @@ class Checkpoints:
     """Two slots, `latest` and `best`, each holding one (state, progress): a tree of arrays, and plain numbers."""
 
     def __init__(self, folder: Path):
-        options = ocp.CheckpointManagerOptions(max_to_keep=1, create=True, enable_async_checkpointing=False)
+        options = ocp.CheckpointManagerOptions(
+            max_to_keep=1, create=True, enable_async_checkpointing=False, cleanup_tmp_directories=True
+        )
         self._slots = {
             name: ocp.CheckpointManager((folder / name).absolute(), options=options) for name in ("latest", "best")
         }
