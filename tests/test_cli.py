@@ -19,7 +19,7 @@ MEVS = [sys.executable, "-m", "mevs_jax"]
 
 @pytest.fixture(scope="module", autouse=True)
 def compiled_once(tmp_path_factory):
-    """Programs that were compiled for one run of the job are there for the next."""
+    """Programs compiled for one run of the job are kept for the next."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("JAX_COMPILATION_CACHE_DIR", str(tmp_path_factory.mktemp("compiled")))
         patch.setenv("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0.1")
