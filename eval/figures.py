@@ -73,7 +73,7 @@ def difference_grid(
         axis.text(
             column,
             row,
-            f"{value:+.1f}",
+            f"{value:+.1f}".replace("-", "−"),
             ha="center",
             va="center",
             fontsize=8,

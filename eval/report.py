@@ -33,7 +33,8 @@ border-bottom:1px solid #e5e7eb;padding-bottom:.2rem}
 table{border-collapse:collapse;margin:1rem 0;font-variant-numeric:tabular-nums}th,td{padding:.25rem .6rem;text-align:right}
 th{border-bottom:2px solid #d1d5db;font-weight:600}td{border-bottom:1px solid #f3f4f6}
 th:first-child,td:first-child{text-align:left}
-.lead{font-size:1.1rem}.note{color:#6b7280;font-size:.9rem}.faint{color:#9ca3af}.figures{display:flex;flex-wrap:wrap;gap:1rem}
+.lead{font-size:1.1rem}.note{color:#6b7280;font-size:.9rem}.faint{color:#9ca3af}
+.figures{display:flex;flex-wrap:wrap;gap:1rem}.figures figure{flex:1 1 45%;margin:0}small{white-space:nowrap}
 figure{margin:1rem 0}figcaption{color:#6b7280;font-size:.85rem}img{max-width:100%;height:auto}
 code{background:#f3f4f6;padding:.1rem .3rem}
 details{margin:1rem 0}summary{cursor:pointer}
@@ -76,13 +77,19 @@ def _percent(value: float) -> str:
     return f"{100 * value:.1f}"
 
 
+def _signed(value: float) -> str:
+    """In points, with a sign, a real minus, and no sign where it rounds to zero."""
+    text = f"{100 * value:+.1f}".replace("-", "−")
+    return "0.0" if text[1:] == "0.0" else text
+
+
 def _range(interval: Sequence[float]) -> str:
     return f"{100 * interval[0]:.1f}–{100 * interval[1]:.1f}"
 
 
 def _difference(value: float, interval: Sequence[float]) -> str:
     """In points; faint where the interval holds zero."""
-    text = f"{100 * value:+.1f} [{100 * interval[0]:+.1f}, {100 * interval[1]:+.1f}]"
+    text = f"{_signed(value)}<br><small>{_signed(interval[0])} to {_signed(interval[1])}</small>"
     return f'<span class="faint">{text}</span>' if interval[0] <= 0 <= interval[1] else text
 
 
@@ -91,7 +98,7 @@ def _verdict(difference: float, interval: Sequence[float]) -> str:
         return f"better than random by {100 * difference:.1f} points"
     if interval[1] < 0:
         return f"worse than random by {-100 * difference:.1f} points"
-    return f"not distinguishable from random ({100 * difference:+.1f} points)"
+    return f"not distinguishable from random ({_signed(difference)} points)"
 
 
 def _lead(inputs: ReportInputs) -> str:
@@ -199,14 +206,13 @@ def _selection_section(inputs: ReportInputs) -> str:
         row = [figures.NAMES[name]]
         for step in steps:
             low_high = _range(result["after_views_interval"][step - 1])
-            row.append(f"{_percent(result['after_views'][step - 1])} <span class='note'>{low_high}</span>")
+            row.append(f"{_percent(result['after_views'][step - 1])}<br><small class='note'>{low_high}</small>")
         ladder.append(row)
     for name, result in against.items():
         row = [f"{figures.NAMES[name]} − random"]
         for step in steps:
-            row.append(
-                _difference(result["after_views_difference"][step - 1], result["after_views_interval"][step - 1])
-            )
+            gain, interval = result["after_views_difference"][step - 1], result["after_views_interval"][step - 1]
+            row.append("–" if step == 1 else _difference(gain, interval))  # the first view is not chosen
         ladder.append(row)
     parts = [
         "<h2>Choosing the next view</h2><p>Accuracy (%) after exactly so many views, without early stopping, with 95 % "
