@@ -144,6 +144,7 @@ def entropy_errors(entropy: dict[str, Any]) -> Figure:
     axis.set_yticks(range(len(rows)), [label for label, _, _ in rows])
     axis.set(xlabel="mean squared error on test objects", title="Predicting depth entropy")
     axis.margins(x=0.2)
+    axis.locator_params(axis="x", nbins=5)
     return figure
 
 

@@ -31,7 +31,7 @@ commands:
 
 common options:
   --preset small|thesis   small (default): 64×64 views, narrow networks, for a CPU; thesis: the
-                          thesis's sizes, for an accelerator; tiny: to see everything run in a minute
+                          thesis's sizes, for an accelerator; tiny: to see it all run in a minute
   --data PATH             furniture10 (default, built in), a folder <class>/{{train,test}}/ of
                           .off, .obj, .stl, .ply or .glb, a ModelNet zip, or an .npz of voxel grids
   --views N               candidate viewpoints around an object (default 40)

@@ -26,6 +26,11 @@ SETTINGS = replace(
             epochs=6, batch_size=16, views_per_object=2, epoch_views=6, learning_rate=3e-3, schedule="cosine"
         ),
     ),
+    entropy=replace(
+        TINY.entropy,
+        network=replace(TINY.entropy.network, dropout=0.1),
+        optimiser=OptimiserConfig(epochs=3, batch_size=16, views_per_object=2, epoch_views=6, learning_rate=1e-2),
+    ),
 )
 
 
@@ -56,7 +61,7 @@ def test_training_learns(trained):
     assert history[-1]["train/loss"] < 0.8 * history[0]["train/loss"]
     assert history[-1]["train/accuracy"] > 0.2  # chance is 0.1
     entropy = lines(trained / "entropy")
-    assert entropy[-1]["train/loss"] < entropy[0]["train/loss"]
+    assert entropy[-1]["train/loss"] < 0.7 * entropy[0]["train/loss"]
     assert list((trained / "classifier" / "tensorboard").iterdir())
 
 
