@@ -29,8 +29,8 @@ def image_input(
 
 
 def cloud_input(
-    pixels: Int[Array, points],
-    pixel_depth: Int[Array, points],
+    pixels: Int[Array, "points"],
+    pixel_depth: Int[Array, "points"],
     pose: Float[Array, "4 4"],
     camera: CaptureConfig,
     frame: str,

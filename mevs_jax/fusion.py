@@ -11,11 +11,11 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 
-def sum_of_logits(belief: Float[Array, classes], logits: Float[Array, classes]) -> Float[Array, classes]:
+def sum_of_logits(belief: Float[Array, "classes"], logits: Float[Array, "classes"]) -> Float[Array, "classes"]:
     """The belief after one more view; the belief before any view is zero."""
     return belief + logits
 
 
-def confidence(belief: Float[Array, classes]) -> Float[Array, ""]:
+def confidence(belief: Float[Array, "classes"]) -> Float[Array, ""]:
     """Probability of the most likely class, in (0, 1]."""
     return jnp.max(jax.nn.softmax(belief))

@@ -14,10 +14,10 @@ from mevs_jax.arrays import AnyArray
 
 
 def confusion_matrix(
-    labels: Int[AnyArray, n],
-    predictions: Int[AnyArray, n],
+    labels: Int[AnyArray, "n"],
+    predictions: Int[AnyArray, "n"],
     classes: int,
-    weights: Float[AnyArray, n] | None = None,
+    weights: Float[AnyArray, "n"] | None = None,
 ) -> Float[Array, "{classes} {classes}"]:
     """Weight by (true class, predicted class); every weight 1 unless given."""
     weights = jnp.ones(labels.shape) if weights is None else weights
@@ -37,7 +37,7 @@ def class_accuracy(confusion: Float[AnyArray, "classes classes"]) -> Float[Array
 
 
 def bootstrap_interval(
-    key: Array, values: Float[AnyArray, objects], *, level: float = 0.95, resamples: int = 2000
+    key: Array, values: Float[AnyArray, "objects"], *, level: float = 0.95, resamples: int = 2000
 ) -> Float[Array, 2]:
     """Percentile interval of the mean over objects, drawn with replacement.
 

@@ -33,7 +33,7 @@ def _squared_distance(dx: Array, dy: Array, dz: Array) -> Array:
     return (_square(dx) + _square(dy)) + _square(dz)
 
 
-def farthest_point_sample(points: Float[AnyArray, "points 3"], k: int) -> Int[Array, {k}]:
+def farthest_point_sample(points: Float[AnyArray, "points 3"], k: int) -> Int[Array, "{k}"]:
     """Indices of `k` points, each the farthest from those taken before it; the first is point 0.
 
     Args:
@@ -81,8 +81,8 @@ def ball_query(
 
     Source: PointNet++ §3.2; reference rule of `pointnet2_ops`.
 
-    The hits of 32 points become the bits of one word. A prefix sum of popcounts then says which word holds the s-th hit,
-    and five halvings find the bit inside it: an eighth of the time of a cumulative sum over the points.
+    The hits of 32 points become the bits of one word. A prefix sum of popcounts and a bisection say which word holds the
+    s-th hit, and five halvings find the bit inside it; no pass over the points but the one that measures distances.
     """
     if k < 1:
         raise ValueError(f"ball_query needs k >= 1, got {k}")
@@ -103,20 +103,29 @@ def _pack(hit: Bool[Array, "centres words 32"]) -> UInt32[Array, "centres words"
     return jnp.sum(jnp.where(hit, bit, jnp.uint32(0)), axis=-1, dtype=jnp.uint32)
 
 
-def _first_set_bits(words: UInt32[Array, words], k: int) -> Int[Array, {k}]:
+def _first_set_bits(words: UInt32[Array, "words"], k: int) -> Int[Array, "{k}"]:
     """Positions of the first `k` set bits of a long bit string, the first one repeated where there are fewer."""
     ones = jax.lax.population_count(words).astype(jnp.int32)
     until = jnp.cumsum(ones)
     slot = jnp.arange(k, dtype=jnp.int32)
     slot = jnp.where(slot < until[-1], slot, 0)
-    word = jnp.sum(until[None, :] <= slot[:, None], axis=1, dtype=jnp.int32)
-    word = jnp.minimum(word, words.shape[0] - 1)  # reached only where nothing is hit
+    word = _first_above(until, slot)
     rank = slot - (until[word] - ones[word])
     position = word * _WORD + _select_bit(words[word], rank)
     return jnp.where(until[-1] > 0, position, 0)
 
 
-def _select_bit(word: UInt32[Array, k], rank: Int[Array, k]) -> Int[Array, k]:
+def _first_above(rising: Int[Array, "n"], values: Int[Array, "k"]) -> Int[Array, "k"]:
+    """For each value the first index of `rising` that exceeds it, at most n − 1, by bisection."""
+    last = rising.shape[0] - 1
+    found = jnp.zeros_like(values)
+    for power in reversed(range(rising.shape[0].bit_length())):
+        below = rising[jnp.minimum(found + 2**power - 1, last)] <= values
+        found = jnp.where(below, jnp.minimum(found + 2**power, last), found)
+    return found
+
+
+def _select_bit(word: UInt32[Array, "k"], rank: Int[Array, "k"]) -> Int[Array, "k"]:
     """Position of the set bit number `rank` (from 0) of each word, by halving."""
     position = jnp.zeros_like(rank)
     for width in (16, 8, 4, 2, 1):

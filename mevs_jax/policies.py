@@ -52,27 +52,27 @@ Policy = Callable[[Array, SelectionState, Scene], Float[Array, "views"]]
 
 
 def maxima_first(
-    weights: Float[Array, views], attempted: Bool[Array, views], neighbours: Bool[Array, "views views"]
-) -> Float[Array, views]:
+    weights: Float[Array, "views"], attempted: Bool[Array, "views"], neighbours: Bool[Array, "views views"]
+) -> Float[Array, "views"]:
     """Scores of the thesis's rule (§4.4): the heaviest unattempted local maximum, or the heaviest view if none is left."""
     maximum = local_maxima(weights, neighbours)
     left = jnp.any(maximum & ~attempted)
     return jnp.where(left & ~maximum, -jnp.inf, weights)
 
 
-def random_view(key: Array, state: SelectionState, scene: Scene) -> Float[Array, views]:
+def random_view(key: Array, state: SelectionState, scene: Scene) -> Float[Array, "views"]:
     """Uniform over the unattempted views, as the thesis's text says (its code draws with replacement)."""
     del scene
     return jax.random.uniform(key, state.attempted.shape)
 
 
-def predicted_entropy(key: Array, state: SelectionState, scene: Scene) -> Float[Array, views]:
+def predicted_entropy(key: Array, state: SelectionState, scene: Scene) -> Float[Array, "views"]:
     """The thesis's policy: local maxima of the entropies predicted from the latest view's cloud come first."""
     del key
     return maxima_first(state.utility, state.attempted, scene.graph.neighbours)
 
 
-def oracle_entropy(key: Array, state: SelectionState, scene: Scene) -> Float[Array, views]:
+def oracle_entropy(key: Array, state: SelectionState, scene: Scene) -> Float[Array, "views"]:
     """The same rule on the true entropies: what a perfect predictor would do."""
     del key
     return maxima_first(scene.entropy, state.attempted, scene.graph.neighbours)

@@ -69,7 +69,7 @@ class Episode:
     count: Int[Array, "*batch"]
 
 
-def best_unattempted(scores: Float[Array, views], attempted: Bool[Array, views]) -> Int[Array, ""]:
+def best_unattempted(scores: Float[Array, "views"], attempted: Bool[Array, "views"]) -> Int[Array, ""]:
     """The unattempted view of highest score, the lowest index among equals; −inf and NaN come last."""
     scores = jnp.where(jnp.isnan(scores), -jnp.inf, scores)
     best = jnp.max(jnp.where(attempted, -jnp.inf, scores))
@@ -166,7 +166,7 @@ def select_from_table(
 
 
 def stop_at(
-    confidences: Float[Array, steps], threshold: float | Float[Array, ""], max_views: int | Int[Array, ""]
+    confidences: Float[Array, "steps"], threshold: float | Float[Array, ""], max_views: int | Int[Array, ""]
 ) -> Int[Array, ""]:
     """How many views a full walk would have used: up to the first confidence ≥ `threshold`, at most `max_views`."""
     sure = confidences >= threshold
