@@ -16,7 +16,7 @@ import os
 import signal
 import zlib
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 from typing import Literal, Protocol
@@ -248,7 +248,3 @@ def capture_all(
         for entry in entries
         if _left_out_path(folder, entry).exists()
     }
-
-
-def describe(config: CaptureConfig) -> dict:
-    return asdict(config)

@@ -15,26 +15,27 @@ def random() -> np.random.Generator:
     return np.random.default_rng(0)
 
 
+def beside_the_checkout(*parts: str) -> Path:
+    """Real data, kept beside a checkout by those who have it, never in it; the test is skipped where it is not."""
+    path = REAL.joinpath(*parts)
+    if not path.exists():
+        pytest.skip(f"{path.name} is not beside the checkout")
+    return path
+
+
 @pytest.fixture(scope="session")
 def real_voxels() -> Path:
-    """The real ModelNet10 as voxel grids; kept beside a checkout by those who have it, never in it."""
-    path = REAL / "data" / "modelnet10_voxels32.npz"
-    if not path.exists():
-        pytest.skip(f"real ModelNet10 voxels are not at {path.parent.name}/{path.name} beside the checkout")
-    return path
+    """All of ModelNet10 as voxel grids."""
+    return beside_the_checkout("data", "modelnet10_voxels32.npz")
 
 
 @pytest.fixture(scope="session")
 def real_meshes() -> Path:
-    path = REAL / "data" / "modelnet10_off"
-    if not path.exists():
-        pytest.skip(f"original ModelNet10 meshes are not in {path.name} beside the checkout")
-    return path
+    """Some original ModelNet10 meshes."""
+    return beside_the_checkout("data", "modelnet10_off")
 
 
 @pytest.fixture(scope="session")
 def thesis_files() -> Path:
-    path = REAL / "thesis"
-    if not path.exists():
-        pytest.skip("the thesis's view graphs and entropy maps are not beside the checkout")
-    return path
+    """The thesis's view graphs and entropy maps."""
+    return beside_the_checkout("thesis")
