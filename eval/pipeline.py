@@ -20,7 +20,7 @@ from data_pipeline.files import read_json, write_json
 from data_pipeline.meshes import DataError
 from data_pipeline.progress import console
 from eval.grid import GridConfig
-from eval.report import ReportInputs, load_summary, read_history, write_report
+from eval.report import ReportInputs, read_history, write_report
 from eval.study import run_study
 from eval.view_tables import ViewTables, compute_view_tables, load_view_tables, save_view_tables
 from mevs_jax.models import Abstraction
@@ -221,7 +221,7 @@ def report(settings: Settings, preset: str, out: Path) -> Path:
                 tables=load_view_tables(out / "tables" / "test.npz"),
                 data=out / "data",
                 histories={name: read_history(folder) for name, folder in networks.items()},
-                summaries={name: load_summary(folder) for name, folder in networks.items()},
+                summaries={name: read_json(folder / "summary.json") for name, folder in networks.items()},
                 preset=preset,
                 settings=asdict(settings),
             ),

@@ -19,7 +19,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from data_pipeline.builder import DatasetStatistics, open_split
-from data_pipeline.files import read_json, write_text
+from data_pipeline.files import write_text
 from eval import figures
 from eval.view_tables import ViewTables
 from mevs_jax.policies import POLICIES, Scene
@@ -345,7 +345,3 @@ def write_report(inputs: ReportInputs, path: Path) -> None:
         f'<!doctype html><html lang="en"><meta charset="utf-8"><meta name="viewport" content="width=device-width">'
         f"<title>{title}</title><style>{_STYLE}</style><h1>{title}</h1>{body}</html>\n",
     )
-
-
-def load_summary(folder: Path) -> dict[str, Any]:
-    return read_json(folder / "summary.json")

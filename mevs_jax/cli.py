@@ -89,7 +89,6 @@ def _run(command: str, arguments: list[str]) -> None:
         console.print(
             f"Single views: {100 * metrics['single_view']['accuracy']:.1f} % of {metrics['objects']} test objects right"
         )
-    if command in ("run", "eval"):
         console.print(f"Metrics: {out / 'metrics.json'}")
     if command in ("run", "report"):
         console.print(f"Report: {pipeline.report(settings, preset, out).absolute()}")

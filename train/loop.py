@@ -252,7 +252,6 @@ def fit(task: Task, data: Path, statistics: DatasetStatistics, folder: Path) -> 
             if better:
                 progress |= {"best_loss": checked["loss"], "best_epoch": progress["epoch"], "best": checked}
                 checkpoints.save("best", step, state, progress)
-            checkpoints.save("latest", step, state, progress)
             rates = {
                 "epoch": progress["epoch"],
                 "learning_rate": float(schedule(state.step)),
@@ -261,6 +260,8 @@ def fit(task: Task, data: Path, statistics: DatasetStatistics, folder: Path) -> 
             log.write(
                 step, rates | {f"train/{k}": v for k, v in means.items()} | {f"val/{k}": v for k, v in checked.items()}
             )
+            # After the log: resuming takes back lines beyond the checkpoint, but cannot invent one that is missing.
+            checkpoints.save("latest", step, state, progress)
             note = ", ".join(f"{name} {value:.4f}" for name, value in checked.items())
             bar.update(line, note=f"val {note}")
             console.print(
