@@ -3,6 +3,9 @@
 An epoch shows every training object once, through `views_per_object` views drawn anew. Batch number `i` is a function of
 (seed, i) alone, so a run that stops and goes on sees the same batches, and nothing but the step needs to be remembered.
 With several processes each reads its own share of every batch.
+
+Validation is by object. The thesis's published code puts views aside instead, so that an object is on both sides; that is here
+as a switch (`ViewBatches.validation_by`), to show what it does.
 """
 
 from __future__ import annotations
@@ -10,7 +13,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import grain
 import jax
@@ -29,6 +32,8 @@ class ViewBatches:
         points: size of the clouds; 0 for no clouds.
         images: `depth` or `image`, or None for neither.
         seed: of order, views and points.
+        validation_by: `object`, the sound way; `view`: train on views of the validation objects too, except for a share
+            of every object's views (`views_aside`).
     """
 
     batch_size: int
@@ -36,6 +41,17 @@ class ViewBatches:
     points: int = 0
     images: str | None = None
     seed: int = 0
+    validation_by: Literal["object", "view"] = "object"
+
+
+VIEWS_ASIDE = 0.2
+"""The share of an object's views that are put aside where validation is by view (thesis §5.2)."""
+
+
+def views_aside(views: int, index: int, seed: int) -> np.ndarray:
+    """Which views of training object `index` are never trained on where validation is by view; at least one."""
+    random = np.random.default_rng([seed, index, views])
+    return np.sort(random.permutation(views)[: max(1, round(VIEWS_ASIDE * views))])
 
 
 def sample_pixels(depth: np.ndarray, points: int, random: np.random.Generator) -> np.ndarray:
@@ -83,8 +99,58 @@ class _DrawViews(grain.transforms.RandomMap):
 
     def random_map(self, element: dict[str, Any], rng: np.random.Generator) -> dict[str, np.ndarray]:
         config = self.config
-        views = rng.choice(len(element["entropy"]), config.views_per_object, replace=False)
+        views = rng.choice(element["trainable"], config.views_per_object, replace=False)
         return select_views(element, views, points=config.points, images=config.images, random=rng)
+
+
+class _TrainingObjects:
+    """The objects of some splits, one after the other, each with the views that may be trained on."""
+
+    def __init__(self, sources: list[Any], config: ViewBatches):
+        self._sources, self._config = sources, config
+
+    def __len__(self) -> int:
+        return sum(map(len, self._sources))
+
+    def __getitem__(self, index: int) -> dict[str, Any]:
+        source, position = self._sources[0], index
+        for source in self._sources:
+            if position < len(source):
+                break
+            position -= len(source)
+        example = source[position]
+        views = np.arange(len(example["entropy"]))
+        if self._config.validation_by == "view":
+            views = np.setdiff1d(views, views_aside(len(views), index, self._config.seed))
+        return example | {"trainable": views}
+
+
+def _training_objects(folder: Path, config: ViewBatches) -> _TrainingObjects:
+    splits = ("train",) if config.validation_by == "object" else ("train", "val")
+    return _TrainingObjects([open_split(folder, split) for split in splits], config)
+
+
+def validation_batches(folder: Path, config: ViewBatches, views: int) -> Iterator[dict[str, np.ndarray]]:
+    """What training is validated on, one object a batch: `views` views of each object put aside, 0 for all of them.
+
+    By object, every view of the lattice gets its turn. By view, an object gives its share of the views put aside.
+    """
+    if config.validation_by == "object":
+        for number, batch in enumerate(
+            evaluation_batches(folder, "val", points=config.points, images=config.images, seed=config.seed)
+        ):
+            count = len(batch["label"])
+            wanted = min(views, count)
+            keep = (np.arange(wanted) * count // wanted + number) % count if views else np.arange(count)
+            yield {name: array[keep] for name, array in batch.items()}
+        return
+    objects = _training_objects(folder, config)
+    for index in range(len(objects)):
+        example = objects[index]
+        aside = views_aside(len(example["entropy"]), index, config.seed)
+        keep = aside[: max(1, round(VIEWS_ASIDE * views))] if views else aside
+        random = np.random.default_rng([config.seed, index])
+        yield select_views(example, keep, points=config.points, images=config.images, random=random)
 
 
 def _join(elements: list[dict[str, np.ndarray]]) -> dict[str, np.ndarray]:
@@ -109,7 +175,8 @@ def train_batches(folder: Path, config: ViewBatches, *, first_step: int = 0) -> 
     if per_batch % processes:
         raise ValueError(f"{per_batch} objects a batch cannot be shared by {processes} processes")
     # Repeated first: then every pass has its own order, and batches may cross from one pass to the next.
-    stream = grain.MapDataset.source(open_split(folder, "train")).seed(config.seed).shuffle().repeat()
+    objects = _training_objects(folder, config)
+    stream = grain.MapDataset.source(objects).seed(config.seed).shuffle().repeat()
     stream = stream.random_map(_DrawViews(config))[jax.process_index() :: processes]
     batches = stream.batch(per_batch // processes, batch_fn=_join)[first_step:]
     return iter(batches.to_iter_dataset(grain.ReadOptions(num_threads=1, prefetch_buffer_size=16)))

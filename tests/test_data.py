@@ -14,7 +14,14 @@ import numpy as np
 import pytest
 
 from data_pipeline.augment import CloudAugmentation, ImageAugmentation, augment_cloud, augment_image
-from data_pipeline.batches import ViewBatches, evaluation_batches, sample_pixels, steps_per_epoch, train_batches
+from data_pipeline.batches import (
+    ViewBatches,
+    evaluation_batches,
+    sample_pixels,
+    steps_per_epoch,
+    train_batches,
+    validation_batches,
+)
 from data_pipeline.builder import DataConfig, load_statistics, open_split, prepare, split_objects, view_entropies
 from data_pipeline.capture import CaptureConfig, capture, rig_for
 from data_pipeline.inputs import cloud_input, image_input
@@ -168,6 +175,26 @@ def test_processes_share_every_batch(data, monkeypatch):
     monkeypatch.setattr(jax, "process_count", lambda: 3)
     with pytest.raises(ValueError, match="cannot be shared by 3"):
         next(train_batches(data, BATCHES))
+
+
+def test_validation_by_view_keeps_a_share_of_every_objects_views_apart(data):
+    """The thesis's published code: an object is on both sides, a view never is."""
+    by_view = replace(BATCHES, validation_by="view", batch_size=9)
+    statistics = load_statistics(data)
+    objects = sum(sum(statistics.counts[split].values()) for split in ("train", "val"))
+    aside: dict[bytes, set[int]] = {}
+    for batch in validation_batches(data, by_view, 0):
+        key = batch["entropy"][0].tobytes()
+        aside[key] = set(batch["view"].tolist())
+    assert len(aside) == objects
+    assert {len(views) for views in aside.values()} == {max(1, round(0.2 * statistics.views))}
+    seen: dict[bytes, set[int]] = {}
+    for batch in islice(train_batches(data, by_view), objects):
+        for entropy, view in zip(batch["entropy"], batch["view"], strict=True):
+            seen.setdefault(entropy.tobytes(), set()).add(int(view))
+    assert seen.keys() == aside.keys()
+    for key, views in seen.items():
+        assert not views & aside[key]
 
 
 def test_pixels_are_drawn_without_repetition_and_repeated_to_fill(random):

@@ -61,7 +61,13 @@ class ClassifierTask:
     @property
     def batches(self) -> ViewBatches:
         config = self.optimiser
-        return ViewBatches(config.batch_size, config.views_per_object, images=self.images, seed=config.seed)
+        return ViewBatches(
+            config.batch_size,
+            config.views_per_object,
+            images=self.images,
+            seed=config.seed,
+            validation_by=config.validation_by,
+        )
 
     def network(self, rngs: nnx.Rngs) -> ResNet:
         shape = self.network_config

@@ -65,7 +65,11 @@ class EntropyTask:
     def batches(self) -> ViewBatches:
         config = self.optimiser
         return ViewBatches(
-            config.batch_size, config.views_per_object, points=self.network_config.points, seed=config.seed
+            config.batch_size,
+            config.views_per_object,
+            points=self.network_config.points,
+            seed=config.seed,
+            validation_by=config.validation_by,
         )
 
     def network(self, rngs: nnx.Rngs) -> PointNet2:

@@ -22,7 +22,7 @@ import optax
 from flax import nnx
 from tensorboardX import SummaryWriter
 
-from data_pipeline.batches import ViewBatches, evaluation_batches, steps_per_epoch, train_batches
+from data_pipeline.batches import ViewBatches, steps_per_epoch, train_batches, validation_batches
 from data_pipeline.builder import DatasetStatistics
 from data_pipeline.files import read_json, write_json, write_text
 from data_pipeline.meshes import DataError
@@ -54,6 +54,8 @@ class OptimiserConfig:
     """decoupled (AdamW)"""
     schedule: Literal["constant", "cosine", "steps"] = "constant"
     """cosine: to zero over `epochs`; steps: ×0.7 every 20,000 samples, not below 1e-5 (thesis's PointNet++)"""
+    validation_by: Literal["object", "view"] = "object"
+    """what is put aside for validation: objects, or (the thesis's published code) a fifth of every object's views"""
     seed: int = 0
     """of initial weights, batches, augmentation and dropout"""
 
@@ -134,21 +136,8 @@ def _make_steps(task: Task, structure: nnx.GraphDef, optimiser: optax.GradientTr
 
 
 def validation_set(task: Task, data: Path) -> list[dict[str, np.ndarray]]:
-    """The validation views in batches of one size; every view of the lattice gets its turn."""
-    wanted = task.optimiser.validation_views
-    chosen: list[dict[str, np.ndarray]] = []
-    for number, batch in enumerate(
-        evaluation_batches(
-            data, "val", points=task.batches.points, images=task.batches.images, seed=task.optimiser.seed
-        )
-    ):
-        views = len(batch["label"])
-        keep = (
-            np.arange(views)
-            if not wanted
-            else (np.arange(min(wanted, views)) * views // min(wanted, views) + number) % views
-        )
-        chosen.append({name: array[keep] for name, array in batch.items()})
+    """The validation views in batches of one size."""
+    chosen = list(validation_batches(data, task.batches, task.optimiser.validation_views))
     whole = {name: np.concatenate([batch[name] for batch in chosen]) for name in chosen[0]}
     size = min(256, len(whole["label"]))
     return [{name: array[i : i + size] for name, array in whole.items()} for i in range(0, len(whole["label"]), size)]
@@ -202,7 +191,8 @@ def fit(task: Task, data: Path, statistics: DatasetStatistics, folder: Path) -> 
         return read_json(folder / "summary.json")
     write_json(folder / "config.json", identity)
 
-    objects = sum(statistics.counts["train"].values())
+    splits = ("train",) if config.validation_by == "object" else ("train", "val")
+    objects = sum(sum(statistics.counts[split].values()) for split in splits)
     # An epoch is a whole number of passes over the objects' views.
     epoch_steps = steps_per_epoch(
         objects * (config.epoch_views or statistics.views) // config.views_per_object, task.batches
