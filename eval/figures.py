@@ -12,8 +12,17 @@ import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.figure import Figure
 
-NAMES = {"random": "random", "predicted_entropy": "PointNet++ entropy", "oracle_entropy": "entropy oracle"}
-COLOURS = {"random": "#6b7280", "predicted_entropy": "#2563eb", "oracle_entropy": "#d97706"}
+COLOURS = {
+    "random": "#6b7280",
+    "farthest": "#0d9488",
+    "predicted_entropy": "#2563eb",
+    "oracle_entropy": "#d97706",
+    "fixed_order": "#9333ea",
+    "information_gain": "#dc2626",
+    "belief_oracle": "#111827",
+}
+"""Of the policies that are drawn as lines; the others are in tables and in the ladder's picture."""
+KNOWS_COLOURS = {"nothing": "#6b7280", "networks": "#2563eb", "others": "#dc2626", "truth": "#d97706"}
 
 plt.rcParams.update(
     {
@@ -29,42 +38,112 @@ plt.rcParams.update(
 )
 
 
-def accuracy_after_views(policies: dict[str, dict[str, Any]], all_views: float) -> Figure:
+def accuracy_after_views(policies: dict[str, dict[str, Any]], titles: dict[str, str], all_views: float) -> Figure:
     """Accuracy after exactly n views, all starts, with 95 % bands over objects."""
-    figure, axis = plt.subplots(figsize=(6.2, 3.6), layout="constrained")
-    for name, result in policies.items():
-        values = 100 * np.array(result["after_views"])
-        low, high = 100 * np.array(result["after_views_interval"]).T
+    figure, axis = plt.subplots(figsize=(7.2, 4.2), layout="constrained")
+    for name, colour in COLOURS.items():
+        values = 100 * np.array(policies[name]["after_views"])
+        low, high = 100 * np.array(policies[name]["after_views_interval"]).T
         steps = np.arange(1, len(values) + 1)
-        axis.plot(steps, values, "o-", color=COLOURS[name], label=NAMES[name], markersize=4)
-        axis.fill_between(steps, low, high, color=COLOURS[name], alpha=0.10, linewidth=0)
-    axis.axhline(100 * all_views, color="#111827", linestyle=":", linewidth=1, label="all views")
+        axis.plot(steps, values, "o-", color=colour, label=titles[name], markersize=3.5)
+        axis.fill_between(steps, low, high, color=colour, alpha=0.06, linewidth=0)
+    axis.axhline(100 * all_views, color="#111827", linestyle=":", linewidth=1, label="all views summed")
     axis.set(xlabel="views looked at", ylabel="test accuracy (%)", title="Accuracy by number of views")
-    axis.legend(frameon=False)
+    axis.legend(frameon=False, fontsize=8, loc="lower right")
     return figure
 
 
-def difference_after_views(against_random: dict[str, dict[str, Any]]) -> Figure:
-    """Accuracy minus random's after n views, paired, with 95 % intervals."""
-    figure, axis = plt.subplots(figsize=(6.2, 3.0), layout="constrained")
-    for offset, (name, result) in zip((-0.08, 0.08), against_random.items(), strict=False):
-        values = 100 * np.array(result["after_views_difference"])
-        low, high = 100 * np.array(result["after_views_interval"]).T
-        steps = np.arange(1, len(values) + 1) + offset
-        errors = [np.maximum(values - low, 0), np.maximum(high - values, 0)]
-        axis.errorbar(steps, values, errors, fmt="o", color=COLOURS[name], label=NAMES[name], markersize=4, capsize=2)
-    axis.axhline(0, color="#111827", linewidth=1)
-    axis.set(
-        xlabel="views looked at", ylabel="points above random", title="Gain over random, paired by object and start"
+def ladder_gains(
+    against: dict[str, dict[str, Any]], ladder: Sequence[dict[str, str]], views: Sequence[int], exclude: Sequence[str]
+) -> Figure:
+    """Points above random after so many views, a panel each, with paired 95 % intervals; hollow where zero is inside."""
+    rungs = [rung for rung in ladder if rung["policy"] in against and rung["policy"] not in exclude]
+    figure, axes = plt.subplots(
+        1, len(views), figsize=(8.4, 0.34 * len(rungs) + 1.1), sharey=True, layout="constrained", squeeze=False
     )
-    axis.legend(frameon=False)
+    for axis, count in zip(axes[0], views, strict=True):
+        for row, rung in enumerate(rungs):
+            result = against[rung["policy"]]
+            gain = 100 * result["after_views_difference"][count - 1]
+            low, high = (100 * end for end in result["after_views_interval"][count - 1])
+            colour = KNOWS_COLOURS[rung["knows"]]
+            axis.plot([low, high], [row, row], color=colour, linewidth=1.5)
+            axis.plot(
+                gain, row, "o", color=colour, markersize=5, markerfacecolor="white" if low <= 0 <= high else colour
+            )
+        axis.axvline(0, color="#111827", linewidth=1)
+        axis.set(xlabel="points above random", title=f"After {count} views")
+        axis.grid(axis="x", color="#e5e7eb", linewidth=0.6)
+        axis.set_axisbelow(True)
+    axes[0][0].set_yticks(range(len(rungs)), [rung["title"].lstrip("— ") for rung in rungs])
+    axes[0][0].invert_yaxis()
+    return figure
+
+
+def accuracy_by_way(
+    policies: dict[str, dict[str, Any]], titles: dict[str, str], movement: dict[str, list[dict[str, Any]]]
+) -> Figure:
+    """Accuracy against the way of the camera; fainter lines pay for the way."""
+    figure, axis = plt.subplots(figsize=(7.2, 4.2), layout="constrained")
+    for name, colour in COLOURS.items():
+        if name == "belief_oracle":
+            continue
+        way, values = np.degrees(policies[name]["travelled"]), 100 * np.array(policies[name]["after_views"])
+        axis.plot(way, values, "o-", color=colour, label=titles[name], markersize=3.5)
+    for name, runs in movement.items():
+        priced = [run for run in runs if run["cost"] > 0]
+        for alpha, run in zip(np.linspace(0.7, 0.3, len(priced)), priced, strict=True):
+            way, values = np.degrees(run["travelled"]), 100 * np.array(run["after_views"])
+            axis.plot(way, values, "-", color=COLOURS[name], alpha=alpha, linewidth=1)
+            axis.annotate(f"{run['cost']:g}", (way[-1], values[-1]), fontsize=6, color=COLOURS[name], alpha=alpha)
+    axis.set(xlabel="way of the camera (°)", ylabel="test accuracy (%)", title="Accuracy by distance travelled")
+    axis.legend(frameon=False, fontsize=8, loc="lower right")
+    return figure
+
+
+def calibration_by_views(readings: dict[str, dict[str, Any]], titles: dict[str, str]) -> Figure:
+    """Expected calibration error after each number of views, a line for each way to read the belief."""
+    figure, axis = plt.subplots(figsize=(8.2, 3.0), layout="constrained")
+    for name, colour in zip(readings, ("#d97706", "#0d9488", "#9333ea", "#dc2626", "#6b7280"), strict=True):
+        values = 100 * np.array(readings[name]["ece"])
+        axis.plot(np.arange(1, len(values) + 1), values, "o-", color=colour, label=titles[name], markersize=3.5)
+    axis.set(
+        xlabel="views looked at", ylabel="expected calibration error (%)", title="How far confidence is off", ylim=0
+    )
+    figure.legend(frameon=False, fontsize=8, loc="outside right center")
+    return figure
+
+
+def reliability_curves(readings: dict[str, dict[str, Any]], titles: dict[str, str], views: Sequence[int]) -> Figure:
+    """Accuracy against confidence in bins, a panel for each number of views; dots grow with the share of answers."""
+    names = [name for name in readings if "reliability" in readings[name]]
+    figure, axes = plt.subplots(
+        1, len(views), figsize=(2.5 * len(views), 2.9), sharey=True, layout="constrained", squeeze=False
+    )
+    for axis, count in zip(axes[0], views, strict=True):
+        axis.plot([0, 100], [0, 100], color="#9ca3af", linewidth=1, linestyle=":")
+        for name, colour in zip(names, ("#d97706", "#dc2626"), strict=True):
+            confidence, accuracy, share = np.array(readings[name]["reliability"])[:, count - 1]
+            there = share > 0
+            axis.plot(100 * confidence[there], 100 * accuracy[there], "-", color=colour, linewidth=1)
+            axis.scatter(
+                100 * confidence[there], 100 * accuracy[there], 4 + 120 * share[there], color=colour, label=titles[name]
+            )
+        axis.set(xlabel="confidence (%)", title=f"{count} view{'s' if count > 1 else ''}", xlim=(0, 102), ylim=(0, 102))
+    axes[0][0].set_ylabel("accuracy (%)")
+    handles, labels = axes[0][0].get_legend_handles_labels()
+    figure.legend(handles, labels, frameon=False, fontsize=8, ncols=2, loc="outside lower center", markerscale=0.5)
     return figure
 
 
 def difference_grid(
-    difference: Sequence[Sequence[float]], thresholds: Sequence[float], max_views: Sequence[int], title: str
+    difference: Sequence[Sequence[float]],
+    intervals: Sequence[Sequence[Sequence[float]]],
+    thresholds: Sequence[float],
+    max_views: Sequence[int],
+    title: str,
 ) -> Figure:
-    """The thesis's Table 7 as a picture: points above random in each (MV, CT) cell."""
+    """The thesis's Table 7 as a picture: points above random in each (MV, CT) cell, bold where its interval leaves out 0."""
     values = 100 * np.array(difference)
     largest = max(0.5, np.abs(values).max())
     figure, axis = plt.subplots(figsize=(5.4, 3.6), layout="constrained")
@@ -73,10 +152,11 @@ def difference_grid(
         axis.text(
             column,
             row,
-            f"{value:+.1f}".replace("-", "−"),
+            f"{value:+.1f}".replace("-", "−") if abs(value) >= 0.05 else "0.0",
             ha="center",
             va="center",
             fontsize=8,
+            fontweight="normal" if intervals[row][column][0] <= 0 <= intervals[row][column][1] else "bold",
             color="white" if abs(value) > 0.65 * largest else "black",
         )
     axis.set_xticks(range(len(thresholds)), [f"{ct:g}" for ct in thresholds])

@@ -1,25 +1,34 @@
-"""The thesis's grid: every policy at every confidence threshold (CT) and limit on views (MV), from every start view.
+"""The whole study as one program: objects × start views × draws × policies × backbones × thresholds × limits on views.
 
-Each object is walked once from each start to the largest MV without stopping; every cell is then read from that walk. Cells
-of one policy so share their randomness, and policies share their starts: differences between them are paired.
+What a walk visits depends on neither the confidence threshold (CT) nor the limit on views (MV). So each object is walked once
+from each start to the largest MV, and every cell is read from that walk: cells of a policy share their randomness, policies
+their starts, and all differences are paired. A policy that does not look at the belief walks once for all backbones: `vmap`
+finds that out by itself, since only the logits have an axis of backbones.
+
+Objects go through in chunks, so memory is bounded; with several devices each takes its share of the objects. An object's
+random draws depend on the seed and its position alone, so neither chunks nor devices change a result.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 
+import flax.struct
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.sharding import Mesh, PartitionSpec
+from jaxtyping import Array, Bool, Float, Int
 
-from mevs_jax.metrics import accuracy, bootstrap_interval, class_accuracy, confusion_matrix
-from mevs_jax.policies import POLICIES, Scene
-from mevs_jax.selection import Episode, ViewTable, select_from_table, stop_at
+from eval.ladder import Rung
+from mevs_jax.policies import POLICIES, Knowledge, with_movement
+from mevs_jax.selection import ViewTable, select_from_table
 from mevs_jax.viewpoints import ViewGraph
 
 THRESHOLDS = (0.5, 0.6, 0.7, 0.8, 0.9, 0.95, 0.99)
 FIRST_MV, LAST_MV = 2, 9
+_WALKS_AT_ONCE = 2**12
 
 
 @dataclass(frozen=True)
@@ -28,89 +37,148 @@ class GridConfig:
 
     max_views: int = LAST_MV
     """largest MV; rows go from 2 up to it"""
-    draws: int = 8
-    """walks per object and start of the random policy, averaged"""
+    draws: int = 64
+    """walks per object and start of a policy that draws, averaged, where the expectation is not exact"""
+    lowest_elevation: float = -90.0
+    """views lower than this, in degrees above the horizon, are out of the camera's reach"""
     seed: int = 0
-    """of the random policy and the bootstrap"""
+    """of the policies that draw and of the bootstrap"""
 
 
-@partial(jax.jit, static_argnames=("policy", "max_views", "draws"))
-def walk_all(key: jax.Array, tables: ViewTable, graph: ViewGraph, policy: str, max_views: int, draws: int) -> Episode:
-    """Full walks of all objects from all starts: an `Episode` with leading axes (objects, starts, draws)."""
-    views = graph.points.shape[0]
-
-    def one(key: jax.Array, table: ViewTable, start: jax.Array) -> Episode:
-        scene = Scene(graph, table.entropy)
-        return select_from_table(key, table, scene, POLICIES[policy], start, max_views=max_views)
-
-    def of_object(key: jax.Array, table: ViewTable) -> Episode:
-        keys = jax.random.split(key, (views, draws))
-        return jax.vmap(jax.vmap(one, (0, None, None)), (0, None, 0))(keys, table, jnp.arange(views))
-
-    objects = tables.label.shape[0]
-    return jax.vmap(of_object)(jax.random.split(key, objects), tables)
-
-
-@partial(jax.jit, static_argnames="classes")
-def read_cell(episode: Episode, labels: jax.Array, threshold: jax.Array, max_views: jax.Array, classes: int):
-    """One cell from full walks: per object (averaged over starts and draws) correctness and views used; the confusion."""
-    used = jax.vmap(jax.vmap(jax.vmap(stop_at, (0, None, None)), (0, None, None)), (0, None, None))(
-        episode.confidences, threshold, max_views
-    )
-    prediction = jnp.take_along_axis(episode.predictions, used[..., None] - 1, axis=-1)[..., 0]
-    right = jnp.mean(prediction == labels[:, None, None], axis=(1, 2))
-    walks = prediction[0].size
-    confusion = confusion_matrix(
-        jnp.repeat(labels, walks), prediction.reshape(-1), classes, jnp.full(prediction.size, 1.0 / walks)
-    )
-    return right, jnp.mean(used, axis=(1, 2)), confusion
-
-
-@dataclass(frozen=True)
-class PolicyGrid:
-    """What one policy reached.
+@flax.struct.dataclass
+class Results:
+    """What a policy reached on each object, averaged over its starts and draws.
 
     Attributes:
-        right: (MV, CT, objects) share of an object's walks that end in the right class.
-        used: (MV, CT, objects) mean views used.
-        confusion: (MV, CT, classes, classes), each object weighing one.
-        after: (steps, objects) share right after exactly 1, 2, … views, never stopping.
+        right: (backbones, objects, MV, CT) share of walks that end in the right class.
+        used: the same shape, views used.
+        after: (backbones, objects, steps) share right after exactly 1, 2, … views, never stopping.
+        travelled: the same shape, great-circle way in radians.
+        views: (backbones, objects, starts, draws, steps) where the walks went, −1 beyond their end; the first draws only.
     """
 
-    right: np.ndarray
-    used: np.ndarray
-    confusion: np.ndarray
-    after: np.ndarray
+    right: Float[Array, "*batch MV CT"]
+    used: Float[Array, "*batch MV CT"]
+    after: Float[Array, "*batch steps"]
+    travelled: Float[Array, "*batch steps"]
+    views: Int[Array, "*walks steps"]
 
 
-def evaluate_policy(key: jax.Array, tables: ViewTable, graph: ViewGraph, policy: str, config: GridConfig) -> PolicyGrid:
-    """The whole grid of one policy."""
-    classes = tables.logits.shape[-1]
-    draws = config.draws if policy == "random" else 1
-    episode = walk_all(key, tables, graph, policy, config.max_views, draws)
-    rows = []
-    for limit in range(FIRST_MV, config.max_views + 1):
-        cells = [read_cell(episode, tables.label, ct, limit, classes) for ct in THRESHOLDS]
-        rows.append([np.stack([np.asarray(cell[i]) for cell in cells]) for i in range(3)])
-    right, used, confusion = (np.stack([row[i] for row in rows]) for i in range(3))
-    after = jnp.mean(episode.predictions == tables.label[:, None, None, None], axis=(1, 2)).T
-    return PolicyGrid(right, used, confusion, np.asarray(after))
+def read_object(
+    logits: Float[Array, "views classes"],
+    label: Int[Array, ""],
+    distances: Float[Array, "views views"],
+    views: Int[Array, "steps walks"],
+    weights: Float[Array, "walks"],
+) -> tuple[Float[Array, "MV CT"], Float[Array, "MV CT"], Float[Array, "steps"], Float[Array, "steps"]]:
+    """Everything that full walks of one object say: `right`, `used`, `after` and `travelled` of `Results`.
+
+    Walks are the last axis of everything here, so that a CPU's vectors run along them, not along ten classes; and what XLA does
+    slowly on CPUs, argmax and cumulative sums, is written otherwise.
+
+    Args:
+        weights: of the walks; they sum to 1.
+    """
+    thresholds = jnp.array(THRESHOLDS)[:, None]
+    before = (jnp.arange(logits.shape[1]) < label)[:, None]
+    none = jnp.zeros(views.shape[1])
+    nothing = jnp.zeros((len(THRESHOLDS), views.shape[1]))
+
+    Carry = tuple[Array, Array, Array, Array, Array]
+
+    def look(carry: Carry, step: tuple[Array, Array]) -> tuple[Carry, tuple[Array, ...]]:
+        belief, way, walking, settled, used = carry
+        previous, view = step
+        valid = view >= 0  # a walk ends early where nothing is left in reach
+        belief += jnp.where(valid, logits.T[:, view], 0.0)
+        way += jnp.where(valid, distances[previous, view], 0.0)
+        used += walking * valid
+        own = belief[label]
+        right = jnp.all(jnp.where(before, belief < own, belief <= own), axis=0)  # argmax: lowest index among equals
+        confidence = 1 / jnp.sum(jnp.exp(belief - jnp.max(belief, axis=0)), axis=0)
+        seen = (settled + walking * right) @ weights, used @ weights, right @ weights, way @ weights
+        stops = walking * (confidence >= thresholds)
+        return (belief, way, walking - stops, settled + stops * right, used), seen
+
+    start = jnp.zeros((logits.shape[1], views.shape[1])), none, nothing + 1, nothing, nothing
+    previous = jnp.concatenate([views[:1], views[:-1]])
+    right, used, after, travelled = jax.lax.scan(look, start, (previous, views))[1]
+    return right[FIRST_MV - 1 :], used[FIRST_MV - 1 :], after, travelled
 
 
-def summarise(grid: PolicyGrid) -> dict[str, list]:
-    """The grid as numbers: accuracy, class accuracy and views used, each (MV, CT)."""
-    confusion = jnp.asarray(grid.confusion)
-    return {
-        "accuracy": np.asarray(jax.vmap(jax.vmap(accuracy))(confusion)).tolist(),
-        "class_accuracy": np.asarray(jax.vmap(jax.vmap(class_accuracy))(confusion)).tolist(),
-        "views_used": grid.used.mean(axis=-1).tolist(),
-        "after_views": grid.after.mean(axis=-1).tolist(),
-    }
+@partial(jax.jit, static_argnames=("rungs", "max_views", "keep_draws"))
+def run_grid(
+    key: Array,
+    tables: ViewTable,
+    graph: ViewGraph,
+    knowledge: Knowledge,
+    rungs: tuple[Rung, ...],
+    *,
+    max_views: int,
+    reachable: Bool[Array, "views"] | None = None,
+    movement_cost: Float[Array, ""] | float | None = None,
+    keep_draws: int = 1,
+) -> dict[str, Results]:
+    """Walks every object from every start by every policy and reads the whole grid.
 
+    Args:
+        key: for policies that draw.
+        tables: (objects, …) of each field, logits (objects, backbones, views, classes).
+        graph: the candidate views.
+        knowledge: what was learnt on other objects, with a leading axis of backbones.
+        rungs: the policies.
+        max_views: the largest MV.
+        reachable: where the camera can go, and start; None for everywhere.
+        movement_cost: taken off the policies' scores per radian of the way.
+        keep_draws: how many draws' views are handed back.
 
-def interval_of(key: jax.Array, values: np.ndarray) -> list[float]:
-    """95 % interval of the mean over objects."""
-    return np.asarray(_interval(key, jnp.asarray(values))).tolist()
+    Returns:
+        Results by policy. Starts out of reach weigh nothing.
+    """
+    devices = jax.devices()
+    objects, starts = tables.label.shape[0], graph.points.shape[0]
+    start_weight = jnp.ones(starts) if reachable is None else reachable.astype(jnp.float32)
+    start_weight /= jnp.sum(start_weight)
 
+    def evaluate(rung: Rung, keys: Array, tables: ViewTable) -> Results:
+        policy = POLICIES[rung.policy]
+        if movement_cost is not None:
+            policy = with_movement(policy, movement_cost)
 
-_interval = jax.jit(bootstrap_interval)
+        def walk(key: Array, table: ViewTable, knowledge: Knowledge, start: Array) -> Array:
+            scene = table.scene(graph, knowledge, reachable)
+            return select_from_table(key, table, scene, policy, start, max_views=max_views).views
+
+        def of_object(arguments: tuple[Array, ViewTable]) -> Results:
+            key, table = arguments
+            keys = jax.random.split(key, (starts, rung.draws))
+            over_draws = jax.vmap(walk, (0, None, None, None))
+            over_starts = jax.vmap(over_draws, (0, None, None, 0))
+
+            def with_backbone(logits: Array, knowledge: Knowledge) -> Array:
+                return over_starts(keys, replace(table, logits=logits), knowledge, jnp.arange(starts))
+
+            views = jax.vmap(with_backbone)(table.logits, knowledge)
+            steps_first = views.reshape(*views.shape[:-3], -1, max_views).swapaxes(-1, -2)
+            read = jax.vmap(read_object, (0, None, None, 0, None))
+            found = read(
+                table.logits, table.label, graph.distances, steps_first, start_weight.repeat(rung.draws) / rung.draws
+            )
+            small = jnp.int8 if starts < 128 else jnp.int16
+            return Results(*found, views[:, :, :keep_draws].astype(small))
+
+        at_once = max(1, min(256, _WALKS_AT_ONCE // (starts * rung.draws)))
+        at_once = min(at_once, -(-objects // len(devices)))
+        padding = -objects % (at_once * len(devices))
+        padded = jax.tree.map(lambda leaf: jnp.concatenate([leaf, leaf[:1].repeat(padding, 0)]), (keys, tables))
+        chunked = partial(jax.lax.map, of_object, batch_size=at_once)
+        if len(devices) > 1:
+            over = PartitionSpec("objects")
+            chunked = jax.shard_map(
+                chunked, mesh=Mesh(np.array(devices), "objects"), in_specs=(over,), out_specs=over, check_vma=False
+            )
+        found = jax.tree.map(lambda leaf: leaf[:objects], chunked(padded))
+        return jax.tree.map(lambda leaf: jnp.moveaxis(leaf, 0, 1), found)
+
+    keys = jax.vmap(jax.random.fold_in, (None, 0))(key, jnp.arange(objects))
+    return {rung.policy: evaluate(rung, keys, tables) for rung in rungs}

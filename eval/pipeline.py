@@ -1,6 +1,7 @@
 """The whole job, stage by stage: data → networks → tables and metrics → report. Each stage skips what is done.
 
-A run directory holds `data/`, `classifier/`, `entropy/`, `tables/`, `metrics.json` and `report/index.html`.
+A run directory holds `data/`, `classifier/`, `entropy/`, `tables/`, `metrics.json` and `report/index.html`; and
+`classifier_by_view/` where the compatibility table is to be whole.
 """
 
 from __future__ import annotations
@@ -12,6 +13,8 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
+import jax.numpy as jnp
+import numpy as np
 import tyro
 
 from data_pipeline.builder import DataConfig, DatasetStatistics, load_statistics, prepare, report_left_out
@@ -20,10 +23,14 @@ from data_pipeline.files import read_json, write_json
 from data_pipeline.meshes import DataError
 from data_pipeline.progress import console
 from eval.grid import GridConfig
-from eval.report import ReportInputs, read_history, write_report
-from eval.study import run_study
+from eval.knowledge import learn
+from eval.live import Agreement, LiveConfig, Networks, compare_with_tables
+from eval.page import ReportInputs
+from eval.report import read_history, write_report
+from eval.study import reachable_views, run_study
 from eval.view_tables import ViewTables, compute_view_tables, load_view_tables, save_view_tables
 from mevs_jax.models import Abstraction
+from mevs_jax.viewpoints import ViewGraph
 from train.classifier import ClassifierConfig, ClassifierTask, ResNetConfig
 from train.entropy import EntropyConfig, EntropyTask, PointNet2Config
 from train.loop import OptimiserConfig, Task, fit, load_best
@@ -37,6 +44,7 @@ class Settings:
     classifier: ClassifierConfig = ClassifierConfig()
     entropy: EntropyConfig = EntropyConfig()
     evaluation: GridConfig = GridConfig()
+    live: LiveConfig = LiveConfig()
 
 
 THESIS = Settings()
@@ -95,6 +103,7 @@ TINY = Settings(
         optimiser=OptimiserConfig(epochs=2, batch_size=16, views_per_object=2, epoch_views=4, schedule="cosine"),
     ),
     evaluation=GridConfig(draws=2),
+    live=LiveConfig(objects=12, at_once=8, max_views=4),
 )
 """Seconds, and no use but to see that everything runs."""
 
@@ -121,13 +130,13 @@ class Options(Settings):
             dataset = replace(dataset, source=self.data)
         if self.views is not None:
             dataset = replace(dataset, capture=replace(dataset.capture, views=self.views))
-        return Settings(dataset, self.classifier, self.entropy, self.evaluation)
+        return Settings(dataset, self.classifier, self.entropy, self.evaluation, self.live)
 
 
 def options_from(preset: Literal["small", "thesis", "tiny"]) -> Options:
     """The defaults of all options under a preset."""
     chosen = PRESETS[preset]
-    return Options(chosen.dataset, chosen.classifier, chosen.entropy, chosen.evaluation, preset=preset)
+    return Options(chosen.dataset, chosen.classifier, chosen.entropy, chosen.evaluation, chosen.live, preset=preset)
 
 
 def check_output(out: Path) -> None:
@@ -169,10 +178,24 @@ def train(settings: Settings, out: Path) -> None:
         )
 
 
-def _made_by(out: Path, statistics: DatasetStatistics) -> str:
-    """Names the data set and both trained networks; changes when either is made anew, but not with the time it took."""
+BY_VIEW = "classifier_by_view"
+
+
+def train_by_view(settings: Settings, out: Path) -> None:
+    """Trains the classifier once more, validated by view as in the thesis's published code, for the compatibility table."""
+    statistics = load_statistics(out / "data")
+    fit(_by_view_task(settings, statistics), out / "data", statistics, out / BY_VIEW)
+
+
+def _by_view_task(settings: Settings, statistics: DatasetStatistics) -> ClassifierTask:
+    classify, _ = tasks(settings, statistics)
+    return replace(classify, optimiser=replace(classify.optimiser, validation_by="view"))
+
+
+def _made_by(out: Path, statistics: DatasetStatistics, networks: tuple[str, str]) -> str:
+    """Names the data set and the networks; changes when any is made anew, but not with the time it took."""
     content: list[Any] = [statistics.fingerprint]
-    for name in ("classifier", "entropy"):
+    for name in networks:
         if not (out / name / "summary.json").exists():
             raise DataError(f"the {name} network in {out} is not fully trained; finish it with: mevs train --out {out}")
         summary = read_json(out / name / "summary.json")
@@ -180,13 +203,17 @@ def _made_by(out: Path, statistics: DatasetStatistics) -> str:
     return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()[:16]
 
 
-def _tables(settings: Settings, out: Path, statistics: DatasetStatistics, made_by: str) -> ViewTables:
-    path = out / "tables" / "test.npz"
+def _tables(
+    settings: Settings, out: Path, statistics: DatasetStatistics, split: str, classifier: str = "classifier"
+) -> ViewTables:
+    """The view tables of a split, made anew where the stored ones are of other networks."""
+    made_by = _made_by(out, statistics, (classifier, "entropy"))
+    path = out / "tables" / (f"{split}.npz" if classifier == "classifier" else f"{split}_by_view.npz")
     if path.exists() and (tables := load_view_tables(path)).made_by == made_by:
         return tables
     classify, predict = tasks(settings, statistics)
-    classifier, predictor = load_best(classify, out / "classifier"), load_best(predict, out / "entropy")
-    tables = compute_view_tables(out / "data", "test", statistics, classify, classifier, predict, predictor)
+    networks = load_best(classify, out / classifier), load_best(predict, out / "entropy")
+    tables = compute_view_tables(out / "data", split, statistics, classify, networks[0], predict, networks[1])
     tables = replace(tables, made_by=made_by)
     save_view_tables(path, tables)
     return tables
@@ -195,15 +222,53 @@ def _tables(settings: Settings, out: Path, statistics: DatasetStatistics, made_b
 def evaluate(settings: Settings, out: Path) -> dict[str, Any]:
     """Metrics of the test split, as written to `metrics.json`."""
     statistics = load_statistics(out / "data")
-    made_by = _made_by(out, statistics)
-    identity = json.loads(json.dumps({"evaluation": asdict(settings.evaluation), "made_by": made_by}))
+    made_by = _made_by(out, statistics, ("classifier", "entropy"))
+    by_view_made_by = None
+    if (out / BY_VIEW / "summary.json").exists():
+        by_view_made_by = _made_by(out, statistics, (BY_VIEW, "entropy"))
+    identity = {"evaluation": asdict(settings.evaluation), "made_by": made_by, "by_view": by_view_made_by}
+    identity = json.loads(json.dumps(identity))
     path = out / "metrics.json"
     if path.exists() and (metrics := read_json(path))["identity"] == identity:
         return metrics
-    metrics = run_study(_tables(settings, out, statistics, made_by), statistics, settings.evaluation)
+    try:
+        reachable_views(np.array(statistics.viewpoints), settings.evaluation.lowest_elevation)
+    except ValueError as error:
+        raise DataError(str(error)) from error
+    tables, by_view, leak = _tables(settings, out, statistics, "test"), None, None
+    if by_view_made_by is not None:
+        by_view = _tables(settings, out, statistics, "test", BY_VIEW)
+        leak = {
+            name: {
+                "validation": float(read_json(out / name / "summary.json")["best"]["accuracy"]),
+                "test": float((made.logits.argmax(-1) == made.labels[:, None]).mean()),
+            }
+            for name, made in (("classifier", tables), (BY_VIEW, by_view))
+        }
+    validation = _tables(settings, out, statistics, "val")
+    metrics = run_study(tables, validation, statistics, settings.evaluation, by_view, leak)
     metrics["identity"] = identity
     write_json(path, metrics)
     return metrics
+
+
+def check_live(settings: Settings, out: Path) -> dict[str, Agreement]:
+    """Walks test objects with the networks in the loop and compares with the tables; writes `live.json`."""
+    statistics = load_statistics(out / "data")
+    classify, predict = tasks(settings, statistics)
+    networks = Networks(classify, load_best(classify, out / "classifier"), predict, load_best(predict, out / "entropy"))
+    validation = _tables(settings, out, statistics, "val")
+    found = compare_with_tables(
+        out / "data",
+        "test",
+        networks,
+        _tables(settings, out, statistics, "test"),
+        learn(jnp.asarray(validation.logits), jnp.asarray(validation.labels)),
+        ViewGraph.from_points(np.array(statistics.viewpoints)),
+        config=settings.live,
+    )
+    write_json(out / "live.json", {policy: asdict(agreement) for policy, agreement in found.items()})
+    return found
 
 
 def report(settings: Settings, preset: str, out: Path) -> Path:

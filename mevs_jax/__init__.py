@@ -3,27 +3,40 @@
 Everything takes *one* object, cloud or view; put `jax.vmap` on for many. No files, no printing, no globals.
 """
 
+from mevs_jax.calibration import (
+    expected_calibration_error,
+    fit_exponent,
+    fit_temperature,
+    negative_log_likelihood,
+    reliability,
+)
 from mevs_jax.cameras import Camera, cameras_at, look_at_origin, partial_cloud, pixel_directions, unproject
 from mevs_jax.entropy import depth_entropy, depth_levels, level_entropy, quantise_depth, shannon_entropy
-from mevs_jax.fusion import confidence, sum_of_logits
-from mevs_jax.metrics import accuracy, bootstrap_interval, class_accuracy, confusion_matrix, mean_squared_error
+from mevs_jax.fusion import beliefs_along, confidence, discounted, mean_of_probabilities, sum_of_logits
+from mevs_jax.metrics import (
+    accuracy,
+    bootstrap_interval,
+    bootstrap_means,
+    class_accuracy,
+    confusion_matrix,
+    mean_squared_error,
+)
 from mevs_jax.models import Abstraction, PointNet2, ResNet, count_parameters
 from mevs_jax.point_ops import ball_query, farthest_point_sample
 from mevs_jax.policies import (
     POLICIES,
+    Knowledge,
+    Observation,
     Policy,
     Scene,
     SelectionState,
+    candidates,
     maxima_first,
-    oracle_entropy,
-    predicted_entropy,
-    random_view,
+    with_movement,
 )
 from mevs_jax.pretrained import pointnet2_from_torch, resnet_from_torch
 from mevs_jax.selection import (
-    NEVER_STOP,
     Episode,
-    Observation,
     ViewTable,
     select_from_table,
     select_views,
@@ -34,11 +47,11 @@ from mevs_jax.viewpoints import ViewGraph, fibonacci_sphere, local_maxima
 __version__ = "0.1.0"
 
 __all__ = [
-    "NEVER_STOP",
     "POLICIES",
     "Abstraction",
     "Camera",
     "Episode",
+    "Knowledge",
     "Observation",
     "PointNet2",
     "Policy",
@@ -49,28 +62,35 @@ __all__ = [
     "ViewTable",
     "accuracy",
     "ball_query",
+    "beliefs_along",
     "bootstrap_interval",
+    "bootstrap_means",
     "cameras_at",
+    "candidates",
     "class_accuracy",
     "confidence",
     "confusion_matrix",
     "count_parameters",
     "depth_entropy",
     "depth_levels",
+    "discounted",
+    "expected_calibration_error",
     "farthest_point_sample",
     "fibonacci_sphere",
+    "fit_exponent",
+    "fit_temperature",
     "level_entropy",
     "local_maxima",
     "look_at_origin",
     "maxima_first",
+    "mean_of_probabilities",
     "mean_squared_error",
-    "oracle_entropy",
+    "negative_log_likelihood",
     "partial_cloud",
     "pixel_directions",
     "pointnet2_from_torch",
-    "predicted_entropy",
     "quantise_depth",
-    "random_view",
+    "reliability",
     "resnet_from_torch",
     "select_from_table",
     "select_views",
@@ -78,4 +98,5 @@ __all__ = [
     "stop_at",
     "sum_of_logits",
     "unproject",
+    "with_movement",
 ]

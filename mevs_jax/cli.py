@@ -14,11 +14,13 @@ if TYPE_CHECKING:
     from eval.pipeline import Settings
 
 COMMANDS = {
-    "run": "everything below, in order, skipping what is done",
+    "run": "data, train, eval and report, skipping what is done",
     "data": "capture objects from every viewpoint, write them as a sharded TFDS data set",
     "train": "train the classifier and the entropy predictor on it",
     "eval": "walk every test object from every start view; write metrics.json",
     "report": "write report/index.html",
+    "compat": "train the classifier the published code's way too, evaluate and report again",
+    "live": "walk test objects with the networks in the loop; compare with the tables",
 }
 
 _HELP = """usage: mevs COMMAND [--preset small|thesis] [--data PATH] [--views N] [--out DIR] [SETTINGS]
@@ -84,13 +86,21 @@ def _run(command: str, arguments: list[str]) -> None:
         pipeline.make_data(settings, out)
     if command in ("run", "train"):
         pipeline.train(settings, out)
-    if command in ("run", "eval"):
+    if command == "compat":
+        pipeline.train_by_view(settings, out)
+    if command in ("run", "eval", "compat"):
         metrics = pipeline.evaluate(settings, out)
         console.print(
             f"Single views: {100 * metrics['single_view']['accuracy']:.1f} % of {metrics['objects']} test objects right"
         )
         console.print(f"Metrics: {out / 'metrics.json'}")
-    if command in ("run", "report"):
+    if command == "live":
+        for policy, found in pipeline.check_live(settings, out).items():
+            console.print(
+                f"{policy}: {found.same} of {found.walks} walks are the same live as by table "
+                f"(confidences within {found.largest_difference:.1e})"
+            )
+    if command in ("run", "report", "compat"):
         console.print(f"Report: {pipeline.report(settings, preset, out).absolute()}")
 
 

@@ -2,6 +2,11 @@
 
 The thesis adds them (§4.4): a product of experts that takes the views to be independent. The belief is kept as unnormalised
 log-probabilities, so a fusion is one function from (belief, logits) to belief.
+
+What the sum gets wrong is not which class is the most likely but how sure one may be: views of one object are anything but
+independent. All of the family p ∝ Π pᵢ^α with an α that depends on the number of views (`discounted`) agree on the class; the
+thesis has α = 1, the mean of log-probabilities α = 1/n, and α = 1/T(n) is what `mevs_jax.calibration` fits. The mean of
+probabilities (a mixture) can disagree.
 """
 
 from __future__ import annotations
@@ -19,3 +24,29 @@ def sum_of_logits(belief: Float[Array, "classes"], logits: Float[Array, "classes
 def confidence(belief: Float[Array, "classes"]) -> Float[Array, ""]:
     """Probability of the most likely class, in (0, 1]."""
     return jnp.max(jax.nn.softmax(belief))
+
+
+def running_sum(values: Float[Array, "steps *rest"]) -> Float[Array, "steps *rest"]:
+    """Cumulative sum over a few steps, written out: XLA's own is quadratic in the steps on CPUs, and fuses with nothing."""
+    sums = [values[0]]
+    for step in range(1, values.shape[0]):
+        sums.append(sums[-1] + values[step])
+    return jnp.stack(sums)
+
+
+def beliefs_along(logits: Float[Array, "steps classes"]) -> Float[Array, "steps classes"]:
+    """Sum of the logits seen so far after each step of a walk."""
+    return running_sum(logits)
+
+
+def discounted(
+    beliefs: Float[Array, "steps classes"], temperatures: Float[Array, "steps"]
+) -> Float[Array, "steps classes"]:
+    """Log-probabilities softmax(belief / T(n)) after each number of views; T = 1 is the thesis, T = n the mean of logits."""
+    return jax.nn.log_softmax(beliefs / temperatures[:, None], axis=-1)
+
+
+def mean_of_probabilities(logits: Float[Array, "steps classes"]) -> Float[Array, "steps classes"]:
+    """Logarithm of the mean probability of each class after each step of a walk (linear opinion pool)."""
+    total = jax.lax.cumlogsumexp(jax.nn.log_softmax(logits, axis=-1), axis=0)
+    return total - jnp.log(jnp.arange(1, len(logits) + 1))[:, None]

@@ -1,12 +1,17 @@
 """Where to look next. A policy is a pure function `(key, state, scene) -> scores over views`, for one object.
 
-The selection loop hides the views that were attempted already and takes the best of the rest; of equal scores, the lowest
-index. A new idea is one function here and one line in `POLICIES`.
+The selection loop hides the views that were attempted already or cannot be reached, and takes the best of the rest; of equal
+scores, the lowest index. A new idea is one function here and one line in `POLICIES`. What each one does, and where it is from,
+is told in `docs/policies.md`.
+
+Policies differ most in what they know. A robot can have `state` (what it saw), the view graph, and `Knowledge` learnt from
+other objects; the entropies, logits and label of *this* object (`Scene`) are for oracles, which no robot can be.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import TypeVar
 
 import flax.struct
 import jax
@@ -14,6 +19,14 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from mevs_jax.viewpoints import ViewGraph, local_maxima
+
+
+@flax.struct.dataclass
+class Observation:
+    """What one look gives: logits (classes,), and the policy network's word on every view (views,)."""
+
+    logits: Float[Array, "*batch classes"]
+    utility: Float[Array, "*batch views"]
 
 
 @flax.struct.dataclass
@@ -25,14 +38,31 @@ class SelectionState:
         view: the latest of them.
         attempted: (views,) which have been looked at.
         belief: (classes,) unnormalised log-probabilities.
-        utility: (views,) what the policy's network says about every view, having seen the latest.
+        latest: what the latest look gave.
+        views: (max_views,) in the order they were looked at, −1 beyond `count`.
+        seen: (max_views, …) what each of them gave, zeros beyond `count`.
     """
 
     count: Int[Array, "*batch"]
     view: Int[Array, "*batch"]
     attempted: Bool[Array, "*batch views"]
     belief: Float[Array, "*batch classes"]
-    utility: Float[Array, "*batch views"]
+    latest: Observation
+    views: Int[Array, "*batch max_views"]
+    seen: Observation
+
+
+@flax.struct.dataclass
+class Knowledge:
+    """What was learnt on other objects, none of them tested on.
+
+    Attributes:
+        order: (views,) scores of the best fixed order; the first to look at has the highest.
+        expected_logits: (classes, views, classes); entry [y, j] is the mean logits at view j of objects of class y.
+    """
+
+    order: Float[Array, "*batch views"]
+    expected_logits: Float[Array, "*batch classes views classes"]
 
 
 @flax.struct.dataclass
@@ -41,45 +71,219 @@ class Scene:
 
     Attributes:
         graph: the candidate views.
-        entropy: (views,) true depth entropies; for oracles only.
+        entropy: (views,) true depth entropies; for oracles.
+        logits: (views, classes) what every view would show; for oracles.
+        label: the true class; for oracles.
+        knowledge: learnt on other objects.
+        reachable: (views,) where the camera can go; None for everywhere. The start may lie outside.
     """
 
     graph: ViewGraph
-    entropy: Float[Array, "*batch views"]
+    entropy: Float[Array, "*batch views"] | None = None
+    logits: Float[Array, "*batch views classes"] | None = None
+    label: Int[Array, "*batch"] | None = None
+    knowledge: Knowledge | None = None
+    reachable: Bool[Array, "*batch views"] | None = None
 
 
 Policy = Callable[[Array, SelectionState, Scene], Float[Array, "views"]]
 
+T = TypeVar("T")
+
+
+def _given(value: T | None, name: str) -> T:
+    if value is None:
+        raise ValueError(f"this policy needs Scene.{name}, which is not given")
+    return value
+
+
+def candidates(state: SelectionState, scene: Scene) -> Bool[Array, "views"]:
+    """Which views may be looked at next: neither attempted nor out of reach."""
+    return ~state.attempted if scene.reachable is None else ~state.attempted & scene.reachable
+
 
 def maxima_first(
-    weights: Float[Array, "views"], attempted: Bool[Array, "views"], neighbours: Bool[Array, "views views"]
+    weights: Float[Array, "views"], allowed: Bool[Array, "views"], neighbours: Bool[Array, "views views"]
 ) -> Float[Array, "views"]:
-    """Scores of the thesis's rule (§4.4): the heaviest unattempted local maximum, or the heaviest view if none is left."""
+    """Scores of the thesis's rule (§4.4): the heaviest allowed local maximum, or the heaviest view if none is left."""
     maximum = local_maxima(weights, neighbours)
-    left = jnp.any(maximum & ~attempted)
+    left = jnp.any(maximum & allowed)
     return jnp.where(left & ~maximum, -jnp.inf, weights)
 
 
+# Knowing nothing of the object.
+
+
 def random_view(key: Array, state: SelectionState, scene: Scene) -> Float[Array, "views"]:
-    """Uniform over the unattempted views, as the thesis's text says (its code draws with replacement)."""
+    """Uniform over the unattempted views, as the thesis's text says (its code: `random_with_repetition`)."""
     del scene
     return jax.random.uniform(key, state.attempted.shape)
+
+
+def random_with_repetition(key: Array, state: SelectionState, scene: Scene) -> Float[Array, "views"]:
+    """Uniform over all views, seen or not: the random baseline of the thesis's published code.
+
+    A view seen again adds its logits again: confidence grows, evidence does not.
+    """
+    del scene
+    views = state.attempted.shape[0]
+    return jnp.where(jnp.arange(views) == jax.random.randint(key, (), 0, views), jnp.inf, 0.0)
+
+
+def farthest_view(key: Array, state: SelectionState, scene: Scene) -> Float[Array, "views"]:
+    """Great-circle distance in radians to the nearest view seen: spread out (farthest-point rule; Gonzalez 1985)."""
+    del key
+    return jnp.min(jnp.where(state.attempted, scene.graph.distances, jnp.inf), axis=1)
+
+
+# Knowing what the networks say of what was seen.
 
 
 def predicted_entropy(key: Array, state: SelectionState, scene: Scene) -> Float[Array, "views"]:
     """The thesis's policy: local maxima of the entropies predicted from the latest view's cloud come first."""
     del key
-    return maxima_first(state.utility, state.attempted, scene.graph.neighbours)
+    return maxima_first(state.latest.utility, candidates(state, scene), scene.graph.neighbours)
+
+
+def predicted_entropy_without_maxima(key: Array, state: SelectionState, scene: Scene) -> Float[Array, "views"]:
+    """The entropies predicted from the latest view's cloud, highest first, neighbours or not."""
+    del key, scene
+    return state.latest.utility
+
+
+def remembered_entropy(key: Array, state: SelectionState, scene: Scene) -> Float[Array, "views"]:
+    """The thesis's rule on the mean of the predictions from every view seen, not the latest alone."""
+    del key
+    mean = jnp.sum(state.seen.utility, axis=0) / jnp.maximum(state.count, 1)  # zeros beyond `count`
+    return maxima_first(mean, candidates(state, scene), scene.graph.neighbours)
+
+
+# Knowing what views of other objects show.
+
+
+def fixed_order(key: Array, state: SelectionState, scene: Scene) -> Float[Array, "views"]:
+    """The same views for every object, in the order that did best on other objects."""
+    del key, state
+    return _given(scene.knowledge, "knowledge").order
+
+
+def information_gain(key: Array, state: SelectionState, scene: Scene) -> Float[Array, "views"]:
+    """Expected drop of the belief's entropy in nats, if view j shows class y its mean logits.
+
+    With p the belief, M[y, j] the mean logits: H(p) − Σ_y p(y) H(softmax(belief + M[y, j])). As in Denzler and Brown (2002)
+    and Wu et al. (3D ShapeNets, 2015), with a table in place of a generative model.
+    """
+    del key
+    expected = _given(scene.knowledge, "knowledge").expected_logits
+    after = _belief_entropy(state.belief + expected)  # (classes, views)
+    return _belief_entropy(state.belief) - jax.nn.softmax(state.belief) @ after
+
+
+def _belief_entropy(belief: Float[Array, "*batch classes"]) -> Float[Array, "*batch"]:
+    """In nats. H = log Σ exp(b) − Σ p b, with one exponential per class."""
+    shifted = belief - jnp.max(belief, axis=-1, keepdims=True)
+    weight = jnp.exp(shifted)
+    total = jnp.sum(weight, axis=-1)
+    return jnp.log(total) - jnp.sum(weight * shifted, axis=-1) / total
+
+
+# Knowing what no robot can: oracles and a control.
 
 
 def oracle_entropy(key: Array, state: SelectionState, scene: Scene) -> Float[Array, "views"]:
-    """The same rule on the true entropies: what a perfect predictor would do."""
+    """The thesis's rule on the true entropies: what a perfect predictor would do."""
     del key
-    return maxima_first(scene.entropy, state.attempted, scene.graph.neighbours)
+    return maxima_first(_given(scene.entropy, "entropy"), candidates(state, scene), scene.graph.neighbours)
+
+
+def lowest_entropy(key: Array, state: SelectionState, scene: Scene) -> Float[Array, "views"]:
+    """The lowest true entropy first: the control. If this does no worse than the oracle, entropy is not what matters."""
+    del key, state
+    return -_given(scene.entropy, "entropy")
+
+
+def belief_oracle(key: Array, state: SelectionState, scene: Scene) -> Float[Array, "views"]:
+    """The view after which the belief is closest (in Kullback–Leibler divergence) to the belief after all views.
+
+    Sees every view but not the label, so it cannot pick views that are right by luck: a fair ceiling for one step.
+    """
+    del key
+    logits = _given(scene.logits, "logits")
+    final = jax.nn.softmax(jnp.sum(logits, axis=0))
+    return jnp.sum(final * jax.nn.log_softmax(state.belief + logits), axis=-1)
+
+
+def label_oracle(key: Array, state: SelectionState, scene: Scene) -> Float[Array, "views"]:
+    """The view after which the true class is most probable. Optimistic: it finds views that are right by luck."""
+    del key
+    logits, label = _given(scene.logits, "logits"), _given(scene.label, "label")
+    return jax.nn.log_softmax(state.belief + logits)[:, label]
+
+
+def pair_oracle(key: Array, state: SelectionState, scene: Scene) -> Float[Array, "views"]:
+    """The first view of the pair after which the true class is most probable, over all pairs; every second view is the greedy
+    one, which completes the pair. More optimistic still (exhaustive search over subsets, as in MVSelect, Hou et al. 2024).
+    """
+    logits, label = _given(scene.logits, "logits"), _given(scene.label, "label")
+
+    def best_partner() -> Float[Array, "views"]:
+        both = state.belief + logits[:, None] + logits[None, :]
+        probability = jax.nn.log_softmax(both)[..., label]
+        partner = candidates(state, scene) & ~jnp.eye(len(logits), dtype=bool)
+        best = jnp.max(jnp.where(partner, probability, -jnp.inf), axis=1)
+        return jnp.where(jnp.any(partner, axis=1), best, label_oracle(key, state, scene))
+
+    return jax.lax.cond(state.count % 2 == 1, best_partner, lambda: label_oracle(key, state, scene))
+
+
+# What the thesis's published code does.
+
+
+def scrambled_entropy(key: Array, state: SelectionState, scene: Scene) -> Float[Array, "views"]:
+    """The thesis's published code: once all local maxima are used up it sorts the shared list of views in place.
+
+    From then on predicted entropies are written onto the wrong views. The permutation is replayed from what was seen.
+    """
+    del key
+    neighbours, views = scene.graph.neighbours, state.attempted.shape[0]
+
+    def written(order: Int[Array, "views"], look: Int[Array, ""]) -> Float[Array, "views"]:
+        return jnp.zeros(views).at[order].set(state.seen.utility[look])
+
+    def replay(look: Int[Array, ""], order: Int[Array, "views"]) -> Int[Array, "views"]:
+        weights = written(order, look)
+        attempted = jnp.any(
+            (state.views[:, None] == jnp.arange(views)) & (jnp.arange(len(state.views)) <= look)[:, None], 0
+        )
+        exhausted = ~jnp.any(local_maxima(weights, neighbours) & ~attempted)
+        return jnp.where(exhausted, order[jnp.argsort(-weights[order], stable=True)], order)
+
+    order = jax.lax.fori_loop(0, state.count - 1, replay, jnp.arange(views))
+    return maxima_first(written(order, state.count - 1), candidates(state, scene), neighbours)
+
+
+def with_movement(policy: Policy, cost: float | Float[Array, ""]) -> Policy:
+    """`policy` with `cost` per radian of the great-circle way from the latest view taken off its scores."""
+
+    def scores(key: Array, state: SelectionState, scene: Scene) -> Float[Array, "views"]:
+        return policy(key, state, scene) - cost * scene.graph.distances[state.view]
+
+    return scores
 
 
 POLICIES: dict[str, Policy] = {
     "random": random_view,
+    "random_with_repetition": random_with_repetition,
+    "farthest": farthest_view,
+    "fixed_order": fixed_order,
     "predicted_entropy": predicted_entropy,
+    "predicted_entropy_without_maxima": predicted_entropy_without_maxima,
+    "remembered_entropy": remembered_entropy,
+    "scrambled_entropy": scrambled_entropy,
+    "information_gain": information_gain,
     "oracle_entropy": oracle_entropy,
+    "lowest_entropy": lowest_entropy,
+    "belief_oracle": belief_oracle,
+    "label_oracle": label_oracle,
+    "pair_oracle": pair_oracle,
 }

@@ -3,8 +3,8 @@
 Written for one object as a `lax.while_loop`; objects, start views, seeds and thresholds are `vmap` axes at the call site. What
 looking means is an argument: `observe(view)` reads a table here, and may as well call the networks.
 
-The views that a policy visits do not depend on when the loop would stop. So a walk with a threshold above 1, which never
-stops early, holds the answer for every threshold and every limit on views at once (`stop_at`).
+The views that a policy visits do not depend on when the loop would stop. So a walk without a threshold, which never stops
+early, holds the answer for every threshold and every limit on views at once (`stop_at`).
 """
 
 from __future__ import annotations
@@ -18,18 +18,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from mevs_jax.fusion import confidence, sum_of_logits
-from mevs_jax.policies import Policy, Scene, SelectionState
-
-NEVER_STOP = 2.0
-"""A threshold that no confidence reaches."""
-
-
-@flax.struct.dataclass
-class Observation:
-    """What one look gives: logits (classes,), and the policy network's word on every view (views,)."""
-
-    logits: Float[Array, "*batch classes"]
-    utility: Float[Array, "*batch views"]
+from mevs_jax.policies import Knowledge, Observation, Policy, Scene, SelectionState, candidates
+from mevs_jax.viewpoints import ViewGraph
 
 
 @flax.struct.dataclass
@@ -37,19 +27,25 @@ class ViewTable:
     """All that the loop needs to know of one object, computed beforehand.
 
     Attributes:
-        logits: (views, classes) of the classifier at each view.
+        logits: (views, classes) of the classifier at each view; an axis of its own where several classifiers are compared.
         utility: (views, views); row i is what the policy's network says about every view after seeing view i.
         entropy: (views,) true depth entropies.
         label: the true class.
     """
 
-    logits: Float[Array, "*batch views classes"]
+    logits: Float[Array, "*batch_and_backbones views classes"]
     utility: Float[Array, "*batch views views"]
     entropy: Float[Array, "*batch views"]
     label: Int[Array, "*batch"]
 
     def observe(self, view: Int[Array, ""]) -> Observation:
         return Observation(self.logits[view], self.utility[view])
+
+    def scene(
+        self, graph: ViewGraph, knowledge: Knowledge | None = None, reachable: Bool[Array, "views"] | None = None
+    ) -> Scene:
+        """The scene with everything that an oracle may ask for."""
+        return Scene(graph, self.entropy, self.logits, self.label, knowledge, reachable)
 
 
 @flax.struct.dataclass
@@ -69,11 +65,15 @@ class Episode:
     count: Int[Array, "*batch"]
 
 
-def best_unattempted(scores: Float[Array, "views"], attempted: Bool[Array, "views"]) -> Int[Array, ""]:
-    """The unattempted view of highest score, the lowest index among equals; −inf and NaN come last."""
+def best_view(scores: Float[Array, "views"], allowed: Bool[Array, "views"]) -> Int[Array, ""]:
+    """The allowed view of highest score, the lowest index among equals; −inf and NaN come last.
+
+    A score of +inf is an order: that view is taken even where it is not allowed, having been seen before.
+    """
     scores = jnp.where(jnp.isnan(scores), -jnp.inf, scores)
-    best = jnp.max(jnp.where(attempted, -jnp.inf, scores))
-    return jnp.argmax(~attempted & (scores == best)).astype(jnp.int32)
+    allowed = allowed | (scores == jnp.inf)
+    best = jnp.max(jnp.where(allowed, scores, -jnp.inf))
+    return jnp.argmax(allowed & (scores == best)).astype(jnp.int32)
 
 
 def select_views(
@@ -83,63 +83,80 @@ def select_views(
     policy: Policy,
     start: int | Int[Array, ""],
     *,
-    classes: int,
-    threshold: float | Float[Array, ""],
+    threshold: float | Float[Array, ""] | None = None,
     max_views: int,
 ) -> Episode:
     """Looks at one object from `start` on until the confidence reaches `threshold` or `max_views` views are seen.
 
+    It ends earlier where no view that can be reached is left.
+
     Args:
         key: for policies that draw.
         observe: what a look at a view gives.
-        scene: the candidate views.
+        scene: the candidate views, and what else the policy may know.
         policy: scores the views; see `mevs_jax.policies`.
         start: the first view, 0..views−1.
-        classes: length of the logits.
-        threshold: on the confidence, CT in the thesis; above 1 it never stops early.
+        threshold: on the confidence, CT in the thesis; None never stops early.
         max_views: 1..views, MV in the thesis.
 
     Raises:
-        ValueError: for `max_views` outside its range.
+        ValueError: for `max_views` outside its range, or a scene that lacks what the policy asks for.
     """
-    views = scene.entropy.shape[0]
+    views = scene.graph.points.shape[0]
     if not 1 <= max_views <= views:
         raise ValueError(f"max_views must be between 1 and the {views} candidate views, got {max_views}")
+    start = jnp.asarray(start, jnp.int32)
+    limit: int | Array = max_views
+    if scene.reachable is not None:
+        limit = jnp.minimum(max_views, jnp.sum(scene.reachable.at[start].set(True)))
 
     def unsure(carry: tuple[SelectionState, Episode]) -> Bool[Array, ""]:
-        _, episode = carry
-        latest = episode.confidences[jnp.maximum(episode.count - 1, 0)]
-        return (episode.count == 0) | ((episode.count < max_views) & (latest < threshold))
+        state, episode = carry
+        if threshold is None:
+            return state.count < limit
+        latest = episode.confidences[jnp.maximum(state.count - 1, 0)]
+        return (state.count == 0) | ((state.count < limit) & (latest < threshold))
 
     def look(carry: tuple[SelectionState, Episode]) -> tuple[SelectionState, Episode]:
         state, episode = carry
-        seen = observe(state.view)
-        state = replace(
-            state,
+        latest = observe(state.view)
+        belief = sum_of_logits(state.belief, latest.logits)
+        state = SelectionState(
             count=state.count + 1,
-            attempted=state.attempted.at[state.view].set(True),
-            belief=sum_of_logits(state.belief, seen.logits),
-            utility=seen.utility,
+            view=state.view,
+            attempted=state.attempted | (jnp.arange(views) == state.view),
+            belief=belief,
+            latest=latest,
+            views=_put(state.views, state.count, state.view),
+            seen=jax.tree.map(lambda history, now: _put(history, state.count, now), state.seen, latest),
         )
         episode = Episode(
-            views=episode.views.at[episode.count].set(state.view),
-            predictions=episode.predictions.at[episode.count].set(jnp.argmax(state.belief).astype(jnp.int32)),
-            confidences=episode.confidences.at[episode.count].set(confidence(state.belief)),
+            views=state.views,
+            predictions=_put(episode.predictions, state.count - 1, jnp.argmax(belief).astype(jnp.int32)),
+            confidences=_put(episode.confidences, state.count - 1, confidence(belief)),
             count=state.count,
         )
         scores = policy(jax.random.fold_in(key, state.count), state, scene)
-        return replace(state, view=best_unattempted(scores, state.attempted)), episode
+        return replace(state, view=best_view(scores, candidates(state, scene))), episode
 
+    shapes = jax.eval_shape(lambda view: jax.tree.leaves(observe(view)), start)
+    blank = Observation(*(jnp.zeros(shape.shape, shape.dtype) for shape in shapes))
+    nothing = jnp.full(max_views, -1, jnp.int32)
     state = SelectionState(
         count=jnp.int32(0),
-        view=jnp.asarray(start, jnp.int32),
+        view=start,
         attempted=jnp.zeros(views, bool),
-        belief=jnp.zeros(classes),
-        utility=jnp.zeros(views),
+        belief=jnp.zeros_like(blank.logits),
+        latest=blank,
+        views=nothing,
+        seen=jax.tree.map(lambda leaf: jnp.zeros((max_views, *leaf.shape), leaf.dtype), blank),
     )
-    nothing = jnp.full(max_views, -1, jnp.int32)
     episode = Episode(nothing, nothing, jnp.zeros(max_views), jnp.int32(0))
     return jax.lax.while_loop(unsure, look, (state, episode))[1]
+
+
+def _put(history: Array, index: Int[Array, ""], now: Array) -> Array:
+    return jax.lax.dynamic_update_index_in_dim(history, now, index, 0)
 
 
 def select_from_table(
@@ -149,26 +166,20 @@ def select_from_table(
     policy: Policy,
     start: int | Int[Array, ""],
     *,
-    threshold: float | Float[Array, ""] = NEVER_STOP,
+    threshold: float | Float[Array, ""] | None = None,
     max_views: int,
 ) -> Episode:
     """`select_views` where a look is a row of `table`."""
-    return select_views(
-        key,
-        table.observe,
-        scene,
-        policy,
-        start,
-        classes=table.logits.shape[1],
-        threshold=threshold,
-        max_views=max_views,
-    )
+    return select_views(key, table.observe, scene, policy, start, threshold=threshold, max_views=max_views)
 
 
 def stop_at(
     confidences: Float[Array, "steps"], threshold: float | Float[Array, ""], max_views: int | Int[Array, ""]
 ) -> Int[Array, ""]:
-    """How many views a full walk would have used: up to the first confidence ≥ `threshold`, at most `max_views`."""
+    """How many views a full walk would have used: up to the first confidence ≥ `threshold`, at most `max_views`.
+
+    Confidences beyond the walk's end are 0.
+    """
     sure = confidences >= threshold
     first = jnp.where(jnp.any(sure), jnp.argmax(sure), confidences.shape[0] - 1) + 1
     return jnp.minimum(first, max_views)

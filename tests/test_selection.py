@@ -11,18 +11,20 @@ import numpy as np
 import pytest
 
 from mevs_jax import (
-    NEVER_STOP,
     POLICIES,
+    Knowledge,
     Observation,
     Scene,
+    SelectionState,
     ViewGraph,
     ViewTable,
     fibonacci_sphere,
     select_from_table,
     select_views,
     stop_at,
+    with_movement,
 )
-from tests.reference import numpy_rules
+from tests.reference import numpy_rules, policies
 
 THRESHOLDS = (0.5, 0.6, 0.7, 0.8, 0.9, 0.95, 0.99)
 TABLES = 10_000
@@ -50,7 +52,7 @@ def walk_jitted(keys, tables, graph, starts, thresholds, policy, max_views):
     return jax.vmap(over_thresholds, in_axes=(0, 0, 0, None))(keys, tables, starts, thresholds)
 
 
-@pytest.mark.parametrize("policy", list(POLICIES))
+@pytest.mark.parametrize("policy", ["random", "predicted_entropy", "oracle_entropy"])
 def test_the_jitted_loop_walks_the_views_of_a_plain_loop(policy):
     views, classes, max_views = 10, 5, 6
     graph = ViewGraph.from_points(fibonacci_sphere(views))
@@ -76,7 +78,7 @@ def test_the_jitted_loop_walks_the_views_of_a_plain_loop(policy):
         }[policy]
         graph_used = None if policy == "random" else neighbours
         # The walk does not depend on the threshold, only its length does, so the plain loop runs once without one.
-        plain = numpy_rules.walk(logits[index], weights, graph_used, int(starts[index]), NEVER_STOP, max_views)
+        plain = numpy_rules.walk(logits[index], weights, graph_used, int(starts[index]), 2.0, max_views)
         for column, threshold in enumerate(THRESHOLDS):
             length = next((i + 1 for i, c in enumerate(plain[2]) if c >= threshold), max_views)
             assert episodes.count[index, column] == length
@@ -88,6 +90,153 @@ def test_the_jitted_loop_walks_the_views_of_a_plain_loop(policy):
             again = numpy_rules.walk(logits[index], weights, graph_used, int(starts[index]), THRESHOLDS[2], max_views)
             count = episodes.count[index, 2]
             assert again[0] == list(episodes.views[index, 2, :count])
+
+
+def knowledge_of(views: int, classes: int) -> Knowledge:
+    random = np.random.default_rng(11)
+    return Knowledge(
+        order=jnp.asarray(random.permutation(views), jnp.float32),
+        expected_logits=jnp.asarray(random.normal(0, 1.5, (classes, views, classes)), jnp.float32),
+    )
+
+
+def whole_scene(table: ViewTable, graph: ViewGraph) -> Scene:
+    return table.scene(graph, knowledge_of(table.logits.shape[0], table.logits.shape[1]))
+
+
+DRAWING = ("random", "random_with_repetition")
+
+
+@pytest.mark.parametrize("policy", [name for name in POLICIES if name not in DRAWING])
+def test_every_step_of_a_policy_is_the_best_by_its_plain_rule(policy):
+    """At each step of the jitted walk the view chosen has the highest score that slow, obvious code gives."""
+    views, classes, count, max_views = 12, 4, 150, 8
+    graph = ViewGraph.from_points(fibonacci_sphere(views))
+    tables = random_tables(views, classes, count, seed=12)
+    knowledge = knowledge_of(views, classes)
+
+    @jax.jit
+    @jax.vmap
+    def walk(table, start):
+        scene = table.scene(graph, knowledge)
+        return select_from_table(jax.random.key(0), table, scene, POLICIES[policy], start, max_views=max_views).views
+
+    walks = np.asarray(walk(tables, jnp.arange(count, dtype=jnp.int32) % views))
+    plain_graph = {name: np.asarray(getattr(graph, name)) for name in ("neighbours", "distances")}
+    plain_knowledge = {name: np.asarray(getattr(knowledge, name)) for name in ("order", "expected_logits")}
+    arrays = {name: np.asarray(leaf) for name, leaf in vars(tables).items()}
+    for index, walked in enumerate(walks):
+        table = {name: leaf[index] for name, leaf in arrays.items()}
+        assert len(set(walked)) == max_views
+        for step in range(1, max_views):
+            seen = walked[:step].tolist()
+            scores = policies.scores(policy, seen, table, plain_graph, plain_knowledge)
+            left = [view for view in range(views) if view not in seen]
+            assert scores[walked[step]] >= scores[left].max() - 1e-5
+
+
+def test_random_draws_are_uniform_over_what_they_may_draw():
+    views, count = 10, 20_000
+    graph = ViewGraph.from_points(fibonacci_sphere(views))
+    table = jax.tree.map(lambda leaf: leaf[0], random_tables(views, 4, 1, seed=2))
+
+    def third(policy):
+        def walk(key):
+            return select_from_table(key, table, whole_scene(table, graph), POLICIES[policy], 3, max_views=3).views
+
+        return np.asarray(jax.jit(jax.vmap(walk))(jax.random.split(jax.random.key(0), count)))
+
+    fresh, repeated = third("random"), third("random_with_repetition")
+    assert all(len(set(walk)) == 3 for walk in fresh[:500])
+    shares = np.bincount(fresh[:, 2], minlength=views) / count
+    np.testing.assert_allclose(np.delete(shares, 3), 1 / 9, atol=0.012)
+    np.testing.assert_allclose(np.bincount(repeated[:, 2], minlength=views) / count, 0.1, atol=0.012)
+    # Any two of three looks may coincide: 1 − (9/10)(8/10) of the walks hold a repetition.
+    assert np.mean([len(set(walk)) < 3 for walk in repeated]) == pytest.approx(0.28, abs=0.02)
+
+
+def test_a_view_seen_again_adds_its_logits_again():
+    graph = ViewGraph.from_points(fibonacci_sphere(10))
+    table = jax.tree.map(lambda leaf: leaf[0], random_tables(10, 4, 1, seed=2))
+
+    def stay(key, state, scene):
+        return jnp.where(jnp.arange(10) == state.view, jnp.inf, 0.0)
+
+    episode = select_from_table(jax.random.key(0), table, whole_scene(table, graph), stay, 6, max_views=4)
+    assert episode.views.tolist() == [6, 6, 6, 6]
+    expected = [jnp.max(jax.nn.softmax(n * table.logits[6])) for n in (1, 2, 3, 4)]
+    np.testing.assert_allclose(episode.confidences, expected, atol=1e-6)
+
+
+@pytest.mark.parametrize("policy", list(POLICIES))
+def test_no_policy_goes_where_it_cannot(policy):
+    views = 12
+    graph = ViewGraph.from_points(fibonacci_sphere(views))
+    table = jax.tree.map(lambda leaf: leaf[0], random_tables(views, 4, 1, seed=4))
+    reachable = jnp.asarray(np.isin(np.arange(views), [0, 2, 3, 7, 9]))
+    scene = whole_scene(table, graph)
+    scene = Scene(**{**vars(scene), "reachable": reachable})
+    walk = jax.jit(
+        lambda start: select_from_table(jax.random.key(0), table, scene, POLICIES[policy], start, max_views=8)
+    )
+    episode = walk(7)
+    if policy == "random_with_repetition":  # an order to go somewhere is an order; the mask is for policies that choose
+        return
+    assert sorted(episode.views[:5].tolist()) == [0, 2, 3, 7, 9]
+    assert episode.views[5:].tolist() == [-1] * 3
+    assert episode.count == 5
+    assert sorted(walk(1).views[:6].tolist()) == [0, 1, 2, 3, 7, 9]  # the start may lie outside
+
+
+def test_a_dear_way_is_not_taken():
+    graph = ViewGraph.from_points(fibonacci_sphere(20))
+    table = jax.tree.map(lambda leaf: leaf[0], random_tables(20, 4, 1, seed=5))
+    plain = POLICIES["predicted_entropy_without_maxima"]
+    ways = []
+    for cost in (0.0, 0.2, 100.0):
+        walk = select_from_table(
+            jax.random.key(0), table, whole_scene(table, graph), with_movement(plain, cost), 4, max_views=6
+        ).views
+        ways.append(float(np.asarray(graph.distances)[walk[:-1], walk[1:]].sum()))
+        if cost == 0.0:
+            same = select_from_table(jax.random.key(0), table, whole_scene(table, graph), plain, 4, max_views=6)
+            np.testing.assert_array_equal(walk, same.views)
+        if cost == 100.0:  # nothing but the distance counts: always the nearest view left
+            seen = [4]
+            for view in walk[1:]:
+                left = [v for v in range(20) if v not in seen]
+                assert view == min(left, key=lambda v: graph.distances[seen[-1], v])
+                seen.append(int(view))
+    assert ways[0] > ways[1] > ways[2]
+
+
+@pytest.mark.parametrize(
+    ("policy", "field"), [("fixed_order", "knowledge"), ("oracle_entropy", "entropy"), ("label_oracle", "logits")]
+)
+def test_a_scene_that_lacks_what_a_policy_needs_is_described(policy, field):
+    graph = ViewGraph.from_points(fibonacci_sphere(10))
+    table = jax.tree.map(lambda leaf: leaf[0], random_tables(10, 4, 1, seed=6))
+    with pytest.raises(ValueError, match=rf"needs Scene\.{field}"):
+        select_from_table(jax.random.key(0), table, Scene(graph), POLICIES[policy], 0, max_views=3)
+
+
+def test_a_policy_may_look_back_on_all_that_was_seen():
+    graph = ViewGraph.from_points(fibonacci_sphere(10))
+    table = jax.tree.map(lambda leaf: leaf[0], random_tables(10, 4, 1, seed=6))
+    states: list[SelectionState] = []
+
+    def watch(key, state, scene):
+        jax.debug.callback(lambda state: states.append(state), state)
+        return -jnp.arange(10.0)
+
+    select_from_table(jax.random.key(0), table, Scene(graph), watch, 5, max_views=3)
+    jax.effects_barrier()
+    last = max(states, key=lambda state: int(state.count))
+    assert last.views.tolist() == [5, 0, 1]
+    np.testing.assert_array_equal(last.seen.logits, table.logits[jnp.array([5, 0, 1])])
+    np.testing.assert_array_equal(last.seen.utility, table.utility[jnp.array([5, 0, 1])])
+    np.testing.assert_array_equal(last.latest.logits, table.logits[1])
+    np.testing.assert_allclose(last.belief, table.logits[jnp.array([5, 0, 1])].sum(axis=0), rtol=1e-5)
 
 
 def test_a_full_walk_holds_the_answer_for_every_threshold_and_limit():
@@ -123,9 +272,7 @@ def test_observing_may_be_anything():
         onehot = jax.nn.one_hot(view, 10)
         return Observation(onehot @ table.logits, jnp.einsum("v,vw->w", onehot, table.utility))
 
-    live = select_views(
-        jax.random.key(0), look, scene, POLICIES["predicted_entropy"], 4, classes=4, threshold=0.9, max_views=8
-    )
+    live = select_views(jax.random.key(0), look, scene, POLICIES["predicted_entropy"], 4, threshold=0.9, max_views=8)
     stored = select_from_table(
         jax.random.key(0), table, scene, POLICIES["predicted_entropy"], 4, threshold=0.9, max_views=8
     )
@@ -135,9 +282,10 @@ def test_observing_may_be_anything():
 def test_all_views_can_be_visited_each_once():
     graph = ViewGraph.from_points(fibonacci_sphere(10))
     table = jax.tree.map(lambda leaf: leaf[0], random_tables(10, 4, 1, seed=7))
-    for policy in POLICIES.values():
-        episode = select_from_table(jax.random.key(0), table, Scene(graph, table.entropy), policy, 0, max_views=10)
-        assert sorted(np.asarray(episode.views)) == list(range(10))
+    for name, policy in POLICIES.items():
+        episode = select_from_table(jax.random.key(0), table, whole_scene(table, graph), policy, 0, max_views=10)
+        if name != "random_with_repetition":
+            assert sorted(np.asarray(episode.views)) == list(range(10))
 
 
 def test_scores_that_are_not_numbers_come_last():

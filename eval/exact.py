@@ -1,0 +1,99 @@
+"""Random selection without repetition, in exact expectation: over all starts and all draws at once.
+
+What such a walk knows after k looks depends on *which* views it has seen, not on their order. So the walk is a Markov chain on
+subsets: P(S) = Σ_{v ∈ S} P(S \\ v, not stopped) / (views left). With 10 views that covers every subset; with 40, those of up to
+three views (10,700 of them), and larger limits on views are left to draws.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import partial
+from itertools import combinations
+from math import comb
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int
+
+LARGEST = 12_000
+"""The most subsets that are worth going through for an object."""
+
+
+@dataclass(frozen=True)
+class Subsets:
+    """All subsets of one size of the views that can be reached.
+
+    Attributes:
+        members: (subsets, size) views.
+        without: (subsets, size) where the subset without its i-th member is in the list of the size below.
+    """
+
+    members: np.ndarray
+    without: np.ndarray
+
+
+def all_subsets(views: np.ndarray, largest: int) -> list[Subsets]:
+    """The subsets of `views` by size, from 1 up to `largest`, or as far as `LARGEST` allows."""
+    found: list[Subsets] = []
+    below: dict[tuple[int, ...], int] = {(): 0}
+    total = 0
+    for size in range(1, min(largest, len(views)) + 1):
+        total += comb(len(views), size)
+        if total > LARGEST:
+            break
+        subsets = list(combinations(views.tolist(), size))
+        without = [[below[s[:i] + s[i + 1 :]] for i in range(size)] for s in subsets]
+        found.append(Subsets(np.array(subsets), np.array(without)))
+        below = {subset: index for index, subset in enumerate(subsets)}
+    return found
+
+
+def expected_of_object(
+    logits: Float[Array, "views classes"],
+    label: Int[Array, ""],
+    sizes: list[Subsets],
+    candidates: int,
+    thresholds: tuple[float, ...],
+) -> tuple[Float[Array, "sizes CT"], Float[Array, "sizes CT"], Float[Array, "sizes"]]:
+    """One object: probability of ending right and views used, by limit on views and threshold; and right after so many."""
+    levels = jnp.array(thresholds)
+    before = jnp.arange(logits.shape[1]) < label
+    belief = jnp.zeros((1, logits.shape[1]))
+    walking = jnp.ones((1, len(thresholds)))  # probability that a walk has come by here and goes on
+    settled, used = jnp.zeros(len(thresholds)), jnp.zeros(len(thresholds))
+    cells, used_cells, after = [], [], []
+    for size, subsets in enumerate(sizes, start=1):
+        reached = jnp.sum(walking[subsets.without], axis=1) / (candidates - size + 1)
+        belief = belief[subsets.without[:, -1]] + logits[subsets.members[:, -1]]
+        own = belief[:, label, None]
+        right = jnp.all(jnp.where(before, belief < own, belief <= own), axis=1).astype(jnp.float32)
+        stops = jnp.max(jax.nn.softmax(belief), axis=1)[:, None] >= levels
+        used += jnp.sum(reached, axis=0)
+        cells.append(settled + right @ reached)
+        used_cells.append(used)
+        after.append(jnp.mean(right))
+        settled += right @ (reached * stops)
+        walking = reached * ~stops
+    return jnp.stack(cells), jnp.stack(used_cells), jnp.stack(after)
+
+
+def expected_random(
+    logits: Float[Array, "objects backbones views classes"],
+    labels: Int[Array, "objects"],
+    reachable: np.ndarray,
+    thresholds: tuple[float, ...],
+    max_views: int,
+) -> tuple[Float[Array, "backbones objects sizes CT"], ...]:
+    """`right` and `used` (backbones, objects, sizes, CT) and `after` (backbones, objects, sizes), as far as sizes go."""
+    views = np.flatnonzero(reachable)
+    sizes = all_subsets(views, max_views)
+    one = partial(expected_of_object, sizes=sizes, candidates=len(views), thresholds=thresholds)
+
+    @jax.jit
+    def every(logits: Array, labels: Array):
+        over_backbones = jax.vmap(one, (0, None))
+        return jax.lax.map(lambda item: over_backbones(*item), (logits, labels), batch_size=4)
+
+    return tuple(jnp.moveaxis(values, 0, 1) for values in every(logits, labels))
