@@ -11,14 +11,17 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
+from mevs_jax.arrays import AnyArray
+
 BINS = 15
 """Of the expected calibration error (Guo et al. 2017)."""
 
 
 def reliability(
-    confidences: Float[Array, "n"], right: Bool[Array, "n"] | Float[Array, "n"], bins: int = BINS
+    confidences: Float[AnyArray, "n"], right: Bool[AnyArray, "n"], bins: int = BINS
 ) -> tuple[Float[Array, "{bins}"], Float[Array, "{bins}"], Float[Array, "{bins}"]]:
     """By bin of confidence, (0, 1/bins], …: mean confidence, accuracy, and the share of answers; 0 where there are none."""
+    confidences, right = jnp.asarray(confidences), jnp.asarray(right)
     index = jnp.clip(jnp.ceil(confidences * bins).astype(jnp.int32) - 1, 0, bins - 1)
     member = index == jnp.arange(bins)[:, None]
     count = jnp.sum(member, axis=1)
@@ -27,24 +30,26 @@ def reliability(
 
 
 def expected_calibration_error(
-    confidences: Float[Array, "n"], right: Bool[Array, "n"] | Float[Array, "n"], bins: int = BINS
+    confidences: Float[AnyArray, "n"], right: Bool[AnyArray, "n"], bins: int = BINS
 ) -> Float[Array, ""]:
     """Mean distance between confidence and accuracy over bins of equal width, weighted by answers; in [0, 1]."""
     confidence, accuracy, share = reliability(confidences, right, bins)
     return jnp.sum(share * jnp.abs(confidence - accuracy))
 
 
-def negative_log_likelihood(beliefs: Float[Array, "n classes"], labels: Int[Array, "n"]) -> Float[Array, ""]:
+def negative_log_likelihood(beliefs: Float[AnyArray, "n classes"], labels: Int[AnyArray, "n"]) -> Float[Array, ""]:
     """Mean of −log softmax(belief)[label] in nats."""
+    beliefs, labels = jnp.asarray(beliefs), jnp.asarray(labels)
     log_probabilities = jax.nn.log_softmax(beliefs, axis=-1)
     return -jnp.mean(jnp.take_along_axis(log_probabilities, labels[:, None], axis=-1))
 
 
-def fit_temperature(beliefs: Float[Array, "n classes"], labels: Int[Array, "n"]) -> Float[Array, ""]:
+def fit_temperature(beliefs: Float[AnyArray, "n classes"], labels: Int[AnyArray, "n"]) -> Float[Array, ""]:
     """The T that makes softmax(belief / T) most likely, in [0.01, 100].
 
     The likelihood is convex in 1/T, so the root of its derivative is found by bisection.
     """
+    beliefs, labels = jnp.asarray(beliefs), jnp.asarray(labels)
     centred = beliefs - jnp.take_along_axis(beliefs, labels[:, None], axis=-1)
 
     def slope(log_inverse: Array) -> Array:
@@ -61,12 +66,13 @@ def fit_temperature(beliefs: Float[Array, "n classes"], labels: Int[Array, "n"])
 
 
 def fit_exponent(
-    beliefs: Float[Array, "n steps classes"], labels: Int[Array, "n"]
+    beliefs: Float[AnyArray, "n steps classes"], labels: Int[AnyArray, "n"]
 ) -> tuple[Float[Array, ""], Float[Array, ""]]:
     """(scale, growth) of temperatures scale · steps^growth, fitted to all numbers of views at once.
 
     The exponent of the product of experts is 1/T: growth 0 takes the views to be independent, 1 takes their mean.
     """
+    beliefs, labels = jnp.asarray(beliefs), jnp.asarray(labels)
     steps = jnp.arange(1, beliefs.shape[1] + 1, dtype=jnp.float32)
 
     def cost(parameters: Array) -> Array:

@@ -227,7 +227,9 @@ def pair_oracle(key: Array, state: SelectionState, scene: Scene) -> Float[Array,
     logits, label = _given(scene.logits, "logits"), _given(scene.label, "label")
 
     def best_partner() -> Float[Array, "views"]:
-        both = state.belief + logits[:, None] + logits[None, :]
+        both = state.belief + (
+            logits[:, None] + logits[None, :]
+        )  # in this order: a pair weighs the same both ways round
         probability = jax.nn.log_softmax(both)[..., label]
         partner = candidates(state, scene) & ~jnp.eye(len(logits), dtype=bool)
         best = jnp.max(jnp.where(partner, probability, -jnp.inf), axis=1)

@@ -363,14 +363,12 @@ def test_the_published_codes_switches_each_change_their_own_side(study):
     np.testing.assert_allclose(rows["sorted_in_place"]["difference"][0], rows["text"]["difference"][0], atol=1e-6)
 
 
-def test_temperatures_change_no_answer_and_lower_the_error_on_what_they_were_fitted_to(study):
+def test_only_a_mixture_may_answer_otherwise(study):
     for confidence in study["confidence"].values():
         readings = confidence["readings"]
         for name in ("mean_of_log_probabilities", "product_of_experts", "temperature"):
             assert readings[name]["accuracy"] == readings["sum_of_logits"]["accuracy"]
-        assert readings["temperature"]["nll"][-1] <= readings["sum_of_logits"]["nll"][-1]
-        before, after = (np.array(readings[name]["validation_ece"]) for name in ("sum_of_logits", "temperature"))
-        assert (after[1:] < before[1:]).all()
+        assert readings["mean_of_probabilities"]["accuracy"] != readings["sum_of_logits"]["accuracy"]
 
 
 def test_tables_are_saved_whole(tables, tmp_path):

@@ -64,6 +64,18 @@ def softmax_confidence(belief: np.ndarray) -> float:
     return float(shifted.max() / shifted.sum())
 
 
+def expected_calibration_error(confidences: np.ndarray, right: np.ndarray, bins: int) -> float:
+    """Guo et al. 2017, eq. (3): bins are (i/bins, (i+1)/bins]."""
+    error = 0.0
+    for i in range(bins):
+        inside = [n for n, c in enumerate(confidences) if i / bins < c <= (i + 1) / bins]
+        if inside:
+            accuracy = sum(right[n] for n in inside) / len(inside)
+            confidence = sum(confidences[n] for n in inside) / len(inside)
+            error += len(inside) / len(confidences) * abs(accuracy - confidence)
+    return float(error)
+
+
 def walk(
     logits: np.ndarray,
     weights_after: np.ndarray,

@@ -1,0 +1,107 @@
+"""With the networks inside the loop, the same views are walked as from tables."""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from flax import nnx
+
+from data_pipeline.capture import CaptureConfig
+from eval.knowledge import learn
+from eval.live import Captures, LiveWalker, Networks
+from mevs_jax import POLICIES, Abstraction, ViewGraph, ViewTable, fibonacci_sphere, select_from_table
+from train.classifier import ClassifierConfig, ClassifierTask, ResNetConfig
+from train.entropy import EntropyConfig, EntropyTask, PointNet2Config
+
+OBJECTS, VIEWS, CLASSES, SIDE, POINTS = 512, 8, 4, 8, 24
+CAMERA = CaptureConfig(views=VIEWS, resolution=SIDE)
+
+
+@pytest.fixture(scope="module")
+def networks() -> Networks:
+    classify = ClassifierTask.of(ClassifierConfig(network=ResNetConfig(width=4, channels=1)), CLASSES, CAMERA)
+    shape = PointNet2Config(
+        points=POINTS,
+        abstractions=(Abstraction(centres=8, radius=0.5, samples=4, layers=(8,)),),
+        global_layers=(16,),
+        head_layers=(16,),
+    )
+    predict = EntropyTask.of(EntropyConfig(network=shape), VIEWS, 5.0, CAMERA)
+    classifier = classify.network(nnx.Rngs(0))
+    # Untrained, it would say nearly the same of every view, and rounding would choose.
+    classifier.head.kernel[...] = 40 * classifier.head.kernel[...]
+    return Networks(classify, classifier, predict, predict.network(nnx.Rngs(1)))
+
+
+@pytest.fixture(scope="module")
+def captures() -> Captures:
+    random = np.random.default_rng(0)
+    depth = random.integers(15_000, 35_000, (OBJECTS, VIEWS, SIDE, SIDE)).astype(np.uint16)
+    pixels = random.integers(0, SIDE * SIDE, (OBJECTS, VIEWS, POINTS)).astype(np.int32)
+    seen = np.take_along_axis(depth.reshape(OBJECTS, VIEWS, -1), pixels, axis=-1)
+    pose = np.tile(np.eye(4, dtype=np.float32), (OBJECTS, VIEWS, 1, 1))
+    return Captures(
+        jnp.asarray(depth), jax.tree.map(jnp.asarray, {"pixels": pixels, "pixel_depth": seen, "pose": pose})
+    )
+
+
+@pytest.fixture(scope="module")
+def tables(networks, captures) -> ViewTable:
+    """Made as the study makes them: all views of one object in a batch."""
+
+    @jax.jit
+    def look(images, clouds):
+        logits = networks.classifier(networks.classify.inputs({networks.classify.images: images}))
+        return logits, networks.predictor(networks.predict.inputs(clouds))
+
+    random = np.random.default_rng(1)
+    seen = [look(captures.images[i], jax.tree.map(lambda leaf, i=i: leaf[i], captures.clouds)) for i in range(OBJECTS)]
+    return ViewTable(
+        jnp.stack([logits for logits, _ in seen]),
+        jnp.stack([utility for _, utility in seen]),
+        jnp.asarray(random.uniform(0, 1, (OBJECTS, VIEWS)), jnp.float32),
+        jnp.asarray(random.integers(0, CLASSES, OBJECTS), jnp.int32),
+    )
+
+
+def both_ways(networks, captures, tables, policy, threshold=None):
+    graph = ViewGraph.from_points(fibonacci_sphere(VIEWS))
+    knowledge = learn(tables.logits[:100], tables.label[:100])
+    keys = jax.random.split(jax.random.key(0), OBJECTS)
+    starts = jnp.arange(OBJECTS, dtype=jnp.int32) % VIEWS
+    scenes = jax.vmap(lambda table: table.scene(graph, knowledge))(tables)
+    walker = LiveWalker(networks, graph)
+    live = walker.walk(keys, captures, scenes, starts, policy=policy, max_views=5, threshold=threshold)
+
+    @jax.jit
+    @jax.vmap
+    def by_table(key, table, start):
+        scene = table.scene(graph, knowledge)
+        return select_from_table(key, table, scene, POLICIES[policy], start, threshold=threshold, max_views=5)
+
+    return live, by_table(keys, tables, starts)
+
+
+@pytest.mark.parametrize("policy", list(POLICIES))
+def test_live_and_table_walk_the_same_views(networks, captures, tables, policy):
+    live, stored = both_ways(networks, captures, tables, policy)
+    np.testing.assert_array_equal(live.views, stored.views)
+    np.testing.assert_allclose(live.confidences, stored.confidences, atol=1e-5)
+    assert (np.asarray(live.count) == 5).all()
+
+
+def test_live_walks_stop_when_they_are_sure(networks, captures, tables):
+    middle = float(np.median(both_ways(networks, captures, tables, "predicted_entropy")[1].confidences[:, 2]))
+    live, stored = both_ways(networks, captures, tables, "predicted_entropy", threshold=middle)
+    np.testing.assert_array_equal(live.views, stored.views)
+    assert len(set(np.asarray(live.count).tolist())) > 2
+
+
+def test_live_walks_look_at_the_images_and_clouds(networks, captures, tables):
+    """Other captures, other walks: nothing is read from the tables but what oracles are told."""
+    other = Captures(captures.images[::-1], jax.tree.map(lambda leaf: leaf[::-1], captures.clouds))
+    live, stored = both_ways(networks, other, tables, "predicted_entropy")
+    assert (np.asarray(live.views) != np.asarray(stored.views)).any(axis=1).mean() > 0.3
+    assert np.abs(np.asarray(live.confidences) - np.asarray(stored.confidences)).max() > 1e-3
