@@ -112,6 +112,8 @@ class LiveConfig:
     """of them in one batch"""
     max_views: int = 9
     """looks at each"""
+    policies: tuple[str, ...] = ()
+    """their names; all of them unless given"""
 
 
 @dataclass(frozen=True)
@@ -132,9 +134,9 @@ def compare_with_tables(
     graph: ViewGraph,
     *,
     config: LiveConfig,
-    policies: tuple[str, ...] = tuple(POLICIES),
 ) -> dict[str, Agreement]:
     """Walks the first objects of a split in both modes, object i from view i mod views, by the same keys."""
+    policies = config.policies or tuple(POLICIES)
     walker = LiveWalker(networks, graph)
     views, stacked = graph.points.shape[0], tables.stacked()
     objects, max_views = min(config.objects, len(tables.labels)), min(config.max_views, views)

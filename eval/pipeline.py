@@ -30,6 +30,7 @@ from eval.report import read_history, write_report
 from eval.study import reachable_views, run_study
 from eval.view_tables import ViewTables, compute_view_tables, load_view_tables, save_view_tables
 from mevs_jax.models import Abstraction
+from mevs_jax.policies import POLICIES
 from mevs_jax.viewpoints import ViewGraph
 from train.classifier import ClassifierConfig, ClassifierTask, ResNetConfig
 from train.entropy import EntropyConfig, EntropyTask, PointNet2Config
@@ -254,6 +255,9 @@ def evaluate(settings: Settings, out: Path) -> dict[str, Any]:
 
 def check_live(settings: Settings, out: Path) -> dict[str, Agreement]:
     """Walks test objects with the networks in the loop and compares with the tables; writes `live.json`."""
+    for policy in settings.live.policies:
+        if policy not in POLICIES:
+            raise DataError(f"unknown policy {policy!r}; it is one of {', '.join(POLICIES)}")
     statistics = load_statistics(out / "data")
     classify, predict = tasks(settings, statistics)
     networks = Networks(classify, load_best(classify, out / "classifier"), predict, load_best(predict, out / "entropy"))

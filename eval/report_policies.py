@@ -77,7 +77,10 @@ def ladder_section(inputs: ReportInputs) -> str:
                 gain, interval = (against[name][f"after_views_{key}"][step - 1] for key in ("difference", "interval"))
                 cell += "<br>" + difference(gain, interval)
             row.append(cell)
-        row.append(percent(result["area"]))
+        area = f"<b>{percent(result['area'])}</b>"
+        if name in against:
+            area += "<br>" + difference(against[name]["area_difference"], against[name]["area_interval"])
+        row.append(area)
         if reach:
             views = reach["views"][name]
             row.append("never" if views is None else f"{views:.1f}")

@@ -93,6 +93,12 @@ def _run(command: str, arguments: list[str]) -> None:
         console.print(
             f"Single views: {100 * metrics['single_view']['accuracy']:.1f} % of {metrics['objects']} test objects right"
         )
+        titles = {rung["policy"]: rung["title"] for rung in metrics["ladder"]}
+        after_two = ", ".join(
+            f"{titles[name]} {100 * metrics['policies'][name]['after_views'][1]:.1f} %"
+            for name in ("random", "predicted_entropy", "oracle_entropy", "information_gain")
+        )
+        console.print(f"After two views: {after_two}")
         console.print(f"Metrics: {out / 'metrics.json'}")
     if command == "live":
         for policy, found in pipeline.check_live(settings, out).items():

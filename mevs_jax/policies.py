@@ -121,13 +121,14 @@ def random_view(key: Array, state: SelectionState, scene: Scene) -> Float[Array,
 
 
 def random_with_repetition(key: Array, state: SelectionState, scene: Scene) -> Float[Array, "views"]:
-    """Uniform over all views, seen or not: the random baseline of the thesis's published code.
+    """Uniform over all views in reach, seen or not: the random baseline of the thesis's published code.
 
     A view seen again adds its logits again: confidence grows, evidence does not.
     """
-    del scene
-    views = state.attempted.shape[0]
-    return jnp.where(jnp.arange(views) == jax.random.randint(key, (), 0, views), jnp.inf, 0.0)
+    drawn = jax.random.uniform(key, state.attempted.shape)
+    if scene.reachable is not None:
+        drawn = jnp.where(scene.reachable, drawn, -1.0)
+    return jnp.where(drawn == jnp.max(drawn), jnp.inf, 0.0)
 
 
 def farthest_view(key: Array, state: SelectionState, scene: Scene) -> Float[Array, "views"]:

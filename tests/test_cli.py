@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import html
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -150,8 +152,20 @@ def test_the_job_leaves_a_report_and_metrics(whole):
     assert metrics["views"] == 6
     page = (whole / "report" / "index.html").read_text()
     assert "http" not in page.replace("http://www.w3.org", "").replace("https://www.w3.org", "")  # needs no other file
-    for heading in ("Choosing the next view", "Predicting depth entropy", "Training", "Data"):
-        assert f"<h2>{heading}</h2>" in page
+    headings = [line.split("</h2>")[0] for line in page.split("<h2>")[1:]]
+    assert headings == [
+        "The ladder: who chooses the next view",
+        "What the way costs",
+        "How sure it may be",
+        "The thesis's grid",
+        "What the published code changes",
+        "Predicting depth entropy",
+        "Training",
+        "Data",
+        "How this was made",
+    ]
+    for rung in metrics["ladder"]:
+        assert html.escape(rung["title"]) in page
     assert "0 objects were left out" in page
 
 
@@ -163,12 +177,40 @@ def test_a_second_run_redoes_nothing(whole):
 
 
 def test_networks_for_another_number_of_views_are_refused(whole, tmp_path):
-    import shutil
-
     assert mevs("data", "--preset", "tiny", "--views", "8", "--out", tmp_path).returncode == 0
     for name in ("classifier", "entropy"):
         shutil.copytree(whole / name, tmp_path / name)
     assert "was trained for 6 views, the data set has 8" in refused(mevs("eval", "--preset", "tiny", "--out", tmp_path))
+
+
+def test_compat_trains_the_published_codes_way_and_fills_its_rows(whole, tmp_path):
+    out = tmp_path / "run"
+    shutil.copytree(whole, out)
+    assert "mevs compat" in (out / "report" / "index.html").read_text()
+    assert mevs("compat", "--preset", "tiny", "--out", out).returncode == 0
+    made = json.loads((out / "metrics.json").read_text())["compatibility"]
+    assert all(row["difference"] is not None for row in made["rows"].values())
+    assert set(made["single_view_accuracy"]) == {"classifier", "classifier_by_view"}
+    assert "mevs compat" not in (out / "report" / "index.html").read_text()
+    before = json.loads((whole / "metrics.json").read_text())
+    assert before["compatibility"]["rows"]["text"] == made["rows"]["text"]
+
+
+def test_live_walks_what_the_tables_say(whole, tmp_path):
+    shutil.copytree(whole, tmp_path / "run")
+    arguments = ("live", "--preset", "tiny", "--live.objects", "6", "--out", tmp_path / "run", "--live.policies")
+    result = mevs(*arguments, "random", "predicted_entropy", "information_gain")
+    assert result.returncode == 0, result.stderr
+    found = json.loads((tmp_path / "run" / "live.json").read_text())
+    assert set(found) == {"random", "predicted_entropy", "information_gain"}
+    for policy, agreement in found.items():
+        assert agreement["walks"] == agreement["same"] == 6, policy
+    assert "unknown policy 'fly'" in refused(mevs(*arguments, "fly"))
+
+
+def test_a_reach_that_leaves_nothing_is_refused(whole):
+    arguments = ("eval", "--preset", "tiny", "--out", whole, "--evaluation.lowest-elevation", "89")
+    assert "viewpoints are 89° above the horizon or higher" in refused(mevs(*arguments))
 
 
 def kill_when(out: Path, ready, sign: int) -> int:

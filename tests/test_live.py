@@ -11,7 +11,7 @@ from flax import nnx
 from data_pipeline.capture import CaptureConfig
 from eval.knowledge import learn
 from eval.live import Captures, LiveWalker, Networks
-from mevs_jax import POLICIES, Abstraction, ViewGraph, ViewTable, fibonacci_sphere, select_from_table
+from mevs_jax import POLICIES, ViewGraph, ViewTable, fibonacci_sphere, select_from_table
 from train.classifier import ClassifierConfig, ClassifierTask, ResNetConfig
 from train.entropy import EntropyConfig, EntropyTask, PointNet2Config
 
@@ -19,20 +19,23 @@ OBJECTS, VIEWS, CLASSES, SIDE, POINTS = 512, 8, 4, 8, 24
 CAMERA = CaptureConfig(views=VIEWS, resolution=SIDE)
 
 
+class Flat(nnx.Module):
+    """One layer over everything, whatever its shape: compiled in no time, and every pixel or point counts."""
+
+    def __init__(self, inputs: int, outputs: int, scale: float, seed: int):
+        self.layer = nnx.Linear(inputs, outputs, rngs=nnx.Rngs(seed))
+        self.scale = scale
+
+    def __call__(self, batch: jax.Array) -> jax.Array:
+        return self.scale * self.layer(batch.reshape(batch.shape[0], -1))
+
+
 @pytest.fixture(scope="module")
 def networks() -> Networks:
-    classify = ClassifierTask.of(ClassifierConfig(network=ResNetConfig(width=4, channels=1)), CLASSES, CAMERA)
-    shape = PointNet2Config(
-        points=POINTS,
-        abstractions=(Abstraction(centres=8, radius=0.5, samples=4, layers=(8,)),),
-        global_layers=(16,),
-        head_layers=(16,),
-    )
-    predict = EntropyTask.of(EntropyConfig(network=shape), VIEWS, 5.0, CAMERA)
-    classifier = classify.network(nnx.Rngs(0))
-    # Untrained, it would say nearly the same of every view, and rounding would choose.
-    classifier.head.kernel[...] = 40 * classifier.head.kernel[...]
-    return Networks(classify, classifier, predict, predict.network(nnx.Rngs(1)))
+    classify = ClassifierTask.of(ClassifierConfig(network=ResNetConfig(channels=1)), CLASSES, CAMERA)
+    predict = EntropyTask.of(EntropyConfig(network=PointNet2Config(points=POINTS)), VIEWS, 5.0, CAMERA)
+    # Scaled up: untrained, it would say nearly the same of every view, and rounding would choose.
+    return Networks(classify, Flat(SIDE * SIDE, CLASSES, 5.0, 0), predict, Flat(3 * POINTS, VIEWS, 1.0, 1))
 
 
 @pytest.fixture(scope="module")
@@ -51,16 +54,15 @@ def captures() -> Captures:
 def tables(networks, captures) -> ViewTable:
     """Made as the study makes them: all views of one object in a batch."""
 
-    @jax.jit
-    def look(images, clouds):
-        logits = networks.classifier(networks.classify.inputs({networks.classify.images: images}))
-        return logits, networks.predictor(networks.predict.inputs(clouds))
+    def look(captured: Captures):
+        logits = networks.classifier(networks.classify.inputs({networks.classify.images: captured.images}))
+        return logits, networks.predictor(networks.predict.inputs(captured.clouds))
 
     random = np.random.default_rng(1)
-    seen = [look(captures.images[i], jax.tree.map(lambda leaf, i=i: leaf[i], captures.clouds)) for i in range(OBJECTS)]
+    logits, utility = jax.jit(lambda captures: jax.lax.map(look, captures))(captures)
     return ViewTable(
-        jnp.stack([logits for logits, _ in seen]),
-        jnp.stack([utility for _, utility in seen]),
+        logits,
+        utility,
         jnp.asarray(random.uniform(0, 1, (OBJECTS, VIEWS)), jnp.float32),
         jnp.asarray(random.integers(0, CLASSES, OBJECTS), jnp.int32),
     )
