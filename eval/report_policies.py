@@ -110,7 +110,7 @@ def ladder_section(inputs: ReportInputs) -> str:
         + f"<p class='note'>Random without repetition is an exact expectation up to {exact} views"
         + ("" if exact >= len(policies["random"]["after_views"]) else f", beyond that a mean over {draws(metrics)}")
         + ". The label oracles are optimistic: they find views that are right by luck. If two views could be had anywhere and "
-        f"the label were known, {percent(metrics['best_pair']['best_pair_right'])} % "
+        f"the label were known, {percent(metrics['best_pair']['accuracy'])} % "
         f"[{span(metrics['best_pair']['interval'])}] would be right.</p>"
         + image(
             figures.ladder_gains(against, metrics["ladder"], _steps(metrics, (2, 4)), ("label_oracle", "pair_oracle")),
