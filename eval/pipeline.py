@@ -22,7 +22,7 @@ from data_pipeline.capture import CaptureConfig
 from data_pipeline.files import read_json, write_json
 from data_pipeline.meshes import DataError
 from data_pipeline.progress import console
-from eval.grid import GridConfig
+from eval.grid import FIRST_MV, GridConfig
 from eval.knowledge import learn
 from eval.live import Agreement, LiveConfig, Networks, compare_with_tables
 from eval.page import ReportInputs
@@ -229,6 +229,8 @@ def evaluate(settings: Settings, out: Path) -> dict[str, Any]:
         by_view_made_by = _made_by(out, statistics, (BY_VIEW, "entropy"))
     identity = {"evaluation": asdict(settings.evaluation), "made_by": made_by, "by_view": by_view_made_by}
     identity = json.loads(json.dumps(identity))
+    if settings.evaluation.max_views < FIRST_MV or settings.evaluation.draws < 1:
+        raise DataError("--evaluation.max-views must be at least 2 and --evaluation.draws at least 1")
     path = out / "metrics.json"
     if path.exists() and (metrics := read_json(path))["identity"] == identity:
         return metrics

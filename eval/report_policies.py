@@ -83,7 +83,8 @@ def ladder_section(inputs: ReportInputs) -> str:
         row.append(area)
         if reach:
             views = reach["views"][name]
-            row.append("never" if views is None else f"{views:.1f}")
+            low, high = ("∞" if end is None else f"{end:.1f}" for end in reach["interval"][name])
+            row.append(("never" if views is None else f"<b>{views:.1f}</b>") + f"<br><small>[{low}, {high}]</small>")
         rows.append(row)
         every = _steps(metrics, range(1, 10))
         details.append(

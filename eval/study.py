@@ -129,6 +129,12 @@ def exactly_random(
     )
 
 
+def accuracy_by_way(results: Results) -> dict[str, list[float]]:
+    """Mean accuracy and mean way after each number of views."""
+    _, _, after, travelled = cells(results)
+    return {"after_views": after.mean(axis=-1).tolist(), "travelled": travelled.mean(axis=-1).tolist()}
+
+
 def reachable_views(viewpoints: np.ndarray, lowest_elevation: float) -> np.ndarray:
     """Which viewpoints are at least so many degrees above the horizon, (views,) bool.
 
@@ -206,19 +212,12 @@ def run_study(
         for name in CONFIDENCE_OF
     }
 
+    movement: dict[str, list[dict[str, Any]]] = {name: [] for name in MOVING}
     moving = tuple(rung for rung in rungs if rung.policy in MOVING)
-    movement: dict[str, Any] = {rung.policy: [] for rung in moving}
     for cost in MOVEMENT_COSTS:
         priced = _walk(tables, moving, graph, knowledge, config, reachable=reachable, movement_cost=jnp.float32(cost))
         for name, result in priced.items():
-            _, _, after, travelled = cells(result)
-            movement[name].append(
-                {
-                    "cost": cost,
-                    "after_views": after.mean(axis=-1).tolist(),
-                    "travelled": travelled.mean(axis=-1).tolist(),
-                }
-            )
+            movement[name].append({"cost": cost} | accuracy_by_way(result))
 
     other = None
     if by_view is not None:
