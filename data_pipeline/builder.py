@@ -28,7 +28,7 @@ from data_pipeline.files import read_json, write_json
 from data_pipeline.meshes import SOURCE_SPLITS, DataError, ObjectEntry, ObjectSource, open_source
 from data_pipeline.progress import console, progress_bar
 from mevs_jax.entropy import level_entropy
-from mevs_jax.viewpoints import fibonacci_sphere
+from mevs_jax.viewpoints import viewpoint_lattice
 
 SPLITS = ("train", "val", "test")
 _SUMMARY = "summary.json"
@@ -285,7 +285,7 @@ def _write_shards(
         classes=list(source.classes),
         counts=counts,
         left_out=left_out,
-        viewpoints=fibonacci_sphere(config.capture.views, config.capture.lattice).tolist(),
+        viewpoints=viewpoint_lattice(config.capture.views, config.capture.lattice).tolist(),
         capture=asdict(config.capture),
         source=source.name,
     )
@@ -301,6 +301,10 @@ def prepare(config: DataConfig, folder: Path) -> DatasetStatistics:
     """
     if config.capture.views < 2:
         raise DataError(f"--views {config.capture.views} is too few: choosing a next view takes at least 2 viewpoints")
+    try:
+        viewpoint_lattice(config.capture.views, config.capture.lattice)
+    except ValueError as error:
+        raise DataError(f"{error}; choose another --views or --dataset.capture.lattice") from error
     identity = asdict(config)
     made_with = folder / "config.json"
     if made_with.exists() and read_json(made_with) != identity:

@@ -37,8 +37,19 @@ class CaptureConfig:
 
     views: int = 40
     """number of candidate viewpoints, at least 2"""
-    lattice: Literal["golden_angle", "equation8"] = "golden_angle"
-    """which Fibonacci lattice they form: the thesis's published code, or its eq. (8)"""
+    lattice: Literal[
+        "golden_angle",
+        "equation8",
+        "nested",
+        "rings",
+        "tetrahedron",
+        "octahedron",
+        "cube",
+        "icosahedron",
+        "dodecahedron",
+    ] = "golden_angle"
+    """how they stand: Fibonacci of the thesis's published code or of its eq. (8), nested (the 10 are among the 40), five
+    rings, or the corners of a Platonic solid"""
     resolution: int = 224
     """pixels along each side of a view"""
     distance: float = 2.0
@@ -80,10 +91,10 @@ def rig_for(config: CaptureConfig) -> Rig:
     import jax
 
     from mevs_jax.cameras import cameras_at, pixel_directions
-    from mevs_jax.viewpoints import fibonacci_sphere
+    from mevs_jax.viewpoints import viewpoint_lattice
 
     cameras = cameras_at(
-        fibonacci_sphere(config.views, config.lattice).astype(np.float32),
+        viewpoint_lattice(config.views, config.lattice).astype(np.float32),
         distance=config.distance,
         resolution=config.resolution,
         field_of_view=np.deg2rad(config.field_of_view),

@@ -47,9 +47,10 @@ def _data_section(inputs: ReportInputs) -> str:
         for name, why in by_name.items()
     ]
     return (
-        f"<h2>Data</h2><p>{html.escape(statistics.source)}: {statistics.views} views of each object on a Fibonacci "
-        f"sphere ({camera.lattice}), {camera.resolution}×{camera.resolution} pixels, {camera.field_of_view:g}° field of view "
-        f"from {camera.distance:g} radii away. Points seen per view: {statistics.points_mean:,.0f} ± "
+        f"<h2>Data</h2><p>{html.escape(statistics.source)}: {statistics.views} views of each object (lattice "
+        f"<code>{camera.lattice}</code>), {camera.resolution}×{camera.resolution} pixels, "
+        f"{camera.field_of_view:g}° field of view from {camera.distance:g} radii away. "
+        f"Points seen per view: {statistics.points_mean:,.0f} ± "
         f"{statistics.points_std:,.0f}. "
         f"Entropies are normalised by the training split's largest, {statistics.entropy_max:.2f} bits.</p>"
         + table(["class", "train", "val", "test"], [*rows, ["<b>all</b>", *totals]])

@@ -42,7 +42,15 @@ from mevs_jax.selection import (
     select_views,
     stop_at,
 )
-from mevs_jax.viewpoints import ViewGraph, fibonacci_sphere, local_maxima
+from mevs_jax.viewpoints import (
+    ViewGraph,
+    fibonacci_sphere,
+    local_maxima,
+    nested_lattice,
+    platonic_solid,
+    ring_lattice,
+    viewpoint_lattice,
+)
 
 __version__ = "0.1.0"
 
@@ -86,17 +94,21 @@ __all__ = [
     "mean_of_probabilities",
     "mean_squared_error",
     "negative_log_likelihood",
+    "nested_lattice",
     "partial_cloud",
     "pixel_directions",
+    "platonic_solid",
     "pointnet2_from_torch",
     "quantise_depth",
     "reliability",
     "resnet_from_torch",
+    "ring_lattice",
     "select_from_table",
     "select_views",
     "shannon_entropy",
     "stop_at",
     "sum_of_logits",
     "unproject",
+    "viewpoint_lattice",
     "with_movement",
 ]

@@ -1,11 +1,13 @@
 """Where the camera can stand: points on the unit sphere and the graph of neighbours between them.
 
 The order of the points is canonical: the thesis's networks predict view `i` at output `i`. Source: thesis §4.1, eq. (8) and
-its published code, which differ; the code's lattice is the default here because the thesis's results were made with it.
+its published code, which differ; the code's lattice is the default here because the thesis's results were made with it. Others
+use Platonic solids (RotationNet, view-GCN) or rings (MORE), and a nested lattice lets few views be compared with many.
 """
 
 from __future__ import annotations
 
+from itertools import product
 from typing import Literal
 
 import flax.struct
@@ -16,10 +18,24 @@ from scipy.spatial import ConvexHull
 
 from mevs_jax.arrays import AnyArray
 
-Lattice = Literal["golden_angle", "equation8"]
+Lattice = Literal[
+    "golden_angle",
+    "equation8",
+    "nested",
+    "rings",
+    "tetrahedron",
+    "octahedron",
+    "cube",
+    "icosahedron",
+    "dodecahedron",
+]
+SOLIDS = {"tetrahedron": 4, "octahedron": 6, "cube": 8, "icosahedron": 12, "dodecahedron": 20}
+"""The Platonic solids, by number of corners."""
+RINGS = 5
+"""Rings of the lattice `rings`, as in MORE (Parisotto, Mukhopadhyay and Kasaei, 2021): 12 views on each of 5."""
 
 
-def fibonacci_sphere(n: int, variant: Lattice = "golden_angle") -> Float[np.ndarray, "{n} 3"]:
+def fibonacci_sphere(n: int, variant: str = "golden_angle") -> Float[np.ndarray, "{n} 3"]:
     """`n` evenly spread unit vectors.
 
     Args:
@@ -44,6 +60,86 @@ def fibonacci_sphere(n: int, variant: Lattice = "golden_angle") -> Float[np.ndar
         ring = np.sqrt(np.maximum(1 - height**2, 0))
         return np.stack([ring * np.cos(angle), ring * np.sin(angle), height], axis=1)
     raise ValueError(f"unknown lattice {variant!r}: it is 'golden_angle' or 'equation8'")
+
+
+def platonic_solid(name: str) -> Float[np.ndarray, "corners 3"]:
+    """Corners of a Platonic solid as unit vectors, sorted by height and then by longitude.
+
+    Raises:
+        ValueError: for another name than those in `SOLIDS`.
+    """
+    golden = (1 + np.sqrt(5)) / 2
+    signs = np.array(list(product((1, -1), repeat=3)), float)
+    turns = [np.roll(np.arange(3), shift) for shift in range(3)]
+    if name == "tetrahedron":
+        corners = signs[signs.prod(axis=1) > 0]
+    elif name == "octahedron":
+        corners = np.concatenate([np.eye(3), -np.eye(3)])
+    elif name == "cube":
+        corners = signs
+    elif name in ("icosahedron", "dodecahedron"):
+        # (0, ±1, ±φ) and its turns; of the dodecahedron (0, ±1/φ, ±φ) and the cube besides.
+        flat = np.array([[0, a, b] for a, b in product((1, -1), repeat=2)], float)
+        lengths = [0, 1, golden] if name == "icosahedron" else [0, 1 / golden, golden]
+        corners = np.concatenate([(flat * lengths)[:, turn] for turn in turns])
+        if name == "dodecahedron":
+            corners = np.concatenate([corners, signs])
+    else:
+        raise ValueError(f"unknown solid {name!r}: it is one of {', '.join(SOLIDS)}")
+    corners = corners / np.linalg.norm(corners, axis=1, keepdims=True)
+    longitude = np.arctan2(corners[:, 1], corners[:, 0])
+    return corners[np.lexsort((longitude.round(9), -corners[:, 2].round(9)))]
+
+
+def ring_lattice(n: int) -> Float[np.ndarray, "{n} 3"]:
+    """`n` views on five rings of equal elevation steps, 60° to −60°, as in MORE; from the top ring down, eastwards.
+
+    Raises:
+        ValueError: where `n` is no multiple of five, or leaves fewer than two views to a ring.
+    """
+    if n % RINGS or n < 2 * RINGS:
+        raise ValueError(f"rings take a multiple of {RINGS} viewpoints, at least {2 * RINGS}, got {n}")
+    elevation = np.pi / 2 - np.pi * np.arange(1, RINGS + 1) / (RINGS + 1)
+    longitude = 2 * np.pi * np.arange(n // RINGS) / (n // RINGS)
+    elevation, longitude = (angle.reshape(-1) for angle in np.meshgrid(elevation, longitude, indexing="ij"))
+    ring = np.cos(elevation)
+    return np.stack([ring * np.cos(longitude), ring * np.sin(longitude), np.sin(elevation)], axis=1)
+
+
+def nested_lattice(n: int) -> Float[np.ndarray, "{n} 3"]:
+    """The first `n` points of one endless sequence, so that the 10 views are among the 40 (the thesis's are not).
+
+    Always the point of a dense Fibonacci sphere that is farthest from those before, starting at its top: the nearest two of the
+    first n are never closer than half of what n points could be apart (Gonzalez 1985).
+
+    Raises:
+        ValueError: for fewer than 2 points, or too many for the dense sphere.
+    """
+    dense = fibonacci_sphere(2000, "equation8")
+    if not 2 <= n <= len(dense) // 4:
+        raise ValueError(f"a nested lattice has between 2 and {len(dense) // 4} viewpoints, got {n}")
+    chosen, nearest = [0], np.full(len(dense), np.inf)
+    while len(chosen) < n:
+        nearest = np.minimum(nearest, np.linalg.norm(dense - dense[chosen[-1]], axis=1))
+        chosen.append(int(nearest.round(12).argmax()))
+    return dense[chosen]
+
+
+def viewpoint_lattice(n: int, lattice: Lattice = "golden_angle") -> Float[np.ndarray, "{n} 3"]:
+    """`n` viewpoints of the kind asked for, unit vectors.
+
+    Raises:
+        ValueError: for a number that the lattice cannot have, or an unknown lattice.
+    """
+    if lattice in SOLIDS:
+        if n != SOLIDS[lattice]:
+            raise ValueError(f"lattice {lattice} has {SOLIDS[lattice]} viewpoints, not {n}")
+        return platonic_solid(lattice)
+    if lattice == "rings":
+        return ring_lattice(n)
+    if lattice == "nested":
+        return nested_lattice(n)
+    return fibonacci_sphere(n, lattice)
 
 
 @flax.struct.dataclass

@@ -3,11 +3,22 @@
 from __future__ import annotations
 
 import json
+from typing import get_args, get_type_hints
 
 import numpy as np
 import pytest
 
-from mevs_jax import ViewGraph, fibonacci_sphere, local_maxima
+from data_pipeline.capture import CaptureConfig
+from mevs_jax import (
+    ViewGraph,
+    fibonacci_sphere,
+    local_maxima,
+    nested_lattice,
+    platonic_solid,
+    ring_lattice,
+    viewpoint_lattice,
+)
+from mevs_jax.viewpoints import SOLIDS, Lattice
 from tests.reference import numpy_rules
 
 # The spherical Delaunay graph of the published 10-view lattice, checked by hand against the hull's 3n − 6 = 24 edges.
@@ -64,6 +75,63 @@ def test_equation_8_is_the_formula_of_the_text():
         theta, phi = np.arccos(2 * x - 1) - np.pi / 2, 2 * np.pi * y
         expected = [np.cos(theta) * np.cos(phi), np.cos(theta) * np.sin(phi), np.sin(theta)]
         np.testing.assert_allclose(point, expected, atol=1e-12)
+
+
+@pytest.mark.parametrize(("name", "edge_count"), [("tetrahedron", 6), ("octahedron", 12), ("icosahedron", 30)])
+def test_solids_of_triangles_have_their_own_edges(name, edge_count):
+    graph = ViewGraph.from_points(platonic_solid(name))
+    assert len(edges_of(graph)) == edge_count
+    assert len(set(np.asarray(graph.neighbours).sum(axis=1))) == 1
+
+
+@pytest.mark.parametrize("name", list(SOLIDS))
+def test_solids_look_the_same_from_every_corner(name):
+    corners = platonic_solid(name)
+    assert corners.shape == (SOLIDS[name], 3)
+    np.testing.assert_allclose(np.linalg.norm(corners, axis=1), 1, atol=1e-12)
+    distances = np.sort(np.linalg.norm(corners[:, None] - corners[None], axis=-1), axis=1)
+    np.testing.assert_allclose(distances, np.tile(distances[:1], (len(corners), 1)), atol=1e-9)
+    assert (np.diff(corners[:, 2]) <= 1e-9).all()
+    graph = ViewGraph.from_points(corners)
+    assert len(edges_of(graph)) == 3 * len(corners) - 6  # flat faces are cut into triangles
+
+
+def test_rings_are_level_and_evenly_spaced():
+    points = ring_lattice(60).reshape(5, 12, 3)
+    np.testing.assert_allclose(
+        np.degrees(np.arcsin(points[:, :, 2])), np.tile([[60], [30], [0], [-30], [-60]], 12), atol=1e-9
+    )
+    turn = np.degrees(np.arctan2(points[:, :, 1], points[:, :, 0])) % 360
+    np.testing.assert_allclose(turn, np.tile(30 * np.arange(12), (5, 1)), atol=1e-9)
+
+
+def test_nested_lattices_are_each_others_beginnings_and_well_spread():
+    forty = nested_lattice(40)
+    for count in (2, 10, 25):
+        np.testing.assert_array_equal(nested_lattice(count), forty[:count])
+    for count in (10, 40):
+        nearest, even = (
+            (np.linalg.norm(points[:, None] - points[None], axis=-1) + 10 * np.eye(count)).min()
+            for points in (forty[:count], fibonacci_sphere(count))
+        )
+        assert nearest > 0.8 * even
+
+
+@pytest.mark.parametrize(
+    ("count", "lattice", "message"),
+    [
+        (10, "cube", "8 viewpoints, not 10"),
+        (12, "rings", "multiple of 5"),
+        (1, "nested", "between 2"),
+    ],
+)
+def test_impossible_lattices_are_described(count, lattice, message):
+    with pytest.raises(ValueError, match=message):
+        viewpoint_lattice(count, lattice)
+
+
+def test_the_capture_settings_offer_every_lattice():
+    assert get_args(get_type_hints(CaptureConfig)["lattice"]) == get_args(Lattice)
 
 
 def test_the_10_view_graph():
