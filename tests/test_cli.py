@@ -211,7 +211,7 @@ def test_live_walks_what_the_tables_say(whole, tmp_path):
 def test_a_reach_that_leaves_nothing_is_refused(whole):
     arguments = ("eval", "--preset", "tiny", "--out", whole, "--evaluation.lowest-elevation", "89")
     assert "viewpoints are 89° above the horizon or higher" in refused(mevs(*arguments))
-    assert "must be at least 2" in refused(mevs(*arguments[:4], "--evaluation.max-views", "1"))
+    assert "must be at least 2" in refused(mevs(*arguments[:5], "--evaluation.max-views", "1"))
 
 
 def kill_when(out: Path, ready, sign: int) -> int:
