@@ -279,8 +279,7 @@ def test_95_percent_intervals_cover_the_truth_95_times_in_100(graph):
     for values in (gain, np.asarray(results["farthest"].after[0, :, 2])):
         drawn = jnp.asarray(values[random.integers(0, population, (1000, sample))])
         keys = jax.random.split(jax.random.key(0), 1000)
-        one = partial(bootstrap_interval, resamples=600)
-        interval = jax.jit(lambda keys, drawn: jax.lax.map(lambda item: one(*item), (keys, drawn)))
+        interval = jax.jit(jax.vmap(partial(bootstrap_interval, resamples=600)))
         low, high = np.asarray(interval(keys, drawn)).T
         assert 0.93 <= np.mean((low <= values.mean()) & (values.mean() <= high)) <= 0.97
 
