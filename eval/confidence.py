@@ -1,4 +1,4 @@
-"""How sure the fused belief may be: four ways to read it, how well each is calibrated, and stopping by calibrated risk.
+"""How sure the fused belief may be: five ways to read it, how well each is calibrated, and stopping by calibrated risk.
 
 Everything that is fitted is fitted on walks over validation objects, for each policy its own: a policy that picks telling views
 makes beliefs of another kind than one that draws.

@@ -27,7 +27,7 @@ def confidence(belief: Float[Array, "classes"]) -> Float[Array, ""]:
 
 
 def running_sum(values: Float[Array, "steps *rest"]) -> Float[Array, "steps *rest"]:
-    """Cumulative sum over a few steps, written out: XLA's own is quadratic in the steps on CPUs, and fuses with nothing."""
+    """Cumulative sum over a few steps, one after the other like the selection loop, so that no rounding differs from it."""
     sums = [values[0]]
     for step in range(1, values.shape[0]):
         sums.append(sums[-1] + values[step])
