@@ -6,6 +6,7 @@ Heavy imports wait until a command needs them, so that `mevs --help` answers at 
 from __future__ import annotations
 
 import os
+import signal
 import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -110,6 +111,12 @@ def _run(command: str, arguments: list[str]) -> None:
         console.print(f"Report: {pipeline.report(settings, preset, out).absolute()}")
 
 
+def _interrupt(signum: int, frame: object) -> None:
+    """Ends the job, and tries again in a second: Python loses an interrupt that falls into a finaliser or a GC callback."""
+    signal.setitimer(signal.ITIMER_REAL, 1.0)
+    raise KeyboardInterrupt
+
+
 def main() -> None:
     """The program `mevs`: exit code 0, 2 for input that cannot be used, 130 when interrupted."""
     arguments = sys.argv[1:]
@@ -127,12 +134,17 @@ def main() -> None:
     os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "2")
     from data_pipeline.meshes import DataError
 
+    if hasattr(signal, "setitimer"):
+        signal.signal(signal.SIGINT, _interrupt)
+        signal.signal(signal.SIGALRM, _interrupt)
     try:
         _run(arguments[0], arguments[1:])
     except DataError as error:
         print(f"mevs: {error}", file=sys.stderr)
         sys.exit(2)
     except KeyboardInterrupt:
+        if hasattr(signal, "setitimer"):
+            signal.setitimer(signal.ITIMER_REAL, 0)
         print("mevs: interrupted; the same command goes on where it stopped", file=sys.stderr)
         sys.exit(130)
 

@@ -214,6 +214,30 @@ def test_a_reach_that_leaves_nothing_is_refused(whole):
     assert "must be at least 2" in refused(mevs(*arguments[:5], "--evaluation.max-views", "1"))
 
 
+def test_an_interrupt_that_is_lost_is_given_again():
+    """Python ignores an interrupt that falls into a finaliser; here one does."""
+    script = """
+import os, signal, sys, time
+from mevs_jax import cli
+
+class Loses:
+    def __del__(self):
+        os.kill(os.getpid(), signal.SIGINT)
+        time.sleep(0.1)
+
+def job(*arguments):
+    Loses()
+    time.sleep(30)
+
+cli._run, sys.argv = job, ["mevs", "run"]
+cli.main()
+"""
+    result = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, timeout=25)
+    assert result.returncode == 130
+    assert "Exception ignored" in result.stderr
+    assert "mevs: interrupted" in result.stderr
+
+
 def kill_when(out: Path, ready, sign: int) -> int:
     """Starts the job, ends it once `ready(out)`, and returns its exit code."""
     process = subprocess.Popen(
