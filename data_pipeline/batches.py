@@ -125,9 +125,13 @@ class _TrainingObjects:
         return example | {"trainable": views}
 
 
+def training_splits(config: ViewBatches) -> tuple[str, ...]:
+    """The splits whose objects are trained on."""
+    return ("train",) if config.validation_by == "object" else ("train", "val")
+
+
 def _training_objects(folder: Path, config: ViewBatches) -> _TrainingObjects:
-    splits = ("train",) if config.validation_by == "object" else ("train", "val")
-    return _TrainingObjects([open_split(folder, split) for split in splits], config)
+    return _TrainingObjects([open_split(folder, split) for split in training_splits(config)], config)
 
 
 def validation_batches(folder: Path, config: ViewBatches, views: int) -> Iterator[dict[str, np.ndarray]]:

@@ -59,15 +59,23 @@ def _fit(logits: Array, labels: Array) -> dict[str, Array]:
     }
 
 
-@partial(jax.jit, static_argnames="reading")
-def _read(logits: Array, labels: Array, temperatures: dict[str, Array], reading: str) -> dict[str, Array]:
+@jax.jit
+def _mixed(logits: Array) -> Array:
+    """Log-probabilities of the mean of probabilities along walks (objects, starts, steps, classes)."""
+    return jax.vmap(jax.vmap(mean_of_probabilities))(logits)
+
+
+@jax.jit
+def _discounted(logits: Array, temperatures: Array) -> Array:
+    """Log-probabilities of all other readings, which differ in their temperatures (steps,) alone."""
+    return jax.vmap(jax.vmap(lambda walk: discounted(beliefs_along(walk), temperatures)))(logits)
+
+
+@jax.jit
+def _score(log_probabilities: Array, labels: Array) -> dict[str, Array]:
     """Calibration and, for every walk, confidence and correctness after each number of views."""
-    objects, starts, steps, classes = logits.shape
-    flat, truth = logits.reshape(-1, steps, classes), jnp.repeat(labels, starts)
-    if reading == "mean_of_probabilities":
-        log_probabilities = jax.vmap(mean_of_probabilities)(flat)
-    else:
-        log_probabilities = jax.vmap(discounted, (0, None))(jax.vmap(beliefs_along)(flat), temperatures[reading])
+    objects, starts, steps, classes = log_probabilities.shape
+    log_probabilities, truth = log_probabilities.reshape(-1, steps, classes), jnp.repeat(labels, starts)
     confidence = jnp.exp(jnp.max(log_probabilities, axis=-1))
     right = jnp.argmax(log_probabilities, axis=-1) == truth[:, None]
     return {
@@ -120,8 +128,9 @@ def confidence_of(
     temperatures = _fit(fitting, jnp.asarray(validation_labels))
     out: dict[str, Any] = {"readings": {}}
     for reading in READINGS:
-        on_validation = _read(fitting, jnp.asarray(validation_labels), temperatures, reading)
-        on_test = _read(testing, jnp.asarray(labels), temperatures, reading)
+        read = partial(_discounted, temperatures=temperatures[reading]) if reading in temperatures else _mixed
+        on_validation = _score(read(fitting), jnp.asarray(validation_labels))
+        on_test = _score(read(testing), jnp.asarray(labels))
         out["readings"][reading] = {
             "accuracy": np.asarray(on_test["accuracy"]).tolist(),
             "ece": np.asarray(on_test["ece"]).tolist(),

@@ -17,6 +17,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
+from mevs_jax.metrics import is_right
+
 LARGEST = 12_000
 """The most subsets that are worth going through for an object."""
 
@@ -59,7 +61,6 @@ def expected_of_object(
 ) -> tuple[Float[Array, "sizes CT"], Float[Array, "sizes CT"], Float[Array, "sizes"]]:
     """One object: probability of ending right and views used, by limit on views and threshold; and right after so many."""
     levels = jnp.array(thresholds)
-    before = jnp.arange(logits.shape[1]) < label
     belief = jnp.zeros((1, logits.shape[1]))
     walking = jnp.ones((1, len(thresholds)))  # probability that a walk has come by here and goes on
     settled, used = jnp.zeros(len(thresholds)), jnp.zeros(len(thresholds))
@@ -67,8 +68,7 @@ def expected_of_object(
     for size, subsets in enumerate(sizes, start=1):
         reached = jnp.sum(walking[subsets.without], axis=1) / (candidates - size + 1)
         belief = belief[subsets.without[:, -1]] + logits[subsets.members[:, -1]]
-        own = belief[:, label, None]
-        right = jnp.all(jnp.where(before, belief < own, belief <= own), axis=1).astype(jnp.float32)
+        right = is_right(belief, label, axis=1).astype(jnp.float32)
         stops = jnp.max(jax.nn.softmax(belief), axis=1)[:, None] >= levels
         used += jnp.sum(reached, axis=0)
         cells.append(settled + right @ reached)

@@ -22,6 +22,7 @@ from jax.sharding import Mesh, PartitionSpec
 from jaxtyping import Array, Bool, Float, Int
 
 from eval.ladder import Rung
+from mevs_jax.metrics import is_right
 from mevs_jax.policies import POLICIES, Knowledge, with_movement
 from mevs_jax.selection import ViewTable, select_from_table
 from mevs_jax.viewpoints import ViewGraph
@@ -54,7 +55,7 @@ class Results:
         used: the same shape, views used.
         after: (backbones, objects, steps) share right after exactly 1, 2, … views, never stopping.
         travelled: the same shape, great-circle way in radians.
-        views: (backbones, objects, starts, draws, steps) where the walks went, −1 beyond their end; the first draws only.
+        views: (backbones, objects, starts, draws, steps) where the walks went, −1 beyond their end; the first draw only.
     """
 
     right: Float[Array, "*batch MV CT"]
@@ -80,7 +81,6 @@ def read_object(
         weights: of the walks; they sum to 1.
     """
     thresholds = jnp.array(THRESHOLDS)[:, None]
-    before = (jnp.arange(logits.shape[1]) < label)[:, None]
     none = jnp.zeros(views.shape[1])
     nothing = jnp.zeros((len(THRESHOLDS), views.shape[1]))
 
@@ -93,8 +93,7 @@ def read_object(
         belief += jnp.where(valid, logits.T[:, view], 0.0)
         way += jnp.where(valid, distances[previous, view], 0.0)
         used += walking * valid
-        own = belief[label]
-        right = jnp.all(jnp.where(before, belief < own, belief <= own), axis=0)  # argmax: lowest index among equals
+        right = is_right(belief, label, axis=0)
         confidence = 1 / jnp.sum(jnp.exp(belief - jnp.max(belief, axis=0)), axis=0)
         seen = (settled + walking * right) @ weights, used @ weights, right @ weights, way @ weights
         stops = walking * (confidence >= thresholds)
@@ -106,7 +105,7 @@ def read_object(
     return right[FIRST_MV - 1 :], used[FIRST_MV - 1 :], after, travelled
 
 
-@partial(jax.jit, static_argnames=("rungs", "max_views", "keep_draws"))
+@partial(jax.jit, static_argnames=("rungs", "max_views"))
 def run_grid(
     key: Array,
     tables: ViewTable,
@@ -117,7 +116,6 @@ def run_grid(
     max_views: int,
     reachable: Bool[Array, "views"] | None = None,
     movement_cost: Float[Array, ""] | float | None = None,
-    keep_draws: int = 1,
 ) -> dict[str, Results]:
     """Walks every object from every start by every policy and reads the whole grid.
 
@@ -130,7 +128,6 @@ def run_grid(
         max_views: the largest MV.
         reachable: where the camera can go, and start; None for everywhere.
         movement_cost: taken off the policies' scores per radian of the way.
-        keep_draws: how many draws' views are handed back.
 
     Returns:
         Results by policy. Starts out of reach weigh nothing.
@@ -165,7 +162,7 @@ def run_grid(
                 table.logits, table.label, graph.distances, steps_first, start_weight.repeat(rung.draws) / rung.draws
             )
             small = jnp.int8 if starts < 128 else jnp.int16
-            return Results(*found, views[:, :, :keep_draws].astype(small))
+            return Results(*found, views[:, :, :1].astype(small))
 
         at_once = max(1, min(256, _WALKS_AT_ONCE // (starts * rung.draws)))
         at_once = min(at_once, -(-objects // len(devices)))

@@ -185,12 +185,9 @@ BY_VIEW = "classifier_by_view"
 def train_by_view(settings: Settings, out: Path) -> None:
     """Trains the classifier once more, validated by view as in the thesis's published code, for the compatibility table."""
     statistics = load_statistics(out / "data")
-    fit(_by_view_task(settings, statistics), out / "data", statistics, out / BY_VIEW)
-
-
-def _by_view_task(settings: Settings, statistics: DatasetStatistics) -> ClassifierTask:
     classify, _ = tasks(settings, statistics)
-    return replace(classify, optimiser=replace(classify.optimiser, validation_by="view"))
+    by_view = replace(classify, optimiser=replace(classify.optimiser, validation_by="view"))
+    fit(by_view, out / "data", statistics, out / BY_VIEW)
 
 
 def _made_by(out: Path, statistics: DatasetStatistics, networks: tuple[str, str]) -> str:

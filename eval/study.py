@@ -29,7 +29,7 @@ BASELINE = "random"
 CONFIDENCE_OF = ("random", "predicted_entropy", "information_gain")
 """Whose confidence is looked into."""
 MOVING = ("predicted_entropy", "information_gain")
-MOVEMENT_COSTS = (0.0, 0.02, 0.05, 0.1, 0.2, 0.5)
+MOVEMENT_COSTS = (0.02, 0.05, 0.1, 0.2, 0.5)
 """In units of the policy's score (normalised entropy, nats) per radian of the way."""
 
 
@@ -212,7 +212,9 @@ def run_study(
         for name in CONFIDENCE_OF
     }
 
-    movement: dict[str, list[dict[str, Any]]] = {name: [] for name in MOVING}
+    movement: dict[str, list[dict[str, Any]]] = {
+        name: [{"cost": 0.0} | accuracy_by_way(results[name])] for name in MOVING
+    }
     moving = tuple(rung for rung in rungs if rung.policy in MOVING)
     for cost in MOVEMENT_COSTS:
         priced = _walk(tables, moving, graph, knowledge, config, reachable=reachable, movement_cost=jnp.float32(cost))

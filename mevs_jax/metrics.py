@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from mevs_jax.arrays import AnyArray
 
@@ -34,6 +34,14 @@ def class_accuracy(confusion: Float[AnyArray, "classes classes"]) -> Float[Array
     total = jnp.sum(confusion, axis=1)
     recall = jnp.diag(confusion) / jnp.maximum(total, 1e-12)
     return jnp.sum(jnp.where(total > 0, recall, 0)) / jnp.maximum(jnp.sum(total > 0), 1)
+
+
+def is_right(beliefs: Float[Array, "..."], label: Int[Array, ""], *, axis: int) -> Bool[Array, "..."]:
+    """Whether the label is the argmax over the axis of classes, the lowest index among equals; XLA's own is slow on CPUs."""
+    beliefs = jnp.moveaxis(beliefs, axis, 0)
+    own = beliefs[label]
+    before = jnp.expand_dims(jnp.arange(beliefs.shape[0]) < label, range(1, beliefs.ndim))
+    return jnp.all(jnp.where(before, beliefs < own, beliefs <= own), axis=0)
 
 
 def bootstrap_means(

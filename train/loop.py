@@ -22,7 +22,7 @@ import optax
 from flax import nnx
 from tensorboardX import SummaryWriter
 
-from data_pipeline.batches import ViewBatches, steps_per_epoch, train_batches, validation_batches
+from data_pipeline.batches import ViewBatches, steps_per_epoch, train_batches, training_splits, validation_batches
 from data_pipeline.builder import DatasetStatistics
 from data_pipeline.files import read_json, write_json, write_text
 from data_pipeline.meshes import DataError
@@ -191,8 +191,7 @@ def fit(task: Task, data: Path, statistics: DatasetStatistics, folder: Path) -> 
         return read_json(folder / "summary.json")
     write_json(folder / "config.json", identity)
 
-    splits = ("train",) if config.validation_by == "object" else ("train", "val")
-    objects = sum(sum(statistics.counts[split].values()) for split in splits)
+    objects = sum(sum(statistics.counts[split].values()) for split in training_splits(task.batches))
     # An epoch is a whole number of passes over the objects' views.
     epoch_steps = steps_per_epoch(
         objects * (config.epoch_views or statistics.views) // config.views_per_object, task.batches
