@@ -43,15 +43,21 @@ class _Reader:
         self.put(norm.bias, f"{name}.bias")
         self.put(norm.mean, f"{name}.running_mean")
         self.put(norm.variance, f"{name}.running_var")
-        self.put(norm.batches, f"{name}.num_batches_tracked")
+        if f"{name}.num_batches_tracked" in self.state:  # files of before 2018 have none
+            self.put(norm.batches, f"{name}.num_batches_tracked")
 
     def finish(self) -> None:
         if self.left:
             raise ValueError(f"the state dict has entries this network lacks: {', '.join(sorted(self.left)[:4])}")
 
 
-def resnet_from_torch(network: ResNet, state: StateDict) -> None:
+def resnet_from_torch(network: ResNet, state: StateDict, *, head: bool = True) -> None:
     """Fills `network` with a torchvision `resnet18` or `resnet34` state dict.
+
+    Args:
+        network: of the same depth, 64 channels wide, for images of three channels.
+        state: torchvision's names to arrays.
+        head: whether the last layer is filled too; without, the network keeps its own, for other classes.
 
     Raises:
         ValueError: for a missing or superfluous entry, or another shape.
@@ -68,8 +74,10 @@ def resnet_from_torch(network: ResNet, state: StateDict) -> None:
         if block.projects:
             reader.put(block.shortcut.kernel, f"{name}.downsample.0.weight", 2, 3, 1, 0)
             reader.norm(block.shortcut_norm, f"{name}.downsample.1")
-    reader.put(network.head.kernel, "fc.weight", 1, 0)
-    reader.put(network.head.bias, "fc.bias")
+    if head:
+        reader.put(network.head.kernel, "fc.weight", 1, 0)
+        reader.put(network.head.bias, "fc.bias")
+    reader.left -= {"fc.weight", "fc.bias"}
     reader.finish()
 
 

@@ -29,6 +29,8 @@ class ResNetConfig:
     """channels of the first stage"""
     channels: int = 3
     """channels of the input; depth and grey images are replicated"""
+    standardise: bool = True
+    """take off ImageNet's mean and divide by its standard deviation, for three channels"""
 
 
 @dataclass(frozen=True)
@@ -71,7 +73,14 @@ class ClassifierTask:
 
     def network(self, rngs: nnx.Rngs) -> ResNet:
         shape = self.network_config
-        return ResNet(depth=shape.depth, classes=self.classes, channels=shape.channels, width=shape.width, rngs=rngs)
+        return ResNet(
+            depth=shape.depth,
+            classes=self.classes,
+            channels=shape.channels,
+            width=shape.width,
+            standardise=shape.standardise and shape.channels == 3,
+            rngs=rngs,
+        )
 
     def inputs(self, batch: Batch) -> jax.Array:
         """Images (views, height, width, channels) of a batch."""

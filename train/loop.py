@@ -28,6 +28,7 @@ from data_pipeline.files import read_json, write_json, write_text
 from data_pipeline.meshes import DataError
 from data_pipeline.progress import console, progress_bar
 from train.checkpoints import Checkpoints
+from train.pretrained import StartingWeights
 
 Batch = dict[str, jax.Array]
 
@@ -105,9 +106,12 @@ def learning_rate_schedule(config: OptimiserConfig, steps: int) -> Callable[[jax
     return optax.constant_schedule(config.learning_rate)
 
 
-def build_network(task: Task) -> tuple[nnx.GraphDef, nnx.State, nnx.State]:
+def build_network(task: Task, start: StartingWeights | None = None) -> tuple[nnx.GraphDef, nnx.State, nnx.State]:
     """Structure, parameters and the rest (batch-norm statistics) of a new network."""
-    structure, parameters, *rest = nnx.split(task.network(nnx.Rngs(task.optimiser.seed)), nnx.Param, ...)
+    network = task.network(nnx.Rngs(task.optimiser.seed))
+    if start is not None:
+        start.put(network)
+    structure, parameters, *rest = nnx.split(network, nnx.Param, ...)
     return structure, parameters, rest[0]
 
 
@@ -175,14 +179,18 @@ class MetricsLog:
         self._board.close()
 
 
-def fit(task: Task, data: Path, statistics: DatasetStatistics, folder: Path) -> dict[str, Any]:
-    """Trains `task` on the data set in `data`, into `folder`; returns the summary of the run.
+def fit(
+    task: Task, data: Path, statistics: DatasetStatistics, folder: Path, start: StartingWeights | None = None
+) -> dict[str, Any]:
+    """Trains `task` on the data set in `data`, into `folder`, from `start` or random weights; returns the run's summary.
 
     A finished run is returned as it is, an unfinished one goes on. Raises `DataError` where the folder holds a run of another
     configuration.
     """
     config = task.optimiser
-    identity = json.loads(json.dumps({"task": asdict(task), "data": statistics.fingerprint}))  # type: ignore[call-overload]
+    identity = json.loads(
+        json.dumps({"task": asdict(task), "data": statistics.fingerprint, "start": start and start.name})  # type: ignore[call-overload]
+    )
     if (folder / "config.json").exists() and read_json(folder / "config.json") != identity:
         raise DataError(
             f"{folder} holds a network trained with other settings; choose another --out, or delete that folder"
@@ -198,7 +206,7 @@ def fit(task: Task, data: Path, statistics: DatasetStatistics, folder: Path) -> 
     )
     total_steps = epoch_steps * config.epochs
 
-    structure, parameters, rest = build_network(task)
+    structure, parameters, rest = build_network(task, start)
     schedule = learning_rate_schedule(config, total_steps)
     optimiser = optax.adamw(schedule, weight_decay=config.weight_decay)
     state = TrainState(jnp.zeros((), jnp.int32), parameters, rest, optimiser.init(parameters))
@@ -259,7 +267,12 @@ def fit(task: Task, data: Path, statistics: DatasetStatistics, folder: Path) -> 
 
     log.close()
     checkpoints.close()
-    summary = progress | {"steps": int(state.step), "stopped_early": progress["epoch"] < config.epochs}
+    started_from = start.name if start else "random weights"
+    summary = progress | {
+        "steps": int(state.step),
+        "start": started_from,
+        "stopped_early": progress["epoch"] < config.epochs,
+    }
     write_json(folder / "summary.json", summary)
     return summary
 

@@ -15,6 +15,7 @@ from mevs_jax.arrays import AnyArray
 from mevs_jax.models.batch_norm import BatchNorm
 
 _BLOCKS = {18: (2, 2, 2, 2), 34: (3, 4, 6, 3)}
+_IMAGENET_MEAN, _IMAGENET_STD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
 
 
 class Convolution(nnx.Module):
@@ -75,16 +76,30 @@ class ResNet(nnx.Module):
         classes: number of logits.
         channels: channels of the image; depth is replicated to 3 in the thesis.
         width: channels of the first stage, doubled at each of the three that follow; 64 in the paper.
+        standardise: take ImageNet's mean off the three channels and divide by its standard deviation, as torchvision's
+            weights expect of images in [0, 1].
         rngs: source of the initial weights.
 
     Raises:
-        ValueError: for another depth.
+        ValueError: for another depth, or `standardise` with other than three channels.
     """
 
-    def __init__(self, *, depth: int = 18, classes: int = 10, channels: int = 3, width: int = 64, rngs: nnx.Rngs):
+    def __init__(
+        self,
+        *,
+        depth: int = 18,
+        classes: int = 10,
+        channels: int = 3,
+        width: int = 64,
+        standardise: bool = False,
+        rngs: nnx.Rngs,
+    ):
         if depth not in _BLOCKS:
             raise ValueError(f"ResNet has depth 18 or 34, got {depth}")
+        if standardise and channels != 3:
+            raise ValueError(f"ResNet standardises images of 3 channels, got {channels}")
         self.depth, self.classes, self.channels, self.width = depth, classes, channels, width
+        self.standardise = standardise
         self.stages = _BLOCKS[depth]
         self.convolution = Convolution(channels, width, 7, 2, rngs=rngs)
         self.norm = BatchNorm(width)
@@ -109,6 +124,8 @@ class ResNet(nnx.Module):
         images = jnp.asarray(images)
         batch = images.shape[:-3]
         x = images.reshape(-1, *images.shape[-3:])
+        if self.standardise:
+            x = (x - jnp.array(_IMAGENET_MEAN)) / jnp.array(_IMAGENET_STD)
         x = jax.nn.relu(self.norm(self.convolution(x), train=train, momentum=momentum))
         x = nnx.max_pool(x, (3, 3), strides=(2, 2), padding=((1, 1), (1, 1)))
         for block in self.blocks:

@@ -1,7 +1,7 @@
 """Plain PyTorch versions of both networks, with torchvision's and pointnet2_ops' names; the standard that ours are held to.
 
-Run as a program it writes `golden.npz`: outputs and gradients for made-up weights, so that parity is checked where PyTorch is
-not installed too.
+Run as a program it writes `golden.npz`, outputs and gradients for made-up weights, and two small files of weights in PyTorch's
+two formats, so that parity is checked where PyTorch is not installed too.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ import torch
 from torch import nn
 from torch.nn import functional
 
-from tests.reference.weights import made_up_inputs, made_up_weights
+from tests.reference.weights import made_up_inputs, made_up_weights, small_state
 
 GOLDEN = Path(__file__).with_name("golden.npz")
 
@@ -172,6 +172,23 @@ def write_golden() -> None:
     np.savez_compressed(GOLDEN, **stored)
 
 
+def small_tensors() -> dict[str, torch.Tensor]:
+    """`small_state` as tensors, with what PyTorch's files may hold: parameters, views of a storage, half precisions."""
+    tensors: dict[str, torch.Tensor] = {name: torch.from_numpy(array) for name, array in small_state().items()}
+    tensors["transposed"] = torch.from_numpy(small_state()["transposed"].T.copy()).T
+    tensors["part"] = torch.cat([torch.zeros(3), tensors["part"], torch.zeros(2)])[3:-2]
+    tensors["parameter"] = nn.Parameter(tensors["parameter"])
+    tensors["bfloat16"] = tensors["bfloat16"].bfloat16()
+    return tensors
+
+
+def write_small_files() -> None:
+    for name, new in (("zip", True), ("legacy", False)):
+        path = Path(__file__).with_name(f"weights_{name}.pth")
+        torch.save(small_tensors(), path, _use_new_zipfile_serialization=new)
+
+
 if __name__ == "__main__":
     write_golden()
+    write_small_files()
     print(f"wrote {GOLDEN} with PyTorch {torch.__version__}", file=sys.stderr)

@@ -37,3 +37,19 @@ def made_up_inputs(kind: str) -> np.ndarray:
         return random.uniform(-1, 1, (4, 64, 64, 3)).astype(np.float32)
     cloud = random.uniform(-1, 1, (3, 600, 3))
     return (cloud / np.maximum(np.linalg.norm(cloud, axis=2, keepdims=True), 1) * 0.9).astype(np.float32)
+
+
+def small_state() -> dict[str, np.ndarray]:
+    """Arrays of the kinds that a file of weights may hold; `bfloat16` is stored as that."""
+    random = np.random.Generator(np.random.PCG64(3))
+    return {
+        "plain": random.normal(size=(2, 3)).astype(np.float32),
+        "transposed": random.normal(size=(3, 2)).astype(np.float32),
+        "part": random.normal(size=4).astype(np.float32),
+        "parameter": random.normal(size=5).astype(np.float32),
+        "half": random.normal(size=3).astype(np.float16),
+        "double": random.normal(size=3),
+        "bfloat16": np.array([1.5, -2.0, 0.25], np.float32),
+        "count": np.array(7),
+        "nothing": np.zeros((0, 3), np.float32),
+    }
