@@ -63,10 +63,11 @@ class DatasetStatistics:
         left_out: name and reason of every object that could not be captured, by the source's split.
         entropy_max: the largest depth entropy in bits: the normaliser of the network's targets (5.46 in the thesis).
         entropy_mean, entropy_std: of the normalised entropies (0.329 and 0.156 in the thesis).
-        entropy_histogram: counts of normalised entropies in 50 bins over [0, 1].
+        entropy_histograms: by split, counts of normalised entropies in 50 bins over [0, 1]; beyond 1 in the last bin.
         mean_map: (views,) mean normalised entropy of each view.
         class_mean_maps: (classes, views) the same by class.
         points_mean, points_std: points seen per view.
+        points_by_class: by class, the 5th, 25th, 50th, 75th and 95th percentiles of points seen per view.
         viewpoints: (views, 3) unit vectors.
         capture: the `CaptureConfig`, as a dictionary.
         source: what the objects are.
@@ -78,11 +79,12 @@ class DatasetStatistics:
     entropy_max: float
     entropy_mean: float
     entropy_std: float
-    entropy_histogram: list[int]
+    entropy_histograms: dict[str, list[int]]
     mean_map: list[float]
     class_mean_maps: list[list[float]]
     points_mean: float
     points_std: float
+    points_by_class: list[list[float]]
     viewpoints: list[list[float]]
     capture: dict[str, Any]
     source: str
@@ -132,34 +134,43 @@ def view_entropies(capture: Capture) -> np.ndarray:
 
 
 class _Statistics:
-    """Sums over the training split while it is being written."""
+    """What is kept of each object while the shards are being written."""
 
-    def __init__(self, classes: int, views: int):
-        self.sums = np.zeros((classes, views))
-        self.counts = np.zeros(classes, int)
-        self.entropies: list[np.ndarray] = []
+    def __init__(self, classes: int):
+        self.classes = classes
+        self.labels: dict[str, list[int]] = {split: [] for split in SPLITS}
+        self.entropies: dict[str, list[np.ndarray]] = {split: [] for split in SPLITS}
         self.points: list[np.ndarray] = []
 
-    def add(self, label: int, entropies: np.ndarray, depth: np.ndarray) -> None:
-        self.sums[label] += entropies
-        self.counts[label] += 1
-        self.entropies.append(entropies)
-        self.points.append(np.count_nonzero(depth, axis=(1, 2)))
+    def add(self, split: str, label: int, entropies: np.ndarray, depth: np.ndarray) -> None:
+        self.labels[split].append(label)
+        self.entropies[split].append(entropies)
+        if split == "train":
+            self.points.append(np.count_nonzero(depth, axis=(1, 2)))
 
     def finish(self, **rest: Any) -> DatasetStatistics:
-        entropies, points = np.stack(self.entropies), np.stack(self.points)
-        largest = float(entropies.max()) or 1.0
-        normalised = entropies / largest
-        class_means = self.sums / np.maximum(self.counts, 1)[:, None] / largest
+        labels, points, entropies = np.array(self.labels["train"]), np.stack(self.points), self.entropies["train"]
+        largest = float(np.max(entropies)) or 1.0
+        normalised = {split: np.stack(members) / largest for split, members in self.entropies.items()}
+        train = normalised["train"]
+        members = [labels == label for label in range(self.classes)]
         return DatasetStatistics(
             entropy_max=largest,
-            entropy_mean=float(normalised.mean()),
-            entropy_std=float(normalised.std()),
-            entropy_histogram=np.histogram(normalised, 50, (0, 1))[0].tolist(),
-            mean_map=normalised.mean(axis=0).tolist(),
-            class_mean_maps=class_means.tolist(),
+            entropy_mean=float(train.mean()),
+            entropy_std=float(train.std()),
+            entropy_histograms={
+                split: np.histogram(np.minimum(values, 1), 50, (0, 1))[0].tolist()
+                for split, values in normalised.items()
+            },
+            mean_map=train.mean(axis=0).tolist(),
+            class_mean_maps=[
+                train[own].mean(axis=0).tolist() if own.any() else [0.0] * train.shape[1] for own in members
+            ],
             points_mean=float(points.mean()),
             points_std=float(points.std()),
+            points_by_class=[
+                np.percentile(points[own], (5, 25, 50, 75, 95)).tolist() if own.any() else [0.0] * 5 for own in members
+            ],
             **rest,
         )
 
@@ -263,14 +274,13 @@ def _write_shards(
     captures: Path,
     folder: Path,
 ) -> DatasetStatistics:
-    statistics = _Statistics(len(source.classes), config.capture.views)
+    statistics = _Statistics(len(source.classes))
     with progress_bar("objects") as bar:
         task = bar.add_task("Writing shards", total=sum(map(len, split.values())), note="")
 
         def on_object(name: str, entry: ObjectEntry, capture: Capture, entropies: np.ndarray) -> None:
             bar.advance(task)
-            if name == "train":
-                statistics.add(entry.label, entropies, capture.depth)
+            statistics.add(name, entry.label, entropies, capture.depth)
 
         builder = _builder_class()(
             source=source, split=split, config_data=config, captures=captures, on_object=on_object, data_dir=str(folder)
@@ -347,7 +357,12 @@ def load_statistics(folder: Path) -> DatasetStatistics:
     path = folder / _SUMMARY
     if not path.exists():
         raise DataError(f"no data set in {folder}; make one with: mevs data --out {os.path.dirname(folder) or '.'}")
-    return DatasetStatistics(**read_json(path))
+    try:
+        return DatasetStatistics(**read_json(path))
+    except TypeError as error:
+        raise DataError(
+            f"{folder} was made by another version of mevs_jax; choose another --out, or delete it"
+        ) from error
 
 
 def open_split(folder: Path, split: str) -> Any:

@@ -63,7 +63,9 @@ def _data_section(inputs: ReportInputs) -> str:
             "png",
         )
         + image(
-            figures.entropy_histogram(statistics.entropy_histogram, statistics.entropy_mean, statistics.entropy_std),
+            figures.entropy_histogram(
+                statistics.entropy_histograms["train"], statistics.entropy_mean, statistics.entropy_std
+            ),
             "The thesis reports a mean of 0.329 and a standard deviation of 0.156 (Fig. 9).",
         )
     )

@@ -83,7 +83,16 @@ def test_statistics_are_of_the_training_split_alone(data):
         statistics.class_mean_maps[3], (entropies[labels == 3] / entropies.max()).mean(axis=0), rtol=1e-5
     )
     assert statistics.counts["train"]["desk"] == 4
-    assert sum(statistics.entropy_histogram) == entropies.size
+    assert sum(statistics.entropy_histograms["train"]) == entropies.size
+    assert sum(statistics.entropy_histograms["test"]) == 8 * sum(statistics.counts["test"].values())
+    points = np.stack([np.count_nonzero(source[i]["depth"], axis=(1, 2)) for i in range(len(source))])
+    np.testing.assert_allclose(statistics.points_by_class[3], np.percentile(points[labels == 3], (5, 25, 50, 75, 95)))
+
+
+def test_statistics_of_another_version_are_described(tmp_path):
+    (tmp_path / "summary.json").write_text('{"classes": [], "entropy_histogram": []}')
+    with pytest.raises(DataError, match="another version of mevs_jax"):
+        load_statistics(tmp_path)
 
 
 def test_a_data_set_is_not_made_twice_nor_mixed(data):
