@@ -28,6 +28,7 @@ from eval.live import Agreement, LiveConfig, Networks, compare_with_tables
 from eval.page import ReportInputs
 from eval.report import read_history, write_report
 from eval.study import reachable_views, run_study
+from eval.thesis_networks import ThesisConfig
 from eval.view_tables import ViewTables, compute_view_tables, load_view_tables, save_view_tables
 from mevs_jax.models import Abstraction
 from mevs_jax.policies import POLICIES
@@ -35,6 +36,7 @@ from mevs_jax.viewpoints import ViewGraph
 from train.classifier import ClassifierConfig, ClassifierTask, ResNetConfig
 from train.entropy import EntropyConfig, EntropyTask, PointNet2Config
 from train.loop import OptimiserConfig, Task, fit, load_best
+from train.pretrained import StartingWeights, weights_from_torch
 
 
 @dataclass(frozen=True)
@@ -46,6 +48,7 @@ class Settings:
     entropy: EntropyConfig = EntropyConfig()
     evaluation: GridConfig = GridConfig()
     live: LiveConfig = LiveConfig()
+    thesis: ThesisConfig = ThesisConfig()
 
 
 THESIS = Settings()
@@ -53,18 +56,15 @@ THESIS = Settings()
 train PointNet++ of this size on 7 clouds a second, five hours for one epoch of ModelNet10.
 `mevs run --preset thesis --data ModelNet10.zip`"""
 
+_BRIEF = OptimiserConfig(
+    epochs=8, batch_size=64, epoch_views=8, validation_views=4, weight_decay=0.02, schedule="cosine"
+)
+
 SMALL = Settings(
     dataset=DataConfig(capture=CaptureConfig(resolution=64)),
     classifier=ClassifierConfig(
-        network=ResNetConfig(width=32, channels=1),
-        optimiser=OptimiserConfig(
-            epochs=8,
-            batch_size=64,
-            epoch_views=8,
-            validation_views=4,
-            weight_decay=0.02,
-            schedule="cosine",
-        ),
+        network=ResNetConfig(width=32, channels=1, standardise=False),
+        optimiser=_BRIEF,
     ),
     entropy=EntropyConfig(
         network=PointNet2Config(
@@ -81,15 +81,23 @@ SMALL = Settings(
             epochs=6, batch_size=32, epoch_views=4, validation_views=2, learning_rate=2e-3, schedule="cosine"
         ),
     ),
+    thesis=ThesisConfig(
+        resnet18=replace(_BRIEF, epochs=5),
+        resnet34=_BRIEF,
+        fine_tuning=replace(_BRIEF, epochs=3, learning_rate=5e-4),
+        resnet34_width=32,
+    ),
 )
 """The same study at 64×64 with narrower networks.
 `mevs run --data modelnet10_voxels32.npz`: 39 minutes on two CPU cores; `mevs run` (furniture10): under ten."""
 
+_TRIFLE = OptimiserConfig(epochs=2, batch_size=16, views_per_object=2, epoch_views=4, schedule="cosine")
+
 TINY = Settings(
     dataset=DataConfig(train_per_class=4, test_per_class=2, capture=CaptureConfig(views=6, resolution=32)),
     classifier=ClassifierConfig(
-        network=ResNetConfig(width=8, channels=1),
-        optimiser=OptimiserConfig(epochs=2, batch_size=16, views_per_object=2, epoch_views=4, schedule="cosine"),
+        network=ResNetConfig(width=8, channels=1, standardise=False),
+        optimiser=_TRIFLE,
     ),
     entropy=EntropyConfig(
         network=PointNet2Config(
@@ -101,10 +109,11 @@ TINY = Settings(
             global_layers=(32, 64),
             head_layers=(32,),
         ),
-        optimiser=OptimiserConfig(epochs=2, batch_size=16, views_per_object=2, epoch_views=4, schedule="cosine"),
+        optimiser=_TRIFLE,
     ),
     evaluation=GridConfig(draws=2),
     live=LiveConfig(objects=12, at_once=8, max_views=4),
+    thesis=ThesisConfig(_TRIFLE, _TRIFLE, _TRIFLE, resnet34_width=8, timing_runs=3),
 )
 """Seconds, and no use but to see that everything runs."""
 
@@ -123,6 +132,8 @@ class Options(Settings):
     """candidate viewpoints around an object; overrides dataset.capture.views"""
     out: Path | None = None
     """where everything is written; runs/<preset> unless given"""
+    pretrained: Annotated[tuple[Path, ...], tyro.conf.arg(metavar="FILE")] = ()
+    """ImageNet weights to start classifiers from: torchvision's resnet18 (and resnet34), .pth or .safetensors"""
 
     def settings(self) -> Settings:
         """The settings with the short names applied."""
@@ -131,13 +142,21 @@ class Options(Settings):
             dataset = replace(dataset, source=self.data)
         if self.views is not None:
             dataset = replace(dataset, capture=replace(dataset.capture, views=self.views))
-        return Settings(dataset, self.classifier, self.entropy, self.evaluation, self.live)
+        return Settings(dataset, self.classifier, self.entropy, self.evaluation, self.live, self.thesis)
 
 
 def options_from(preset: Literal["small", "thesis", "tiny"]) -> Options:
     """The defaults of all options under a preset."""
     chosen = PRESETS[preset]
-    return Options(chosen.dataset, chosen.classifier, chosen.entropy, chosen.evaluation, chosen.live, preset=preset)
+    return Options(
+        chosen.dataset,
+        chosen.classifier,
+        chosen.entropy,
+        chosen.evaluation,
+        chosen.live,
+        chosen.thesis,
+        preset=preset,
+    )
 
 
 def check_output(out: Path) -> None:
@@ -166,12 +185,16 @@ def tasks(settings: Settings, statistics: DatasetStatistics) -> tuple[Classifier
     )
 
 
-def train(settings: Settings, out: Path) -> None:
+def train(settings: Settings, out: Path, pretrained: tuple[Path, ...] = ()) -> None:
     statistics = load_statistics(out / "data")
     classify, predict = tasks(settings, statistics)
-    pairs: list[tuple[Task, str]] = [(classify, "classifier"), (predict, "entropy")]
-    for task, name in pairs:
-        summary = fit(task, out / "data", statistics, out / name)
+    start = weights_from_torch(pretrained, classify.network_config.depth) if pretrained else None
+    planned: list[tuple[Task, str, StartingWeights | None]] = [
+        (classify, "classifier", start),
+        (predict, "entropy", None),
+    ]
+    for task, name, weights in planned:
+        summary = fit(task, out / "data", statistics, out / name, weights)
         console.print(
             f"{task.name}: best epoch {summary['best_epoch']} of {summary['epoch']}, validation "
             + ", ".join(f"{key} {value:.4f}" for key, value in summary["best"].items())

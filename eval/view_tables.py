@@ -45,6 +45,33 @@ class ViewTables:
         return ViewTable(*(jnp.asarray(a) for a in (self.logits, self.utility, self.entropy, self.labels)))
 
 
+def network_outputs(data: Path, split: str, task: ClassifierTask | EntropyTask, network: nnx.Module) -> np.ndarray:
+    """What a network says of every view of every object of a split, (objects, views, classes or views)."""
+    structure, state = nnx.split(network)
+
+    @jax.jit
+    def look(state, batch):
+        return nnx.merge(structure, state)(task.inputs(batch))
+
+    objects = len(open_split(data, split))
+    with progress_bar("objects") as bar:
+        line = bar.add_task(f"Looking at {split} objects: {task.name}", total=objects, note="")
+        out = []
+        for batch in evaluation_batches(data, split, points=task.batches.points, images=task.batches.images):
+            out.append(np.asarray(look(state, batch)))
+            bar.advance(line)
+    return np.stack(out)
+
+
+def objects_of(data: Path, split: str, statistics: DatasetStatistics) -> tuple[list[str], np.ndarray, np.ndarray]:
+    """Names, labels (objects,) and normalised entropies (objects, views) of a split, in the order of the shards."""
+    source = open_split(data, split)
+    examples = [source[index] for index in range(len(source))]
+    names = [example["name"].decode() for example in examples]
+    labels = np.array([example["label"] for example in examples], np.int32)
+    return names, labels, np.stack([example["entropy"] / statistics.entropy_max for example in examples])
+
+
 def compute_view_tables(
     data: Path,
     split: str,
@@ -55,29 +82,9 @@ def compute_view_tables(
     predictor: nnx.Module,
 ) -> ViewTables:
     """Runs both networks on every view of every object of a split."""
-    classifier_graph, classifier_state = nnx.split(classifier)
-    predictor_graph, predictor_state = nnx.split(predictor)
-
-    @jax.jit
-    def look(classifier_state, predictor_state, batch):
-        logits = nnx.merge(classifier_graph, classifier_state)(classify.inputs(batch))
-        utility = nnx.merge(predictor_graph, predictor_state)(predict.inputs(batch))
-        return logits, utility
-
-    source = open_split(data, split)
-    names = [source[index]["name"].decode() for index in range(len(source))]
-    batches = evaluation_batches(data, split, points=predict.network_config.points, images=classify.images)
-    labels, logits, utility, entropy = [], [], [], []
-    with progress_bar("objects") as bar:
-        line = bar.add_task(f"Looking at {split} objects", total=len(source), note="")
-        for batch in batches:
-            labels.append(batch["label"][0])
-            entropy.append(batch["entropy"][0] / statistics.entropy_max)
-            seen = look(classifier_state, predictor_state, batch)
-            logits.append(np.asarray(seen[0]))
-            utility.append(np.asarray(seen[1]))
-            bar.advance(line)
-    return ViewTables(names, np.array(labels, np.int32), np.stack(logits), np.stack(utility), np.stack(entropy))
+    names, labels, entropy = objects_of(data, split, statistics)
+    logits = network_outputs(data, split, classify, classifier)
+    return ViewTables(names, labels, logits, network_outputs(data, split, predict, predictor), entropy)
 
 
 def save_view_tables(path: Path, tables: ViewTables) -> None:

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from eval.pipeline import Settings
+    from eval.pipeline import Options
 
 COMMANDS = {
     "run": "data, train, eval and report, skipping what is done",
@@ -21,6 +21,7 @@ COMMANDS = {
     "eval": "walk every test object from every start view; write metrics.json",
     "report": "write report/index.html",
     "compat": "train the classifier the published code's way too, evaluate and report again",
+    "thesis": "every network, table and figure of the thesis, beside its own numbers",
     "live": "walk test objects with the networks in the loop; compare with the tables",
 }
 
@@ -57,7 +58,7 @@ def _preset_of(arguments: list[str]) -> str:
     return "small"
 
 
-def _parse(command: str, arguments: list[str]) -> tuple[str, Path, Settings]:
+def _parse(command: str, arguments: list[str]) -> Options:
     import tyro
 
     from data_pipeline.meshes import DataError
@@ -67,26 +68,32 @@ def _parse(command: str, arguments: list[str]) -> tuple[str, Path, Settings]:
     if preset not in PRESETS:
         raise DataError(f"unknown preset {preset!r}; it is one of {', '.join(PRESETS)}")
 
-    options = tyro.cli(
+    return tyro.cli(
         Options,
         prog=f"mevs {command}",
         description=COMMANDS[command],
         args=arguments,
         default=options_from(preset),  # type: ignore[arg-type]
     )
-    return preset, options.out or Path("runs") / preset, options.settings()
 
 
 def _run(command: str, arguments: list[str]) -> None:
-    preset, out, settings = _parse(command, arguments)
+    options = _parse(command, arguments)
+    preset, settings = options.preset, options.settings()
+    out = options.out or Path("runs") / (preset if command != "thesis" else f"thesis-{preset}")
     from data_pipeline.progress import console
     from eval import pipeline
 
     pipeline.check_output(out)
+    if command == "thesis":
+        from eval.thesis import reproduce
+
+        console.print(f"Report: {reproduce(settings, preset, out, options.pretrained).absolute()}")
+        return
     if command in ("run", "data"):
         pipeline.make_data(settings, out)
     if command in ("run", "train"):
-        pipeline.train(settings, out)
+        pipeline.train(settings, out, options.pretrained)
     if command == "compat":
         pipeline.train_by_view(settings, out)
     if command in ("run", "eval", "compat"):

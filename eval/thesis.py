@@ -1,0 +1,227 @@
+"""`mevs thesis`: every network, table and figure of the thesis, from one run directory; each stage skips what is done.
+
+The directory holds both data sets (`views10/`, `views40/`), the networks (`backbones/`, `entropy/`), what they say of every
+view (`outputs/`), `timing.json`, `thesis.json` and the report (`report/`).
+"""
+
+from __future__ import annotations
+
+import hashlib
+import io
+import json
+from collections.abc import Callable
+from dataclasses import asdict, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from flax import nnx
+
+from data_pipeline.builder import DatasetStatistics, prepare, report_left_out
+from data_pipeline.files import read_json, write_bytes, write_json
+from data_pipeline.meshes import DataError
+from data_pipeline.progress import console
+from eval.pipeline import Settings
+from eval.report import read_history
+from eval.thesis_figures import FigureInputs
+from eval.thesis_networks import (
+    BACKBONES,
+    FRAMES,
+    PIPELINE,
+    VIEWS,
+    Frame,
+    ThesisFolder,
+    backbone_task,
+    entropy_task,
+    train_thesis,
+)
+from eval.thesis_page import write_thesis_report
+from eval.thesis_results import LatticeTables, all_results, machine
+from eval.timing import decision_memory_alone, time_local_maxima, time_predictor
+from eval.view_tables import network_outputs, objects_of
+from train.classifier import ClassifierTask
+from train.entropy import EntropyTask
+from train.loop import load_best
+
+SPLITS = ("test", "val")
+
+
+def make_thesis_data(settings: Settings, folder: ThesisFolder) -> None:
+    """Both data sets, of the same objects and splits."""
+    for views in VIEWS:
+        dataset = replace(settings.dataset, capture=replace(settings.dataset.capture, views=views))
+        report_left_out(prepare(dataset, folder.data(views)))
+
+
+# --------------------------------------------------------------------------------------------------------------- outputs
+
+
+def _made_by(network: Path, statistics: DatasetStatistics) -> str:
+    """Names a trained network and the data it looks at."""
+    summary = read_json(network / "summary.json")
+    content = [statistics.fingerprint, read_json(network / "config.json"), summary["best_epoch"], summary["best"]]
+    return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()[:16]
+
+
+def _stored(path: Path, made_by: str, compute: Callable[[], np.ndarray]) -> np.ndarray:
+    """The array in `path`, computed anew where it is not there or was made by other networks."""
+    if path.exists():
+        with np.load(path) as stored:
+            if str(stored["made_by"]) == made_by:
+                return stored["array"]
+    array = compute()
+    buffer = io.BytesIO()
+    np.savez(buffer, array=array, made_by=np.array(made_by))
+    write_bytes(path, buffer.getvalue())
+    return array
+
+
+def lattice_tables(settings: Settings, folder: ThesisFolder, views: int, split: str) -> LatticeTables:
+    """What all networks say of one split of one data set."""
+    statistics, data = folder.statistics(views), folder.data(views)
+
+    def outputs(name: str, network: Path, task: ClassifierTask | EntropyTask) -> np.ndarray:
+        return _stored(
+            folder.out / "outputs" / f"{name}_on_{views}_{split}.npz",
+            _made_by(network, statistics),
+            lambda: network_outputs(data, split, task, load_best(task, network)),
+        )
+
+    logits: dict[str, np.ndarray] = {}
+    for backbone in BACKBONES:
+        task = backbone_task(backbone, settings.classifier, settings.thesis, statistics)
+        logits[backbone.name] = outputs(backbone.name, folder.backbone(backbone.name), task)
+    utility: dict[Frame, np.ndarray] = {}
+    for frame in FRAMES:
+        predict = entropy_task(frame, settings.entropy, statistics)
+        utility[frame] = outputs(f"entropy_{frame}", folder.entropy(views, frame), predict)
+    names, labels, entropy = objects_of(data, split, statistics)
+    return LatticeTables(names, labels, entropy, logits, utility)
+
+
+# --------------------------------------------------------------------------------------------------------- time and memory
+
+
+def _memory(settings: Settings, folder: ThesisFolder) -> dict[str, Any]:
+    statistics = {views: folder.statistics(views) for views in VIEWS}
+    out = {}
+    for backbone in (PIPELINE[1], PIPELINE[2]):
+        classify = backbone_task(backbone, settings.classifier, settings.thesis, statistics[40])
+        name = f"ResNet-{backbone.depth}"
+        out[f"{name} + Random view selection"] = decision_memory_alone(classify, None)
+        for views in VIEWS:
+            predict = entropy_task("world", settings.entropy, statistics[views])
+            out[f"{name} + PointNet++ ({views} views)"] = decision_memory_alone(classify, predict)
+    return out
+
+
+def _timing(settings: Settings, folder: ThesisFolder, tables: dict[int, LatticeTables]) -> dict[str, Any]:
+    runs = settings.thesis.timing_runs
+    out: dict[str, Any] = {"runs": runs}
+    for views in VIEWS:
+        statistics, data = folder.statistics(views), folder.data(views)
+        task = entropy_task("world", settings.entropy, statistics)
+        network: nnx.Module = load_best(task, folder.entropy(views, "world"))
+        out[str(views)] = {
+            "by_class": time_predictor(data, task, network, tables[views].labels, statistics.classes, runs),
+            "local_maxima": time_local_maxima(views),
+        }
+    return out
+
+
+def measure(settings: Settings, folder: ThesisFolder, tables: dict[int, LatticeTables]) -> dict[str, Any]:
+    """Machine, times and memory; measured once, and again on another machine or with networks of another size."""
+    ran_on = machine()
+    identity = json.loads(json.dumps([ran_on, settings.thesis.timing_runs, asdict(settings.entropy.network)]))
+    path = folder.out / "timing.json"
+    if path.exists() and (found := read_json(path))["identity"] == identity:
+        return found
+    console.print(f"Timing {settings.thesis.timing_runs} decisions a class, and measuring their memory")
+    found = {
+        "identity": identity,
+        "machine": ran_on,
+        "timing": _timing(settings, folder, tables),
+        "memory": _memory(settings, folder),
+    }
+    write_json(path, found)
+    return found
+
+
+# ------------------------------------------------------------------------------------------------------------- everything
+
+
+def _example(tables: LatticeTables, classes: list[str]) -> int:
+    """The first test object of the thesis's example class, bathtubs, or of the first class there is."""
+    label = classes.index("bathtub") if "bathtub" in classes else int(tables.labels[0])
+    return int(np.flatnonzero(tables.labels == label)[0])
+
+
+def _training(folder: ThesisFolder) -> dict[str, Any]:
+    """Losses and beginnings of the classifiers (Table 5), and how long every network took."""
+    backbones = {}
+    for backbone in BACKBONES:
+        summary = read_json(folder.backbone(backbone.name) / "summary.json")
+        history = read_history(folder.backbone(backbone.name))
+        backbones[backbone.name] = {
+            "train_loss": min(entry["train/loss"] for entry in history),
+            "val_loss": summary["best_loss"],
+            "epochs": summary["epoch"],
+            "best_epoch": summary["best_epoch"],
+            "start": summary["start"],
+        }
+    seconds = {
+        backbone.name: read_json(folder.backbone(backbone.name) / "summary.json")["seconds"] for backbone in BACKBONES
+    }
+    for views in VIEWS:
+        for frame in FRAMES:
+            name = folder.entropy(views, frame)
+            seconds[f"entropy_{name.name}"] = read_json(name / "summary.json")["seconds"]
+    return {"backbones": backbones, "training_seconds": seconds}
+
+
+def evaluate_thesis(settings: Settings, folder: ThesisFolder) -> tuple[dict[str, Any], dict[int, LatticeTables]]:
+    """All numbers, as written to `thesis.json`, and the tables of the test objects."""
+    test, validation = ({v: lattice_tables(settings, folder, v, split) for v in VIEWS} for split in SPLITS)
+    measured = measure(settings, folder, test)
+    statistics = {views: folder.statistics(views) for views in VIEWS}
+    networks = [folder.backbone(backbone.name) for backbone in BACKBONES]
+    networks += [folder.entropy(views, frame) for views in VIEWS for frame in FRAMES]
+    made_by = [_made_by(network, statistics[40]) for network in networks]
+    identity = json.loads(json.dumps([made_by, asdict(settings.evaluation), measured]))
+    path = folder.out / "thesis.json"
+    if path.exists() and (results := read_json(path))["identity"] == identity:
+        return results, test
+    console.print(f"Walking {len(test[40].labels)} test objects with {len(PIPELINE)} classifiers on two lattices")
+    results = all_results(test, validation, statistics, settings.evaluation)
+    results |= _training(folder) | {name: measured[name] for name in ("machine", "timing", "memory")}
+    results |= {"identity": identity, "left_out": {str(v): s.left_out for v, s in statistics.items()}}
+    write_json(path, results)
+    return results, test
+
+
+def reproduce(settings: Settings, preset: str, out: Path, pretrained: tuple[Path, ...] = ()) -> Path:
+    """Makes data, networks, tables and figures in `out`; returns the page.
+
+    Raises:
+        DataError: settings that the thesis's grid cannot be had with, or a directory that holds another run.
+    """
+    if settings.evaluation.lowest_elevation > -90:
+        raise DataError("mevs thesis walks from every view; leave --evaluation.lowest-elevation as it is")
+    folder = ThesisFolder(out)
+    make_thesis_data(settings, folder)
+    train_thesis(folder, settings.classifier, settings.entropy, settings.thesis, pretrained)
+    results, tables = evaluate_thesis(settings, folder)
+    statistics = {views: folder.statistics(views) for views in VIEWS}
+    histories = {backbone.name: read_history(folder.backbone(backbone.name)) for backbone in BACKBONES}
+    for views in VIEWS:
+        for frame in FRAMES:
+            histories[f"{views}_{frame}"] = read_history(folder.entropy(views, frame))
+    inputs = FigureInputs(folder, results, statistics, tables, histories, _example(tables[40], statistics[40].classes))
+    minutes = sum(results["training_seconds"].values()) / 60
+    camera = statistics[40].camera
+    lead = (
+        f"{statistics[40].source}, preset {preset}: views of {camera.resolution}×{camera.resolution} pixels, "
+        f"{results['objects']['40']} test objects, {statistics[40].left_out_count} of all objects left out, "
+        f"{minutes:.0f} minutes of training on {results['machine']['device']}. Ours first, the thesis's in brackets."
+    )
+    return write_thesis_report(inputs, lead, out / "report")

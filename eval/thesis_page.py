@@ -1,0 +1,98 @@
+"""The thesis beside our run, in its own order: a page, the same as Markdown, and every figure as PNG and SVG."""
+
+from __future__ import annotations
+
+import base64
+import html
+import io
+from pathlib import Path
+
+import matplotlib.pyplot as plt
+
+from data_pipeline.files import write_bytes, write_text
+from eval.page import STYLE, table
+from eval.thesis_figures import FIGURES, FigureInputs, ThesisFigure
+from eval.thesis_tables import ThesisTable, all_tables, cell_text, markdown
+
+CHAPTERS = (
+    ("The data (§4.1)", ("F5", "F6", "F7", "F8", "F9", "F10", "F11")),
+    ("Computation time (§5.3.1)", ("T1", "T2", "T3")),
+    ("Entropy learning (§5.3.2)", ("F17", "T4")),
+    ("Classification (§5.3.3)", ("T5", "F18", "F19", "T6", "T7", "T8", "F20")),
+    ("Memory (§5.3.4)", ("T9",)),
+    ("Appendices", ("F21", "F22", "F23", "F24", "T10", "F25", "T11", "T12", "T13", "T14", "T15")),
+)
+"""Tables and figures in the order in which the thesis has them."""
+
+
+def _table_html(shown: ThesisTable) -> str:
+    rows = []
+    for row in shown.rows:
+        cells = [html.escape(row.name)]
+        for index, value in enumerate(row.ours):
+            text = html.escape(cell_text(value, shown))
+            if index < len(row.bold) and row.bold[index]:
+                text = f"<b>{text}</b>"
+            if index < len(row.thesis) and row.thesis[index] is not None:
+                text += f' <small class="faint">({html.escape(cell_text(row.thesis[index], shown))})</small>'
+            cells.append(text)
+        rows.append(cells)
+    return (
+        f'<h3 id="table-{shown.number}">Table {shown.number}. {html.escape(shown.title)}</h3>'
+        f'<div class="wide">{table(["", *shown.columns], rows)}</div>'
+        f'<p class="note">{html.escape(shown.note)} In brackets: the thesis.</p>'
+    )
+
+
+def _save_figure(shown: ThesisFigure, inputs: FigureInputs, folder: Path) -> str:
+    """Draws a figure, saves it as PNG and SVG, and returns it for the page."""
+    figure = shown.draw(inputs)
+    name = f"figure_{int(shown.number):02d}"
+    for kind, options in (("png", {"dpi": 160}), ("svg", {"metadata": {"Date": None}})):
+        buffer = io.BytesIO()
+        figure.savefig(buffer, format=kind, **options)
+        write_bytes(folder / f"{name}.{kind}", buffer.getvalue())
+    plt.close(figure)
+    embedded = base64.b64encode((folder / f"{name}.svg").read_bytes()).decode()
+    return (
+        f'<figure id="figure-{shown.number}"><img alt="{html.escape(shown.caption)}" src="data:image/svg+xml;base64,{embedded}">'
+        f"<figcaption><b>Figure {shown.number}.</b> {html.escape(shown.caption)}</figcaption></figure>"
+    )
+
+
+def write_thesis_report(inputs: FigureInputs, lead: str, folder: Path) -> Path:
+    """Writes `index.html`, `thesis.md` and `figures/` into `folder`; returns the page.
+
+    Args:
+        inputs: what everything is drawn from.
+        lead: what was run, in a sentence.
+        folder: where to.
+    """
+    tables = {f"T{shown.number}": shown for shown in all_tables(inputs.results)}
+    drawn = {f"F{shown.number}": shown for shown in FIGURES}
+    page, text = [], []
+    for chapter, names in CHAPTERS:
+        page.append(f"<h2>{html.escape(chapter)}</h2>")
+        text.append(f"## {chapter}\n")
+        for name in names:
+            if name in tables:
+                page.append(_table_html(tables[name]))
+                text.append(markdown(tables[name]))
+            else:
+                shown = drawn[name]
+                page.append(_save_figure(shown, inputs, folder / "figures"))
+                text.append(
+                    f"![Figure {shown.number}](figures/figure_{int(shown.number):02d}.png)\n\n"
+                    f"**Figure {shown.number}.** {shown.caption}\n"
+                )
+    title = "The thesis, reproduced"
+    style = STYLE + ".wide{overflow-x:auto}td,th{white-space:nowrap}"
+    write_text(folder / "thesis.md", f"# {title}\n\n{lead}\n\n" + "\n".join(text))
+    path = folder / "index.html"
+    write_text(
+        path,
+        f'<!doctype html><html lang="en"><meta charset="utf-8"><meta name="viewport" content="width=device-width">'
+        f'<title>{title}</title><style>{style}</style><h1>{title}</h1><p class="lead">{html.escape(lead)}</p>'
+        f"{''.join(page)}</html>\n",
+    )
+    return path
