@@ -15,7 +15,7 @@ import shutil
 import struct
 from collections.abc import Iterator, Sequence
 from contextlib import redirect_stdout
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -23,9 +23,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from data_pipeline.archives import ARCHIVES, download, download_folder, local
 from data_pipeline.capture import DEPTH_SCALE, Capture, CaptureConfig, capture_all, capture_path, load_capture, rig_for
 from data_pipeline.files import read_json, write_json
-from data_pipeline.meshes import SOURCE_SPLITS, DataError, ObjectEntry, ObjectSource, open_source
+from data_pipeline.meshes import SOURCE_SPLITS, DataError, ObjectEntry, ObjectSource, mesh_zip, open_source
 from data_pipeline.progress import console, progress_bar
 from mevs_jax.entropy import level_entropy
 from mevs_jax.viewpoints import viewpoint_lattice
@@ -39,7 +40,10 @@ class DataConfig:
     """Which objects, and how they are looked at."""
 
     source: str = "furniture10"
-    """furniture10, a folder of <class>/{train,test}/ meshes, a ModelNet zip, or an .npz of voxel grids"""
+    """furniture10, modelnet10 or modelnet40 (downloaded), a folder of <class>/{train,test}/ meshes, a zip of the same
+    layout, or an .npz of voxel grids"""
+    archive: str = ""
+    """ModelNet10.zip or ModelNet40.zip where it is here already, in place of the download"""
     train_per_class: int = 60
     """training objects a class, for furniture10 (validation is taken from them)"""
     test_per_class: int = 20
@@ -301,6 +305,27 @@ def _write_shards(
     )
 
 
+def _open(config: DataConfig) -> ObjectSource:
+    """The source of objects; official archives are downloaded, or taken from `config.archive`."""
+    official = ARCHIVES.get(config.source)
+    if official is None:
+        if config.archive:
+            raise DataError(f"--archive goes with --data {' or '.join(ARCHIVES)}, not with {config.source}")
+        return open_source(config.source, train_per_class=config.train_per_class, test_per_class=config.test_per_class)
+    if config.archive:
+        path = local(official, Path(config.archive).expanduser().resolve())
+    else:
+        path = download(official, download_folder())
+    source = mesh_zip(path)
+    counts = {split: sum(entry.split == split for entry in source.entries) for split in SOURCE_SPLITS}
+    if (len(source.classes), counts["train"], counts["test"]) != (official.classes, official.train, official.test):
+        console.print(
+            f"{path} holds {len(source.classes)} classes, {counts['train']} training and {counts['test']} test objects; "
+            f"{official.name} has {official.classes}, {official.train} and {official.test}"
+        )
+    return replace(source, name=official.name)
+
+
 def prepare(config: DataConfig, folder: Path) -> DatasetStatistics:
     """Makes the data set in `folder`, or finds it there.
 
@@ -327,7 +352,7 @@ def prepare(config: DataConfig, folder: Path) -> DatasetStatistics:
     if (folder / _SUMMARY).exists():
         shutil.rmtree(captures, ignore_errors=True)  # of a run that was stopped between the two
         return load_statistics(folder)
-    source = open_source(config.source, train_per_class=config.train_per_class, test_per_class=config.test_per_class)
+    source = _open(config)
     folder.mkdir(parents=True, exist_ok=True)
     write_json(made_with, identity)
     left_out = capture_all(source.entries, config.capture, captures, skip_damaged=config.skip_damaged)

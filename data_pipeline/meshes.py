@@ -381,7 +381,8 @@ def open_source(data: str, *, train_per_class: int, test_per_class: int) -> Obje
     path = Path(os.path.expanduser(data))
     if not path.exists():
         raise DataError(
-            f"no such file or folder: {data}; --data takes furniture10, a folder of class folders, a .zip or a .npz"
+            f"no such file or folder: {data}; --data takes furniture10, modelnet10, modelnet40, a folder of class folders, "
+            f"a .zip or a .npz"
         )
     if path.is_dir():
         return mesh_folder(path.resolve())

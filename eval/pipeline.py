@@ -127,7 +127,10 @@ class Options(Settings):
     preset: Literal["small", "thesis", "tiny"] = "small"
     """which defaults all other settings have"""
     data: str | None = None
-    """furniture10, a folder of meshes, a ModelNet zip, or an .npz of voxel grids; overrides dataset.source"""
+    """furniture10, modelnet10 or modelnet40 (downloaded), a folder of meshes, a zip of the same layout, or an .npz of voxel
+    grids; overrides dataset.source"""
+    archive: Annotated[str | None, tyro.conf.arg(metavar="FILE")] = None
+    """ModelNet10.zip or ModelNet40.zip where it is here already; overrides dataset.archive"""
     views: Annotated[int | None, tyro.conf.arg(metavar="N")] = None
     """candidate viewpoints around an object; overrides dataset.capture.views"""
     out: Path | None = None
@@ -140,6 +143,8 @@ class Options(Settings):
         dataset = self.dataset
         if self.data is not None:
             dataset = replace(dataset, source=self.data)
+        if self.archive is not None:
+            dataset = replace(dataset, archive=self.archive)
         if self.views is not None:
             dataset = replace(dataset, capture=replace(dataset.capture, views=self.views))
         return Settings(dataset, self.classifier, self.entropy, self.evaluation, self.live, self.thesis)
