@@ -6,6 +6,7 @@ from either side, so holes and flipped triangles of CAD models do no harm.
 
 What is kept of each view: depth as 16-bit integers of 1/10,000 unit (the thesis's own format), a shaded image, and the pose.
 The partial cloud of a view is its depth unprojected by its pose (`mevs_jax.cameras.unproject`), so it needs no room of its own.
+The thesis's own way, a window of Open3D's, is in `data_pipeline.visualizer`.
 """
 
 from __future__ import annotations
@@ -15,7 +16,7 @@ import multiprocessing
 import os
 import signal
 import zlib
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -56,6 +57,8 @@ class CaptureConfig:
     """of the camera from the object's centre, in radii of the object"""
     field_of_view: float = 60.0
     """in degrees"""
+    backend: Literal["raycast", "visualizer"] = "raycast"
+    """how: by casting rays, or the thesis's way, by a window of Open3D's, which needs a display"""
 
 
 @dataclass(frozen=True)
@@ -65,10 +68,12 @@ class Rig:
     Attributes:
         poses: (views, 4, 4) camera to world, float32.
         directions: (views, resolution, resolution, 3) ray directions of unit length along the optical axis, float32.
+        field_of_view: in radians.
     """
 
     poses: np.ndarray
     directions: np.ndarray
+    field_of_view: float
 
 
 @dataclass(frozen=True)
@@ -100,7 +105,11 @@ def rig_for(config: CaptureConfig) -> Rig:
         field_of_view=np.deg2rad(config.field_of_view),
     )
     directions = jax.vmap(pixel_directions)(cameras)
-    return Rig(np.asarray(cameras.pose, np.float32), np.asarray(directions, np.float32))
+    return Rig(
+        np.asarray(cameras.pose, np.float32),
+        np.asarray(directions, np.float32),
+        float(np.deg2rad(config.field_of_view)),
+    )
 
 
 # ---------------------------------------------------------------------------------------------------------------- casters
@@ -162,10 +171,16 @@ def capture(mesh: Mesh, rig: Rig, caster: Caster | None = None) -> Capture:
     image = np.zeros(len(depth), np.uint8)
     image[hit] = np.round(255 * (_AMBIENT + (1 - _AMBIENT) * np.clip(facing, 0, 1)))
 
-    stored = np.zeros(len(depth), np.uint16)
-    stored[hit] = np.clip(depth[hit] * np.float32(DEPTH_SCALE), 1, 65535).astype(np.uint16)
     shape = (views, resolution, resolution)
-    return Capture(stored.reshape(shape), image.reshape(shape), mesh.extent)
+    return Capture(store_depth(depth).reshape(shape), image.reshape(shape), mesh.extent)
+
+
+def store_depth(depth: np.ndarray) -> np.ndarray:
+    """Metric depth, inf where nothing is hit, as it is kept: uint16, 1/10,000 unit, 0 where nothing is hit."""
+    stored = np.zeros(depth.shape, np.uint16)
+    hit = np.isfinite(depth)
+    stored[hit] = np.clip(depth[hit] * np.float32(DEPTH_SCALE), 1, 65535).astype(np.uint16)
+    return stored
 
 
 def save_capture(path: Path, capture: Capture) -> None:
@@ -197,12 +212,21 @@ def _left_out_path(folder: Path, entry: ObjectEntry) -> Path:
 
 _rig: Rig | None = None
 _folder: Path | None = None
+_backend = "raycast"
 
 
-def _start_worker(rig: Rig, folder: Path) -> None:
-    global _rig, _folder
-    _rig, _folder = rig, folder
+def _start_worker(rig: Rig, folder: Path, backend: str) -> None:
+    global _rig, _folder, _backend
+    _rig, _folder, _backend = rig, folder, backend
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent answers Ctrl-C and ends its workers
+
+
+def _capture_by(backend: str) -> Callable[[Mesh, Rig], Capture]:
+    if backend == "visualizer":
+        from data_pipeline.visualizer import capture_with_visualizer
+
+        return capture_with_visualizer
+    return capture
 
 
 def _capture_entry(entry: ObjectEntry) -> str | None:
@@ -210,7 +234,7 @@ def _capture_entry(entry: ObjectEntry) -> str | None:
     assert _rig is not None
     assert _folder is not None
     try:
-        save_capture(capture_path(_folder, entry), capture(load_object(entry), _rig))
+        save_capture(capture_path(_folder, entry), _capture_by(_backend)(load_object(entry), _rig))
     except EmptyMesh as reason:
         write_text(_left_out_path(_folder, entry), str(reason))
     except DamagedMesh as reason:
@@ -245,7 +269,7 @@ def capture_all(
         context = multiprocessing.get_context("spawn")
         with (
             progress_bar("objects") as bar,
-            context.Pool(min(workers, len(todo)), _start_worker, (rig_for(config), folder)) as pool,
+            context.Pool(min(workers, len(todo)), _start_worker, (rig_for(config), folder, config.backend)) as pool,
         ):
             task = bar.add_task("Capturing", total=len(entries), completed=len(entries) - len(todo), note="")
             for entry, damage in zip(todo, pool.imap(_capture_entry, todo, chunksize=4), strict=True):
