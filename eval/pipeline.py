@@ -17,6 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 import tyro
 
+from data_pipeline.augment import CloudAugmentation
 from data_pipeline.builder import DataConfig, DatasetStatistics, load_statistics, prepare, report_left_out
 from data_pipeline.capture import CaptureConfig
 from data_pipeline.files import read_json, write_json
@@ -70,15 +71,20 @@ SMALL = Settings(
         network=PointNet2Config(
             points=1024,
             abstractions=(
-                Abstraction(centres=128, radius=0.25, samples=32, layers=(32, 32, 64)),
-                Abstraction(centres=32, radius=0.5, samples=32, layers=(64, 64, 128)),
+                Abstraction(centres=128, radius=0.25, samples=16, layers=(32, 32, 64)),
+                Abstraction(centres=32, radius=0.5, samples=16, layers=(64, 64, 128)),
             ),
-            global_layers=(128, 256, 512),
-            head_layers=(256, 128),
-            dropout=0.3,
+            dropout=0.0,
         ),
+        augmentation=CloudAugmentation(scale=False, tilt=False, translate=False, drop=False),
         optimiser=OptimiserConfig(
-            epochs=6, batch_size=32, epoch_views=4, validation_views=2, learning_rate=2e-3, schedule="cosine"
+            epochs=10,
+            batch_size=32,
+            views_per_object=2,
+            epoch_views=4,
+            validation_views=2,
+            learning_rate=2e-3,
+            schedule="cosine",
         ),
     ),
     thesis=ThesisConfig(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import flax.nnx as nnx
@@ -18,6 +19,7 @@ from data_pipeline.progress import progress_bar
 from mevs_jax.selection import ViewTable
 from train.classifier import ClassifierTask
 from train.entropy import EntropyTask
+from train.loop import Batch
 
 
 @dataclass(frozen=True)
@@ -45,20 +47,20 @@ class ViewTables:
         return ViewTable(*(jnp.asarray(a) for a in (self.logits, self.utility, self.entropy, self.labels)))
 
 
+@partial(jax.jit, static_argnames=("task", "structure"))
+def _look(task: ClassifierTask | EntropyTask, structure: nnx.GraphDef, state: nnx.State, batch: Batch) -> jax.Array:
+    return nnx.merge(structure, state)(task.inputs(batch))
+
+
 def network_outputs(data: Path, split: str, task: ClassifierTask | EntropyTask, network: nnx.Module) -> np.ndarray:
     """What a network says of every view of every object of a split, (objects, views, classes or views)."""
     structure, state = nnx.split(network)
-
-    @jax.jit
-    def look(state, batch):
-        return nnx.merge(structure, state)(task.inputs(batch))
-
     objects = len(open_split(data, split))
     with progress_bar("objects") as bar:
         line = bar.add_task(f"Looking at {split} objects: {task.name}", total=objects, note="")
         out = []
         for batch in evaluation_batches(data, split, points=task.batches.points, images=task.batches.images):
-            out.append(np.asarray(look(state, batch)))
+            out.append(np.asarray(_look(task, structure, state, batch)))
             bar.advance(line)
     return np.stack(out)
 
