@@ -181,6 +181,18 @@ def check_output(out: Path) -> None:
         raise DataError(f"cannot write to {out} ({error.strerror}); choose another --out") from error
 
 
+def check_pretrained(settings: Settings, pretrained: tuple[Path, ...]) -> None:
+    """Raises `DataError` where files of weights cannot be read or fit no classifier of these settings."""
+    shape = settings.classifier.network
+    if pretrained and (shape.width, shape.channels) != (64, 3):
+        raise DataError(
+            f"--pretrained weights are of a ResNet 64 channels wide that sees three, this one has {shape.width} and "
+            f"{shape.channels}; use --preset thesis, or --classifier.network.width 64 --classifier.network.channels 3"
+        )
+    if pretrained:
+        weights_from_torch(pretrained, shape.depth)
+
+
 def make_data(settings: Settings, out: Path) -> DatasetStatistics:
     statistics = prepare(settings.dataset, out / "data")
     report_left_out(statistics)

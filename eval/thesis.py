@@ -217,11 +217,13 @@ def reproduce(settings: Settings, preset: str, out: Path, pretrained: tuple[Path
         for frame in FRAMES:
             histories[f"{views}_{frame}"] = read_history(folder.entropy(views, frame))
     inputs = FigureInputs(folder, results, statistics, tables, histories, _example(tables[40], statistics[40].classes))
+    ran_on = results["machine"]
+    where = f"{ran_on['cores']} CPU cores" if "CPU" in ran_on["device"] else ran_on["device"]
     minutes = sum(results["training_seconds"].values()) / 60
     camera = statistics[40].camera
     lead = (
         f"{statistics[40].source}, preset {preset}: views of {camera.resolution}×{camera.resolution} pixels, "
         f"{results['objects']['40']} test objects, {statistics[40].left_out_count} of all objects left out, "
-        f"{minutes:.0f} minutes of training on {results['machine']['device']}. Ours first, the thesis's in brackets."
+        f"{minutes:.0f} minutes of training on {where}. Ours first, the thesis's in brackets."
     )
     return write_thesis_report(inputs, lead, out / "report")

@@ -11,6 +11,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator
 
 from data_pipeline.builder import DatasetStatistics, open_split
 from eval import figures
@@ -72,7 +73,7 @@ def class_distribution(inputs: FigureInputs) -> Figure:
     views.set_ylim(0, axis.get_ylim()[1] * statistics.views)
     views.spines.right.set_visible(True)
     views.set_ylabel(f"views ({statistics.views} an object)")
-    axis.legend(frameon=False)
+    figure.legend(frameon=False, ncols=2, loc="outside upper center")
     return figure
 
 
@@ -120,7 +121,7 @@ def _sphere(axis: Any, points: np.ndarray) -> None:
     longitude, latitude = np.mgrid[0 : 2 * np.pi : 30j, -np.pi / 2 : np.pi / 2 : 16j]
     x, y, z = np.cos(latitude) * np.cos(longitude), np.cos(latitude) * np.sin(longitude), np.sin(latitude)
     axis.plot_wireframe(0.97 * x, 0.97 * y, 0.97 * z, color="#e5e7eb", linewidth=0.4)
-    axis.set_box_aspect((1, 1, 1))
+    axis.set_box_aspect((1, 1, 1), zoom=0.88)
     axis.set(xlim=(-1, 1), ylim=(-1, 1), zlim=(-1, 1), xlabel="x", ylabel="y", zlabel="z")
     axis.set(xticks=[-1, 0, 1], yticks=[-1, 0, 1], zticks=[-1, 0, 1])
 
@@ -294,6 +295,7 @@ def entropy_losses(inputs: FigureInputs) -> Figure:
         for frame in FRAMES:
             _losses(axis, inputs.histories[f"{views}_{frame}"], colours[frame], f"{frame} frame, ")
         axis.set(xlabel="epoch", ylabel="mean squared error", yscale="log", title=f"({letter}) {views} views")
+        axis.xaxis.set_major_locator(MaxNLocator(integer=True))
         axis.legend(frameon=False, fontsize=8)
     return figure
 
@@ -304,8 +306,10 @@ def backbone_losses(indices: Sequence[int]) -> Callable[[FigureInputs], Figure]:
         for axis, index, letter in zip(axes, indices, "ab", strict=True):
             backbone = BACKBONES[index]
             _losses(axis, inputs.histories[backbone.name], "#2563eb", "")
-            axis.set(xlabel="epoch", ylabel="cross entropy", ylim=0, title=f"({letter}) {backbone.title}")
+            axis.set(xlabel="epoch", ylabel="cross entropy", title=f"({letter}) {backbone.title}")
+            axis.xaxis.set_major_locator(MaxNLocator(integer=True))
             axis.legend(frameon=False, fontsize=8)
+        axes[0].set_ylim(bottom=0)
         return figure
 
     return draw

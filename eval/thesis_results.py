@@ -217,7 +217,7 @@ def machine() -> dict[str, Any]:
         "operating_system": f"{platform.system()} {platform.release()}",
         "cpu": _processor(),
         "cores": os.cpu_count(),
-        "device": f"{len(jax.devices())} × {device.device_kind} ({device.platform})",
+        "device": "none but the CPU" if device.platform == "cpu" else f"{len(jax.devices())} × {device.device_kind}",
         "memory_gib": memory,
         "python": platform.python_version(),
         "jax": jax.__version__,

@@ -36,14 +36,18 @@ commands:
 common options:
   --preset small|thesis   small (default): 64×64 views, narrow networks, for a CPU; thesis: the
                           thesis's sizes, for an accelerator; tiny: to see it all run in a minute
-  --data PATH             furniture10 (default, built in), a folder <class>/{{train,test}}/ of
-                          .off, .obj, .stl, .ply or .glb, a ModelNet zip, or an .npz of voxel grids
+  --data PATH             furniture10 (default, built in), modelnet10 or modelnet40 (downloaded), a
+                          folder <class>/{{train,test}}/ of .off, .obj, .stl, .ply or .glb, a zip of
+                          that layout, or an .npz of voxel grids
+  --archive FILE          ModelNet10.zip or ModelNet40.zip, where it is here already
+  --pretrained FILE ...   ImageNet weights for the classifiers: torchvision's .pth or .safetensors
   --views N               candidate viewpoints around an object (default 40)
   --out DIR               where everything is written (default runs/<preset>); a run goes on there
 
 `mevs COMMAND --help` lists every setting. Examples:
   mevs run
-  mevs run --data ModelNet10.zip --out runs/modelnet10
+  mevs run --data modelnet10 --out runs/modelnet10
+  mevs thesis --data modelnet10 --archive ModelNet10.zip
   mevs train --out runs/modelnet10 --classifier.optimiser.epochs 20
 """
 
@@ -85,8 +89,15 @@ def _run(command: str, arguments: list[str]) -> None:
     from eval import pipeline
 
     pipeline.check_output(out)
+    pipeline.check_pretrained(settings, options.pretrained)
     if command == "thesis":
+        from data_pipeline.meshes import DataError
         from eval.thesis import reproduce
+
+        if options.views is not None:
+            raise DataError(
+                "mevs thesis makes both of the thesis's data sets, of 10 and of 40 views; leave --views out"
+            )
 
         console.print(f"Report: {reproduce(settings, preset, out, options.pretrained).absolute()}")
         return

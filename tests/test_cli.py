@@ -100,6 +100,19 @@ def unwritable(root: Path) -> list:
     return ["--out", root / "file" / "run"]
 
 
+def no_archive(root: Path) -> list:
+    return ["--data", "modelnet10", "--archive", root / "ModelNet10.zip"]
+
+
+def weights_for_another(root: Path) -> list:
+    (root / "resnet18.pth").write_bytes(b"")
+    return ["--pretrained", root / "resnet18.pth"]
+
+
+def weights_that_are_none(root: Path) -> list:
+    return [*weights_for_another(root), "--classifier.network.width", "64", "--classifier.network.channels", "3"]
+
+
 @pytest.mark.parametrize(
     ("make", "message"),
     [
@@ -111,6 +124,9 @@ def unwritable(root: Path) -> list:
         (zip_that_leaves, "a path that leaves its folder"),
         (one_view, "--views 1 is too few"),
         (unwritable, "cannot write to"),
+        (no_archive, r"--archive .*ModelNet10.zip cannot be read: No such file"),
+        (weights_for_another, r"64 channels wide that sees three, this one has 8 and 1; use --preset thesis"),
+        (weights_that_are_none, r"resnet18.pth is not a file of weights that can be read safely"),
     ],
     ids=lambda value: getattr(value, "__name__", ""),
 )
@@ -127,6 +143,7 @@ def test_unknown_words_are_refused_and_help_reads_well(tmp_path):
     assert "unknown command 'fly'" in refused(mevs("fly"))
     assert "unknown preset 'huge'" in refused(mevs("run", "--preset", "huge"))
     assert mevs("run", "--no-such-option").returncode == 2
+    assert "of 10 and of 40 views" in refused(mevs("thesis", "--views", "5", "--out", tmp_path / "thesis"))
     assert "no data set in" in refused(mevs("train", "--out", tmp_path))
     shown = mevs("--help")
     assert shown.returncode == 0

@@ -17,6 +17,7 @@ from data_pipeline.builder import load_statistics, prepare
 from data_pipeline.meshes import DataError
 from eval.pipeline import TINY, tasks
 from train.loop import OptimiserConfig, fit, learning_rate_schedule, load_best
+from train.pretrained import weights_from_network
 
 SETTINGS = replace(
     TINY,
@@ -98,6 +99,22 @@ def test_a_stopped_run_ends_as_if_it_had_not_been(name, trained, data, tmp_path,
         np.testing.assert_array_equal(mine, theirs)
     timeless = [{key: value for key, value in entry.items() if key != "seconds"} for entry in lines(tmp_path)]
     assert timeless == [{k: v for k, v in entry.items() if k != "seconds"} for entry in lines(trained / name)]
+
+
+def test_training_goes_on_from_other_weights(trained, data, tmp_path):
+    """The first epoch begins where the other network ended, and the run knows where it began."""
+    statistics = load_statistics(data)
+    task = tasks(SETTINGS, statistics)[0]
+    once = replace(task, optimiser=replace(task.optimiser, epochs=1, learning_rate=1e-6))
+    start = weights_from_network(load_best(task, trained / "classifier"), "the one before")
+    summary = fit(once, data, statistics, tmp_path, start)
+    assert summary["start"] == "the one before"
+    assert json.loads((trained / "classifier" / "summary.json").read_text())["start"] == "random weights"
+    before = json.loads((trained / "classifier" / "summary.json").read_text())
+    assert summary["best"]["loss"] == pytest.approx(before["best"]["loss"], rel=0.2)
+    assert lines(tmp_path)[0]["train/loss"] < 0.8 * lines(trained / "classifier")[0]["train/loss"]
+    with pytest.raises(DataError, match="other settings"):
+        fit(once, data, statistics, tmp_path)
 
 
 def test_a_finished_run_is_not_repeated_nor_mixed(trained, data):

@@ -220,9 +220,7 @@ def weights_from_torch(paths: tuple[Path, ...], depth: int) -> StartingWeights:
         try:
             resnet_from_torch(network, state, head=False)
         except ValueError as error:
-            raise DataError(
-                f"{path} does not fit the classifier: {error}; use --classifier.network.width 64 and .channels 3"
-            ) from error
+            raise DataError(f"{path} does not fit the classifier: {error}") from error
 
     digest = hashlib.sha256(path.read_bytes()).hexdigest()
     return StartingWeights(f"{path.name}, sha256 {digest[:16]}", put)
