@@ -27,7 +27,7 @@ th:first-child,td:first-child{text-align:left}td[colspan]{padding-top:.9rem}
 .figures{display:flex;flex-wrap:wrap;gap:1rem}.figures figure{flex:1 1 45%;margin:0}small{white-space:nowrap}
 figure{margin:1rem 0}figcaption{color:#6b7280;font-size:.85rem}img{max-width:100%;height:auto}
 code{background:#f3f4f6;padding:.1rem .3rem}
-details{margin:1rem 0}summary{cursor:pointer}
+details{margin:1rem 0}summary{cursor:pointer}.wide{overflow-x:auto}.wide td,.wide th{white-space:nowrap}
 """
 
 
@@ -45,15 +45,35 @@ class ReportInputs:
     settings: dict[str, Any]
 
 
-def image(figure: Figure, caption: str, kind: str = "svg") -> str:
+def drawn(figure: Figure, kind: str) -> bytes:
+    """A figure as the content of an SVG or PNG file."""
     buffer = io.BytesIO()
     figure.savefig(buffer, format=kind, **({"metadata": {"Date": None}} if kind == "svg" else {"dpi": 130}))
-    plt.close(figure)
+    return buffer.getvalue()
+
+
+def embedded(content: bytes, kind: str, caption: str, name: str = "") -> str:
+    """A picture inside the page; with a name, such as "Figure 5", it is captioned with it and can be linked to."""
     mime = "svg+xml" if kind == "svg" else kind
-    encoded = base64.b64encode(buffer.getvalue()).decode()
+    anchor = f' id="{name.lower().replace(" ", "-")}"' if name else ""
+    label = f"<b>{html.escape(name)}.</b> " if name else ""
     return (
-        f'<figure><img alt="{html.escape(caption)}" src="data:image/{mime};base64,{encoded}">'
-        f"<figcaption>{html.escape(caption)}</figcaption></figure>"
+        f'<figure{anchor}><img alt="{html.escape(caption)}" src="data:image/{mime};base64,{base64.b64encode(content).decode()}">'
+        f"<figcaption>{label}{html.escape(caption)}</figcaption></figure>"
+    )
+
+
+def image(figure: Figure, caption: str, kind: str = "svg") -> str:
+    content = drawn(figure, kind)
+    plt.close(figure)
+    return embedded(content, kind, caption)
+
+
+def document(title: str, body: str) -> str:
+    """A whole page that needs no other file."""
+    return (
+        f'<!doctype html><html lang="en"><meta charset="utf-8"><meta name="viewport" content="width=device-width">'
+        f"<title>{title}</title><style>{STYLE}</style><h1>{title}</h1>{body}</html>\n"
     )
 
 

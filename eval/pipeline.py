@@ -6,7 +6,6 @@ A run directory holds `data/`, `classifier/`, `entropy/`, `tables/`, `metrics.js
 
 from __future__ import annotations
 
-import hashlib
 import json
 import os
 from dataclasses import asdict, dataclass, replace
@@ -30,7 +29,7 @@ from eval.page import ReportInputs
 from eval.report import read_history, write_report
 from eval.study import reachable_views, run_study
 from eval.thesis_networks import ThesisConfig
-from eval.view_tables import ViewTables, compute_view_tables, load_view_tables, save_view_tables
+from eval.view_tables import ViewTables, compute_view_tables, load_view_tables, made_by, save_view_tables
 from mevs_jax.models import Abstraction
 from mevs_jax.policies import POLICIES
 from mevs_jax.viewpoints import ViewGraph
@@ -236,44 +235,41 @@ def train_by_view(settings: Settings, out: Path) -> None:
     fit(by_view, out / "data", statistics, out / BY_VIEW)
 
 
-def _made_by(out: Path, statistics: DatasetStatistics, networks: tuple[str, str]) -> str:
-    """Names the data set and the networks; changes when any is made anew, but not with the time it took."""
-    content: list[Any] = [statistics.fingerprint]
-    for name in networks:
-        if not (out / name / "summary.json").exists():
-            raise DataError(f"the {name} network in {out} is not fully trained; finish it with: mevs train --out {out}")
-        summary = read_json(out / name / "summary.json")
-        content += [read_json(out / name / "config.json"), summary["best_epoch"], summary["best"]]
-    return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()[:16]
-
-
 def _tables(
     settings: Settings, out: Path, statistics: DatasetStatistics, split: str, classifier: str = "classifier"
 ) -> ViewTables:
     """The view tables of a split, made anew where the stored ones are of other networks."""
-    made_by = _made_by(out, statistics, (classifier, "entropy"))
+    made = made_by(statistics, out / classifier, out / "entropy")
     path = out / "tables" / (f"{split}.npz" if classifier == "classifier" else f"{split}_by_view.npz")
-    if path.exists() and (tables := load_view_tables(path)).made_by == made_by:
+    if path.exists() and (tables := load_view_tables(path)).made_by == made:
         return tables
     classify, predict = tasks(settings, statistics)
     networks = load_best(classify, out / classifier), load_best(predict, out / "entropy")
     tables = compute_view_tables(out / "data", split, statistics, classify, networks[0], predict, networks[1])
-    tables = replace(tables, made_by=made_by)
+    tables = replace(tables, made_by=made)
     save_view_tables(path, tables)
     return tables
+
+
+def check_evaluation(config: GridConfig) -> None:
+    """Raises `DataError` for a grid without cells."""
+    if config.max_views < FIRST_MV or config.draws < 1:
+        raise DataError("--evaluation.max-views must be at least 2 and --evaluation.draws at least 1")
 
 
 def evaluate(settings: Settings, out: Path) -> dict[str, Any]:
     """Metrics of the test split, as written to `metrics.json`."""
     statistics = load_statistics(out / "data")
-    made_by = _made_by(out, statistics, ("classifier", "entropy"))
-    by_view_made_by = None
+    by_view_made = None
     if (out / BY_VIEW / "summary.json").exists():
-        by_view_made_by = _made_by(out, statistics, (BY_VIEW, "entropy"))
-    identity = {"evaluation": asdict(settings.evaluation), "made_by": made_by, "by_view": by_view_made_by}
+        by_view_made = made_by(statistics, out / BY_VIEW, out / "entropy")
+    identity = {
+        "evaluation": asdict(settings.evaluation),
+        "made_by": made_by(statistics, out / "classifier", out / "entropy"),
+        "by_view": by_view_made,
+    }
     identity = json.loads(json.dumps(identity))
-    if settings.evaluation.max_views < FIRST_MV or settings.evaluation.draws < 1:
-        raise DataError("--evaluation.max-views must be at least 2 and --evaluation.draws at least 1")
+    check_evaluation(settings.evaluation)
     path = out / "metrics.json"
     if path.exists() and (metrics := read_json(path))["identity"] == identity:
         return metrics
@@ -282,7 +278,7 @@ def evaluate(settings: Settings, out: Path) -> dict[str, Any]:
     except ValueError as error:
         raise DataError(str(error)) from error
     tables, by_view, leak = _tables(settings, out, statistics, "test"), None, None
-    if by_view_made_by is not None:
+    if by_view_made is not None:
         by_view = _tables(settings, out, statistics, "test", BY_VIEW)
         leak = {
             name: {

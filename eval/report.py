@@ -14,7 +14,7 @@ import numpy as np
 from data_pipeline.builder import open_split
 from data_pipeline.files import write_text
 from eval import figures
-from eval.page import STYLE, ReportInputs, image, percent, table
+from eval.page import ReportInputs, document, image, percent, table
 from eval.report_policies import (
     compatibility_section,
     confidence_section,
@@ -163,8 +163,4 @@ def write_report(inputs: ReportInputs, path: Path) -> None:
     """Writes the page; it needs no other file."""
     body = "".join(section(inputs) for section in _SECTIONS)
     title = f"Where to look next: {html.escape(inputs.statistics.source)}"
-    write_text(
-        path,
-        f'<!doctype html><html lang="en"><meta charset="utf-8"><meta name="viewport" content="width=device-width">'
-        f"<title>{title}</title><style>{STYLE}</style><h1>{title}</h1>{body}</html>\n",
-    )
+    write_text(path, document(title, body))

@@ -6,7 +6,6 @@ view (`outputs/`), `timing.json`, `thesis.json` and the report (`report/`).
 
 from __future__ import annotations
 
-import hashlib
 import io
 import json
 from collections.abc import Callable
@@ -17,11 +16,11 @@ from typing import Any
 import numpy as np
 from flax import nnx
 
-from data_pipeline.builder import DatasetStatistics, prepare, report_left_out
+from data_pipeline.builder import prepare, report_left_out
 from data_pipeline.files import read_json, write_bytes, write_json
 from data_pipeline.meshes import DataError
 from data_pipeline.progress import console
-from eval.pipeline import Settings
+from eval.pipeline import Settings, check_evaluation
 from eval.report import read_history
 from eval.thesis_figures import FigureInputs
 from eval.thesis_networks import (
@@ -38,7 +37,7 @@ from eval.thesis_networks import (
 from eval.thesis_page import write_thesis_report
 from eval.thesis_results import LatticeTables, all_results, machine
 from eval.timing import decision_memory_alone, time_local_maxima, time_predictor
-from eval.view_tables import network_outputs, objects_of
+from eval.view_tables import made_by, network_outputs, objects_of
 from train.classifier import ClassifierTask
 from train.entropy import EntropyTask
 from train.loop import load_best
@@ -56,22 +55,15 @@ def make_thesis_data(settings: Settings, folder: ThesisFolder) -> None:
 # --------------------------------------------------------------------------------------------------------------- outputs
 
 
-def _made_by(network: Path, statistics: DatasetStatistics) -> str:
-    """Names a trained network and the data it looks at."""
-    summary = read_json(network / "summary.json")
-    content = [statistics.fingerprint, read_json(network / "config.json"), summary["best_epoch"], summary["best"]]
-    return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()[:16]
-
-
-def _stored(path: Path, made_by: str, compute: Callable[[], np.ndarray]) -> np.ndarray:
+def _stored(path: Path, made: str, compute: Callable[[], np.ndarray]) -> np.ndarray:
     """The array in `path`, computed anew where it is not there or was made by other networks."""
     if path.exists():
         with np.load(path) as stored:
-            if str(stored["made_by"]) == made_by:
+            if str(stored["made_by"]) == made:
                 return stored["array"]
     array = compute()
     buffer = io.BytesIO()
-    np.savez(buffer, array=array, made_by=np.array(made_by))
+    np.savez(buffer, array=array, made_by=np.array(made))
     write_bytes(path, buffer.getvalue())
     return array
 
@@ -83,7 +75,7 @@ def lattice_tables(settings: Settings, folder: ThesisFolder, views: int, split: 
     def outputs(name: str, network: Path, task: ClassifierTask | EntropyTask) -> np.ndarray:
         return _stored(
             folder.out / "outputs" / f"{name}_on_{views}_{split}.npz",
-            _made_by(network, statistics),
+            made_by(statistics, network),
             lambda: network_outputs(data, split, task, load_best(task, network)),
         )
 
@@ -186,8 +178,8 @@ def evaluate_thesis(settings: Settings, folder: ThesisFolder) -> tuple[dict[str,
     statistics = {views: folder.statistics(views) for views in VIEWS}
     networks = [folder.backbone(backbone.name) for backbone in BACKBONES]
     networks += [folder.entropy(views, frame) for views in VIEWS for frame in FRAMES]
-    made_by = [_made_by(network, statistics[40]) for network in networks]
-    identity = json.loads(json.dumps([made_by, asdict(settings.evaluation), measured]))
+    made = made_by(statistics[40], *networks)
+    identity = json.loads(json.dumps([made, asdict(settings.evaluation), measured]))
     path = folder.out / "thesis.json"
     if path.exists() and (results := read_json(path))["identity"] == identity:
         return results, test
@@ -207,6 +199,7 @@ def reproduce(settings: Settings, preset: str, out: Path, pretrained: tuple[Path
     """
     if settings.evaluation.lowest_elevation > -90:
         raise DataError("mevs thesis walks from every view; leave --evaluation.lowest-elevation as it is")
+    check_evaluation(settings.evaluation)
     folder = ThesisFolder(out)
     make_thesis_data(settings, folder)
     train_thesis(folder, settings.classifier, settings.entropy, settings.thesis, pretrained)

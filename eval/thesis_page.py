@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-import base64
 import html
-import io
 from pathlib import Path
 
 import matplotlib.pyplot as plt
 
 from data_pipeline.files import write_bytes, write_text
-from eval.page import STYLE, table
+from eval.page import document, drawn, embedded, table
 from eval.thesis_figures import FIGURES, FigureInputs, ThesisFigure
 from eval.thesis_tables import ThesisTable, all_tables, cell_text, markdown
 
@@ -47,17 +45,11 @@ def _table_html(shown: ThesisTable) -> str:
 def _save_figure(shown: ThesisFigure, inputs: FigureInputs, folder: Path) -> str:
     """Draws a figure, saves it as PNG and SVG, and returns it for the page."""
     figure = shown.draw(inputs)
-    name = f"figure_{int(shown.number):02d}"
-    for kind, options in (("png", {"dpi": 160}), ("svg", {"metadata": {"Date": None}})):
-        buffer = io.BytesIO()
-        figure.savefig(buffer, format=kind, **options)
-        write_bytes(folder / f"{name}.{kind}", buffer.getvalue())
+    files = {kind: drawn(figure, kind) for kind in ("png", "svg")}
     plt.close(figure)
-    embedded = base64.b64encode((folder / f"{name}.svg").read_bytes()).decode()
-    return (
-        f'<figure id="figure-{shown.number}"><img alt="{html.escape(shown.caption)}" src="data:image/svg+xml;base64,{embedded}">'
-        f"<figcaption><b>Figure {shown.number}.</b> {html.escape(shown.caption)}</figcaption></figure>"
-    )
+    for kind, content in files.items():
+        write_bytes(folder / f"figure_{int(shown.number):02d}.{kind}", content)
+    return embedded(files["svg"], "svg", shown.caption, f"Figure {shown.number}")
 
 
 def write_thesis_report(inputs: FigureInputs, lead: str, folder: Path) -> Path:
@@ -69,7 +61,7 @@ def write_thesis_report(inputs: FigureInputs, lead: str, folder: Path) -> Path:
         folder: where to.
     """
     tables = {f"T{shown.number}": shown for shown in all_tables(inputs.results)}
-    drawn = {f"F{shown.number}": shown for shown in FIGURES}
+    pictures = {f"F{shown.number}": shown for shown in FIGURES}
     page, text = [], []
     for chapter, names in CHAPTERS:
         page.append(f"<h2>{html.escape(chapter)}</h2>")
@@ -79,20 +71,14 @@ def write_thesis_report(inputs: FigureInputs, lead: str, folder: Path) -> Path:
                 page.append(_table_html(tables[name]))
                 text.append(markdown(tables[name]))
             else:
-                shown = drawn[name]
+                shown = pictures[name]
                 page.append(_save_figure(shown, inputs, folder / "figures"))
                 text.append(
                     f"![Figure {shown.number}](figures/figure_{int(shown.number):02d}.png)\n\n"
                     f"**Figure {shown.number}.** {shown.caption}\n"
                 )
     title = "The thesis, reproduced"
-    style = STYLE + ".wide{overflow-x:auto}td,th{white-space:nowrap}"
     write_text(folder / "thesis.md", f"# {title}\n\n{lead}\n\n" + "\n".join(text))
     path = folder / "index.html"
-    write_text(
-        path,
-        f'<!doctype html><html lang="en"><meta charset="utf-8"><meta name="viewport" content="width=device-width">'
-        f'<title>{title}</title><style>{style}</style><h1>{title}</h1><p class="lead">{html.escape(lead)}</p>'
-        f"{''.join(page)}</html>\n",
-    )
+    write_text(path, document(title, f'<p class="lead">{html.escape(lead)}</p>' + "".join(page)))
     return path

@@ -73,11 +73,15 @@ def _by_class(errors: np.ndarray, labels: np.ndarray, classes: Sequence[str]) ->
 
 
 def entropy_learning(lattice: LatticeTables, statistics: DatasetStatistics) -> dict[str, Any]:
-    """Errors of the predicted entropies on test objects, by frame and class, beside two predictors that look at nothing."""
+    """Errors of the predicted entropies on test objects, by frame and class, beside two predictors that look at nothing.
+
+    `every_side` is the error of the mean prediction over the clouds of all views: about as far as one gets by looking.
+    """
     true, labels, classes = lattice.entropy, lattice.labels, statistics.classes
     errors = {frame: np.square(lattice.utility[frame] - true[:, None]).mean(axis=-1) for frame in FRAMES}
     mean_map = np.square(np.array(statistics.mean_map) - true).mean(axis=1, keepdims=True)
     class_map = np.square(np.array(statistics.class_mean_maps)[labels] - true).mean(axis=1, keepdims=True)
+    every_side = np.square(lattice.utility["world"].mean(axis=1) - true).mean(axis=1, keepdims=True)
     variance = float(true.var())
     per_object = {frame: of.mean(axis=1) for frame, of in errors.items()}
     return {
@@ -90,6 +94,7 @@ def entropy_learning(lattice: LatticeTables, statistics: DatasetStatistics) -> d
             }
             for frame, of in per_object.items()
         },
+        "every_side": _by_class(every_side, labels, classes),
         "variance": variance,
         "mean_map": _by_class(mean_map, labels, classes),
         "class_mean_map": _by_class(class_map, labels, classes),

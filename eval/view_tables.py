@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import hashlib
 import io
+import json
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import flax.nnx as nnx
 import jax
@@ -14,7 +17,8 @@ import numpy as np
 
 from data_pipeline.batches import evaluation_batches
 from data_pipeline.builder import DatasetStatistics, open_split
-from data_pipeline.files import write_bytes
+from data_pipeline.files import read_json, write_bytes
+from data_pipeline.meshes import DataError
 from data_pipeline.progress import progress_bar
 from mevs_jax.selection import ViewTable
 from train.classifier import ClassifierTask
@@ -63,6 +67,23 @@ def network_outputs(data: Path, split: str, task: ClassifierTask | EntropyTask, 
             out.append(np.asarray(_look(task, structure, state, batch)))
             bar.advance(line)
     return np.stack(out)
+
+
+def made_by(statistics: DatasetStatistics, *networks: Path) -> str:
+    """Names a data set and trained networks; changes when any is made anew, but not with the time it took.
+
+    Raises:
+        DataError: where one is not fully trained.
+    """
+    content: list[Any] = [statistics.fingerprint]
+    for network in networks:
+        if not (network / "summary.json").exists():
+            raise DataError(
+                f"the network in {network} is not fully trained; finish it with: mevs train --out {network.parent}"
+            )
+        summary = read_json(network / "summary.json")
+        content += [read_json(network / "config.json"), summary["best_epoch"], summary["best"]]
+    return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()[:16]
 
 
 def objects_of(data: Path, split: str, statistics: DatasetStatistics) -> tuple[list[str], np.ndarray, np.ndarray]:
