@@ -77,7 +77,7 @@ SMALL = Settings(
         ),
         augmentation=CloudAugmentation(scale=False, tilt=False, translate=False, drop=False),
         optimiser=OptimiserConfig(
-            epochs=10,
+            epochs=8,
             batch_size=32,
             views_per_object=2,
             epoch_views=4,
@@ -87,9 +87,9 @@ SMALL = Settings(
         ),
     ),
     thesis=ThesisConfig(
-        resnet18=replace(_BRIEF, epochs=5),
-        resnet34=_BRIEF,
-        fine_tuning=replace(_BRIEF, epochs=3, learning_rate=5e-4),
+        resnet18=replace(_BRIEF, epochs=7, views_per_object=1, learning_rate=2e-3),
+        resnet34=replace(_BRIEF, epochs=8, views_per_object=2, learning_rate=2e-3),
+        fine_tuning=replace(_BRIEF, epochs=4, views_per_object=2),
         resnet34_width=32,
     ),
 )
