@@ -186,8 +186,8 @@ def test_the_thesiss_visualizer_sees_what_rays_see(tmp_path):
             assert off[off < 0.1].mean() <= 0.01  # beyond: edges, where one sees past and the other does not
             # A window's depth is of the first of its driver's samples in a pixel, up to half a pixel from the centre: on a
             # surface that is nearly edge-on that is more than 1 %, so it is held to the nine rays through its pixel.
-            rays = np.where(fine.depth[view] > 0, fine.depth[view], np.nan).reshape(224, 3, 224, 3) / 10_000
-            low, high = np.nanmin(rays, axis=(1, 3))[both], np.nanmax(rays, axis=(1, 3))[both]
+            rays = fine.depth[view].reshape(224, 3, 224, 3) / 10_000
+            low, high = np.where(rays > 0, rays, np.inf).min(axis=(1, 3))[both], rays.max(axis=(1, 3))[both]
             seen = drawn.depth[view][both] / 10_000
             assert ((seen > low - 0.01) & (seen < high + 0.01)).mean() >= 0.99
             assert (drawn.image[view][both] > 0).mean() > 0.95
