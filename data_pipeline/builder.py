@@ -24,7 +24,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from data_pipeline.archives import ARCHIVES, download, download_folder, local
-from data_pipeline.capture import DEPTH_SCALE, Capture, CaptureConfig, capture_all, capture_path, load_capture, rig_for
+from data_pipeline.capture import DEPTH_SCALE, Capture, CaptureConfig, load_capture, rig_for
+from data_pipeline.captures import capture_all, capture_path
 from data_pipeline.files import read_json, write_json
 from data_pipeline.meshes import SOURCE_SPLITS, DataError, ObjectEntry, ObjectSource, mesh_zip, open_source
 from data_pipeline.progress import console, progress_bar

@@ -12,11 +12,7 @@ The thesis's own way, a window of Open3D's, is in `data_pipeline.visualizer`.
 from __future__ import annotations
 
 import io
-import multiprocessing
-import os
-import signal
 import zlib
-from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -24,9 +20,8 @@ from typing import Literal, Protocol
 
 import numpy as np
 
-from data_pipeline.files import write_bytes, write_text
-from data_pipeline.meshes import DamagedMesh, EmptyMesh, Mesh, ObjectEntry, load_object
-from data_pipeline.progress import progress_bar
+from data_pipeline.files import write_bytes
+from data_pipeline.meshes import Mesh
 
 DEPTH_SCALE = 10_000  # as in mevs_jax.entropy, which capture workers do without; a test holds the two together
 _AMBIENT = 0.25
@@ -197,89 +192,3 @@ def load_capture(path: Path) -> Capture:
         depth = np.frombuffer(zlib.decompress(stored["depth"].tobytes()), np.uint16).reshape(shape)
         image = np.frombuffer(zlib.decompress(stored["image"].tobytes()), np.uint8).reshape(shape)
         return Capture(depth, image, stored["extent"])
-
-
-# ------------------------------------------------------------------------------------------------------------ many objects
-
-
-def capture_path(folder: Path, entry: ObjectEntry) -> Path:
-    return folder / (entry.name.replace("/", "__") + ".npz")
-
-
-def _left_out_path(folder: Path, entry: ObjectEntry) -> Path:
-    return capture_path(folder, entry).with_suffix(".left_out")
-
-
-_rig: Rig | None = None
-_folder: Path | None = None
-_backend = "raycast"
-
-
-def _start_worker(rig: Rig, folder: Path, backend: str) -> None:
-    global _rig, _folder, _backend
-    _rig, _folder, _backend = rig, folder, backend
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent answers Ctrl-C and ends its workers
-
-
-def _capture_by(backend: str) -> Callable[[Mesh, Rig], Capture]:
-    if backend == "visualizer":
-        from data_pipeline.visualizer import capture_with_visualizer
-
-        return capture_with_visualizer
-    return capture
-
-
-def _capture_entry(entry: ObjectEntry) -> str | None:
-    """Captures one object into the folder; returns what is wrong with a damaged one."""
-    assert _rig is not None
-    assert _folder is not None
-    try:
-        save_capture(capture_path(_folder, entry), _capture_by(_backend)(load_object(entry), _rig))
-    except EmptyMesh as reason:
-        write_text(_left_out_path(_folder, entry), str(reason))
-    except DamagedMesh as reason:
-        return str(reason)
-    return None
-
-
-def capture_all(
-    entries: Sequence[ObjectEntry],
-    config: CaptureConfig,
-    folder: Path,
-    *,
-    skip_damaged: bool = False,
-    workers: int | None = None,
-) -> dict[str, str]:
-    """Captures every object into `folder`, several at a time, and returns the objects left out with the reason.
-
-    Objects whose capture is there already are not captured again, so an interrupted run goes on where it stopped.
-
-    Raises:
-        DamagedMesh: at the first damaged mesh, unless `skip_damaged`, which leaves them out like empty ones.
-    """
-    folder.mkdir(parents=True, exist_ok=True)
-    there = {path.name for path in folder.iterdir()}
-    todo = [
-        entry
-        for entry in entries
-        if capture_path(folder, entry).name not in there and _left_out_path(folder, entry).name not in there
-    ]
-    if todo:
-        workers = workers or os.cpu_count() or 1
-        context = multiprocessing.get_context("spawn")
-        with (
-            progress_bar("objects") as bar,
-            context.Pool(min(workers, len(todo)), _start_worker, (rig_for(config), folder, config.backend)) as pool,
-        ):
-            task = bar.add_task("Capturing", total=len(entries), completed=len(entries) - len(todo), note="")
-            for entry, damage in zip(todo, pool.imap(_capture_entry, todo, chunksize=4), strict=True):
-                if damage and not skip_damaged:
-                    raise DamagedMesh(f"{damage}, or leave such objects out with --dataset.skip-damaged")
-                if damage:
-                    write_text(_left_out_path(folder, entry), damage)
-                bar.advance(task)
-    return {
-        entry.name: _left_out_path(folder, entry).read_text()
-        for entry in entries
-        if _left_out_path(folder, entry).exists()
-    }

@@ -17,8 +17,6 @@ from data_pipeline.capture import (
     CaptureConfig,
     Rig,
     capture,
-    capture_all,
-    capture_path,
     cast_embree,
     cast_open3d,
     default_caster,
@@ -26,6 +24,7 @@ from data_pipeline.capture import (
     rig_for,
     save_capture,
 )
+from data_pipeline.captures import capture_all, capture_path
 from data_pipeline.meshes import DamagedMesh, FurniturePiece, MeshFile, ObjectEntry, VoxelGrid, load_object, normalise
 from mevs_jax import Camera, partial_cloud
 
