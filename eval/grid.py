@@ -110,7 +110,7 @@ def run_grid(
     key: Array,
     tables: ViewTable,
     graph: ViewGraph,
-    knowledge: Knowledge,
+    knowledge: Knowledge | None,
     rungs: tuple[Rung, ...],
     *,
     max_views: int,
@@ -123,7 +123,7 @@ def run_grid(
         key: for policies that draw.
         tables: (objects, …) of each field, logits (objects, backbones, views, classes).
         graph: the candidate views.
-        knowledge: what was learnt on other objects, with a leading axis of backbones.
+        knowledge: what was learnt on other objects, with a leading axis of backbones; None where no policy asks for it.
         rungs: the policies.
         max_views: the largest MV.
         reachable: where the camera can go, and start; None for everywhere.
@@ -142,7 +142,7 @@ def run_grid(
         if movement_cost is not None:
             policy = with_movement(policy, movement_cost)
 
-        def walk(key: Array, table: ViewTable, knowledge: Knowledge, start: Array) -> Array:
+        def walk(key: Array, table: ViewTable, knowledge: Knowledge | None, start: Array) -> Array:
             scene = table.scene(graph, knowledge, reachable)
             return select_from_table(key, table, scene, policy, start, max_views=max_views).views
 
@@ -152,7 +152,7 @@ def run_grid(
             over_draws = jax.vmap(walk, (0, None, None, None))
             over_starts = jax.vmap(over_draws, (0, None, None, 0))
 
-            def with_backbone(logits: Array, knowledge: Knowledge) -> Array:
+            def with_backbone(logits: Array, knowledge: Knowledge | None) -> Array:
                 return over_starts(keys, replace(table, logits=logits), knowledge, jnp.arange(starts))
 
             views = jax.vmap(with_backbone)(table.logits, knowledge)

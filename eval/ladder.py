@@ -32,6 +32,10 @@ class Rung:
     draws: int = 1
 
 
+SCRAMBLED = Rung("scrambled_entropy", "sorted in place", "networks")
+"""The thesis's policy as its published code has it: no rung of the ladder, but part of what that code changes."""
+
+
 def ladder(draws: int) -> tuple[Rung, ...]:
     """All rungs; `draws` walks per object and start for those that draw. The first is what others are compared with."""
     return (

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import json
 import os
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -36,7 +36,7 @@ from mevs_jax.viewpoints import ViewGraph
 from train.classifier import ClassifierConfig, ClassifierTask, ResNetConfig
 from train.entropy import EntropyConfig, EntropyTask, PointNet2Config
 from train.loop import OptimiserConfig, Task, fit, load_best
-from train.pretrained import StartingWeights, weights_from_torch
+from train.pretrained import StartingWeights
 
 
 @dataclass(frozen=True)
@@ -152,21 +152,14 @@ class Options(Settings):
             dataset = replace(dataset, archive=self.archive)
         if self.views is not None:
             dataset = replace(dataset, capture=replace(dataset.capture, views=self.views))
-        return Settings(dataset, self.classifier, self.entropy, self.evaluation, self.live, self.thesis)
+        chosen = {field.name: getattr(self, field.name) for field in fields(Settings)}
+        return Settings(**chosen | {"dataset": dataset})
 
 
 def options_from(preset: Literal["small", "thesis", "tiny"]) -> Options:
     """The defaults of all options under a preset."""
     chosen = PRESETS[preset]
-    return Options(
-        chosen.dataset,
-        chosen.classifier,
-        chosen.entropy,
-        chosen.evaluation,
-        chosen.live,
-        chosen.thesis,
-        preset=preset,
-    )
+    return Options(**{field.name: getattr(chosen, field.name) for field in fields(Settings)}, preset=preset)
 
 
 def check_output(out: Path) -> None:
@@ -178,18 +171,6 @@ def check_output(out: Path) -> None:
         probe.unlink()
     except OSError as error:
         raise DataError(f"cannot write to {out} ({error.strerror}); choose another --out") from error
-
-
-def check_pretrained(settings: Settings, pretrained: tuple[Path, ...]) -> None:
-    """Raises `DataError` where files of weights cannot be read or fit no classifier of these settings."""
-    shape = settings.classifier.network
-    if pretrained and (shape.width, shape.channels) != (64, 3):
-        raise DataError(
-            f"--pretrained weights are of a ResNet 64 channels wide that sees three, this one has {shape.width} and "
-            f"{shape.channels}; use --preset thesis, or --classifier.network.width 64 --classifier.network.channels 3"
-        )
-    if pretrained:
-        weights_from_torch(pretrained, shape.depth)
 
 
 def make_data(settings: Settings, out: Path) -> DatasetStatistics:
@@ -207,10 +188,10 @@ def tasks(settings: Settings, statistics: DatasetStatistics) -> tuple[Classifier
     )
 
 
-def train(settings: Settings, out: Path, pretrained: tuple[Path, ...] = ()) -> None:
+def train(settings: Settings, out: Path, start: StartingWeights | None = None) -> None:
+    """Trains both networks, the classifier from `start` or random weights."""
     statistics = load_statistics(out / "data")
     classify, predict = tasks(settings, statistics)
-    start = weights_from_torch(pretrained, classify.network_config.depth) if pretrained else None
     planned: list[tuple[Task, str, StartingWeights | None]] = [
         (classify, "classifier", start),
         (predict, "entropy", None),
@@ -227,12 +208,12 @@ def train(settings: Settings, out: Path, pretrained: tuple[Path, ...] = ()) -> N
 BY_VIEW = "classifier_by_view"
 
 
-def train_by_view(settings: Settings, out: Path) -> None:
+def train_by_view(settings: Settings, out: Path, start: StartingWeights | None = None) -> None:
     """Trains the classifier once more, validated by view as in the thesis's published code, for the compatibility table."""
     statistics = load_statistics(out / "data")
     classify, _ = tasks(settings, statistics)
     by_view = replace(classify, optimiser=replace(classify.optimiser, validation_by="view"))
-    fit(by_view, out / "data", statistics, out / BY_VIEW)
+    fit(by_view, out / "data", statistics, out / BY_VIEW, start)
 
 
 def _tables(

@@ -17,7 +17,7 @@ from eval.confidence import confidence_of
 from eval.exact import expected_random
 from eval.grid import FIRST_MV, THRESHOLDS, GridConfig, Results, run_grid
 from eval.knowledge import learn
-from eval.ladder import Rung, ladder
+from eval.ladder import SCRAMBLED, Rung, ladder
 from eval.view_tables import ViewTables
 from mevs_jax.metrics import accuracy, class_accuracy, confusion_matrix
 from mevs_jax.policies import Knowledge
@@ -187,9 +187,8 @@ def run_study(
     labels = jnp.asarray(tables.labels)
 
     rungs = ladder(config.draws)
-    scrambled = Rung("scrambled_entropy", "sorted in place", "networks")
     console.print(f"Walking {len(tables.labels)} test objects from {can_reach.sum()} views by {len(rungs)} policies")
-    results = _walk(tables, (*rungs, scrambled), graph, knowledge, config, reachable=reachable)
+    results = _walk(tables, (*rungs, SCRAMBLED), graph, knowledge, config, reachable=reachable)
     results[BASELINE], exact = exactly_random(results[BASELINE], jnp.asarray(tables.logits)[:, None], labels, can_reach)
     shown = {rung.policy: results[rung.policy] for rung in rungs}
 
@@ -224,7 +223,7 @@ def run_study(
     other = None
     if by_view is not None:
         wanted = ("random", "random_with_repetition", "predicted_entropy")
-        switched = (*(rung for rung in rungs if rung.policy in wanted), scrambled)
+        switched = (*(rung for rung in rungs if rung.policy in wanted), SCRAMBLED)
         other = _walk(by_view, switched, graph, knowledge, config, reachable=reachable)
         other[BASELINE], _ = exactly_random(other[BASELINE], jnp.asarray(by_view.logits)[:, None], labels, can_reach)
 

@@ -32,17 +32,16 @@ from eval.thesis_networks import (
     ThesisFolder,
     backbone_task,
     entropy_task,
+    first_weights,
     train_thesis,
 )
 from eval.thesis_page import write_thesis_report
-from eval.thesis_results import LatticeTables, all_results, machine
+from eval.thesis_results import NO_ACCELERATOR, LatticeTables, all_results, machine
 from eval.timing import decision_memory_alone, time_local_maxima, time_predictor
 from eval.view_tables import made_by, network_outputs, objects_of
 from train.classifier import ClassifierTask
 from train.entropy import EntropyTask
 from train.loop import load_best
-
-SPLITS = ("test", "val")
 
 
 def make_thesis_data(settings: Settings, folder: ThesisFolder) -> None:
@@ -148,47 +147,43 @@ def _example(tables: LatticeTables, classes: list[str]) -> int:
     return int(np.flatnonzero(tables.labels == label)[0])
 
 
-def _training(folder: ThesisFolder) -> dict[str, Any]:
+def _training(folder: ThesisFolder, histories: dict[str, list[dict[str, float]]]) -> dict[str, Any]:
     """Losses and beginnings of the classifiers (Table 5), and how long every network took."""
-    backbones = {}
-    for backbone in BACKBONES:
-        summary = read_json(folder.backbone(backbone.name) / "summary.json")
-        history = read_history(folder.backbone(backbone.name))
-        backbones[backbone.name] = {
-            "train_loss": min(entry["train/loss"] for entry in history),
-            "val_loss": summary["best_loss"],
-            "epochs": summary["epoch"],
-            "best_epoch": summary["best_epoch"],
-            "start": summary["start"],
+    summaries = {name: read_json(network / "summary.json") for name, network in folder.networks().items()}
+    backbones = {
+        backbone.name: {
+            "train_loss": min(entry["train/loss"] for entry in histories[backbone.name]),
+            "val_loss": summaries[backbone.name]["best_loss"],
+            "epochs": summaries[backbone.name]["epoch"],
+            "best_epoch": summaries[backbone.name]["best_epoch"],
+            "start": summaries[backbone.name]["start"],
         }
-    seconds = {
-        backbone.name: read_json(folder.backbone(backbone.name) / "summary.json")["seconds"] for backbone in BACKBONES
+        for backbone in BACKBONES
     }
-    for views in VIEWS:
-        for frame in FRAMES:
-            name = folder.entropy(views, frame)
-            seconds[f"entropy_{name.name}"] = read_json(name / "summary.json")["seconds"]
-    return {"backbones": backbones, "training_seconds": seconds}
+    return {
+        "backbones": backbones,
+        "training_seconds": {name: summary["seconds"] for name, summary in summaries.items()},
+    }
 
 
-def evaluate_thesis(settings: Settings, folder: ThesisFolder) -> tuple[dict[str, Any], dict[int, LatticeTables]]:
-    """All numbers, as written to `thesis.json`, and the tables of the test objects."""
-    test, validation = ({v: lattice_tables(settings, folder, v, split) for v in VIEWS} for split in SPLITS)
-    measured = measure(settings, folder, test)
+def evaluate_thesis(settings: Settings, folder: ThesisFolder) -> FigureInputs:
+    """All numbers, as written to `thesis.json`, and what else the report is drawn from."""
     statistics = {views: folder.statistics(views) for views in VIEWS}
-    networks = [folder.backbone(backbone.name) for backbone in BACKBONES]
-    networks += [folder.entropy(views, frame) for views in VIEWS for frame in FRAMES]
-    made = made_by(statistics[40], *networks)
+    histories = {name: read_history(network) for name, network in folder.networks().items()}
+    test = {views: lattice_tables(settings, folder, views, "test") for views in VIEWS}
+    measured = measure(settings, folder, test)
+    made = made_by(statistics[40], *folder.networks().values())
     identity = json.loads(json.dumps([made, asdict(settings.evaluation), measured]))
     path = folder.out / "thesis.json"
-    if path.exists() and (results := read_json(path))["identity"] == identity:
-        return results, test
-    console.print(f"Walking {len(test[40].labels)} test objects with {len(PIPELINE)} classifiers on two lattices")
-    results = all_results(test, validation, statistics, settings.evaluation)
-    results |= _training(folder) | {name: measured[name] for name in ("machine", "timing", "memory")}
-    results |= {"identity": identity, "left_out": {str(v): s.left_out for v, s in statistics.items()}}
-    write_json(path, results)
-    return results, test
+    results = read_json(path) if path.exists() else {"identity": None}
+    if results["identity"] != identity:
+        validation = {views: lattice_tables(settings, folder, views, "val") for views in VIEWS}
+        console.print(f"Walking {len(test[40].labels)} test objects with {len(PIPELINE)} classifiers on two lattices")
+        results = all_results(test, validation, statistics, settings.evaluation) | _training(folder, histories)
+        results |= {name: measured[name] for name in ("machine", "timing", "memory")}
+        results |= {"identity": identity, "left_out": {str(v): s.left_out for v, s in statistics.items()}}
+        write_json(path, results)
+    return FigureInputs(folder, results, statistics, test, histories, _example(test[40], statistics[40].classes))
 
 
 def reproduce(settings: Settings, preset: str, out: Path, pretrained: tuple[Path, ...] = ()) -> Path:
@@ -200,23 +195,19 @@ def reproduce(settings: Settings, preset: str, out: Path, pretrained: tuple[Path
     if settings.evaluation.lowest_elevation > -90:
         raise DataError("mevs thesis walks from every view; leave --evaluation.lowest-elevation as it is")
     check_evaluation(settings.evaluation)
+    first = first_weights(settings.classifier, settings.thesis, pretrained)
     folder = ThesisFolder(out)
     make_thesis_data(settings, folder)
-    train_thesis(folder, settings.classifier, settings.entropy, settings.thesis, pretrained)
-    results, tables = evaluate_thesis(settings, folder)
-    statistics = {views: folder.statistics(views) for views in VIEWS}
-    histories = {backbone.name: read_history(folder.backbone(backbone.name)) for backbone in BACKBONES}
-    for views in VIEWS:
-        for frame in FRAMES:
-            histories[f"{views}_{frame}"] = read_history(folder.entropy(views, frame))
-    inputs = FigureInputs(folder, results, statistics, tables, histories, _example(tables[40], statistics[40].classes))
+    train_thesis(folder, settings.classifier, settings.entropy, settings.thesis, first)
+    inputs = evaluate_thesis(settings, folder)
+    results, statistics = inputs.results, inputs.statistics[40]
     ran_on = results["machine"]
-    where = f"{ran_on['cores']} CPU cores" if "CPU" in ran_on["device"] else ran_on["device"]
+    where = f"{ran_on['cores']} CPU cores" if ran_on["device"] == NO_ACCELERATOR else ran_on["device"]
     minutes = sum(results["training_seconds"].values()) / 60
-    camera = statistics[40].camera
+    camera = statistics.camera
     lead = (
-        f"{statistics[40].source}, preset {preset}: views of {camera.resolution}×{camera.resolution} pixels, "
-        f"{results['objects']['40']} test objects, {statistics[40].left_out_count} of all objects left out, "
+        f"{statistics.source}, preset {preset}: views of {camera.resolution}×{camera.resolution} pixels, "
+        f"{results['objects']['40']} test objects, {statistics.left_out_count} of all objects left out, "
         f"{minutes:.0f} minutes of training on {where}. Ours first, the thesis's in brackets."
     )
     return write_thesis_report(inputs, lead, out / "report")

@@ -13,7 +13,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
-from data_pipeline.builder import DatasetStatistics, open_split
+from data_pipeline.builder import DatasetStatistics, metric_depth, open_split
 from eval import figures
 from eval.thesis_networks import BACKBONES, FRAMES, Frame, ThesisFolder
 from eval.thesis_results import LatticeTables
@@ -257,12 +257,15 @@ def example_graph(inputs: FigureInputs) -> Figure:
 
 def best_and_worst_depths(inputs: FigureInputs) -> Figure:
     weights = inputs.tables[40].entropy[inputs.example]
-    depth = open_split(inputs.folder.data(40), "test")[inputs.example]["depth"].astype(float)
+    depth = np.asarray(metric_depth(open_split(inputs.folder.data(40), "test")[inputs.example]["depth"]))
+    nearest = inputs.statistics[40].camera.distance - 1
     order = np.argsort(weights)
     figure, axes = plt.subplots(2, 3, figsize=(6.6, 4.8), layout="constrained")
     for row, chosen in zip(axes, (order[::-1][:3], order[:3]), strict=True):
         for axis, view in zip(row, chosen, strict=True):
-            axis.imshow(np.where(depth[view] > 0, depth[view] / 10_000, np.nan), cmap="viridis_r", vmin=1, vmax=3)
+            axis.imshow(
+                np.where(depth[view] > 0, depth[view], np.nan), cmap="viridis_r", vmin=nearest, vmax=nearest + 2
+            )
             axis.set_title(f"view {view}: {weights[view]:.3f}", fontsize=9)
             axis.set(xticks=[], yticks=[])
             axis.spines[:].set_visible(False)
@@ -293,7 +296,7 @@ def entropy_losses(inputs: FigureInputs) -> Figure:
     colours: dict[Frame, str] = {"world": "#2563eb", "camera": "#d97706"}
     for axis, views, letter in zip(axes, inputs.statistics, "ab", strict=True):
         for frame in FRAMES:
-            _losses(axis, inputs.histories[f"{views}_{frame}"], colours[frame], f"{frame} frame, ")
+            _losses(axis, inputs.histories[f"entropy_{views}_{frame}"], colours[frame], f"{frame} frame, ")
         axis.set(xlabel="epoch", ylabel="mean squared error", yscale="log", title=f"({letter}) {views} views")
         axis.xaxis.set_major_locator(MaxNLocator(integer=True))
         axis.legend(frameon=False, fontsize=8)

@@ -8,10 +8,10 @@ from typing import Literal
 
 from data_pipeline.builder import DatasetStatistics, load_statistics
 from data_pipeline.files import read_json
-from train.classifier import ClassifierConfig, ClassifierTask
+from train.classifier import ClassifierConfig, ClassifierTask, ResNetConfig, starting_weights
 from train.entropy import EntropyConfig, EntropyTask
 from train.loop import OptimiserConfig, fit, load_best
-from train.pretrained import StartingWeights, weights_from_network, weights_from_torch
+from train.pretrained import StartingWeights, weights_from_network
 
 VIEWS = (10, 40)
 """The thesis's two data sets, by views of an object."""
@@ -81,19 +81,44 @@ class ThesisFolder:
     def entropy(self, views: int, frame: Frame) -> Path:
         return self.out / "entropy" / f"{views}_{frame}"
 
+    def networks(self) -> dict[str, Path]:
+        """The folders of all eight, by name."""
+        out = {backbone.name: self.backbone(backbone.name) for backbone in BACKBONES}
+        return out | {f"entropy_{views}_{frame}": self.entropy(views, frame) for views in VIEWS for frame in FRAMES}
+
     def statistics(self, views: int) -> DatasetStatistics:
         return load_statistics(self.data(views))
+
+
+def backbone_network(backbone: Backbone, classifier: ClassifierConfig, thesis: ThesisConfig) -> ResNetConfig:
+    """The shape of a backbone, under the settings of a run."""
+    width = classifier.network.width if backbone.depth == 18 else thesis.resnet34_width
+    return replace(classifier.network, depth=backbone.depth, width=width)
+
+
+def first_weights(
+    classifier: ClassifierConfig, thesis: ThesisConfig, pretrained: tuple[Path, ...]
+) -> dict[str, StartingWeights | None]:
+    """What the backbones begin with that go on from no other, by name.
+
+    Raises:
+        DataError: where the files cannot be read, or one that is needed is not among them.
+    """
+    return {
+        backbone.name: starting_weights(pretrained, backbone_network(backbone, classifier, thesis))
+        for backbone in BACKBONES
+        if backbone.start is None
+    }
 
 
 def backbone_task(
     backbone: Backbone, classifier: ClassifierConfig, thesis: ThesisConfig, statistics: DatasetStatistics
 ) -> ClassifierTask:
     """How a backbone is trained, under the settings of a run."""
-    width = classifier.network.width if backbone.depth == 18 else thesis.resnet34_width
     alone = thesis.resnet18 if backbone.depth == 18 else thesis.resnet34
     config = replace(
         classifier,
-        network=replace(classifier.network, depth=backbone.depth, width=width),
+        network=backbone_network(backbone, classifier, thesis),
         images=backbone.images,
         optimiser=thesis.fine_tuning if backbone.start else alone,
     )
@@ -113,13 +138,13 @@ def train_thesis(
     classifier: ClassifierConfig,
     entropy: EntropyConfig,
     thesis: ThesisConfig,
-    pretrained: tuple[Path, ...] = (),
+    first: dict[str, StartingWeights | None],
 ) -> None:
-    """Trains all eight networks, skipping those that are done."""
+    """Trains all eight networks, skipping those that are done; `first` is what `first_weights` gives."""
     for backbone in BACKBONES:
         statistics = folder.statistics(backbone.views)
         task = backbone_task(backbone, classifier, thesis, statistics)
-        start = _start(backbone, folder, classifier, thesis, pretrained)
+        start = _weights_before(backbone, folder, classifier, thesis) if backbone.start else first[backbone.name]
         fit(task, folder.data(backbone.views), statistics, folder.backbone(backbone.name), start)
     for views in VIEWS:
         statistics = folder.statistics(views)
@@ -128,15 +153,10 @@ def train_thesis(
             fit(predict, folder.data(views), statistics, folder.entropy(views, frame))
 
 
-def _start(
-    backbone: Backbone,
-    folder: ThesisFolder,
-    classifier: ClassifierConfig,
-    thesis: ThesisConfig,
-    pretrained: tuple[Path, ...],
-) -> StartingWeights | None:
-    if backbone.start is None:
-        return weights_from_torch(pretrained, backbone.depth) if pretrained else None
+def _weights_before(
+    backbone: Backbone, folder: ThesisFolder, classifier: ClassifierConfig, thesis: ThesisConfig
+) -> StartingWeights:
+    """The weights of the backbone that this one goes on from."""
     before = next(other for other in BACKBONES if other.name == backbone.start)
     task = backbone_task(before, classifier, thesis, folder.statistics(before.views))
     trained = folder.backbone(before.name)

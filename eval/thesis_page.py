@@ -10,7 +10,7 @@ import matplotlib.pyplot as plt
 from data_pipeline.files import write_bytes, write_text
 from eval.page import document, drawn, embedded, table
 from eval.thesis_figures import FIGURES, FigureInputs, ThesisFigure
-from eval.thesis_tables import ThesisTable, all_tables, cell_text, markdown
+from eval.thesis_tables import ThesisTable, all_tables, markdown, shown_cells
 
 CHAPTERS = (
     ("The data (§4.1)", ("F5", "F6", "F7", "F8", "F9", "F10", "F11")),
@@ -27,13 +27,9 @@ def _table_html(shown: ThesisTable) -> str:
     rows = []
     for row in shown.rows:
         cells = [html.escape(row.name)]
-        for index, value in enumerate(row.ours):
-            text = html.escape(cell_text(value, shown))
-            if index < len(row.bold) and row.bold[index]:
-                text = f"<b>{text}</b>"
-            if index < len(row.thesis) and row.thesis[index] is not None:
-                text += f' <small class="faint">({html.escape(cell_text(row.thesis[index], shown))})</small>'
-            cells.append(text)
+        for ours, bold, theirs in shown_cells(row, shown):
+            text = f"<b>{html.escape(ours)}</b>" if bold else html.escape(ours)
+            cells.append(text + (f' <small class="faint">({html.escape(theirs)})</small>' if theirs else ""))
         rows.append(cells)
     return (
         f'<h3 id="table-{shown.number}">Table {shown.number}. {html.escape(shown.title)}</h3>'

@@ -15,8 +15,7 @@ import numpy as np
 from data_pipeline.builder import DatasetStatistics
 from eval.comparison import class_mean, intervals
 from eval.grid import FIRST_MV, THRESHOLDS, GridConfig, Results, run_grid
-from eval.knowledge import learn
-from eval.ladder import Rung
+from eval.ladder import SCRAMBLED, Rung, ladder
 from eval.study import HEADLINE_CT, HEADLINE_MV, exactly_random, headline_confusion
 from eval.thesis_networks import BACKBONES, FRAMES, PIPELINE, Frame
 from eval.view_tables import ViewTables
@@ -108,14 +107,8 @@ def entropy_learning(lattice: LatticeTables, statistics: DatasetStatistics) -> d
 # ---------------------------------------------------------------------------------------------------------------- walking
 
 
-def _rungs(draws: int) -> tuple[Rung, ...]:
-    return (
-        Rung("random", "random", "nothing", draws),
-        Rung("random_with_repetition", "random, with repetition", "nothing", draws),
-        Rung("predicted_entropy", "PointNet++", "networks"),
-        Rung("scrambled_entropy", "PointNet++, sorted in place", "networks"),
-        Rung("oracle_entropy", "oracle", "truth"),
-    )
+POLICIES = ("random", "random_with_repetition", "predicted_entropy", "oracle_entropy")
+"""Of the ladder, those that the thesis has."""
 
 
 def walk(
@@ -123,9 +116,8 @@ def walk(
 ) -> dict[str, Results]:
     """Every policy's grid, (backbones, objects, MV, CT); random selection in exact expectation where that can be."""
     table = lattice.stacked(frame)
-    knowledge = jax.vmap(lambda logits: learn(logits, table.label), 1)(table.logits)  # no policy here asks for it
     max_views = min(config.max_views, lattice.entropy.shape[1])
-    found = run_grid(jax.random.key(config.seed), table, graph, knowledge, rungs, max_views=max_views)
+    found = run_grid(jax.random.key(config.seed), table, graph, None, rungs, max_views=max_views)
     if "random" in found:
         everywhere = np.ones(lattice.entropy.shape[1], bool)
         found["random"], _ = exactly_random(found["random"], table.logits, table.label, everywhere)
@@ -179,7 +171,7 @@ def pipeline(
 ) -> dict[str, Any]:
     """The thesis's multi-view grid on one lattice: Tables 7–8 and 10–15, and the confusion of Fig. 23."""
     graph = ViewGraph.from_points(np.array(statistics.viewpoints))
-    rungs = _rungs(config.draws)
+    rungs = (*(rung for rung in ladder(config.draws) if rung.policy in POLICIES), SCRAMBLED)
     found = walk(test, graph, config, "world", rungs)
     camera = walk(test, graph, config, "camera", tuple(r for r in rungs if r.knows == "networks"))
     chosen = walk(validation, graph, config, "world", tuple(r for r in rungs if r.policy == "predicted_entropy"))
@@ -214,6 +206,9 @@ def pipeline(
 # ---------------------------------------------------------------------------------------------------------------- machine
 
 
+NO_ACCELERATOR = "none but the CPU"
+
+
 def machine() -> dict[str, Any]:
     """What ran all this (Table 1)."""
     device = jax.devices()[0]
@@ -222,7 +217,7 @@ def machine() -> dict[str, Any]:
         "operating_system": f"{platform.system()} {platform.release()}",
         "cpu": _processor(),
         "cores": os.cpu_count(),
-        "device": "none but the CPU" if device.platform == "cpu" else f"{len(jax.devices())} × {device.device_kind}",
+        "device": NO_ACCELERATOR if device.platform == "cpu" else f"{len(jax.devices())} × {device.device_kind}",
         "memory_gib": memory,
         "python": platform.python_version(),
         "jax": jax.__version__,

@@ -9,6 +9,8 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from eval.thesis_networks import BACKBONES, FRAMES, PIPELINE
 from eval.thesis_results import ORACLE_MV
 
@@ -57,10 +59,9 @@ def _ct(results: dict[str, Any]) -> list[str]:
     return [f"CT {threshold:g}" for threshold in results["thresholds"]]
 
 
-def _mean_of_backbones(policy: dict[str, Any], name: str) -> list[list[float]]:
+def _mean_of_backbones(policy: dict[str, Any], name: str) -> np.ndarray:
     """(MV, CT)."""
-    per_backbone = policy[name]
-    return [[sum(cell) / len(cell) for cell in zip(*rows, strict=True)] for rows in zip(*per_backbone, strict=True)]
+    return np.mean(policy[name], axis=0)
 
 
 # ------------------------------------------------------------------------------------------------------------- the tables
@@ -143,6 +144,11 @@ def entropy_table(results: dict[str, Any]) -> ThesisTable:
         f"{100 * results['entropy'][views]['frames']['camera']['explained_variance']:.1f} % in the camera's"
         for views in ("10", "40")
     )
+    differences = []
+    for views in ("10", "40"):
+        found = results["entropy"][views]["camera_minus_world"]
+        low, high = found["interval"]
+        differences.append(f"{found['mse']:+.4f} [{low:+.4f}, {high:+.4f}] for {views} views".replace("-", "−"))
     above = []  # where predicting is no better than looking at nothing
     for views in ("10", "40"):
         found = results["entropy"][views]
@@ -157,7 +163,8 @@ def entropy_table(results: dict[str, Any]) -> ThesisTable:
         "Test objects, which the thesis chose its checkpoints on and we did not; normalised by each training split's largest "
         "entropy. The thesis's clouds lose the camera's pose; ours are in the world frame, and in the camera's for comparison. "
         "Mean maps look at nothing; the class map, the mean of a class, is told the true class. Variance explained, "
-        f"{shares}. Not below both trivial predictors: {', '.join(above) or 'none'}. From the thesis's means and its standard "
+        f"{shares}. Error in the camera's frame minus the world's, paired by object: {', '.join(differences)}. Not below both "
+        f"trivial predictors: {', '.join(above) or 'none'}. From the thesis's means and its standard "
         "deviation of 0.156: 51 % and 30 %.",
         digits=4,
     )
@@ -299,7 +306,7 @@ def _pairs(
 def accuracy_table(number: int, views: str, results: dict[str, Any]) -> ThesisTable:
     found = results["pipeline"][views]
     grids = {
-        short: [_percent(row) for row in _mean_of_backbones(found["policies"][name], "accuracy")]
+        short: (100 * _mean_of_backbones(found["policies"][name], "accuracy")).tolist()
         for short, name in (("random", "random"), ("pcd", "predicted_entropy"))
     }
     note = (
@@ -312,8 +319,8 @@ def accuracy_table(number: int, views: str, results: dict[str, Any]) -> ThesisTa
 def _views_used(results: dict[str, Any], policy: str) -> list[list[float]]:
     """Mean over backbones and both lattices, (MV, CT), the first row being one view."""
     lattices = [_mean_of_backbones(found["policies"][policy], "views_used") for found in results["pipeline"].values()]
-    both = [[sum(cell) / len(cell) for cell in zip(*rows, strict=True)] for rows in zip(*lattices, strict=False)]
-    return [[1.0] * len(results["thresholds"]), *both]
+    rows = min(map(len, lattices))
+    return [[1.0] * len(results["thresholds"]), *np.mean([lattice[:rows] for lattice in lattices], axis=0).tolist()]
 
 
 def views_table(results: dict[str, Any]) -> ThesisTable:
@@ -395,18 +402,24 @@ def cell_text(value: Cell, table: ThesisTable) -> str:
     return text.replace("-", "−")
 
 
+def shown_cells(row: Row, table: ThesisTable) -> list[tuple[str, bool, str]]:
+    """Of each cell: ours, whether it is bold, and the thesis's, empty where it has none."""
+    bold = [*row.bold, *[False] * (len(row.ours) - len(row.bold))]
+    thesis = [*row.thesis, *[None] * (len(row.ours) - len(row.thesis))]
+    return [
+        (cell_text(ours, table), marked, "" if theirs is None else cell_text(theirs, table))
+        for ours, marked, theirs in zip(row.ours, bold, thesis, strict=True)
+    ]
+
+
 def markdown(table: ThesisTable) -> str:
     """The table with the thesis's numbers in brackets behind ours."""
     lines = [f"**Table {table.number}. {table.title}**", "", f"| | {' | '.join(table.columns)} |"]
     lines.append("|---" * (len(table.columns) + 1) + "|")
     for row in table.rows:
-        cells = []
-        for index, value in enumerate(row.ours):
-            text = cell_text(value, table)
-            if index < len(row.bold) and row.bold[index]:
-                text = f"**{text}**"
-            if index < len(row.thesis) and row.thesis[index] is not None:
-                text += f" ({cell_text(row.thesis[index], table)})"
-            cells.append(text)
+        cells = [
+            (f"**{ours}**" if bold else ours) + (f" ({theirs})" if theirs else "")
+            for ours, bold, theirs in shown_cells(row, table)
+        ]
         lines.append(f"| {row.name} | {' | '.join(cells)} |")
     return "\n".join([*lines, "", f"{table.note} In brackets: the thesis.", ""])

@@ -10,8 +10,9 @@ from __future__ import annotations
 import multiprocessing
 import os
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from concurrent.futures import ProcessPoolExecutor
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -30,14 +31,14 @@ from train.entropy import EntropyTask
 _WARM_UP = 3
 
 
-def milliseconds(call: Callable[[], Any], runs: int) -> np.ndarray:
-    """Time of each of `runs` calls, until their results are there, (runs,)."""
+def milliseconds(call: Callable[[Any], Any], inputs: Sequence[Any]) -> np.ndarray:
+    """Time of a call with each of the inputs, until its result is there, (inputs,)."""
     for _ in range(_WARM_UP):
-        jax.block_until_ready(call())
-    times = np.empty(runs)
-    for run in range(runs):
+        jax.block_until_ready(call(inputs[0]))
+    times = np.empty(len(inputs))
+    for run, given in enumerate(inputs):
         started = time.perf_counter()
-        jax.block_until_ready(call())
+        jax.block_until_ready(call(given))
         times[run] = 1000 * (time.perf_counter() - started)
     return times
 
@@ -59,8 +60,7 @@ def time_predictor(
             views = random.integers(task.views, size=1)
             chosen = select_views(source[index], views, points=task.network_config.points, images=None, random=random)
             clouds.append(task.inputs({name: jnp.asarray(array) for name, array in chosen.items()})[0])
-        waiting = iter(clouds[:_WARM_UP] + clouds) if runs >= _WARM_UP else iter(clouds * (_WARM_UP + 1))
-        times = milliseconds(lambda: predict(state, next(waiting)), runs)  # noqa: B023 - called before the next class
+        times = milliseconds(partial(predict, state), clouds)
         out[name] = [float(times.mean()), float(times.std())]
         every.append(times)
     return out | {"all": [float(np.mean(every)), float(np.std(every))]}
@@ -73,8 +73,8 @@ def time_local_maxima(views: int, runs: int = 200, objects: int = 1000) -> dict[
     alone = jax.jit(lambda entropies: local_maxima(entropies, graph.neighbours))
     batched = jax.jit(jax.vmap(lambda entropies: local_maxima(entropies, graph.neighbours)))
     return {
-        "alone": float(np.median(milliseconds(lambda: alone(maps[0]), runs))),
-        "batched": float(np.median(milliseconds(lambda: batched(maps), runs))) / objects,
+        "alone": float(np.median(milliseconds(alone, [maps[0]] * runs))),
+        "batched": float(np.median(milliseconds(batched, [maps] * runs))) / objects,
     }
 
 

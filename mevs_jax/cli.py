@@ -87,9 +87,9 @@ def _run(command: str, arguments: list[str]) -> None:
     out = options.out or Path("runs") / (preset if command != "thesis" else f"thesis-{preset}")
     from data_pipeline.progress import console
     from eval import pipeline
+    from train.classifier import starting_weights
 
     pipeline.check_output(out)
-    pipeline.check_pretrained(settings, options.pretrained)
     if command == "thesis":
         from data_pipeline.meshes import DataError
         from eval.thesis import reproduce
@@ -101,12 +101,13 @@ def _run(command: str, arguments: list[str]) -> None:
 
         console.print(f"Report: {reproduce(settings, preset, out, options.pretrained).absolute()}")
         return
+    start = starting_weights(options.pretrained, settings.classifier.network)
     if command in ("run", "data"):
         pipeline.make_data(settings, out)
     if command in ("run", "train"):
-        pipeline.train(settings, out, options.pretrained)
+        pipeline.train(settings, out, start)
     if command == "compat":
-        pipeline.train_by_view(settings, out)
+        pipeline.train_by_view(settings, out, start)
     if command in ("run", "eval", "compat"):
         metrics = pipeline.evaluate(settings, out)
         console.print(

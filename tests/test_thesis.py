@@ -205,7 +205,7 @@ def test_entropy_errors_are_by_class_and_beside_what_looks_at_nothing(lattices, 
 
 def test_every_figure_but_the_captures_is_drawn(lattices, statistics, results, tmp_path):
     history = [{"epoch": e, "train/loss": 1 / e, "val/loss": 1.2 / e} for e in (1, 2, 3)]
-    names = [backbone.name for backbone in BACKBONES] + [f"{v}_{frame}" for v in VIEWS for frame in FRAMES]
+    names = [backbone.name for backbone in BACKBONES] + [f"entropy_{v}_{frame}" for v in VIEWS for frame in FRAMES]
     inputs = FigureInputs(ThesisFolder(tmp_path), results, statistics, lattices, dict.fromkeys(names, history), 0)
     for shown in FIGURES:
         if shown.number == "22":  # of stored captures; drawn by the whole command below
@@ -244,7 +244,7 @@ def test_networks_are_trained_as_the_thesis_says(statistics):
 
 def test_times_are_taken_after_warming_up():
     calls = []
-    times = milliseconds(lambda: calls.append(None) or np.zeros(1), 5)
+    times = milliseconds(lambda _: calls.append(None) or np.zeros(1), [0] * 5)
     assert times.shape == (5,)
     assert (times > 0).all()
     assert len(calls) == 8

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import partial
+from pathlib import Path
 from typing import Literal
 
 import jax
@@ -15,8 +16,10 @@ from data_pipeline.augment import ImageAugmentation, augment_image
 from data_pipeline.batches import ViewBatches
 from data_pipeline.capture import CaptureConfig
 from data_pipeline.inputs import image_input
+from data_pipeline.meshes import DataError
 from mevs_jax.models import ResNet
 from train.loop import Batch, OptimiserConfig
+from train.pretrained import StartingWeights, weights_from_torch
 
 
 @dataclass(frozen=True)
@@ -31,6 +34,22 @@ class ResNetConfig:
     """channels of the input; depth and grey images are replicated"""
     standardise: bool = True
     """take off ImageNet's mean and divide by its standard deviation, for three channels"""
+
+
+def starting_weights(files: tuple[Path, ...], network: ResNetConfig) -> StartingWeights | None:
+    """What a classifier of this shape begins with: the weights of the file that is of its depth; None without files.
+
+    Raises:
+        DataError: where the files cannot be read, or none fits.
+    """
+    if not files:
+        return None
+    if (network.width, network.channels) != (64, 3):
+        raise DataError(
+            f"--pretrained weights are of a ResNet 64 channels wide that sees three, this one has {network.width} and "
+            f"{network.channels}; use --preset thesis, or --classifier.network.width 64 --classifier.network.channels 3"
+        )
+    return weights_from_torch(files, network.depth)
 
 
 @dataclass(frozen=True)
