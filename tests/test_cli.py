@@ -16,6 +16,8 @@ import numpy as np
 import pytest
 import trimesh
 
+from mevs_jax import cli
+
 MEVS = [sys.executable, "-m", "mevs_jax"]
 
 
@@ -299,3 +301,22 @@ def test_a_job_that_is_killed_again_and_again_ends_with_the_same_metrics(whole, 
         np.testing.assert_array_equal(a["logits"], b["logits"])
     leftovers = [path for path in tmp_path.rglob("*.partial*")]
     assert leftovers == []
+
+
+@pytest.mark.skipif("CS_GNU_LIBC_VERSION" not in os.confstr_names, reason="large pages are asked of glibc")
+def test_jobs_begin_again_with_large_pages(monkeypatch):
+    """Once, with the arguments they had; and never where `main` is called from another program."""
+    begun = []
+    monkeypatch.setattr(os, "execv", lambda *command: begun.append(command))
+    monkeypatch.setattr(sys, "orig_argv", ["python", "-m", "mevs_jax", "run", "--views", "10"])
+    monkeypatch.delenv("GLIBC_TUNABLES", raising=False)
+    monkeypatch.setattr(sys, "argv", ["/usr/bin/notebook"])
+    cli._begin_with_large_pages()
+    assert not begun
+    for program in ("/somewhere/bin/mevs", "/somewhere/mevs_jax/__main__.py"):
+        monkeypatch.setattr(sys, "argv", [program])
+        monkeypatch.delenv("GLIBC_TUNABLES", raising=False)
+        cli._begin_with_large_pages()
+        assert os.environ["GLIBC_TUNABLES"] == "glibc.malloc.hugetlb=1"
+        cli._begin_with_large_pages()
+    assert begun == [(sys.executable, [sys.executable, "-m", "mevs_jax", "run", "--views", "10"])] * 2
