@@ -28,6 +28,7 @@ from eval.thesis_networks import (
     FRAMES,
     PIPELINE,
     VIEWS,
+    Backbone,
     Frame,
     ThesisFolder,
     backbone_task,
@@ -67,8 +68,15 @@ def _stored(path: Path, made: str, compute: Callable[[], np.ndarray]) -> np.ndar
     return array
 
 
-def lattice_tables(settings: Settings, folder: ThesisFolder, views: int, split: str) -> LatticeTables:
-    """What all networks say of one split of one data set."""
+def lattice_tables(
+    settings: Settings,
+    folder: ThesisFolder,
+    views: int,
+    split: str,
+    backbones: tuple[Backbone, ...] = BACKBONES,
+    frames: tuple[Frame, ...] = FRAMES,
+) -> LatticeTables:
+    """What the networks say of one split of one data set."""
     statistics, data = folder.statistics(views), folder.data(views)
 
     def outputs(name: str, network: Path, task: ClassifierTask | EntropyTask) -> np.ndarray:
@@ -79,11 +87,11 @@ def lattice_tables(settings: Settings, folder: ThesisFolder, views: int, split: 
         )
 
     logits: dict[str, np.ndarray] = {}
-    for backbone in BACKBONES:
+    for backbone in backbones:
         task = backbone_task(backbone, settings.classifier, settings.thesis, statistics)
         logits[backbone.name] = outputs(backbone.name, folder.backbone(backbone.name), task)
     utility: dict[Frame, np.ndarray] = {}
-    for frame in FRAMES:
+    for frame in frames:
         predict = entropy_task(frame, settings.entropy, statistics)
         utility[frame] = outputs(f"entropy_{frame}", folder.entropy(views, frame), predict)
     names, labels, entropy = objects_of(data, split, statistics)
@@ -177,7 +185,7 @@ def evaluate_thesis(settings: Settings, folder: ThesisFolder) -> FigureInputs:
     path = folder.out / "thesis.json"
     results = read_json(path) if path.exists() else {"identity": None}
     if results["identity"] != identity:
-        validation = {views: lattice_tables(settings, folder, views, "val") for views in VIEWS}
+        validation = {views: lattice_tables(settings, folder, views, "val", PIPELINE, ("world",)) for views in VIEWS}
         console.print(f"Walking {len(test[40].labels)} test objects with {len(PIPELINE)} classifiers on two lattices")
         results = all_results(test, validation, statistics, settings.evaluation) | _training(folder, histories)
         results |= {name: measured[name] for name in ("machine", "timing", "memory")}
