@@ -47,25 +47,32 @@ def _rotation(axis: int, angle: Array) -> Float[Array, "3 3"]:
     return jnp.eye(3).at[i, i].set(c).at[j, j].set(c).at[i, j].set(-s).at[j, i].set(s)
 
 
-def augment_cloud(key: Array, points: Float[Array, "points 3"], config: CloudAugmentation) -> Float[Array, "points 3"]:
-    """One cloud in the unit sphere, changed by what `config` switches on."""
+def augment_cloud(
+    key: Array, cloud: Float[Array, "points columns"], config: CloudAugmentation
+) -> Float[Array, "points columns"]:
+    """One cloud in the unit sphere, changed by what `config` switches on.
+
+    Args:
+        cloud: a point a row, xyz; and where there are six columns a direction, which only turns and is dropped with its point.
+    """
     scale, turn, tilt, translate, jitter, share, drop = jax.random.split(key, 7)
+    points, directions = cloud[:, :3], cloud[:, 3:].reshape(len(cloud), -1, 3)
     if config.scale:
         points = points * jax.random.uniform(scale, (), minval=0.8, maxval=1.25)
-    if config.turn:
-        points = points @ _rotation(2, jax.random.uniform(turn, (), maxval=2 * jnp.pi)).T
-    if config.tilt:
-        angles = jnp.clip(0.06 * jax.random.normal(tilt, (3,)), -0.18, 0.18)
-        for axis in range(3):
-            points = points @ _rotation(axis, angles[axis]).T
+    angles = jnp.clip(0.06 * jax.random.normal(tilt, (3,)), -0.18, 0.18)
+    turns = [_rotation(2, jax.random.uniform(turn, (), maxval=2 * jnp.pi))] if config.turn else []
+    turns += [_rotation(axis, angles[axis]) for axis in range(3)] if config.tilt else []
+    for rotation in turns:
+        points, directions = points @ rotation.T, directions @ rotation.T
     if config.translate:
         points = points + jax.random.uniform(translate, (3,), minval=-0.1, maxval=0.1)
     if config.jitter:
         points = points + jnp.clip(0.01 * jax.random.normal(jitter, points.shape), -0.05, 0.05)
+    cloud = jnp.concatenate([points, directions.reshape(len(cloud), -1)], axis=1)
     if config.drop:
-        gone = jax.random.uniform(drop, (len(points), 1)) < jax.random.uniform(share, (), maxval=0.875)
-        points = jnp.where(gone, points[0], points)
-    return points
+        gone = jax.random.uniform(drop, (len(cloud), 1)) < jax.random.uniform(share, (), maxval=0.875)
+        cloud = jnp.where(gone, cloud[0], cloud)
+    return cloud
 
 
 def augment_image(

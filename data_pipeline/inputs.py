@@ -34,7 +34,16 @@ def cloud_input(
     pose: Float[Array, "4 4"],
     camera: CaptureConfig,
     frame: str,
-) -> Float[Array, "points 3"]:
-    """The partial cloud behind the sampled pixels of one view, in the `world` or the `camera` frame."""
+    directions: bool = False,
+) -> Float[Array, "points 3"] | Float[Array, "points 6"]:
+    """The partial cloud behind the sampled pixels of one view, in the `world` or the `camera` frame.
+
+    With `directions`, the unit vector from each point to the camera stands beside it; from the camera's own centre, zeros.
+    """
     pinhole = Camera(pose, math.radians(camera.field_of_view), camera.resolution)
-    return unproject(pixels, metric_depth(pixel_depth), pinhole, frame=frame)
+    cloud = unproject(pixels, metric_depth(pixel_depth), pinhole, frame=frame)
+    if not directions:
+        return cloud
+    way = (pose[:3, 3] if frame == "world" else 0.0) - cloud
+    length = jnp.linalg.norm(way, axis=-1, keepdims=True)
+    return jnp.concatenate([cloud, way / jnp.maximum(length, 1e-6)], axis=-1)

@@ -242,6 +242,15 @@ def test_inputs_are_what_the_stored_view_shows(data):
     )
     np.testing.assert_allclose(cloud, np.asarray(whole)[pixels], atol=1e-5)
     assert np.linalg.norm(cloud, axis=1).max() <= 1.01
+    pose = example["pose"][0]
+    for frame, eye in (("world", pose[:3, 3]), ("camera", np.zeros(3))):
+        both = np.asarray(
+            cloud_input(jnp.asarray(pixels), jnp.asarray(depth), jnp.asarray(pose), camera, frame, directions=True)
+        )
+        way = eye - both[:, :3]
+        np.testing.assert_allclose(both[:, 3:], way / np.linalg.norm(way, axis=1, keepdims=True), atol=1e-5)
+    nothing = cloud_input(jnp.zeros(2, int), jnp.zeros(2, int), jnp.asarray(pose), camera, "world", directions=True)
+    np.testing.assert_allclose(nothing[:, 3:], 0, atol=1e-6)
 
 
 def test_stored_entropies_are_the_librarys(data):
@@ -298,6 +307,21 @@ def test_each_cloud_augmentation_does_what_the_thesis_says(random):
     np.testing.assert_array_equal(
         augment_cloud(jax.random.key(0), jnp.asarray(cloud), CloudAugmentation(*[False] * 6)), cloud
     )
+
+
+def test_directions_beside_points_turn_with_them_and_are_else_as_they_were(random):
+    cloud = random.normal(size=(40, 6)).astype(np.float32)
+    for name in ("scale", "translate", "jitter"):
+        np.testing.assert_array_equal(many(name, cloud)[..., 3:], np.broadcast_to(cloud[:, 3:], (300, 40, 3)))
+    for name in ("turn", "tilt"):
+        changed = many(name, cloud)
+        along = np.sum(changed[..., :3] * changed[..., 3:], axis=-1)
+        np.testing.assert_allclose(
+            along, np.broadcast_to(np.sum(cloud[:, :3] * cloud[:, 3:], axis=-1), (300, 40)), atol=1e-4
+        )
+        np.testing.assert_array_equal(changed[..., :3], many(name, cloud[:, :3]))
+    dropped = many("drop", cloud)
+    assert ((dropped == cloud[0]).all(axis=2) | (dropped == cloud).all(axis=2)).all()
 
 
 def test_images_are_mirrored_and_shifted_and_nothing_else(random):

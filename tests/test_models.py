@@ -176,6 +176,16 @@ def test_batch_norm_in_training_updates_with_the_momentum_given():
     np.testing.assert_allclose(norm.variance[...], 0.75 + 0.25 * jnp.var(x, 0, ddof=1), rtol=1e-5)
 
 
+def test_directions_stand_in_the_place_of_the_normals(random):
+    """Zeros there are the network of the thesis; anything else is seen."""
+    network = PointNet2(views=4, rngs=nnx.Rngs(0))
+    cloud = random.normal(0, 0.4, (600, 3)).astype(np.float32)
+    directions = random.normal(0, 1, (600, 3)).astype(np.float32)
+    nothing = network(np.concatenate([cloud, np.zeros_like(cloud)], axis=1))
+    np.testing.assert_array_equal(network(cloud), nothing)
+    assert np.abs(np.asarray(network(np.concatenate([cloud, directions], axis=1)) - nothing)).max() > 1e-3
+
+
 def test_dropout_acts_in_training_only():
     network = PointNet2(views=4, rngs=nnx.Rngs(0))
     cloud = jax.random.uniform(jax.random.key(0), (2, 600, 3))
@@ -198,5 +208,7 @@ def test_wrong_state_dicts_are_refused():
         resnet_from_torch(network, state | {"fc.bias": np.zeros(40, np.float32)})
     with pytest.raises(ValueError, match="18 or 34"):
         ResNet(depth=50, rngs=nnx.Rngs(0))
+    with pytest.raises(ValueError, match="3 or 6 columns, got 4"):
+        PointNet2(views=4, rngs=nnx.Rngs(0))(jnp.zeros((600, 4)))
     with pytest.raises(ValueError, match="at least 2"):
         PointNet2(views=1, rngs=nnx.Rngs(0))

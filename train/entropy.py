@@ -26,6 +26,8 @@ class PointNet2Config:
     """points of a cloud"""
     frame: Literal["world", "camera"] = "world"
     """the frame of the clouds: world (the camera's pose is known) or camera (the thesis, whose clouds lose it)"""
+    directions: bool = False
+    """beside each point of a cloud in the world frame, the direction to the camera, in the place of the normals"""
     abstractions: tuple[Abstraction, ...] = THESIS_ABSTRACTIONS
     """the set-abstraction levels"""
     global_layers: tuple[int, ...] = (256, 512, 1024)
@@ -84,8 +86,10 @@ class EntropyTask:
         )
 
     def inputs(self, batch: Batch) -> jax.Array:
-        """Clouds (views, points, 3) of a batch."""
-        convert = partial(cloud_input, camera=self.camera, frame=self.network_config.frame)
+        """Clouds (views, points, 3 or 6) of a batch."""
+        shape = self.network_config
+        directions = shape.directions and shape.frame == "world"
+        convert = partial(cloud_input, camera=self.camera, frame=shape.frame, directions=directions)
         return jax.vmap(convert)(batch["pixels"], batch["pixel_depth"], batch["pose"])
 
     def momentum(self, samples: jax.Array) -> jax.Array:

@@ -1,8 +1,8 @@
 """PointNet++ with single-scale grouping: one partial cloud to the depth entropy of every candidate view.
 
 Source: Qi et al., *PointNet++*, 2017, and the thesis §4.3.2. The thesis's network reads six numbers a point, xyz and three
-zeros in the place of normals; the zeros are kept so that its weights and its parameter count (1,471,509 for 10 views,
-1,479,219 for 40) carry over.
+zeros in the place of normals; the place is kept so that its weights and its parameter count (1,471,509 for 10 views,
+1,479,219 for 40) carry over. Where the camera's pose is known, the direction from each point to the camera can stand there.
 """
 
 from __future__ import annotations
@@ -106,7 +106,7 @@ class PointNet2(nnx.Module):
 
     def __call__(
         self,
-        points: Float[AnyArray, "*batch points 3"],
+        points: Float[AnyArray, "*batch points columns"],
         *,
         train: bool = False,
         key: Array | None = None,
@@ -115,7 +115,7 @@ class PointNet2(nnx.Module):
         """Predicted entropy, in units of the training split's largest, of every view.
 
         Args:
-            points: one cloud (points, 3) or a batch of them, in the unit sphere.
+            points: one cloud (points, 3) or a batch of them, in the unit sphere; or (points, 6), a direction beside each point.
             train: normalise over the batch, update running statistics, drop out.
             key: for dropout; needed where `train`.
             momentum: of the running statistics, in [0, 1].
@@ -123,9 +123,13 @@ class PointNet2(nnx.Module):
         if train and key is None:
             raise ValueError("PointNet2 in training needs a key for its dropout")
         points = jnp.asarray(points)
+        if points.shape[-1] not in (3, 6):
+            raise ValueError(f"PointNet2 reads clouds of 3 or 6 columns, got {points.shape[-1]}")
         batch = points.shape[:-2]
-        centres = points.reshape(-1, *points.shape[-2:])
-        features = jnp.zeros_like(centres)
+        clouds = points.reshape(-1, *points.shape[-2:])
+        centres, features = clouds[..., :3], clouds[..., 3:]
+        if not features.size:
+            features = jnp.zeros_like(centres)
         for level, perceptron in zip(self.levels, self.perceptrons, strict=True):
             centres, grouped = jax.vmap(group, in_axes=(0, 0, None))(centres, features, level)
             features = jnp.max(perceptron(grouped, train=train, momentum=momentum), axis=2)
