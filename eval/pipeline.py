@@ -88,7 +88,7 @@ SMALL = Settings(
     ),
     thesis=ThesisConfig(
         resnet18=replace(_BRIEF, epochs=7, views_per_object=1, learning_rate=2e-3),
-        resnet34=replace(_BRIEF, epochs=8, views_per_object=2, learning_rate=2e-3),
+        resnet34=replace(_BRIEF, epochs=9, views_per_object=2, learning_rate=2e-3),
         fine_tuning=replace(_BRIEF, epochs=4, views_per_object=2),
         resnet34_width=32,
     ),

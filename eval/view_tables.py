@@ -64,9 +64,11 @@ def network_outputs(data: Path, split: str, task: ClassifierTask | EntropyTask, 
         line = bar.add_task(f"Looking at {split} objects: {task.name}", total=objects, note="")
         out = []
         for batch in evaluation_batches(data, split, points=task.batches.points, images=task.batches.images):
-            out.append(np.asarray(_look(task, structure, state, batch)))
+            out.append(
+                _look(task, structure, state, batch)
+            )  # the next object is read while the device looks at this one
             bar.advance(line)
-    return np.stack(out)
+    return np.stack([np.asarray(found) for found in out])
 
 
 def made_by(statistics: DatasetStatistics, *networks: Path) -> str:
