@@ -75,7 +75,7 @@ SMALL = Settings(
             ),
             dropout=0.0,
         ),
-        augmentation=CloudAugmentation(scale=False, tilt=False, translate=False, drop=False),
+        augmentation=CloudAugmentation(scale=False, tilt=False, translate=False, jitter=False, drop=False),
         optimiser=OptimiserConfig(
             epochs=8,
             batch_size=32,

@@ -165,7 +165,8 @@ def entropy_table(results: dict[str, Any]) -> ThesisTable:
         parts,
         rows,
         "Test objects, which the thesis chose its checkpoints on and we did not; normalised by each training split's largest "
-        "entropy. The thesis's clouds lose the camera's pose; ours are in the world frame, and in the camera's for comparison. "
+        "entropy. The thesis's clouds lose the camera's pose; ours are in the world frame, each point with the "
+        "direction to the camera, and in the camera's for comparison. "
         "Mean maps look at nothing; the class map, the mean of a class, is told the true class. Variance explained, "
         f"{shares}. Error in the camera's frame minus the world's, paired by object: {', '.join(differences)}. Not below both "
         f"trivial predictors: in the world frame {', '.join(above['world']) or 'none'}; in the camera's "

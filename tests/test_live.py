@@ -35,7 +35,7 @@ def networks() -> Networks:
     classify = ClassifierTask.of(ClassifierConfig(network=ResNetConfig(channels=1)), CLASSES, CAMERA)
     predict = EntropyTask.of(EntropyConfig(network=PointNet2Config(points=POINTS)), VIEWS, 5.0, CAMERA)
     # Scaled up: untrained, it would say nearly the same of every view, and rounding would choose.
-    return Networks(classify, Flat(SIDE * SIDE, CLASSES, 5.0, 0), predict, Flat(3 * POINTS, VIEWS, 1.0, 1))
+    return Networks(classify, Flat(SIDE * SIDE, CLASSES, 5.0, 0), predict, Flat(6 * POINTS, VIEWS, 1.0, 1))
 
 
 @pytest.fixture(scope="module")

@@ -26,7 +26,7 @@ class PointNet2Config:
     """points of a cloud"""
     frame: Literal["world", "camera"] = "world"
     """the frame of the clouds: world (the camera's pose is known) or camera (the thesis, whose clouds lose it)"""
-    directions: bool = False
+    directions: bool = True
     """beside each point of a cloud in the world frame, the direction to the camera, in the place of the normals"""
     abstractions: tuple[Abstraction, ...] = THESIS_ABSTRACTIONS
     """the set-abstraction levels"""
