@@ -94,7 +94,8 @@ SMALL = Settings(
     ),
 )
 """The same study at 64×64 with narrower networks.
-`mevs run --data modelnet10_voxels32.npz`: 39 minutes on two CPU cores; `mevs run` (furniture10): under ten."""
+`mevs run --data modelnet10_voxels32.npz`: 39 minutes on two CPU cores with an earlier, slower PointNet++; `mevs run`
+(furniture10): under ten."""
 
 _TRIFLE = OptimiserConfig(epochs=2, batch_size=16, views_per_object=2, epoch_views=4, schedule="cosine")
 

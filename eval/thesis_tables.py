@@ -150,9 +150,8 @@ def entropy_table(results: dict[str, Any]) -> ThesisTable:
         found = results["entropy"][views]["camera_minus_world"]
         low, high = found["interval"]
         differences.append(f"{found['mse']:+.4f} [{low:+.4f}, {high:+.4f}] for {views} views".replace("-", "−"))
-    above: dict[str, list[str]] = {
-        frame: [] for frame in FRAMES
-    }  # where predicting is no better than looking at nothing
+    # Where predicting is no better than looking at nothing.
+    above: dict[str, list[str]] = {frame: [] for frame in FRAMES}
     for frame, views in product(FRAMES, ("10", "40")):
         found = results["entropy"][views]
         for name, (error, _) in found["frames"][frame]["by_class"].items():
@@ -166,7 +165,7 @@ def entropy_table(results: dict[str, Any]) -> ThesisTable:
         rows,
         "Test objects, which the thesis chose its checkpoints on and we did not; normalised by each training split's largest "
         "entropy. The thesis's clouds lose the camera's pose; ours are in the world frame, each point with the "
-        "direction to the camera, and in the camera's for comparison. "
+        "direction to the camera unless that was switched off, and in the camera's, without, for comparison. "
         "Mean maps look at nothing; the class map, the mean of a class, is told the true class. Variance explained, "
         f"{shares}. Error in the camera's frame minus the world's, paired by object: {', '.join(differences)}. Not below both "
         f"trivial predictors: in the world frame {', '.join(above['world']) or 'none'}; in the camera's "

@@ -64,9 +64,8 @@ def network_outputs(data: Path, split: str, task: ClassifierTask | EntropyTask, 
         line = bar.add_task(f"Looking at {split} objects: {task.name}", total=objects, note="")
         out = []
         for batch in evaluation_batches(data, split, points=task.batches.points, images=task.batches.images):
-            out.append(
-                _look(task, structure, state, batch)
-            )  # the next object is read while the device looks at this one
+            # Fetched after the loop: the next object is read while the device looks at this one.
+            out.append(_look(task, structure, state, batch))
             bar.advance(line)
     return np.stack([np.asarray(found) for found in out])
 
