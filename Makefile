@@ -20,6 +20,7 @@ lint: $(READY)
 bench: $(READY)  ## what is fast, beside its peers, in one run
 	$(BIN)/python benchmarks/point_ops.py
 	$(BIN)/python benchmarks/evaluation.py
+	$(BIN)/python benchmarks/sweep.py
 
 $(READY): requirements.lock pyproject.toml
 	$(PYTHON) -c 'import sys; sys.exit(not (3, 11) <= sys.version_info < (3, 13) and "mevs_jax needs Python 3.11 or 3.12, this is " + sys.version.split()[0] + "; set PYTHON=python3.12, say")'

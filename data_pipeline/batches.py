@@ -2,7 +2,7 @@
 
 An epoch shows every training object once, through `views_per_object` views drawn anew. Batch number `i` is a function of
 (seed, i) alone, so a run that stops and goes on sees the same batches, and nothing but the step needs to be remembered.
-With several processes each reads its own share of every batch.
+With several processes each reads its own piece of every batch.
 
 Validation is by object. The thesis's published code puts views aside instead, so that an object is on both sides; that is here
 as a switch (`ViewBatches.validation_by`), to show what it does.
@@ -10,6 +10,7 @@ as a switch (`ViewBatches.validation_by`), to show what it does.
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -134,25 +135,30 @@ def _training_objects(folder: Path, config: ViewBatches) -> _TrainingObjects:
     return _TrainingObjects([open_split(folder, split) for split in training_splits(config)], config)
 
 
-def validation_batches(folder: Path, config: ViewBatches, views: int) -> Iterator[dict[str, np.ndarray]]:
+def validation_splits(config: ViewBatches) -> tuple[str, ...]:
+    """The splits whose objects training is validated on."""
+    return ("val",) if config.validation_by == "object" else training_splits(config)
+
+
+def validation_batches(
+    folder: Path, config: ViewBatches, views: int, part: slice = slice(None)
+) -> Iterator[dict[str, np.ndarray]]:
     """What training is validated on, one object a batch: `views` views of each object put aside, 0 for all of them.
 
-    By object, every view of the lattice gets its turn. By view, an object gives its share of the views put aside.
+    By object, every view of the lattice gets its turn. By view, an object gives its share of the views put aside. `part` of
+    the objects, all unless given.
     """
-    if config.validation_by == "object":
-        for number, batch in enumerate(
-            evaluation_batches(folder, "val", points=config.points, images=config.images, seed=config.seed)
-        ):
-            count = len(batch["label"])
-            wanted = min(views, count)
-            keep = (np.arange(wanted) * count // wanted + number) % count if views else np.arange(count)
-            yield {name: array[keep] for name, array in batch.items()}
-        return
-    objects = _training_objects(folder, config)
-    for index in range(len(objects)):
+    by_object = config.validation_by == "object"
+    objects = open_split(folder, "val") if by_object else _training_objects(folder, config)
+    for index in range(len(objects))[part]:
         example = objects[index]
-        aside = views_aside(len(example["entropy"]), index, config.seed)
-        keep = aside[: max(1, round(VIEWS_ASIDE * views))] if views else aside
+        count = len(example["entropy"])
+        if by_object:
+            wanted = min(views or count, count)
+            keep = (np.arange(wanted) * count // wanted + index) % count if views else np.arange(count)
+        else:
+            aside = views_aside(count, index, config.seed)
+            keep = aside[: max(1, round(VIEWS_ASIDE * views))] if views else aside
         random = np.random.default_rng([config.seed, index])
         yield select_views(example, keep, points=config.points, images=config.images, random=random)
 
@@ -173,17 +179,19 @@ def steps_per_epoch(objects: int, config: ViewBatches) -> int:
 
 
 def train_batches(folder: Path, config: ViewBatches, *, first_step: int = 0) -> Iterator[dict[str, np.ndarray]]:
-    """Endless batches from step `first_step` on, this process's share of each, read ahead by a thread."""
+    """Endless batches from step `first_step` on, of each this process's piece, read ahead by threads."""
     processes = jax.process_count()
     per_batch = objects_per_batch(config)
     if per_batch % processes:
         raise ValueError(f"{per_batch} objects a batch cannot be shared by {processes} processes")
     # Repeated first: then every pass has its own order, and batches may cross from one pass to the next.
     objects = _training_objects(folder, config)
-    stream = grain.MapDataset.source(objects).seed(config.seed).shuffle().repeat()
-    stream = stream.random_map(_DrawViews(config))[jax.process_index() :: processes]
-    batches = stream.batch(per_batch // processes, batch_fn=_join)[first_step:]
-    return iter(batches.to_iter_dataset(grain.ReadOptions(num_threads=1, prefetch_buffer_size=16)))
+    stream = grain.MapDataset.source(objects).seed(config.seed).shuffle().repeat().random_map(_DrawViews(config))
+    # Pieces one after the other make the batch that a single process would read.
+    pieces = stream.batch(per_batch // processes, batch_fn=_join)[jax.process_index() :: processes]
+    threads = min(16, max(1, (os.cpu_count() or 1) // 2))
+    options = grain.ReadOptions(num_threads=threads, prefetch_buffer_size=16)
+    return iter(pieces[first_step:].to_iter_dataset(options))
 
 
 def evaluation_batches(

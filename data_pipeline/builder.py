@@ -24,6 +24,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from data_pipeline.archives import ARCHIVES, download, download_folder, local
+from data_pipeline.beam import beam_options, capture_by_beam, examples_by_beam
 from data_pipeline.capture import DEPTH_SCALE, Capture, CaptureConfig, load_capture, rig_for
 from data_pipeline.captures import capture_all, capture_path
 from data_pipeline.files import read_json, write_json
@@ -98,6 +99,10 @@ class DatasetStatistics:
     def views(self) -> int:
         return len(self.viewpoints)
 
+    def objects_of(self, splits: Sequence[str]) -> int:
+        """How many objects some splits hold."""
+        return sum(sum(self.counts[split].values()) for split in splits)
+
     @property
     def fingerprint(self) -> str:
         """Changes with the objects, the views or their order."""
@@ -143,20 +148,21 @@ class _Statistics:
 
     def __init__(self, classes: int):
         self.classes = classes
-        self.labels: dict[str, list[int]] = {split: [] for split in SPLITS}
-        self.entropies: dict[str, list[np.ndarray]] = {split: [] for split in SPLITS}
-        self.points: list[np.ndarray] = []
+        self.objects: dict[str, dict[str, tuple[int, np.ndarray, np.ndarray]]] = {split: {} for split in SPLITS}
 
-    def add(self, split: str, label: int, entropies: np.ndarray, depth: np.ndarray) -> None:
-        self.labels[split].append(label)
-        self.entropies[split].append(entropies)
-        if split == "train":
-            self.points.append(np.count_nonzero(depth, axis=(1, 2)))
+    def add(self, split: str, name: str, example: dict[str, Any]) -> None:
+        """`example` as in the shards, of the object `name`."""
+        points = np.count_nonzero(example["depth"], axis=(1, 2))
+        self.objects[split][name] = int(example["label"]), example["entropy"], points
 
     def finish(self, **rest: Any) -> DatasetStatistics:
-        labels, points, entropies = np.array(self.labels["train"]), np.stack(self.points), self.entropies["train"]
-        largest = float(np.max(entropies)) or 1.0
-        normalised = {split: np.stack(members) / largest for split, members in self.entropies.items()}
+        # In the order of names, so that sums are the same in whatever order objects came.
+        ordered = {split: [members[name] for name in sorted(members)] for split, members in self.objects.items()}
+        labels = np.array([label for label, _, _ in ordered["train"]])
+        points = np.stack([points for _, _, points in ordered["train"]])
+        entropies = {split: np.stack([entropy for _, entropy, _ in members]) for split, members in ordered.items()}
+        largest = float(np.max(entropies["train"])) or 1.0
+        normalised = {split: members / largest for split, members in entropies.items()}
         train = normalised["train"]
         members = [labels == label for label in range(self.classes)]
         return DatasetStatistics(
@@ -223,6 +229,20 @@ def _spill_without_tensorflow() -> None:
     shuffle._Bucket = Bucket
 
 
+def example_of(entry: ObjectEntry, captures: Path, poses: np.ndarray) -> tuple[str, dict[str, Any]]:
+    """Key and content of an object's record."""
+    capture = load_capture(capture_path(captures, entry))
+    return entry.name, {
+        "name": entry.name,
+        "label": entry.label,
+        "depth": capture.depth,
+        "image": capture.image,
+        "pose": poses,
+        "entropy": view_entropies(capture),
+        "extent": capture.extent,
+    }
+
+
 @functools.cache
 def _builder_class() -> type:
     """The TFDS builder; made on first use, so that importing this module stays quick."""
@@ -237,9 +257,10 @@ def _builder_class() -> type:
         VERSION = tfds.core.Version("1.0.0")
 
         def __init__(self, *, source: ObjectSource, split, config_data: DataConfig, captures: Path, on_object, **rest):
-            self._source, self._split, self._data, self._captures = source, split, config_data, captures
-            self._on_object = on_object
-            self._poses = rig_for(config_data.capture).poses
+            self._source, self._split, self._data = source, split, config_data
+            self._on_object = on_object  # None where Beam makes the examples, elsewhere
+            poses = rig_for(config_data.capture).poses
+            self._example_of = functools.partial(example_of, captures=captures.absolute(), poses=poses)
             super().__init__(file_format="array_record", **rest)
 
         def _info(self):
@@ -248,25 +269,15 @@ def _builder_class() -> type:
 
         def _split_generators(self, dl_manager):
             del dl_manager  # the captures are on disk already
+            if self._on_object is None:
+                return {name: examples_by_beam(self._split[name], self._example_of) for name in SPLITS}
             return {name: self._generate_examples(name) for name in SPLITS}
 
         def _generate_examples(self, split: str) -> Iterator[tuple[str, dict[str, Any]]]:
             for entry in self._split[split]:
-                capture = load_capture(capture_path(self._captures, entry))
-                entropies = view_entropies(capture)
-                self._on_object(split, entry, capture, entropies)
-                yield (
-                    entry.name,
-                    {
-                        "name": entry.name,
-                        "label": entry.label,
-                        "depth": capture.depth,
-                        "image": capture.image,
-                        "pose": self._poses,
-                        "entropy": entropies,
-                        "extent": capture.extent,
-                    },
-                )
+                name, example = self._example_of(entry)
+                self._on_object(split, name, example)
+                yield name, example
 
     return MultiViewObjects
 
@@ -278,20 +289,32 @@ def _write_shards(
     config: DataConfig,
     captures: Path,
     folder: Path,
+    beam: Any,
 ) -> DatasetStatistics:
+    import tensorflow_datasets as tfds
+
     statistics = _Statistics(len(source.classes))
     with progress_bar("objects") as bar:
         task = bar.add_task("Writing shards", total=sum(map(len, split.values())), note="")
 
-        def on_object(name: str, entry: ObjectEntry, capture: Capture, entropies: np.ndarray) -> None:
+        def on_object(name: str, key: str, example: dict[str, Any]) -> None:
             bar.advance(task)
-            statistics.add(name, entry.label, entropies, capture.depth)
+            statistics.add(name, key, example)
 
         builder = _builder_class()(
-            source=source, split=split, config_data=config, captures=captures, on_object=on_object, data_dir=str(folder)
+            source=source,
+            split=split,
+            config_data=config,
+            captures=captures,
+            on_object=on_object if beam is None else None,
+            data_dir=str(folder),
         )
         with redirect_stdout(io.StringIO()):  # TFDS prints where it writes, twice
-            builder.download_and_prepare()
+            builder.download_and_prepare(download_config=tfds.download.DownloadConfig(beam_options=beam))
+        if beam is not None:
+            for name in SPLITS:
+                for example in open_split(folder.parent, name):
+                    on_object(name, example["name"].decode(), example)
     counts = {
         name: {c: sum(entry.label == i for entry in members) for i, c in enumerate(source.classes)}
         for name, members in split.items()
@@ -327,10 +350,11 @@ def _open(config: DataConfig) -> ObjectSource:
     return replace(source, name=official.name)
 
 
-def prepare(config: DataConfig, folder: Path) -> DatasetStatistics:
+def prepare(config: DataConfig, folder: Path, beam: str | None = None) -> DatasetStatistics:
     """Makes the data set in `folder`, or finds it there.
 
-    The steps leave their results behind (captures, then shards, then the summary), so an interrupted run goes on.
+    The steps leave their results behind (captures, then shards, then the summary), so an interrupted run goes on. With `beam`,
+    the options of a Beam pipeline, Beam does the work; the records are the same.
 
     Raises:
         DataError: unusable source, or a folder that holds a data set made otherwise.
@@ -353,10 +377,14 @@ def prepare(config: DataConfig, folder: Path) -> DatasetStatistics:
     if (folder / _SUMMARY).exists():
         shutil.rmtree(captures, ignore_errors=True)  # of a run that was stopped between the two
         return load_statistics(folder)
+    options = None if beam is None else beam_options(beam)
     source = _open(config)
     folder.mkdir(parents=True, exist_ok=True)
     write_json(made_with, identity)
-    left_out = capture_all(source.entries, config.capture, captures, skip_damaged=config.skip_damaged)
+    if options is None:
+        left_out = capture_all(source.entries, config.capture, captures, skip_damaged=config.skip_damaged)
+    else:
+        left_out = capture_by_beam(source.entries, config.capture, captures, options, skip_damaged=config.skip_damaged)
     kept = [entry for entry in source.entries if entry.name not in left_out]
     split = split_objects(kept, config.validation_share, config.seed)
     for name, members in split.items():
@@ -372,7 +400,7 @@ def prepare(config: DataConfig, folder: Path) -> DatasetStatistics:
     }
     shards = folder / "shards"
     shutil.rmtree(shards, ignore_errors=True)  # half-written ones
-    statistics = _write_shards(source, split, reasons, config, captures, shards)
+    statistics = _write_shards(source, split, reasons, config, captures, shards, options)
     write_json(folder / _SUMMARY, asdict(statistics))
     shutil.rmtree(captures, ignore_errors=True)
     return statistics

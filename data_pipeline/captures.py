@@ -23,29 +23,51 @@ def _left_out_path(folder: Path, entry: ObjectEntry) -> Path:
     return capture_path(folder, entry).with_suffix(".left_out")
 
 
-_rig: Rig | None = None
-_folder: Path | None = None
-_backend = "raycast"
 _BACKENDS: dict[str, Callable[[Mesh, Rig], Capture]] = {"raycast": capture, "visualizer": capture_with_visualizer}
 
 
-def _start_worker(rig: Rig, folder: Path, backend: str) -> None:
-    global _rig, _folder, _backend
-    _rig, _folder, _backend = rig, folder, backend
+def capture_entry(entry: ObjectEntry, rig: Rig, folder: Path, backend: str, skip_damaged: bool) -> str | None:
+    """Captures one object into the folder; returns what is wrong with a damaged one, unless such are left out like empty ones."""
+    try:
+        save_capture(capture_path(folder, entry), _BACKENDS[backend](load_object(entry), rig))
+    except (EmptyMesh, DamagedMesh) as reason:
+        if isinstance(reason, DamagedMesh) and not skip_damaged:
+            return str(reason)
+        write_text(_left_out_path(folder, entry), str(reason))
+    return None
+
+
+def still_to_capture(entries: Sequence[ObjectEntry], folder: Path) -> list[ObjectEntry]:
+    """Those that are neither captured nor left out yet."""
+    folder.mkdir(parents=True, exist_ok=True)
+    there = {path.name for path in folder.iterdir()}
+    done = (capture_path, _left_out_path)
+    return [entry for entry in entries if not any(path(folder, entry).name in there for path in done)]
+
+
+def left_out_of(entries: Sequence[ObjectEntry], folder: Path) -> dict[str, str]:
+    """The objects left out, with the reason."""
+    paths = {entry.name: _left_out_path(folder, entry) for entry in entries}
+    return {name: path.read_text() for name, path in paths.items() if path.exists()}
+
+
+_worker: tuple[Rig, Path, str, bool] | None = None
+
+
+def _start_worker(rig: Rig, folder: Path, backend: str, skip_damaged: bool) -> None:
+    global _worker
+    _worker = rig, folder, backend, skip_damaged
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent answers Ctrl-C and ends its workers
 
 
-def _capture_entry(entry: ObjectEntry) -> str | None:
-    """Captures one object into the folder; returns what is wrong with a damaged one."""
-    assert _rig is not None
-    assert _folder is not None
-    try:
-        save_capture(capture_path(_folder, entry), _BACKENDS[_backend](load_object(entry), _rig))
-    except EmptyMesh as reason:
-        write_text(_left_out_path(_folder, entry), str(reason))
-    except DamagedMesh as reason:
-        return str(reason)
-    return None
+def _work(entry: ObjectEntry) -> str | None:
+    assert _worker is not None
+    return capture_entry(entry, *_worker)
+
+
+def say_damaged(damage: str) -> DamagedMesh:
+    """The error about a damaged object, with the way around it."""
+    return DamagedMesh(f"{damage}, or leave such objects out with --dataset.skip-damaged")
 
 
 def capture_all(
@@ -63,29 +85,19 @@ def capture_all(
     Raises:
         DamagedMesh: at the first damaged mesh, unless `skip_damaged`, which leaves them out like empty ones.
     """
-    folder.mkdir(parents=True, exist_ok=True)
-    there = {path.name for path in folder.iterdir()}
-    todo = [
-        entry
-        for entry in entries
-        if capture_path(folder, entry).name not in there and _left_out_path(folder, entry).name not in there
-    ]
+    todo = still_to_capture(entries, folder)
     if todo:
         workers = workers or os.cpu_count() or 1
         context = multiprocessing.get_context("spawn")
         with (
             progress_bar("objects") as bar,
-            context.Pool(min(workers, len(todo)), _start_worker, (rig_for(config), folder, config.backend)) as pool,
+            context.Pool(
+                min(workers, len(todo)), _start_worker, (rig_for(config), folder, config.backend, skip_damaged)
+            ) as pool,
         ):
             task = bar.add_task("Capturing", total=len(entries), completed=len(entries) - len(todo), note="")
-            for entry, damage in zip(todo, pool.imap(_capture_entry, todo, chunksize=4), strict=True):
-                if damage and not skip_damaged:
-                    raise DamagedMesh(f"{damage}, or leave such objects out with --dataset.skip-damaged")
+            for damage in pool.imap(_work, todo, chunksize=4):
                 if damage:
-                    write_text(_left_out_path(folder, entry), damage)
+                    raise say_damaged(damage)
                 bar.advance(task)
-    return {
-        entry.name: _left_out_path(folder, entry).read_text()
-        for entry in entries
-        if _left_out_path(folder, entry).exists()
-    }
+    return left_out_of(entries, folder)

@@ -17,11 +17,10 @@ from functools import partial
 import flax.struct
 import jax
 import jax.numpy as jnp
-import numpy as np
-from jax.sharding import Mesh, PartitionSpec
 from jaxtyping import Array, Bool, Float, Int
 
 from eval.ladder import Rung
+from eval.over_objects import over_objects
 from mevs_jax.metrics import is_right
 from mevs_jax.policies import POLICIES, Knowledge, with_movement
 from mevs_jax.selection import ViewTable, select_from_table
@@ -132,7 +131,6 @@ def run_grid(
     Returns:
         Results by policy. Starts out of reach weigh nothing.
     """
-    devices = jax.devices()
     objects, starts = tables.label.shape[0], graph.points.shape[0]
     start_weight = jnp.ones(starts) if reachable is None else reachable.astype(jnp.float32)
     start_weight /= jnp.sum(start_weight)
@@ -165,16 +163,9 @@ def run_grid(
             return Results(*found, views[:, :, :1].astype(small))
 
         at_once = max(1, min(256, _WALKS_AT_ONCE // (starts * rung.draws)))
-        at_once = min(at_once, -(-objects // len(devices)))
-        padding = -objects % (at_once * len(devices))
-        padded = jax.tree.map(lambda leaf: jnp.concatenate([leaf, leaf[:1].repeat(padding, 0)]), (keys, tables))
+        at_once = min(at_once, -(-objects // jax.device_count()))
         chunked = partial(jax.lax.map, of_object, batch_size=at_once)
-        if len(devices) > 1:
-            over = PartitionSpec("objects")
-            chunked = jax.shard_map(
-                chunked, mesh=Mesh(np.array(devices), "objects"), in_specs=(over,), out_specs=over, check_vma=False
-            )
-        found = jax.tree.map(lambda leaf: leaf[:objects], chunked(padded))
+        found = over_objects(chunked, (keys, tables), at_once)
         return jax.tree.map(lambda leaf: jnp.moveaxis(leaf, 0, 1), found)
 
     keys = jax.vmap(jax.random.fold_in, (None, 0))(key, jnp.arange(objects))

@@ -21,11 +21,13 @@ from jaxtyping import Array, Int
 
 from data_pipeline.batches import evaluation_batches
 from data_pipeline.progress import progress_bar
+from eval.over_objects import over_objects
 from eval.view_tables import ViewTables
 from mevs_jax.policies import POLICIES, Knowledge, Observation, Scene
 from mevs_jax.selection import Episode, ViewTable, select_from_table, select_views
 from mevs_jax.viewpoints import ViewGraph
 from train.classifier import ClassifierTask
+from train.devices import device_mesh, parameter_sharding, place
 from train.entropy import EntropyTask
 
 _CLOUD = ("pixels", "pixel_depth", "pose")
@@ -55,13 +57,14 @@ class Networks:
 
 
 class LiveWalker:
-    """Walks objects with the networks in the loop; one program for each policy and number of objects."""
+    """Walks objects with the networks in the loop, on all devices; one program for each policy and number of objects."""
 
     def __init__(self, networks: Networks, graph: ViewGraph):
         self._graph, self._tasks = graph, (networks.classify, networks.predict)
-        self._structures, self._states = zip(
+        self._structures, states = zip(
             *(nnx.split(network) for network in (networks.classifier, networks.predictor)), strict=True
         )
+        self._states = place(states, parameter_sharding(device_mesh(), states))
 
     def walk(
         self,
@@ -87,7 +90,9 @@ class LiveWalker:
     def _walk(self, states, keys, captures, scenes, starts, policy, max_views, threshold):
         classify, predict = self._tasks
 
-        def of_object(key: Array, captures: Captures, scene: Scene, start: Array) -> Episode:
+        def of_object(arguments: tuple[Array, Captures, Scene, Array]) -> Episode:
+            key, captures, scene, start = arguments
+
             def observe(view: Int[Array, ""]) -> Observation:
                 classifier, predictor = (
                     nnx.merge(structure, state, copy=True)
@@ -99,7 +104,7 @@ class LiveWalker:
 
             return select_views(key, observe, scene, POLICIES[policy], start, threshold=threshold, max_views=max_views)
 
-        return jax.vmap(of_object)(keys, captures, scenes, starts)
+        return over_objects(jax.vmap(of_object), (keys, captures, scenes, starts))
 
 
 @dataclass(frozen=True)

@@ -12,6 +12,7 @@ from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import tyro
@@ -28,6 +29,7 @@ from eval.live import Agreement, LiveConfig, Networks, compare_with_tables
 from eval.page import ReportInputs
 from eval.report import read_history, write_report
 from eval.study import reachable_views, run_study
+from eval.sweep_report import write_sweep_report
 from eval.thesis_networks import ThesisConfig
 from eval.view_tables import ViewTables, compute_view_tables, load_view_tables, made_by, save_view_tables
 from mevs_jax.models import Abstraction
@@ -35,8 +37,11 @@ from mevs_jax.policies import POLICIES
 from mevs_jax.viewpoints import ViewGraph
 from train.classifier import ClassifierConfig, ClassifierTask, ResNetConfig
 from train.entropy import EntropyConfig, EntropyTask, PointNet2Config
-from train.loop import OptimiserConfig, Task, fit, load_best
+from train.loop import fit, load_best
+from train.optimiser import OptimiserConfig
 from train.pretrained import StartingWeights
+from train.step import Task
+from train.sweep import Member, SweepConfig, sweep
 
 
 @dataclass(frozen=True)
@@ -49,6 +54,7 @@ class Settings:
     evaluation: GridConfig = GridConfig()
     live: LiveConfig = LiveConfig()
     thesis: ThesisConfig = ThesisConfig()
+    sweep: SweepConfig = SweepConfig()
 
 
 THESIS = Settings()
@@ -94,8 +100,7 @@ SMALL = Settings(
     ),
 )
 """The same study at 64×64 with narrower networks.
-`mevs run --data modelnet10_voxels32.npz`: 39 minutes on two CPU cores with an earlier, slower PointNet++; `mevs run`
-(furniture10): under ten."""
+`mevs run --data modelnet10_voxels32.npz`: 12 minutes on two cores of an AMD EPYC (Zen 5), `mevs thesis` 40."""
 
 _TRIFLE = OptimiserConfig(epochs=2, batch_size=16, views_per_object=2, epoch_views=4, schedule="cosine")
 
@@ -143,6 +148,12 @@ class Options(Settings):
     """where everything is written; runs/<preset> unless given"""
     pretrained: Annotated[tuple[Path, ...], tyro.conf.arg(metavar="FILE")] = ()
     """ImageNet weights to start classifiers from: torchvision's resnet18 (and resnet34), .pth or .safetensors"""
+    beam: Annotated[str | None, tyro.conf.arg(metavar="OPTIONS")] = None
+    """for mevs data: capture and write by Apache Beam, with such options, say "--runner=DirectRunner" (docs/scaling.md)"""
+    distributed: bool = False
+    """for mevs train: this is one of several processes, on one machine or many, that train together (docs/scaling.md)"""
+    model_devices: Annotated[int, tyro.conf.arg(metavar="N")] = 1
+    """for mevs train: devices that share one copy of a network's weights; batches are split over the others"""
 
     def settings(self) -> Settings:
         """The settings with the short names applied."""
@@ -174,8 +185,8 @@ def check_output(out: Path) -> None:
         raise DataError(f"cannot write to {out} ({error.strerror}); choose another --out") from error
 
 
-def make_data(settings: Settings, out: Path) -> DatasetStatistics:
-    statistics = prepare(settings.dataset, out / "data")
+def make_data(settings: Settings, out: Path, beam: str | None = None) -> DatasetStatistics:
+    statistics = prepare(settings.dataset, out / "data", beam)
     report_left_out(statistics)
     return statistics
 
@@ -189,8 +200,10 @@ def tasks(settings: Settings, statistics: DatasetStatistics) -> tuple[Classifier
     )
 
 
-def train(settings: Settings, out: Path, start: StartingWeights | None = None) -> None:
-    """Trains both networks, the classifier from `start` or random weights."""
+def train(
+    settings: Settings, out: Path, start: StartingWeights | None = None, mesh: jax.sharding.Mesh | None = None
+) -> None:
+    """Trains both networks, the classifier from `start` or random weights, on `mesh` or all devices."""
     statistics = load_statistics(out / "data")
     classify, predict = tasks(settings, statistics)
     planned: list[tuple[Task, str, StartingWeights | None]] = [
@@ -198,12 +211,23 @@ def train(settings: Settings, out: Path, start: StartingWeights | None = None) -
         (predict, "entropy", None),
     ]
     for task, name, weights in planned:
-        summary = fit(task, out / "data", statistics, out / name, weights)
+        summary = fit(task, out / "data", statistics, out / name, weights, mesh)
         console.print(
             f"{task.name}: best epoch {summary['best_epoch']} of {summary['epoch']}, validation "
             + ", ".join(f"{key} {value:.4f}" for key, value in summary["best"].items())
             + f", {summary['seconds'] / 60:.1f} min"
         )
+
+
+def train_sweep(settings: Settings, out: Path, mesh: jax.sharding.Mesh | None = None) -> tuple[Path, list[Member]]:
+    """Trains many configurations of one network together; returns the sweep's folder and its members."""
+    statistics = load_statistics(out / "data")
+    name = settings.sweep.network
+    task = tasks(settings, statistics)[("classifier", "entropy").index(name)]
+    folder = out / "sweep" / name
+    members = sweep(task, out / "data", statistics, folder, settings.sweep, mesh)
+    write_sweep_report(members, folder)
+    return folder, members
 
 
 BY_VIEW = "classifier_by_view"

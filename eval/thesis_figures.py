@@ -397,7 +397,11 @@ FIGURES = (
         graph_with_maxima,
         "The view graph and the local maxima (red rings) of one test object; dotted edges go around the back.",
     ),
-    ThesisFigure("17", entropy_losses, "PointNet++: losses in training; training losses are with augmentation."),
+    ThesisFigure(
+        "17",
+        entropy_losses,
+        "PointNet++: losses in training; those of training are means over an epoch, with augmentation where it is on.",
+    ),
     ThesisFigure("18", backbone_losses((0, 1)), "ResNet-18 on images: training on 10 views, and going on with 40."),
     ThesisFigure("19", backbone_losses((2, 3)), "ResNet-18 on depth, going on from images, and ResNet-34 on depth."),
     ThesisFigure("20", accuracy_grid(10), "Table 10 as a picture. Green: PointNet++ above random; red: below."),

@@ -10,7 +10,8 @@ from data_pipeline.builder import DatasetStatistics, load_statistics
 from data_pipeline.files import read_json
 from train.classifier import ClassifierConfig, ClassifierTask, ResNetConfig, starting_weights
 from train.entropy import EntropyConfig, EntropyTask
-from train.loop import OptimiserConfig, fit, load_best
+from train.loop import fit, load_best
+from train.optimiser import OptimiserConfig
 from train.pretrained import StartingWeights, weights_from_network
 
 VIEWS = (10, 40)

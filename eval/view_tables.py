@@ -7,6 +7,7 @@ import io
 import json
 from dataclasses import dataclass
 from functools import partial
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -22,8 +23,9 @@ from data_pipeline.meshes import DataError
 from data_pipeline.progress import progress_bar
 from mevs_jax.selection import ViewTable
 from train.classifier import ClassifierTask
+from train.devices import device_mesh, parameter_sharding, place, place_batch
 from train.entropy import EntropyTask
-from train.loop import Batch
+from train.step import Batch
 
 
 @dataclass(frozen=True)
@@ -59,15 +61,21 @@ def _look(task: ClassifierTask | EntropyTask, structure: nnx.GraphDef, state: nn
 def network_outputs(data: Path, split: str, task: ClassifierTask | EntropyTask, network: nnx.Module) -> np.ndarray:
     """What a network says of every view of every object of a split, (objects, views, classes or views)."""
     structure, state = nnx.split(network)
+    mesh = device_mesh()
+    state = place(state, parameter_sharding(mesh, state))
     objects = len(open_split(data, split))
+    batches = evaluation_batches(data, split, points=task.batches.points, images=task.batches.images)
     with progress_bar("objects") as bar:
         line = bar.add_task(f"Looking at {split} objects: {task.name}", total=objects, note="")
         out = []
-        for batch in evaluation_batches(data, split, points=task.batches.points, images=task.batches.images):
-            # Fetched after the loop: the next object is read while the device looks at this one.
-            out.append(_look(task, structure, state, batch))
-            bar.advance(line)
-    return np.stack([np.asarray(found) for found in out])
+        while chunk := list(islice(batches, mesh.size)):
+            filled = [*chunk, *chunk[:1] * (mesh.size - len(chunk))]
+            batch = {name: np.concatenate([one[name] for one in filled]) for name in filled[0]}
+            # Fetched after the loop: the next objects are read while the devices look at these.
+            out.append(_look(task, structure, state, place_batch(mesh, batch)))
+            bar.advance(line, len(chunk))
+    found = np.concatenate([np.asarray(part) for part in out])
+    return found.reshape(len(out) * mesh.size, -1, found.shape[-1])[:objects]
 
 
 def made_by(statistics: DatasetStatistics, *networks: Path) -> str:

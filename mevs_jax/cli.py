@@ -18,6 +18,7 @@ COMMANDS = {
     "run": "data, train, eval and report, skipping what is done",
     "data": "capture objects from every viewpoint, write them as a sharded TFDS data set",
     "train": "train the classifier and the entropy predictor on it",
+    "sweep": "train many configurations of one of them as one program",
     "eval": "walk every test object from every start view; write metrics.json",
     "report": "write report/index.html",
     "compat": "train the classifier the published code's way too, evaluate and report again",
@@ -82,16 +83,30 @@ def _parse(command: str, arguments: list[str]) -> Options:
 
 
 def _run(command: str, arguments: list[str]) -> None:
+    from data_pipeline.meshes import DataError
+
     options = _parse(command, arguments)
+    if command != "train" and (options.distributed or options.model_devices != 1):
+        raise DataError(
+            "--distributed and --model-devices go with mevs train alone; make the data first, then train, then eval"
+        )
+    if command != "data" and options.beam is not None:
+        raise DataError("--beam goes with mevs data alone")
+    if options.distributed:
+        from train.devices import join_processes
+
+        join_processes()  # before anything is computed
     preset, settings = options.preset, options.settings()
     out = options.out or Path("runs") / (preset if command != "thesis" else f"thesis-{preset}")
     from data_pipeline.progress import console
     from eval import pipeline
     from train.classifier import starting_weights
+    from train.devices import device_mesh, is_first
+
+    console.quiet = options.distributed and not is_first()
 
     pipeline.check_output(out)
     if command == "thesis":
-        from data_pipeline.meshes import DataError
         from eval.thesis import reproduce
 
         if options.views is not None:
@@ -103,9 +118,17 @@ def _run(command: str, arguments: list[str]) -> None:
         return
     start = starting_weights(options.pretrained, settings.classifier.network)
     if command in ("run", "data"):
-        pipeline.make_data(settings, out)
+        pipeline.make_data(settings, out, options.beam)
     if command in ("run", "train"):
-        pipeline.train(settings, out, start)
+        pipeline.train(settings, out, start, device_mesh(options.model_devices))
+    if command == "sweep":
+        folder, members = pipeline.train_sweep(settings, out)
+        best = min(members, key=lambda member: member.loss)
+        console.print(
+            f"Best of {len(members)}: validation loss {best.loss:.4f} with learning rate {best.learning_rate:.2e}, weight decay "
+            f"{best.weight_decay:.2e}, dropout {best.dropout:.2f}, augmentation {best.augmentation:.2f}"
+        )
+        console.print(f"All of them: {folder / 'members.md'}; the best network: {folder / 'network'}")
     if command == "compat":
         pipeline.train_by_view(settings, out, start)
     if command in ("run", "eval", "compat"):
@@ -148,7 +171,11 @@ def _begin_with_large_pages() -> None:
 
 
 def main() -> None:
-    """The program `mevs`: exit code 0, 2 for input that cannot be used, 130 when interrupted."""
+    """The program `mevs`.
+
+    Exit codes: 0; 2 for input that cannot be used; 130 when interrupted; 143 when asked to end (SIGTERM), with everything
+    saved; 75 when another process of the run was lost. After the last three, the same command goes on where it stopped.
+    """
     arguments = sys.argv[1:]
     if not arguments or arguments[0] in ("-h", "--help"):
         print(_HELP.format(commands="\n".join(f"  {name:<8}{what}" for name, what in COMMANDS.items())))
@@ -170,7 +197,7 @@ def main() -> None:
         signal.signal(signal.SIGALRM, _interrupt)
     try:
         _run(arguments[0], arguments[1:])
-    except DataError as error:
+    except (DataError, FloatingPointError) as error:  # the latter: a loss that is no number any more
         print(f"mevs: {error}", file=sys.stderr)
         sys.exit(2)
     except KeyboardInterrupt:
@@ -178,6 +205,23 @@ def main() -> None:
             signal.setitimer(signal.ITIMER_REAL, 0)
         print("mevs: interrupted; the same command goes on where it stopped", file=sys.stderr)
         sys.exit(130)
+    except Exception as error:
+        from train.devices import is_lost_process
+        from train.preemption import Preempted
+
+        if isinstance(error, Preempted):
+            print(f"mevs: {error} and saved it; the same command goes on from there", file=sys.stderr)
+            sys.exit(143)
+        if not is_lost_process(error):
+            raise
+        reason = str(error).splitlines()[0]
+        print(
+            f"mevs: another process of this run is gone ({reason}); start all of them again with the same command, which goes "
+            f"on from the last checkpoint",
+            file=sys.stderr,
+        )
+        sys.stderr.flush()
+        os._exit(75)  # JAX's own way out waits for the process that is gone
 
 
 if __name__ == "__main__":

@@ -147,6 +147,9 @@ def test_unknown_words_are_refused_and_help_reads_well(tmp_path):
     assert mevs("run", "--no-such-option").returncode == 2
     assert "of 10 and of 40 views" in refused(mevs("thesis", "--views", "5", "--out", tmp_path / "thesis"))
     assert "no data set in" in refused(mevs("train", "--out", tmp_path))
+    assert "go with mevs train alone" in refused(mevs("run", "--distributed", "--out", tmp_path))
+    assert "--beam goes with mevs data alone" in refused(mevs("run", "--beam", "", "--out", tmp_path))
+    assert "cannot join the other processes" in refused(mevs("train", "--distributed", "--out", tmp_path))
     shown = mevs("--help")
     assert shown.returncode == 0
     for word in ("run", "data", "train", "eval", "report", "--preset", "--data", "--views", "--out"):
@@ -225,6 +228,37 @@ def test_live_walks_what_the_tables_say(whole, tmp_path):
     for policy, agreement in found.items():
         assert agreement["walks"] == agreement["same"] == 6, policy
     assert "unknown policy 'fly'" in refused(mevs(*arguments, "fly"))
+
+
+def test_many_devices_say_what_one_does(whole, tmp_path, monkeypatch):
+    """View tables and live walks on four simulated devices, whose number divides neither the objects nor the chunks."""
+    out = tmp_path / "run"
+    shutil.copytree(whole, out)
+    shutil.rmtree(out / "tables")
+    (out / "metrics.json").unlink()
+    monkeypatch.setenv("JAX_NUM_CPU_DEVICES", "4")
+    result = mevs("eval", "--preset", "tiny", "--out", out)
+    assert result.returncode == 0, result.stderr
+    with np.load(out / "tables" / "test.npz") as mine, np.load(whole / "tables" / "test.npz") as theirs:
+        for name in ("logits", "utility"):
+            np.testing.assert_allclose(mine[name], theirs[name], rtol=1e-4, atol=1e-5)
+    result = mevs("live", "--preset", "tiny", "--live.objects", "6", "--out", out, "--live.policies", "random")
+    assert result.returncode == 0, result.stderr
+    agreement = json.loads((out / "live.json").read_text())["random"]
+    assert agreement["walks"] == agreement["same"] == 6
+
+
+def test_a_sweep_is_made_by_command(whole, tmp_path):
+    for folder in (tmp_path, tmp_path / "other"):
+        folder.mkdir(exist_ok=True)
+        (folder / "data").symlink_to(whole / "data")
+    result = mevs("sweep", "--preset", "tiny", "--out", tmp_path, "--sweep.members", "3")
+    assert result.returncode == 0, result.stderr
+    assert "Best of 3: validation loss" in result.stderr
+    assert len(json.loads((tmp_path / "sweep" / "entropy" / "members.json").read_text())) == 3
+    assert "--sweep.members 0 is too few" in refused(
+        mevs("sweep", "--preset", "tiny", "--out", tmp_path / "other", "--sweep.members", "0")
+    )
 
 
 def test_a_reach_that_leaves_nothing_is_refused(whole):

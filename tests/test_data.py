@@ -22,7 +22,15 @@ from data_pipeline.batches import (
     train_batches,
     validation_batches,
 )
-from data_pipeline.builder import DataConfig, load_statistics, open_split, prepare, split_objects, view_entropies
+from data_pipeline.builder import (
+    SPLITS,
+    DataConfig,
+    load_statistics,
+    open_split,
+    prepare,
+    split_objects,
+    view_entropies,
+)
 from data_pipeline.capture import CaptureConfig, capture, rig_for
 from data_pipeline.inputs import cloud_input, image_input
 from data_pipeline.meshes import DataError, load_object, open_source
@@ -180,7 +188,7 @@ def test_processes_share_every_batch(data, monkeypatch):
         monkeypatch.setattr(jax, "process_index", lambda p=process: p)
         parts.append(next(train_batches(data, BATCHES, first_step=2)))
     rows = [row.tobytes() for part in parts for row in part["depth"]]
-    assert sorted(rows) == sorted(row.tobytes() for row in whole["depth"])
+    assert rows == [row.tobytes() for row in whole["depth"]]  # one after the other, as one process reads them
     monkeypatch.setattr(jax, "process_count", lambda: 3)
     with pytest.raises(ValueError, match="cannot be shared by 3"):
         next(train_batches(data, BATCHES))
@@ -333,3 +341,26 @@ def test_images_are_mirrored_and_shifted_and_nothing_else(random):
     assert len({each.tobytes() for each in out}) == 50  # 2 mirrors × 5 × 5 shifts
     still = augment_image(jax.random.key(0), jnp.asarray(image), ImageAugmentation(False, 0))
     np.testing.assert_array_equal(still, image)
+
+
+def test_beam_makes_the_same_records(data, tmp_path):
+    """Beam's own local runner, where Beam is installed."""
+    pytest.importorskip("apache_beam", reason="Apache Beam is an optional extra: pip install mevs-jax[beam]")
+    folder = tmp_path / "data"
+    by_beam, alone = prepare(CONFIG, folder, beam="--runner=DirectRunner"), load_statistics(data)
+    assert by_beam == alone
+    for split in SPLITS:
+        records, expected = open_split(folder, split), open_split(data, split)
+        assert len(records) == len(expected)
+        for mine, theirs in zip(records, expected, strict=True):
+            assert mine.keys() == theirs.keys()
+            for name, value in theirs.items():
+                np.testing.assert_array_equal(mine[name], value, err_msg=name)
+    assert not (folder / "captures").exists()
+
+
+def test_beam_where_it_is_not_installed(tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "apache_beam.options.pipeline_options", None)
+    with pytest.raises(DataError, match=r"pip install mevs-jax\[beam\]"):
+        prepare(CONFIG, tmp_path / "data", beam="")
+    assert not (tmp_path / "data").exists()

@@ -16,7 +16,8 @@ import train.loop
 from data_pipeline.builder import load_statistics, prepare
 from data_pipeline.meshes import DataError
 from eval.pipeline import TINY, tasks
-from train.loop import OptimiserConfig, fit, learning_rate_schedule, load_best
+from train.loop import fit, load_best
+from train.optimiser import OptimiserConfig, learning_rate
 from train.pretrained import weights_from_network
 
 SETTINGS = replace(
@@ -154,14 +155,16 @@ def test_networks_of_another_size_are_described(trained, data):
 
 
 def test_schedules():
-    steps = learning_rate_schedule(OptimiserConfig(batch_size=32, schedule="steps"), 0)
-    assert float(steps(jnp.int32(0))) == pytest.approx(1e-3)
-    assert float(steps(jnp.int32(20_000 // 32 - 1))) == pytest.approx(1e-3)
-    assert float(steps(jnp.int32(20_000 // 32 + 1))) == pytest.approx(0.7e-3)
-    assert float(steps(jnp.int32(10**6))) == pytest.approx(1e-5)
-    cosine = learning_rate_schedule(OptimiserConfig(schedule="cosine"), 1000)
-    assert float(cosine(1000)) == pytest.approx(0, abs=1e-9)
-    assert float(cosine(100)) == pytest.approx(1e-3)
+    steps = learning_rate(OptimiserConfig(batch_size=32, schedule="steps"), 0)
+    assert float(steps(jnp.int32(0), 1e-3)) == pytest.approx(1e-3)
+    assert float(steps(jnp.int32(20_000 // 32 - 1), 1e-3)) == pytest.approx(1e-3)
+    assert float(steps(jnp.int32(20_000 // 32 + 1), 1e-3)) == pytest.approx(0.7e-3)
+    assert float(steps(jnp.int32(10**6), 1e-3)) == pytest.approx(1e-5)
+    cosine = learning_rate(OptimiserConfig(schedule="cosine"), 1000)
+    assert float(cosine(jnp.int32(1000), 1e-3)) == pytest.approx(0, abs=1e-9)
+    assert float(cosine(jnp.int32(100), 1e-3)) == pytest.approx(1e-3)
+    assert float(cosine(jnp.int32(100), 1e-2)) == pytest.approx(1e-2)
+    assert float(learning_rate(OptimiserConfig(), 10)(jnp.int32(7), 1e-2)) == pytest.approx(1e-2)
     statistics_like = tasks(SETTINGS, _Like())[1]
     assert float(statistics_like.momentum(jnp.int32(0))) == 0.5
     assert float(statistics_like.momentum(jnp.int32(45_000))) == 0.125

@@ -1,16 +1,20 @@
 """What a training run leaves on disk: its latest state, its best one, and how far it got. Orbax does the writing.
 
-Each save appears whole under its step, or not at all; older ones are removed after.
+Each save appears whole under its step, or not at all; older ones are removed after. Training goes on while it is written.
 """
 
 from __future__ import annotations
 
 import logging
+from copy import deepcopy
 from pathlib import Path
+from types import TracebackType
 from typing import Any
 
 import jax
 import orbax.checkpoint as ocp
+
+from train.devices import is_lost_process
 
 logging.getLogger("absl").setLevel(logging.ERROR)  # Orbax tells every step of every save
 
@@ -20,7 +24,7 @@ class Checkpoints:
 
     def __init__(self, folder: Path):
         options = ocp.CheckpointManagerOptions(
-            max_to_keep=1, create=True, enable_async_checkpointing=False, cleanup_tmp_directories=True
+            max_to_keep=1, create=True, enable_async_checkpointing=True, cleanup_tmp_directories=True
         )
         self._slots = {
             name: ocp.CheckpointManager((folder / name).absolute(), options=options) for name in ("latest", "best")
@@ -30,8 +34,11 @@ class Checkpoints:
         manager = self._slots[slot]
         if manager.latest_step() == step:
             return
+        for other in self._slots.values():
+            other.wait_until_finished()  # what `latest` says of `best` has to be there before
         manager.save(
-            step, args=ocp.args.Composite(state=ocp.args.StandardSave(state), progress=ocp.args.JsonSave(progress))
+            step,
+            args=ocp.args.Composite(state=ocp.args.StandardSave(state), progress=ocp.args.JsonSave(deepcopy(progress))),
         )
 
     def restore(self, slot: str, like: Any) -> tuple[Any, dict[str, Any]] | None:
@@ -49,3 +56,10 @@ class Checkpoints:
     def close(self) -> None:
         for manager in self._slots.values():
             manager.close()
+
+    def __enter__(self) -> Checkpoints:
+        return self
+
+    def __exit__(self, kind: type | None, error: BaseException | None, trace: TracebackType | None) -> None:
+        if error is None or not is_lost_process(error):  # a lost process never finishes its part of a save
+            self.close()

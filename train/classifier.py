@@ -18,8 +18,9 @@ from data_pipeline.capture import CaptureConfig
 from data_pipeline.inputs import image_input
 from data_pipeline.meshes import DataError
 from mevs_jax.models import ResNet
-from train.loop import Batch, OptimiserConfig
+from train.optimiser import OptimiserConfig
 from train.pretrained import StartingWeights, weights_from_torch
+from train.step import Batch, Hyperparameters, Metrics
 
 
 @dataclass(frozen=True)
@@ -86,9 +87,17 @@ class ClassifierTask:
             config.batch_size,
             config.views_per_object,
             images=self.images,
-            seed=config.seed,
+            seed=config.data_seed,
             validation_by=config.validation_by,
         )
+
+    @property
+    def metrics(self) -> tuple[str, ...]:
+        return ("accuracy", "loss")
+
+    @property
+    def hyperparameters(self) -> Hyperparameters:
+        return Hyperparameters.of(self.optimiser, 0.0, self.augmentation.strength)
 
     def network(self, rngs: nnx.Rngs) -> ResNet:
         shape = self.network_config
@@ -98,6 +107,7 @@ class ClassifierTask:
             channels=shape.channels,
             width=shape.width,
             standardise=shape.standardise and shape.channels == 3,
+            dtype=jnp.dtype(self.optimiser.compute),
             rngs=rngs,
         )
 
@@ -107,17 +117,19 @@ class ClassifierTask:
         return jax.vmap(convert)(batch[self.images])
 
     def loss(
-        self, network: ResNet, batch: Batch, key: jax.Array, samples: jax.Array
-    ) -> tuple[jax.Array, dict[str, jax.Array]]:
+        self, network: ResNet, batch: Batch, key: jax.Array, samples: jax.Array, hyper: Hyperparameters
+    ) -> tuple[jax.Array, Metrics]:
         del samples
         images = self.inputs(batch)
         keys = jax.random.split(key, len(images))
-        images = jax.vmap(augment_image, in_axes=(0, 0, None))(keys, images, self.augmentation)
+        images = jax.vmap(augment_image, in_axes=(0, 0, None, None))(
+            keys, images, self.augmentation, hyper.augmentation
+        )
         logits = network(images, train=True)
         loss = jnp.mean(optax.softmax_cross_entropy_with_integer_labels(logits, batch["label"]))
         return loss, {"loss": loss, "accuracy": jnp.mean(jnp.argmax(logits, -1) == batch["label"])}
 
-    def evaluate(self, network: ResNet, batch: Batch) -> dict[str, jax.Array]:
+    def evaluate(self, network: ResNet, batch: Batch) -> Metrics:
         logits = network(self.inputs(batch))
         return {
             "loss": optax.softmax_cross_entropy_with_integer_labels(logits, batch["label"]),

@@ -15,7 +15,8 @@ from data_pipeline.batches import ViewBatches
 from data_pipeline.capture import CaptureConfig
 from data_pipeline.inputs import cloud_input
 from mevs_jax.models import THESIS_ABSTRACTIONS, Abstraction, PointNet2
-from train.loop import Batch, OptimiserConfig
+from train.optimiser import OptimiserConfig
+from train.step import Batch, Hyperparameters, Metrics
 
 
 @dataclass(frozen=True)
@@ -70,9 +71,17 @@ class EntropyTask:
             config.batch_size,
             config.views_per_object,
             points=self.network_config.points,
-            seed=config.seed,
+            seed=config.data_seed,
             validation_by=config.validation_by,
         )
+
+    @property
+    def metrics(self) -> tuple[str, ...]:
+        return ("loss",)
+
+    @property
+    def hyperparameters(self) -> Hyperparameters:
+        return Hyperparameters.of(self.optimiser, self.network_config.dropout, self.augmentation.strength)
 
     def network(self, rngs: nnx.Rngs) -> PointNet2:
         shape = self.network_config
@@ -82,6 +91,7 @@ class EntropyTask:
             global_layers=shape.global_layers,
             head_layers=shape.head_layers,
             dropout=shape.dropout,
+            dtype=jnp.dtype(self.optimiser.compute),
             rngs=rngs,
         )
 
@@ -97,16 +107,18 @@ class EntropyTask:
         return jnp.maximum(0.5 * 0.5 ** (samples // 20_000), 0.01)
 
     def loss(
-        self, network: PointNet2, batch: Batch, key: jax.Array, samples: jax.Array
-    ) -> tuple[jax.Array, dict[str, jax.Array]]:
+        self, network: PointNet2, batch: Batch, key: jax.Array, samples: jax.Array, hyper: Hyperparameters
+    ) -> tuple[jax.Array, Metrics]:
         augment, drop = jax.random.split(key)
         clouds = self.inputs(batch)
         keys = jax.random.split(augment, len(clouds))
-        clouds = jax.vmap(augment_cloud, in_axes=(0, 0, None))(keys, clouds, self.augmentation)
-        predicted = network(clouds, train=True, key=drop, momentum=self.momentum(samples))
+        clouds = jax.vmap(augment_cloud, in_axes=(0, 0, None, None))(
+            keys, clouds, self.augmentation, hyper.augmentation
+        )
+        predicted = network(clouds, train=True, key=drop, momentum=self.momentum(samples), dropout=hyper.dropout)
         loss = jnp.mean(jnp.square(predicted - batch["entropy"] / self.entropy_max))
         return loss, {"loss": loss}
 
-    def evaluate(self, network: PointNet2, batch: Batch) -> dict[str, jax.Array]:
+    def evaluate(self, network: PointNet2, batch: Batch) -> Metrics:
         predicted = network(self.inputs(batch))
         return {"loss": jnp.mean(jnp.square(predicted - batch["entropy"] / self.entropy_max), axis=-1)}

@@ -28,8 +28,9 @@ class BatchNorm(nnx.Module):
     ) -> Float[Array, "... features"]:
         """Normalises by the batch and updates the running statistics where `train`, else by the running statistics.
 
-        `momentum` is the weight of the new batch, in [0, 1].
+        `momentum` is the weight of the new batch, in [0, 1]. Statistics are at least float32; the result is as `x`.
         """
+        dtype, x = x.dtype, x.astype(jnp.promote_types(x.dtype, jnp.float32))
         if train:
             axes = tuple(range(x.ndim - 1))
             mean = jnp.mean(x, axes)
@@ -42,4 +43,4 @@ class BatchNorm(nnx.Module):
         else:
             mean, variance = self.mean[...], self.variance[...]
         factor = self.scale[...] * jax.lax.rsqrt(variance + self.epsilon)
-        return (x - mean) * factor + self.bias[...]
+        return ((x - mean) * factor + self.bias[...]).astype(dtype)

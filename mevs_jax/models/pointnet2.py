@@ -42,10 +42,10 @@ THESIS_HEAD_LAYERS = (512, 256)
 class Perceptron(nnx.Module):
     """Linear layers without bias, each with batch norm and ReLU: the "shared MLP" of the paper."""
 
-    def __init__(self, inputs: int, layers: Sequence[int], *, rngs: nnx.Rngs):
+    def __init__(self, inputs: int, layers: Sequence[int], *, rngs: nnx.Rngs, dtype: jnp.dtype | None = None):
         sizes = [inputs, *layers]
         self.linear = nnx.List(
-            nnx.Linear(a, b, use_bias=False, kernel_init=nnx.initializers.he_normal(), rngs=rngs)
+            nnx.Linear(a, b, use_bias=False, kernel_init=nnx.initializers.he_normal(), dtype=dtype, rngs=rngs)
             for a, b in pairwise(sizes)
         )
         self.norm = nnx.List(BatchNorm(size) for size in layers)
@@ -77,6 +77,8 @@ class PointNet2(nnx.Module):
         abstractions, global_layers, head_layers: sizes; the thesis's by default.
         dropout: rate before the last layer, in [0, 1).
         rngs: source of the initial weights.
+        dtype: what the hidden layers calculate in, that of the clouds unless given; coordinates, weights, batch-norm statistics
+            and the last layer keep their own.
     """
 
     def __init__(
@@ -88,6 +90,7 @@ class PointNet2(nnx.Module):
         head_layers: Sequence[int] = THESIS_HEAD_LAYERS,
         dropout: float = 0.5,
         rngs: nnx.Rngs,
+        dtype: jnp.dtype | None = None,
     ):
         if views < 2:
             raise ValueError(f"PointNet2 needs at least 2 candidate views, got {views}")
@@ -96,12 +99,12 @@ class PointNet2(nnx.Module):
         channels = 3  # the place of the normals
         perceptrons = []
         for level in self.levels:
-            perceptrons.append(Perceptron(3 + channels, level.layers, rngs=rngs))
+            perceptrons.append(Perceptron(3 + channels, level.layers, rngs=rngs, dtype=dtype))
             channels = level.layers[-1]
         self.perceptrons = nnx.List(perceptrons)
-        self.whole = Perceptron(3 + channels, global_layers, rngs=rngs)
-        self.head = Perceptron(global_layers[-1], head_layers, rngs=rngs)
-        self.dropout = nnx.Dropout(dropout)
+        self.whole = Perceptron(3 + channels, global_layers, rngs=rngs, dtype=dtype)
+        self.head = Perceptron(global_layers[-1], head_layers, rngs=rngs, dtype=dtype)
+        self.dropout = dropout
         self.out = nnx.Linear(head_layers[-1], views, rngs=rngs)
 
     def __call__(
@@ -111,6 +114,7 @@ class PointNet2(nnx.Module):
         train: bool = False,
         key: Array | None = None,
         momentum: float | Float[Array, ""] = 0.1,
+        dropout: float | Float[Array, ""] | None = None,
     ) -> Float[Array, "*batch views"]:
         """Predicted entropy, in units of the training split's largest, of every view.
 
@@ -119,6 +123,7 @@ class PointNet2(nnx.Module):
             train: normalise over the batch, update running statistics, drop out.
             key: for dropout; needed where `train`.
             momentum: of the running statistics, in [0, 1].
+            dropout: rate in the place of the network's own, in [0, 1).
         """
         if train and key is None:
             raise ValueError("PointNet2 in training needs a key for its dropout")
@@ -135,5 +140,9 @@ class PointNet2(nnx.Module):
             features = jnp.max(perceptron(grouped, train=train, momentum=momentum), axis=2)
         everything = jnp.concatenate([centres, features], axis=-1)
         features = jnp.max(self.whole(everything, train=train, momentum=momentum), axis=1)
-        hidden = self.dropout(self.head(features, train=train, momentum=momentum), deterministic=not train, rngs=key)
+        hidden = self.head(features, train=train, momentum=momentum).astype(points.dtype)
+        if train and key is not None:
+            # Flax's own layer takes no rate that is traced.
+            kept = 1 - (self.dropout if dropout is None else dropout)
+            hidden = jnp.where(jax.random.bernoulli(key, kept, hidden.shape), hidden / kept, 0.0)
         return self.out(hidden).reshape(*batch, self.views)

@@ -31,7 +31,7 @@ class Convolution(nnx.Module):
         self.size, self.stride = size, stride
 
     def __call__(self, x: Float[Array, "batch height width inputs"]) -> Float[Array, "batch rows columns outputs"]:
-        kernel, size, stride, pad = self.kernel[...], self.size, self.stride, self.size // 2
+        kernel, size, stride, pad = self.kernel[...].astype(x.dtype), self.size, self.stride, self.size // 2
         rows, columns = (-(-extent // stride) for extent in x.shape[1:3])
         if jax.default_backend() == "cpu" and rows * columns <= 64:
             x = jnp.pad(x, ((0, 0), (pad, pad), (pad, pad), (0, 0)))
@@ -79,6 +79,8 @@ class ResNet(nnx.Module):
         standardise: take ImageNet's mean off the three channels and divide by its standard deviation, as torchvision's
             weights expect of images in [0, 1].
         rngs: source of the initial weights.
+        dtype: what the convolutions calculate in, that of the images unless given; weights, batch-norm statistics and the last
+                layer keep their own.
 
     Raises:
         ValueError: for another depth, or `standardise` with other than three channels.
@@ -93,13 +95,14 @@ class ResNet(nnx.Module):
         width: int = 64,
         standardise: bool = False,
         rngs: nnx.Rngs,
+        dtype: jnp.dtype | None = None,
     ):
         if depth not in _BLOCKS:
             raise ValueError(f"ResNet has depth 18 or 34, got {depth}")
         if standardise and channels != 3:
             raise ValueError(f"ResNet standardises images of 3 channels, got {channels}")
         self.depth, self.classes, self.channels, self.width = depth, classes, channels, width
-        self.standardise = standardise
+        self.standardise, self.dtype = standardise, dtype
         self.stages = _BLOCKS[depth]
         self.convolution = Convolution(channels, width, 7, 2, rngs=rngs)
         self.norm = BatchNorm(width)
@@ -126,11 +129,12 @@ class ResNet(nnx.Module):
         x = images.reshape(-1, *images.shape[-3:])
         if self.standardise:
             x = (x - jnp.array(_IMAGENET_MEAN)) / jnp.array(_IMAGENET_STD)
+        exact, x = x.dtype, x.astype(self.dtype or x.dtype)
         x = jax.nn.relu(self.norm(self.convolution(x), train=train, momentum=momentum))
         x = nnx.max_pool(x, (3, 3), strides=(2, 2), padding=((1, 1), (1, 1)))
         for block in self.blocks:
             x = block(x, train=train, momentum=momentum)
-        return jnp.mean(x, axis=(1, 2)).reshape(*batch, -1)
+        return jnp.mean(x, axis=(1, 2), dtype=exact).reshape(*batch, -1)
 
     def __call__(
         self,

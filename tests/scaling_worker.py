@@ -1,0 +1,83 @@
+"""Trains in a process of its own, on as many simulated devices as asked for: `python scaling_worker.py '{"devices": 8, …}'`."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import jax
+from jax.sharding import Mesh
+
+import train.loop
+from data_pipeline.batches import train_batches
+from data_pipeline.builder import load_statistics
+from eval.pipeline import TINY, tasks
+from train.devices import DATA, MODEL, device_mesh, parameter_sharding, place, place_batch
+from train.preemption import Preempted
+from train.step import initial_state, train_step_of
+
+_BRIEF = replace(TINY.classifier.optimiser, epochs=4, learning_rate=1e-4)
+
+SETTINGS = replace(
+    TINY,
+    classifier=replace(TINY.classifier, optimiser=_BRIEF),
+    entropy=replace(TINY.entropy, optimiser=_BRIEF),
+)
+"""Both networks with augmentation, PointNet++ with dropout. A low learning rate: once in some dozens of steps rounding decides
+whether a rectified unit is on, and what follows from that grows with the rate."""
+
+
+def losses(data: Path, mesh: Mesh, steps: int) -> dict[str, list[float]]:
+    """The training loss of the first steps, by network; PointNet++ alone where weights are split, which compiles sooner."""
+    out = {}
+    for task in tasks(SETTINGS, load_statistics(data))[mesh.shape["model"] > 1 :]:
+        structure, state = initial_state(task, task.optimiser.seed)
+        where = parameter_sharding(mesh, state)
+        state = place(state, where)
+        step = jax.jit(train_step_of(task, structure, steps), donate_argnums=0, out_shardings=(where, None))
+        batches = train_batches(data, task.batches)
+        found = []
+        for _ in range(steps):
+            state, loss = step(state, place_batch(mesh, next(batches)), task.hyperparameters)
+            found.append(loss)
+        out[task.name] = [float(loss) for loss in found]
+    return out
+
+
+def fit_until(data: Path, out: Path, stop_at: int) -> None:
+    """Trains PointNet++; at the batch of number `stop_at` the process is told to end."""
+    real = train.loop.train_batches
+
+    def batches(*arguments, first_step: int = 0):
+        for number, batch in enumerate(real(*arguments, first_step=first_step), first_step):
+            if number == stop_at:
+                os.kill(os.getpid(), signal.SIGTERM)
+            yield batch
+
+    train.loop.train_batches = batches
+    statistics = load_statistics(data)
+    task = tasks(SETTINGS, statistics)[1]
+    try:
+        train.loop.fit(task, data, statistics, out)
+    except Preempted:
+        sys.exit(143)
+
+
+def meshes() -> dict[str, Mesh]:
+    """One device, all of them, and all of them with weights split in two."""
+    return {"1": Mesh([[jax.devices()[0]]], (DATA, MODEL)), "8": device_mesh(), "4 × 2": device_mesh(2)}
+
+
+if __name__ == "__main__":
+    asked = json.loads(sys.argv[1])
+    jax.config.update("jax_num_cpu_devices", asked["devices"])
+    assert len(jax.devices()) == asked["devices"]
+    if "steps" in asked:
+        curves = {name: losses(Path(asked["data"]), mesh, asked["steps"]) for name, mesh in meshes().items()}
+        print(json.dumps(curves))
+    else:
+        fit_until(Path(asked["data"]), Path(asked["out"]), asked["stop_at"])

@@ -1,0 +1,120 @@
+"""Which devices a training runs on, and where its arrays lie: one mesh, from a laptop's CPU to a pod.
+
+The mesh has two axes. Batches are split along `data`; weights are copied along it, and those that are large enough are split
+along `model`, by their last axis. The rest is the compiler's work.
+"""
+
+from __future__ import annotations
+
+import os
+from typing import Any
+
+import jax
+import numpy as np
+from jax.sharding import Mesh, NamedSharding, PartitionSpec
+
+from data_pipeline.meshes import DataError
+from train.step import Task
+
+DATA, MODEL = "data", "model"
+_SMALLEST_SPLIT = 2**12
+"""Weights smaller than this are copied to every device."""
+
+
+def join_processes() -> None:
+    """Makes this process one of several that train together; to be called before JAX computes anything.
+
+    On Slurm, Open MPI, Kubernetes and Cloud TPUs JAX finds the others by itself; elsewhere the environment says where they are:
+    JAX_COORDINATOR_ADDRESS (host:port of process 0), JAX_NUM_PROCESSES and JAX_PROCESS_ID.
+
+    Raises:
+        DataError: where the others cannot be found or reached.
+    """
+    numbers = {}
+    try:
+        for argument, name in (("num_processes", "JAX_NUM_PROCESSES"), ("process_id", "JAX_PROCESS_ID")):
+            if name in os.environ:
+                numbers[argument] = int(os.environ[name])
+        jax.distributed.initialize(**numbers, heartbeat_timeout_seconds=30)  # type: ignore[arg-type]
+    except (ValueError, RuntimeError) as error:
+        raise DataError(
+            f"--distributed cannot join the other processes ({str(error).splitlines()[0]}); outside Slurm, Open MPI, Kubernetes "
+            f"and Cloud TPUs set JAX_COORDINATOR_ADDRESS=host:port, JAX_NUM_PROCESSES and JAX_PROCESS_ID for each"
+        ) from error
+
+
+def is_first() -> bool:
+    """Whether this process is the one that writes and speaks for all."""
+    return jax.process_index() == 0
+
+
+def device_mesh(model: int = 1) -> Mesh:
+    """All devices of all processes, `model` of them to a copy of the weights.
+
+    A process's devices lie together along `data`, so that its part of a batch is one piece.
+
+    Raises:
+        DataError: where the devices cannot be grouped so.
+    """
+    devices = sorted(jax.devices(), key=lambda device: (device.process_index, device.id))
+    local = jax.local_device_count()
+    if model < 1 or local % model:
+        raise DataError(
+            f"--model-devices {model} does not divide the {local} devices of a process; use 1, or a divisor"
+        )
+    return Mesh(np.array(devices).reshape(-1, model), (DATA, MODEL))
+
+
+def check_batch(task: Task, mesh: Mesh) -> None:
+    """Raises `DataError` where a batch cannot be split over the mesh."""
+    config, processes, devices = task.optimiser, jax.process_count(), mesh.shape[DATA]
+    if config.parts < 1 or config.batch_size % (devices * config.parts):
+        parts = f" in {config.parts} parts" if config.parts != 1 else ""
+        raise DataError(
+            f"{task.name}: a batch of {config.batch_size} views{parts} cannot be shared equally by {devices} devices; "
+            f"choose another optimiser.batch-size or optimiser.parts, or use fewer devices"
+        )
+    if config.batch_size % (config.views_per_object * processes):
+        raise DataError(
+            f"{task.name}: a batch of {config.batch_size} views, {config.views_per_object} of an object, cannot be read "
+            f"equally by {processes} processes; choose another optimiser.batch-size or optimiser.views-per-object"
+        )
+
+
+def parameter_sharding(mesh: Mesh, tree: Any) -> Any:
+    """Where every array of a tree belongs: large ones split along `model` by their last axis, all others everywhere."""
+    model = mesh.shape[MODEL]
+
+    def of(leaf: jax.Array) -> NamedSharding:
+        splits = model > 1 and leaf.ndim > 1 and leaf.size >= _SMALLEST_SPLIT and leaf.shape[-1] % model == 0
+        return NamedSharding(mesh, PartitionSpec(*[None] * (leaf.ndim - 1), MODEL) if splits else PartitionSpec())
+
+    return jax.tree.map(of, tree)
+
+
+def place(tree: Any, sharding: Any) -> Any:
+    """Puts arrays that every process holds whole where they belong."""
+
+    def put(leaf: jax.Array, where: NamedSharding) -> jax.Array:
+        whole = np.asarray(leaf)
+        return jax.make_array_from_callback(whole.shape, where, lambda index: whole[index])
+
+    return jax.tree.map(put, tree, sharding)
+
+
+def place_batch(mesh: Mesh, batch: Any) -> Any:
+    """One batch over all devices, from this process's part of it."""
+    split = NamedSharding(mesh, PartitionSpec(DATA))
+    return jax.tree.map(lambda part: jax.make_array_from_process_local_data(split, part), batch)
+
+
+_LOST = ("gloo", "coordination service", "heartbeat", "connection closed by peer", "connection reset", "nccl")
+
+
+def is_lost_process(error: BaseException) -> bool:
+    """Whether an error of JAX's runtime says that another process is gone."""
+    chain, link = [], error
+    while link is not None and link not in chain:
+        chain.append(link)
+        link = link.__cause__ or link.__context__  # type: ignore[assignment]
+    return jax.process_count() > 1 and any(sign in str(link).lower() for link in chain for sign in _LOST)

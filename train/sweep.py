@@ -1,0 +1,298 @@
+"""Many configurations of one network trained as one program: the training step, vmapped over states and hyper-parameters.
+
+All members see the same batches, so the data is read once for all of them; each device trains its share. A member that gets
+no better for `patience` epochs, or whose loss is no number any more, is left as it is while the others go on. A member ends
+as it would have ended alone.
+"""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Callable
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any, Literal
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.sharding import Mesh, NamedSharding, PartitionSpec
+from scipy.stats import qmc
+
+from data_pipeline.batches import train_batches
+from data_pipeline.builder import DatasetStatistics
+from data_pipeline.files import read_json, write_json, write_text
+from data_pipeline.meshes import DataError
+from data_pipeline.progress import console, progress_bar
+from train.checkpoints import Checkpoints
+from train.classifier import ClassifierTask
+from train.devices import DATA, device_mesh
+from train.entropy import EntropyTask
+from train.loop import Lead, identity_of, steps_of_an_epoch, validation_set, weighted_means
+from train.preemption import Preempted, Preemption
+from train.step import Hyperparameters, TrainState, evaluate_step_of, initial_state, train_step_of
+
+SweepTask = ClassifierTask | EntropyTask
+Range = tuple[float, float]
+
+
+@dataclass(frozen=True)
+class SweepConfig:
+    """Which configurations are tried; a range whose ends are equal fixes what it is of."""
+
+    network: Literal["entropy", "classifier"] = "entropy"
+    """which network"""
+    members: int = 16
+    """configurations, drawn from the ranges by a Sobol sequence"""
+    learning_rate: Range = (3e-4, 1e-2)
+    """even in its logarithm"""
+    weight_decay: Range = (1e-4, 1e-1)
+    """even in its logarithm"""
+    dropout: Range = (0.0, 0.5)
+    """of the entropy predictor; the classifier has none"""
+    augmentation: Range = (0.0, 1.0)
+    """strength of what the network's augmentation switches on"""
+    same_start: bool = False
+    """give all members the network's seed; else member i has i more than that, for other weights and draws"""
+    seed: int = 0
+    """of the draw"""
+
+
+@dataclass(frozen=True)
+class Member:
+    """One configuration, and what became of it.
+
+    Attributes:
+        best: validation metrics of the best epoch.
+        epochs: trained.
+        diverged: its loss was no number any more.
+    """
+
+    learning_rate: float
+    weight_decay: float
+    dropout: float
+    augmentation: float
+    seed: int
+    best_epoch: int = 0
+    best: dict[str, float] | None = None
+    epochs: int = 0
+    diverged: bool = False
+
+    @property
+    def loss(self) -> float:
+        return self.best["loss"] if self.best else float("inf")
+
+
+def draw_members(config: SweepConfig, task: SweepTask) -> list[Member]:
+    """The configurations of a sweep.
+
+    Raises:
+        DataError: for a range that cannot be drawn from.
+    """
+    if config.members < 1:
+        raise DataError(f"--sweep.members {config.members} is too few; it must be at least 1")
+    ranges = {"learning_rate": config.learning_rate, "weight_decay": config.weight_decay}
+    for name, (low, high) in ranges.items():
+        if not 0 < low <= high:
+            raise DataError(f"--sweep.{name.replace('_', '-')} {low} {high} must go up from more than 0")
+    shares = {"dropout": config.dropout, "augmentation": config.augmentation}
+    for name, (low, high) in shares.items():
+        if not 0 <= low <= high <= 1 or (name == "dropout" and high == 1):
+            raise DataError(f"--sweep.{name} {low} {high} must go up within 0 and 1")
+    low, high = np.array([*(np.log(pair) for pair in ranges.values()), *shares.values()]).T
+    drawn = qmc.Sobol(len(low), seed=config.seed).random_base2(int(np.ceil(np.log2(config.members))))
+    members = []
+    for index, place in enumerate(low + drawn[: config.members] * (high - low)):
+        rate, decay, dropout, augmentation = place
+        members.append(
+            Member(
+                learning_rate=float(np.exp(rate)),
+                weight_decay=float(np.exp(decay)),
+                dropout=float(dropout) if isinstance(task, EntropyTask) else 0.0,
+                augmentation=float(augmentation),
+                seed=task.optimiser.seed + (0 if config.same_start else index),
+            )
+        )
+    return members
+
+
+def task_of(task: SweepTask, member: Member) -> SweepTask:
+    """What `train.loop.fit` would train alone to get the same network."""
+    optimiser = replace(
+        task.optimiser, learning_rate=member.learning_rate, weight_decay=member.weight_decay, seed=member.seed
+    )
+    if isinstance(task, ClassifierTask):
+        augmentation = replace(task.augmentation, strength=member.augmentation)
+        return replace(task, optimiser=optimiser, augmentation=augmentation)
+    return replace(
+        task,
+        optimiser=optimiser,
+        augmentation=replace(task.augmentation, strength=member.augmentation),
+        network_config=replace(task.network_config, dropout=member.dropout),
+    )
+
+
+def sweep(
+    task: SweepTask,
+    data: Path,
+    statistics: DatasetStatistics,
+    folder: Path,
+    config: SweepConfig,
+    mesh: Mesh | None = None,
+) -> list[Member]:
+    """Trains all members; returns them, and leaves `members.json` and the best one as a run of its own (`network/`).
+
+    An interrupted sweep goes on from its last epoch.
+
+    Raises:
+        DataError: for a configuration that cannot be drawn or shared out, or a folder with another sweep.
+        Preempted: after SIGTERM, at the end of an epoch.
+    """
+    identity = json.loads(json.dumps({"task": asdict(task), "sweep": asdict(config), "data": statistics.fingerprint}))
+    if (folder / "config.json").exists() and read_json(folder / "config.json") != identity:
+        raise DataError(f"{folder} holds a sweep made with other settings; choose another --out, or delete that folder")
+    members = draw_members(config, task)
+    if (folder / "members.json").exists():
+        return [Member(**member) for member in read_json(folder / "members.json")]
+    mesh = mesh or device_mesh()
+    if len(members) % mesh.size:
+        raise DataError(f"--sweep.members {len(members)} cannot be shared equally by {mesh.size} devices")
+    write_json(folder / "config.json", identity)
+
+    optimiser = task.optimiser
+    epoch_steps = steps_of_an_epoch(task, statistics)
+    hyper = jax.tree.map(lambda *numbers: np.stack(numbers), *(task_of(task, m).hyperparameters for m in members))
+    structure, _ = initial_state(task, 0)
+    apart = NamedSharding(mesh, PartitionSpec(DATA))
+
+    def over_members(function: Callable, arguments: str) -> Callable:
+        """`function` for all members, shared out; each of its arguments is of a member (m) or the same for all (s)."""
+        axes = tuple(0 if kind == "m" else None for kind in arguments)
+        specs = tuple(PartitionSpec(DATA) if kind == "m" else PartitionSpec() for kind in arguments)
+        vmapped = jax.vmap(function, axes)
+        return jax.shard_map(vmapped, mesh=mesh, in_specs=specs, out_specs=PartitionSpec(DATA), check_vma=False)
+
+    step = train_step_of(task, structure, epoch_steps)
+
+    def step_if(training: jax.Array, state: TrainState, batch: Any, hyper: Hyperparameters):
+        after, loss = step(state, batch, hyper)
+        return jax.tree.map(lambda new, old: jnp.where(training, new, old), after, state), loss
+
+    train_step = jax.jit(over_members(step_if, "mmsm"), donate_argnums=1)
+    evaluate_step = jax.jit(over_members(evaluate_step_of(task, structure), "mmss"))
+    keep = jax.jit(
+        over_members(lambda better, new, old: jax.tree.map(lambda a, b: jnp.where(better, a, b), new, old), "mmm")
+    )
+    state = jax.jit(over_members(lambda seed: initial_state(task, seed)[1], "m"))(jax.device_put(hyper.seed, apart))
+    hyper = jax.device_put(hyper, apart)
+    best = jax.tree.map(jnp.copy, (state.parameters, state.statistics))
+
+    progress: dict[str, Any] = {"epoch": 0, "seconds": 0.0, "histories": [[] for _ in members]}
+    validation = validation_set(task, data, statistics, devices=1)  # every member sees all of a batch
+
+    def goes_on(member: Member) -> bool:
+        return not member.diverged and member.epochs - member.best_epoch < optimiser.patience
+
+    lead = Lead()
+    with Checkpoints(folder) as checkpoints, progress_bar("views") as bar, Preemption() as preemption:
+        if (saved := checkpoints.restore("latest", (state, best))) is not None:
+            (state, best), progress = saved
+            members = [Member(**member) for member in progress.pop("members")]
+            console.print(f"Sweep: going on after epoch {progress['epoch']}")
+        batches = train_batches(data, task.batches, first_step=progress["epoch"] * epoch_steps)
+        line = bar.add_task(
+            f"Sweep of {len(members)}: {task.name}",
+            total=epoch_steps * optimiser.epochs * optimiser.batch_size,
+            completed=progress["epoch"] * epoch_steps * optimiser.batch_size,
+            note="",
+        )
+        while progress["epoch"] < optimiser.epochs and any(map(goes_on, members)):
+            started = time.perf_counter()
+            training = np.array([goes_on(member) for member in members])
+            for _ in range(epoch_steps):
+                state, loss = train_step(training, state, next(batches), hyper)
+                lead.limit(loss)
+                bar.advance(line, optimiser.batch_size)
+            means = {name: np.asarray(sums) / epoch_steps for name, sums in state.sums.items()}
+            found = [evaluate_step(state.parameters, state.statistics, *batch) for batch in validation]
+            progress["epoch"] += 1
+            members, better = _after_epoch(members, training, means, weighted_means(found), progress)
+            best = keep(better, (state.parameters, state.statistics), best)
+            progress["seconds"] += time.perf_counter() - started
+            checkpoints.save(
+                "latest", progress["epoch"], (state, best), progress | {"members": [asdict(m) for m in members]}
+            )
+            leader = min(members, key=lambda member: member.loss)
+            console.print(
+                f"Sweep of {len(members)}, epoch {progress['epoch']}/{optimiser.epochs}: {sum(map(goes_on, members))} go on, "
+                f"best val loss {leader.loss:.4f}"
+            )
+            if preemption.after(progress["epoch"]):
+                raise Preempted(f"the sweep was asked to end after epoch {progress['epoch']}")
+    _export(task, statistics, folder, members, progress, jax.device_get(best), epoch_steps)
+    write_json(folder / "members.json", [asdict(member) for member in members])
+    return members
+
+
+def _after_epoch(
+    members: list[Member],
+    training: np.ndarray,
+    means: dict[str, Any],
+    checked: dict[str, Any],
+    progress: dict[str, Any],
+) -> tuple[list[Member], np.ndarray]:
+    """Members with this epoch counted, and which of them were never better."""
+    after, better = [], np.zeros(len(members), bool)
+    for index, member in enumerate(members):
+        if training[index]:
+            now = {name: float(values[index]) for name, values in checked.items()}
+            trained = {f"train/{name}": float(values[index]) for name, values in means.items()}
+            progress["histories"][index].append(
+                {"epoch": progress["epoch"]} | trained | {f"val/{k}": v for k, v in now.items()}
+            )
+            member = replace(member, epochs=progress["epoch"])
+            if not np.isfinite([now["loss"], trained["train/loss"]]).all():
+                member = replace(member, diverged=True)
+            elif now["loss"] < member.loss:
+                better[index] = True
+                member = replace(member, best=now, best_epoch=progress["epoch"])
+        after.append(member)
+    return after, better
+
+
+def _export(
+    task: SweepTask,
+    statistics: DatasetStatistics,
+    folder: Path,
+    members: list[Member],
+    progress: dict[str, Any],
+    best: Any,
+    epoch_steps: int,
+) -> None:
+    """Writes the best member as `train.loop.fit` would have left it, into `network/`."""
+    index = int(np.argmin([member.loss for member in members]))
+    member, alone = members[index], task_of(task, members[index])
+    if member.best is None:
+        raise DataError(f"every member of the sweep in {folder} diverged; lower --sweep.learning-rate")
+    out = folder / "network"
+    _, state = initial_state(alone, member.seed)
+    parameters, rest = jax.tree.map(lambda leaf: jnp.asarray(leaf[index]), best)
+    step = member.best_epoch * epoch_steps
+    state = replace(state, step=jnp.int32(step), parameters=parameters, statistics=rest)
+    summary = {
+        "epoch": member.epochs,
+        "best_loss": member.loss,
+        "best_epoch": member.best_epoch,
+        "best": member.best,
+        "seconds": progress["seconds"],
+        "steps": member.epochs * epoch_steps,
+        "start": "random weights",
+        "stopped_early": member.epochs < task.optimiser.epochs,
+    }
+    with Checkpoints(out) as checkpoints:
+        checkpoints.save("best", step, state, summary)
+    lines = [entry | {"step": entry["epoch"] * epoch_steps} for entry in progress["histories"][index]]
+    write_text(out / "metrics.jsonl", "".join(json.dumps(line) + "\n" for line in lines))
+    write_json(out / "config.json", identity_of(alone, statistics))
+    write_json(out / "summary.json", summary)
