@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import signal
 import sys
 from dataclasses import replace
@@ -31,9 +32,13 @@ SETTINGS = replace(
 whether a rectified unit is on, and what follows from that grows with the rate."""
 
 
-def losses(data: Path, mesh: Mesh, steps: int) -> dict[str, list[float]]:
-    """The training loss of the first steps, by network; PointNet++ alone where weights are split, which compiles sooner."""
-    out = {}
+COLLECTIVES = re.compile(r"\b(all-reduce|all-gather|all-to-all|reduce-scatter|collective-permute)(?:-start)?\(")
+
+
+def losses(data: Path, mesh: Mesh, steps: int) -> tuple[dict[str, list[float]], dict[str, list[str]]]:
+    """The training loss of the first steps, and how devices talk in a step, by network; PointNet++ alone where weights are
+    split, which compiles sooner."""
+    out, talk = {}, {}
     for task in tasks(SETTINGS, load_statistics(data))[mesh.shape["model"] > 1 :]:
         structure, state = initial_state(task, task.optimiser.seed)
         where = parameter_sharding(mesh, state)
@@ -41,11 +46,15 @@ def losses(data: Path, mesh: Mesh, steps: int) -> dict[str, list[float]]:
         step = jax.jit(train_step_of(task, structure, steps), donate_argnums=0, out_shardings=(where, None))
         batches = train_batches(data, task.batches)
         found = []
+        program = step.lower(
+            state, place_batch(mesh, next(train_batches(data, task.batches))), task.hyperparameters
+        ).compile()
+        talk[task.name] = sorted(set(COLLECTIVES.findall(program.as_text())))
         for _ in range(steps):
-            state, loss = step(state, place_batch(mesh, next(batches)), task.hyperparameters)
+            state, loss = program(state, place_batch(mesh, next(batches)), task.hyperparameters)
             found.append(loss)
         out[task.name] = [float(loss) for loss in found]
-    return out
+    return out, talk
 
 
 def fit_until(data: Path, out: Path, stop_at: int) -> None:
@@ -77,7 +86,6 @@ if __name__ == "__main__":
     jax.config.update("jax_num_cpu_devices", asked["devices"])
     assert len(jax.devices()) == asked["devices"]
     if "steps" in asked:
-        curves = {name: losses(Path(asked["data"]), mesh, asked["steps"]) for name, mesh in meshes().items()}
-        print(json.dumps(curves))
+        print(json.dumps({name: losses(Path(asked["data"]), mesh, asked["steps"]) for name, mesh in meshes().items()}))
     else:
         fit_until(Path(asked["data"]), Path(asked["out"]), asked["stop_at"])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import signal
 from dataclasses import replace
 from pathlib import Path
 
@@ -16,6 +17,7 @@ import train.loop
 from data_pipeline.builder import load_statistics, prepare
 from data_pipeline.meshes import DataError
 from eval.pipeline import TINY, tasks
+from train.checkpoints import Checkpoints
 from train.loop import fit, load_best
 from train.optimiser import OptimiserConfig, learning_rate
 from train.pretrained import weights_from_network
@@ -186,3 +188,25 @@ def test_a_loss_that_is_no_number_stops_the_run(data, tmp_path):
     task = replace(task, optimiser=replace(task.optimiser, learning_rate=1e30, schedule="constant", epochs=1))
     with pytest.raises(FloatingPointError, match="no longer finite"):
         fit(task, data, statistics, tmp_path)
+
+
+def test_an_interrupt_waits_for_the_checkpoint(tmp_path, monkeypatch):
+    """One that falls into Orbax would leave its threads waiting for each other, and the program with them."""
+    state = {"weights": jnp.arange(4.0)}
+    with Checkpoints(tmp_path) as checkpoints:
+        manager = checkpoints._slots["latest"]
+        save = manager.save
+
+        def interrupted(*arguments, **named):
+            signal.raise_signal(signal.SIGINT)
+            return save(*arguments, **named)
+
+        monkeypatch.setattr(manager, "save", interrupted)
+        with pytest.raises(KeyboardInterrupt):
+            checkpoints.save("latest", 1, state, {"epoch": 1})
+        restored = checkpoints.restore("latest", state)
+        assert restored is not None
+        assert restored[1] == {"epoch": 1}
+        np.testing.assert_array_equal(restored[0]["weights"], state["weights"])
+    with pytest.raises(KeyboardInterrupt):
+        signal.raise_signal(signal.SIGINT)

@@ -15,6 +15,7 @@ import jax
 import orbax.checkpoint as ocp
 
 from train.devices import is_lost_process
+from train.preemption import interrupts_held
 
 logging.getLogger("absl").setLevel(logging.ERROR)  # Orbax tells every step of every save
 
@@ -30,6 +31,7 @@ class Checkpoints:
             name: ocp.CheckpointManager((folder / name).absolute(), options=options) for name in ("latest", "best")
         }
 
+    @interrupts_held()
     def save(self, slot: str, step: int, state: Any, progress: dict[str, Any]) -> None:
         manager = self._slots[slot]
         if manager.latest_step() == step:
@@ -53,6 +55,7 @@ class Checkpoints:
         )
         return restored["state"], restored["progress"]
 
+    @interrupts_held()
     def close(self) -> None:
         for manager in self._slots.values():
             manager.close()

@@ -4,10 +4,36 @@ from __future__ import annotations
 
 import signal
 import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
 from types import FrameType, TracebackType
+from typing import Any
 
 import jax
 from jax.experimental import multihost_utils
+
+
+@contextmanager
+def interrupts_held() -> Iterator[None]:
+    """Holds an interrupt back to the end of the block: one that falls into Orbax's threads leaves them waiting for each other."""
+    if threading.current_thread() is not threading.main_thread():
+        yield  # gets no signals
+        return
+    heard: list[tuple[int, FrameType | None]] = []
+    numbers = [
+        signal.SIGINT,
+        *([signal.SIGALRM] if hasattr(signal, "SIGALRM") else []),
+    ]  # the alarm repeats an interrupt
+    before: dict[int, Any] = {
+        number: signal.signal(number, lambda *arguments: heard.append(arguments)) for number in numbers
+    }
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+        if heard and callable(before[heard[0][0]]):
+            before[heard[0][0]](*heard[0])
 
 
 class Preempted(Exception):

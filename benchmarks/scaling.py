@@ -1,0 +1,156 @@
+"""What a training step costs, whether reading keeps up with it, and what a second core gains: the numbers of docs/scaling.md.
+
+`python benchmarks/scaling.py [RESULTS.json]` takes both networks of the `small` and `thesis` presets, on built-in objects:
+
+* arithmetic of a step (as XLA counts it in the compiled program) and its memory, in bytes of the program on one device;
+* views a second, trained and read alone, on all cores: reading is not the limit where it is the faster;
+* views a second of one process on one core, and of two processes (gloo) on a core each, that share a batch of twice the size.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import socket
+import subprocess
+import sys
+import time
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+
+import jax
+import numpy as np
+
+from data_pipeline.batches import train_batches
+from data_pipeline.builder import DatasetStatistics, load_statistics, prepare
+from data_pipeline.files import write_json
+from eval.pipeline import SMALL, THESIS, tasks
+from train.devices import device_mesh, join_processes, parameter_sharding, place, place_batch
+from train.step import Task, initial_state, train_step_of
+
+PRESETS = {"small": SMALL, "thesis": THESIS}
+NETWORKS = ("classifier", "entropy")
+STEPS = 5
+READ_SECONDS = 10.0
+
+
+def task_named(preset: str, name: str, statistics: DatasetStatistics, batch_size: int | None = None) -> Task:
+    """A task of a preset, with another batch size if given."""
+    settings = PRESETS[preset]
+    if batch_size:
+        part = getattr(settings, name)
+        settings = replace(settings, **{name: replace(part, optimiser=replace(part.optimiser, batch_size=batch_size))})
+    return tasks(settings, statistics)[NETWORKS.index(name)]
+
+
+def compiled_step(task: Task):
+    """The compiled training step on all devices, the state it begins with, and the mesh."""
+    mesh = device_mesh()
+    structure, state = initial_state(task, 0)
+    where = parameter_sharding(mesh, state)
+    state = place(state, where)
+    step = jax.jit(train_step_of(task, structure, 1000), donate_argnums=0, out_shardings=(where, None))
+    return step, state, mesh
+
+
+def train_rate(task: Task, data: Path) -> float:
+    """Views a second, over all processes; the median of some steps, the first apart."""
+    step, state, mesh = compiled_step(task)
+    batch = place_batch(mesh, next(train_batches(data, task.batches)))
+    taken = []
+    for _ in range(STEPS + 1):
+        start = time.perf_counter()
+        state, loss = step(state, batch, task.hyperparameters)
+        loss.block_until_ready()
+        taken.append(time.perf_counter() - start)
+    return task.optimiser.batch_size / float(np.median(taken[1:]))
+
+
+def read_rate(task: Task, data: Path) -> float:
+    """Views a second from disk to batches, with nothing else to do."""
+    batches = train_batches(data, task.batches)
+    next(batches)
+    start, read = time.perf_counter(), 0
+    while time.perf_counter() - start < READ_SECONDS:
+        next(batches)
+        read += task.optimiser.batch_size
+    return read / (time.perf_counter() - start)
+
+
+def costs(task: Task, data: Path) -> dict[str, float]:
+    """Of the step's program: arithmetic of a view, bytes of weights, of the state, and of what it holds besides."""
+    step, state, mesh = compiled_step(task)
+    batch = place_batch(mesh, next(train_batches(data, task.batches)))
+    compiled = step.lower(state, batch, task.hyperparameters).compile()
+    memory = compiled.memory_analysis()
+    count = task.optimiser.batch_size
+    return {
+        "batch_size": count,
+        "gflop_per_view": compiled.cost_analysis()["flops"] / count / 1e9,
+        "weights_mb": sum(leaf.nbytes for leaf in jax.tree.leaves(state.parameters)) / 1e6,
+        "state_mb": sum(leaf.nbytes for leaf in jax.tree.leaves(state)) / 1e6,
+        "temporary_mb_per_view": memory.temp_size_in_bytes / count / 1e6,
+    }
+
+
+def pinned_rate(preset: str, name: str, data: Path, batch_size: int, processes: int) -> float:
+    """Views a second of `processes` processes, each on a core of its own."""
+    with socket.socket() as found:
+        found.bind(("127.0.0.1", 0))
+        address = f"127.0.0.1:{found.getsockname()[1]}"
+    workers = []
+    for index in range(processes):
+        environment = os.environ | {"JAX_PLATFORMS": "cpu"}
+        if processes > 1:
+            environment |= {
+                "JAX_COORDINATOR_ADDRESS": address,
+                "JAX_NUM_PROCESSES": str(processes),
+                "JAX_PROCESS_ID": str(index),
+            }
+        asked = [sys.executable, __file__, "--worker", preset, name, str(data), str(batch_size)]
+        pin = partial(os.sched_setaffinity, 0, [index])
+        workers.append(subprocess.Popen(asked, env=environment, stdout=subprocess.PIPE, text=True, preexec_fn=pin))
+    said = [worker.communicate()[0] for worker in workers]
+    if any(worker.returncode for worker in workers):
+        raise RuntimeError("a worker failed; its message is above")
+    return float(said[0].splitlines()[-1])
+
+
+def work(preset: str, name: str, data: str, batch_size: str) -> None:
+    """What a pinned process does."""
+    if "JAX_NUM_PROCESSES" in os.environ:
+        join_processes()
+    task = task_named(preset, name, load_statistics(Path(data)), int(batch_size))
+    print(train_rate(task, Path(data)))
+
+
+def main() -> None:
+    print(f"{os.cpu_count()} cores, {jax.devices()[0].device_kind}, JAX {jax.__version__}")
+    found: dict[str, dict[str, float]] = {}
+    for preset, settings in PRESETS.items():
+        with TemporaryDirectory() as folder:
+            data = Path(folder) / "data"
+            statistics = prepare(replace(settings.dataset, train_per_class=5, test_per_class=1), data)
+            for name in NETWORKS:
+                task = task_named(preset, name, statistics)
+                half = task.optimiser.batch_size // 2
+                row = costs(task, data) | {
+                    "trained_per_second": train_rate(task, data),
+                    "read_per_second": read_rate(task, data),
+                    "one_core_per_second": pinned_rate(preset, name, data, half, 1),
+                    "two_processes_per_second": pinned_rate(preset, name, data, 2 * half, 2),
+                }
+                found[f"{preset} {name}"] = row
+                print(
+                    json.dumps({f"{preset} {name}": {key: round(value, 2) for key, value in row.items()}}), flush=True
+                )
+    if len(sys.argv) > 1:
+        write_json(Path(sys.argv[1]), found)
+
+
+if __name__ == "__main__":
+    work(*sys.argv[2:]) if sys.argv[1:2] == ["--worker"] else main()
