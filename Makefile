@@ -18,7 +18,7 @@ lint: $(READY)
 	$(BIN)/mypy
 
 bench: $(READY)  ## what is fast, beside its peers, in one run
-	$(BIN)/python benchmarks/point_ops.py
+	$(BIN)/python benchmarks/points.py
 	$(BIN)/python benchmarks/evaluation.py
 	$(BIN)/python benchmarks/sweep.py
 

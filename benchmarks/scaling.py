@@ -3,8 +3,9 @@
 `python benchmarks/scaling.py [RESULTS.json]` takes both networks of the `small` and `thesis` presets, on built-in objects:
 
 * arithmetic of a step (as XLA counts it in the compiled program) and its memory, in bytes of the program on one device;
-* views a second, trained and read alone, on all cores: reading is not the limit where it is the faster;
-* views a second of one process on one core, and of two processes (gloo) on a core each, that share a batch of twice the size.
+* views a second, read alone: reading is not the limit where it is the faster;
+* views a second, trained: on one core, on two, on two simulated devices and in two processes (gloo) that share the two cores. The
+  batch is the same throughout.
 """
 
 from __future__ import annotations
@@ -16,7 +17,6 @@ import subprocess
 import sys
 import time
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
@@ -34,17 +34,12 @@ from train.step import Task, initial_state, train_step_of
 
 PRESETS = {"small": SMALL, "thesis": THESIS}
 NETWORKS = ("classifier", "entropy")
-STEPS = 5
+STEPS = 4
 READ_SECONDS = 10.0
 
 
-def task_named(preset: str, name: str, statistics: DatasetStatistics, batch_size: int | None = None) -> Task:
-    """A task of a preset, with another batch size if given."""
-    settings = PRESETS[preset]
-    if batch_size:
-        part = getattr(settings, name)
-        settings = replace(settings, **{name: replace(part, optimiser=replace(part.optimiser, batch_size=batch_size))})
-    return tasks(settings, statistics)[NETWORKS.index(name)]
+def task_named(preset: str, name: str, statistics: DatasetStatistics) -> Task:
+    return tasks(PRESETS[preset], statistics)[NETWORKS.index(name)]
 
 
 def compiled_step(task: Task):
@@ -97,34 +92,36 @@ def costs(task: Task, data: Path) -> dict[str, float]:
     }
 
 
-def pinned_rate(preset: str, name: str, data: Path, batch_size: int, processes: int) -> float:
-    """Views a second of `processes` processes, each on a core of its own."""
+def rate_apart(preset: str, name: str, data: Path, *, cores: int, processes: int = 1, devices: int = 1) -> float:
+    """Views a second of fresh processes, on so many cores together, each with so many simulated devices."""
     with socket.socket() as found:
         found.bind(("127.0.0.1", 0))
         address = f"127.0.0.1:{found.getsockname()[1]}"
+    everywhere = os.sched_getaffinity(0)
+    os.sched_setaffinity(0, sorted(everywhere)[:cores])  # which the processes inherit
     workers = []
     for index in range(processes):
-        environment = os.environ | {"JAX_PLATFORMS": "cpu"}
+        environment = os.environ | {"JAX_PLATFORMS": "cpu", "JAX_NUM_CPU_DEVICES": str(devices)}
         if processes > 1:
             environment |= {
                 "JAX_COORDINATOR_ADDRESS": address,
                 "JAX_NUM_PROCESSES": str(processes),
                 "JAX_PROCESS_ID": str(index),
             }
-        asked = [sys.executable, __file__, "--worker", preset, name, str(data), str(batch_size)]
-        pin = partial(os.sched_setaffinity, 0, [index])
-        workers.append(subprocess.Popen(asked, env=environment, stdout=subprocess.PIPE, text=True, preexec_fn=pin))
+        asked = [sys.executable, __file__, "--worker", preset, name, str(data)]
+        workers.append(subprocess.Popen(asked, env=environment, stdout=subprocess.PIPE, text=True))
+    os.sched_setaffinity(0, everywhere)
     said = [worker.communicate()[0] for worker in workers]
     if any(worker.returncode for worker in workers):
         raise RuntimeError("a worker failed; its message is above")
     return float(said[0].splitlines()[-1])
 
 
-def work(preset: str, name: str, data: str, batch_size: str) -> None:
-    """What a pinned process does."""
+def work(preset: str, name: str, data: str) -> None:
+    """What such a process does."""
     if "JAX_NUM_PROCESSES" in os.environ:
         join_processes()
-    task = task_named(preset, name, load_statistics(Path(data)), int(batch_size))
+    task = task_named(preset, name, load_statistics(Path(data)))
     print(train_rate(task, Path(data)))
 
 
@@ -137,12 +134,12 @@ def main() -> None:
             statistics = prepare(replace(settings.dataset, train_per_class=5, test_per_class=1), data)
             for name in NETWORKS:
                 task = task_named(preset, name, statistics)
-                half = task.optimiser.batch_size // 2
                 row = costs(task, data) | {
-                    "trained_per_second": train_rate(task, data),
                     "read_per_second": read_rate(task, data),
-                    "one_core_per_second": pinned_rate(preset, name, data, half, 1),
-                    "two_processes_per_second": pinned_rate(preset, name, data, 2 * half, 2),
+                    "one_core_per_second": rate_apart(preset, name, data, cores=1),
+                    "two_cores_per_second": rate_apart(preset, name, data, cores=2),
+                    "two_devices_per_second": rate_apart(preset, name, data, cores=2, devices=2),
+                    "two_processes_per_second": rate_apart(preset, name, data, cores=2, processes=2),
                 }
                 found[f"{preset} {name}"] = row
                 print(

@@ -182,7 +182,7 @@ def test_directions_stand_in_the_place_of_the_normals(random):
     cloud = random.normal(0, 0.4, (600, 3)).astype(np.float32)
     directions = random.normal(0, 1, (600, 3)).astype(np.float32)
     nothing = network(np.concatenate([cloud, np.zeros_like(cloud)], axis=1))
-    np.testing.assert_array_equal(network(cloud), nothing)
+    np.testing.assert_allclose(network(cloud), nothing, rtol=1e-5, atol=1e-6)
     assert np.abs(np.asarray(network(np.concatenate([cloud, directions], axis=1)) - nothing)).max() > 1e-3
 
 

@@ -7,6 +7,7 @@ along `model`, by their last axis. The rest is the compiler's work.
 from __future__ import annotations
 
 import os
+from collections.abc import Callable
 from typing import Any
 
 import jax
@@ -106,6 +107,17 @@ def place_batch(mesh: Mesh, batch: Any) -> Any:
     """One batch over all devices, from this process's part of it."""
     split = NamedSharding(mesh, PartitionSpec(DATA))
     return jax.tree.map(lambda part: jax.make_array_from_process_local_data(split, part), batch)
+
+
+def summed_over(mesh: Mesh, function: Callable) -> Callable:
+    """`function(parameters, statistics, batch, weights)`, which adds up over a batch, of one that lies on all devices: each adds
+    up its own part as it likes, in however many pieces."""
+
+    def own(*arguments: Any) -> Any:
+        return jax.tree.map(lambda part: jax.lax.psum(part, DATA), function(*arguments))
+
+    whole, split = PartitionSpec(), PartitionSpec(DATA)
+    return jax.shard_map(own, mesh=mesh, in_specs=(whole, whole, split, split), out_specs=whole, check_vma=False)
 
 
 _LOST = ("gloo", "coordination service", "heartbeat", "connection closed by peer", "connection reset", "nccl")

@@ -27,7 +27,7 @@ from data_pipeline.files import read_json, write_json, write_text
 from data_pipeline.meshes import DataError
 from data_pipeline.progress import console, progress_bar
 from train.checkpoints import Checkpoints
-from train.devices import DATA, check_batch, device_mesh, is_first, parameter_sharding, place, place_batch
+from train.devices import DATA, check_batch, device_mesh, is_first, parameter_sharding, place, place_batch, summed_over
 from train.optimiser import learning_rate
 from train.preemption import Preempted, Preemption
 from train.pretrained import StartingWeights
@@ -161,7 +161,7 @@ def fit(
     state = place(state, where)
     # The state is given up to the step that changes it, and stays where it is.
     train_step = jax.jit(train_step_of(task, structure, epoch_steps), donate_argnums=0, out_shardings=(where, None))
-    evaluate_step = jax.jit(evaluate_step_of(task, structure))
+    evaluate_step = jax.jit(summed_over(mesh, evaluate_step_of(task, structure)))
     validation = validation_set(task, data, statistics, mesh.shape[DATA])
     progress: dict[str, Any] = {"epoch": 0, "best_loss": None, "best_epoch": 0, "seconds": 0.0}
     lead = Lead()

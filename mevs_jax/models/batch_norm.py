@@ -6,6 +6,8 @@ training (§5, `BNMomentumScheduler`), and a momentum that is an argument needs 
 
 from __future__ import annotations
 
+from functools import partial
+
 import jax
 import jax.numpy as jnp
 from flax import nnx
@@ -23,6 +25,11 @@ class BatchNorm(nnx.Module):
         self.batches = nnx.BatchStat(jnp.zeros((), jnp.int32))
         self.epsilon = epsilon
 
+    def folded(self) -> tuple[Float[Array, "features"], Float[Array, "features"]]:
+        """What normalising by the running statistics comes to: a factor for the linear layer before it, and a bias after."""
+        factor = self.scale[...] * jax.lax.rsqrt(self.variance[...] + self.epsilon)
+        return factor, self.bias[...] - self.mean[...] * factor
+
     def __call__(
         self, x: Float[Array, "... features"], *, train: bool = False, momentum: float | Float[Array, ""] = 0.1
     ) -> Float[Array, "... features"]:
@@ -32,15 +39,49 @@ class BatchNorm(nnx.Module):
         """
         dtype, x = x.dtype, x.astype(jnp.promote_types(x.dtype, jnp.float32))
         if train:
-            axes = tuple(range(x.ndim - 1))
-            mean = jnp.mean(x, axes)
-            variance = jnp.mean(jnp.square(x - mean), axes)
+            out, mean, variance = _normalise(x, self.scale[...], self.bias[...], self.epsilon)
             count = x.size // x.shape[-1]
             unbiased = variance * (count / max(count - 1, 1))
-            self.mean[...] = (1 - momentum) * self.mean[...] + momentum * jax.lax.stop_gradient(mean)
-            self.variance[...] = (1 - momentum) * self.variance[...] + momentum * jax.lax.stop_gradient(unbiased)
+            self.mean[...] = (1 - momentum) * self.mean[...] + momentum * mean
+            self.variance[...] = (1 - momentum) * self.variance[...] + momentum * unbiased
             self.batches[...] = self.batches[...] + 1
-        else:
-            mean, variance = self.mean[...], self.variance[...]
-        factor = self.scale[...] * jax.lax.rsqrt(variance + self.epsilon)
-        return ((x - mean) * factor + self.bias[...]).astype(dtype)
+            return out.astype(dtype)
+        factor, bias = self.folded()
+        return (x * factor + bias).astype(dtype)
+
+
+@partial(jax.custom_vjp, nondiff_argnums=(3,))
+def _normalise(
+    x: Float[Array, "... features"], scale: Float[Array, "features"], bias: Float[Array, "features"], epsilon: float
+) -> tuple[Float[Array, "... features"], Float[Array, "features"], Float[Array, "features"]]:
+    """`x` normalised by its own mean and (biased) variance, and these two, through which no gradient flows.
+
+    The gradient is written out: of all that is as large as `x` it keeps `x` alone, and takes half the time of the derived one.
+    """
+    mean, variance, factor = _moments(x, scale, epsilon)
+    return (x - mean) * factor + bias, mean, variance
+
+
+def _moments(x: Array, scale: Array, epsilon: float) -> tuple[Array, Array, Array]:
+    axes = tuple(range(x.ndim - 1))
+    mean = jnp.mean(x, axes)
+    variance = jnp.maximum(jnp.mean(jnp.square(x), axes) - jnp.square(mean), 0)
+    return mean, variance, scale * jax.lax.rsqrt(variance + epsilon)
+
+
+def _normalise_forward(x: Array, scale: Array, bias: Array, epsilon: float):
+    mean, variance, factor = _moments(x, scale, epsilon)
+    return ((x - mean) * factor + bias, mean, variance), (x, mean, jax.lax.rsqrt(variance + epsilon), scale)
+
+
+def _normalise_backward(epsilon: float, kept: tuple[Array, ...], cotangents: tuple[Array, Array, Array]):
+    x, mean, inverse, scale = kept
+    towards = cotangents[0]
+    axes, count = tuple(range(x.ndim - 1)), x.size // x.shape[-1]
+    of_bias = jnp.sum(towards, axes)
+    of_scale = jnp.sum(towards * (x - mean), axes) * inverse
+    of_x = scale * inverse * (towards - of_bias / count - (x - mean) * (inverse * of_scale / count))
+    return of_x, of_scale, of_bias
+
+
+_normalise.defvjp(_normalise_forward, _normalise_backward)

@@ -7,14 +7,16 @@ zeros in the place of normals; the place is kept so that its weights and its par
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial, reduce
 from itertools import pairwise
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 from flax import nnx
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
 from mevs_jax.arrays import AnyArray
 from mevs_jax.models.batch_norm import BatchNorm
@@ -50,23 +52,128 @@ class Perceptron(nnx.Module):
         )
         self.norm = nnx.List(BatchNorm(size) for size in layers)
 
-    def __call__(self, x: Array, *, train: bool, momentum: float | Array) -> Array:
+    def __call__(self, x: Array, *, momentum: float | Array, passed: int = 0) -> Array:
+        """In training; the first `passed` linear layers were passed before."""
         # One long matrix instead of many small ones: the gradient of the weights is then a single product.
         batch = x.shape[:-1]
         x = x.reshape(-1, x.shape[-1])
-        for linear, norm in zip(self.linear, self.norm, strict=True):
-            x = jax.nn.relu(norm(linear(x), train=train, momentum=momentum))
+        for number, (linear, norm) in enumerate(zip(self.linear, self.norm, strict=True)):
+            x = x if number < passed else linear(x)
+            x = jax.nn.relu(norm(x, train=True, momentum=momentum))
         return x.reshape(*batch, -1)
 
+    def folded(self) -> list[tuple[Array, Array]]:
+        """Weights and bias of each layer, with batch norm by its running statistics among them."""
+        layers = []
+        for linear, norm in zip(self.linear, self.norm, strict=True):
+            factor, bias = norm.folded()
+            layers.append((linear.kernel[...] * factor, bias))
+        return layers
 
-def group(
-    points: Float[Array, "points 3"], features: Float[Array, "points channels"], level: Abstraction
-) -> tuple[Float[Array, "centres 3"], Float[Array, "centres samples channels+3"]]:
-    """Centres of one cloud, and for each the neighbours' offsets from it beside their features."""
-    centres = points[farthest_point_sample(points, level.centres)]
+
+def _product(x: Array, kernel: Array) -> Array:
+    """x @ kernel in the precision of `x`, summed in that of the weights at least."""
+    return jnp.matmul(x, kernel.astype(x.dtype), preferred_element_type=jnp.promote_types(x.dtype, kernel.dtype))
+
+
+def _infer(layers: list[tuple[Array, Array]], x: Array) -> Array:
+    """Folded layers, each followed by ReLU."""
+    for kernel, bias in layers:
+        x = jax.nn.relu(_product(x, kernel) + bias).astype(x.dtype)
+    return x
+
+
+def _passes_first(kernel: Float[Array, "inputs outputs"]) -> bool:
+    """Whether points pass the first layer before they are gathered.
+
+    The layer is linear, so they may: once for a point instead of once for every neighbourhood that the point is in. A few
+    columns are gathered as they are, since that costs less than gathering what becomes of them.
+    """
+    return kernel.shape[0] > 8
+
+
+def _passed(
+    points: Float[Array, "points 3"], features: Float[Array, "points channels"], kernel: Float[Array, "inputs outputs"]
+) -> Float[Array, "points columns"]:
+    """What is gathered of every neighbour."""
+    if _passes_first(kernel):
+        return points @ kernel[:3] + _product(features, kernel[3:])
+    return jnp.concatenate([points, features.astype(points.dtype)], axis=-1)
+
+
+def _first_layer(
+    passed: Float[Array, "points columns"],
+    centres: Float[Array, "centres 3"],
+    neighbours: Int[Array, "centres samples"],
+    kernel: Float[Array, "inputs outputs"],
+) -> Float[Array, "centres samples outputs"]:
+    """The neighbours' offsets from their centres beside their features, times the first layer's weights."""
+    if _passes_first(kernel):
+        return passed[neighbours] - (centres @ kernel[:3])[:, None]
+    # As products that fuse with what follows, not one thin matrix product, whose gradient wants another layout.
+    columns = passed.shape[-1]
+    gathered = passed[neighbours] - jnp.pad(centres, ((0, 0), (0, columns - 3)))[:, None]
+    return reduce(jnp.add, [gathered[..., column, None] * kernel[column] for column in range(columns)])
+
+
+@jax.custom_vjp
+def _largest(x: Float[Array, "*batch rows channels"]) -> Float[Array, "*batch channels"]:
+    """The maximum over rows. Equal ones share the gradient, as in JAX's own rule, which writes an array as large as `x` more."""
+    return jnp.max(x, axis=-2)
+
+
+def _largest_forward(x: Array) -> tuple[Array, tuple[Array, Array]]:
+    largest = jnp.max(x, axis=-2)
+    return largest, (x, largest)
+
+
+def _largest_backward(kept: tuple[Array, Array], towards: Array) -> tuple[Array]:
+    x, largest = kept
+    chosen = x == largest[..., None, :]
+    share = towards / jnp.sum(chosen, axis=-2, dtype=towards.dtype)
+    # The barrier keeps the compiler from counting anew for every row.
+    return (jnp.where(chosen, jax.lax.optimization_barrier(share)[..., None, :], jnp.zeros((), x.dtype)),)
+
+
+_largest.defvjp(_largest_forward, _largest_backward)
+
+
+def _map(function: Callable, clouds: Any, at_once: int = 1) -> Any:
+    """`function` of every cloud, in inference: on CPU so few at once that they stay in the cache, elsewhere so many that the
+    device is busy and memory bounded (64 of the thesis's size take 2 GB)."""
+    return jax.lax.map(function, clouds, batch_size=at_once if jax.default_backend() == "cpu" else 64)
+
+
+def _abstract(
+    points: Float[Array, "points 3"],
+    features: Float[Array, "points channels"],
+    centres: Float[Array, "centres 3"],
+    *,
+    level: Abstraction,
+    layers: list[tuple[Array, Array]],
+) -> Float[Array, "centres outputs"]:
+    """One level of one cloud in inference, on CPU some centres at a time."""
     neighbours = ball_query(points, centres, level.radius, level.samples)
-    offsets = points[neighbours] - centres[:, None, :]
-    return centres, jnp.concatenate([offsets, features[neighbours]], axis=-1)
+    kernel, bias = layers[0]
+    passed = _passed(points, features, kernel)
+
+    def some(piece: tuple[Array, Array]) -> Array:
+        x = _first_layer(passed, *piece, kernel) + bias
+        x = x.reshape(-1, x.shape[-1])  # one long matrix
+        x = _infer(layers[1:], jax.nn.relu(x).astype(features.dtype))
+        return jnp.max(x.reshape(*piece[1].shape, -1), axis=1)
+
+    pieces = _pieces(level)
+    split = jax.tree.map(lambda array: array.reshape(pieces, -1, array.shape[-1]), (centres, neighbours))
+    return jax.lax.map(some, split).reshape(level.centres, -1)
+
+
+def _pieces(level: Abstraction) -> int:
+    """How many pieces a level's centres come in: on CPU as many as divide them, of at most 4,096 neighbours."""
+    if jax.default_backend() != "cpu":
+        return 1
+    fewest = -(-level.centres * level.samples // 4096)
+    return next(count for count in range(fewest, level.centres + 1) if level.centres % count == 0)
 
 
 class PointNet2(nnx.Module):
@@ -104,7 +211,7 @@ class PointNet2(nnx.Module):
         self.perceptrons = nnx.List(perceptrons)
         self.whole = Perceptron(3 + channels, global_layers, rngs=rngs, dtype=dtype)
         self.head = Perceptron(global_layers[-1], head_layers, rngs=rngs, dtype=dtype)
-        self.dropout = dropout
+        self.dropout, self.dtype = dropout, dtype
         self.out = nnx.Linear(head_layers[-1], views, rngs=rngs)
 
     def __call__(
@@ -125,24 +232,43 @@ class PointNet2(nnx.Module):
             momentum: of the running statistics, in [0, 1].
             dropout: rate in the place of the network's own, in [0, 1).
         """
-        if train and key is None:
-            raise ValueError("PointNet2 in training needs a key for its dropout")
         points = jnp.asarray(points)
         if points.shape[-1] not in (3, 6):
             raise ValueError(f"PointNet2 reads clouds of 3 or 6 columns, got {points.shape[-1]}")
-        batch = points.shape[:-2]
+        batch, dtype = points.shape[:-2], self.dtype or points.dtype
         clouds = points.reshape(-1, *points.shape[-2:])
-        centres, features = clouds[..., :3], clouds[..., 3:]
-        if not features.size:
-            features = jnp.zeros_like(centres)
+        if not train:
+            embedded = self._embed(clouds[..., :3], clouds[..., 3:].astype(dtype))
+            return self.out(_infer(self.head.folded(), embedded).astype(points.dtype)).reshape(*batch, self.views)
+        if key is None:
+            raise ValueError("PointNet2 in training needs a key for its dropout")
+        coordinates, features = clouds[..., :3], clouds[..., 3:].astype(dtype)
         for level, perceptron in zip(self.levels, self.perceptrons, strict=True):
-            centres, grouped = jax.vmap(group, in_axes=(0, 0, None))(centres, features, level)
-            features = jnp.max(perceptron(grouped, train=train, momentum=momentum), axis=2)
-        everything = jnp.concatenate([centres, features], axis=-1)
-        features = jnp.max(self.whole(everything, train=train, momentum=momentum), axis=1)
-        hidden = self.head(features, train=train, momentum=momentum).astype(points.dtype)
-        if train and key is not None:
-            # Flax's own layer takes no rate that is traced.
-            kept = 1 - (self.dropout if dropout is None else dropout)
-            hidden = jnp.where(jax.random.bernoulli(key, kept, hidden.shape), hidden / kept, 0.0)
+            chosen = jax.vmap(farthest_point_sample, in_axes=(0, None))(coordinates, level.centres)
+            centres = jnp.take_along_axis(coordinates, chosen[..., None], axis=1)
+            neighbours = jax.vmap(partial(ball_query, radius=level.radius, k=level.samples))(coordinates, centres)
+            kernel = perceptron.linear[0].kernel[...]
+            passed = jax.vmap(_passed, in_axes=(0, 0, None))(coordinates, features, kernel)
+            x = jax.vmap(_first_layer, in_axes=(0, 0, 0, None))(passed, centres, neighbours, kernel)
+            features = _largest(perceptron(x.astype(dtype), momentum=momentum, passed=1))
+            coordinates = centres
+        everything = jnp.concatenate([coordinates.astype(dtype), features], axis=-1)
+        features = _largest(self.whole(everything, momentum=momentum))
+        hidden = self.head(features, momentum=momentum).astype(points.dtype)
+        # Flax's own layer takes no rate that is traced.
+        kept = 1 - (self.dropout if dropout is None else dropout)
+        hidden = jnp.where(jax.random.bernoulli(key, kept, hidden.shape), hidden / kept, 0.0)
         return self.out(hidden).reshape(*batch, self.views)
+
+    def _embed(
+        self, points: Float[Array, "clouds points 3"], features: Float[Array, "clouds points channels"]
+    ) -> Float[Array, "clouds embedding"]:
+        """Clouds to the vectors before the head, by the running statistics."""
+        for level, perceptron in zip(self.levels, self.perceptrons, strict=True):
+            chosen = _map(lambda cloud, level=level: farthest_point_sample(cloud, level.centres), points, at_once=4)
+            centres = jnp.take_along_axis(points, chosen[..., None], axis=1)
+            abstract = partial(_abstract, level=level, layers=perceptron.folded())
+            features = _map(lambda cloud, abstract=abstract: abstract(*cloud), (points, features, centres))
+            points = centres
+        everything = jnp.concatenate([points.astype(features.dtype), features], axis=-1)
+        return jnp.max(_infer(self.whole.folded(), everything), axis=1)

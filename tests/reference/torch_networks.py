@@ -109,13 +109,13 @@ class Abstraction(nn.Module):
 class PointNet2(nn.Module):
     """Without dropout, whose random numbers cannot be shared; `nn.Identity` keeps its place in the names."""
 
-    def __init__(self, views: int):
+    def __init__(self, views: int, abstraction: type[Abstraction] = Abstraction):
         super().__init__()
         self.SA_modules = nn.ModuleList(
             [
-                Abstraction(512, 0.2, 64, [6, 64, 64, 128]),
-                Abstraction(128, 0.4, 64, [131, 128, 128, 256]),
-                Abstraction(None, 0, 0, [259, 256, 512, 1024]),
+                abstraction(512, 0.2, 64, [6, 64, 64, 128]),
+                abstraction(128, 0.4, 64, [131, 128, 128, 256]),
+                abstraction(None, 0, 0, [259, 256, 512, 1024]),
             ]
         )
         self.fc_layer = nn.Sequential(

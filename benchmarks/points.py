@@ -1,0 +1,340 @@
+"""Point operations and PointNet++, each beside its peers in one run: `make bench`, or `python benchmarks/points.py`.
+
+Rows: farthest-point sampling and ball query of one cloud and of sixteen; PointNet++'s forward pass and training step on sixteen
+clouds of 4,096 points with the same weights, and beside the forward pass its matrix products alone; one decision. All
+answers are compared before anything is timed. Calls take turns, so that a busy moment of the machine strikes all of them; times
+are medians and quartiles, and what counts is their ratio. Peers that are not installed are left out, and it is said.
+
+The table goes to `benchmarks/results/points.json` and `points.md`. With `--guard` nothing is written: ratios to peers are
+compared with those stored, and one below a third of its like ends the program with exit code 1.
+"""
+
+from __future__ import annotations
+
+import importlib.util
+import json
+import platform
+import sys
+import time
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+from flax import nnx
+from scipy.spatial import cKDTree
+
+from data_pipeline.files import read_json, write_json, write_text
+from mevs_jax import (
+    PointNet2,
+    ViewGraph,
+    ball_query,
+    farthest_point_sample,
+    fibonacci_sphere,
+    local_maxima,
+    pointnet2_from_torch,
+)
+from tests.reference import numpy_rules
+from tests.reference.weights import made_up_weights
+
+RESULTS = Path(__file__).parent / "results" / "points.json"
+CLOUDS, POINTS, CENTRES, RADIUS, SAMPLES = 16, 4096, 512, 0.2, 64
+CUDA_ORDER = {"rtol": 1e-4, "atol": 1e-5}
+GUARD = 3.0
+
+
+@dataclass
+class Row:
+    """One thing timed beside one peer.
+
+    Attributes:
+        what, peer: in words.
+        ours, theirs: lower quartile, median and upper quartile, in milliseconds.
+        ratio: how many of ours fit into one of theirs.
+        note: where the two do not quite do the same.
+    """
+
+    what: str
+    peer: str
+    ours: list[float]
+    theirs: list[float]
+    ratio: float
+    note: str = ""
+
+
+def take_turns(calls: list[Callable[[], Any]], rounds: int) -> np.ndarray:
+    """Milliseconds (calls, rounds), each call once a round, after one to warm up."""
+    for call in calls:
+        jax.block_until_ready(call())
+    taken = np.empty((len(calls), rounds))
+    for turn in range(rounds):
+        for number, call in enumerate(calls):
+            start = time.perf_counter()
+            jax.block_until_ready(call())
+            taken[number, turn] = 1000 * (time.perf_counter() - start)
+    return taken
+
+
+def compare(
+    what: str, ours: Callable, peers: dict[str, Callable], rounds: int, notes: dict[str, str] = {}
+) -> list[Row]:  # noqa: B006
+    taken = take_turns([ours, *peers.values()], rounds)
+    quartiles = np.quantile(taken, [0.25, 0.5, 0.75], axis=1).T
+    rows = [
+        Row(what, peer, list(quartiles[0]), list(theirs), theirs[1] / quartiles[0, 1], notes.get(peer, ""))
+        for peer, theirs in zip(peers, quartiles[1:], strict=True)
+    ]
+    for row in rows:
+        print(line_of(row), flush=True)
+    return rows
+
+
+def installed(name: str) -> bool:
+    found = importlib.util.find_spec(name) is not None
+    if not found:
+        print(f"(without {name}, which is not installed)")
+    return found
+
+
+def partial_clouds() -> np.ndarray:
+    """(clouds, points, 3) float32: what a camera above sees of wobbly balls, in the unit sphere."""
+    random = np.random.default_rng(0)
+    ways = random.normal(size=(CLOUDS, POINTS, 3))
+    ways /= np.linalg.norm(ways, axis=-1, keepdims=True)
+    ways[..., 2] = np.abs(ways[..., 2])
+    return (ways * random.uniform(0.8, 0.97, (CLOUDS, POINTS, 1))).astype(np.float32)
+
+
+def first_within(tree: cKDTree, centres: np.ndarray) -> np.ndarray:
+    """Ball query from a tree's answer: the first in index order, the first of them repeated."""
+    out = np.zeros((len(centres), SAMPLES), np.int32)
+    for row, hits in enumerate(tree.query_ball_point(centres, np.nextafter(RADIUS, 0), return_sorted=True)):
+        if hits:
+            out[row] = hits[0]
+            out[row, : len(hits[:SAMPLES])] = hits[:SAMPLES]
+    return out
+
+
+def share_equal(a: np.ndarray, b: np.ndarray) -> float:
+    return float(np.mean(np.asarray(a) == np.asarray(b)))
+
+
+def point_operations(clouds: np.ndarray, torch_peer: Any, rounds: int) -> list[Row]:
+    sample = jax.jit(lambda cloud: farthest_point_sample(cloud, CENTRES))
+    sample_all = jax.jit(lambda clouds: jax.lax.map(sample, clouds, batch_size=4))
+    query = jax.jit(lambda cloud, centres: ball_query(cloud, centres, RADIUS, SAMPLES))
+    query_all = jax.jit(jax.vmap(query))
+    cloud = clouds[0]
+    chosen = np.asarray(sample_all(clouds))
+    centres = np.take_along_axis(clouds, chosen[..., None], axis=1)
+    neighbours = np.asarray(query_all(clouds, centres))
+
+    one: dict[str, Callable] = {"NumPy loop": lambda: numpy_rules.farthest_point_sample(cloud, CENTRES)}
+    notes = {}
+    if installed("fpsample"):
+        import fpsample
+
+        one["fpsample, plain"] = lambda: fpsample.fps_sampling(cloud, CENTRES, start_idx=0)
+        one["fpsample, buckets"] = lambda: fpsample.bucket_fps_kdline_sampling(cloud, CENTRES, h=5, start_idx=0)
+        for name in ("fpsample, plain", "fpsample, buckets"):
+            notes[name] = f"{share_equal(one[name](), chosen[0]):.1%} of indices equal"
+    if installed("open3d"):
+        import open3d
+
+        theirs = open3d.geometry.PointCloud(open3d.utility.Vector3dVector(cloud))
+        one["Open3D"] = lambda: theirs.farthest_point_down_sample(CENTRES)
+    np.testing.assert_array_equal(one["NumPy loop"](), chosen[0])
+    rows = compare("farthest points, one cloud", lambda: sample(cloud), one, rounds, notes)
+
+    tree: dict[str, Callable] = {"SciPy's k-d tree": lambda: first_within(cKDTree(cloud), centres[0])}
+    np.testing.assert_array_equal(numpy_rules.ball_query(cloud, centres[0], RADIUS, SAMPLES), neighbours[0])
+    notes = {
+        "SciPy's k-d tree": f"{share_equal(tree['SciPy' + chr(39) + 's k-d tree'](), neighbours[0]):.2%} of indices equal"
+    }
+    rows += compare("ball query, one cloud", lambda: query(cloud, centres[0]), tree, rounds, notes)
+
+    if torch_peer:
+        import torch
+
+        them, theirs_at = torch.from_numpy(clouds), torch.from_numpy(centres)
+        found = torch_peer.farthest_point_sample(them, CENTRES).numpy()
+        np.testing.assert_array_equal(found, chosen)
+        rows += compare(
+            "farthest points, 16 clouds",
+            lambda: sample_all(clouds),
+            {"PyTorch": lambda: torch_peer.farthest_point_sample(them, CENTRES)},
+            rounds,
+        )
+        ask = lambda: torch_peer.ball_query(them, theirs_at, RADIUS, SAMPLES)  # noqa: E731
+        notes = {"PyTorch": f"{share_equal(ask().numpy(), neighbours):.3%} of indices equal"}
+        rows += compare(
+            "ball query, 16 clouds", lambda: query_all(clouds, centres), {"PyTorch": ask}, max(3, rounds // 3), notes
+        )
+    return rows
+
+
+def matrix_products(network: PointNet2) -> Callable[[], jax.Array]:
+    """The forward pass's matrix products and maxima alone, on numbers that lie ready, in pieces that suit the cache."""
+    random = np.random.default_rng(0)
+    work = []
+    for rows, pieces, group, layers in (
+        (4096, 8, 64, network.perceptrons[0].linear),
+        (4096, 2, 64, network.perceptrons[1].linear),
+        (128, 1, 128, network.whole.linear),
+    ):
+        kernels = [layer.kernel[...] for layer in layers]
+        work.append((jnp.asarray(random.normal(size=(pieces, rows, kernels[0].shape[0])), jnp.float32), kernels, group))
+
+    @jax.jit
+    def products(work, shifts):
+        def cloud(shift):
+            def piece(x, kernels, group):
+                for kernel in kernels:
+                    x = x @ kernel
+                return jnp.max(x.reshape(-1, group, x.shape[-1]), axis=1)
+
+            return sum(
+                jnp.sum(jax.lax.map(lambda x, kernels=kernels, group=group: piece(x, kernels, group), x + shift))
+                for x, kernels, group in work
+            )
+
+        return jax.lax.map(cloud, shifts)
+
+    static = [group for *_, group in work]
+    arrays = [(x, kernels) for x, kernels, _ in work]
+    run = jax.jit(
+        lambda arrays, shifts: products.__wrapped__(
+            [(x, k, g) for (x, k), g in zip(arrays, static, strict=True)], shifts
+        )
+    )
+    shifts = jnp.arange(CLOUDS, dtype=jnp.float32)
+    return lambda: run(arrays, shifts)
+
+
+def networks(clouds: np.ndarray, torch_peer: Any, rounds: int) -> list[Row]:
+    network = PointNet2(views=40, dropout=0.0, rngs=nnx.Rngs(0))
+    peers: dict[str, Callable] = {}
+    if torch_peer:
+        import torch
+
+        theirs = torch_peer.pointnet2(40)
+        state = made_up_weights({name: tuple(value.shape) for name, value in theirs.state_dict().items()})
+        pointnet2_from_torch(network, state)
+        theirs.load_state_dict({name: torch.from_numpy(value) for name, value in state.items()})
+        tensor = torch.from_numpy(clouds)
+
+        def forward_peer() -> Any:
+            with torch.no_grad():
+                return theirs.eval()(tensor)
+
+        peers["PyTorch"] = forward_peer
+    structure, parameters, statistics = nnx.split(network, nnx.Param, ...)
+    forward = jax.jit(lambda clouds: nnx.merge(structure, parameters, statistics)(clouds))
+    notes = {"its matrix products alone": "a floor, not a peer"}
+    if torch_peer:
+        largest = float(np.abs(np.asarray(forward(clouds)) - peers["PyTorch"]().numpy()).max())
+        notes["PyTorch"] = f"outputs equal to {largest:.0e}"
+        assert largest < 1e-3
+    peers["its matrix products alone"] = matrix_products(network)
+    rows = compare("PointNet++ forward, 16 clouds", lambda: forward(clouds), peers, max(3, rounds // 2), notes)
+
+    if torch_peer:
+        targets = np.random.default_rng(1).uniform(0, 1, (CLOUDS, 40)).astype(np.float32)
+        adam = optax.adam(1e-5)
+
+        @jax.jit
+        def step(parameters, statistics, moments):
+            def loss_of(parameters):
+                network = nnx.merge(structure, parameters, statistics, copy=True)
+                out = network(clouds, train=True, key=jax.random.key(0))
+                return jnp.mean(jnp.square(out - targets)), nnx.state(network, nnx.Not(nnx.Param))
+
+            (loss, statistics), gradients = jax.value_and_grad(loss_of, has_aux=True)(parameters)
+            updates, moments = adam.update(gradients, moments)
+            return optax.apply_updates(parameters, updates), statistics, moments, loss
+
+        moments = adam.init(parameters)
+        their_adam = torch.optim.Adam(theirs.parameters(), 1e-5)
+        their_targets = torch.from_numpy(targets)
+
+        def train_peer() -> Any:
+            their_adam.zero_grad()
+            loss = torch.mean((theirs.train()(tensor) - their_targets) ** 2)
+            loss.backward()
+            their_adam.step()
+            return loss
+
+        apart = abs(float(step(parameters, statistics, moments)[3]) / float(train_peer()) - 1)
+        assert apart < 1e-3
+        rows += compare(
+            "PointNet++ training step, 16 clouds",
+            lambda: step(parameters, statistics, moments),
+            {"PyTorch": train_peer},
+            max(3, rounds // 4),
+            {"PyTorch": f"first loss equal to {apart:.0e}"},
+        )
+    return rows
+
+
+def decision(clouds: np.ndarray, calls: int = 200) -> dict[str, float]:
+    """Milliseconds from a cloud of 4,096 points to the next of 40 views, as a robot asks: one at a time."""
+    structure, state = nnx.split(PointNet2(views=40, rngs=nnx.Rngs(0)))
+    graph = ViewGraph.from_points(fibonacci_sphere(40))
+
+    @jax.jit
+    def next_view(state, cloud):
+        entropy = nnx.merge(structure, state)(cloud)
+        return jnp.argmax(jnp.where(local_maxima(entropy, graph.neighbours), entropy, entropy - 1e3))
+
+    taken = take_turns([lambda: next_view(state, clouds[0])], calls)[0]
+    found = {"p50": float(np.median(taken)), "p99": float(np.quantile(taken, 0.99))}
+    print(f"one decision, 4,096 points, 40 views: p50 {found['p50']:.1f} ms, p99 {found['p99']:.1f} ms")
+    return found
+
+
+def line_of(row: Row) -> str:
+    ours, theirs = (f"{m:.3g} ({low:.3g}–{high:.3g})" for low, m, high in (row.ours, row.theirs))
+    return f"| {row.what} | {ours} | {row.peer} | {theirs} | {row.ratio:.3g} | {row.note} |"
+
+
+def slower_than_before(rows: list[Row], before: dict[str, Any]) -> list[str]:
+    """Sentences about ratios that fell below a third of the stored ones; rows that one of the two lacks are passed over."""
+    stored = {(row["what"], row["peer"]): row["ratio"] for row in before["rows"]}
+    known = [(row, stored[row.what, row.peer]) for row in rows if (row.what, row.peer) in stored]
+    return [
+        f"{row.what}: {row.ratio:.2g} times as fast as {row.peer}, stored {ratio:.2g}"
+        for row, ratio in known
+        if row.ratio < ratio / GUARD
+    ]
+
+
+def main() -> None:
+    guard = sys.argv[1:] == ["--guard"]
+    rounds = 3 if guard else 15
+    machine = f"{platform.processor() or platform.machine()}, {jax.devices()[0].device_kind}, JAX {jax.__version__}"
+    print(f"Measured on: {machine}. Milliseconds: median (quartiles).\n")
+    print("| what | ours | peer | theirs | ratio | |\n|---|---|---|---|---|---|")
+    torch_peer = None
+    if installed("torch"):
+        from benchmarks import torch_peer
+    clouds = partial_clouds()
+    rows = point_operations(clouds, torch_peer, rounds) + networks(clouds, torch_peer, rounds)
+    if guard:
+        slower = slower_than_before(rows, read_json(RESULTS))
+        for sentence in slower:
+            print(f"slower than before: {sentence}", file=sys.stderr)
+        sys.exit(bool(slower))
+    found = decision(clouds)
+    write_json(RESULTS, {"machine": machine, "rows": [asdict(row) for row in rows], "decision_ms": found})
+    table = "\n".join(["| what | ours | peer | theirs | ratio | |", "|---|---|---|---|---|---|", *map(line_of, rows)])
+    write_text(RESULTS.with_suffix(".md"), f"{machine}. Milliseconds: median (quartiles).\n\n{table}\n")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,60 @@
+"""The pure-PyTorch PointNet++ that most people use, in our own plain words: the peer that ours is timed beside.
+
+Its algorithm is the well-known one: farthest-point sampling as a loop over whole batches; ball query as a matrix of all
+distances whose indices outside the ball are replaced by the number of points and sorted; gathering; shared layers as 1×1
+convolutions. Layers and names are those of the reference network (`tests/reference/torch_networks.py`): the same weights fit.
+"""
+
+from __future__ import annotations
+
+import torch
+
+from tests.reference import torch_networks
+
+
+def farthest_point_sample(points: torch.Tensor, k: int) -> torch.Tensor:
+    """(batch, points, 3) to (batch, k) indices; the first is 0."""
+    batch, count, _ = points.shape
+    rows = torch.arange(batch)
+    chosen = torch.zeros(batch, k, dtype=torch.long)
+    nearest = torch.full((batch, count), 1e10)
+    last = torch.zeros(batch, dtype=torch.long)
+    for i in range(k):
+        chosen[:, i] = last
+        distance = torch.sum((points - points[rows, last][:, None]) ** 2, -1)
+        nearest = torch.minimum(nearest, distance)
+        last = torch.argmax(nearest, -1)
+    return chosen
+
+
+def ball_query(points: torch.Tensor, centres: torch.Tensor, radius: float, k: int) -> torch.Tensor:
+    """(batch, points, 3) and (batch, centres, 3) to (batch, centres, k) indices; the first repeated where there are fewer."""
+    batch, count, _ = points.shape
+    squared = -2 * centres @ points.transpose(1, 2)
+    squared += torch.sum(centres**2, -1)[:, :, None] + torch.sum(points**2, -1)[:, None]
+    index = torch.arange(count).expand(batch, centres.shape[1], count).clone()
+    index[squared >= radius**2] = count
+    index = index.sort(dim=-1)[0][:, :, :k]
+    first = index[:, :, :1].expand_as(index)
+    return torch.where(index == count, first, index)
+
+
+def gather(values: torch.Tensor, index: torch.Tensor) -> torch.Tensor:
+    """(batch, points, channels) at (batch, …) indices."""
+    rows = torch.arange(len(values)).view(-1, *[1] * (index.ndim - 1))
+    return values[rows, index]
+
+
+class Abstraction(torch_networks.Abstraction):
+    def forward(self, points, features):
+        if self.centres is None:
+            return super().forward(points, features)
+        centres = gather(points, farthest_point_sample(points, self.centres))
+        index = ball_query(points, centres, self.radius, self.samples)
+        grouped = torch.cat([gather(points, index) - centres[:, :, None], gather(features, index)], dim=3)
+        out = self.mlps[0](grouped.permute(0, 3, 2, 1))  # (batch, channels, samples, centres)
+        return centres, out.amax(dim=2).transpose(1, 2)
+
+
+def pointnet2(views: int) -> torch_networks.PointNet2:
+    return torch_networks.PointNet2(views, Abstraction)
