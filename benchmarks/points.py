@@ -12,12 +12,12 @@ compared with those stored, and one below a third of its like ends the program w
 from __future__ import annotations
 
 import importlib.util
-import json
 import platform
 import sys
 import time
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -45,7 +45,6 @@ from tests.reference.weights import made_up_weights
 
 RESULTS = Path(__file__).parent / "results" / "points.json"
 CLOUDS, POINTS, CENTRES, RADIUS, SAMPLES = 16, 4096, 512, 0.2, 64
-CUDA_ORDER = {"rtol": 1e-4, "atol": 1e-5}
 GUARD = 3.0
 
 
@@ -82,12 +81,12 @@ def take_turns(calls: list[Callable[[], Any]], rounds: int) -> np.ndarray:
 
 
 def compare(
-    what: str, ours: Callable, peers: dict[str, Callable], rounds: int, notes: dict[str, str] = {}
-) -> list[Row]:  # noqa: B006
+    what: str, ours: Callable, peers: dict[str, Callable], rounds: int, notes: dict[str, str] | None = None
+) -> list[Row]:
     taken = take_turns([ours, *peers.values()], rounds)
     quartiles = np.quantile(taken, [0.25, 0.5, 0.75], axis=1).T
     rows = [
-        Row(what, peer, list(quartiles[0]), list(theirs), theirs[1] / quartiles[0, 1], notes.get(peer, ""))
+        Row(what, peer, list(quartiles[0]), list(theirs), theirs[1] / quartiles[0, 1], (notes or {}).get(peer, ""))
         for peer, theirs in zip(peers, quartiles[1:], strict=True)
     ]
     for row in rows:
@@ -152,12 +151,11 @@ def point_operations(clouds: np.ndarray, torch_peer: Any, rounds: int) -> list[R
     np.testing.assert_array_equal(one["NumPy loop"](), chosen[0])
     rows = compare("farthest points, one cloud", lambda: sample(cloud), one, rounds, notes)
 
-    tree: dict[str, Callable] = {"SciPy's k-d tree": lambda: first_within(cKDTree(cloud), centres[0])}
+    tree = "SciPy's k-d tree"
+    search: dict[str, Callable] = {tree: lambda: first_within(cKDTree(cloud), centres[0])}
     np.testing.assert_array_equal(numpy_rules.ball_query(cloud, centres[0], RADIUS, SAMPLES), neighbours[0])
-    notes = {
-        "SciPy's k-d tree": f"{share_equal(tree['SciPy' + chr(39) + 's k-d tree'](), neighbours[0]):.2%} of indices equal"
-    }
-    rows += compare("ball query, one cloud", lambda: query(cloud, centres[0]), tree, rounds, notes)
+    notes = {tree: f"{share_equal(search[tree](), neighbours[0]):.2%} of indices equal"}
+    rows += compare("ball query, one cloud", lambda: query(cloud, centres[0]), search, rounds, notes)
 
     if torch_peer:
         import torch
@@ -191,30 +189,27 @@ def matrix_products(network: PointNet2) -> Callable[[], jax.Array]:
         kernels = [layer.kernel[...] for layer in layers]
         work.append((jnp.asarray(random.normal(size=(pieces, rows, kernels[0].shape[0])), jnp.float32), kernels, group))
 
-    @jax.jit
-    def products(work, shifts):
-        def cloud(shift):
-            def piece(x, kernels, group):
-                for kernel in kernels:
-                    x = x @ kernel
-                return jnp.max(x.reshape(-1, group, x.shape[-1]), axis=1)
+    sizes = [group for *_, group in work]
+    arrays = [(x, kernels) for x, kernels, _ in work]
 
-            return sum(
-                jnp.sum(jax.lax.map(lambda x, kernels=kernels, group=group: piece(x, kernels, group), x + shift))
-                for x, kernels, group in work
-            )
+    def largest(x: jax.Array, kernels: list[jax.Array], group: int) -> jax.Array:
+        for kernel in kernels:
+            x = x @ kernel
+        return jnp.max(x.reshape(-1, group, x.shape[-1]), axis=1)
+
+    @jax.jit
+    def products(arrays, shifts):
+        def cloud(shift):
+            parts = []
+            for (x, kernels), group in zip(arrays, sizes, strict=True):
+                piece = partial(largest, kernels=kernels, group=group)
+                parts.append(jnp.sum(jax.lax.map(piece, x + shift)))
+            return sum(parts)
 
         return jax.lax.map(cloud, shifts)
 
-    static = [group for *_, group in work]
-    arrays = [(x, kernels) for x, kernels, _ in work]
-    run = jax.jit(
-        lambda arrays, shifts: products.__wrapped__(
-            [(x, k, g) for (x, k), g in zip(arrays, static, strict=True)], shifts
-        )
-    )
     shifts = jnp.arange(CLOUDS, dtype=jnp.float32)
-    return lambda: run(arrays, shifts)
+    return lambda: products(arrays, shifts)
 
 
 def networks(clouds: np.ndarray, torch_peer: Any, rounds: int) -> list[Row]:
