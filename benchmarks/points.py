@@ -2,8 +2,9 @@
 
 Rows: farthest-point sampling and ball query of one cloud and of sixteen; PointNet++'s forward pass and training step on sixteen
 clouds of 4,096 points with the same weights, and beside the forward pass its matrix products alone; one decision. All
-answers are compared before anything is timed. Calls take turns, so that a busy moment of the machine strikes all of them; times
-are medians and quartiles, and what counts is their ratio. Peers that are not installed are left out, and it is said.
+answers are compared before anything is timed. Calls take turns, so that a busy moment of the machine strikes all of them
+(training steps come one kind after the other, since each would have to take its gigabytes from the other anew); times are
+medians and quartiles, and what counts is their ratio. Peers that are not installed are left out, and it is said.
 
 The table goes to `benchmarks/results/points.json` and `points.md`. With `--guard` nothing is written: ratios to peers are
 compared with those stored, and one below a third of its like ends the program with exit code 1.
@@ -81,9 +82,15 @@ def take_turns(calls: list[Callable[[], Any]], rounds: int) -> np.ndarray:
 
 
 def compare(
-    what: str, ours: Callable, peers: dict[str, Callable], rounds: int, notes: dict[str, str] | None = None
+    what: str,
+    ours: Callable,
+    peers: dict[str, Callable],
+    rounds: int,
+    notes: dict[str, str] | None = None,
+    turns: bool = True,
 ) -> list[Row]:
-    taken = take_turns([ours, *peers.values()], rounds)
+    calls = [ours, *peers.values()]
+    taken = take_turns(calls, rounds) if turns else np.concatenate([take_turns([call], rounds) for call in calls])
     quartiles = np.quantile(taken, [0.25, 0.5, 0.75], axis=1).T
     rows = [
         Row(what, peer, list(quartiles[0]), list(theirs), theirs[1] / quartiles[0, 1], (notes or {}).get(peer, ""))
@@ -230,15 +237,7 @@ def networks(clouds: np.ndarray, torch_peer: Any, rounds: int) -> list[Row]:
 
         peers["PyTorch"] = forward_peer
     structure, parameters, statistics = nnx.split(network, nnx.Param, ...)
-    forward = jax.jit(lambda clouds: nnx.merge(structure, parameters, statistics)(clouds))
-    notes = {"its matrix products alone": "a floor, not a peer"}
-    if torch_peer:
-        largest = float(np.abs(np.asarray(forward(clouds)) - peers["PyTorch"]().numpy()).max())
-        notes["PyTorch"] = f"outputs equal to {largest:.0e}"
-        assert largest < 1e-3
-    peers["its matrix products alone"] = matrix_products(network)
-    rows = compare("PointNet++ forward, 16 clouds", lambda: forward(clouds), peers, max(3, rounds // 2), notes)
-
+    rows: list[Row] = []
     if torch_peer:
         targets = np.random.default_rng(1).uniform(0, 1, (CLOUDS, 40)).astype(np.float32)
         adam = optax.adam(1e-5)
@@ -265,7 +264,7 @@ def networks(clouds: np.ndarray, torch_peer: Any, rounds: int) -> list[Row]:
             their_adam.step()
             return loss
 
-        apart = abs(float(step(parameters, statistics, moments)[3]) / float(train_peer()) - 1)
+        apart = abs(float(step(parameters, statistics, moments)[3]) / train_peer().item() - 1)
         assert apart < 1e-3
         rows += compare(
             "PointNet++ training step, 16 clouds",
@@ -273,7 +272,18 @@ def networks(clouds: np.ndarray, torch_peer: Any, rounds: int) -> list[Row]:
             {"PyTorch": train_peer},
             max(3, rounds // 4),
             {"PyTorch": f"first loss equal to {apart:.0e}"},
+            turns=False,
         )
+    forward = jax.jit(lambda clouds: nnx.merge(structure, parameters, statistics)(clouds))
+    notes = {"its matrix products alone": "a floor, not a peer"}
+    if torch_peer:
+        theirs.load_state_dict({name: torch.from_numpy(value) for name, value in state.items()})  # as before training
+        largest = float(np.abs(np.asarray(forward(clouds)) - peers["PyTorch"]().numpy()).max())
+        notes["PyTorch"] = f"outputs equal to {largest:.0e}"
+        assert largest < 1e-3
+    peers["its matrix products alone"] = matrix_products(network)
+    rows += compare("PointNet++ forward, 16 clouds", lambda: forward(clouds), peers, max(3, rounds // 2), notes)
+
     return rows
 
 
@@ -319,7 +329,7 @@ def main() -> None:
     if installed("torch"):
         from benchmarks import torch_peer
     clouds = partial_clouds()
-    rows = point_operations(clouds, torch_peer, rounds) + networks(clouds, torch_peer, rounds)
+    rows = networks(clouds, torch_peer, rounds) + point_operations(clouds, torch_peer, rounds)
     if guard:
         slower = slower_than_before(rows, read_json(RESULTS))
         for sentence in slower:

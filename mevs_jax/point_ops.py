@@ -50,20 +50,35 @@ def farthest_point_sample(points: Float[AnyArray, "points 3"], k: int) -> Int[Ar
     count = points.shape[0]
     if count < 1:
         raise ValueError("farthest_point_sample needs at least one point")
-    # Three contiguous arrays, and max followed by "smallest index equal to it": XLA vectorises both on CPU, not argmax.
+    # On CPU, XLA vectorises what runs along columns, and neither argmax nor a maximum over everything. So points stand in a grid,
+    # consecutive ones below each other; the maxima of its columns say in which column the farthest is, and then in which row.
     points = jnp.asarray(points)
-    x, y, z = points[:, 0], points[:, 1], points[:, 2]
-    index = jnp.arange(count, dtype=jnp.int32)
+    rows = 1 << max(0, (count.bit_length() - 1) // 2 - 1)
+    padded = jnp.pad(points, ((0, -count % rows), (0, 0)))
+    x, y, z = (padded[:, axis].reshape(-1, rows).T for axis in range(3))
+    columns = x.shape[1]
+    index = jnp.arange(rows * columns).reshape(columns, rows).T
 
     def step(i: Array, carry: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
         chosen, nearest, last = carry
-        nearest = jnp.minimum(nearest, _squared_distance(x - x[last], y - y[last], z - z[last]))
-        last = jnp.min(jnp.where(nearest == jnp.max(nearest), index, count - 1))
+        here = padded[last]
+        nearest = jnp.minimum(nearest, _squared_distance(x - here[0], y - here[1], z - here[2]))
+        best = jnp.max(nearest, axis=0)
+        farthest = jnp.max(best)
+        column = _first_equal(best, farthest)
+        row = _first_equal(jax.lax.dynamic_index_in_dim(nearest, column, 1, keepdims=False), farthest)
+        last = jnp.minimum(column * rows + row, count - 1)
         return chosen.at[i].set(last), nearest, last
 
     chosen = jnp.zeros(k, jnp.int32)
-    nearest = jnp.full(count, jnp.inf, points.dtype)
+    nearest = jnp.where(index < count, jnp.array(jnp.inf, points.dtype), -1)
     return jax.lax.fori_loop(1, k, step, (chosen, nearest, jnp.int32(0)))[0]
+
+
+def _first_equal(values: Float[Array, "n"], value: Float[Array, ""]) -> Int[Array, ""]:
+    """The smallest index where `values` are equal to `value`, the last where none is."""
+    index = jnp.arange(values.shape[0], dtype=jnp.int32)
+    return jnp.min(jnp.where(values == value, index, index[-1]))
 
 
 def ball_query(
