@@ -186,6 +186,19 @@ def test_directions_stand_in_the_place_of_the_normals(random):
     assert np.abs(np.asarray(network(np.concatenate([cloud, directions], axis=1)) - nothing)).max() > 1e-3
 
 
+@pytest.mark.parametrize("columns", [3, 6])
+def test_pieces_of_a_cloud_equal_the_whole(columns, monkeypatch, random):
+    """On a CPU neighbourhoods pass in pieces, elsewhere all at once; in bfloat16 coordinates keep their own precision."""
+    network = PointNet2(views=4, rngs=nnx.Rngs(0))
+    clouds = random.normal(0, 0.4, (3, 700, columns)).astype(np.float32)
+    pieces = network(clouds)
+    rough = PointNet2(views=4, rngs=nnx.Rngs(0), dtype=jnp.dtype("bfloat16"))(clouds)
+    monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
+    np.testing.assert_allclose(network(clouds), pieces, rtol=1e-4, atol=1e-5)
+    assert rough.dtype == jnp.float32
+    np.testing.assert_allclose(rough, pieces, atol=0.05 * float(jnp.abs(pieces).max()))
+
+
 def test_dropout_acts_in_training_only():
     network = PointNet2(views=4, rngs=nnx.Rngs(0))
     cloud = jax.random.uniform(jax.random.key(0), (2, 600, 3))

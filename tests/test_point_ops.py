@@ -48,8 +48,9 @@ def test_indices_equal_an_obvious_loop(kind, points, k, radius, samples, random)
         np.testing.assert_array_equal(group, numpy_rules.ball_query(cloud, centre, radius, samples))
 
 
-def test_indices_at_the_thesis_sizes(random):
-    cloud = clouds_of("random", random, 1, 4096)[0]
+@pytest.mark.parametrize("points", [4096, 3001, 700])
+def test_indices_at_the_thesis_sizes(points, random):
+    cloud = clouds_of("random", random, 1, points)[0]
     chosen = np.asarray(farthest_point_sample(cloud, 512))
     np.testing.assert_array_equal(chosen, numpy_rules.farthest_point_sample(cloud, 512))
     groups = np.asarray(ball_query(cloud, cloud[chosen[:40]], 0.2, 64))
