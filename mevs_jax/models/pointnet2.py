@@ -97,8 +97,13 @@ def _passed(
 ) -> Float[Array, "points columns"]:
     """What is gathered of every neighbour."""
     if _passes_first(kernel):
-        return points @ kernel[:3] + _product(features, kernel[3:])
+        return _placed(points, kernel) + _product(features, kernel[3:])
     return jnp.concatenate([points, features.astype(points.dtype)], axis=-1)
+
+
+def _placed(points: Float[Array, "points 3"], kernel: Float[Array, "inputs outputs"]) -> Float[Array, "points outputs"]:
+    """The coordinates' part of the first layer; exactly, since a difference of two such is small."""
+    return jnp.matmul(points, kernel[:3], precision=jax.lax.Precision.HIGHEST)
 
 
 def _first_layer(
@@ -109,7 +114,7 @@ def _first_layer(
 ) -> Float[Array, "centres samples outputs"]:
     """The neighbours' offsets from their centres beside their features, times the first layer's weights."""
     if _passes_first(kernel):
-        return passed[neighbours] - (centres @ kernel[:3])[:, None]
+        return passed[neighbours] - _placed(centres, kernel)[:, None]
     # As products that fuse with what follows, not one thin matrix product, whose gradient wants another layout.
     columns = passed.shape[-1]
     gathered = passed[neighbours] - jnp.pad(centres, ((0, 0), (0, columns - 3)))[:, None]
