@@ -6,8 +6,8 @@ answers are compared before anything is timed. Calls take turns, so that a busy 
 (training steps come one kind after the other, since each would have to take its gigabytes from the other anew); times are
 medians and quartiles, and what counts is their ratio. Peers that are not installed are left out, and it is said.
 
-The table goes to `benchmarks/results/points.json` and `points.md`. With `--guard` nothing is written: ratios to peers are
-compared with those stored, and one below a third of its like ends the program with exit code 1.
+The table goes to `benchmarks/results/points.json` and `points.md`. With `--guard` nothing is written and nothing trained:
+ratios to peers are compared with those stored, and one below a third of its like ends the program with exit code 1.
 """
 
 from __future__ import annotations
@@ -219,7 +219,7 @@ def matrix_products(network: PointNet2) -> Callable[[], jax.Array]:
     return lambda: products(arrays, shifts)
 
 
-def networks(clouds: np.ndarray, torch_peer: Any, rounds: int) -> list[Row]:
+def networks(clouds: np.ndarray, torch_peer: Any, rounds: int, training: bool) -> list[Row]:
     network = PointNet2(views=40, dropout=0.0, rngs=nnx.Rngs(0))
     peers: dict[str, Callable] = {}
     if torch_peer:
@@ -238,7 +238,7 @@ def networks(clouds: np.ndarray, torch_peer: Any, rounds: int) -> list[Row]:
         peers["PyTorch"] = forward_peer
     structure, parameters, statistics = nnx.split(network, nnx.Param, ...)
     rows: list[Row] = []
-    if torch_peer:
+    if torch_peer and training:
         targets = np.random.default_rng(1).uniform(0, 1, (CLOUDS, 40)).astype(np.float32)
         adam = optax.adam(1e-5)
 
@@ -329,7 +329,7 @@ def main() -> None:
     if installed("torch"):
         from benchmarks import torch_peer
     clouds = partial_clouds()
-    rows = networks(clouds, torch_peer, rounds) + point_operations(clouds, torch_peer, rounds)
+    rows = networks(clouds, torch_peer, rounds, not guard) + point_operations(clouds, torch_peer, rounds)
     if guard:
         slower = slower_than_before(rows, read_json(RESULTS))
         for sentence in slower:
