@@ -47,6 +47,7 @@ from tests.reference.weights import made_up_weights
 RESULTS = Path(__file__).parent / "results" / "points.json"
 CLOUDS, POINTS, CENTRES, RADIUS, SAMPLES = 16, 4096, 512, 0.2, 64
 GUARD = 3.0
+HEADER = "| what | ours | peer | theirs | ratio | |\n|---|---|---|---|---|---|"
 
 
 @dataclass
@@ -324,7 +325,7 @@ def main() -> None:
     rounds = 3 if guard else 15
     machine = f"{platform.processor() or platform.machine()}, {jax.devices()[0].device_kind}, JAX {jax.__version__}"
     print(f"Measured on: {machine}. Milliseconds: median (quartiles).\n")
-    print("| what | ours | peer | theirs | ratio | |\n|---|---|---|---|---|---|")
+    print(HEADER)
     torch_peer = None
     if installed("torch"):
         from benchmarks import torch_peer
@@ -337,7 +338,7 @@ def main() -> None:
         sys.exit(bool(slower))
     found = decision(clouds)
     write_json(RESULTS, {"machine": machine, "rows": [asdict(row) for row in rows], "decision_ms": found})
-    table = "\n".join(["| what | ours | peer | theirs | ratio | |", "|---|---|---|---|---|---|", *map(line_of, rows)])
+    table = "\n".join([HEADER, *map(line_of, rows)])
     write_text(RESULTS.with_suffix(".md"), f"{machine}. Milliseconds: median (quartiles).\n\n{table}\n")
 
 

@@ -124,7 +124,7 @@ def _first_layer(
 @jax.custom_vjp
 def _largest(x: Float[Array, "*batch rows channels"]) -> Float[Array, "*batch channels"]:
     """The maximum over rows. Equal ones share the gradient, as in JAX's own rule, which writes an array as large as `x` more."""
-    return jnp.max(x, axis=-2)
+    return _largest_forward(x)[0]
 
 
 def _largest_forward(x: Array) -> tuple[Array, tuple[Array, Array]]:

@@ -80,7 +80,7 @@ class ResNet(nnx.Module):
             weights expect of images in [0, 1].
         rngs: source of the initial weights.
         dtype: what the convolutions calculate in, that of the images unless given; weights, batch-norm statistics and the last
-                layer keep their own.
+            layer keep their own.
 
     Raises:
         ValueError: for another depth, or `standardise` with other than three channels.
