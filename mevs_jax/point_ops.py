@@ -7,30 +7,28 @@ that weights trained there mean the same thing here:
 * ball query takes the first `k` points, in index order, that lie strictly within the radius, and fills what is missing
   with the first of them (with point 0 where there is none).
 
-Equal indices need equal distances to the last bit. A compiler may fuse `x*x + y*y` into one rounding instead of two, which
-moves a squared distance by one unit in the last place and, now and then, an index. `_squared_distance` keeps the roundings
-apart, so a plain NumPy loop, a CPU and an accelerator agree.
+On one GPU both are kernels (`mevs_jax.point_kernels`); elsewhere, for larger clouds and in float64, array programs. All give the
+same indices, since all compare the same distances (`mevs_jax.distances`).
 """
 
 from __future__ import annotations
+
+from functools import partial
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int, UInt32
 
+from mevs_jax import point_kernels
 from mevs_jax.arrays import AnyArray
+from mevs_jax.distances import square, squared_distance
 
 _WORD = 32  # hits of 32 points are packed into one machine word
 
 
-def _square(x: Array) -> Array:
-    """x², rounded on its own: the comparison stops the compiler from fusing the product into a following addition."""
-    product = x * x
-    return jnp.where(product > 0, product, 0.0)
-
-
-def _squared_distance(dx: Array, dy: Array, dz: Array) -> Array:
-    return (_square(dx) + _square(dy)) + _square(dz)
+def _on_one_gpu(points: Array) -> bool:
+    """Whether a kernel may be chosen: where a program spans several devices, the compiler could not split it."""
+    return jax.default_backend() == "gpu" and jax.device_count() == 1 and points.dtype == jnp.float32
 
 
 def farthest_point_sample(points: Float[AnyArray, "points 3"], k: int) -> Int[Array, "{k}"]:
@@ -50,9 +48,20 @@ def farthest_point_sample(points: Float[AnyArray, "points 3"], k: int) -> Int[Ar
     count = points.shape[0]
     if count < 1:
         raise ValueError("farthest_point_sample needs at least one point")
+    points = jax.lax.stop_gradient(jnp.asarray(points))
+    if _on_one_gpu(points) and count <= point_kernels.LARGEST_CLOUD:
+        return jax.lax.platform_dependent(
+            points,
+            cuda=partial(point_kernels.farthest_point_sample, k=k),
+            default=partial(_farthest_of_array, k=k),
+        )
+    return _farthest_of_array(points, k)
+
+
+def _farthest_of_array(points: Float[Array, "points 3"], k: int) -> Int[Array, "{k}"]:
     # On CPU, XLA vectorises what runs along columns, and neither argmax nor a maximum over everything. So points stand in a grid,
     # consecutive ones below each other; the maxima of its columns say in which column the farthest is, and then in which row.
-    points = jnp.asarray(points)
+    count = points.shape[0]
     rows = 1 << max(0, (count.bit_length() - 1) // 2 - 1)
     padded = jnp.pad(points, ((0, -count % rows), (0, 0)))
     x, y, z = (padded[:, axis].reshape(-1, rows).T for axis in range(3))
@@ -62,7 +71,7 @@ def farthest_point_sample(points: Float[AnyArray, "points 3"], k: int) -> Int[Ar
     def step(i: Array, carry: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
         chosen, nearest, last = carry
         here = padded[last]
-        nearest = jnp.minimum(nearest, _squared_distance(x - here[0], y - here[1], z - here[2]))
+        nearest = jnp.minimum(nearest, squared_distance(x - here[0], y - here[1], z - here[2]))
         best = jnp.max(nearest, axis=0)
         farthest = jnp.max(best)
         column = _first_equal(best, farthest)
@@ -95,19 +104,30 @@ def ball_query(
         (centres, k) int32 indices.
 
     Source: PointNet++ §3.2; reference rule of `pointnet2_ops`.
-
-    The hits of 32 points become the bits of one word. Prefix sums of popcounts say which word holds the s-th hit, and five
-    halvings find the bit inside it; no pass over the points but the one that measures distances.
     """
     if k < 1:
         raise ValueError(f"ball_query needs k >= 1, got {k}")
-    points, centres = jnp.asarray(points), jnp.asarray(centres)
+    points, centres = (jax.lax.stop_gradient(jnp.asarray(array)) for array in (points, centres))
+    squared_radius = square(jnp.asarray(radius, points.dtype))
+    arguments = (points, centres, squared_radius)
+    if _on_one_gpu(points):
+        return jax.lax.platform_dependent(
+            *arguments, cuda=partial(point_kernels.ball_query, k=k), default=partial(_query_of_array, k=k)
+        )
+    return _query_of_array(*arguments, k)
+
+
+def _query_of_array(
+    points: Float[Array, "points 3"], centres: Float[Array, "centres 3"], squared_radius: Float[Array, ""], k: int
+) -> Int[Array, "centres {k}"]:
+    """The hits of 32 points become the bits of one word. Prefix sums of popcounts say which word holds the s-th hit, and five
+    halvings find the bit inside it; no pass over the points but the one that measures distances.
+    """
     padded = jnp.pad(points, ((0, -points.shape[0] % _WORD), (0, 0)), constant_values=jnp.inf)
-    squared_radius = _square(jnp.asarray(radius, points.dtype))
     # A word's points one below the other, so that words lie side by side and the sum over bits runs along all of them at once.
     x, y, z = (padded[:, axis].reshape(-1, _WORD).T for axis in range(3))
     hit = (
-        _squared_distance(centres[:, 0, None, None] - x, centres[:, 1, None, None] - y, centres[:, 2, None, None] - z)
+        squared_distance(centres[:, 0, None, None] - x, centres[:, 1, None, None] - y, centres[:, 2, None, None] - z)
         < squared_radius
     )
     bit = jnp.uint32(1) << jnp.arange(_WORD, dtype=jnp.uint32)

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from mevs_jax import ball_query, farthest_point_sample
+from mevs_jax import ball_query, farthest_point_sample, point_kernels
 from tests.reference import numpy_rules
 
 
@@ -79,3 +79,45 @@ def test_indices_are_int32_and_sampling_starts_at_point_zero(random):
 def test_zero_samples_are_refused(call):
     with pytest.raises(ValueError, match="k >= 1"):
         call(np.zeros((4, 3), np.float32))
+
+
+KERNELS = [
+    ("random", 700, 40, 0.2, 24),
+    ("lattice", 120, 32, 0.5, 12),
+    ("one_point", 7, 10, 0.2, 9),
+    ("random", 130, 17, 0.6, 64),
+]
+
+
+@pytest.mark.parametrize(("kind", "points", "k", "radius", "samples"), KERNELS)
+def test_kernels_give_the_same_indices(kind, points, k, radius, samples, random):
+    """Interpreted, since there need not be a GPU; batched as in the networks, and with a centre that has no neighbour."""
+    clouds = clouds_of(kind, random, 2, points)
+    chosen = jax.vmap(lambda cloud: point_kernels.farthest_point_sample(cloud, k, interpret=True))(clouds)
+    centres = np.concatenate([clouds[:, : points // 2], np.full((2, 1, 3), 9, np.float32)], axis=1)
+    query = lambda p, c: point_kernels.ball_query(p, c, jnp.square(jnp.float32(radius)), samples, interpret=True)  # noqa: E731
+    groups = jax.vmap(query)(clouds, centres)
+    for cloud, centre, indices, group in zip(clouds, centres, chosen, groups, strict=True):
+        np.testing.assert_array_equal(indices, numpy_rules.farthest_point_sample(cloud, k))
+        np.testing.assert_array_equal(group, numpy_rules.ball_query(cloud, centre, radius, samples))
+
+
+def test_one_gpu_runs_the_kernels_and_nothing_else_does(monkeypatch):
+    """What is lowered for a GPU; whether it runs there is not seen here."""
+
+    def both(cloud):
+        return farthest_point_sample(cloud, 64), ball_query(cloud, cloud[:32], 0.2, 16)
+
+    def lowered(points, platform, dtype=np.float32):
+        # A function of its own, since JAX remembers what it traced.
+        traced = jax.jit(lambda cloud: both(cloud)).trace(jax.ShapeDtypeStruct((points, 3), dtype))
+        return traced.lower(lowering_platforms=(platform,)).as_text().count("xla.gpu.triton")
+
+    assert lowered(1000, "cuda") == 0
+    monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
+    assert lowered(1000, "cuda") == 2
+    assert lowered(20_000, "cuda") == 1  # too large a cloud for the registers of a block
+    assert lowered(1000, "cuda", np.float16) == 0
+    assert lowered(1000, "cpu") == 0
+    monkeypatch.setattr(jax, "device_count", lambda: 8)
+    assert lowered(1000, "cuda") == 0

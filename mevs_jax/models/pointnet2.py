@@ -270,7 +270,8 @@ class PointNet2(nnx.Module):
     ) -> Float[Array, "clouds embedding"]:
         """Clouds to the vectors before the head, by the running statistics."""
         for level, perceptron in zip(self.levels, self.perceptrons, strict=True):
-            chosen = _map(lambda cloud, level=level: farthest_point_sample(cloud, level.centres), points, at_once=4)
+            sample = partial(farthest_point_sample, k=level.centres)
+            chosen = _map(sample, points, at_once=4) if jax.default_backend() == "cpu" else jax.vmap(sample)(points)
             centres = jnp.take_along_axis(points, chosen[..., None], axis=1)
             abstract = partial(_abstract, level=level, layers=perceptron.folded())
             features = _map(lambda cloud, abstract=abstract: abstract(*cloud), (points, features, centres))
