@@ -5,7 +5,9 @@ from __future__ import annotations
 import multiprocessing
 import os
 import signal
+import threading
 from collections.abc import Callable, Sequence
+from multiprocessing.pool import ThreadPool
 from pathlib import Path
 
 from data_pipeline.capture import Capture, CaptureConfig, Rig, capture, rig_for, save_capture
@@ -23,7 +25,17 @@ def _left_out_path(folder: Path, entry: ObjectEntry) -> Path:
     return capture_path(folder, entry).with_suffix(".left_out")
 
 
-_BACKENDS: dict[str, Callable[[Mesh, Rig], Capture]] = {"raycast": capture, "visualizer": capture_with_visualizer}
+def _rasterise(mesh: Mesh, rig: Rig) -> Capture:
+    from data_pipeline.rasterise import capture_by_rasterising  # imports JAX, which the other two do without
+
+    return capture_by_rasterising(mesh, rig)
+
+
+_BACKENDS: dict[str, Callable[[Mesh, Rig], Capture]] = {
+    "raycast": capture,
+    "rasterise": _rasterise,
+    "visualizer": capture_with_visualizer,
+}
 
 
 def capture_entry(entry: ObjectEntry, rig: Rig, folder: Path, backend: str, skip_damaged: bool) -> str | None:
@@ -57,7 +69,8 @@ _worker: tuple[Rig, Path, str, bool] | None = None
 def _start_worker(rig: Rig, folder: Path, backend: str, skip_damaged: bool) -> None:
     global _worker
     _worker = rig, folder, backend, skip_damaged
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent answers Ctrl-C and ends its workers
+    if threading.current_thread() is threading.main_thread():  # of a process of its own
+        signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent answers Ctrl-C and ends its workers
 
 
 def _work(entry: ObjectEntry) -> str | None:
@@ -88,10 +101,11 @@ def capture_all(
     todo = still_to_capture(entries, folder)
     if todo:
         workers = workers or os.cpu_count() or 1
-        context = multiprocessing.get_context("spawn")
+        # What rasterises is one program on one device; threads read meshes for it and write captures.
+        make_pool = ThreadPool if config.backend == "rasterise" else multiprocessing.get_context("spawn").Pool
         with (
             progress_bar("objects") as bar,
-            context.Pool(
+            make_pool(
                 min(workers, len(todo)), _start_worker, (rig_for(config), folder, config.backend, skip_damaged)
             ) as pool,
         ):

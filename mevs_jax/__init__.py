@@ -11,6 +11,7 @@ from mevs_jax.calibration import (
     reliability,
 )
 from mevs_jax.cameras import Camera, cameras_at, look_at_origin, partial_cloud, pixel_directions, unproject
+from mevs_jax.decisions import Decision, NextView
 from mevs_jax.entropy import depth_entropy, depth_levels, level_entropy, quantise_depth, shannon_entropy
 from mevs_jax.fusion import beliefs_along, confidence, discounted, mean_of_probabilities, sum_of_logits
 from mevs_jax.metrics import (
@@ -58,8 +59,10 @@ __all__ = [
     "POLICIES",
     "Abstraction",
     "Camera",
+    "Decision",
     "Episode",
     "Knowledge",
+    "NextView",
     "Observation",
     "PointNet2",
     "Policy",

@@ -21,9 +21,8 @@ from jaxtyping import Array, Float, Int, UInt32
 
 from mevs_jax import point_kernels
 from mevs_jax.arrays import AnyArray
+from mevs_jax.bits import WORD, bits_until, set_bits
 from mevs_jax.distances import square, squared_distance
-
-_WORD = 32  # hits of 32 points are packed into one machine word
 
 
 def _on_one_gpu(points: Array) -> bool:
@@ -123,54 +122,21 @@ def _query_of_array(
     """The hits of 32 points become the bits of one word. Prefix sums of popcounts say which word holds the s-th hit, and five
     halvings find the bit inside it; no pass over the points but the one that measures distances.
     """
-    padded = jnp.pad(points, ((0, -points.shape[0] % _WORD), (0, 0)), constant_values=jnp.inf)
+    padded = jnp.pad(points, ((0, -points.shape[0] % WORD), (0, 0)), constant_values=jnp.inf)
     # A word's points one below the other, so that words lie side by side and the sum over bits runs along all of them at once.
-    x, y, z = (padded[:, axis].reshape(-1, _WORD).T for axis in range(3))
+    x, y, z = (padded[:, axis].reshape(-1, WORD).T for axis in range(3))
     hit = (
         squared_distance(centres[:, 0, None, None] - x, centres[:, 1, None, None] - y, centres[:, 2, None, None] - z)
         < squared_radius
     )
-    bit = jnp.uint32(1) << jnp.arange(_WORD, dtype=jnp.uint32)
+    bit = jnp.uint32(1) << jnp.arange(WORD, dtype=jnp.uint32)
     words = jnp.sum(jnp.where(hit, bit[:, None], jnp.uint32(0)), axis=1, dtype=jnp.uint32)
-    return jax.vmap(_first_set_bits, in_axes=(0, None))(words, k)
+    return jax.vmap(_first_hits, in_axes=(0, None))(words, k)
 
 
-def _first_set_bits(words: UInt32[Array, "words"], k: int) -> Int[Array, "{k}"]:
-    """Positions of the first `k` set bits of a long bit string, the first one repeated where there are fewer."""
-    ones = jax.lax.population_count(words).astype(jnp.int32)
-    until = jax.lax.associative_scan(jnp.add, ones)  # on CPU twice as fast as cumsum
+def _first_hits(words: UInt32[Array, "words"], k: int) -> Int[Array, "{k}"]:
+    """Positions of the first `k` set bits, the first one repeated where there are fewer, 0 where there is none."""
+    until = bits_until(words)
     slot = jnp.arange(k, dtype=jnp.int32)
-    slot = jnp.where(slot < until[-1], slot, 0)
-    word = _first_above(until, slot)
-    rank = slot - (until[word] - ones[word])
-    position = word * _WORD + _select_bit(words[word], rank)
+    position = set_bits(words, until, jnp.where(slot < until[-1], slot, 0))
     return jnp.where(until[-1] > 0, position, 0)
-
-
-def _first_above(rising: Int[Array, "n"], values: Int[Array, "k"]) -> Int[Array, "k"]:
-    """For each value the first index of `rising` that exceeds it, at most n − 1.
-
-    Comparing with the ends of some sixteen blocks, one after the other, says which block, and bisection where in it: bisection
-    alone gathers at every halving, which CPUs do one by one.
-    """
-    count = rising.shape[0]
-    block = max(8, 1 << (count // 16).bit_length() - 1) if count >= 16 else 1 << count.bit_length()
-    ends = [rising[end] for end in range(block - 1, count, block)]
-    found = block * sum(((end <= values).astype(jnp.int32) for end in ends), jnp.zeros_like(values))
-    while block := block // 2:
-        below = rising[jnp.minimum(found + block, count) - 1] <= values
-        found = jnp.where(below, found + block, found)
-    return jnp.minimum(found, count - 1)
-
-
-def _select_bit(word: UInt32[Array, "k"], rank: Int[Array, "k"]) -> Int[Array, "k"]:
-    """Position of the set bit number `rank` (from 0) of each word, by halving."""
-    position = jnp.zeros_like(rank)
-    for width in (16, 8, 4, 2, 1):
-        low = word & jnp.uint32((1 << width) - 1)
-        ones = jax.lax.population_count(low).astype(jnp.int32)
-        above = rank >= ones
-        rank = jnp.where(above, rank - ones, rank)
-        position = jnp.where(above, position + width, position)
-        word = jnp.where(above, word >> width, low)
-    return position
