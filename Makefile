@@ -19,6 +19,7 @@ lint: $(READY)
 
 bench: $(READY)  ## what is fast, beside its peers, in one run
 	$(BIN)/python benchmarks/points.py
+	$(BIN)/python benchmarks/capture.py
 	$(BIN)/python benchmarks/evaluation.py
 	$(BIN)/python benchmarks/sweep.py
 

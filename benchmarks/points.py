@@ -1,7 +1,7 @@
 """Point operations and PointNet++, each beside its peers in one run: `make bench`, or `python benchmarks/points.py`.
 
 Rows: farthest-point sampling and ball query of one cloud and of sixteen; PointNet++'s forward pass and training step on sixteen
-clouds of 4,096 points with the same weights, and beside the forward pass its matrix products alone; one decision. All
+clouds of 4,096 points with the same weights, and beside the forward pass its matrix products alone; decisions. All
 answers are compared before anything is timed. Calls take turns, so that a busy moment of the machine strikes all of them
 (training steps come one kind after the other, since each would have to take its gigabytes from the other anew); times are
 medians and quartiles, and what counts is their ratio. Peers that are not installed are left out, and it is said.
@@ -32,13 +32,14 @@ from flax import nnx
 from scipy.spatial import cKDTree
 
 from data_pipeline.files import read_json, write_json, write_text
+from eval.timing import time_local_maxima
 from mevs_jax import (
+    NextView,
     PointNet2,
     ViewGraph,
     ball_query,
     farthest_point_sample,
     fibonacci_sphere,
-    local_maxima,
     pointnet2_from_torch,
 )
 from tests.reference import numpy_rules
@@ -47,6 +48,10 @@ from tests.reference.weights import made_up_weights
 RESULTS = Path(__file__).parent / "results" / "points.json"
 CLOUDS, POINTS, CENTRES, RADIUS, SAMPLES = 16, 4096, 512, 0.2, 64
 GUARD = 3.0
+DECISIONS = """One decision, cloud to next of 40 views:
+
+| points | clouds | p50, ms | p99, ms | ms a cloud | memory, MB |
+|---|---|---|---|---|---|"""
 HEADER = "| what | ours | peer | theirs | ratio | |\n|---|---|---|---|---|---|"
 
 
@@ -109,6 +114,26 @@ def installed(name: str) -> bool:
     return found
 
 
+def peer_device() -> str:
+    """Where PyTorch calculates: on the GPU where JAX does and PyTorch can."""
+    import torch
+
+    return "cuda" if jax.default_backend() == "gpu" and torch.cuda.is_available() else "cpu"
+
+
+def finished(call: Callable[[], Any]) -> Callable[[], Any]:
+    """A call of PyTorch's that returns when its device is done."""
+    import torch
+
+    def until_done() -> Any:
+        out = call()
+        if peer_device() == "cuda":
+            torch.cuda.synchronize()
+        return out
+
+    return until_done
+
+
 def partial_clouds() -> np.ndarray:
     """(clouds, points, 3) float32: what a camera above sees of wobbly balls, in the unit sphere."""
     random = np.random.default_rng(0)
@@ -168,17 +193,18 @@ def point_operations(clouds: np.ndarray, torch_peer: Any, rounds: int) -> list[R
     if torch_peer:
         import torch
 
-        them, theirs_at = torch.from_numpy(clouds), torch.from_numpy(centres)
-        found = torch_peer.farthest_point_sample(them, CENTRES).numpy()
+        device = peer_device()
+        them, theirs_at = (torch.from_numpy(array).to(device) for array in (clouds, centres))
+        found = torch_peer.farthest_point_sample(them, CENTRES).cpu().numpy()
         np.testing.assert_array_equal(found, chosen)
         rows += compare(
             "farthest points, 16 clouds",
             lambda: sample_all(clouds),
-            {"PyTorch": lambda: torch_peer.farthest_point_sample(them, CENTRES)},
+            {"PyTorch": finished(lambda: torch_peer.farthest_point_sample(them, CENTRES))},
             rounds,
         )
-        ask = lambda: torch_peer.ball_query(them, theirs_at, RADIUS, SAMPLES)  # noqa: E731
-        notes = {"PyTorch": f"{share_equal(ask().numpy(), neighbours):.3%} of indices equal"}
+        ask = finished(lambda: torch_peer.ball_query(them, theirs_at, RADIUS, SAMPLES))
+        notes = {"PyTorch": f"{share_equal(ask().cpu().numpy(), neighbours):.3%} of indices equal"}
         rows += compare(
             "ball query, 16 clouds", lambda: query_all(clouds, centres), {"PyTorch": ask}, max(3, rounds // 3), notes
         )
@@ -226,17 +252,18 @@ def networks(clouds: np.ndarray, torch_peer: Any, rounds: int, training: bool) -
     if torch_peer:
         import torch
 
-        theirs = torch_peer.pointnet2(40)
+        device = peer_device()
+        theirs = torch_peer.pointnet2(40).to(device)
         state = made_up_weights({name: tuple(value.shape) for name, value in theirs.state_dict().items()})
         pointnet2_from_torch(network, state)
         theirs.load_state_dict({name: torch.from_numpy(value) for name, value in state.items()})
-        tensor = torch.from_numpy(clouds)
+        tensor = torch.from_numpy(clouds).to(device)
 
         def forward_peer() -> Any:
             with torch.no_grad():
                 return theirs.eval()(tensor)
 
-        peers["PyTorch"] = forward_peer
+        peers["PyTorch"] = finished(forward_peer)
     structure, parameters, statistics = nnx.split(network, nnx.Param, ...)
     rows: list[Row] = []
     if torch_peer and training:
@@ -256,7 +283,7 @@ def networks(clouds: np.ndarray, torch_peer: Any, rounds: int, training: bool) -
 
         moments = adam.init(parameters)
         their_adam = torch.optim.Adam(theirs.parameters(), 1e-5)
-        their_targets = torch.from_numpy(targets)
+        their_targets = torch.from_numpy(targets).to(device)
 
         def train_peer() -> Any:
             their_adam.zero_grad()
@@ -270,7 +297,7 @@ def networks(clouds: np.ndarray, torch_peer: Any, rounds: int, training: bool) -
         rows += compare(
             "PointNet++ training step, 16 clouds",
             lambda: step(parameters, statistics, moments),
-            {"PyTorch": train_peer},
+            {"PyTorch": finished(train_peer)},
             max(3, rounds // 4),
             {"PyTorch": f"first loss equal to {apart:.0e}"},
             turns=False,
@@ -279,7 +306,7 @@ def networks(clouds: np.ndarray, torch_peer: Any, rounds: int, training: bool) -
     notes = {"its matrix products alone": "a floor, not a peer"}
     if torch_peer:
         theirs.load_state_dict({name: torch.from_numpy(value) for name, value in state.items()})  # as before training
-        largest = float(np.abs(np.asarray(forward(clouds)) - peers["PyTorch"]().numpy()).max())
+        largest = float(np.abs(np.asarray(forward(clouds)) - peers["PyTorch"]().cpu().numpy()).max())
         notes["PyTorch"] = f"outputs equal to {largest:.0e}"
         assert largest < 1e-3
     peers["its matrix products alone"] = matrix_products(network)
@@ -288,20 +315,44 @@ def networks(clouds: np.ndarray, torch_peer: Any, rounds: int, training: bool) -
     return rows
 
 
-def decision(clouds: np.ndarray, calls: int = 200) -> dict[str, float]:
-    """Milliseconds from a cloud of 4,096 points to the next of 40 views, as a robot asks: one at a time."""
-    structure, state = nnx.split(PointNet2(views=40, rngs=nnx.Rngs(0)))
+def decisions(clouds: np.ndarray, calls: int = 200) -> list[dict[str, float]]:
+    """From clouds to the next of 40 views: by size of cloud one at a time, as a robot asks, and 256 clouds of 4,096 points."""
     graph = ViewGraph.from_points(fibonacci_sphere(40))
-
-    @jax.jit
-    def next_view(state, cloud):
-        entropy = nnx.merge(structure, state)(cloud)
-        return jnp.argmax(jnp.where(local_maxima(entropy, graph.neighbours), entropy, entropy - 1e3))
-
-    taken = take_turns([lambda: next_view(state, clouds[0])], calls)[0]
-    found = {"p50": float(np.median(taken)), "p99": float(np.quantile(taken, 0.99))}
-    print(f"one decision, 4,096 points, 40 views: p50 {found['p50']:.1f} ms, p99 {found['p99']:.1f} ms")
+    network = PointNet2(views=40, rngs=nnx.Rngs(0))
+    choose = NextView(network, graph)
+    structure, state = nnx.split(network)
+    found = []
+    for size, batch in [(size, 1) for size in choose.sizes] + [(POINTS, 256)]:
+        some = [cloud[: size - 7] for cloud in np.resize(clouds, (batch, *clouds.shape[1:]))]  # filled up by as many
+        taken = take_turns([lambda some=some: choose.of_many(some)], calls if batch == 1 else 5)[0]
+        arguments = (state, jnp.zeros((batch, size, 3)))
+        plan = jax.jit(lambda state, clouds: nnx.merge(structure, state)(clouds)).lower(*arguments).compile()
+        memory = plan.memory_analysis()
+        found.append(
+            {
+                "points": size,
+                "batch": batch,
+                "p50_ms": float(np.median(taken)),
+                "p99_ms": float(np.quantile(taken, 0.99)),
+                "memory_mb": (memory.argument_size_in_bytes + memory.temp_size_in_bytes) / 1e6,
+            }
+        )
+        print(decision_line(found[-1]), flush=True)
     return found
+
+
+def maxima(maps: int = 1000) -> dict[str, float]:
+    """Microseconds for the local maxima of one object's map of 40 views, alone and as one of a thousand."""
+    found = time_local_maxima(40, objects=maps)
+    print(f"local maxima of 40 views: {1000 * found['alone']:.1f} µs alone, {1000 * found['batched']:.2f} µs of {maps}")
+    return {name: 1000 * value for name, value in found.items()}
+
+
+def decision_line(row: dict[str, float]) -> str:
+    return (
+        f"| {row['points']:,.0f} | {row['batch']:.0f} | {row['p50_ms']:.3g} | {row['p99_ms']:.3g} "
+        f"| {row['p50_ms'] / row['batch']:.3g} | {row['memory_mb']:.0f} |"
+    )
 
 
 def line_of(row: Row) -> str:
@@ -336,10 +387,14 @@ def main() -> None:
         for sentence in slower:
             print(f"slower than before: {sentence}", file=sys.stderr)
         sys.exit(bool(slower))
-    found = decision(clouds)
-    write_json(RESULTS, {"machine": machine, "rows": [asdict(row) for row in rows], "decision_ms": found})
-    table = "\n".join([HEADER, *map(line_of, rows)])
-    write_text(RESULTS.with_suffix(".md"), f"{machine}. Milliseconds: median (quartiles).\n\n{table}\n")
+    found, of_maps = decisions(clouds), maxima()
+    write_json(
+        RESULTS,
+        {"machine": machine, "rows": [asdict(row) for row in rows], "decisions": found, "local_maxima_us": of_maps},
+    )
+    table = "\n".join([HEADER, *map(line_of, rows), "", DECISIONS, *map(decision_line, found)])
+    last = f"Local maxima of a map of 40 views: {of_maps['alone']:.0f} µs alone, {of_maps['batched']:.2f} µs as one of 1,000."
+    write_text(RESULTS.with_suffix(".md"), f"{machine}. Milliseconds: median (quartiles).\n\n{table}\n\n{last}\n")
 
 
 if __name__ == "__main__":

@@ -15,10 +15,10 @@ from tests.reference import torch_networks
 def farthest_point_sample(points: torch.Tensor, k: int) -> torch.Tensor:
     """(batch, points, 3) to (batch, k) indices; the first is 0."""
     batch, count, _ = points.shape
-    rows = torch.arange(batch)
-    chosen = torch.zeros(batch, k, dtype=torch.long)
-    nearest = torch.full((batch, count), 1e10)
-    last = torch.zeros(batch, dtype=torch.long)
+    rows = torch.arange(batch, device=points.device)
+    chosen = torch.zeros(batch, k, dtype=torch.long, device=points.device)
+    nearest = torch.full((batch, count), 1e10, device=points.device)
+    last = torch.zeros(batch, dtype=torch.long, device=points.device)
     for i in range(k):
         chosen[:, i] = last
         distance = torch.sum((points - points[rows, last][:, None]) ** 2, -1)
@@ -32,7 +32,7 @@ def ball_query(points: torch.Tensor, centres: torch.Tensor, radius: float, k: in
     batch, count, _ = points.shape
     squared = -2 * centres @ points.transpose(1, 2)
     squared += torch.sum(centres**2, -1)[:, :, None] + torch.sum(points**2, -1)[:, None]
-    index = torch.arange(count).expand(batch, centres.shape[1], count).clone()
+    index = torch.arange(count, device=points.device).expand(batch, centres.shape[1], count).clone()
     index[squared >= radius**2] = count
     index = index.sort(dim=-1)[0][:, :, :k]
     first = index[:, :, :1].expand_as(index)
@@ -41,7 +41,7 @@ def ball_query(points: torch.Tensor, centres: torch.Tensor, radius: float, k: in
 
 def gather(values: torch.Tensor, index: torch.Tensor) -> torch.Tensor:
     """(batch, points, channels) at (batch, …) indices."""
-    rows = torch.arange(len(values)).view(-1, *[1] * (index.ndim - 1))
+    rows = torch.arange(len(values), device=values.device).view(-1, *[1] * (index.ndim - 1))
     return values[rows, index]
 
 

@@ -6,6 +6,8 @@ layout is channels-last. `width` scales all stages, for data sets and machines s
 
 from __future__ import annotations
 
+from functools import partial
+
 import jax
 import jax.numpy as jnp
 from flax import nnx
@@ -30,8 +32,12 @@ class Convolution(nnx.Module):
         self.kernel = nnx.Param(initial(rngs.params(), (size, size, inputs, outputs)))
         self.size, self.stride = size, stride
 
-    def __call__(self, x: Float[Array, "batch height width inputs"]) -> Float[Array, "batch rows columns outputs"]:
-        kernel, size, stride, pad = self.kernel[...].astype(x.dtype), self.size, self.stride, self.size // 2
+    def __call__(
+        self, x: Float[Array, "batch height width inputs"], factor: Float[Array, "outputs"] | None = None
+    ) -> Float[Array, "batch rows columns outputs"]:
+        """Each output channel is multiplied by its `factor`, where that is given, by way of the weights."""
+        kernel, size, stride, pad = self.kernel[...], self.size, self.stride, self.size // 2
+        kernel = (kernel if factor is None else kernel * factor).astype(x.dtype)
         rows, columns = (-(-extent // stride) for extent in x.shape[1:3])
         if jax.default_backend() == "cpu" and rows * columns <= 64:
             x = jnp.pad(x, ((0, 0), (pad, pad), (pad, pad), (0, 0)))
@@ -45,6 +51,14 @@ class Convolution(nnx.Module):
         return jax.lax.conv_general_dilated(
             x, kernel, (stride, stride), [(pad, pad)] * 2, dimension_numbers=("NHWC", "HWIO", "NHWC")
         )
+
+
+def _normalised(convolution: Convolution, norm: BatchNorm, x: Array, *, train: bool, momentum: float | Array) -> Array:
+    """A convolution and its batch norm, which in inference is a factor of the weights and a bias."""
+    if train:
+        return norm(convolution(x), train=True, momentum=momentum)
+    factor, bias = norm.folded()
+    return convolution(x, factor) + bias.astype(x.dtype)
 
 
 class BasicBlock(nnx.Module):
@@ -61,10 +75,11 @@ class BasicBlock(nnx.Module):
             self.shortcut_norm = BatchNorm(outputs)
 
     def __call__(self, x: Array, *, train: bool, momentum: float | Array) -> Array:
-        out = jax.nn.relu(self.norm1(self.convolution1(x), train=train, momentum=momentum))
-        out = self.norm2(self.convolution2(out), train=train, momentum=momentum)
+        normalised = partial(_normalised, train=train, momentum=momentum)
+        out = jax.nn.relu(normalised(self.convolution1, self.norm1, x))
+        out = normalised(self.convolution2, self.norm2, out)
         if self.projects:
-            x = self.shortcut_norm(self.shortcut(x), train=train, momentum=momentum)
+            x = normalised(self.shortcut, self.shortcut_norm, x)
         return jax.nn.relu(out + x)
 
 
@@ -130,7 +145,7 @@ class ResNet(nnx.Module):
         if self.standardise:
             x = (x - jnp.array(_IMAGENET_MEAN)) / jnp.array(_IMAGENET_STD)
         exact, x = x.dtype, x.astype(self.dtype or x.dtype)
-        x = jax.nn.relu(self.norm(self.convolution(x), train=train, momentum=momentum))
+        x = jax.nn.relu(_normalised(self.convolution, self.norm, x, train=train, momentum=momentum))
         x = nnx.max_pool(x, (3, 3), strides=(2, 2), padding=((1, 1), (1, 1)))
         for block in self.blocks:
             x = block(x, train=train, momentum=momentum)

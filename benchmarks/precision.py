@@ -1,0 +1,134 @@
+"""What folding batch norm and calculating in bfloat16 cost in accuracy: `python benchmarks/precision.py RUN`.
+
+RUN is a directory that `mevs run` made. Every view of every test object, by the same weights in three ways: float32 with batch
+norm as layers of its own, float32 with batch norm folded into weights (what inference does), and bfloat16, folded too. With
+differences from the first, their 95 % intervals paired by object, and how often the first decision stays the same: which view
+the thesis's rule chooses after one cloud.
+
+The table goes to `benchmarks/results/precision.md`.
+"""
+
+from __future__ import annotations
+
+import platform
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from flax import nnx
+
+from data_pipeline.builder import load_statistics
+from data_pipeline.files import write_text
+from eval.pipeline import PRESETS, tasks
+from eval.view_tables import network_outputs, objects_of
+from mevs_jax import ViewGraph, bootstrap_interval, maxima_first
+from mevs_jax.models.batch_norm import BatchNorm
+from train.loop import load_best
+
+RESULTS = Path(__file__).parent / "results" / "precision.md"
+
+
+class Unfolded(nnx.Module):
+    """A network whose batch norms are layers of their own: as in training, but by the running statistics."""
+
+    def __init__(self, network: nnx.Module):
+        self.network = network
+
+    def __call__(self, inputs: jax.Array) -> jax.Array:
+        by_batch = BatchNorm.__call__
+
+        def by_running_statistics(
+            norm: BatchNorm, x: jax.Array, *, train: bool = False, momentum: object = None
+        ) -> jax.Array:
+            del train, momentum
+            return by_batch(norm, x)
+
+        BatchNorm.__call__ = by_running_statistics  # type: ignore[assignment, method-assign]
+        try:
+            if hasattr(self.network, "views"):
+                return self.network(inputs, train=True, key=jax.random.key(0), dropout=0.0)
+            return self.network(inputs, train=True)
+        finally:
+            BatchNorm.__call__ = by_batch  # type: ignore[method-assign]
+
+
+def interval(by_object: np.ndarray) -> str:
+    low, high = np.asarray(bootstrap_interval(jax.random.key(0), jnp.asarray(by_object)))
+    return f"{by_object.mean():+.3f} [{low:+.3f}, {high:+.3f}]"
+
+
+def main() -> None:
+    if len(sys.argv) != 2 or not (Path(sys.argv[1]) / "metrics.json").exists():
+        print("usage: python benchmarks/precision.py RUN, where RUN was made by `mevs run`", file=sys.stderr)
+        sys.exit(2)
+    run = Path(sys.argv[1])
+    statistics = load_statistics(run / "data")
+    classify, predict = tasks(PRESETS["small"], statistics)
+    graph = ViewGraph.from_points(np.array(statistics.viewpoints))
+    _, labels, entropy = objects_of(run / "data", "test", statistics)
+    variance = np.square(entropy - entropy.mean()).mean()
+
+    @jax.jit
+    def first_choices(utility: jax.Array) -> jax.Array:
+        def choice(start: jax.Array, weights: jax.Array) -> jax.Array:
+            allowed = jnp.arange(statistics.views) != start
+            return jnp.argmax(jnp.where(allowed, maxima_first(weights, allowed, graph.neighbours), -jnp.inf))
+
+        return jax.vmap(jax.vmap(choice), in_axes=(None, 0))(jnp.arange(statistics.views), utility)
+
+    found = {}
+    for name, dtype, wrap in (
+        ("float32, batch norm by itself", "float32", Unfolded),
+        ("float32, folded", "float32", lambda network: network),
+        ("bfloat16, folded", "bfloat16", lambda network: network),
+    ):
+        outputs = []
+        for task, folder in ((classify, "classifier"), (predict, "entropy")):
+            saved = replace(task, optimiser=replace(task.optimiser, compute=dtype))
+            network = load_best(saved, run / folder)
+            outputs.append(network_outputs(run / "data", "test", saved, wrap(network)))
+        logits, utility = outputs
+        error = np.square(utility - entropy[:, None]).mean(axis=(1, 2))
+        found[name] = {
+            "right": (logits.argmax(-1) == labels[:, None]).mean(axis=1),
+            "error": error,
+            "logits": logits,
+            "utility": utility,
+            "chosen": np.asarray(first_choices(jnp.asarray(utility))),
+        }
+        print(name, f"{100 * found[name]['right'].mean():.2f} %, R² {1 - error.mean() / variance:.4f}", flush=True)
+    first = next(iter(found.values()))
+    columns = (
+        "calculated in",
+        "accuracy of single views, %",
+        "difference, points",
+        "R² of entropies",
+        "difference of squared errors, % of variance",
+        "logits differ by at most",
+        "entropies",
+        "first choice the same",
+    )
+    lines = [
+        f"{len(labels)} test objects × {statistics.views} views; {platform.machine()}, {jax.default_backend()}.",
+        "",
+        "| " + " | ".join(columns) + " |",
+        "|---" * len(columns) + "|",
+    ]
+    for name, by in found.items():
+        lines.append(
+            f"| {name} | {100 * by['right'].mean():.2f} | {interval(100 * (by['right'] - first['right']))} "
+            f"| {1 - by['error'].mean() / variance:.4f} | {interval(100 * (by['error'] - first['error']) / variance)} "
+            f"| {np.abs(by['logits'] - first['logits']).max():.1e} | {np.abs(by['utility'] - first['utility']).max():.1e} "
+            f"| {100 * (by['chosen'] == first['chosen']).mean():.2f} % |"
+        )
+    write_text(RESULTS, "\n".join(lines) + "\n")
+    print("\n".join(lines))
+
+
+if __name__ == "__main__":
+    main()
