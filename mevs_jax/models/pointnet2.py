@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import partial, reduce
+from functools import partial
 from itertools import pairwise
 from typing import Any
 
@@ -20,6 +20,7 @@ from jaxtyping import Array, Float, Int
 
 from mevs_jax.arrays import AnyArray
 from mevs_jax.models.batch_norm import BatchNorm
+from mevs_jax.models.product import product
 from mevs_jax.point_ops import ball_query, farthest_point_sample
 
 
@@ -52,15 +53,25 @@ class Perceptron(nnx.Module):
         )
         self.norm = nnx.List(BatchNorm(size) for size in layers)
 
-    def __call__(self, x: Array, *, momentum: float | Array, passed: int = 0) -> Array:
-        """In training; the first `passed` linear layers were passed before."""
+    def __call__(self, x: Array, *, momentum: float | Array) -> Array:
+        """In training."""
+        for linear, norm in zip(self.linear, self.norm, strict=True):
+            x = jax.nn.relu(norm(linear(x), train=True, momentum=momentum))
+        return x
+
+    def largest(
+        self, x: Float[Array, "*batch rows columns"], *, momentum: float | Array, passed: int = 0
+    ) -> Float[Array, "*batch outputs"]:
+        """In training, the maximum over rows of what becomes of them; the first `passed` linear layers were passed before."""
         # One long matrix instead of many small ones: the gradient of the weights is then a single product.
         batch = x.shape[:-1]
         x = x.reshape(-1, x.shape[-1])
+        last = len(self.linear) - 1
         for number, (linear, norm) in enumerate(zip(self.linear, self.norm, strict=True)):
-            x = x if number < passed else linear(x)
-            x = jax.nn.relu(norm(x, train=True, momentum=momentum))
-        return x.reshape(*batch, -1)
+            x = x if number < passed else product(x, linear.kernel[...]).astype(x.dtype)
+            if number < last:
+                x = jax.nn.relu(norm(x, train=True, momentum=momentum))
+        return self.norm[last].largest(x.reshape(*batch, -1), momentum=momentum)
 
     def folded(self) -> list[tuple[Array, Array]]:
         """Weights and bias of each layer, with batch norm by its running statistics among them."""
@@ -71,15 +82,10 @@ class Perceptron(nnx.Module):
         return layers
 
 
-def _product(x: Array, kernel: Array) -> Array:
-    """x @ kernel in the precision of `x`, summed in that of the weights at least."""
-    return jnp.matmul(x, kernel.astype(x.dtype), preferred_element_type=jnp.promote_types(x.dtype, kernel.dtype))
-
-
 def _infer(layers: list[tuple[Array, Array]], x: Array) -> Array:
     """Folded layers, each followed by ReLU."""
     for kernel, bias in layers:
-        x = jax.nn.relu(_product(x, kernel) + bias).astype(x.dtype)
+        x = jax.nn.relu(product(x, kernel) + bias).astype(x.dtype)
     return x
 
 
@@ -97,7 +103,7 @@ def _passed(
 ) -> Float[Array, "points columns"]:
     """What is gathered of every neighbour."""
     if _passes_first(kernel):
-        return _placed(points, kernel) + _product(features, kernel[3:])
+        return _placed(points, kernel) + product(features, kernel[3:])
     return jnp.concatenate([points, features.astype(points.dtype)], axis=-1)
 
 
@@ -115,32 +121,9 @@ def _first_layer(
     """The neighbours' offsets from their centres beside their features, times the first layer's weights."""
     if _passes_first(kernel):
         return passed[neighbours] - _placed(centres, kernel)[:, None]
-    # As products that fuse with what follows, not one thin matrix product, whose gradient wants another layout.
     columns = passed.shape[-1]
     gathered = passed[neighbours] - jnp.pad(centres, ((0, 0), (0, columns - 3)))[:, None]
-    return reduce(jnp.add, [gathered[..., column, None] * kernel[column] for column in range(columns)])
-
-
-@jax.custom_vjp
-def _largest(x: Float[Array, "*batch rows channels"]) -> Float[Array, "*batch channels"]:
-    """The maximum over rows. Equal ones share the gradient, as in JAX's own rule, which writes an array as large as `x` more."""
-    return _largest_forward(x)[0]
-
-
-def _largest_forward(x: Array) -> tuple[Array, tuple[Array, Array]]:
-    largest = jnp.max(x, axis=-2)
-    return largest, (x, largest)
-
-
-def _largest_backward(kept: tuple[Array, Array], towards: Array) -> tuple[Array]:
-    x, largest = kept
-    chosen = x == largest[..., None, :]
-    share = towards / jnp.sum(chosen, axis=-2, dtype=towards.dtype)
-    # The barrier keeps the compiler from counting anew for every row.
-    return (jnp.where(chosen, jax.lax.optimization_barrier(share)[..., None, :], jnp.zeros((), x.dtype)),)
-
-
-_largest.defvjp(_largest_forward, _largest_backward)
+    return product(gathered.reshape(-1, columns), kernel[:columns]).reshape(*gathered.shape[:-1], -1)
 
 
 def _map(function: Callable, clouds: Any, at_once: int = 1) -> Any:
@@ -255,10 +238,10 @@ class PointNet2(nnx.Module):
             kernel = perceptron.linear[0].kernel[...]
             passed = jax.vmap(_passed, in_axes=(0, 0, None))(coordinates, features, kernel)
             x = jax.vmap(_first_layer, in_axes=(0, 0, 0, None))(passed, centres, neighbours, kernel)
-            features = _largest(perceptron(x.astype(dtype), momentum=momentum, passed=1))
+            features = perceptron.largest(x.astype(dtype), momentum=momentum, passed=1)
             coordinates = centres
         everything = jnp.concatenate([coordinates.astype(dtype), features], axis=-1)
-        features = _largest(self.whole(everything, momentum=momentum))
+        features = self.whole.largest(everything, momentum=momentum)
         hidden = self.head(features, momentum=momentum).astype(points.dtype)
         # Flax's own layer takes no rate that is traced.
         kept = 1 - (self.dropout if dropout is None else dropout)
