@@ -10,7 +10,7 @@ from mevs_jax.calibration import (
     negative_log_likelihood,
     reliability,
 )
-from mevs_jax.cameras import Camera, cameras_at, look_at_origin, partial_cloud, pixel_directions, unproject
+from mevs_jax.cameras import Camera, cameras_at, look_at_origin, orbit, partial_cloud, pixel_directions, unproject
 from mevs_jax.decisions import Decision, NextView
 from mevs_jax.entropy import depth_entropy, depth_levels, level_entropy, quantise_depth, shannon_entropy
 from mevs_jax.fusion import beliefs_along, confidence, discounted, mean_of_probabilities, sum_of_logits
@@ -98,6 +98,7 @@ __all__ = [
     "mean_squared_error",
     "negative_log_likelihood",
     "nested_lattice",
+    "orbit",
     "partial_cloud",
     "pixel_directions",
     "platonic_solid",

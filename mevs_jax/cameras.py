@@ -50,6 +50,29 @@ def look_at_origin(position: Float[AnyArray, 3]) -> Float[Array, "4 4"]:
     return jnp.eye(4).at[:3, :3].set(rotation).at[:3, 3].set(position)
 
 
+def orbit(pose: Float[AnyArray, "4 4"], step: Float[AnyArray, 2]) -> Float[Array, "4 4"]:
+    """The pose after a step over the sphere, still looking at the origin from the same distance.
+
+    Args:
+        step: to the camera's right and downwards, on the unit sphere; tangents for small ones. A step of length s goes through
+            an angle of arctan(s).
+
+    The image turns no more than it must, so no direction is special, neither pole: steps before and after
+    are in frames that belong together (parallel transport), and gradients are finite everywhere.
+    """
+    pose, step = jnp.asarray(pose), jnp.asarray(step)
+    right, down, forward = pose[:3, 0], pose[:3, 1], pose[:3, 2]
+    distance = jnp.linalg.norm(pose[:3, 3])
+    moved = (
+        forward - step[0] * right - step[1] * down
+    )  # what is seen moves to the left where the camera moves to the right
+    forward = moved / jnp.linalg.norm(moved)
+    right = right - jnp.dot(right, forward) * forward
+    right = right / jnp.linalg.norm(right)
+    rotation = jnp.stack([right, jnp.cross(forward, right), forward], axis=1)
+    return pose.at[:3, :3].set(rotation).at[:3, 3].set(-distance * forward)
+
+
 def pixel_directions(camera: Camera) -> Float[Array, "resolution resolution 3"]:
     """World direction through each pixel centre, with length one *along the optical axis*: a hit at `t` has depth `t`."""
     offset = (jnp.arange(camera.resolution) + 0.5 - camera.resolution / 2) / camera.focal_length

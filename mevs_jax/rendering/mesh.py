@@ -1,0 +1,117 @@
+"""A mesh rendered softly: silhouette, depth and normals with gradients to the camera and to the corners of its faces.
+
+The soft rasteriser (Liu et al., *Soft Rasterizer*, 2019). Every face covers every pixel a little, by how far δ (in pixels) the
+pixel lies inside or outside of it: D = sigmoid(δ / σ). Coverages combine as independent chances, 1 − Π(1 − D), and what is seen
+is a mean of all faces, weighted by D · exp(nearness / γ). As σ and γ go to 0 that becomes what a ray sees.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import flax.struct
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from mevs_jax.arrays import AnyArray
+from mevs_jax.cameras import Camera
+
+_AT_ONCE = 64  # faces; memory is bounded by so many times the pixels
+_NEAREST = 1e-3
+
+
+@dataclass(frozen=True)
+class Softness:
+    """How far a soft rendering is from a hard one."""
+
+    edge: float = 0.5
+    """σ, in pixels: the width of a face's border"""
+    nearness: float = 0.005
+    """γ, in 1/units: how much nearer (in 1/depth) a face must be to hide another"""
+
+
+@flax.struct.dataclass
+class SoftRendering:
+    """What a camera sees of a mesh, softly.
+
+    Attributes:
+        silhouette: (resolution, resolution) in [0, 1], how much of a pixel is covered.
+        depth: (resolution, resolution) along the optical axis, of what covers it, or of the faces next to it.
+        normal: (resolution, resolution, 3) in the camera's frame, towards the camera; a mean of unit vectors.
+    """
+
+    silhouette: Float[Array, "*batch resolution resolution"]
+    depth: Float[Array, "*batch resolution resolution"]
+    normal: Float[Array, "*batch resolution resolution 3"]
+
+
+def render_mesh(
+    triangles: Float[AnyArray, "faces 3 3"], camera: Camera, softness: Softness = Softness()
+) -> SoftRendering:
+    """Silhouette, depth and normals of a mesh, with gradients to both arguments, forwards and in reverse.
+
+    Args:
+        triangles: `vertices[faces]`, corners in the world's frame, all before the camera. One without area is not seen, and has
+            no gradient.
+    """
+    triangles = jnp.asarray(triangles)
+    corners = (triangles - camera.pose[:3, 3]) @ camera.pose[:3, :3]
+    corners = jnp.pad(corners, ((0, -len(corners) % _AT_ONCE), (0, 0), (0, 0)))
+    side, focal = camera.resolution, camera.focal_length
+    pixel = jnp.arange(side, dtype=corners.dtype) + 0.5 - side / 2
+    rows, columns = jnp.meshgrid(pixel, pixel, indexing="ij")
+    at = jnp.stack([columns.reshape(-1), rows.reshape(-1)])
+
+    @jax.checkpoint
+    def some(carry: tuple[Array, ...], chunk: Float[Array, "faces 3 3"]) -> tuple[tuple[Array, ...], None]:
+        empty, largest, total, seen = carry
+        cover, nearness, normal = _faces(chunk, at, focal, softness.edge)
+        empty = empty - jnp.sum(jax.nn.softplus(cover), axis=0)  # log(1 − sigmoid(x)) = −softplus(x)
+        weight = jax.nn.log_sigmoid(cover) + nearness / softness.nearness
+        now = jax.lax.stop_gradient(jnp.maximum(largest, jnp.max(weight, axis=0)))
+        weight, before = jnp.exp(weight - now), jnp.exp(largest - now)
+        # Nothing in these is a matrix product whose precision an accelerator might lower.
+        depths = jnp.sum(weight / nearness, axis=0)
+        normals = [jnp.sum(weight * normal[:, axis, None], axis=0) for axis in range(3)]
+        total = before * total + jnp.sum(weight, axis=0)
+        return (empty, now, total, before * seen + jnp.stack([depths, *normals])), None
+
+    none = jnp.zeros_like(at[0])
+    start = (none, jnp.full_like(none, -1e30), none, jnp.zeros((4, len(none)), none.dtype))
+    (empty, _, total, seen), _ = jax.lax.scan(some, start, corners.reshape(-1, _AT_ONCE, 3, 3))
+    seen = (seen / total).reshape(4, side, side)
+    return SoftRendering(-jnp.expm1(empty).reshape(side, side), seen[0], jnp.moveaxis(seen[1:], 0, -1))
+
+
+def _faces(
+    corners: Float[Array, "faces 3 3"], at: Float[Array, "2 pixels"], focal: float, edge: float
+) -> tuple[Float[Array, "faces pixels"], Float[Array, "faces pixels"], Float[Array, "faces 3"]]:
+    """How far pixels lie inside of some faces, in units of the border's width; 1/depth there; and the faces' normals."""
+    depth = jnp.maximum(corners[..., 2], _NEAREST)
+    x, y = (focal * corners[..., axis] / depth for axis in range(2))  # (faces, 3), in pixels from the middle
+    before, after = (0, 1, 2), (1, 2, 0)
+    area = (x[:, 1] - x[:, 0]) * (y[:, 2] - y[:, 0]) - (x[:, 2] - x[:, 0]) * (y[:, 1] - y[:, 0])
+    flat = jnp.abs(area) < 1e-9
+    over_area = 1 / jnp.where(flat, 1.0, area)
+    shares, squares = [], []
+    for i, j in zip(before, after, strict=True):
+        along = x[:, j] - x[:, i], y[:, j] - y[:, i]
+        over_length = 1 / jnp.where(flat, 1.0, along[0] ** 2 + along[1] ** 2)
+        dx, dy = at[0] - x[:, i, None], at[1] - y[:, i, None]
+        part = jnp.clip((dx * along[0][:, None] + dy * along[1][:, None]) * over_length[:, None], 0, 1)
+        squares.append(jnp.square(dx - part * along[0][:, None]) + jnp.square(dy - part * along[1][:, None]))
+        # The share of the corner across from this edge.
+        shares.append((along[0][:, None] * dy - along[1][:, None] * dx) * over_area[:, None])
+    inside = (shares[0] >= 0) & (shares[1] >= 0) & (shares[2] >= 0)
+    distance = jnp.sqrt(jnp.minimum(jnp.minimum(squares[0], squares[1]), squares[2]) + 1e-12)
+    cover = jnp.where(inside, distance, -distance) / edge
+    clipped = [jnp.clip(share, 0, 1) for share in shares]
+    total = jnp.where(flat[:, None], 1.0, clipped[0] + clipped[1] + clipped[2])
+    across = (2, 0, 1)
+    nearness = sum(share / depth[:, corner, None] for share, corner in zip(clipped, across, strict=True)) / total
+    normal = jnp.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    length = jnp.sqrt(jnp.where(flat, 1.0, jnp.sum(jnp.square(normal), axis=-1)))
+    normal = normal / length[:, None] * -jnp.sign(jnp.sum(normal * corners[:, 0], axis=-1))[:, None]
+    hidden = (flat | (jnp.min(corners[..., 2], axis=-1) < _NEAREST))[:, None]
+    return jnp.where(hidden, -1e6, cover), jnp.where(hidden, 1.0, nearness), jnp.where(hidden, 0.0, normal)

@@ -1,0 +1,298 @@
+"""Rendering with gradients: images that become what rays see, slopes that are those of differences, climbs that arrive."""
+
+from __future__ import annotations
+
+from functools import cache, partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from data_pipeline.meshes import DataError, FurniturePiece, Mesh, ObjectEntry, load_object
+from data_pipeline.volumes import decimate, reconstruct, voxelise, voxelise_cloud
+from mevs_jax import Camera, depth_entropy, fibonacci_sphere, look_at_origin, orbit, partial_cloud
+from mevs_jax.rendering import (
+    Softness,
+    ascend,
+    corners_of_cells,
+    distinct_optima,
+    edge_content,
+    march,
+    opacity_entropy,
+    pad_triangles,
+    render_depth,
+    render_mesh,
+    render_volume,
+    silhouette_gaussian,
+    soft_depth_entropy,
+    visible_area,
+)
+
+NAMES = ("chair", "bathtub", "desk", "toilet", "sofa")
+POLES = np.array([[0.0, 0, 1], [0, 0, -1]])
+
+
+@cache
+def furniture(name: str, seed: int = 3) -> Mesh:
+    return load_object(ObjectEntry(name, 0, "train", FurniturePiece(name, seed)))
+
+
+@cache
+def triangles_of(name: str) -> np.ndarray:
+    mesh = furniture(name)
+    padded = np.zeros((1024, 3, 3), np.float32)  # one shape, so that each function is compiled once
+    padded[: len(mesh.faces)] = mesh.vertices[mesh.faces]
+    return padded
+
+
+def camera_at(direction: np.ndarray, side: int) -> Camera:
+    return Camera(look_at_origin(2 * jnp.asarray(direction)), np.pi / 3, side)
+
+
+# ---------------------------------------------------------------------------------------------------------------- cameras
+
+
+def test_a_step_goes_where_it_says_and_back_again():
+    for direction in np.concatenate([POLES, fibonacci_sphere(5)]):
+        pose = look_at_origin(2 * direction)
+        moved = orbit(pose, jnp.array([0.01, 0.0]))
+        np.testing.assert_allclose(moved[:3, 3] - pose[:3, 3], 0.02 * pose[:3, 0], atol=2e-4)
+        moved = orbit(pose, jnp.array([0.0, 0.01]))
+        np.testing.assert_allclose(moved[:3, 3] - pose[:3, 3], 0.02 * pose[:3, 1], atol=2e-4)
+        far = orbit(pose, jnp.array([0.3, -0.4]))
+        np.testing.assert_allclose(far[:3, :3].T @ far[:3, :3], jnp.eye(3), atol=1e-6)
+        np.testing.assert_allclose(far[:3, 3], -2 * far[:3, 2], atol=1e-6)
+        np.testing.assert_allclose(jnp.arccos(far[:3, 2] @ pose[:3, 2]), np.arctan(0.5), rtol=1e-4)
+
+
+# ------------------------------------------------------------------------------------------------------------------ images
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_hardly_soft_meshes_look_as_rays_see_them(name):
+    hard = jax.jit(lambda triangles, pose: render_depth(triangles, Camera(pose, resolution=48)))
+    soft = jax.jit(
+        lambda triangles, pose: render_mesh(triangles, Camera(pose, resolution=48), Softness(edge=1e-3, nearness=1e-4))
+    )
+    agree = []
+    for direction in np.concatenate([POLES[:1], fibonacci_sphere(5)]):
+        pose = camera_at(direction, 48).pose
+        seen, rays = soft(triangles_of(name), pose), hard(triangles_of(name), pose)
+        hit = np.isfinite(rays.depth)
+        inside = np.asarray(seen.silhouette) > 0.5
+        agree.append((inside == hit) & (~hit | (np.abs(np.where(hit, rays.depth, 0) - seen.depth) < 5e-3)))
+        mean_normal = np.linalg.norm(np.asarray(seen.normal)[hit & inside], axis=-1)
+        assert (mean_normal < 1 + 1e-5).all()
+        assert np.median(mean_normal) > 0.999
+    assert np.mean(agree) > 0.99
+
+
+def test_volumes_look_as_rays_see_their_mesh():
+    """A ball of voxels, absorbing hard: silhouette and depth of the ball, to about a voxel."""
+    at = (np.arange(48) + 0.5) / 24 - 1
+    density = (np.linalg.norm(np.stack(np.meshgrid(at, at, at)), axis=0) < 0.7).astype(np.float32)
+    seen = render_volume(density, camera_at(np.array([0.3, 0.4, 0.8660254]), 64), steps=256, absorption=1e4)
+    offset = (np.arange(64) + 0.5 - 32) / camera_at(POLES[0], 64).focal_length
+    squared = 1 + offset[:, None] ** 2 + offset**2
+    discriminant = 4 - squared * (4 - 0.7**2)
+    hit = discriminant > 0
+    assert ((np.asarray(seen.opacity) > 0.5) == hit).mean() > 0.97
+    inner = discriminant > 0.3
+    depth = (2 - np.sqrt(np.where(hit, discriminant, 0))) / squared
+    np.testing.assert_allclose(np.asarray(seen.depth)[inner], depth[inner], atol=0.05)
+
+
+def test_objectives_of_hard_images_are_their_hard_counterparts():
+    camera = camera_at(fibonacci_sphere(7)[3], 48)
+    rays = render_depth(triangles_of("chair"), camera)
+    hit = jnp.isfinite(rays.depth)
+    depth = jnp.where(hit, rays.depth, 1.0)
+    np.testing.assert_allclose(soft_depth_entropy(depth, hit.astype(float), 1e-5), depth_entropy(rays.depth), rtol=1e-3)
+    np.testing.assert_allclose(opacity_entropy(hit.astype(float)), np.log(hit.sum()) / np.log(48 * 48), rtol=1e-5)
+    assert opacity_entropy(jnp.zeros((4, 4))) == 0
+    # A square of side 1 seen frontally from a distance of 2.
+    square = np.array([[[-1, -1, 0], [1, -1, 0], [1, 1, 0]], [[-1, -1, 0], [1, 1, 0], [-1, 1, 0]]], np.float32) / 2
+    front = camera_at(POLES[0], 64)
+    seen = render_mesh(square, front, Softness(edge=1e-2, nearness=1e-3))
+    np.testing.assert_allclose(visible_area(seen.depth, seen.normal, seen.silhouette, front), 1, rtol=0.05)
+    middle = silhouette_gaussian(jnp.exp2(-4 * (jnp.square((jnp.arange(32) + 0.5) / 32 - 0.5)[:, None] * 0)))
+    assert middle < silhouette_gaussian(jnp.zeros((32, 32)))
+    flat = edge_content(jnp.full((9, 9), 2.0), jnp.ones((9, 9)))
+    assert flat == 0
+    assert edge_content(jnp.full((9, 9), 2.0).at[:, :4].set(1.0), jnp.ones((9, 9))) > 0.1
+
+
+# ---------------------------------------------------------------------------------------------------------------- gradients
+
+
+def of_mesh(objective: str, triangles, pose):
+    camera = Camera(pose, np.pi / 3, 24)
+    seen = render_mesh(triangles, camera)
+    return {
+        "opacity entropy": lambda: opacity_entropy(seen.silhouette),
+        "depth entropy": lambda: soft_depth_entropy(seen.depth, seen.silhouette),
+        "Gaussian": lambda: silhouette_gaussian(seen.silhouette),
+        "visible area": lambda: visible_area(seen.depth, seen.normal, seen.silhouette, camera),
+        "edges": lambda: edge_content(seen.depth, seen.silhouette),
+    }[objective]()
+
+
+def of_volume(objective: str, density, pose):
+    seen = render_volume(density, Camera(pose, np.pi / 3, 24), steps=48)
+    return {
+        "opacity entropy": lambda: opacity_entropy(seen.opacity),
+        "depth entropy": lambda: soft_depth_entropy(seen.depth, seen.opacity),
+        "Gaussian": lambda: silhouette_gaussian(seen.opacity),
+        "edges": lambda: edge_content(seen.depth, seen.opacity),
+    }[objective]()
+
+
+@cache
+def volume_of(name: str) -> np.ndarray:
+    try:
+        return voxelise(furniture(name), 16)
+    except DataError as error:
+        pytest.skip(str(error))
+
+
+CASES = [("mesh", kind) for kind in ("opacity entropy", "depth entropy", "Gaussian", "visible area", "edges")]
+CASES += [("volume", kind) for kind in ("opacity entropy", "depth entropy", "Gaussian", "edges")]
+
+
+@pytest.mark.parametrize(("renderer", "objective"), CASES)
+def test_camera_gradients_are_finite_and_those_of_differences(renderer, objective):
+    """In float64: 100 pairs of object and camera, both poles among them; a median, since faces and levels have corners."""
+    with jax.enable_x64(True):
+        value = partial(of_mesh if renderer == "mesh" else of_volume, objective)
+        thing = (lambda name: triangles_of(name)[:256]) if renderer == "mesh" else volume_of
+        along = lambda what, pose, step: value(what, orbit(pose, step))  # noqa: E731
+        gradient = jax.jit(jax.grad(along, argnums=2))
+        difference = jax.jit(
+            lambda what, pose: jnp.stack(
+                [(along(what, pose, h) - along(what, pose, -h)) / 2e-5 for h in 1e-5 * jnp.eye(2)]
+            )
+        )
+        errors = []
+        for name in NAMES:
+            what = np.asarray(thing(name), np.float64)
+            for direction in np.concatenate([POLES, fibonacci_sphere(18)]):
+                pose = look_at_origin(2 * jnp.asarray(direction, jnp.float64))
+                ours, theirs = gradient(what, pose, jnp.zeros(2)), difference(what, pose)
+                assert jnp.isfinite(ours).all()
+                errors.append(float(jnp.linalg.norm(ours - theirs) / (jnp.linalg.norm(theirs) + 1e-9)))
+        assert len(errors) == 100
+        assert np.median(errors) < 1e-2
+
+
+def test_gradients_in_reverse_equal_those_forwards_and_reach_corners_and_densities():
+    with jax.enable_x64(True):
+        direction = fibonacci_sphere(5)[1]
+        camera = Camera(look_at_origin(2 * jnp.asarray(direction, jnp.float64)), np.pi / 3, 16)
+        random = np.random.default_rng(0)
+        density = random.uniform(0, 1, (6, 6, 6))
+        weights = random.normal(size=(2, 16, 16))
+
+        def seen(density, pose, render):
+            out = render(density, Camera(pose, np.pi / 3, 16))
+            return jnp.sum(weights[0] * out.opacity + weights[1] * out.depth)
+
+        plain = lambda density, camera: march(corners_of_cells(density), camera, steps=20)  # noqa: E731
+        back = partial(render_volume, steps=20)
+        for argument in (0, 1):
+            ours = jax.grad(seen, argument)(density, camera.pose, back)
+            np.testing.assert_allclose(
+                ours, jax.jacfwd(seen, argument)(density, camera.pose, plain), rtol=1e-8, atol=1e-10
+            )
+        corners = np.asarray(triangles_of("desk")[:64], np.float64)
+        area = lambda corners: jnp.sum(render_mesh(corners, camera).silhouette)  # noqa: E731
+        slope, way = jax.grad(area)(corners), random.normal(size=corners.shape)
+        ahead, behind = (area(corners + sign * 1e-6 * way) for sign in (1, -1))
+        np.testing.assert_allclose(jnp.sum(slope * way), (ahead - behind) / 2e-6, rtol=1e-3)
+
+
+def test_reverse_through_a_volume_needs_no_memory_for_its_steps():
+    camera = camera_at(POLES[0], 32)
+    density = np.ones((16, 16, 16), np.float32)
+
+    def memory(steps: int) -> int:
+        value = lambda density: jnp.sum(render_volume(density, camera, steps=steps).depth)  # noqa: E731
+        return jax.jit(jax.grad(value)).lower(density).compile().memory_analysis().temp_size_in_bytes
+
+    assert memory(256) < 1.1 * memory(16)
+
+
+# ------------------------------------------------------------------------------------------------------------------- ascent
+
+
+def test_climbing_finds_the_best_view_of_a_smooth_hill_from_everywhere():
+    summit = jnp.array([0.0, 0.0, 1.0])  # a pole
+    height = lambda pose: 2 + jnp.dot(pose[:3, 3] / 2, summit)  # noqa: E731
+    starts = jax.vmap(look_at_origin)(2 * jnp.asarray(fibonacci_sphere(12), jnp.float32))
+    found = jax.jit(partial(ascend, height, steps=80))(starts)
+    np.testing.assert_allclose(found.values, 3, atol=0.01)
+    np.testing.assert_allclose(jnp.linalg.norm(found.path, axis=-1), 2, rtol=1e-5)
+    np.testing.assert_allclose(found.path[:, 0], starts[:, :3, 3], atol=1e-6)
+    assert (found.steps <= 80).all()
+    assert (np.asarray(found.path_values[:, 0]) < 3).all()
+    together = jax.jit(partial(ascend, height, steps=80, at_once=12))(starts)
+    np.testing.assert_allclose(together.values, found.values, atol=1e-4)
+    order, kept = distinct_optima(found.poses, found.values, 0.3)
+    assert kept.sum() == 1
+    assert kept[0]
+    assert found.values[order[0]] == found.values.max()
+
+
+def test_a_plate_is_found_from_its_side():
+    """The view that covers most of the image faces the plate; some starts see only its edge."""
+    plate = np.array([[[-1, -1, 0], [1, -1, 0], [1, 1, 0]], [[-1, -1, 0], [1, 1, 0], [-1, 1, 0]]], np.float32) * 0.6
+    value = lambda pose: opacity_entropy(render_mesh(pad_triangles(plate), Camera(pose, resolution=24)).silhouette)  # noqa: E731
+    starts = jax.vmap(look_at_origin)(2 * jnp.asarray(fibonacci_sphere(6), jnp.float32))
+    found = jax.jit(partial(ascend, value))(starts)
+    best = int(found.values.argmax())
+    assert abs(float(found.poses[best, 2, 2])) > 0.95
+    assert float(found.values.max()) >= float(jax.lax.map(value, starts).max())
+
+
+# ------------------------------------------------------------------------------------------- from meshes and from clouds
+
+
+def test_meshes_are_decimated_and_voxelised():
+    import trimesh
+
+    ball = trimesh.creation.icosphere(4)
+    mesh = Mesh((0.7 * ball.vertices).astype(np.float32), ball.faces.astype(np.int32), np.ones(3))
+    try:
+        fewer = decimate(mesh, 500)
+    except DataError as error:
+        pytest.skip(str(error))
+    assert 300 < len(fewer.faces) <= 500
+    np.testing.assert_allclose(np.linalg.norm(fewer.vertices, axis=1), 0.7, atol=0.02)
+    assert decimate(fewer, 500) is fewer
+    density = voxelise(mesh, 32)
+    at = (np.arange(32) + 0.5) / 16 - 1
+    radius = np.linalg.norm(np.stack(np.meshgrid(at, at, at, indexing="ij")), axis=0)
+    assert set(np.unique(density)) == {0, 1}
+    assert (np.abs(radius[density > 0] - 0.7) < 0.06).all()
+    assert (density[np.abs(radius - 0.7) < 0.01] == 1).mean() > 0.95
+    cloud = voxelise_cloud(np.array([[0.01, -0.99, 0.5], [9.0, 0, 0]]), 4)
+    assert cloud.sum() == 1
+    assert cloud[2, 0, 3] == 1
+
+
+def test_a_surface_is_reconstructed_through_what_was_seen():
+    camera = camera_at(fibonacci_sphere(7)[3], 64)
+    rays = render_depth(triangles_of("bathtub"), camera)
+    points, real = partial_cloud(jnp.where(jnp.isfinite(rays.depth), rays.depth, 0.0), camera)
+    cloud = np.asarray(points)[np.asarray(real)]
+    try:
+        mesh = reconstruct(cloud, np.asarray(camera.pose[:3, 3]) - cloud, 500)
+    except DataError as error:
+        pytest.skip(str(error))
+    assert 50 < len(mesh.faces) <= 500
+    again = render_depth(mesh.vertices[mesh.faces], camera)
+    both = np.isfinite(rays.depth) & np.isfinite(again.depth)
+    assert both.sum() > 0.8 * np.isfinite(rays.depth).sum()
+    assert np.median(np.abs(rays.depth - again.depth)[both]) < 0.05
+    with pytest.raises(DataError, match="at least 16 points"):
+        reconstruct(cloud[:5], cloud[:5], 500)
