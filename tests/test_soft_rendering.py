@@ -90,8 +90,8 @@ def test_hardly_soft_meshes_look_as_rays_see_them(name):
 
 def test_volumes_look_as_rays_see_their_mesh():
     """A ball of voxels, absorbing hard: silhouette and depth of the ball, to about a voxel."""
-    at = (np.arange(48) + 0.5) / 24 - 1
-    density = (np.linalg.norm(np.stack(np.meshgrid(at, at, at)), axis=0) < 0.7).astype(np.float32)
+    at = (np.arange(96) + 0.5) / 48 - 1
+    density = (np.linalg.norm(np.stack(np.meshgrid(at, at, at)), axis=0) < 0.69).astype(np.float32)
     seen = render_volume(density, camera_at(np.array([0.3, 0.4, 0.8660254]), 64), steps=256, absorption=1e4)
     offset = (np.arange(64) + 0.5 - 32) / camera_at(POLES[0], 64).focal_length
     squared = 1 + offset[:, None] ** 2 + offset**2
@@ -116,8 +116,13 @@ def test_objectives_of_hard_images_are_their_hard_counterparts():
     front = camera_at(POLES[0], 64)
     seen = render_mesh(square, front, Softness(edge=1e-2, nearness=1e-3))
     np.testing.assert_allclose(visible_area(seen.depth, seen.normal, seen.silhouette, front), 1, rtol=0.05)
-    middle = silhouette_gaussian(jnp.exp2(-4 * (jnp.square((jnp.arange(32) + 0.5) / 32 - 0.5)[:, None] * 0)))
-    assert middle < silhouette_gaussian(jnp.zeros((32, 32)))
+    at = (jnp.arange(32) + 0.5) / 32 - 0.5
+    radius = jnp.hypot(at[:, None], at)
+    gaussian = jnp.exp(-4 * np.log(2) * (radius / (70 / 256)) ** 2)
+    np.testing.assert_allclose(silhouette_gaussian(gaussian), 0, atol=1e-6)
+    np.testing.assert_allclose(
+        silhouette_gaussian(1 - gaussian), -np.square(1 - 2 * gaussian).mean() * 256**2, rtol=1e-5
+    )
     flat = edge_content(jnp.full((9, 9), 2.0), jnp.ones((9, 9)))
     assert flat == 0
     assert edge_content(jnp.full((9, 9), 2.0).at[:, :4].set(1.0), jnp.ones((9, 9))) > 0.1

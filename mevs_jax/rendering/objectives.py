@@ -5,6 +5,8 @@ Each takes soft images. Of hard ones, what rays or a threshold give, it is its o
 
 from __future__ import annotations
 
+import math
+
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
@@ -41,16 +43,15 @@ def soft_depth_entropy(
     """
     scaled = jnp.asarray(depth).reshape(-1) * (DEPTH_SCALE / _LEVELS)
     covered = jnp.asarray(silhouette).reshape(-1)
-
-    def mass(counts: Array, some: tuple[Array, Array]) -> tuple[Array, None]:
-        scaled, covered = some
-        edges = jnp.arange(_LEVELS + 1, dtype=scaled.dtype)
-        below = jax.nn.sigmoid((edges[:, None] - scaled) / softness)  # the part of each pixel that lies below each edge
-        return counts + jnp.sum(jnp.diff(below, axis=0) * covered, axis=1), None
-
-    rows = jnp.asarray(depth).shape[0]
-    start = jnp.zeros(_LEVELS, scaled.dtype).at[0].set(jnp.sum(1 - covered))
-    counts, _ = jax.lax.scan(jax.checkpoint(mass), start, (scaled.reshape(rows, -1), covered.reshape(rows, -1)))
+    level = jnp.floor(jax.lax.stop_gradient(scaled))
+    reach = 1 + math.ceil(10 * softness)  # beyond it a pixel has less than e⁻¹⁰ of itself
+    counts = jnp.zeros(_LEVELS, scaled.dtype).at[0].set(jnp.sum(1 - covered))
+    below = jax.nn.sigmoid((level - reach - scaled) / softness)
+    for offset in range(-reach, reach + 1):
+        above = jax.nn.sigmoid((level + offset + 1 - scaled) / softness)
+        index = jnp.clip(level + offset, 0, _LEVELS - 1).astype(jnp.int32)
+        counts = counts.at[index].add((above - below) * covered)
+        below = above
     return shannon_entropy(counts)
 
 
