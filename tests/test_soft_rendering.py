@@ -69,6 +69,18 @@ def test_a_step_goes_where_it_says_and_back_again():
 # ------------------------------------------------------------------------------------------------------------------ images
 
 
+def test_no_seams_show_between_faces():
+    """At the usual softness what lies behind does not shine through where faces meet."""
+    soft = jax.jit(lambda triangles, pose: render_mesh(triangles, Camera(pose, resolution=64)))
+    for name in NAMES:
+        camera = camera_at(fibonacci_sphere(5)[3], 64)
+        seen, rays = soft(triangles_of(name), camera.pose), render_depth(triangles_of(name), camera)
+        hit = np.isfinite(rays.depth)
+        off = np.abs(np.where(hit, rays.depth, 0) - seen.depth)[hit]
+        assert (off < 0.03).mean() > 0.85  # the rest is at edges, which are soft
+        assert (np.asarray(seen.silhouette)[hit] > 0.5).mean() > 0.99
+
+
 @pytest.mark.parametrize("name", NAMES)
 def test_hardly_soft_meshes_look_as_rays_see_them(name):
     hard = jax.jit(lambda triangles, pose: render_depth(triangles, Camera(pose, resolution=48)))

@@ -2,13 +2,14 @@
 
 The soft rasteriser (Liu et al., *Soft Rasterizer*, 2019). Every face covers every pixel a little, by how far δ (in pixels) the
 pixel lies inside or outside of it: D = sigmoid(δ / σ). Coverages combine as independent chances, 1 − Π(1 − D), and what is seen
-is a mean of all faces, weighted by exp((nearness + log D) / γ): a face that covers a pixel less counts as one further away. (The
-paper weights by D · exp(nearness / γ), by which near faces hide others many σ beyond their border.) As σ and γ go to 0 that
+is a mean of all faces, weighted by exp((nearness + min(0, log 2D)) / γ): beyond its border a face counts as one further away.
+(The paper weights by D · exp(nearness / γ), by which near faces hide others many σ beyond their border.) As σ and γ go to 0 that
 becomes what a ray sees.
 """
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import flax.struct
@@ -20,7 +21,7 @@ from mevs_jax.arrays import AnyArray
 from mevs_jax.cameras import Camera
 
 _NEAREST = 1e-3  # depth of the nearest corner that is seen
-_LEAST = -5.0  # log D
+_LEAST = -5.0  # log 2D
 
 
 @dataclass(frozen=True)
@@ -77,7 +78,8 @@ def render_mesh(
         cover, nearness, normal = _faces(chunk, at, focal, softness.edge)
         empty = empty - jnp.sum(jax.nn.softplus(cover), axis=0)  # log(1 − sigmoid(x)) = −softplus(x)
         # With less coverage a face is not seen whatever its nearness, and larger numbers would lose the difference of nearness.
-        weight = (jnp.maximum(jax.nn.log_sigmoid(cover), _LEAST) + nearness) / softness.nearness
+        hidden = jnp.clip(jax.nn.log_sigmoid(cover) + math.log(2), _LEAST, 0)
+        weight = (hidden + nearness) / softness.nearness
         now = jax.lax.stop_gradient(jnp.maximum(largest, jnp.max(weight, axis=0)))
         weight, before = jnp.exp(weight - now), jnp.exp(largest - now)
         # Nothing in these is a matrix product whose precision an accelerator might lower.
