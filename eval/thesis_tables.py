@@ -94,7 +94,7 @@ def rendering_times(results: dict[str, Any]) -> ThesisTable:
         "Time of the methods by differentiable rendering (s)",
         thesis["columns"],
         [Row(name, [None] * 4, values) for name, values in thesis["rows"].items()],
-        "The differentiable renderers are not built yet; the thesis's numbers keep their place.",
+        "Ours are not part of this study yet; the thesis's numbers keep their place.",
     )
 
 
@@ -287,7 +287,7 @@ def memory_table(results: dict[str, Any]) -> ThesisTable:
         ["planned by XLA", "device's peak"],
         rows,
         "Networks of the sizes of this run; weights, inputs and temporaries of one compiled decision. CPUs report no peak. The "
-        "thesis's are PyTorch's peak on a GPU. The differentiable renderers are not built yet.",
+        "thesis's are PyTorch's peak on a GPU. Our differentiable renderers are not part of this study yet.",
         digits=2,
     )
 
