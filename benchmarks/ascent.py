@@ -13,49 +13,22 @@ from __future__ import annotations
 
 import sys
 import time
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import trimesh
 
 from data_pipeline.files import read_json, write_json
-from data_pipeline.meshes import EmptyMesh, Mesh, load_object, open_source
-from data_pipeline.volumes import decimate, voxelise
-from mevs_jax import Camera, cameras_at, fibonacci_sphere
-from mevs_jax.rendering import ascend, corners_of_cells, march, opacity_entropy, render_mesh, soft_depth_entropy
+from data_pipeline.meshes import EmptyMesh, load_object, open_source
+from eval.ascent import METHODS, climb, look_everywhere
 
 RESULTS = Path(__file__).parent / "results"
-SIDE, FACES, STARTS = 64, 512, 40
-
-
-def triangles_of(mesh: Mesh) -> np.ndarray:
-    simpler = decimate(mesh, 500)
-    padded = np.zeros((FACES, 3, 3), np.float32)
-    padded[: len(simpler.faces)] = simpler.vertices[simpler.faces][:FACES]
-    return padded
-
-
-def depth_entropy_of(triangles: jax.Array) -> Callable[[jax.Array], jax.Array]:
-    def objective(pose: jax.Array) -> jax.Array:
-        seen = render_mesh(triangles, Camera(pose, resolution=SIDE))
-        return soft_depth_entropy(seen.depth, seen.silhouette)
-
-    return objective
-
-
-def opacity_entropy_of(cells: jax.Array) -> Callable[[jax.Array], jax.Array]:
-    return lambda pose: opacity_entropy(march(cells, Camera(pose, resolution=SIDE)).opacity)
-
-
-METHODS: dict[str, tuple[Callable[[Mesh], Any], Callable]] = {
-    "mesh": (triangles_of, depth_entropy_of),
-    "volume": (lambda mesh: corners_of_cells(voxelise(mesh)), opacity_entropy_of),
-}
+SIDE, STARTS = 64, 40
 
 
 def summary(rows: list[dict[str, Any]]) -> str:
@@ -82,15 +55,14 @@ def main() -> None:
     if len(sys.argv) not in (3, 4) or sys.argv[1] not in METHODS:
         print("usage: python benchmarks/ascent.py mesh|volume DATA [OBJECTS]", file=sys.stderr)
         sys.exit(2)
-    prepare, objective_of = METHODS[sys.argv[1]]
+    method = METHODS[sys.argv[1]]
     count = int(sys.argv[3]) if len(sys.argv) == 4 else 100
     source = open_source(sys.argv[2], train_per_class=1, test_per_class=count // 10)
     entries = [entry for entry in source.entries if entry.split == "test"]
     chosen = [entries[index] for index in np.linspace(0, len(entries) - 1, count).astype(int)]
-    starts = cameras_at(fibonacci_sphere(STARTS)).pose
-    dense = cameras_at(np.asarray(trimesh.creation.icosphere(4).vertices, np.float32)).pose
-    climb = jax.jit(lambda thing: ascend(objective_of(thing), starts))
-    look = jax.jit(lambda thing: jax.lax.map(objective_of(thing), dense))
+    dense = np.asarray(trimesh.creation.icosphere(4).vertices)
+    climb_on = jax.jit(lambda thing: climb(method, thing, STARTS, SIDE))
+    look = jax.jit(lambda thing: look_everywhere(method, thing, dense, SIDE))
 
     path = RESULTS / f"ascent_{sys.argv[1]}.json"
     rows: list[dict[str, Any]] = read_json(path)["rows"] if path.exists() else []
@@ -99,14 +71,14 @@ def main() -> None:
         if entry.name in done:
             continue
         try:
-            thing = prepare(load_object(entry))
+            thing = jnp.asarray(method.prepare(load_object(entry)))
         except EmptyMesh as reason:
             print(f"left out: {entry.name}: {reason}")
             continue
         if not rows:
-            jax.block_until_ready(climb(thing))  # compiles
+            jax.block_until_ready(climb_on(thing))  # compiles
         begun = time.perf_counter()
-        found = jax.block_until_ready(climb(thing))
+        found = jax.block_until_ready(climb_on(thing))
         seconds = time.perf_counter() - begun
         grid = np.asarray(look(thing))
         rows.append(

@@ -329,7 +329,7 @@ def _write_shards(
     )
 
 
-def _open(config: DataConfig) -> ObjectSource:
+def open_objects(config: DataConfig) -> ObjectSource:
     """The source of objects; official archives are downloaded, or taken from `config.archive`."""
     official = ARCHIVES.get(config.source)
     if official is None:
@@ -378,7 +378,7 @@ def prepare(config: DataConfig, folder: Path, beam: str | None = None) -> Datase
         shutil.rmtree(captures, ignore_errors=True)  # of a run that was stopped between the two
         return load_statistics(folder)
     options = None if beam is None else beam_options(beam)
-    source = _open(config)
+    source = open_objects(config)
     folder.mkdir(parents=True, exist_ok=True)
     write_json(made_with, identity)
     if options is None:

@@ -23,6 +23,7 @@ from data_pipeline.capture import CaptureConfig
 from data_pipeline.files import read_json, write_json
 from data_pipeline.meshes import DataError
 from data_pipeline.progress import console
+from eval.ascent import AscentConfig
 from eval.grid import FIRST_MV, GridConfig
 from eval.knowledge import learn
 from eval.live import Agreement, LiveConfig, Networks, compare_with_tables
@@ -55,6 +56,7 @@ class Settings:
     live: LiveConfig = LiveConfig()
     thesis: ThesisConfig = ThesisConfig()
     sweep: SweepConfig = SweepConfig()
+    ascent: AscentConfig = AscentConfig()
 
 
 THESIS = Settings()

@@ -23,6 +23,7 @@ COMMANDS = {
     "report": "write report/index.html",
     "compat": "train the classifier the published code's way too, evaluate and report again",
     "thesis": "every network, table and figure of the thesis, beside its own numbers",
+    "ascend": "climb to the best view of one object by a renderer's gradient; draw it",
     "live": "walk test objects with the networks in the loop; compare with the tables",
 }
 
@@ -115,6 +116,13 @@ def _run(command: str, arguments: list[str]) -> None:
             )
 
         console.print(f"Report: {reproduce(settings, preset, out, options.pretrained).absolute()}")
+        return
+    if command == "ascend":
+        from eval.ascent import ascend_on
+
+        sentence, path = ascend_on(settings.dataset, settings.ascent, out)
+        console.print(sentence)
+        console.print(f"Animation: {path.absolute()}")
         return
     start = starting_weights(options.pretrained, settings.classifier.network)
     if command in ("run", "data"):

@@ -313,3 +313,26 @@ def test_a_surface_is_reconstructed_through_what_was_seen():
     assert np.median(np.abs(rays.depth - again.depth)[both]) < 0.05
     with pytest.raises(DataError, match="at least 16 points"):
         reconstruct(cloud[:5], cloud[:5], 500)
+
+
+@pytest.mark.parametrize("method", ["volume", "mesh"])
+def test_the_command_climbs_and_draws(method, tmp_path):
+    from PIL import Image
+
+    from data_pipeline.builder import DataConfig
+    from eval.ascent import AscentConfig, ascend_on
+
+    data = DataConfig(source="furniture10")
+    config = AscentConfig(object="chair_test_0001", method=method, starts=2, resolution=16)
+    try:
+        sentence, path = ascend_on(data, config, tmp_path)
+    except DataError as error:
+        pytest.skip(str(error))
+    assert "chair_test_0001: best view from (" in sentence
+    with Image.open(path) as moving:
+        assert moving.format == "GIF"
+        assert moving.n_frames > 4
+    with pytest.raises(DataError, match="no object 'nobody'"):
+        ascend_on(data, AscentConfig(object="nobody"), tmp_path)
+    with pytest.raises(DataError, match="at least 1"):
+        ascend_on(data, AscentConfig(starts=0), tmp_path)
