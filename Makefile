@@ -10,7 +10,7 @@ demo: $(READY)  ## environment, data, networks, evaluation, report
 	$(BIN)/mevs run --preset small --out $(OUT)
 
 test: lint  ## format, lint, types and tests
-	$(BIN)/python -m pytest -n 2 --dist loadfile
+	$(BIN)/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder
 
 lint: $(READY)
 	$(BIN)/ruff format --check .

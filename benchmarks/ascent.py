@@ -66,7 +66,7 @@ def main() -> None:
 
     path = RESULTS / f"ascent_{sys.argv[1]}.json"
     rows: list[dict[str, Any]] = read_json(path)["rows"] if path.exists() else []
-    done = {row["object"] for row in rows}
+    done, left_out = {row["object"] for row in rows}, 0
     for entry in chosen:
         if entry.name in done:
             continue
@@ -74,6 +74,7 @@ def main() -> None:
             thing = jnp.asarray(method.prepare(load_object(entry)))
         except EmptyMesh as reason:
             print(f"left out: {entry.name}: {reason}")
+            left_out += 1
             continue
         if not rows:
             jax.block_until_ready(climb_on(thing))  # compiles
@@ -93,7 +94,7 @@ def main() -> None:
         )
         write_json(path, {"summary": summary(rows), "rows": rows})
         print(f"{len(rows)} {entry.name}: {found.values.max():.4f} of {grid.max():.4f}, {seconds:.1f} s", flush=True)
-    print(summary(rows))
+    print(f"{summary(rows)}; {left_out} objects left out")
 
 
 if __name__ == "__main__":

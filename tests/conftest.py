@@ -10,6 +10,17 @@ import pytest
 REAL = Path(__file__).resolve().parents[2] / "shared"
 
 
+# The files that take longest, one worker each: begun first, so that none is left for one worker at the end.
+LONG = ("test_cli", "test_sweep", "test_thesis", "test_training", "test_scaling", "test_processes", "test_evaluation")
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    def place(item: pytest.Item) -> int:
+        return LONG.index(item.path.stem) if item.path.stem in LONG else len(LONG)
+
+    items.sort(key=place)
+
+
 @pytest.fixture
 def random() -> np.random.Generator:
     return np.random.default_rng(0)

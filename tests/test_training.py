@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import signal
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
@@ -190,6 +191,15 @@ def test_a_loss_that_is_no_number_stops_the_run(data, tmp_path):
         fit(task, data, statistics, tmp_path)
 
 
+@pytest.fixture
+def interruptible() -> Iterator[None]:
+    """Jobs in the background may have been started with interrupts ignored."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, before)
+
+
+@pytest.mark.usefixtures("interruptible")
 def test_an_interrupt_waits_for_the_checkpoint(tmp_path, monkeypatch):
     """One that falls into Orbax would leave its threads waiting for each other, and the program with them."""
     state = {"weights": jnp.arange(4.0)}

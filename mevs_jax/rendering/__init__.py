@@ -1,6 +1,7 @@
 """Images of a mesh or a volume as array programs: for making data on an accelerator, and with gradients, for finding views."""
 
 from mevs_jax.rendering.depth import Rendering, pad_triangles, render_depth
+from mevs_jax.rendering.kato import render_silhouette
 from mevs_jax.rendering.mesh import Softness, SoftRendering, render_mesh
 from mevs_jax.rendering.objectives import (
     edge_content,
@@ -27,6 +28,7 @@ __all__ = [
     "pad_triangles",
     "render_depth",
     "render_mesh",
+    "render_silhouette",
     "render_volume",
     "silhouette_gaussian",
     "soft_depth_entropy",

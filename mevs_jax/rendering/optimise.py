@@ -59,17 +59,19 @@ def ascend(
     tolerance: float = 1e-3,
     patience: int = 6,
     at_once: int | None = None,
+    forwards: bool = True,
 ) -> Ascent:
     """Climbs from every start until it has not risen for a while.
 
     Args:
-        objective: of a camera's pose; differentiable forwards.
+        objective: of a camera's pose.
         starts: poses that look at the origin.
         rate: of Adam, in tangents on the unit sphere at first; it falls to a tenth over `steps` (cosine).
         steps: at most so many for each start.
         tolerance: a relative gain that counts as one.
         patience: steps without one after which a start ends. Ended ones wait for the others of their batch and cost
             nothing where they are the last.
+        forwards: how the gradient is calculated; in reverse for objectives that know no other, as `render_silhouette`.
         at_once: starts in one batch; all of them unless given, on a CPU one after the other.
     """
     rates = optax.cosine_decay_schedule(rate, steps, 0.1)
@@ -77,6 +79,8 @@ def ascend(
     here = jnp.zeros(2, starts.dtype)
 
     def value_and_slope(pose: Array) -> tuple[Array, Array]:
+        if not forwards:
+            return jax.value_and_grad(lambda step: objective(orbit(pose, step)))(here)
         along = lambda push: jax.jvp(lambda step: objective(orbit(pose, step)), (here,), (push,))  # noqa: E731
         return jax.vmap(along, out_axes=(None, 0))(jnp.eye(2, dtype=here.dtype))
 
