@@ -31,24 +31,30 @@ RESULTS = Path(__file__).parent / "results"
 SIDE, STARTS = 64, 40
 
 
+def row_of(name: str, values: np.ndarray, grid: np.ndarray, seconds: float) -> dict[str, Any]:
+    """What is kept of an object: the grid's ends, the highest climb, and the shares of starts that came near."""
+    best, worst = float(grid.max()), float(grid.min())
+    return {
+        "object": name,
+        "best": best,
+        "worst": worst,
+        "highest": float(values.max()),
+        "near_maximum": float((values >= best - 0.05 * abs(best)).mean()),
+        "near_range": float((values >= best - 0.05 * (best - worst)).mean()),
+        "seconds": round(seconds, 2),
+    }
+
+
 def summary(rows: list[dict[str, Any]]) -> str:
-    reached = {}
-    for name, slack in (
-        ("maximum", lambda row: 0.05 * abs(row["best"])),
-        ("range", lambda row: 0.05 * (row["best"] - row["worst"])),
-    ):
-        near = [np.array(row["values"]) >= row["best"] - slack(row) for row in rows]
-        reached[name] = (np.mean([of_object.any() for of_object in near]), np.mean(near))
+    parts = []
+    for name in ("maximum", "range"):
+        near = np.array([row[f"near_{name}"] for row in rows])
+        parts.append(
+            f"within 5 % of the {name}: {100 * (near > 0).mean():.1f} % of objects, {100 * near.mean():.1f} % of single starts"
+        )
     seconds = np.array([row["seconds"] for row in rows])
-    parts = [
-        f"within 5 % of the {name}: {100 * best:.1f} % of objects, {100 * single:.1f} % of single starts"
-        for name, (best, single) in reached.items()
-    ]
-    return (
-        f"{len(rows)} objects; "
-        + "; ".join(parts)
-        + f"; {np.median(seconds):.1f} s an object (median), {seconds.max():.1f} s at most"
-    )
+    parts.append(f"{np.median(seconds):.1f} s an object (median), {seconds.max():.1f} s at most")
+    return f"{len(rows)} objects; " + "; ".join(parts)
 
 
 def main() -> None:
@@ -81,19 +87,12 @@ def main() -> None:
         begun = time.perf_counter()
         found = jax.block_until_ready(climb_on(thing))
         seconds = time.perf_counter() - begun
-        grid = np.asarray(look(thing))
-        rows.append(
-            {
-                "object": entry.name,
-                "best": float(grid.max()),
-                "worst": float(grid.min()),
-                "values": np.asarray(found.values, float).round(5).tolist(),
-                "steps": float(found.steps.mean()),
-                "seconds": round(seconds, 2),
-            }
-        )
+        rows.append(row_of(entry.name, np.asarray(found.values), np.asarray(look(thing)), seconds))
         write_json(path, {"summary": summary(rows), "rows": rows})
-        print(f"{len(rows)} {entry.name}: {found.values.max():.4f} of {grid.max():.4f}, {seconds:.1f} s", flush=True)
+        print(
+            f"{len(rows)} {entry.name}: {rows[-1]['highest']:.4f} of {rows[-1]['best']:.4f}, {seconds:.1f} s",
+            flush=True,
+        )
     print(f"{summary(rows)}; {left_out} objects left out")
 
 
