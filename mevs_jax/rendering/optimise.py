@@ -69,8 +69,7 @@ def ascend(
         rate: of Adam, in tangents on the unit sphere at first; it falls to a tenth over `steps` (cosine).
         steps: at most so many for each start.
         tolerance: a relative gain that counts as one.
-        patience: steps without one after which a start ends. Ended ones wait for the others of their batch and cost
-            nothing where they are the last.
+        patience: steps without one after which a start ends; ended ones wait for the others of their batch.
         forwards: how the gradient is calculated; in reverse for objectives that know no other, as `render_silhouette`.
         at_once: starts in one batch; all of them unless given, on a CPU one after the other.
     """
@@ -92,7 +91,7 @@ def ascend(
             value, slope = value_and_slope(walk.pose)
             # A slope's size says nothing across objectives; Adam takes its direction, and a slope of nothing stays one.
             update, moments = optimiser.update(-slope, walk.moments)
-            gain = value > walk.best_value + tolerance * jnp.abs(walk.best_value)
+            gain = value - walk.best_value > tolerance * jnp.abs(value)
             better = value > walk.best_value
             pose = orbit(walk.pose, update)
             return _Walk(
