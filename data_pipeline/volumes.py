@@ -22,14 +22,18 @@ def _open3d() -> Any:
     return open3d
 
 
+def _surface(mesh: Mesh) -> Any:
+    utility = _open3d().utility
+    return _open3d().geometry.TriangleMesh(
+        utility.Vector3dVector(mesh.vertices.astype(np.float64)), utility.Vector3iVector(mesh.faces)
+    )
+
+
 def decimate(mesh: Mesh, faces: int) -> Mesh:
     """The mesh with at most about `faces` triangles, as it is where it has no more."""
     if len(mesh.faces) <= faces:
         return mesh
-    open3d = _open3d()
-    surface = open3d.geometry.TriangleMesh(
-        open3d.utility.Vector3dVector(mesh.vertices.astype(np.float64)), open3d.utility.Vector3iVector(mesh.faces)
-    )
+    surface = _surface(mesh)
     surface.merge_close_vertices(1e-6)  # else every face of a CAD model is an island that cannot be simplified
     simpler = surface.simplify_quadric_decimation(faces)
     return Mesh(np.asarray(simpler.vertices, np.float32), np.asarray(simpler.triangles, np.int32), mesh.extent)
@@ -65,11 +69,8 @@ def reconstruct(points: np.ndarray, normals: np.ndarray, faces: int, *, depth: i
 
 def voxelise(mesh: Mesh, nodes: int = 32) -> np.ndarray:
     """Density (nodes, nodes, nodes) float32, 1 in every voxel of the cube [−1, 1]³ that the surface passes through."""
-    open3d = _open3d()
-    surface = open3d.geometry.TriangleMesh(
-        open3d.utility.Vector3dVector(mesh.vertices.astype(np.float64)), open3d.utility.Vector3iVector(mesh.faces)
-    )
-    grid = open3d.geometry.VoxelGrid.create_from_triangle_mesh_within_bounds(
+    surface = _surface(mesh)
+    grid = _open3d().geometry.VoxelGrid.create_from_triangle_mesh_within_bounds(
         surface, 2 / nodes, -np.ones(3), np.ones(3)
     )
     return _density([voxel.grid_index for voxel in grid.get_voxels()], nodes)

@@ -21,6 +21,14 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     items.sort(key=place)
 
 
+def open3d_or_skip() -> None:
+    """For what needs Open3D and its system libraries."""
+    try:
+        import open3d  # noqa: F401
+    except (ImportError, OSError) as error:
+        pytest.skip(f"Open3D cannot be loaded here: {error}")
+
+
 @pytest.fixture
 def random() -> np.random.Generator:
     return np.random.default_rng(0)

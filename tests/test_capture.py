@@ -27,6 +27,7 @@ from data_pipeline.capture import (
 from data_pipeline.captures import capture_all, capture_path
 from data_pipeline.meshes import DamagedMesh, FurniturePiece, MeshFile, ObjectEntry, VoxelGrid, load_object, normalise
 from mevs_jax import Camera, partial_cloud
+from tests.conftest import open3d_or_skip
 
 CONFIG = CaptureConfig(views=6, resolution=48)
 
@@ -38,13 +39,6 @@ def entry(name: str, recipe) -> ObjectEntry:
 @pytest.fixture(scope="module")
 def rig() -> Rig:
     return rig_for(CONFIG)
-
-
-def open3d_or_skip():
-    try:
-        import open3d  # noqa: F401
-    except (ImportError, OSError) as error:
-        pytest.skip(f"Open3D cannot be loaded here: {error}")
 
 
 @pytest.mark.parametrize("name", ["chair", "bathtub", "desk", "toilet"])

@@ -29,6 +29,7 @@ from mevs_jax.rendering import (
     soft_depth_entropy,
     visible_area,
 )
+from tests.conftest import open3d_or_skip
 
 NAMES = ("chair", "bathtub", "desk", "toilet", "sofa")
 POLES = np.array([[0.0, 0, 1], [0, 0, -1]])
@@ -168,10 +169,8 @@ def of_volume(objective: str, density, pose):
 
 @cache
 def volume_of(name: str) -> np.ndarray:
-    try:
-        return voxelise(furniture(name), 16)
-    except DataError as error:
-        pytest.skip(str(error))
+    open3d_or_skip()
+    return voxelise(furniture(name), 16)
 
 
 CASES = [("mesh", kind) for kind in ("opacity entropy", "depth entropy", "Gaussian", "visible area", "edges")]
@@ -327,10 +326,8 @@ def test_meshes_are_decimated_and_voxelised():
 
     ball = trimesh.creation.icosphere(4)
     mesh = Mesh((0.7 * ball.vertices).astype(np.float32), ball.faces.astype(np.int32), np.ones(3))
-    try:
-        fewer = decimate(mesh, 500)
-    except DataError as error:
-        pytest.skip(str(error))
+    open3d_or_skip()
+    fewer = decimate(mesh, 500)
     assert 300 < len(fewer.faces) <= 500
     np.testing.assert_allclose(np.linalg.norm(fewer.vertices, axis=1), 0.7, atol=0.02)
     assert decimate(fewer, 500) is fewer
@@ -350,10 +347,8 @@ def test_a_surface_is_reconstructed_through_what_was_seen():
     rays = render_depth(triangles_of("bathtub"), camera)
     points, real = partial_cloud(jnp.where(jnp.isfinite(rays.depth), rays.depth, 0.0), camera)
     cloud = np.asarray(points)[np.asarray(real)]
-    try:
-        mesh = reconstruct(cloud, np.asarray(camera.pose[:3, 3]) - cloud, 500)
-    except DataError as error:
-        pytest.skip(str(error))
+    open3d_or_skip()
+    mesh = reconstruct(cloud, np.asarray(camera.pose[:3, 3]) - cloud, 500)
     assert 50 < len(mesh.faces) <= 500
     again = render_depth(mesh.vertices[mesh.faces], camera)
     both = np.isfinite(rays.depth) & np.isfinite(again.depth)
@@ -372,10 +367,8 @@ def test_the_command_climbs_and_draws(method, tmp_path):
 
     data = DataConfig(source="furniture10")
     config = AscentConfig(object="chair_test_0001", method=method, starts=2, resolution=16)
-    try:
-        sentence, path = ascend_on(data, config, tmp_path)
-    except DataError as error:
-        pytest.skip(str(error))
+    open3d_or_skip()
+    sentence, path = ascend_on(data, config, tmp_path)
     assert "chair_test_0001: best view from (" in sentence
     with Image.open(path) as moving:
         assert moving.format == "GIF"
