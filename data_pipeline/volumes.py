@@ -39,6 +39,15 @@ def decimate(mesh: Mesh, faces: int) -> Mesh:
     return Mesh(np.asarray(simpler.vertices, np.float32), np.asarray(simpler.triangles, np.int32), mesh.extent)
 
 
+def normals_towards(points: np.ndarray, camera: np.ndarray) -> np.ndarray:
+    """Normals (points, 3) of a surface seen from the position `camera`, from each point's neighbours."""
+    open3d = _open3d()
+    cloud = open3d.geometry.PointCloud(open3d.utility.Vector3dVector(points.astype(np.float64)))
+    cloud.estimate_normals(open3d.geometry.KDTreeSearchParamKNN(12))
+    cloud.orient_normals_towards_camera_location(camera.astype(np.float64))
+    return np.asarray(cloud.normals, np.float32)
+
+
 def reconstruct(points: np.ndarray, normals: np.ndarray, faces: int, *, depth: int = 6) -> Mesh:
     """The surface through a cloud by Poisson reconstruction, without what lies far from every point, decimated.
 

@@ -5,12 +5,13 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal
 
-Knows = Literal["nothing", "networks", "others", "truth"]
+Knows = Literal["nothing", "networks", "others", "rendering", "truth"]
 
 KNOWS: dict[Knows, str] = {
     "nothing": "nothing of the object",
     "networks": "what the entropy predictor says of the views seen",
     "others": "what views show of other (validation) objects",
+    "rendering": "what a surface or volume through the latest view's points would look like from elsewhere",
     "truth": "the object itself, which no robot does",
 }
 
@@ -34,6 +35,14 @@ class Rung:
 
 SCRAMBLED = Rung("scrambled_entropy", "sorted in place", "networks")
 """The thesis's policy as its published code has it: no rung of the ladder, but part of what that code changes."""
+
+CLIMBED = (
+    Rung("diff_volume", "climbing on a volume", "rendering"),
+    Rung("diff_mesh", "climbing on a surface", "rendering"),
+    Rung("diff_volume_whole", "climbing on the whole volume", "truth"),
+    Rung("diff_mesh_whole", "climbing on the whole mesh", "truth"),
+)
+"""Differentiable rendering, on fewer objects than the rest of the ladder and in a table of its own."""
 
 
 def ladder(draws: int) -> tuple[Rung, ...]:

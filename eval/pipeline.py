@@ -24,6 +24,7 @@ from data_pipeline.files import read_json, write_json
 from data_pipeline.meshes import DataError
 from data_pipeline.progress import console
 from eval.ascent import AscentConfig
+from eval.climbing import ClimbConfig, climb_objects, climbing_study, load_climbed
 from eval.grid import FIRST_MV, GridConfig
 from eval.knowledge import learn
 from eval.live import Agreement, LiveConfig, Networks, compare_with_tables
@@ -32,7 +33,7 @@ from eval.report import read_history, write_report
 from eval.study import reachable_views, run_study
 from eval.sweep_report import write_sweep_report
 from eval.thesis_networks import ThesisConfig
-from eval.view_tables import ViewTables, compute_view_tables, load_view_tables, made_by, save_view_tables
+from eval.view_tables import ViewTables, compute_view_tables, load_view_tables, made_by, objects_of, save_view_tables
 from mevs_jax.models import Abstraction
 from mevs_jax.policies import POLICIES
 from mevs_jax.viewpoints import ViewGraph
@@ -57,6 +58,7 @@ class Settings:
     thesis: ThesisConfig = ThesisConfig()
     sweep: SweepConfig = SweepConfig()
     ascent: AscentConfig = AscentConfig()
+    climb: ClimbConfig = ClimbConfig()
 
 
 THESIS = Settings()
@@ -126,7 +128,8 @@ TINY = Settings(
     ),
     evaluation=GridConfig(draws=2),
     live=LiveConfig(objects=12, at_once=8, max_views=4),
-    thesis=ThesisConfig(_TRIFLE, _TRIFLE, _TRIFLE, resnet34_width=8, timing_runs=3),
+    thesis=ThesisConfig(_TRIFLE, _TRIFLE, _TRIFLE, resnet34_width=8, timing_runs=3, climbing_runs=1, climbing_starts=1),
+    climb=ClimbConfig(objects=2, starts=2, resolution=16, faces=64),
 )
 """Seconds, and no use but to see that everything runs."""
 
@@ -275,7 +278,12 @@ def evaluate(settings: Settings, out: Path) -> dict[str, Any]:
         "evaluation": asdict(settings.evaluation),
         "made_by": made_by(statistics, out / "classifier", out / "entropy"),
         "by_view": by_view_made,
+        "climbed": None,
     }
+    names = objects_of(out / "data", "test", statistics)[0]
+    climbed = load_climbed(out, statistics, settings.climb, names)
+    if climbed is not None:
+        identity["climbed"] = asdict(settings.climb)
     identity = json.loads(json.dumps(identity))
     check_evaluation(settings.evaluation)
     path = out / "metrics.json"
@@ -297,9 +305,18 @@ def evaluate(settings: Settings, out: Path) -> dict[str, Any]:
         }
     validation = _tables(settings, out, statistics, "val")
     metrics = run_study(tables, validation, statistics, settings.evaluation, by_view, leak)
+    if climbed is not None:
+        metrics["climbing"] = climbing_study(tables, statistics, climbed, settings.evaluation)
     metrics["identity"] = identity
     write_json(path, metrics)
     return metrics
+
+
+def climb_on_objects(settings: Settings, out: Path) -> None:
+    """Finds where differentiable rendering would look next on many test objects; `evaluate` then compares it."""
+    statistics = load_statistics(out / "data")
+    names = objects_of(out / "data", "test", statistics)[0]
+    climb_objects(settings.dataset, statistics, names, out, settings.climb)
 
 
 def check_live(settings: Settings, out: Path) -> dict[str, Agreement]:

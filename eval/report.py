@@ -16,6 +16,7 @@ from data_pipeline.files import write_text
 from eval import figures
 from eval.page import ReportInputs, document, image, percent, table
 from eval.report_policies import (
+    climbing_section,
     compatibility_section,
     confidence_section,
     draws,
@@ -148,6 +149,7 @@ def read_history(folder: Path) -> list[dict[str, float]]:
 _SECTIONS = (
     lead,
     ladder_section,
+    climbing_section,
     movement_section,
     confidence_section,
     grid_section,

@@ -128,6 +128,42 @@ def ladder_section(inputs: ReportInputs) -> str:
     )
 
 
+def climbing_section(inputs: ReportInputs) -> str:
+    """Empty where nothing was climbed."""
+    found = inputs.metrics.get("climbing")
+    if found is None:
+        return ""
+    steps = _steps(inputs.metrics, (2, 3, 4, 6))
+    against, rows, known = found["against"], [], None
+    for rung in found["ladder"]:
+        name = rung["policy"]
+        if rung["knows"] != known:
+            known = rung["knows"]
+            rows.append([f'<b class="note">Knows {html.escape(KNOWS[known])}</b>'])
+        row = [html.escape(rung["title"])]
+        for step in steps:
+            cell = f"<b>{percent(found['policies'][name]['after_views'][step - 1])}</b>"
+            for base in against.values():
+                if name in base:
+                    gain, interval = (base[name][f"after_views_{key}"][step - 1] for key in ("difference", "interval"))
+                    cell += "<br>" + difference(gain, interval)
+                else:
+                    cell += "<br>–"
+            row.append(cell)
+        rows.append(row)
+    settings = found["settings"]
+    return (
+        "<h2>Choosing by differentiable rendering</h2><p>The thesis's other two methods: make a volume, or a surface of at most "
+        f"{settings['faces']} faces, of what the latest view shows, and climb over the sphere from {settings['starts']} starts "
+        f"to where it looks best, at {settings['resolution']}×{settings['resolution']} pixels. Distinct optima are looked at in "
+        "the order of their values. Accuracy (%) after so many views; below it the difference from random, and below that from "
+        "the thesis's predicted entropy, both with 95 % intervals.</p>"
+        + table(["next view chosen by", *(f"{step} views" for step in steps)], rows)
+        + f"<p class='note'>{found['objects']} test objects, every start view. {found['views_without_surface']} of "
+        f"{found['views']:,} views show too little for a surface; after those the choice is arbitrary.</p>"
+    )
+
+
 def draws(metrics: dict[str, Any]) -> str:
     return f"{metrics['random_draws_per_start']} draws for each object and start"
 

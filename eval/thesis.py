@@ -16,10 +16,11 @@ from typing import Any
 import numpy as np
 from flax import nnx
 
-from data_pipeline.builder import prepare, report_left_out
+from data_pipeline.builder import open_objects, prepare, report_left_out
 from data_pipeline.files import read_json, write_bytes, write_json
-from data_pipeline.meshes import DataError
+from data_pipeline.meshes import DataError, load_object
 from data_pipeline.progress import console
+from eval.ascent import METHODS
 from eval.pipeline import Settings, check_evaluation
 from eval.report import read_history
 from eval.thesis_figures import FigureInputs
@@ -38,7 +39,7 @@ from eval.thesis_networks import (
 )
 from eval.thesis_page import write_thesis_report
 from eval.thesis_results import NO_ACCELERATOR, LatticeTables, all_results, machine
-from eval.timing import decision_memory_alone, time_local_maxima, time_predictor
+from eval.timing import CLIMBING_SIDE, decision_memory_alone, time_climbing, time_local_maxima, time_predictor
 from eval.view_tables import made_by, network_outputs, objects_of
 from train.classifier import ClassifierTask
 from train.entropy import EntropyTask
@@ -128,19 +129,35 @@ def _timing(settings: Settings, folder: ThesisFolder, tables: dict[int, LatticeT
     return out
 
 
+def _climbing(settings: Settings, tables: LatticeTables, classes: list[str]) -> dict[str, Any]:
+    runs, starts = settings.thesis.climbing_runs, settings.thesis.climbing_starts
+    meshes = {}
+    entries = {entry.name: entry for entry in open_objects(settings.dataset).entries}
+    for label, name in enumerate(classes):
+        members = np.flatnonzero(tables.labels == label)
+        evenly = np.unique(np.linspace(0, len(members) - 1, min(runs, len(members))).round().astype(int))
+        if len(members):
+            meshes[name] = [load_object(entries[tables.names[members[at]]]) for at in evenly]
+    methods = {name: time_climbing(method, meshes, starts) for name, method in METHODS.items()}
+    return {"runs": runs, "starts": starts, "resolution": CLIMBING_SIDE, **methods}
+
+
 def measure(settings: Settings, folder: ThesisFolder, tables: dict[int, LatticeTables]) -> dict[str, Any]:
     """Machine, times and memory; measured once, and again on another machine or with networks of another size."""
     ran_on = machine()
-    identity = json.loads(json.dumps([ran_on, settings.thesis.timing_runs, asdict(settings.entropy.network)]))
+    thesis = settings.thesis
+    counts = thesis.timing_runs, thesis.climbing_runs, thesis.climbing_starts
+    identity = json.loads(json.dumps([ran_on, counts, asdict(settings.entropy.network)]))
     path = folder.out / "timing.json"
     if path.exists() and (found := read_json(path))["identity"] == identity:
         return found
-    console.print(f"Timing {settings.thesis.timing_runs} decisions a class, and measuring their memory")
+    console.print(f"Timing {counts[0]} decisions and {counts[1]} climbs a class, and measuring their memory")
     found = {
         "identity": identity,
         "machine": ran_on,
         "timing": _timing(settings, folder, tables),
         "memory": _memory(settings, folder),
+        "climbing": _climbing(settings, tables[40], folder.statistics(40).classes),
     }
     write_json(path, found)
     return found
@@ -188,7 +205,7 @@ def evaluate_thesis(settings: Settings, folder: ThesisFolder) -> FigureInputs:
         validation = {views: lattice_tables(settings, folder, views, "val", PIPELINE, ("world",)) for views in VIEWS}
         console.print(f"Walking {len(test[40].labels)} test objects with {len(PIPELINE)} classifiers on two lattices")
         results = all_results(test, validation, statistics, settings.evaluation) | _training(folder, histories)
-        results |= {name: measured[name] for name in ("machine", "timing", "memory")}
+        results |= {name: measured[name] for name in ("machine", "timing", "memory", "climbing")}
         results |= {"identity": identity, "left_out": {str(v): s.left_out for v, s in statistics.items()}}
         write_json(path, results)
     return FigureInputs(folder, results, statistics, test, histories, _example(test[40], statistics[40].classes))

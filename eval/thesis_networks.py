@@ -65,6 +65,10 @@ class ThesisConfig:
     """channels of ResNet-34's first stage"""
     timing_runs: int = 50
     """of PointNet++ on each class, for the thesis's Table 3"""
+    climbing_runs: int = 3
+    """objects of each class that are climbed on, for the thesis's Table 2"""
+    climbing_starts: int = 8
+    """viewpoints to climb from; the thesis's times are of one"""
 
 
 @dataclass(frozen=True)

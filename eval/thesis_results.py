@@ -45,7 +45,8 @@ class LatticeTables:
     def stacked(self, frame: Frame) -> ViewTable:
         """With the three backbones that are walked with as an axis of the logits."""
         logits = np.stack([self.logits[backbone.name] for backbone in PIPELINE], axis=1)
-        return ViewTable(*(jnp.asarray(a) for a in (logits, self.utility[frame], self.entropy, self.labels)))
+        of_frame = jnp.asarray(self.utility[frame])
+        return ViewTable(jnp.asarray(logits), of_frame, jnp.asarray(self.entropy), jnp.asarray(self.labels))
 
     def of(self, backbone: str, frame: Frame) -> ViewTables:
         return ViewTables(self.names, self.labels, self.logits[backbone], self.utility[frame], self.entropy)

@@ -23,12 +23,16 @@ from flax import nnx
 
 from data_pipeline.batches import select_views
 from data_pipeline.builder import open_split
+from data_pipeline.meshes import Mesh
+from eval.ascent import Method, climb
 from mevs_jax.policies import maxima_first
 from mevs_jax.viewpoints import ViewGraph, fibonacci_sphere, local_maxima
 from train.classifier import ClassifierTask
 from train.entropy import EntropyTask
 
 _WARM_UP = 3
+CLIMBING_SIDE = 64
+"""Pixels along each side of what is rendered for Table 2."""
 
 
 def milliseconds(call: Callable[[Any], Any], inputs: Sequence[Any]) -> np.ndarray:
@@ -78,6 +82,34 @@ def time_local_maxima(views: int, runs: int = 200, objects: int = 1000) -> dict[
     }
 
 
+def time_climbing(method: Method, meshes: dict[str, list[Mesh]], starts: int) -> dict[str, Any]:
+    """Seconds of climbs on each class's objects, mean and standard deviation, and megabytes planned for one object."""
+    things = {name: [jnp.asarray(method.prepare(mesh)) for mesh in some] for name, some in meshes.items()}
+    first = next(iter(things.values()))[0]
+    compiled = jax.jit(lambda thing: climb(method, thing, starts, CLIMBING_SIDE).values).lower(first).compile()
+    jax.block_until_ready(compiled(first))
+    seconds: dict[str, np.ndarray] = {}
+    for name, some in things.items():
+        times = []
+        for thing in some:
+            begun = time.perf_counter()
+            jax.block_until_ready(compiled(thing))
+            times.append(time.perf_counter() - begun)
+        seconds[name] = np.array(times)
+    seconds["all"] = np.concatenate(list(seconds.values()))
+    return {
+        "seconds": {name: [float(times.mean()), float(times.std())] for name, times in seconds.items()},
+        "memory": {"planned": _planned(compiled), "device_peak": None},
+    }
+
+
+def _planned(compiled: Any) -> float | None:
+    """Megabytes that XLA plans for a program: arguments, results and temporaries."""
+    plan = compiled.memory_analysis()
+    parts = ("argument_size_in_bytes", "output_size_in_bytes", "temp_size_in_bytes")
+    return sum(getattr(plan, part) for part in parts) / 1e6 if plan else None
+
+
 def decision_memory(classify: ClassifierTask, predict: EntropyTask | None) -> dict[str, float | None]:
     """Megabytes of one decision by networks of these sizes: what they see of a view → logits and the next view.
 
@@ -109,11 +141,9 @@ def decision_memory(classify: ClassifierTask, predict: EntropyTask | None) -> di
     compiled = jax.jit(decide).lower(*arguments).compile()
     for _ in range(_WARM_UP):
         jax.block_until_ready(compiled(*arguments))
-    plan = compiled.memory_analysis()
-    parts = ("argument_size_in_bytes", "output_size_in_bytes", "temp_size_in_bytes")
     reported = jax.devices()[0].memory_stats()
     return {
-        "planned": sum(getattr(plan, part) for part in parts) / 1e6 if plan else None,
+        "planned": _planned(compiled),
         "device_peak": reported["peak_bytes_in_use"] / 1e6 if reported else None,
     }
 

@@ -50,7 +50,8 @@ class ViewTables:
 
     def stacked(self) -> ViewTable:
         """As one `ViewTable` with a leading axis of objects, to be vmapped over."""
-        return ViewTable(*(jnp.asarray(a) for a in (self.logits, self.utility, self.entropy, self.labels)))
+        logits, utility, entropy, labels = map(jnp.asarray, (self.logits, self.utility, self.entropy, self.labels))
+        return ViewTable(logits, utility, entropy, labels)
 
 
 @partial(jax.jit, static_argnames=("task", "structure"))

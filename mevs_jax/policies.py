@@ -76,6 +76,7 @@ class Scene:
         label: the true class; for oracles.
         knowledge: learnt on other objects.
         reachable: (views,) where the camera can go; None for everywhere. The start may lie outside.
+        climbed: (views, views) by policy; row i scores the views after seeing view i, by climbing with a renderer's gradient.
     """
 
     graph: ViewGraph
@@ -84,6 +85,7 @@ class Scene:
     label: Int[Array, "*batch"] | None = None
     knowledge: Knowledge | None = None
     reachable: Bool[Array, "*batch views"] | None = None
+    climbed: dict[str, Float[Array, "*batch views views"]] | None = None
 
 
 Policy = Callable[[Array, SelectionState, Scene], Float[Array, "views"]]
@@ -188,6 +190,22 @@ def _belief_entropy(belief: Float[Array, "*batch classes"]) -> Float[Array, "*ba
     return jnp.log(total) - jnp.sum(weight * shifted, axis=-1) / total
 
 
+# Knowing what a surface or a volume made from the latest view would look like from elsewhere.
+
+
+def climbed(name: str) -> Policy:
+    """The thesis's methods by differentiable rendering (§4.2.1): the best views of what was seen, by climbing on it.
+
+    Climbs are far slower than a look into a table, so `Scene.climbed` holds how they end after each view.
+    """
+
+    def scores(key: Array, state: SelectionState, scene: Scene) -> Float[Array, "views"]:
+        del key
+        return _given(scene.climbed, "climbed")[name][state.view]
+
+    return scores
+
+
 # Knowing what no robot can: oracles and a control.
 
 
@@ -284,6 +302,10 @@ POLICIES: dict[str, Policy] = {
     "remembered_entropy": remembered_entropy,
     "scrambled_entropy": scrambled_entropy,
     "information_gain": information_gain,
+    "diff_volume": climbed("diff_volume"),
+    "diff_mesh": climbed("diff_mesh"),
+    "diff_volume_whole": climbed("diff_volume_whole"),
+    "diff_mesh_whole": climbed("diff_mesh_whole"),
     "oracle_entropy": oracle_entropy,
     "lowest_entropy": lowest_entropy,
     "belief_oracle": belief_oracle,

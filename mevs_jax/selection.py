@@ -31,12 +31,14 @@ class ViewTable:
         utility: (views, views); row i is what the policy's network says about every view after seeing view i.
         entropy: (views,) true depth entropies.
         label: the true class.
+        climbed: (views, views) by policy; row i is where differentiable rendering would look after seeing view i.
     """
 
     logits: Float[Array, "*batch_and_backbones views classes"]
     utility: Float[Array, "*batch views views"]
     entropy: Float[Array, "*batch views"]
     label: Int[Array, "*batch"]
+    climbed: dict[str, Float[Array, "*batch views views"]] | None = None
 
     def observe(self, view: Int[Array, ""]) -> Observation:
         return Observation(self.logits[view], self.utility[view])
@@ -45,7 +47,7 @@ class ViewTable:
         self, graph: ViewGraph, knowledge: Knowledge | None = None, reachable: Bool[Array, "views"] | None = None
     ) -> Scene:
         """The scene with everything that an oracle may ask for."""
-        return Scene(graph, self.entropy, self.logits, self.label, knowledge, reachable)
+        return Scene(graph, self.entropy, self.logits, self.label, knowledge, reachable, self.climbed)
 
 
 @flax.struct.dataclass

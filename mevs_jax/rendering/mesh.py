@@ -15,13 +15,14 @@ from dataclasses import dataclass
 import flax.struct
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
 from mevs_jax.arrays import AnyArray
 from mevs_jax.cameras import Camera
 
 _NEAREST = 1e-3  # depth of the nearest corner that is seen
 _LEAST = -5.0  # log 2D
+_FAR = 12.0  # σ from a face's border, beyond which it covers less than 1e-5 and is left out
 
 
 @dataclass(frozen=True)
@@ -40,7 +41,7 @@ class SoftRendering:
 
     Attributes:
         silhouette: (resolution, resolution) in [0, 1], how much of a pixel is covered.
-        depth: (resolution, resolution) along the optical axis, of what covers it, or of the faces next to it.
+        depth: (resolution, resolution) along the optical axis, of what covers it or lies next to it; 0 where nothing does.
         normal: (resolution, resolution, 3) in the camera's frame, towards the camera; a mean of unit vectors.
     """
 
@@ -49,9 +50,40 @@ class SoftRendering:
     normal: Float[Array, "*batch resolution resolution 3"]
 
 
-def _at_once() -> int:
-    """Faces in one piece, which bounds memory by so many times the pixels; on a CPU few, which stay in the cache."""
-    return 32 if jax.default_backend() == "cpu" else 256
+@jax.custom_jvp
+def _softplus(x: Float[Array, "..."]) -> Float[Array, "..."]:
+    """log(1 + exp(x)); JAX's own takes two more exponentials for its derivative."""
+    return jnp.maximum(x, 0) + jnp.log1p(jnp.exp(-jnp.abs(x)))
+
+
+@_softplus.defjvp
+def _softplus_jvp(primals: tuple[Array], tangents: tuple[Array]) -> tuple[Array, Array]:
+    (x,), (along,) = primals, tangents
+    small = jnp.exp(-jnp.abs(x))
+    return jnp.maximum(x, 0) + jnp.log1p(small), jnp.where(x >= 0, 1, small) / (1 + small) * along
+
+
+def _pieces(side: int) -> tuple[int, int]:
+    """Pixels along a tile's side, and faces at once; on a CPU few of both, which stay in the cache."""
+    return (16, 16) if jax.default_backend() == "cpu" else (side, 256)
+
+
+def _near_tiles(
+    corners: Float[Array, "faces 3 3"], camera: Camera, margin: float, tile: int
+) -> tuple[Int[Array, "tiles faces"], Int[Array, "tiles"]]:
+    """For each tile the faces whose bounding boxes come within `margin` pixels of it, the others as `faces`; and how many."""
+    depth = jnp.maximum(corners[..., 2:], _NEAREST)
+    at = camera.focal_length * corners[..., :2] / depth + camera.resolution / 2  # (faces, 3, 2), column and row
+    low, high = at.min(axis=1) - margin, at.max(axis=1) + margin
+    seen = jnp.min(corners[..., 2], axis=-1) >= _NEAREST
+    edge = jnp.arange(0, camera.resolution, tile)[:, None]
+    columns, rows = ((low[:, axis] < edge + tile) & (high[:, axis] > edge) for axis in range(2))  # (tiles along, faces)
+    near = (rows[:, None] & columns & seen).reshape(-1, len(corners))
+    place = jnp.where(near, jnp.cumsum(near, axis=1) - 1, len(corners))
+    every = jnp.broadcast_to(jnp.arange(len(corners)), near.shape)
+    nobody = jnp.full(near.shape, len(corners))
+    listed = jax.vmap(lambda into, at, which: into.at[at].set(which, mode="drop"))(nobody, place, every)
+    return listed, jnp.sum(near, axis=1)
 
 
 def render_mesh(
@@ -65,34 +97,57 @@ def render_mesh(
     """
     triangles = jnp.asarray(triangles)
     corners = (triangles - camera.pose[:3, 3]) @ camera.pose[:3, :3]
-    at_once = min(_at_once(), len(corners))
-    corners = jnp.pad(corners, ((0, -len(corners) % at_once), (0, 0), (0, 0)))
     side, focal = camera.resolution, camera.focal_length
-    pixel = jnp.arange(side, dtype=corners.dtype) + 0.5 - side / 2
+    tile, at_once = _pieces(side)
+    listed, counts = _near_tiles(jax.lax.stop_gradient(corners), camera, _FAR * softness.edge, tile)
+    listed = jnp.pad(listed, ((0, 0), (0, -len(corners) % at_once)), constant_values=len(corners))
+    corners = jnp.pad(corners, ((0, 1), (0, 0), (0, 0)))  # the last is nobody's
+    pixel = jnp.arange(tile, dtype=corners.dtype) + 0.5 - side / 2
     rows, columns = jnp.meshgrid(pixel, pixel, indexing="ij")
-    at = jnp.stack([columns.reshape(-1), rows.reshape(-1)])
+    within = jnp.stack([columns.reshape(-1), rows.reshape(-1)])
+    none = jnp.zeros_like(within[0])
 
-    @jax.checkpoint
-    def some(carry: tuple[Array, ...], chunk: Float[Array, "faces 3 3"]) -> tuple[tuple[Array, ...], None]:
-        empty, largest, total, seen = carry
-        cover, nearness, normal = _faces(chunk, at, focal, softness.edge)
-        empty = empty - jnp.sum(jax.nn.softplus(cover), axis=0)  # log(1 − sigmoid(x)) = −softplus(x)
-        # With less coverage a face is not seen whatever its nearness, and larger numbers would lose the difference of nearness.
-        hidden = jnp.clip(jax.nn.log_sigmoid(cover) + math.log(2), _LEAST, 0)
-        weight = (hidden + nearness) / softness.nearness
-        now = jax.lax.stop_gradient(jnp.maximum(largest, jnp.max(weight, axis=0)))
-        weight, before = jnp.exp(weight - now), jnp.exp(largest - now)
-        # Nothing in these is a matrix product whose precision an accelerator might lower.
-        depths = jnp.sum(weight / nearness, axis=0)
-        normals = [jnp.sum(weight * normal[:, axis, None], axis=0) for axis in range(3)]
-        total = before * total + jnp.sum(weight, axis=0)
-        return (empty, now, total, before * seen + jnp.stack([depths, *normals])), None
+    def of_tile(arguments: tuple[Array, Array, Array]) -> tuple[Array, Array]:
+        faces, count, corner = arguments
+        at = within + corner[:, None]
 
-    none = jnp.zeros_like(at[0])
-    start = (none, jnp.full_like(none, -1e30), none, jnp.zeros((4, len(none)), none.dtype))
-    (empty, _, total, seen), _ = jax.lax.scan(some, start, corners.reshape(-1, at_once, 3, 3))
-    seen = (seen / total).reshape(4, side, side)
-    return SoftRendering(-jnp.expm1(empty).reshape(side, side), seen[0], jnp.moveaxis(seen[1:], 0, -1))
+        def look(carry: tuple[Array, ...], chunk: Float[Array, "faces 3 3"]) -> tuple[Array, ...]:
+            empty, largest, total, *seen = carry
+            # The barriers keep XLA from calculating all of this again for each of the sums.
+            cover, nearness, normal = jax.lax.optimization_barrier(_faces(chunk, at, focal, softness.edge))
+            spread = _softplus(cover)
+            empty = empty - jnp.sum(spread, axis=0)  # log(1 − sigmoid(x)) = −softplus(x)
+            # With less coverage a face is not seen whatever its nearness, and larger numbers would lose the difference of
+            # nearness. log(sigmoid(x)) = x − softplus(x).
+            hidden = jnp.clip(cover - spread + math.log(2), _LEAST, 0)
+            weight = (hidden + nearness) / softness.nearness
+            now = jax.lax.stop_gradient(jnp.maximum(largest, jnp.max(weight, axis=0)))
+            weight, before = jax.lax.optimization_barrier((jnp.exp(weight - now), jnp.exp(largest - now)))
+            # Nothing in these is a matrix product whose precision an accelerator might lower.
+            here = [weight / nearness, *(weight * normal[:, axis, None] for axis in range(3))]
+            seen = [before * sofar + jnp.sum(part, axis=0) for sofar, part in zip(seen, here, strict=True)]
+            return empty, now, before * total + jnp.sum(weight, axis=0), *seen
+
+        @jax.checkpoint
+        def some(carry: tuple[Array, ...], chunk: tuple[Array, Array]) -> tuple[tuple[Array, ...], None]:
+            first, chosen = chunk
+            return jax.lax.cond(first < count, lambda: look(carry, corners[chosen]), lambda: carry), None
+
+        start = (none, jnp.full_like(none, -1e30), *[none] * 5)
+        chunks = jnp.arange(0, len(faces), at_once), faces.reshape(-1, at_once)
+        (empty, _, total, *seen), _ = jax.lax.scan(some, start, chunks)
+        return empty, jnp.stack(seen) / jnp.where(total > 0, total, 1.0)
+
+    edge = jnp.arange(0, side, tile, dtype=corners.dtype)
+    corner = jnp.stack(jnp.meshgrid(edge, edge, indexing="xy"), axis=-1).reshape(-1, 2)
+    empty, seen = jax.lax.map(of_tile, (listed, counts, corner))
+
+    def image(tiles: Float[Array, "tiles pixels"]) -> Float[Array, "side side"]:
+        whole = tiles.reshape(len(edge), len(edge), tile, tile).swapaxes(1, 2)
+        return whole.reshape(len(edge) * tile, -1)[:side, :side]
+
+    depth, *normal = (image(seen[:, channel]) for channel in range(4))
+    return SoftRendering(-jnp.expm1(image(empty)), depth, jnp.stack(normal, axis=-1))
 
 
 def _faces(
