@@ -40,7 +40,13 @@ def decimate(mesh: Mesh, faces: int) -> Mesh:
 
 
 def normals_towards(points: np.ndarray, camera: np.ndarray) -> np.ndarray:
-    """Normals (points, 3) of a surface seen from the position `camera`, from each point's neighbours."""
+    """Normals (points, 3) of a surface seen from the position `camera`, from each point's neighbours.
+
+    Raises:
+        DataError: where there are too few points for a plane.
+    """
+    if len(points) < 3:
+        raise DataError(f"normals need at least 3 points, got {len(points)}")
     open3d = _open3d()
     cloud = open3d.geometry.PointCloud(open3d.utility.Vector3dVector(points.astype(np.float64)))
     cloud.estimate_normals(open3d.geometry.KDTreeSearchParamKNN(12))

@@ -27,6 +27,7 @@ from eval.ascent import AscentConfig
 from eval.climbing import ClimbConfig, climb_objects, climbing_study, load_climbed
 from eval.grid import FIRST_MV, GridConfig
 from eval.knowledge import learn
+from eval.ladder import CLIMBED
 from eval.live import Agreement, LiveConfig, Networks, compare_with_tables
 from eval.page import ReportInputs
 from eval.report import read_history, write_report
@@ -324,6 +325,8 @@ def check_live(settings: Settings, out: Path) -> dict[str, Agreement]:
     for policy in settings.live.policies:
         if policy not in POLICIES:
             raise DataError(f"unknown policy {policy!r}; it is one of {', '.join(POLICIES)}")
+        if policy in {rung.policy for rung in CLIMBED}:
+            raise DataError(f"{policy} looks into what mevs climb has found; live walks have no such tables")
     statistics = load_statistics(out / "data")
     classify, predict = tasks(settings, statistics)
     networks = Networks(classify, load_best(classify, out / "classifier"), predict, load_best(predict, out / "entropy"))

@@ -17,6 +17,7 @@ import pytest
 import trimesh
 
 from mevs_jax import cli
+from tests.conftest import open3d_or_skip
 
 MEVS = [sys.executable, "-m", "mevs_jax"]
 
@@ -203,6 +204,19 @@ def test_networks_for_another_number_of_views_are_refused(whole, tmp_path):
     for name in ("classifier", "entropy"):
         shutil.copytree(whole / name, tmp_path / name)
     assert "was trained for 6 views, the data set has 8" in refused(mevs("eval", "--preset", "tiny", "--out", tmp_path))
+
+
+def test_climbing_adds_its_ladder(whole, tmp_path):
+    open3d_or_skip()
+    out = tmp_path / "run"
+    shutil.copytree(whole, out)
+    shown = mevs("climb", "--preset", "tiny", "--out", out, "--data", "furniture10")
+    assert shown.returncode == 0, shown.stderr
+    found = json.loads((out / "metrics.json").read_text())["climbing"]
+    assert found["objects"] == 2
+    assert found["views"] == 12
+    assert {"random", "predicted_entropy", "diff_volume", "diff_mesh"} <= set(found["policies"])
+    assert "Choosing by differentiable rendering" in (out / "report" / "index.html").read_text()
 
 
 def test_compat_trains_the_published_codes_way_and_fills_its_rows(whole, tmp_path):

@@ -86,7 +86,7 @@ def both_ways(networks, captures, tables, policy, threshold=None):
     return live, by_table(keys, tables, starts)
 
 
-@pytest.mark.parametrize("policy", list(POLICIES))
+@pytest.mark.parametrize("policy", [name for name in POLICIES if not name.startswith("diff_")])
 def test_live_and_table_walk_the_same_views(networks, captures, tables, policy):
     live, stored = both_ways(networks, captures, tables, policy)
     np.testing.assert_array_equal(live.views, stored.views)

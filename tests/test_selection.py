@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from eval.ladder import CLIMBED
 from mevs_jax import (
     POLICIES,
     Knowledge,
@@ -39,6 +40,7 @@ def random_tables(views: int, classes: int, count: int, seed: int) -> ViewTable:
         utility=jnp.asarray(random.uniform(0, 1, (count, views, views)), jnp.float32),
         entropy=jnp.asarray(entropy, jnp.float32),
         label=jnp.asarray(random.integers(0, classes, count), jnp.int32),
+        climbed={rung.policy: jnp.asarray(random.uniform(0, 1, (count, views, views))) for rung in CLIMBED},
     )
 
 
@@ -124,9 +126,9 @@ def test_every_step_of_a_policy_is_the_best_by_its_plain_rule(policy):
     walks = np.asarray(walk(tables, jnp.arange(count, dtype=jnp.int32) % views))
     plain_graph = {name: np.asarray(getattr(graph, name)) for name in ("neighbours", "distances")}
     plain_knowledge = {name: np.asarray(getattr(knowledge, name)) for name in ("order", "expected_logits")}
-    arrays = {name: np.asarray(leaf) for name, leaf in vars(tables).items()}
+    arrays = jax.tree.map(np.asarray, vars(tables))
     for index, walked in enumerate(walks):
-        table = {name: leaf[index] for name, leaf in arrays.items()}
+        table = jax.tree.map(lambda leaf, at=index: leaf[at], arrays)
         assert len(set(walked)) == max_views
         for step in range(1, max_views):
             seen = walked[:step].tolist()
@@ -212,7 +214,8 @@ def test_a_dear_way_is_not_taken():
 
 
 @pytest.mark.parametrize(
-    ("policy", "field"), [("fixed_order", "knowledge"), ("oracle_entropy", "entropy"), ("label_oracle", "logits")]
+    ("policy", "field"),
+    [("fixed_order", "knowledge"), ("diff_mesh", "climbed"), ("oracle_entropy", "entropy"), ("label_oracle", "logits")],
 )
 def test_a_scene_that_lacks_what_a_policy_needs_is_described(policy, field):
     graph = ViewGraph.from_points(fibonacci_sphere(10))

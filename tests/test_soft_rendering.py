@@ -29,6 +29,7 @@ from mevs_jax.rendering import (
     soft_depth_entropy,
     visible_area,
 )
+from mevs_jax.rendering import mesh as mesh_renderer
 from tests.conftest import open3d_or_skip
 
 NAMES = ("chair", "bathtub", "desk", "toilet", "sofa")
@@ -81,6 +82,25 @@ def test_no_seams_show_between_faces():
         off = np.abs(np.where(hit, rays.depth, 0) - seen.depth)[hit]
         assert (off < 0.03).mean() > 0.85  # the rest is at edges, which are soft
         assert (np.asarray(seen.silhouette)[hit] > 0.5).mean() > 0.99
+
+
+def test_tiles_make_one_image(monkeypatch):
+    """What is left out of a tile is not seen there: one tile for all and small ones, that do not fit the image, show the same."""
+    pose = camera_at(fibonacci_sphere(5)[1], 40).pose
+
+    def look(side, at_once):
+        monkeypatch.setattr(mesh_renderer, "_pieces", lambda _: (side, at_once))
+        see = lambda step: render_mesh(triangles_of("chair"), Camera(orbit(pose, step), resolution=40))  # noqa: E731
+        return jax.jit(lambda step, along: jax.jvp(see, (step,), (along,)))(jnp.zeros(2), jnp.array([0.6, 0.8]))
+
+    (seen, slopes), (whole, whole_slopes) = look(16, 16), look(40, 1024)
+    np.testing.assert_allclose(slopes.silhouette, whole_slopes.silhouette, atol=1e-3)
+    np.testing.assert_allclose(seen.silhouette, whole.silhouette, atol=1e-4)
+    covered = np.asarray(whole.silhouette) > 1e-3
+    for name, largest in (("depth", 1e-4), ("normal", 1e-4)):
+        parts = [np.asarray(getattr(image, name))[covered] for image in (seen, whole, slopes, whole_slopes)]
+        np.testing.assert_allclose(parts[0], parts[1], atol=largest)
+        np.testing.assert_allclose(parts[2], parts[3], atol=1e-2, rtol=1e-3)
 
 
 @pytest.mark.parametrize("name", NAMES)

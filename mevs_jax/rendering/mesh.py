@@ -21,8 +21,9 @@ from mevs_jax.arrays import AnyArray
 from mevs_jax.cameras import Camera
 
 _NEAREST = 1e-3  # depth of the nearest corner that is seen
-_LEAST = -5.0  # log 2D
+_NOWHERE = -1e6  # σ from its border: a face that is not seen
 _FAR = 12.0  # σ from a face's border, beyond which it covers less than 1e-5 and is left out
+_LEAST = math.log(2) - _FAR  # log 2D there
 
 
 @dataclass(frozen=True)
@@ -120,7 +121,7 @@ def render_mesh(
             # With less coverage a face is not seen whatever its nearness, and larger numbers would lose the difference of
             # nearness. log(sigmoid(x)) = x − softplus(x).
             hidden = jnp.clip(cover - spread + math.log(2), _LEAST, 0)
-            weight = (hidden + nearness) / softness.nearness
+            weight = jnp.where(cover > _NOWHERE, (hidden + nearness) / softness.nearness, -jnp.inf)
             now = jax.lax.stop_gradient(jnp.maximum(largest, jnp.max(weight, axis=0)))
             weight, before = jax.lax.optimization_barrier((jnp.exp(weight - now), jnp.exp(largest - now)))
             # Nothing in these is a matrix product whose precision an accelerator might lower.
@@ -180,4 +181,4 @@ def _faces(
     length = jnp.sqrt(jnp.where(flat, 1.0, jnp.sum(jnp.square(normal), axis=-1)))
     normal = normal / length[:, None] * -jnp.sign(jnp.sum(normal * corners[:, 0], axis=-1))[:, None]
     hidden = (flat | (jnp.min(corners[..., 2], axis=-1) < _NEAREST))[:, None]
-    return jnp.where(hidden, -1e6, cover), jnp.where(hidden, 1.0, nearness), jnp.where(hidden, 0.0, normal)
+    return jnp.where(hidden, _NOWHERE, cover), jnp.where(hidden, 1.0, nearness), jnp.where(hidden, 0.0, normal)

@@ -51,12 +51,14 @@ def scores(policy: str, seen: list[int], table: dict, graph: dict, knowledge: di
     """Scores of a policy that does not draw.
 
     Args:
-        table: logits (views, classes), utility (views, views), entropy (views,), label.
+        table: logits (views, classes), utility (views, views), entropy (views,), label; climbed by policy, each (views, views).
         graph: neighbours and distances, each (views, views).
         knowledge: order (views,) and expected_logits (classes, views, classes).
     """
     logits, utility, entropy, label = (table[name] for name in ("logits", "utility", "entropy", "label"))
     neighbours, views = graph["neighbours"], len(logits)
+    if policy.startswith("diff_"):
+        return table["climbed"][policy][seen[-1]]
     belief = logits[seen].sum(axis=0)
     if policy == "farthest":
         return np.array([min(graph["distances"][view, other] for other in seen) for view in range(views)])
