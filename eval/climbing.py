@@ -100,7 +100,7 @@ def _scores(method: str, things: Array, points: Array, config: ClimbConfig) -> F
         found = climb(METHODS[method], thing, config.starts, config.resolution)
         return view_scores(found.poses, found.values, points)
 
-    at_once = 1 if jax.default_backend() == "cpu" else len(things)
+    at_once = None if jax.default_backend() == "cpu" else len(things)
     return jax.lax.map(one, things, batch_size=at_once)
 
 

@@ -127,7 +127,8 @@ def ascend(
 
     if at_once is None:
         at_once = 1 if jax.default_backend() == "cpu" else len(starts)
-    walks = jax.lax.map(one, starts, batch_size=at_once)
+    # Not in batches of one, in which a branch that is not taken is calculated all the same.
+    walks = jax.lax.map(one, starts, batch_size=at_once if at_once > 1 else None)
     return Ascent(walks.best, walks.best_value, walks.path, walks.path_values, walks.step)
 
 
