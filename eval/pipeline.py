@@ -25,6 +25,7 @@ from data_pipeline.meshes import DataError
 from data_pipeline.progress import console
 from eval.ascent import AscentConfig
 from eval.climbing import ClimbConfig, climb_objects, climbing_study, load_climbed
+from eval.fusing import classifier_features, fuse, fusion_study, load_fusion
 from eval.grid import FIRST_MV, GridConfig
 from eval.knowledge import learn
 from eval.ladder import CLIMBED
@@ -40,6 +41,7 @@ from mevs_jax.policies import POLICIES
 from mevs_jax.viewpoints import ViewGraph
 from train.classifier import ClassifierConfig, ClassifierTask, ResNetConfig
 from train.entropy import EntropyConfig, EntropyTask, PointNet2Config
+from train.fusion import FusionConfig
 from train.loop import fit, load_best
 from train.optimiser import OptimiserConfig
 from train.pretrained import StartingWeights
@@ -60,6 +62,7 @@ class Settings:
     sweep: SweepConfig = SweepConfig()
     ascent: AscentConfig = AscentConfig()
     climb: ClimbConfig = ClimbConfig()
+    fusion: FusionConfig = FusionConfig()
 
 
 THESIS = Settings()
@@ -130,6 +133,7 @@ TINY = Settings(
     evaluation=GridConfig(draws=2),
     live=LiveConfig(objects=12, at_once=8, max_views=4),
     thesis=ThesisConfig(_TRIFLE, _TRIFLE, _TRIFLE, resnet34_width=8, timing_runs=3, climbing_runs=1, climbing_starts=1),
+    fusion=FusionConfig(width=16, heads=2, blocks=1, epochs=2, batch_size=16),
     climb=ClimbConfig(objects=2, starts=2, resolution=16, faces=64),
 )
 """Seconds, and no use but to see that everything runs."""
@@ -285,6 +289,9 @@ def evaluate(settings: Settings, out: Path) -> dict[str, Any]:
     climbed = load_climbed(out, statistics, settings.climb, names)
     if climbed is not None:
         identity["climbed"] = asdict(settings.climb)
+    classify, _ = tasks(settings, statistics)
+    fused = load_fusion(out, statistics, classify, settings.fusion)
+    identity["fused"] = fused[1]["identity"] if fused else None
     identity = json.loads(json.dumps(identity))
     check_evaluation(settings.evaluation)
     path = out / "metrics.json"
@@ -308,9 +315,20 @@ def evaluate(settings: Settings, out: Path) -> dict[str, Any]:
     metrics = run_study(tables, validation, statistics, settings.evaluation, by_view, leak)
     if climbed is not None:
         metrics["climbing"] = climbing_study(tables, statistics, climbed, settings.evaluation)
+    if fused is not None:
+        validation_features, test_features = (
+            classifier_features(out, split, statistics, classify) for split in ("val", "test")
+        )
+        metrics["fusion"] = fusion_study(fused[0], validation_features, test_features)
     metrics["identity"] = identity
     write_json(path, metrics)
     return metrics
+
+
+def train_set_fusion(settings: Settings, out: Path) -> None:
+    """Trains the set fusion on the features of the classifier; `evaluate` then compares it with the sum of logits."""
+    statistics = load_statistics(out / "data")
+    fuse(out, statistics, tasks(settings, statistics)[0], settings.fusion)
 
 
 def climb_on_objects(settings: Settings, out: Path) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import io
 import json
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 from itertools import islice
@@ -54,13 +55,33 @@ class ViewTables:
         return ViewTable(logits, utility, entropy, labels)
 
 
-@partial(jax.jit, static_argnames=("task", "structure"))
-def _look(task: ClassifierTask | EntropyTask, structure: nnx.GraphDef, state: nnx.State, batch: Batch) -> jax.Array:
-    return nnx.merge(structure, state)(task.inputs(batch))
+def _ask(network: Any, inputs: jax.Array) -> jax.Array:
+    return network(inputs)
 
 
-def network_outputs(data: Path, split: str, task: ClassifierTask | EntropyTask, network: nnx.Module) -> np.ndarray:
-    """What a network says of every view of every object of a split, (objects, views, classes or views)."""
+@partial(jax.jit, static_argnames=("task", "structure", "ask"))
+def _look(
+    task: ClassifierTask | EntropyTask,
+    structure: nnx.GraphDef,
+    state: nnx.State,
+    batch: Batch,
+    ask: Callable[[Any, jax.Array], jax.Array],
+) -> jax.Array:
+    return ask(nnx.merge(structure, state), task.inputs(batch))
+
+
+def network_outputs(
+    data: Path,
+    split: str,
+    task: ClassifierTask | EntropyTask,
+    network: nnx.Module,
+    ask: Callable[[Any, jax.Array], jax.Array] = _ask,
+) -> np.ndarray:
+    """What a network says of every view of every object of a split, (objects, views, classes or views).
+
+    Args:
+        ask: the network and its inputs to what is wanted of it, (views, numbers); its outputs unless given.
+    """
     structure, state = nnx.split(network)
     mesh = device_mesh()
     state = place(state, parameter_sharding(mesh, state))
@@ -73,7 +94,7 @@ def network_outputs(data: Path, split: str, task: ClassifierTask | EntropyTask, 
             filled = [*chunk, *chunk[:1] * (mesh.size - len(chunk))]
             batch = {name: np.concatenate([one[name] for one in filled]) for name in filled[0]}
             # Fetched after the loop: the next objects are read while the devices look at these.
-            out.append(_look(task, structure, state, place_batch(mesh, batch)))
+            out.append(_look(task, structure, state, place_batch(mesh, batch), ask))
             bar.advance(line, len(chunk))
     found = np.concatenate([np.asarray(part) for part in out])
     return found.reshape(len(out) * mesh.size, -1, found.shape[-1])[:objects]

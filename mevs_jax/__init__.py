@@ -13,7 +13,7 @@ from mevs_jax.calibration import (
 from mevs_jax.cameras import Camera, cameras_at, look_at_origin, orbit, partial_cloud, pixel_directions, unproject
 from mevs_jax.decisions import Decision, NextView
 from mevs_jax.entropy import depth_entropy, depth_levels, level_entropy, quantise_depth, shannon_entropy
-from mevs_jax.fusion import beliefs_along, confidence, discounted, mean_of_probabilities, sum_of_logits
+from mevs_jax.fusion import SetFusion, beliefs_along, confidence, discounted, mean_of_probabilities, sum_of_logits
 from mevs_jax.metrics import (
     accuracy,
     bootstrap_interval,
@@ -69,6 +69,7 @@ __all__ = [
     "ResNet",
     "Scene",
     "SelectionState",
+    "SetFusion",
     "ViewGraph",
     "ViewTable",
     "accuracy",

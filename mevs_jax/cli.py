@@ -24,6 +24,7 @@ COMMANDS = {
     "compat": "train the classifier the published code's way too, evaluate and report again",
     "thesis": "every network, table and figure of the thesis, beside its own numbers",
     "ascend": "climb to the best view of one object by a renderer's gradient; draw it",
+    "fuse": "train the set fusion on the classifier's features; evaluate and report again",
     "climb": "where differentiable rendering would look next; evaluate and report again",
     "live": "walk test objects with the networks in the loop; compare with the tables",
 }
@@ -142,7 +143,9 @@ def _run(command: str, arguments: list[str]) -> None:
         pipeline.train_by_view(settings, out, start)
     if command == "climb":
         pipeline.climb_on_objects(settings, out)
-    if command in ("run", "eval", "compat", "climb"):
+    if command == "fuse":
+        pipeline.train_set_fusion(settings, out)
+    if command in ("run", "eval", "compat", "climb", "fuse"):
         metrics = pipeline.evaluate(settings, out)
         console.print(
             f"Single views: {100 * metrics['single_view']['accuracy']:.1f} % of {metrics['objects']} test objects right"
@@ -160,7 +163,7 @@ def _run(command: str, arguments: list[str]) -> None:
                 f"{policy}: {found.same} of {found.walks} walks are the same live as by table "
                 f"(confidences within {found.largest_difference:.1e})"
             )
-    if command in ("run", "report", "compat", "climb"):
+    if command in ("run", "report", "compat", "climb", "fuse"):
         console.print(f"Report: {pipeline.report(settings, preset, out).absolute()}")
 
 

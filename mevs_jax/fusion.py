@@ -7,13 +7,18 @@ What the sum gets wrong is not which class is the most likely but how sure one m
 independent. All of the family p ∝ Π pᵢ^α with an α that depends on the number of views (`discounted`) agree on the class; the
 thesis has α = 1, the mean of log-probabilities α = 1/n, and α = 1/T(n) is what `mevs_jax.calibration` fits. The mean of
 probabilities (a mixture) can disagree.
+
+`SetFusion` is learnt: a belief of features and directions of any views, which need not be independent.
 """
 
 from __future__ import annotations
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from flax import nnx
+from jaxtyping import Array, Bool, Float
+
+from mevs_jax.arrays import AnyArray
 
 
 def sum_of_logits(belief: Float[Array, "classes"], logits: Float[Array, "classes"]) -> Float[Array, "classes"]:
@@ -50,3 +55,80 @@ def mean_of_probabilities(logits: Float[Array, "steps classes"]) -> Float[Array,
     """Logarithm of the mean probability of each class after each step of a walk (linear opinion pool)."""
     total = jax.lax.cumlogsumexp(jax.nn.log_softmax(logits, axis=-1), axis=0)
     return total - jnp.log(jnp.arange(1, len(logits) + 1))[:, None]
+
+
+class _Block(nnx.Module):
+    """Attention among tokens, then two layers on each, beside what they are added to (pre-norm)."""
+
+    def __init__(self, width: int, heads: int, dropout: float, *, rngs: nnx.Rngs):
+        self.norm1, self.norm2 = nnx.LayerNorm(width, rngs=rngs), nnx.LayerNorm(width, rngs=rngs)
+        self.attention = nnx.MultiHeadAttention(heads, width, decode=False, rngs=rngs)
+        self.layer1, self.layer2 = nnx.Linear(width, 2 * width, rngs=rngs), nnx.Linear(2 * width, width, rngs=rngs)
+        self.dropout = nnx.Dropout(dropout, rngs=rngs)
+
+    def __call__(self, x: Array, present: Array, *, train: bool) -> Array:
+        seen = present[..., None, None, :]  # one query like another, over all heads
+        x = x + self.dropout(self.attention(self.norm1(x), mask=seen), deterministic=not train)
+        hidden = self.layer2(jax.nn.gelu(self.layer1(self.norm2(x))))
+        return x + self.dropout(hidden, deterministic=not train)
+
+
+class SetFusion(nnx.Module):
+    """What several views say together: a small set transformer over features and viewing directions.
+
+    Any subset of views in any order, also none: a token of its own attends to those that are there, and becomes the belief. As
+    in Set Transformer (Lee et al. 2019) and ViewFormer (Sun et al. 2023), with directions, which the latter leaves out.
+
+    Args:
+        features: length of a view's feature vector.
+        classes: number of logits.
+        width: of the tokens.
+        heads: of attention.
+        blocks: of attention and layers.
+        dropout: within blocks, and of whole feature channels before them.
+        rngs: source of initial weights and of dropout.
+    """
+
+    def __init__(
+        self,
+        features: int,
+        classes: int,
+        *,
+        width: int = 128,
+        heads: int = 4,
+        blocks: int = 2,
+        dropout: float = 0.1,
+        rngs: nnx.Rngs,
+    ):
+        self.norm = nnx.LayerNorm(features, rngs=rngs)
+        self.dropout = nnx.Dropout(dropout, rngs=rngs)
+        self.view = nnx.Linear(features, width, rngs=rngs)
+        self.direction = nnx.Linear(3, width, rngs=rngs)
+        self.object = nnx.Param(0.02 * jax.random.normal(rngs.params(), (width,)))
+        self.blocks = nnx.List([_Block(width, heads, dropout, rngs=rngs) for _ in range(blocks)])
+        self.last_norm = nnx.LayerNorm(width, rngs=rngs)
+        self.head = nnx.Linear(width, classes, rngs=rngs)
+
+    def __call__(
+        self,
+        features: Float[AnyArray, "*batch views features"],
+        directions: Float[AnyArray, "*batch views 3"],
+        present: Bool[AnyArray, "*batch views"],
+        *,
+        train: bool = False,
+    ) -> Float[Array, "*batch classes"]:
+        """Logits of what was seen.
+
+        Args:
+            directions: unit vectors from the object to the cameras.
+            present: which views were looked at; what the others hold does not matter.
+        """
+        features, directions, present = jnp.asarray(features), jnp.asarray(directions), jnp.asarray(present)
+        known = self.dropout(self.norm(jnp.where(present[..., None], features, 0.0)), deterministic=not train)
+        tokens = self.view(known) + self.direction(directions)
+        own = jnp.broadcast_to(self.object[...], (*tokens.shape[:-2], 1, tokens.shape[-1]))
+        x = jnp.concatenate([own, tokens], axis=-2)
+        there = jnp.concatenate([jnp.ones((*present.shape[:-1], 1), bool), present], axis=-1)
+        for block in self.blocks:
+            x = block(x, there, train=train)
+        return self.head(self.last_norm(x[..., 0, :]))

@@ -16,6 +16,7 @@ import numpy as np
 import pytest
 import trimesh
 
+from eval.pipeline import TINY, climb_on_objects, train_set_fusion
 from mevs_jax import cli
 from tests.conftest import open3d_or_skip
 
@@ -206,28 +207,26 @@ def test_networks_for_another_number_of_views_are_refused(whole, tmp_path):
     assert "was trained for 6 views, the data set has 8" in refused(mevs("eval", "--preset", "tiny", "--out", tmp_path))
 
 
-def test_climbing_adds_its_ladder(whole, tmp_path):
+def test_compat_climbs_and_fusion_fill_their_tables(whole, tmp_path):
+    """One evaluation of what `mevs compat`, `climb` and `fuse` add to a run."""
     open3d_or_skip()
     out = tmp_path / "run"
     shutil.copytree(whole, out)
-    shown = mevs("climb", "--preset", "tiny", "--out", out, "--data", "furniture10")
-    assert shown.returncode == 0, shown.stderr
-    found = json.loads((out / "metrics.json").read_text())["climbing"]
-    assert found["objects"] == 2
-    assert found["views"] == 12
-    assert {"random", "predicted_entropy", "diff_volume", "diff_mesh"} <= set(found["policies"])
-    assert "Choosing by differentiable rendering" in (out / "report" / "index.html").read_text()
-
-
-def test_compat_trains_the_published_codes_way_and_fills_its_rows(whole, tmp_path):
-    out = tmp_path / "run"
-    shutil.copytree(whole, out)
     assert "mevs compat" in (out / "report" / "index.html").read_text()
+    train_set_fusion(TINY, out)
+    climb_on_objects(TINY, out)
     assert mevs("compat", "--preset", "tiny", "--out", out).returncode == 0
-    made = json.loads((out / "metrics.json").read_text())["compatibility"]
+    metrics = json.loads((out / "metrics.json").read_text())
+    made = metrics["compatibility"]
     assert all(row["difference"] is not None for row in made["rows"].values())
     assert set(made["single_view_accuracy"]) == {"classifier", "classifier_by_view"}
-    assert "mevs compat" not in (out / "report" / "index.html").read_text()
+    assert (metrics["climbing"]["objects"], metrics["climbing"]["views"]) == (2, 12)
+    assert {"random", "predicted_entropy", "diff_volume", "diff_mesh"} <= set(metrics["climbing"]["policies"])
+    assert [row["views"] for row in metrics["fusion"]["rows"]] == [1, 2, 3, 4, 5, 6]
+    page = (out / "report" / "index.html").read_text()
+    assert "Choosing by differentiable rendering" in page
+    assert "Fusing views" in page
+    assert "mevs compat" not in page
     before = json.loads((whole / "metrics.json").read_text())
     assert before["compatibility"]["rows"]["text"] == made["rows"]["text"]
 

@@ -55,6 +55,10 @@ class Checkpoints:
         )
         return restored["state"], restored["progress"]
 
+    def latest_step(self, slot: str) -> int:
+        """The newest step of a slot; 0 where nothing was saved."""
+        return self._slots[slot].latest_step() or 0
+
     @interrupts_held()
     def close(self) -> None:
         for manager in self._slots.values():

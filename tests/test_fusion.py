@@ -1,0 +1,143 @@
+"""Fusing views by attention: the plain formula, any order, padding, and that it learns what a sum cannot say."""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from flax import nnx
+
+from eval.fusing import fusion_study, sets_of_size
+from mevs_jax.fusion import SetFusion
+from train.fusion import Features, FusionConfig, random_sets, train_fusion
+
+VIEWS, FEATURES, CLASSES = 5, 12, 3
+
+
+@pytest.fixture(scope="module")
+def network() -> SetFusion:
+    made = SetFusion(FEATURES, CLASSES, width=16, heads=4, blocks=2, dropout=0.5, rngs=nnx.Rngs(0))
+    # Biases and scales begin as zeros and ones, which would hide mistakes.
+    state = nnx.state(made, nnx.Param)
+    leaves, tree = jax.tree.flatten(state)
+    keys = jax.random.split(jax.random.key(5), len(leaves))
+    moved = [leaf + 0.3 * jax.random.normal(key, leaf.shape) for leaf, key in zip(leaves, keys, strict=True)]
+    nnx.update(made, jax.tree.unflatten(tree, moved))
+    return made
+
+
+@pytest.fixture(scope="module")
+def seen() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    random = np.random.default_rng(3)
+    directions = random.normal(size=(VIEWS, 3))
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    present = np.array([True, False, True, True, False])
+    return random.normal(size=(VIEWS, FEATURES)).astype(np.float32), directions.astype(np.float32), present
+
+
+def plain(network: SetFusion, features: np.ndarray, directions: np.ndarray, present: np.ndarray) -> np.ndarray:
+    """Token by token, head by head."""
+    value = lambda parameter: np.asarray(parameter[...], np.float64)  # noqa: E731
+
+    def norm(layer, x):
+        return (x - x.mean()) / np.sqrt(x.var() + 1e-6) * value(layer.scale) + value(layer.bias)
+
+    def linear(layer, x):
+        return x @ value(layer.kernel) + value(layer.bias)
+
+    tokens = [value(network.object)]
+    for view in np.flatnonzero(present):
+        known = norm(network.norm, features[view].astype(np.float64))
+        tokens.append(linear(network.view, known) + linear(network.direction, directions[view]))
+    for block in network.blocks:
+        normed = [norm(block.norm1, token) for token in tokens]
+        attention, after = block.attention, []
+        for at, token in enumerate(tokens):
+            out = value(attention.out.bias).copy()
+            for head in range(attention.num_heads):
+                query, key, content = (
+                    [one @ value(part.kernel)[:, head] + value(part.bias)[head] for one in normed]
+                    for part in (attention.query, attention.key, attention.value)
+                )
+                scores = np.array([query[at] @ other for other in key]) / np.sqrt(len(query[at]))
+                weights = np.exp(scores - scores.max())
+                mixed = sum(w * c for w, c in zip(weights / weights.sum(), content, strict=True))
+                out += mixed @ value(attention.out.kernel)[head]
+            after.append(token + out)
+        tokens = []
+        for token in after:
+            hidden = linear(block.layer1, norm(block.norm2, token))
+            smooth = 0.5 * hidden * (1 + np.tanh(np.sqrt(2 / np.pi) * (hidden + 0.044715 * hidden**3)))
+            tokens.append(token + linear(block.layer2, smooth))
+    return linear(network.head, norm(network.last_norm, tokens[0]))
+
+
+@nnx.jit
+def fused(network: SetFusion, *arguments: np.ndarray) -> jax.Array:
+    return network(*arguments)
+
+
+def test_it_is_the_plain_formula(network, seen):
+    np.testing.assert_allclose(fused(network, *seen), plain(network, *seen), atol=2e-5)
+
+
+def test_order_and_padding_do_not_matter_and_no_view_is_a_belief_too(network, seen):
+    features, directions, present = seen
+    belief = fused(network, features, directions, present)
+    order = np.array([3, 1, 4, 0, 2])
+    np.testing.assert_allclose(fused(network, features[order], directions[order], present[order]), belief, atol=1e-5)
+    junk = np.where(present[:, None], features, np.nan).astype(np.float32)
+    np.testing.assert_allclose(fused(network, junk, directions, present), belief, atol=1e-6)
+    some = np.flatnonzero(present)
+    alone = fused(network, features[some], directions[some], present[some])
+    np.testing.assert_allclose(alone, belief, atol=1e-5)
+    nothing = np.zeros(VIEWS, bool)
+    assert np.isfinite(fused(network, features, directions, nothing)).all()
+    both = fused(network, *(np.stack([array, array]) for array in (features, directions)), np.stack([present, nothing]))
+    np.testing.assert_allclose(both[0], belief, atol=1e-5)
+
+
+def test_training_sets_have_every_size_as_often_and_views_as_often():
+    sets = np.asarray(random_sets(jax.random.key(0), 20_000, 6, 4))
+    sizes = np.bincount(sets.sum(axis=1), minlength=7) / len(sets)
+    np.testing.assert_allclose(sizes, [0, 0.25, 0.25, 0.25, 0.25, 0, 0], atol=0.02)
+    np.testing.assert_allclose(sets.mean(axis=0), 2.5 / 6, atol=0.02)
+    tried = sets_of_size(50, 6, 2, 8)
+    assert (tried.sum(axis=-1) == 2).all()
+    assert (tried[0] != tried[1]).any()
+    np.testing.assert_array_equal(tried, sets_of_size(50, 6, 2, 8))
+
+
+def made_up(objects: int, seed: int) -> Features:
+    """Objects whose class is the parity of two signs that no single view shows both of: single-view logits say nothing."""
+    random = np.random.default_rng(seed)
+    signs = random.choice([-1.0, 1.0], (objects, 2))
+    features = random.normal(0, 0.3, (objects, 4, 6))
+    features[:, 0::2, 0] += 2 * signs[:, :1]
+    features[:, 1::2, 1] += 2 * signs[:, 1:]
+    labels = (signs.prod(axis=1) > 0).astype(np.int32)
+    logits = random.normal(0, 0.1, (objects, 4, 2))
+    directions = np.array([[1.0, 0, 0], [0, 1, 0], [-1, 0, 0], [0, -1, 0]])
+    return Features(
+        *(jnp.asarray(a, jnp.float32) for a in (features, logits)), jnp.asarray(labels), jnp.asarray(directions)
+    )
+
+
+def test_what_no_view_shows_alone_is_learnt_and_reported():
+    config = FusionConfig(
+        width=32, heads=2, blocks=1, dropout=0.0, largest_set=4, epochs=25, batch_size=64, learning_rate=3e-3
+    )
+    train, validation, test = (made_up(objects, seed) for seed, objects in enumerate((512, 128, 256)))
+    network, found = train_fusion(config, train, validation)
+    assert len(found["epochs"]) == 25
+    assert found["best_loss"] == min(epoch["validation"] for epoch in found["epochs"])
+    rows = {row["views"]: row for row in fusion_study(network, validation, test)["rows"]}
+    assert list(rows) == [1, 2, 3, 4]
+    assert rows[1]["learnt"]["accuracy"] < 0.6  # one sign says nothing
+    assert rows[4]["learnt"]["accuracy"] > 0.95
+    assert rows[4]["sum"]["accuracy"] < 0.65
+    assert rows[4]["difference_interval"][0] > 0.25
+    # Two of four views show both signs in four cases of six, in the others one guesses.
+    assert 0.75 < rows[2]["learnt"]["accuracy"] < 0.88
+    assert rows[2]["learnt"]["calibration_error"] < 0.1
