@@ -108,7 +108,7 @@ def rendering_times(results: dict[str, Any]) -> ThesisTable:
         rows,
         f"Ours: depth entropy of a soft mesh of at most {FACES} faces, and opacity entropy of a 32³ volume, both at "
         f"{ours['resolution']}×{ours['resolution']} pixels; all {ours['starts']} starts of an object together, {ours['runs']} "
-        "objects a class, on the machine of Table 1. The thesis: one start, at 256×256 (NR) and 512×512 (DiffDVR), on its GPU.",
+        "objects a class, on the machine of Table 1. The thesis: one start, on its GPU.",
     )
 
 
