@@ -11,7 +11,16 @@ REAL = Path(__file__).resolve().parents[2] / "shared"
 
 
 # The files that take longest, one worker each: begun first, so that none is left for one worker at the end.
-LONG = ("test_cli", "test_sweep", "test_thesis", "test_training", "test_scaling", "test_processes", "test_evaluation")
+LONG = (
+    "test_cli",
+    "test_sweep",
+    "test_thesis",
+    "test_training",
+    "test_soft_rendering",
+    "test_scaling",
+    "test_processes",
+    "test_evaluation",
+)
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
