@@ -31,7 +31,7 @@ from data_pipeline.volumes import decimate, normals_towards, reconstruct, voxeli
 from eval.ascent import METHODS, climb, padded_triangles
 from eval.comparison import difference, summarise
 from eval.grid import GridConfig, run_grid
-from eval.ladder import CLIMBED, Rung, ladder
+from eval.ladder import CLIMBED, KNOWS, Rung, ladder
 from eval.study import exactly_random, reachable_views
 from eval.view_tables import ViewTables
 from mevs_jax.cameras import Camera, partial_cloud
@@ -259,7 +259,8 @@ def climbing_study(
         logits=table.logits[:, None],
         climbed={name: jnp.asarray(scores, jnp.float32) for name, scores in climbed.scores.items()},
     )
-    rungs: tuple[Rung, ...] = (*(rung for rung in ladder(config.draws) if rung.policy in COMPARED), *CLIMBED)
+    compared = [rung for rung in ladder(config.draws) if rung.policy in COMPARED]
+    rungs: tuple[Rung, ...] = tuple(sorted((*compared, *CLIMBED), key=lambda rung: [*KNOWS].index(rung.knows)))
     console.print(f"Walking {len(chosen)} test objects by differentiable rendering")
     found = run_grid(
         jax.random.key(config.seed),
