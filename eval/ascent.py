@@ -152,8 +152,8 @@ def ascend_on(data: DataConfig, config: AscentConfig, out: Path) -> tuple[str, P
     Raises:
         DataError: where there is no such object, or nothing to see of it.
     """
-    if config.starts < 1 or config.resolution < 8:
-        raise DataError("--ascent.starts must be at least 1 and --ascent.resolution at least 8")
+    if config.starts < 2 or config.resolution < 8:
+        raise DataError("--ascent.starts must be at least 2 and --ascent.resolution at least 8")
     entry, method = find(data, config.object), METHODS[config.method]
     try:
         thing = jnp.asarray(method.prepare(load_object(entry)))

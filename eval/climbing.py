@@ -200,8 +200,8 @@ def climb_objects(
     Args:
         names: of all objects of the test split, in the order of the shards.
     """
-    if min(config.objects, config.starts, config.faces) < 1 or config.resolution < 8:
-        raise DataError("--climb.objects, starts and faces must be at least 1 and --climb.resolution at least 8")
+    if min(config.objects, config.starts - 1, config.faces) < 1 or config.resolution < 8:
+        raise DataError("--climb.objects and faces must be at least 1, --climb.starts 2 and --climb.resolution 8")
     entries = {entry.name: entry for entry in open_objects(dataset).entries}
     folder, chosen = _folder(out, statistics, config), chosen_objects(config, len(names))
     for at in chosen:

@@ -132,9 +132,9 @@ TINY = Settings(
     ),
     evaluation=GridConfig(draws=2),
     live=LiveConfig(objects=12, at_once=8, max_views=4),
-    thesis=ThesisConfig(_TRIFLE, _TRIFLE, _TRIFLE, resnet34_width=8, timing_runs=3, climbing_runs=1, climbing_starts=1),
+    thesis=ThesisConfig(_TRIFLE, _TRIFLE, _TRIFLE, resnet34_width=8, timing_runs=3, climbing_runs=1, climbing_starts=2),
     fusion=FusionConfig(width=16, heads=2, blocks=1, epochs=2, batch_size=16),
-    climb=ClimbConfig(objects=2, starts=2, resolution=16, faces=64),
+    climb=ClimbConfig(objects=1, starts=2, resolution=16, faces=64),
 )
 """Seconds, and no use but to see that everything runs."""
 

@@ -220,6 +220,8 @@ def reproduce(settings: Settings, preset: str, out: Path, pretrained: tuple[Path
     if settings.evaluation.lowest_elevation > -90:
         raise DataError("mevs thesis walks from every view; leave --evaluation.lowest-elevation as it is")
     check_evaluation(settings.evaluation)
+    if settings.thesis.climbing_runs < 1 or settings.thesis.climbing_starts < 2:
+        raise DataError("--thesis.climbing-runs must be at least 1 and --thesis.climbing-starts at least 2")
     first = first_weights(settings.classifier, settings.thesis, pretrained)
     folder = ThesisFolder(out)
     make_thesis_data(settings, folder)

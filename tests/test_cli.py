@@ -220,7 +220,7 @@ def test_compat_climbs_and_fusion_fill_their_tables(whole, tmp_path):
     made = metrics["compatibility"]
     assert all(row["difference"] is not None for row in made["rows"].values())
     assert set(made["single_view_accuracy"]) == {"classifier", "classifier_by_view"}
-    assert (metrics["climbing"]["objects"], metrics["climbing"]["views"]) == (2, 12)
+    assert (metrics["climbing"]["objects"], metrics["climbing"]["views"]) == (1, 6)
     assert {"random", "predicted_entropy", "diff_volume", "diff_mesh"} <= set(metrics["climbing"]["policies"])
     assert [row["views"] for row in metrics["fusion"]["rows"]] == [1, 2, 3, 4, 5, 6]
     page = (out / "report" / "index.html").read_text()

@@ -395,5 +395,5 @@ def test_the_command_climbs_and_draws(method, tmp_path):
         assert moving.n_frames > 4
     with pytest.raises(DataError, match="no object 'nobody'"):
         ascend_on(data, AscentConfig(object="nobody"), tmp_path)
-    with pytest.raises(DataError, match="at least 1"):
-        ascend_on(data, AscentConfig(starts=0), tmp_path)
+    with pytest.raises(DataError, match="at least 2"):
+        ascend_on(data, AscentConfig(starts=1), tmp_path)
