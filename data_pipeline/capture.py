@@ -11,7 +11,6 @@ The thesis's own way, a window of Open3D's, is in `data_pipeline.visualizer`.
 
 from __future__ import annotations
 
-import io
 import zlib
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -21,7 +20,7 @@ from typing import Literal, Protocol
 
 import numpy as np
 
-from data_pipeline.files import write_bytes
+from data_pipeline.files import write_npz
 from data_pipeline.meshes import Mesh
 
 DEPTH_SCALE = 10_000  # as in mevs_jax.entropy, which capture workers do without; a test holds the two together
@@ -231,10 +230,8 @@ def store_depth(depth: np.ndarray) -> np.ndarray:
 
 def save_capture(path: Path, capture: Capture) -> None:
     """Fast compression: most of a view is background."""
-    buffer = io.BytesIO()
     depth, image = (np.frombuffer(zlib.compress(a.tobytes(), 1), np.uint8) for a in (capture.depth, capture.image))
-    np.savez(buffer, shape=np.array(capture.depth.shape), extent=capture.extent, depth=depth, image=image)
-    write_bytes(path, buffer.getvalue())
+    write_npz(path, shape=np.array(capture.depth.shape), extent=capture.extent, depth=depth, image=image)
 
 
 def load_capture(path: Path) -> Capture:

@@ -11,14 +11,14 @@ from multiprocessing.pool import ThreadPool
 from pathlib import Path
 
 from data_pipeline.capture import Capture, CaptureConfig, Rig, capture, rig_for, save_capture
-from data_pipeline.files import write_text
+from data_pipeline.files import npz_of, write_text
 from data_pipeline.meshes import DamagedMesh, EmptyMesh, Mesh, ObjectEntry, load_object
 from data_pipeline.progress import progress_bar
 from data_pipeline.visualizer import capture_with_visualizer
 
 
 def capture_path(folder: Path, entry: ObjectEntry) -> Path:
-    return folder / (entry.name.replace("/", "__") + ".npz")
+    return npz_of(folder, entry.name)
 
 
 def _left_out_path(folder: Path, entry: ObjectEntry) -> Path:

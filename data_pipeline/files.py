@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import json
 import os
 from pathlib import Path
@@ -22,6 +23,17 @@ def write_bytes(path: Path, content: bytes) -> None:
 
 def write_text(path: Path, content: str) -> None:
     write_bytes(path, content.encode())
+
+
+def write_npz(path: Path, **arrays: Any) -> None:
+    buffer = io.BytesIO()
+    np.savez(buffer, **arrays)
+    write_bytes(path, buffer.getvalue())
+
+
+def npz_of(folder: Path, name: str) -> Path:
+    """The file in `folder` that belongs to an object of this name."""
+    return folder / (name.replace("/", "__") + ".npz")
 
 
 def _plain(value: Any) -> Any:

@@ -29,6 +29,10 @@ def _surface(mesh: Mesh) -> Any:
     )
 
 
+def _cloud(points: np.ndarray) -> Any:
+    return _open3d().geometry.PointCloud(_open3d().utility.Vector3dVector(points.astype(np.float64)))
+
+
 def decimate(mesh: Mesh, faces: int) -> Mesh:
     """The mesh with at most about `faces` triangles, as it is where it has no more."""
     if len(mesh.faces) <= faces:
@@ -47,8 +51,7 @@ def normals_towards(points: np.ndarray, camera: np.ndarray) -> np.ndarray:
     """
     if len(points) < 3:
         raise DataError(f"normals need at least 3 points, got {len(points)}")
-    open3d = _open3d()
-    cloud = open3d.geometry.PointCloud(open3d.utility.Vector3dVector(points.astype(np.float64)))
+    open3d, cloud = _open3d(), _cloud(points)
     cloud.estimate_normals(open3d.geometry.KDTreeSearchParamKNN(12))
     cloud.orient_normals_towards_camera_location(camera.astype(np.float64))
     return np.asarray(cloud.normals, np.float32)
@@ -68,8 +71,7 @@ def reconstruct(points: np.ndarray, normals: np.ndarray, faces: int, *, depth: i
     """
     if len(points) < 16:
         raise DataError(f"a surface needs at least 16 points, got {len(points)}")
-    open3d = _open3d()
-    cloud = open3d.geometry.PointCloud(open3d.utility.Vector3dVector(points.astype(np.float64)))
+    open3d, cloud = _open3d(), _cloud(points)
     unit = normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
     cloud.normals = open3d.utility.Vector3dVector(unit.astype(np.float64))
     surface, support = open3d.geometry.TriangleMesh.create_from_point_cloud_poisson(cloud, depth=depth, n_threads=1)

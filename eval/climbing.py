@@ -7,7 +7,6 @@ candidate view. `mevs climb` makes these tables object by object, then evaluates
 
 from __future__ import annotations
 
-import io
 import multiprocessing
 import os
 import signal
@@ -24,7 +23,7 @@ from jaxtyping import Array, Float
 
 from data_pipeline.builder import DataConfig, DatasetStatistics, open_objects, open_split
 from data_pipeline.capture import DEPTH_SCALE
-from data_pipeline.files import write_bytes
+from data_pipeline.files import npz_of, write_npz
 from data_pipeline.meshes import DataError, Mesh, ObjectEntry, load_object
 from data_pipeline.progress import console, progress_bar
 from data_pipeline.volumes import decimate, normals_towards, reconstruct, voxelise, voxelise_cloud
@@ -33,7 +32,7 @@ from eval.comparison import difference, summarise
 from eval.grid import GridConfig, run_grid
 from eval.ladder import CLIMBED, KNOWS, Rung, ladder
 from eval.study import exactly_random, reachable_views
-from eval.view_tables import ViewTables
+from eval.view_tables import ViewTables, objects_of
 from mevs_jax.cameras import Camera, partial_cloud
 from mevs_jax.rendering import corners_of_cells, distinct_optima
 from mevs_jax.viewpoints import ViewGraph
@@ -127,7 +126,7 @@ def scores_of_object(
         (views, views) by the names of `CLIMBED`, and `without_surface`, how many views show too little for one.
     """
     volumes, surfaces, missing = [], [], 0
-    nothing = np.zeros_like(padded_triangles(mesh, 1), shape=(config.faces, 3, 3))
+    nothing = np.zeros((config.faces, 3, 3), np.float32)
     for image, pose in zip(depth, poses, strict=True):
         seen, real = partial_cloud(image, Camera(jnp.asarray(pose), field_of_view, len(image)))
         cloud = np.asarray(seen)[np.asarray(real)]
@@ -154,10 +153,6 @@ def _folder(out: Path, statistics: DatasetStatistics, config: ClimbConfig) -> Pa
     return out / "climbed" / "_".join((statistics.fingerprint, *made))
 
 
-def _path(folder: Path, name: str) -> Path:
-    return folder / (name.replace("/", "__") + ".npz")
-
-
 def chosen_objects(config: ClimbConfig, objects: int) -> np.ndarray:
     """Positions of the chosen objects in a split of so many."""
     return np.unique(np.linspace(0, objects - 1, min(config.objects, objects)).round().astype(int))
@@ -174,14 +169,12 @@ def _climb_one(job: _Job, data: Path, statistics: DatasetStatistics, folder: Pat
     depth = example["depth"].reshape(statistics.views, statistics.camera.resolution, -1) / DEPTH_SCALE
     points = jnp.array(statistics.viewpoints, jnp.float32)
     found = scores_of_object(load_object(entry), depth, example["pose"], field_of_view, points, config)
-    buffer = io.BytesIO()
-    np.savez(buffer, **found)  # type: ignore[arg-type]
-    write_bytes(_path(folder, entry.name), buffer.getvalue())
+    write_npz(npz_of(folder, entry.name), **found)
 
 
-def _start_worker(*arguments: Any) -> None:
+def _start_worker(data: Path, statistics: DatasetStatistics, folder: Path, config: ClimbConfig) -> None:
     global _worker
-    _worker = partial(_climb_one, **dict(zip(("data", "statistics", "folder", "config"), arguments, strict=True)))
+    _worker = partial(_climb_one, data=data, statistics=statistics, folder=folder, config=config)
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent answers Ctrl-C and ends its workers
 
 
@@ -190,24 +183,20 @@ def _work(job: _Job) -> None:
     _worker(job)
 
 
-def climb_objects(
-    dataset: DataConfig, statistics: DatasetStatistics, names: list[str], out: Path, config: ClimbConfig
-) -> None:
+def climb_objects(dataset: DataConfig, statistics: DatasetStatistics, out: Path, config: ClimbConfig) -> None:
     """Climbs on the chosen test objects, each into a file of its own; those that are there are not climbed on again.
 
     On a CPU several processes at a time: a climb uses one core.
-
-    Args:
-        names: of all objects of the test split, in the order of the shards.
     """
     if min(config.objects, config.starts - 1, config.faces) < 1 or config.resolution < 8:
         raise DataError("--climb.objects and faces must be at least 1, --climb.starts 2 and --climb.resolution 8")
     entries = {entry.name: entry for entry in open_objects(dataset).entries}
+    names = objects_of(out / "data", "test", statistics)[0]
     folder, chosen = _folder(out, statistics, config), chosen_objects(config, len(names))
     for at in chosen:
         if names[at] not in entries:
             raise DataError(f"{dataset.source} has no object {names[at]!r}; give the --data that {out} was made of")
-    jobs = [(int(at), entries[names[at]]) for at in chosen if not _path(folder, names[at]).exists()]
+    jobs = [(int(at), entries[names[at]]) for at in chosen if not npz_of(folder, names[at]).exists()]
     given = out / "data", statistics, folder, config
     with progress_bar("objects") as bar:
         line = bar.add_task("Climbing", total=len(chosen), completed=len(chosen) - len(jobs), note="")
@@ -222,10 +211,14 @@ def climb_objects(
                 bar.advance(line)
 
 
-def load_climbed(out: Path, statistics: DatasetStatistics, config: ClimbConfig, names: list[str]) -> Climbed | None:
+def load_climbed(out: Path, statistics: DatasetStatistics, config: ClimbConfig) -> Climbed | None:
     """What was climbed, or None where some chosen objects are missing."""
-    folder, chosen = _folder(out, statistics, config), chosen_objects(config, len(names))
-    paths = [_path(folder, names[at]) for at in chosen]
+    folder = _folder(out, statistics, config)
+    if not folder.exists():
+        return None
+    names = objects_of(out / "data", "test", statistics)[0]  # reads the whole split
+    chosen = chosen_objects(config, len(names))
+    paths = [npz_of(folder, names[at]) for at in chosen]
     if not all(path.exists() for path in paths):
         return None
     scores: dict[str, list[np.ndarray]] = {rung.policy: [] for rung in CLIMBED}

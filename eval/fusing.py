@@ -6,7 +6,6 @@ validation objects, which it never saw, decide which epoch is kept and fit the t
 
 from __future__ import annotations
 
-import io
 from dataclasses import asdict
 from functools import partial
 from pathlib import Path
@@ -19,10 +18,11 @@ from flax import nnx
 from jaxtyping import Array, Bool, Float
 
 from data_pipeline.builder import DatasetStatistics
-from data_pipeline.files import read_json, write_bytes, write_json
+from data_pipeline.files import read_json, write_json
+from data_pipeline.meshes import DataError
 from data_pipeline.progress import console
 from eval.comparison import intervals
-from eval.view_tables import made_by, network_outputs, objects_of
+from eval.view_tables import made_by, network_outputs, objects_of, stored_array
 from mevs_jax.calibration import expected_calibration_error, fit_temperature, negative_log_likelihood
 from mevs_jax.fusion import SetFusion
 from mevs_jax.models import ResNet
@@ -43,17 +43,12 @@ def _features(network: ResNet, images: Array) -> Array:
 
 def classifier_features(out: Path, split: str, statistics: DatasetStatistics, task: ClassifierTask) -> Features:
     """Of every view of a split; kept in `out/features` until the classifier is another."""
-    made, path = made_by(statistics, out / "classifier"), out / "features" / f"{split}.npz"
     labels = objects_of(out / "data", split, statistics)[1]
-    both = None
-    if path.exists():
-        with np.load(path) as stored:
-            both = stored["both"] if str(stored["made_by"]) == made else None
-    if both is None:
-        both = network_outputs(out / "data", split, task, load_best(task, out / "classifier"), _features)
-        buffer = io.BytesIO()
-        np.savez(buffer, both=both, made_by=np.array(made))
-        write_bytes(path, buffer.getvalue())
+    both = stored_array(
+        out / "features" / f"{split}.npz",
+        made_by(statistics, out / "classifier"),
+        lambda: network_outputs(out / "data", split, task, load_best(task, out / "classifier"), _features),
+    )
     directions = jnp.array(statistics.viewpoints, jnp.float32)
     classes = len(statistics.classes)
     return Features(
@@ -67,10 +62,10 @@ def _identity(out: Path, statistics: DatasetStatistics, config: FusionConfig) ->
 
 def fuse(out: Path, statistics: DatasetStatistics, task: ClassifierTask, config: FusionConfig) -> None:
     """Trains the set fusion on the features of the training objects, unless it is there."""
+    if fusion_identity(out, statistics, config) is not None:
+        return
     folder, identity = out / "fusion", _identity(out, statistics, config)
     path = folder / "summary.json"
-    if path.exists() and read_json(path)["identity"] == identity:
-        return
     train, validation = (classifier_features(out, split, statistics, task) for split in ("train", "val"))
     console.print(f"Training the set fusion on {len(train.labels)} objects, {config.epochs} epochs")
     network, found = train_fusion(config, train, validation)
@@ -82,20 +77,23 @@ def fuse(out: Path, statistics: DatasetStatistics, task: ClassifierTask, config:
     console.print(f"set fusion: validation loss {found['best_loss']:.4f}")
 
 
-def load_fusion(
-    out: Path, statistics: DatasetStatistics, task: ClassifierTask, config: FusionConfig
-) -> tuple[SetFusion, dict[str, Any]] | None:
-    """The trained network and its summary; None where there is none of this classifier and configuration."""
+def fusion_identity(out: Path, statistics: DatasetStatistics, config: FusionConfig) -> dict[str, Any] | None:
+    """Of the trained fusion; None where there is none of this classifier and configuration."""
     path = out / "fusion" / "summary.json"
-    if not path.exists() or (summary := read_json(path))["identity"] != _identity(out, statistics, config):
+    if not path.exists() or (identity := read_json(path)["identity"]) != _identity(out, statistics, config):
         return None
-    network = new_fusion(config, 8 * task.network_config.width, len(statistics.classes))
+    return identity
+
+
+def load_fusion(out: Path, classes: int, task: ClassifierTask, config: FusionConfig) -> SetFusion:
+    """The trained network, which is there (`fusion_identity`)."""
+    network = new_fusion(config, 8 * task.network_config.width, classes)
     with Checkpoints(out / "fusion") as checkpoints:
         restored = checkpoints.restore("best", nnx.state(network, nnx.Param))
     if restored is None:
-        return None
+        raise DataError(f"no trained set fusion in {out / 'fusion'}; train one with: mevs fuse --out {out}")
     nnx.update(network, restored[0])
-    return network, summary
+    return network
 
 
 def sets_of_size(
@@ -131,8 +129,7 @@ def fusion_study(network: SetFusion, validation: Features, test: Features, seed:
     """
     structure, state = nnx.split(network)
     views = test.features.shape[1]
-    sizes = [*range(1, min(views, 12) + 1), *(size for size in (16, 20, 40, views) if 12 < size <= views)]
-    sizes = sorted(set(sizes))
+    sizes = sorted({*range(1, min(views, 12) + 1), *(size for size in (16, 20, 40, views) if size <= views)})
     rows = []
     for size in sizes:
         draws = 1 if size == views else DRAWS

@@ -25,7 +25,7 @@ from data_pipeline.meshes import DataError
 from data_pipeline.progress import console
 from eval.ascent import AscentConfig
 from eval.climbing import ClimbConfig, climb_objects, climbing_study, load_climbed
-from eval.fusing import classifier_features, fuse, fusion_study, load_fusion
+from eval.fusing import classifier_features, fuse, fusion_identity, fusion_study, load_fusion
 from eval.grid import FIRST_MV, GridConfig
 from eval.knowledge import learn
 from eval.ladder import CLIMBED
@@ -35,7 +35,7 @@ from eval.report import read_history, write_report
 from eval.study import reachable_views, run_study
 from eval.sweep_report import write_sweep_report
 from eval.thesis_networks import ThesisConfig
-from eval.view_tables import ViewTables, compute_view_tables, load_view_tables, made_by, objects_of, save_view_tables
+from eval.view_tables import ViewTables, compute_view_tables, load_view_tables, made_by, save_view_tables
 from mevs_jax.models import Abstraction
 from mevs_jax.policies import POLICIES
 from mevs_jax.viewpoints import ViewGraph
@@ -285,13 +285,11 @@ def evaluate(settings: Settings, out: Path) -> dict[str, Any]:
         "by_view": by_view_made,
         "climbed": None,
     }
-    names = objects_of(out / "data", "test", statistics)[0]
-    climbed = load_climbed(out, statistics, settings.climb, names)
+    climbed = load_climbed(out, statistics, settings.climb)
     if climbed is not None:
         identity["climbed"] = asdict(settings.climb)
     classify, _ = tasks(settings, statistics)
-    fused = load_fusion(out, statistics, classify, settings.fusion)
-    identity["fused"] = fused[1]["identity"] if fused else None
+    identity["fused"] = fusion_identity(out, statistics, settings.fusion)
     identity = json.loads(json.dumps(identity))
     check_evaluation(settings.evaluation)
     path = out / "metrics.json"
@@ -315,11 +313,12 @@ def evaluate(settings: Settings, out: Path) -> dict[str, Any]:
     metrics = run_study(tables, validation, statistics, settings.evaluation, by_view, leak)
     if climbed is not None:
         metrics["climbing"] = climbing_study(tables, statistics, climbed, settings.evaluation)
-    if fused is not None:
+    if identity["fused"] is not None:
+        fusion = load_fusion(out, len(statistics.classes), classify, settings.fusion)
         validation_features, test_features = (
             classifier_features(out, split, statistics, classify) for split in ("val", "test")
         )
-        metrics["fusion"] = fusion_study(fused[0], validation_features, test_features)
+        metrics["fusion"] = fusion_study(fusion, validation_features, test_features)
     metrics["identity"] = identity
     write_json(path, metrics)
     return metrics
@@ -334,8 +333,7 @@ def train_set_fusion(settings: Settings, out: Path) -> None:
 def climb_on_objects(settings: Settings, out: Path) -> None:
     """Finds where differentiable rendering would look next on many test objects; `evaluate` then compares it."""
     statistics = load_statistics(out / "data")
-    names = objects_of(out / "data", "test", statistics)[0]
-    climb_objects(settings.dataset, statistics, names, out, settings.climb)
+    climb_objects(settings.dataset, statistics, out, settings.climb)
 
 
 def check_live(settings: Settings, out: Path) -> dict[str, Agreement]:

@@ -6,9 +6,7 @@ view (`outputs/`), `timing.json`, `thesis.json` and the report (`report/`).
 
 from __future__ import annotations
 
-import io
 import json
-from collections.abc import Callable
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
@@ -17,7 +15,7 @@ import numpy as np
 from flax import nnx
 
 from data_pipeline.builder import open_objects, prepare, report_left_out
-from data_pipeline.files import read_json, write_bytes, write_json
+from data_pipeline.files import read_json, write_json
 from data_pipeline.meshes import DataError, load_object
 from data_pipeline.progress import console
 from eval.ascent import METHODS
@@ -40,7 +38,7 @@ from eval.thesis_networks import (
 from eval.thesis_page import write_thesis_report
 from eval.thesis_results import NO_ACCELERATOR, LatticeTables, all_results, machine
 from eval.timing import CLIMBING_SIDE, decision_memory_alone, time_climbing, time_local_maxima, time_predictor
-from eval.view_tables import made_by, network_outputs, objects_of
+from eval.view_tables import made_by, network_outputs, objects_of, stored_array
 from train.classifier import ClassifierTask
 from train.entropy import EntropyTask
 from train.loop import load_best
@@ -56,19 +54,6 @@ def make_thesis_data(settings: Settings, folder: ThesisFolder) -> None:
 # --------------------------------------------------------------------------------------------------------------- outputs
 
 
-def _stored(path: Path, made: str, compute: Callable[[], np.ndarray]) -> np.ndarray:
-    """The array in `path`, computed anew where it is not there or was made by other networks."""
-    if path.exists():
-        with np.load(path) as stored:
-            if str(stored["made_by"]) == made:
-                return stored["array"]
-    array = compute()
-    buffer = io.BytesIO()
-    np.savez(buffer, array=array, made_by=np.array(made))
-    write_bytes(path, buffer.getvalue())
-    return array
-
-
 def lattice_tables(
     settings: Settings,
     folder: ThesisFolder,
@@ -81,7 +66,7 @@ def lattice_tables(
     statistics, data = folder.statistics(views), folder.data(views)
 
     def outputs(name: str, network: Path, task: ClassifierTask | EntropyTask) -> np.ndarray:
-        return _stored(
+        return stored_array(
             folder.out / "outputs" / f"{name}_on_{views}_{split}.npz",
             made_by(statistics, network),
             lambda: network_outputs(data, split, task, load_best(task, network)),

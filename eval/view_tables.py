@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import io
 import json
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -19,7 +18,7 @@ import numpy as np
 
 from data_pipeline.batches import evaluation_batches
 from data_pipeline.builder import DatasetStatistics, open_split
-from data_pipeline.files import read_json, write_bytes
+from data_pipeline.files import read_json, write_npz
 from data_pipeline.meshes import DataError
 from data_pipeline.progress import progress_bar
 from mevs_jax.selection import ViewTable
@@ -100,6 +99,17 @@ def network_outputs(
     return found.reshape(len(out) * mesh.size, -1, found.shape[-1])[:objects]
 
 
+def stored_array(path: Path, made: str, compute: Callable[[], np.ndarray]) -> np.ndarray:
+    """The array in `path`, computed anew where it is not there or was made by other networks."""
+    if path.exists():
+        with np.load(path) as stored:
+            if str(stored["made_by"]) == made:
+                return stored["array"]
+    array = compute()
+    write_npz(path, array=array, made_by=np.array(made))
+    return array
+
+
 def made_by(statistics: DatasetStatistics, *networks: Path) -> str:
     """Names a data set and trained networks; changes when any is made anew, but not with the time it took.
 
@@ -142,9 +152,8 @@ def compute_view_tables(
 
 
 def save_view_tables(path: Path, tables: ViewTables) -> None:
-    buffer = io.BytesIO()
-    np.savez(
-        buffer,
+    write_npz(
+        path,
         names=np.array(tables.names),
         labels=tables.labels,
         logits=tables.logits,
@@ -152,7 +161,6 @@ def save_view_tables(path: Path, tables: ViewTables) -> None:
         entropy=tables.entropy,
         made_by=np.array(tables.made_by),
     )
-    write_bytes(path, buffer.getvalue())
 
 
 def load_view_tables(path: Path) -> ViewTables:
