@@ -33,6 +33,7 @@ class ViewBatches:
         points: size of the clouds; 0 for no clouds.
         images: `depth` or `image`, or None for neither.
         seed: of order, views and points.
+        fold: train without part k of n of the training objects, (k, n); all of them unless given.
         validation_by: `object`, the sound way; `view`: train on views of the validation objects too, except for a share
             of every object's views (`views_aside`).
     """
@@ -42,6 +43,7 @@ class ViewBatches:
     points: int = 0
     images: str | None = None
     seed: int = 0
+    fold: tuple[int, int] | None = None
     validation_by: Literal["object", "view"] = "object"
 
 
@@ -74,11 +76,12 @@ def select_views(
     """Some views of one object, as arrays with a leading axis of views.
 
     Returns:
-        `label`, `view`, `entropy` (of *all* views) and, as asked for, `depth` or `image`, and `pixels`, `pixel_depth`, `pose`.
+        `label`, `view`, `pose`, `entropy` (of *all* views) and, as asked for, `depth` or `image`, and `pixels`, `pixel_depth`.
     """
     out = {
         "label": np.full(len(views), example["label"], np.int32),
         "view": views.astype(np.int32),
+        "pose": example["pose"][views],
         "entropy": np.repeat(example["entropy"][None], len(views), axis=0),
     }
     if images:
@@ -86,11 +89,7 @@ def select_views(
     if points:
         pixels = np.stack([sample_pixels(example["depth"][view], points, random) for view in views])
         flat = example["depth"][views].reshape(len(views), -1)
-        out |= {
-            "pixels": pixels,
-            "pixel_depth": np.take_along_axis(flat, pixels, axis=1),
-            "pose": example["pose"][views],
-        }
+        out |= {"pixels": pixels, "pixel_depth": np.take_along_axis(flat, pixels, axis=1)}
     return out
 
 
@@ -104,16 +103,27 @@ class _DrawViews(grain.transforms.RandomMap):
         return select_views(element, views, points=config.points, images=config.images, random=rng)
 
 
+def fold_of(objects: int, folds: int) -> np.ndarray:
+    """The part, 0 to folds − 1, of each training object, in the order of the shards (which is none)."""
+    return np.arange(objects) % folds
+
+
 class _TrainingObjects:
     """The objects of some splits, one after the other, each with the views that may be trained on."""
 
     def __init__(self, sources: list[Any], config: ViewBatches):
         self._sources, self._config = sources, config
 
+        every = np.arange(sum(map(len, sources)))
+        self._kept = (
+            every if config.fold is None else np.flatnonzero(fold_of(len(every), config.fold[1]) != config.fold[0])
+        )
+
     def __len__(self) -> int:
-        return sum(map(len, self._sources))
+        return len(self._kept)
 
     def __getitem__(self, index: int) -> dict[str, Any]:
+        index = int(self._kept[index])
         source, position = self._sources[0], index
         for source in self._sources:
             if position < len(source):
@@ -195,11 +205,18 @@ def train_batches(folder: Path, config: ViewBatches, *, first_step: int = 0) -> 
 
 
 def evaluation_batches(
-    folder: Path, split: str, *, points: int = 0, images: str | None = None, seed: int = 0, objects: int | None = None
+    folder: Path,
+    split: str,
+    *,
+    points: int = 0,
+    images: str | None = None,
+    seed: int = 0,
+    chosen: np.ndarray | None = None,
 ) -> Iterator[dict[str, np.ndarray]]:
-    """Every view of every object of a split, one object a batch, in the order of the shards; the same at every call."""
+    """Every view of every object of a split, or of those at the `chosen` positions, one object a batch, in the order of the
+    shards; the same at every call."""
     source = open_split(folder, split)
-    for index in range(len(source) if objects is None else min(objects, len(source))):
+    for index in range(len(source)) if chosen is None else map(int, chosen):
         example = source[index]
         views = np.arange(len(example["entropy"]))
         random = np.random.default_rng([seed, index])

@@ -25,7 +25,7 @@ import numpy as np
 
 from data_pipeline.archives import ARCHIVES, download, download_folder, local
 from data_pipeline.beam import beam_options, capture_by_beam, examples_by_beam
-from data_pipeline.capture import DEPTH_SCALE, Capture, CaptureConfig, load_capture, rig_for
+from data_pipeline.capture import DEPTH_SCALE, Capture, CaptureConfig, Rig, load_capture, rig_for
 from data_pipeline.captures import capture_all, capture_path
 from data_pipeline.files import read_json, write_json
 from data_pipeline.meshes import SOURCE_SPLITS, DataError, ObjectEntry, ObjectSource, mesh_zip, open_source
@@ -229,7 +229,7 @@ def _spill_without_tensorflow() -> None:
     shuffle._Bucket = Bucket
 
 
-def example_of(entry: ObjectEntry, captures: Path, poses: np.ndarray) -> tuple[str, dict[str, Any]]:
+def example_of(entry: ObjectEntry, captures: Path, rig: Rig) -> tuple[str, dict[str, Any]]:
     """Key and content of an object's record."""
     capture = load_capture(capture_path(captures, entry))
     return entry.name, {
@@ -237,7 +237,7 @@ def example_of(entry: ObjectEntry, captures: Path, poses: np.ndarray) -> tuple[s
         "label": entry.label,
         "depth": capture.depth,
         "image": capture.image,
-        "pose": poses,
+        "pose": rig.around(entry.name).poses,
         "entropy": view_entropies(capture),
         "extent": capture.extent,
     }
@@ -259,8 +259,8 @@ def _builder_class() -> type:
         def __init__(self, *, source: ObjectSource, split, config_data: DataConfig, captures: Path, on_object, **rest):
             self._source, self._split, self._data = source, split, config_data
             self._on_object = on_object  # None where Beam makes the examples, elsewhere
-            poses = rig_for(config_data.capture).poses
-            self._example_of = functools.partial(example_of, captures=captures.absolute(), poses=poses)
+            rig = rig_for(config_data.capture)
+            self._example_of = functools.partial(example_of, captures=captures.absolute(), rig=rig)
             super().__init__(file_format="array_record", **rest)
 
         def _info(self):

@@ -19,6 +19,7 @@ from pathlib import Path
 from typing import Literal, Protocol
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from data_pipeline.files import write_npz
 from data_pipeline.meshes import Mesh
@@ -47,6 +48,8 @@ class CaptureConfig:
     ] = "golden_angle"
     """how they stand: Fibonacci of the thesis's published code or of its eq. (8), nested (the 10 are among the 40), five
     rings, or the corners of a Platonic solid"""
+    turned: bool = False
+    """turn them at random around each object: directions all around for training, none of them twice"""
     resolution: int = 224
     """pixels along each side of a view"""
     distance: float = 2.0
@@ -66,11 +69,32 @@ class Rig:
         poses: (views, 4, 4) camera to world, float32.
         directions: (views, resolution, resolution, 3) ray directions of unit length along the optical axis, float32.
         field_of_view: in radians.
+        turned: whether each object has them turned in its own way.
     """
 
     poses: np.ndarray
     directions: np.ndarray
     field_of_view: float
+    turned: bool = False
+
+    def around(self, name: str) -> Rig:
+        """The cameras around the object of this name: these, or where `turned` these after a random turn that its name decides.
+
+        The turn moves the cameras; each then looks at the object with the world's z upwards in its image, as before.
+        """
+        if not self.turned:
+            return self
+        turn = Rotation.from_quat(np.random.default_rng(zlib.crc32(name.encode())).normal(size=4)).as_matrix()
+        position = self.poses[:, :3, 3] @ turn.T
+        forward = -position / np.linalg.norm(position, axis=1, keepdims=True)
+        right = np.cross(forward, [0.0, 0.0, 1.0])  # a camera straight above the object has no chance to be drawn
+        right /= np.linalg.norm(right, axis=1, keepdims=True)
+        axes = np.stack([right, np.cross(forward, right), forward], axis=-1)
+        poses = np.tile(np.eye(4), (len(axes), 1, 1))
+        poses[:, :3, :3], poses[:, :3, 3] = axes, position
+        local = self.directions[0] @ self.poses[0, :3, :3]
+        directions = np.einsum("hwc,vdc->vhwd", local, axes)
+        return Rig(poses.astype(np.float32), directions.astype(np.float32), self.field_of_view)
 
 
 @dataclass(frozen=True)
@@ -106,6 +130,7 @@ def rig_for(config: CaptureConfig) -> Rig:
         np.asarray(cameras.pose, np.float32),
         np.asarray(directions, np.float32),
         float(np.deg2rad(config.field_of_view)),
+        config.turned,
     )
 
 

@@ -41,7 +41,7 @@ _BACKENDS: dict[str, Callable[[Mesh, Rig], Capture]] = {
 def capture_entry(entry: ObjectEntry, rig: Rig, folder: Path, backend: str, skip_damaged: bool) -> str | None:
     """Captures one object into the folder; returns what is wrong with a damaged one, unless such are left out like empty ones."""
     try:
-        save_capture(capture_path(folder, entry), _BACKENDS[backend](load_object(entry), rig))
+        save_capture(capture_path(folder, entry), _BACKENDS[backend](load_object(entry), rig.around(entry.name)))
     except (EmptyMesh, DamagedMesh) as reason:
         if isinstance(reason, DamagedMesh) and not skip_damaged:
             return str(reason)

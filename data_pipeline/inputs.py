@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from data_pipeline.builder import metric_depth
 from data_pipeline.capture import CaptureConfig
@@ -26,6 +26,35 @@ def image_input(
     else:
         pixels = view.astype(jnp.float32) / 255
     return jnp.repeat(pixels[..., None], channels, axis=-1)
+
+
+def depth_and_normals(view: Int[Array, "height width"], camera: CaptureConfig) -> Float[Array, "height width 4"]:
+    """One stored view as depth (`image_input`) and the surface normal behind each pixel in the camera's frame, 0 for background.
+
+    A normal is that of the plane through a pixel's point and its neighbours, in each direction the one that is nearer in
+    depth, so that an edge takes no part; 0 where a pixel has none beside it, or none above and below it.
+    """
+    metric = metric_depth(view)
+    side, hit = len(view), metric > 0
+    slope = (jnp.arange(side) + 0.5 - side / 2) * (2 * math.tan(math.radians(camera.field_of_view) / 2) / side)
+    x, y = jnp.meshgrid(slope, slope)
+    points = jnp.stack([x, y, jnp.ones_like(x)], axis=-1) * metric[..., None]
+
+    def step(axis: int) -> tuple[Float[Array, "height width 3"], Bool[Array, "height width"]]:
+        """Towards the next pixel along an axis, by way of the nearer neighbour."""
+        ahead = jnp.roll(points, -1, axis) - points
+        edge = jnp.arange(side) == side - 1
+        edge = edge[:, None] if axis == 0 else edge[None]
+        apart = jnp.where(hit & jnp.roll(hit, -1, axis) & ~edge, jnp.abs(ahead[..., 2]), jnp.inf)
+        behind, apart_behind = jnp.roll(ahead, 1, axis), jnp.roll(apart, 1, axis)
+        nearer = apart <= apart_behind
+        return jnp.where(nearer[..., None], ahead, behind), jnp.isfinite(jnp.minimum(apart, apart_behind))
+
+    (down, has_down), (right, has_right) = step(0), step(1)
+    normals = jnp.cross(down, right)
+    length = jnp.linalg.norm(normals, axis=-1, keepdims=True)
+    normals = jnp.where((has_down & has_right)[..., None], normals / jnp.maximum(length, 1e-12), 0.0)
+    return jnp.concatenate([image_input(view, "depth", 1, camera), normals], axis=-1)
 
 
 def cloud_input(

@@ -5,12 +5,13 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal
 
-Knows = Literal["nothing", "networks", "others", "rendering", "truth"]
+Knows = Literal["nothing", "networks", "others", "learnt", "rendering", "truth"]
 
 KNOWS: dict[Knows, str] = {
     "nothing": "nothing of the object",
     "networks": "what the entropy predictor says of the views seen",
     "others": "what views show of other (validation) objects",
+    "learnt": "what looking was worth on training objects, by recognisers that never saw them",
     "rendering": "what a surface or volume through the latest view's points would look like from elsewhere",
     "truth": "the object itself, which no robot does",
 }

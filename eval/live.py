@@ -157,7 +157,11 @@ def compare_with_tables(
 
     walks: dict[str, list[tuple[np.ndarray, np.ndarray]]] = {policy: [] for policy in policies}
     batches = evaluation_batches(
-        data, split, points=networks.predict.network_config.points, images=networks.classify.images, objects=objects
+        data,
+        split,
+        points=networks.predict.network_config.points,
+        images=networks.classify.images,
+        chosen=np.arange(objects),
     )
     with progress_bar("objects") as bar:
         line = bar.add_task("Walking live", total=objects, note="")

@@ -23,9 +23,10 @@ from data_pipeline.capture import CaptureConfig
 from data_pipeline.files import read_json, write_json
 from data_pipeline.meshes import DataError
 from data_pipeline.progress import console
+from eval.active import ActiveConfig, Stages, check_active, measure, train_all
+from eval.active_page import write_active_page
 from eval.ascent import AscentConfig
 from eval.climbing import ClimbConfig, climb_objects, climbing_study, load_climbed
-from eval.fusing import classifier_features, fuse, fusion_identity, fusion_study, load_fusion
 from eval.grid import FIRST_MV, GridConfig
 from eval.knowledge import learn
 from eval.ladder import CLIMBED
@@ -41,10 +42,12 @@ from mevs_jax.policies import POLICIES
 from mevs_jax.viewpoints import ViewGraph
 from train.classifier import ClassifierConfig, ClassifierTask, ResNetConfig
 from train.entropy import EntropyConfig, EntropyTask, PointNet2Config
-from train.fusion import FusionConfig
+from train.fusion import FusionConfig, SetFusionConfig
 from train.loop import fit, load_best
 from train.optimiser import OptimiserConfig
+from train.policy import PolicyConfig
 from train.pretrained import StartingWeights
+from train.recogniser import RecogniserConfig
 from train.step import Task
 from train.sweep import Member, SweepConfig, sweep
 
@@ -62,7 +65,7 @@ class Settings:
     sweep: SweepConfig = SweepConfig()
     ascent: AscentConfig = AscentConfig()
     climb: ClimbConfig = ClimbConfig()
-    fusion: FusionConfig = FusionConfig()
+    active: ActiveConfig = ActiveConfig()
 
 
 THESIS = Settings()
@@ -106,10 +109,26 @@ SMALL = Settings(
         fine_tuning=replace(_BRIEF, epochs=4, views_per_object=2),
         resnet34_width=32,
     ),
+    active=ActiveConfig(
+        recogniser=RecogniserConfig(
+            network=ResNetConfig(width=32, channels=4, standardise=False, stem="patches"),
+            optimiser=OptimiserConfig(
+                epochs=8,
+                batch_size=128,
+                epoch_views=20,
+                validation_views=8,
+                learning_rate=1.5e-3,
+                weight_decay=0.05,
+                schedule="cosine",
+            ),
+        ),
+        fold_epochs=5,
+    ),
 )
 """The same study at 64×64 with narrower networks.
 `mevs run --data modelnet10_voxels32.npz`: 12 minutes on two cores of an AMD EPYC (Zen 5), `mevs thesis` 40."""
 
+_TRIFLING_SETS = SetFusionConfig(width=16, heads=2, blocks=1)
 _TRIFLE = OptimiserConfig(epochs=2, batch_size=16, views_per_object=2, epoch_views=4, schedule="cosine")
 
 TINY = Settings(
@@ -133,7 +152,18 @@ TINY = Settings(
     evaluation=GridConfig(draws=2),
     live=LiveConfig(objects=12, at_once=8, max_views=4),
     thesis=ThesisConfig(_TRIFLE, _TRIFLE, _TRIFLE, resnet34_width=8, timing_runs=3, climbing_runs=1, climbing_starts=2),
-    fusion=FusionConfig(width=16, heads=2, blocks=1, epochs=2, batch_size=16),
+    active=ActiveConfig(
+        recogniser=RecogniserConfig(
+            network=ResNetConfig(width=8, channels=4, standardise=False, stem="patches"),
+            fusion=_TRIFLING_SETS,
+            optimiser=replace(_TRIFLE, validation_views=2),
+        ),
+        fusion=FusionConfig(network=_TRIFLING_SETS, epochs=2, batch_size=16),
+        policy=PolicyConfig(width=16, heads=2, blocks=1, most_seen=3, walks=1, rounds=2, epochs=2, batch_size=32),
+        max_views=4,
+        draws=2,
+        lattices=(),
+    ),
     climb=ClimbConfig(objects=1, starts=2, resolution=16, faces=64),
 )
 """Seconds, and no use but to see that everything runs."""
@@ -288,8 +318,6 @@ def evaluate(settings: Settings, out: Path) -> dict[str, Any]:
     climbed = load_climbed(out, statistics, settings.climb)
     if climbed is not None:
         identity["climbed"] = asdict(settings.climb)
-    classify, _ = tasks(settings, statistics)
-    identity["fused"] = fusion_identity(out, statistics, settings.fusion)
     identity = json.loads(json.dumps(identity))
     check_evaluation(settings.evaluation)
     path = out / "metrics.json"
@@ -313,21 +341,24 @@ def evaluate(settings: Settings, out: Path) -> dict[str, Any]:
     metrics = run_study(tables, validation, statistics, settings.evaluation, by_view, leak)
     if climbed is not None:
         metrics["climbing"] = climbing_study(tables, statistics, climbed, settings.evaluation)
-    if identity["fused"] is not None:
-        fusion = load_fusion(out, len(statistics.classes), classify, settings.fusion)
-        validation_features, test_features = (
-            classifier_features(out, split, statistics, classify) for split in ("val", "test")
-        )
-        metrics["fusion"] = fusion_study(fusion, validation_features, test_features)
     metrics["identity"] = identity
     write_json(path, metrics)
     return metrics
 
 
-def train_set_fusion(settings: Settings, out: Path) -> None:
-    """Trains the set fusion on the features of the classifier; `evaluate` then compares it with the sum of logits."""
-    statistics = load_statistics(out / "data")
-    fuse(out, statistics, tasks(settings, statistics)[0], settings.fusion)
+def learn_to_choose(settings: Settings, out: Path) -> Path:
+    """Trains and measures learnt fusion and learnt choice; returns the page."""
+    config, found = settings.active, []
+    check_active(config, settings.dataset.capture.views)
+    for seed in range(config.seeds):
+        stages = Stages(config, settings.dataset, out, seed)
+        train_all(stages)
+        found.append(measure(stages))
+    metrics = {"seeds": found, "settings": asdict(config)}
+    write_json(out / "active" / "metrics.json", metrics)
+    page = out / "active" / "index.html"
+    write_active_page(metrics, load_statistics(out / "data"), page)
+    return page
 
 
 def climb_on_objects(settings: Settings, out: Path) -> None:
@@ -362,10 +393,11 @@ def check_live(settings: Settings, out: Path) -> dict[str, Agreement]:
 
 def report(settings: Settings, preset: str, out: Path) -> Path:
     """Writes the page and returns where it is; one that is newer than its metrics is left as it is."""
-    page, metrics = out / "report" / "index.html", out / "metrics.json"
+    page, metrics, active = out / "report" / "index.html", out / "metrics.json", out / "active" / "metrics.json"
     if not metrics.exists():
         raise DataError(f"no metrics in {out}; make them with: mevs eval --out {out}")
-    if not page.exists() or page.stat().st_mtime < metrics.stat().st_mtime:
+    made_of = [path for path in (metrics, active) if path.exists()]
+    if not page.exists() or page.stat().st_mtime < max(path.stat().st_mtime for path in made_of):
         statistics = load_statistics(out / "data")
         networks = {"classifier": out / "classifier", "entropy predictor": out / "entropy"}
         write_report(
@@ -378,6 +410,7 @@ def report(settings: Settings, preset: str, out: Path) -> Path:
                 summaries={name: read_json(folder / "summary.json") for name, folder in networks.items()},
                 preset=preset,
                 settings=asdict(settings),
+                active=read_json(active) if active.exists() else None,
             ),
             page,
         )

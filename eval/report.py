@@ -14,13 +14,13 @@ import numpy as np
 from data_pipeline.builder import open_split
 from data_pipeline.files import write_text
 from eval import figures
+from eval.active_page import active_section
 from eval.page import ReportInputs, document, image, percent, table
 from eval.report_policies import (
     climbing_section,
     compatibility_section,
     confidence_section,
     draws,
-    fusion_section,
     grid_section,
     ladder_section,
     lead,
@@ -151,7 +151,7 @@ _SECTIONS = (
     lead,
     ladder_section,
     climbing_section,
-    fusion_section,
+    active_section,
     movement_section,
     confidence_section,
     grid_section,

@@ -128,33 +128,6 @@ def ladder_section(inputs: ReportInputs) -> str:
     )
 
 
-def fusion_section(inputs: ReportInputs) -> str:
-    """Empty where no fusion was trained."""
-    found = inputs.metrics.get("fusion")
-    if found is None:
-        return ""
-    rows = [
-        [
-            str(row["views"]),
-            *(
-                f"{percent(row[name]['accuracy'])} <small>[{span(row[name]['interval'])}]</small>"
-                for name in ("sum", "learnt")
-            ),
-            difference(row["difference"], row["difference_interval"]),
-            *(percent(row[name]["calibration_error"]) for name in ("sum", "learnt")),
-        ]
-        for row in found["rows"]
-    ]
-    header = ["random views", "sum of logits", "set fusion", "difference", "ECE, sum", "ECE, set fusion"]
-    return (
-        "<h2>Fusing views</h2><p>Accuracy (%) when random views are fused by adding logits, as the thesis does, or by a set "
-        "transformer on the same classifier's features and the viewing directions, trained on random sets of the training "
-        f"objects' views. The same {found['draws']} sets of each size for each of {found['objects']} test objects; 95 % "
-        "intervals by object. Calibration errors (%) with a temperature for each number of views, fitted on validation "
-        "objects after fusion.</p>" + table(header, rows)
-    )
-
-
 def climbing_section(inputs: ReportInputs) -> str:
     """Empty where nothing was climbed."""
     found = inputs.metrics.get("climbing")

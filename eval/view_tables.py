@@ -25,7 +25,7 @@ from mevs_jax.selection import ViewTable
 from train.classifier import ClassifierTask
 from train.devices import device_mesh, parameter_sharding, place, place_batch
 from train.entropy import EntropyTask
-from train.step import Batch
+from train.step import Batch, Task
 
 
 @dataclass(frozen=True)
@@ -54,38 +54,45 @@ class ViewTables:
         return ViewTable(logits, utility, entropy, labels)
 
 
-def _ask(network: Any, inputs: jax.Array) -> jax.Array:
-    return network(inputs)
+Ask = Callable[[Any, Task, Batch], jax.Array]
+"""A network, its task and a batch to what is wanted of each view, (views, numbers)."""
+
+
+def _answer(network: Any, task: Task, batch: Batch) -> jax.Array:
+    return network(task.inputs(batch))
 
 
 @partial(jax.jit, static_argnames=("task", "structure", "ask"))
 def _look(
-    task: ClassifierTask | EntropyTask,
+    task: Task,
     structure: nnx.GraphDef,
     state: nnx.State,
     batch: Batch,
-    ask: Callable[[Any, jax.Array], jax.Array],
+    ask: Ask,
 ) -> jax.Array:
-    return ask(nnx.merge(structure, state), task.inputs(batch))
+    return ask(nnx.merge(structure, state), task, batch)
 
 
 def network_outputs(
     data: Path,
     split: str,
-    task: ClassifierTask | EntropyTask,
+    task: Task,
     network: nnx.Module,
-    ask: Callable[[Any, jax.Array], jax.Array] = _ask,
+    ask: Ask = _answer,
+    chosen: np.ndarray | None = None,
 ) -> np.ndarray:
     """What a network says of every view of every object of a split, (objects, views, classes or views).
 
     Args:
-        ask: the network and its inputs to what is wanted of it, (views, numbers); its outputs unless given.
+        ask: what is wanted of it; its outputs unless given.
+        chosen: positions of some objects in the split, in order; all of them unless given.
     """
     structure, state = nnx.split(network)
     mesh = device_mesh()
     state = place(state, parameter_sharding(mesh, state))
-    objects = len(open_split(data, split))
-    batches = evaluation_batches(data, split, points=task.batches.points, images=task.batches.images)
+    chosen = np.arange(len(open_split(data, split))) if chosen is None else chosen
+    objects = len(chosen)
+    batches = evaluation_batches(data, split, points=task.batches.points, images=task.batches.images, chosen=chosen)
     with progress_bar("objects") as bar:
         line = bar.add_task(f"Looking at {split} objects: {task.name}", total=objects, note="")
         out = []

@@ -24,7 +24,7 @@ COMMANDS = {
     "compat": "train the classifier the published code's way too, evaluate and report again",
     "thesis": "every network, table and figure of the thesis, beside its own numbers",
     "ascend": "climb to the best view of one object by a renderer's gradient; draw it",
-    "fuse": "train the set fusion on the classifier's features; evaluate and report again",
+    "active": "learn to fuse views and to choose them; compare with every other policy",
     "climb": "where differentiable rendering would look next; evaluate and report again",
     "live": "walk test objects with the networks in the loop; compare with the tables",
 }
@@ -126,6 +126,9 @@ def _run(command: str, arguments: list[str]) -> None:
         console.print(sentence)
         console.print(f"Animation: {path.absolute()}")
         return
+    if command == "active":
+        console.print(f"Report: {pipeline.learn_to_choose(settings, out).absolute()}")
+        return
     start = starting_weights(options.pretrained, settings.classifier.network)
     if command in ("run", "data"):
         pipeline.make_data(settings, out, options.beam)
@@ -143,9 +146,7 @@ def _run(command: str, arguments: list[str]) -> None:
         pipeline.train_by_view(settings, out, start)
     if command == "climb":
         pipeline.climb_on_objects(settings, out)
-    if command == "fuse":
-        pipeline.train_set_fusion(settings, out)
-    if command in ("run", "eval", "compat", "climb", "fuse"):
+    if command in ("run", "eval", "compat", "climb"):
         metrics = pipeline.evaluate(settings, out)
         console.print(
             f"Single views: {100 * metrics['single_view']['accuracy']:.1f} % of {metrics['objects']} test objects right"
@@ -163,7 +164,7 @@ def _run(command: str, arguments: list[str]) -> None:
                 f"{policy}: {found.same} of {found.walks} walks are the same live as by table "
                 f"(confidences within {found.largest_difference:.1e})"
             )
-    if command in ("run", "report", "compat", "climb", "fuse"):
+    if command in ("run", "report", "compat", "climb"):
         console.print(f"Report: {pipeline.report(settings, preset, out).absolute()}")
 
 

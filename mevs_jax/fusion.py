@@ -13,6 +13,7 @@ probabilities (a mixture) can disagree.
 
 from __future__ import annotations
 
+import flax.struct
 import jax
 import jax.numpy as jnp
 from flax import nnx
@@ -57,6 +58,13 @@ def mean_of_probabilities(logits: Float[Array, "steps classes"]) -> Float[Array,
     return total - jnp.log(jnp.arange(1, len(logits) + 1))[:, None]
 
 
+def _drop_out(key: Array | None, rate: float, x: Array) -> Array:
+    """Without a key, `x` as it is."""
+    if key is None or not rate:
+        return x
+    return jnp.where(jax.random.bernoulli(key, 1 - rate, x.shape), x / (1 - rate), 0.0)
+
+
 class _Block(nnx.Module):
     """Attention among tokens, then two layers on each, beside what they are added to (pre-norm)."""
 
@@ -64,13 +72,14 @@ class _Block(nnx.Module):
         self.norm1, self.norm2 = nnx.LayerNorm(width, rngs=rngs), nnx.LayerNorm(width, rngs=rngs)
         self.attention = nnx.MultiHeadAttention(heads, width, decode=False, rngs=rngs)
         self.layer1, self.layer2 = nnx.Linear(width, 2 * width, rngs=rngs), nnx.Linear(2 * width, width, rngs=rngs)
-        self.dropout = nnx.Dropout(dropout, rngs=rngs)
+        self.dropout = dropout
 
-    def __call__(self, x: Array, present: Array, *, train: bool) -> Array:
+    def __call__(self, x: Array, present: Array, key: Array | None) -> Array:
         seen = present[..., None, None, :]  # one query like another, over all heads
-        x = x + self.dropout(self.attention(self.norm1(x), mask=seen), deterministic=not train)
+        keys = (None, None) if key is None else jax.random.split(key)
+        x = x + _drop_out(keys[0], self.dropout, self.attention(self.norm1(x), mask=seen))
         hidden = self.layer2(jax.nn.gelu(self.layer1(self.norm2(x))))
-        return x + self.dropout(hidden, deterministic=not train)
+        return x + _drop_out(keys[1], self.dropout, hidden)
 
 
 class SetFusion(nnx.Module):
@@ -86,7 +95,7 @@ class SetFusion(nnx.Module):
         heads: of attention.
         blocks: of attention and layers.
         dropout: within blocks, and of whole feature channels before them.
-        rngs: source of initial weights and of dropout.
+        rngs: source of initial weights.
     """
 
     def __init__(
@@ -101,7 +110,7 @@ class SetFusion(nnx.Module):
         rngs: nnx.Rngs,
     ):
         self.norm = nnx.LayerNorm(features, rngs=rngs)
-        self.dropout = nnx.Dropout(dropout, rngs=rngs)
+        self.dropout = dropout
         self.view = nnx.Linear(features, width, rngs=rngs)
         self.direction = nnx.Linear(3, width, rngs=rngs)
         self.object = nnx.Param(0.02 * jax.random.normal(rngs.params(), (width,)))
@@ -114,21 +123,50 @@ class SetFusion(nnx.Module):
         features: Float[AnyArray, "*batch views features"],
         directions: Float[AnyArray, "*batch views 3"],
         present: Bool[AnyArray, "*batch views"],
-        *,
-        train: bool = False,
+        key: Array | None = None,
     ) -> Float[Array, "*batch classes"]:
         """Logits of what was seen.
 
         Args:
             directions: unit vectors from the object to the cameras.
             present: which views were looked at; what the others hold does not matter.
+            key: for dropout, in training; nothing is dropped without.
         """
         features, directions, present = jnp.asarray(features), jnp.asarray(directions), jnp.asarray(present)
-        known = self.dropout(self.norm(jnp.where(present[..., None], features, 0.0)), deterministic=not train)
+        keys = [None] * (len(self.blocks) + 1) if key is None else list(jax.random.split(key, len(self.blocks) + 1))
+        known = _drop_out(keys[-1], self.dropout, self.norm(jnp.where(present[..., None], features, 0.0)))
         tokens = self.view(known) + self.direction(directions)
         own = jnp.broadcast_to(self.object[...], (*tokens.shape[:-2], 1, tokens.shape[-1]))
         x = jnp.concatenate([own, tokens], axis=-2)
         there = jnp.concatenate([jnp.ones((*present.shape[:-1], 1), bool), present], axis=-1)
-        for block in self.blocks:
-            x = block(x, there, train=train)
+        for block, drops in zip(self.blocks, keys[:-1], strict=True):
+            x = block(x, there, drops)
         return self.head(self.last_norm(x[..., 0, :]))
+
+
+@flax.struct.dataclass
+class CalibratedFusion:
+    """A trained set fusion whose log-probabilities can be taken at their word.
+
+    Attributes:
+        structure: of the network.
+        weights: of the network.
+        temperatures: (most,) by number of views, from one view on; the last is also that of more.
+        single: temperature of the logits of a view alone.
+    """
+
+    structure: nnx.GraphDef = flax.struct.field(pytree_node=False)
+    weights: nnx.State
+    temperatures: Float[Array, "most"]
+    single: Float[Array, ""]
+
+    def __call__(
+        self,
+        features: Float[AnyArray, "*batch views features"],
+        directions: Float[AnyArray, "*batch views 3"],
+        present: Bool[AnyArray, "*batch views"],
+    ) -> Float[Array, "*batch classes"]:
+        """Log-probabilities of what was seen, as in `SetFusion`."""
+        logits = nnx.merge(self.structure, self.weights)(features, directions, present)
+        count = jnp.clip(jnp.sum(present, axis=-1), 1, len(self.temperatures))
+        return jax.nn.log_softmax(logits / self.temperatures[count - 1][..., None], axis=-1)

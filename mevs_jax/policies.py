@@ -11,22 +11,26 @@ other objects; the entropies, logits and label of *this* object (`Scene`) are fo
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import TypeVar
+from typing import Literal, TypeVar
 
 import flax.struct
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
+from mevs_jax.fusion import CalibratedFusion
+from mevs_jax.models.view_policy import ViewPolicy, expected_information
 from mevs_jax.viewpoints import ViewGraph, local_maxima
 
 
 @flax.struct.dataclass
 class Observation:
-    """What one look gives: logits (classes,), and the policy network's word on every view (views,)."""
+    """What one look gives: logits (classes,); the entropy predictor's word on every view (views,), where it is asked; and the
+    encoder's features (features,), where they are fused."""
 
     logits: Float[Array, "*batch classes"]
-    utility: Float[Array, "*batch views"]
+    utility: Float[Array, "*batch views"] | None = None
+    features: Float[Array, "*batch features"] | None = None
 
 
 @flax.struct.dataclass
@@ -77,6 +81,7 @@ class Scene:
         knowledge: learnt on other objects.
         reachable: (views,) where the camera can go; None for everywhere. The start may lie outside.
         climbed: (views, views) by policy; row i scores the views after seeing view i, by climbing with a renderer's gradient.
+        features: (views, features) of every view; for oracles.
     """
 
     graph: ViewGraph
@@ -86,6 +91,7 @@ class Scene:
     knowledge: Knowledge | None = None
     reachable: Bool[Array, "*batch views"] | None = None
     climbed: dict[str, Float[Array, "*batch views views"]] | None = None
+    features: Float[Array, "*batch views features"] | None = None
 
 
 Policy = Callable[[Array, SelectionState, Scene], Float[Array, "views"]]
@@ -95,7 +101,7 @@ T = TypeVar("T")
 
 def _given(value: T | None, name: str) -> T:
     if value is None:
-        raise ValueError(f"this policy needs Scene.{name}, which is not given")
+        raise ValueError(f"this policy needs {name}, which is not given")
     return value
 
 
@@ -145,19 +151,23 @@ def farthest_view(key: Array, state: SelectionState, scene: Scene) -> Float[Arra
 def predicted_entropy(key: Array, state: SelectionState, scene: Scene) -> Float[Array, "views"]:
     """The thesis's policy: local maxima of the entropies predicted from the latest view's cloud come first."""
     del key
-    return maxima_first(state.latest.utility, candidates(state, scene), scene.graph.neighbours)
+    return maxima_first(
+        _given(state.latest.utility, "Observation.utility"), candidates(state, scene), scene.graph.neighbours
+    )
 
 
 def predicted_entropy_without_maxima(key: Array, state: SelectionState, scene: Scene) -> Float[Array, "views"]:
     """The entropies predicted from the latest view's cloud, highest first, neighbours or not."""
     del key, scene
-    return state.latest.utility
+    return _given(state.latest.utility, "Observation.utility")
 
 
 def remembered_entropy(key: Array, state: SelectionState, scene: Scene) -> Float[Array, "views"]:
     """The thesis's rule on the mean of the predictions from every view seen, not the latest alone."""
     del key
-    mean = jnp.sum(state.seen.utility, axis=0) / jnp.maximum(state.count, 1)  # zeros beyond `count`
+    mean = jnp.sum(_given(state.seen.utility, "Observation.utility"), axis=0) / jnp.maximum(
+        state.count, 1
+    )  # zeros beyond `count`
     return maxima_first(mean, candidates(state, scene), scene.graph.neighbours)
 
 
@@ -167,7 +177,7 @@ def remembered_entropy(key: Array, state: SelectionState, scene: Scene) -> Float
 def fixed_order(key: Array, state: SelectionState, scene: Scene) -> Float[Array, "views"]:
     """The same views for every object, in the order that did best on other objects."""
     del key, state
-    return _given(scene.knowledge, "knowledge").order
+    return _given(scene.knowledge, "Scene.knowledge").order
 
 
 def information_gain(key: Array, state: SelectionState, scene: Scene) -> Float[Array, "views"]:
@@ -177,7 +187,7 @@ def information_gain(key: Array, state: SelectionState, scene: Scene) -> Float[A
     and Wu et al. (3D ShapeNets, 2015), with a table in place of a generative model.
     """
     del key
-    expected = _given(scene.knowledge, "knowledge").expected_logits
+    expected = _given(scene.knowledge, "Scene.knowledge").expected_logits
     after = _belief_entropy(state.belief + expected)  # (classes, views)
     return _belief_entropy(state.belief) - jax.nn.softmax(state.belief) @ after
 
@@ -188,6 +198,30 @@ def _belief_entropy(belief: Float[Array, "*batch classes"]) -> Float[Array, "*ba
     weight = jnp.exp(shifted)
     total = jnp.sum(weight, axis=-1)
     return jnp.log(total) - jnp.sum(weight * shifted, axis=-1) / total
+
+
+# Having learnt what looking was worth.
+
+
+def learnt(
+    network: ViewPolicy, temperature: float | Float[Array, ""], *, by: Literal["gain", "information"] = "gain"
+) -> Policy:
+    """The view from which `network` expects most.
+
+    Args:
+        network: trained by `train.policy`.
+        temperature: of the logits of single views.
+        by: the expected drop in cross-entropy, or the expected information gain by the beliefs it expects for each class.
+    """
+
+    def scores(key: Array, state: SelectionState, scene: Scene) -> Float[Array, "views"]:
+        del key
+        points, present = scene.graph.points, jnp.arange(len(state.views)) < state.count
+        views = jax.nn.log_softmax(state.seen.logits / temperature, axis=-1)
+        gain, after = network(state.belief, views, points[state.views], present, points)
+        return gain if by == "gain" else expected_information(state.belief, after)
+
+    return scores
 
 
 # Knowing what a surface or a volume made from the latest view would look like from elsewhere.
@@ -201,7 +235,7 @@ def climbed(name: str) -> Policy:
 
     def scores(key: Array, state: SelectionState, scene: Scene) -> Float[Array, "views"]:
         del key
-        return _given(scene.climbed, "climbed")[name][state.view]
+        return _given(scene.climbed, "Scene.climbed")[name][state.view]
 
     return scores
 
@@ -212,13 +246,13 @@ def climbed(name: str) -> Policy:
 def oracle_entropy(key: Array, state: SelectionState, scene: Scene) -> Float[Array, "views"]:
     """The thesis's rule on the true entropies: what a perfect predictor would do."""
     del key
-    return maxima_first(_given(scene.entropy, "entropy"), candidates(state, scene), scene.graph.neighbours)
+    return maxima_first(_given(scene.entropy, "Scene.entropy"), candidates(state, scene), scene.graph.neighbours)
 
 
 def lowest_entropy(key: Array, state: SelectionState, scene: Scene) -> Float[Array, "views"]:
     """The lowest true entropy first: the control. If this does no worse than the oracle, entropy is not what matters."""
     del key, state
-    return -_given(scene.entropy, "entropy")
+    return -_given(scene.entropy, "Scene.entropy")
 
 
 def belief_oracle(key: Array, state: SelectionState, scene: Scene) -> Float[Array, "views"]:
@@ -227,7 +261,7 @@ def belief_oracle(key: Array, state: SelectionState, scene: Scene) -> Float[Arra
     Sees every view but not the label, so it cannot pick views that are right by luck: a fair ceiling for one step.
     """
     del key
-    logits = _given(scene.logits, "logits")
+    logits = _given(scene.logits, "Scene.logits")
     final = jax.nn.softmax(jnp.sum(logits, axis=0))
     return jnp.sum(final * jax.nn.log_softmax(state.belief + logits), axis=-1)
 
@@ -235,7 +269,7 @@ def belief_oracle(key: Array, state: SelectionState, scene: Scene) -> Float[Arra
 def label_oracle(key: Array, state: SelectionState, scene: Scene) -> Float[Array, "views"]:
     """The view after which the true class is most probable. Optimistic: it finds views that are right by luck."""
     del key
-    logits, label = _given(scene.logits, "logits"), _given(scene.label, "label")
+    logits, label = _given(scene.logits, "Scene.logits"), _given(scene.label, "Scene.label")
     return jax.nn.log_softmax(state.belief + logits)[:, label]
 
 
@@ -243,7 +277,7 @@ def pair_oracle(key: Array, state: SelectionState, scene: Scene) -> Float[Array,
     """The first view of the pair after which the true class is most probable, over all pairs; every second view is the greedy
     one, which completes the pair. More optimistic still (exhaustive search over subsets, as in MVSelect, Hou et al. 2024).
     """
-    logits, label = _given(scene.logits, "logits"), _given(scene.label, "label")
+    logits, label = _given(scene.logits, "Scene.logits"), _given(scene.label, "Scene.label")
 
     def best_partner() -> Float[Array, "views"]:
         both = state.belief + (
@@ -257,6 +291,25 @@ def pair_oracle(key: Array, state: SelectionState, scene: Scene) -> Float[Array,
     return jax.lax.cond(state.count % 2 == 1, best_partner, lambda: label_oracle(key, state, scene))
 
 
+def fused_oracle(fusion: CalibratedFusion, *, by: Literal["belief", "label"] = "belief") -> Policy:
+    """`belief_oracle` or `label_oracle` where a learnt fusion makes the belief."""
+
+    def scores(key: Array, state: SelectionState, scene: Scene) -> Float[Array, "views"]:
+        del key
+        features, points = _given(scene.features, "Scene.features"), scene.graph.points
+        seen = features[state.views], points[state.views], jnp.arange(len(state.views)) < state.count
+
+        def with_one_more(*view: Array) -> Float[Array, "classes"]:
+            return fusion(*(jnp.concatenate([known, new[None]]) for known, new in zip(seen, view, strict=True)))
+
+        after = jax.vmap(with_one_more)(features, points, jnp.ones(len(points), bool))
+        if by == "label":
+            return after[:, _given(scene.label, "Scene.label")]
+        return after @ jnp.exp(fusion(features, points, jnp.ones(len(points), bool)))
+
+    return scores
+
+
 # What the thesis's published code does.
 
 
@@ -267,9 +320,10 @@ def scrambled_entropy(key: Array, state: SelectionState, scene: Scene) -> Float[
     """
     del key
     neighbours, views = scene.graph.neighbours, state.attempted.shape[0]
+    utility = _given(state.seen.utility, "Observation.utility")
 
     def written(order: Int[Array, "views"], look: Int[Array, ""]) -> Float[Array, "views"]:
-        return jnp.zeros(views).at[order].set(state.seen.utility[look])
+        return jnp.zeros(views).at[order].set(utility[look])
 
     def replay(look: Int[Array, ""], order: Int[Array, "views"]) -> Int[Array, "views"]:
         weights = written(order, look)

@@ -14,6 +14,7 @@ from flax import nnx
 
 from mevs_jax.models import BatchNorm, PointNet2, ResNet
 from mevs_jax.models.pointnet2 import Perceptron
+from mevs_jax.models.resnet import Convolution
 
 StateDict = Mapping[str, np.ndarray]
 
@@ -63,6 +64,7 @@ def resnet_from_torch(network: ResNet, state: StateDict, *, head: bool = True) -
         ValueError: for a missing or superfluous entry, or another shape.
     """
     reader = _Reader(state)
+    assert isinstance(network.convolution, Convolution), "torchvision has no such stem"
     reader.put(network.convolution.kernel, "conv1.weight", 2, 3, 1, 0)
     reader.norm(network.norm, "bn1")
     names = [f"layer{stage + 1}.{block}" for stage, blocks in enumerate(network.stages) for block in range(blocks)]

@@ -17,7 +17,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from mevs_jax.fusion import confidence, sum_of_logits
+from mevs_jax.fusion import CalibratedFusion, confidence, sum_of_logits
 from mevs_jax.policies import Knowledge, Observation, Policy, Scene, SelectionState, candidates
 from mevs_jax.viewpoints import ViewGraph
 
@@ -28,26 +28,32 @@ class ViewTable:
 
     Attributes:
         logits: (views, classes) of the classifier at each view; an axis of its own where several classifiers are compared.
-        utility: (views, views); row i is what the policy's network says about every view after seeing view i.
+        utility: (views, views); row i is what the entropy predictor says about every view after seeing view i.
         entropy: (views,) true depth entropies.
         label: the true class.
         climbed: (views, views) by policy; row i is where differentiable rendering would look after seeing view i.
+        features: (views, features) of the encoder, for a learnt fusion.
     """
 
     logits: Float[Array, "*batch_and_backbones views classes"]
-    utility: Float[Array, "*batch views views"]
-    entropy: Float[Array, "*batch views"]
+    utility: Float[Array, "*batch views views"] | None
+    entropy: Float[Array, "*batch views"] | None
     label: Int[Array, "*batch"]
     climbed: dict[str, Float[Array, "*batch views views"]] | None = None
+    features: Float[Array, "*batch views features"] | None = None
 
     def observe(self, view: Int[Array, ""]) -> Observation:
-        return Observation(self.logits[view], self.utility[view])
+        return Observation(
+            self.logits[view],
+            None if self.utility is None else self.utility[view],
+            None if self.features is None else self.features[view],
+        )
 
     def scene(
         self, graph: ViewGraph, knowledge: Knowledge | None = None, reachable: Bool[Array, "views"] | None = None
     ) -> Scene:
         """The scene with everything that an oracle may ask for."""
-        return Scene(graph, self.entropy, self.logits, self.label, knowledge, reachable, self.climbed)
+        return Scene(graph, self.entropy, self.logits, self.label, knowledge, reachable, self.climbed, self.features)
 
 
 @flax.struct.dataclass
@@ -78,6 +84,28 @@ def best_view(scores: Float[Array, "views"], allowed: Bool[Array, "views"]) -> I
     return jnp.argmax(allowed & (scores == best)).astype(jnp.int32)
 
 
+Fuse = Callable[[SelectionState, Scene], Float[Array, "classes"]]
+"""The belief once the latest look is among those `seen`; `belief` is still that before it."""
+
+
+def adding(state: SelectionState, scene: Scene) -> Float[Array, "classes"]:
+    """The thesis's fusion (§4.4): the sum of logits."""
+    del scene
+    return sum_of_logits(state.belief, state.latest.logits)
+
+
+def by_attention(fusion: CalibratedFusion) -> Fuse:
+    """A learnt fusion of the features that were seen; the belief is its log-probabilities."""
+
+    def fuse(state: SelectionState, scene: Scene) -> Float[Array, "classes"]:
+        if state.seen.features is None:
+            raise ValueError("a learnt fusion needs the features of every look, which are not given")
+        present = jnp.arange(len(state.views)) < state.count
+        return fusion(state.seen.features, scene.graph.points[state.views], present)
+
+    return fuse
+
+
 def select_views(
     key: Array,
     observe: Callable[[Int[Array, ""]], Observation],
@@ -87,6 +115,7 @@ def select_views(
     *,
     threshold: float | Float[Array, ""] | None = None,
     max_views: int,
+    fuse: Fuse = adding,
 ) -> Episode:
     """Looks at one object from `start` on until the confidence reaches `threshold` or `max_views` views are seen.
 
@@ -100,6 +129,7 @@ def select_views(
         start: the first view, 0..views−1.
         threshold: on the confidence, CT in the thesis; None never stops early.
         max_views: 1..views, MV in the thesis.
+        fuse: how looks become a belief.
 
     Raises:
         ValueError: for `max_views` outside its range, or a scene that lacks what the policy asks for.
@@ -122,16 +152,16 @@ def select_views(
     def look(carry: tuple[SelectionState, Episode]) -> tuple[SelectionState, Episode]:
         state, episode = carry
         latest = observe(state.view)
-        belief = sum_of_logits(state.belief, latest.logits)
-        state = SelectionState(
+        state = replace(
+            state,
             count=state.count + 1,
-            view=state.view,
             attempted=state.attempted | (jnp.arange(views) == state.view),
-            belief=belief,
             latest=latest,
             views=_put(state.views, state.count, state.view),
             seen=jax.tree.map(lambda history, now: _put(history, state.count, now), state.seen, latest),
         )
+        belief = fuse(state, scene)
+        state = replace(state, belief=belief)
         episode = Episode(
             views=state.views,
             predictions=_put(episode.predictions, state.count - 1, jnp.argmax(belief).astype(jnp.int32)),
@@ -141,8 +171,15 @@ def select_views(
         scores = policy(jax.random.fold_in(key, state.count), state, scene)
         return replace(state, view=best_view(scores, candidates(state, scene))), episode
 
-    shapes = jax.eval_shape(lambda view: jax.tree.leaves(observe(view)), start)
-    blank = Observation(*(jnp.zeros(shape.shape, shape.dtype) for shape in shapes))
+    kind = []  # of tree, once `observe` was traced
+
+    def leaves_of(view: Int[Array, ""]) -> list[Array]:
+        leaves, tree = jax.tree.flatten(observe(view))
+        kind.append(tree)
+        return leaves
+
+    shapes = jax.eval_shape(leaves_of, start)
+    blank = jax.tree.unflatten(kind[0], [jnp.zeros(shape.shape, shape.dtype) for shape in shapes])
     nothing = jnp.full(max_views, -1, jnp.int32)
     state = SelectionState(
         count=jnp.int32(0),
@@ -170,9 +207,10 @@ def select_from_table(
     *,
     threshold: float | Float[Array, ""] | None = None,
     max_views: int,
+    fuse: Fuse = adding,
 ) -> Episode:
     """`select_views` where a look is a row of `table`."""
-    return select_views(key, table.observe, scene, policy, start, threshold=threshold, max_views=max_views)
+    return select_views(key, table.observe, scene, policy, start, threshold=threshold, max_views=max_views, fuse=fuse)
 
 
 def stop_at(

@@ -2,10 +2,21 @@
 
 from __future__ import annotations
 
+import atexit
+import os
+import shutil
+import tempfile
 from pathlib import Path
 
 import numpy as np
 import pytest
+
+if "PYTEST_XDIST_WORKER" not in os.environ:
+    # What one test has compiled the others need not, nor the workers and programs that they start, which inherit this. JAX is not
+    # imported yet.
+    compiled = tempfile.mkdtemp(prefix="mevs_jax-compiled-")
+    atexit.register(shutil.rmtree, compiled, ignore_errors=True)
+    os.environ |= {"JAX_COMPILATION_CACHE_DIR": compiled, "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0.2"}
 
 REAL = Path(__file__).resolve().parents[2] / "shared"
 

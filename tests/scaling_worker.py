@@ -9,6 +9,7 @@ import signal
 import sys
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import jax
 from jax.sharding import Mesh
@@ -35,10 +36,18 @@ whether a rectified unit is on, and what follows from that grows with the rate."
 COLLECTIVES = re.compile(r"\b(all-reduce|all-gather|all-to-all|reduce-scatter|collective-permute)(?:-start)?\(")
 
 
-def losses(data: Path, mesh: Mesh, steps: int) -> tuple[dict[str, list[float]], dict[str, list[str]]]:
-    """The training loss of the first steps, and how devices talk in a step, by network; PointNet++ alone where weights are
-    split, which compiles sooner."""
-    out, talk = {}, {}
+STRETCH = 10
+"""Steps in a row. Each stretch begins where one device was then, before rounding has grown into another training altogether."""
+
+States = dict[tuple[str, int], Any]
+
+
+def losses(
+    data: Path, mesh: Mesh, steps: int, of_one: States
+) -> tuple[dict[str, list[float]], dict[str, list[str]], States]:
+    """The training loss of the first steps, how devices talk in a step, and the state at each stretch's beginning, by network;
+    PointNet++ alone where weights are split, which compiles sooner. Stretches begin with the states `of_one` device, if given."""
+    out, talk, begins = {}, {}, {}
     for task in tasks(SETTINGS, load_statistics(data))[mesh.shape["model"] > 1 :]:
         structure, state = initial_state(task, task.optimiser.seed)
         where = parameter_sharding(mesh, state)
@@ -50,11 +59,15 @@ def losses(data: Path, mesh: Mesh, steps: int) -> tuple[dict[str, list[float]], 
             state, place_batch(mesh, next(train_batches(data, task.batches))), task.hyperparameters
         ).compile()
         talk[task.name] = sorted(set(COLLECTIVES.findall(program.as_text())))
-        for _ in range(steps):
+        for number in range(steps):
+            if number % STRETCH == 0:
+                begins[task.name, number] = jax.device_get(state)
+                if of_one:
+                    state = place(of_one[task.name, number], where)
             state, loss = program(state, place_batch(mesh, next(batches)), task.hyperparameters)
             found.append(loss)
         out[task.name] = [float(loss) for loss in found]
-    return out, talk
+    return out, talk, begins
 
 
 def fit_until(data: Path, out: Path, stop_at: int) -> None:
@@ -86,6 +99,10 @@ if __name__ == "__main__":
     jax.config.update("jax_num_cpu_devices", asked["devices"])
     assert len(jax.devices()) == asked["devices"]
     if "steps" in asked:
-        print(json.dumps({name: losses(Path(asked["data"]), mesh, asked["steps"]) for name, mesh in meshes().items()}))
+        found, of_one = {}, {}
+        for name, mesh in meshes().items():
+            *found[name], begins = losses(Path(asked["data"]), mesh, asked["steps"], of_one)
+            of_one = of_one or begins
+        print(json.dumps(found))
     else:
         fit_until(Path(asked["data"]), Path(asked["out"]), asked["stop_at"])

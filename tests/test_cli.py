@@ -5,6 +5,7 @@ from __future__ import annotations
 import html
 import json
 import os
+import re
 import shutil
 import signal
 import subprocess
@@ -16,24 +17,34 @@ import numpy as np
 import pytest
 import trimesh
 
-from eval.pipeline import TINY, climb_on_objects, train_set_fusion
+from eval.pipeline import TINY, climb_on_objects, learn_to_choose
 from mevs_jax import cli
 from tests.conftest import open3d_or_skip
 
 MEVS = [sys.executable, "-m", "mevs_jax"]
 
 
-@pytest.fixture(scope="module", autouse=True)
-def compiled_once(tmp_path_factory):
-    """Programs compiled for one run of the job are kept for the next."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("JAX_COMPILATION_CACHE_DIR", str(tmp_path_factory.mktemp("compiled")))
-        patch.setenv("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0.1")
-        yield
-
-
 def mevs(*arguments: str | Path, cwd: Path | None = None) -> subprocess.CompletedProcess:
     return subprocess.run([*MEVS, *map(str, arguments)], capture_output=True, text=True, cwd=cwd, timeout=600)
+
+
+@pytest.fixture
+def refuses(monkeypatch, capfd):
+    """`mevs` in this process, which imports nothing anew, where it is to refuse something: the sentence that it says."""
+
+    def run(*arguments: str | Path) -> str:
+        handlers = {sign: signal.getsignal(sign) for sign in (signal.SIGINT, signal.SIGALRM)}
+        monkeypatch.setattr(sys, "argv", ["test", *map(str, arguments)])  # not `mevs`, which would begin again
+        capfd.readouterr()
+        try:
+            with pytest.raises(SystemExit) as ended:
+                cli.main()
+        finally:
+            for sign, handler in handlers.items():
+                signal.signal(sign, handler)
+        return refused(subprocess.CompletedProcess([], ended.value.code, "", capfd.readouterr().err))
+
+    return run
 
 
 def cube_off() -> str:
@@ -134,23 +145,21 @@ def weights_that_are_none(root: Path) -> list:
     ],
     ids=lambda value: getattr(value, "__name__", ""),
 )
-def test_bad_input_gets_one_sentence_and_exit_code_2(tmp_path, make, message):
+def test_bad_input_gets_one_sentence_and_exit_code_2(tmp_path, make, message, refuses):
     arguments = make(tmp_path)
     if "--out" not in arguments:
         arguments += ["--out", tmp_path / "run"]
-    import re
-
-    assert re.search(message, refused(mevs("run", "--preset", "tiny", *arguments)))
+    assert re.search(message, refuses("run", "--preset", "tiny", *arguments))
 
 
-def test_unknown_words_are_refused_and_help_reads_well(tmp_path):
+def test_unknown_words_are_refused_and_help_reads_well(tmp_path, refuses):
     assert "unknown command 'fly'" in refused(mevs("fly"))
-    assert "unknown preset 'huge'" in refused(mevs("run", "--preset", "huge"))
+    assert "unknown preset 'huge'" in refuses("run", "--preset", "huge")
     assert mevs("run", "--no-such-option").returncode == 2
-    assert "of 10 and of 40 views" in refused(mevs("thesis", "--views", "5", "--out", tmp_path / "thesis"))
-    assert "no data set in" in refused(mevs("train", "--out", tmp_path))
-    assert "go with mevs train alone" in refused(mevs("run", "--distributed", "--out", tmp_path))
-    assert "--beam goes with mevs data alone" in refused(mevs("run", "--beam", "", "--out", tmp_path))
+    assert "of 10 and of 40 views" in refuses("thesis", "--views", "5", "--out", tmp_path / "thesis")
+    assert "no data set in" in refuses("train", "--out", tmp_path)
+    assert "go with mevs train alone" in refuses("run", "--distributed", "--out", tmp_path)
+    assert "--beam goes with mevs data alone" in refuses("run", "--beam", "", "--out", tmp_path)
     assert "cannot join the other processes" in refused(mevs("train", "--distributed", "--out", tmp_path))
     shown = mevs("--help")
     assert shown.returncode == 0
@@ -200,20 +209,25 @@ def test_a_second_run_redoes_nothing(whole):
     assert before == {path: path.stat().st_mtime_ns for path in whole.rglob("*") if path.is_file()}
 
 
-def test_networks_for_another_number_of_views_are_refused(whole, tmp_path):
+def test_networks_for_another_number_of_views_are_refused(whole, tmp_path, refuses):
     assert mevs("data", "--preset", "tiny", "--views", "8", "--out", tmp_path).returncode == 0
     for name in ("classifier", "entropy"):
         shutil.copytree(whole / name, tmp_path / name)
-    assert "was trained for 6 views, the data set has 8" in refused(mevs("eval", "--preset", "tiny", "--out", tmp_path))
+    assert "was trained for 6 views, the data set has 8" in refuses("eval", "--preset", "tiny", "--out", tmp_path)
 
 
-def test_compat_climbs_and_fusion_fill_their_tables(whole, tmp_path):
-    """One evaluation of what `mevs compat`, `climb` and `fuse` add to a run."""
+def test_compat_climbs_and_learning_fill_their_tables(whole, tmp_path):
+    """One evaluation of what `mevs compat`, `climb` and `active` add to a run."""
     open3d_or_skip()
     out = tmp_path / "run"
     shutil.copytree(whole, out)
     assert "mevs compat" in (out / "report" / "index.html").read_text()
-    train_set_fusion(TINY, out)
+    page = learn_to_choose(TINY, out).read_text()
+    made_once = (out / "active" / "seed_0" / "policy" / "summary.json").stat().st_mtime_ns
+    assert learn_to_choose(TINY, out).read_text() == page
+    assert (out / "active" / "seed_0" / "policy" / "summary.json").stat().st_mtime_ns == made_once
+    for said in ("6 candidate views", "PointNet++ entropy (thesis)", "learnt: expected gain", "label-free oracle"):
+        assert html.escape(said) in page
     climb_on_objects(TINY, out)
     assert mevs("compat", "--preset", "tiny", "--out", out).returncode == 0
     metrics = json.loads((out / "metrics.json").read_text())
@@ -222,16 +236,15 @@ def test_compat_climbs_and_fusion_fill_their_tables(whole, tmp_path):
     assert set(made["single_view_accuracy"]) == {"classifier", "classifier_by_view"}
     assert (metrics["climbing"]["objects"], metrics["climbing"]["views"]) == (1, 6)
     assert {"random", "predicted_entropy", "diff_volume", "diff_mesh"} <= set(metrics["climbing"]["policies"])
-    assert [row["views"] for row in metrics["fusion"]["rows"]] == [1, 2, 3, 4, 5, 6]
     page = (out / "report" / "index.html").read_text()
     assert "Choosing by differentiable rendering" in page
-    assert "Fusing views" in page
+    assert "Learning to fuse and to choose" in page
     assert "mevs compat" not in page
     before = json.loads((whole / "metrics.json").read_text())
     assert before["compatibility"]["rows"]["text"] == made["rows"]["text"]
 
 
-def test_live_walks_what_the_tables_say(whole, tmp_path):
+def test_live_walks_what_the_tables_say(whole, tmp_path, refuses):
     shutil.copytree(whole, tmp_path / "run")
     arguments = ("live", "--preset", "tiny", "--live.objects", "6", "--out", tmp_path / "run", "--live.policies")
     result = mevs(*arguments, "random", "predicted_entropy", "information_gain")
@@ -240,7 +253,7 @@ def test_live_walks_what_the_tables_say(whole, tmp_path):
     assert set(found) == {"random", "predicted_entropy", "information_gain"}
     for policy, agreement in found.items():
         assert agreement["walks"] == agreement["same"] == 6, policy
-    assert "unknown policy 'fly'" in refused(mevs(*arguments, "fly"))
+    assert "unknown policy 'fly'" in refuses(*arguments, "fly")
 
 
 def test_many_devices_say_what_one_does(whole, tmp_path, monkeypatch):
@@ -261,7 +274,7 @@ def test_many_devices_say_what_one_does(whole, tmp_path, monkeypatch):
     assert agreement["walks"] == agreement["same"] == 6
 
 
-def test_a_sweep_is_made_by_command(whole, tmp_path):
+def test_a_sweep_is_made_by_command(whole, tmp_path, refuses):
     for folder in (tmp_path, tmp_path / "other"):
         folder.mkdir(exist_ok=True)
         (folder / "data").symlink_to(whole / "data")
@@ -269,15 +282,15 @@ def test_a_sweep_is_made_by_command(whole, tmp_path):
     assert result.returncode == 0, result.stderr
     assert "Best of 3: validation loss" in result.stderr
     assert len(json.loads((tmp_path / "sweep" / "entropy" / "members.json").read_text())) == 3
-    assert "--sweep.members 0 is too few" in refused(
-        mevs("sweep", "--preset", "tiny", "--out", tmp_path / "other", "--sweep.members", "0")
+    assert "--sweep.members 0 is too few" in refuses(
+        "sweep", "--preset", "tiny", "--out", tmp_path / "other", "--sweep.members", "0"
     )
 
 
-def test_a_reach_that_leaves_nothing_is_refused(whole):
+def test_a_reach_that_leaves_nothing_is_refused(whole, refuses):
     arguments = ("eval", "--preset", "tiny", "--out", whole, "--evaluation.lowest-elevation", "89")
-    assert "viewpoints are 89° above the horizon or higher" in refused(mevs(*arguments))
-    assert "must be at least 2" in refused(mevs(*arguments[:5], "--evaluation.max-views", "1"))
+    assert "viewpoints are 89° above the horizon or higher" in refuses(*arguments)
+    assert "must be at least 2" in refuses(*arguments[:5], "--evaluation.max-views", "1")
 
 
 def test_an_interrupt_that_is_lost_is_given_again():

@@ -8,9 +8,10 @@ import numpy as np
 import pytest
 from flax import nnx
 
-from eval.fusing import fusion_study, sets_of_size
+from eval.active import calibrated
+from eval.active_study import random_sets_study
 from mevs_jax.fusion import SetFusion
-from train.fusion import Features, FusionConfig, random_sets, train_fusion
+from train.fusion import Features, FusionConfig, SetFusionConfig, random_sets, sets_of_size, train_fusion
 
 VIEWS, FEATURES, CLASSES = 5, 12, 3
 
@@ -120,19 +121,27 @@ def made_up(objects: int, seed: int) -> Features:
     logits = random.normal(0, 0.1, (objects, 4, 2))
     directions = np.array([[1.0, 0, 0], [0, 1, 0], [-1, 0, 0], [0, -1, 0]])
     return Features(
-        *(jnp.asarray(a, jnp.float32) for a in (features, logits)), jnp.asarray(labels), jnp.asarray(directions)
+        *(jnp.asarray(a, jnp.float32) for a in (features, logits)),
+        jnp.asarray(labels),
+        jnp.broadcast_to(jnp.asarray(directions), (objects, 4, 3)),
     )
 
 
 def test_what_no_view_shows_alone_is_learnt_and_reported():
     config = FusionConfig(
-        width=32, heads=2, blocks=1, dropout=0.0, largest_set=4, epochs=25, batch_size=64, learning_rate=3e-3
+        network=SetFusionConfig(width=32, heads=2, blocks=1, dropout=0.0),
+        largest_set=4,
+        epochs=25,
+        batch_size=64,
+        learning_rate=3e-3,
     )
     train, validation, test = (made_up(objects, seed) for seed, objects in enumerate((512, 128, 256)))
     network, found = train_fusion(config, train, validation)
     assert len(found["epochs"]) == 25
     assert found["best_loss"] == min(epoch["validation"] for epoch in found["epochs"])
-    rows = {row["views"]: row for row in fusion_study(network, validation, test)["rows"]}
+    fusion = calibrated(network, validation)
+    assert fusion.temperatures.shape == (4,)
+    rows = {row["views"]: row for row in random_sets_study(fusion, validation, test)}
     assert list(rows) == [1, 2, 3, 4]
     assert rows[1]["learnt"]["accuracy"] < 0.6  # one sign says nothing
     assert rows[4]["learnt"]["accuracy"] > 0.95

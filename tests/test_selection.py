@@ -246,24 +246,24 @@ def test_a_policy_may_look_back_on_all_that_was_seen():
 def test_a_full_walk_holds_the_answer_for_every_threshold_and_limit():
     graph = ViewGraph.from_points(fibonacci_sphere(10))
     tables = random_tables(10, 4, 50, seed=5)
-    scene = Scene(graph, tables.entropy[0])
-    for index in range(50):
-        table = jax.tree.map(lambda leaf, i=index: leaf[i], tables)
-        full = select_from_table(jax.random.key(0), table, scene, POLICIES["predicted_entropy"], 2, max_views=9)
-        for threshold in (0.6, 0.9):
-            for limit in (1, 3, 9):
-                stopped = select_from_table(
-                    jax.random.key(0),
-                    table,
-                    scene,
-                    POLICIES["predicted_entropy"],
-                    2,
-                    threshold=threshold,
-                    max_views=limit,
-                )
-                used = int(stop_at(full.confidences, threshold, limit))
-                assert used == int(stopped.count)
-                assert int(full.predictions[used - 1]) == int(stopped.predictions[used - 1])
+    keys, starts = jax.random.split(jax.random.key(0), 50), jnp.full(50, 2)
+    policy = POLICIES["predicted_entropy"]
+
+    @jax.jit
+    def whole(keys, tables, starts):
+        def walk(key, table, start):
+            return select_from_table(key, table, Scene(graph), policy, start, max_views=9)
+
+        return jax.vmap(walk)(keys, tables, starts)
+
+    full, thresholds = whole(keys, tables, starts), jnp.array([0.6, 0.9])
+    for limit in (1, 3, 9):
+        stopped = walk_jitted(keys, tables, graph, starts, thresholds, policy="predicted_entropy", max_views=limit)
+        for index in range(50):
+            for at, threshold in enumerate(thresholds):
+                used = int(stop_at(full.confidences[index], threshold, limit))
+                assert used == int(stopped.count[index, at])
+                assert int(full.predictions[index, used - 1]) == int(stopped.predictions[index, at, used - 1])
 
 
 def test_observing_may_be_anything():

@@ -35,6 +35,8 @@ class ResNetConfig:
     """channels of the input; depth and grey images are replicated"""
     standardise: bool = True
     """take off ImageNet's mean and divide by its standard deviation, for three channels"""
+    stem: Literal["convolution", "patches"] = "convolution"
+    """the first layer: ResNet's, or pieces of 4×4 pixels, a third faster on a CPU"""
 
 
 def starting_weights(files: tuple[Path, ...], network: ResNetConfig) -> StartingWeights | None:
@@ -107,6 +109,7 @@ class ClassifierTask:
             channels=shape.channels,
             width=shape.width,
             standardise=shape.standardise and shape.channels == 3,
+            stem=shape.stem,
             dtype=jnp.dtype(self.optimiser.compute),
             rngs=rngs,
         )

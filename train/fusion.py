@@ -21,8 +21,8 @@ from mevs_jax.fusion import SetFusion
 
 
 @dataclass(frozen=True)
-class FusionConfig:
-    """The set fusion and its training."""
+class SetFusionConfig:
+    """Shape of the set fusion."""
 
     width: int = 128
     """of the tokens"""
@@ -32,6 +32,13 @@ class FusionConfig:
     """of attention and layers"""
     dropout: float = 0.2
     """within blocks, and of features"""
+
+
+@dataclass(frozen=True)
+class FusionConfig:
+    """The set fusion's training on features that are there."""
+
+    network: SetFusionConfig = SetFusionConfig()
     largest_set: int = 12
     """views in a training set at most"""
     epochs: int = 60
@@ -56,24 +63,24 @@ class Features:
         features: (objects, views, features).
         logits: (objects, views, classes) of the single views.
         labels: (objects,).
-        directions: (views, 3) unit vectors to the cameras.
+        directions: (objects, views, 3) unit vectors to the cameras.
     """
 
     features: Float[Array, "objects views features"]
     logits: Float[Array, "objects views classes"]
     labels: Int[Array, "objects"]
-    directions: Float[Array, "views 3"]
+    directions: Float[Array, "objects views 3"]
 
 
-def new_fusion(config: FusionConfig, features: int, classes: int) -> SetFusion:
+def new_fusion(shape: SetFusionConfig, features: int, classes: int, rngs: nnx.Rngs) -> SetFusion:
     return SetFusion(
         features,
         classes,
-        width=config.width,
-        heads=config.heads,
-        blocks=config.blocks,
-        dropout=config.dropout,
-        rngs=nnx.Rngs(config.seed),
+        width=shape.width,
+        heads=shape.heads,
+        blocks=shape.blocks,
+        dropout=shape.dropout,
+        rngs=rngs,
     )
 
 
@@ -85,22 +92,27 @@ def random_sets(key: Array, objects: int, views: int, largest: int) -> Bool[Arra
     return ranks < count
 
 
-def fusion_loss(network: SetFusion, chosen: Features, present: Array, *, train: bool) -> Float[Array, "objects"]:
-    """Cross-entropy of each set, in nats."""
-    directions = jnp.broadcast_to(chosen.directions, (*present.shape, 3))
-    logits = network(chosen.features, directions, present, train=train)
+def sets_of_size(objects: int, views: int, size: int, draws: int, seed: int = 0) -> Bool[Array, "draws objects views"]:
+    """Random sets of so many views, the same at every call."""
+    drawn = jax.random.uniform(jax.random.key(seed), (draws, objects, views))
+    return jnp.argsort(jnp.argsort(drawn, axis=-1), axis=-1) < size
+
+
+def fusion_loss(
+    network: SetFusion, chosen: Features, present: Array, key: Array | None = None
+) -> Float[Array, "objects"]:
+    """Cross-entropy of each set, in nats; with a key, dropping out."""
+    logits = network(chosen.features, chosen.directions, present, key=key)
     return optax.softmax_cross_entropy_with_integer_labels(logits, chosen.labels)
 
 
-def _some(data: Features, index: Array) -> Features:
-    return Features(data.features[index], data.logits[index], data.labels[index], data.directions)
-
-
-def train_fusion(config: FusionConfig, train: Features, validation: Features) -> tuple[SetFusion, dict[str, Any]]:
-    """The network of the best epoch, and what happened: losses by epoch."""
-    network = new_fusion(config, train.features.shape[-1], train.logits.shape[-1])
-    structure, parameters, *others = nnx.split(network, nnx.Param, ...)
-    rest = others[0]
+def train_fusion(
+    config: FusionConfig, train: Features, validation: Features, start: SetFusion | None = None
+) -> tuple[SetFusion, dict[str, Any]]:
+    """The network of the best epoch, and what happened: losses by epoch. It begins as `start`, or with random weights."""
+    if start is None:
+        start = new_fusion(config.network, train.features.shape[-1], train.logits.shape[-1], nnx.Rngs(config.seed))
+    structure, parameters = nnx.split(start)
     objects, views = train.features.shape[:2]
     batch = min(config.batch_size, objects)
     steps = objects // batch
@@ -119,9 +131,8 @@ def train_fusion(config: FusionConfig, train: Features, validation: Features) ->
         present = random_sets(sets, batch, views, config.largest_set)
 
         def loss_of(parameters: nnx.State) -> Array:
-            network = nnx.merge(structure, parameters, rest, copy=True)
-            nnx.reseed(network, dropout=noise)
-            return jnp.mean(fusion_loss(network, _some(train, index), present, train=True))
+            some = jax.tree.map(lambda leaf: leaf[index], train)
+            return jnp.mean(fusion_loss(nnx.merge(structure, parameters), some, present, noise))
 
         loss, gradient = jax.value_and_grad(loss_of)(parameters)
         update, moments = optimiser.update(gradient, moments, parameters)
@@ -139,10 +150,10 @@ def train_fusion(config: FusionConfig, train: Features, validation: Features) ->
 
     @partial(jax.jit, static_argnames="draws")
     def validate(mean: nnx.State, draws: int = 4) -> Array:
-        network = nnx.merge(structure, mean, rest)
+        network = nnx.merge(structure, mean)
         keys = jax.random.split(jax.random.key(1), draws)  # the same sets after every epoch
         sets = [random_sets(key, len(validation.labels), views, config.largest_set) for key in keys]
-        return jnp.mean(jnp.stack([fusion_loss(network, validation, present, train=False) for present in sets]))
+        return jnp.mean(jnp.stack([fusion_loss(network, validation, present) for present in sets]))
 
     carry = parameters, optimiser.init(parameters), parameters, jnp.float32(0)
     best, best_loss, history = parameters, float("inf"), []
@@ -152,4 +163,4 @@ def train_fusion(config: FusionConfig, train: Features, validation: Features) ->
         history.append({"train": float(train_loss), "validation": loss})
         if loss < best_loss:
             best, best_loss = carry[2], loss
-    return nnx.merge(structure, best, rest), {"best_loss": best_loss, "epochs": history}
+    return nnx.merge(structure, best), {"best_loss": best_loss, "epochs": history}

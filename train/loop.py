@@ -50,6 +50,8 @@ class Lead:
 def steps_of_an_epoch(task: Task, statistics: DatasetStatistics) -> int:
     """Steps between two validations: a whole number of passes over the training objects' views."""
     config, objects = task.optimiser, statistics.objects_of(training_splits(task.batches))
+    if task.batches.fold is not None:
+        objects -= objects // task.batches.fold[1]
     return steps_per_epoch(objects * (config.epoch_views or statistics.views) // config.views_per_object, task.batches)
 
 

@@ -76,6 +76,9 @@ class Task(Protocol):
     def network(self, rngs: nnx.Rngs) -> Any:
         """A new network."""
 
+    def inputs(self, batch: Batch) -> jax.Array:
+        """What it looks at, of every view of a batch."""
+
     def loss(
         self, network: Any, batch: Batch, key: jax.Array, samples: jax.Array, hyper: Hyperparameters
     ) -> tuple[jax.Array, Metrics]:

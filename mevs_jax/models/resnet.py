@@ -7,6 +7,7 @@ layout is channels-last. `width` scales all stages, for data sets and machines s
 from __future__ import annotations
 
 from functools import partial
+from typing import Literal
 
 import jax
 import jax.numpy as jnp
@@ -20,11 +21,53 @@ _BLOCKS = {18: (2, 2, 2, 2), 34: (3, 4, 6, 3)}
 _IMAGENET_MEAN, _IMAGENET_STD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
 
 
+def _patches(x: Float[Array, "batch height width inputs"], size: int, stride: int) -> Float[Array, "places patch"]:
+    """What a square kernel sees at each of its places, a row each."""
+    pad = size // 2
+    rows, columns = (-(-extent // stride) for extent in x.shape[1:3])
+    x = jnp.pad(x, ((0, 0), (pad, pad), (pad, pad), (0, 0)))
+    seen = [
+        x[:, i : i + (rows - 1) * stride + 1 : stride, j : j + (columns - 1) * stride + 1 : stride]
+        for i in range(size)
+        for j in range(size)
+    ]
+    return jnp.concatenate(seen, axis=-1).reshape(x.shape[0] * rows * columns, -1)
+
+
+def _convolve(x: Array, kernel: Array, stride: int) -> Array:
+    pad = kernel.shape[0] // 2
+    return jax.lax.conv_general_dilated(
+        x, kernel, (stride, stride), [(pad, pad)] * 2, dimension_numbers=("NHWC", "HWIO", "NHWC")
+    )
+
+
+@partial(jax.custom_vjp, nondiff_argnums=(2,))
+def _convolve_on_cpu(x: Array, kernel: Array, stride: int) -> Array:
+    """`_convolve`, but the gradient of the weights is one matrix product."""
+    return _convolve(x, kernel, stride)
+
+
+def _forwards(x: Array, kernel: Array, stride: int) -> tuple[Array, tuple[Array, Array]]:
+    return _convolve(x, kernel, stride), (x, kernel)
+
+
+def _backwards(stride: int, kept: tuple[Array, Array], towards: Array) -> tuple[Array, Array]:
+    x, kernel = kept
+    (of_x,) = jax.vjp(lambda x: _convolve(x, kernel, stride), x)[1](towards)
+    rows = towards.reshape(-1, towards.shape[-1])
+    of_kernel = jnp.matmul(_patches(x, kernel.shape[0], stride).T, rows, preferred_element_type=jnp.float32)
+    return of_x, of_kernel.reshape(kernel.shape).astype(kernel.dtype)
+
+
+_convolve_on_cpu.defvjp(_forwards, _backwards)
+
+
 class Convolution(nnx.Module):
     """Square convolution without bias, padded by half its size; torchvision's initial weights.
 
     On CPU, XLA's convolution of small maps is slow (2×2 by 192 channels: 14 ms, as one matrix product 1.5 ms; backward
-    likewise), so maps of at most 8×8 outputs become a matrix product over gathered patches there. Same sums, other order.
+    likewise), so maps of at most 8×8 outputs become a matrix product over gathered patches there; of larger ones the gradient
+    of the weights does. Same sums, other order.
     """
 
     def __init__(self, inputs: int, outputs: int, size: int, stride: int, *, rngs: nnx.Rngs):
@@ -36,21 +79,15 @@ class Convolution(nnx.Module):
         self, x: Float[Array, "batch height width inputs"], factor: Float[Array, "outputs"] | None = None
     ) -> Float[Array, "batch rows columns outputs"]:
         """Each output channel is multiplied by its `factor`, where that is given, by way of the weights."""
-        kernel, size, stride, pad = self.kernel[...], self.size, self.stride, self.size // 2
+        kernel, stride = self.kernel[...], self.stride
         kernel = (kernel if factor is None else kernel * factor).astype(x.dtype)
+        if jax.default_backend() != "cpu":
+            return _convolve(x, kernel, stride)
         rows, columns = (-(-extent // stride) for extent in x.shape[1:3])
-        if jax.default_backend() == "cpu" and rows * columns <= 64:
-            x = jnp.pad(x, ((0, 0), (pad, pad), (pad, pad), (0, 0)))
-            patches = [
-                x[:, i : i + (rows - 1) * stride + 1 : stride, j : j + (columns - 1) * stride + 1 : stride]
-                for i in range(size)
-                for j in range(size)
-            ]
-            flat = jnp.concatenate(patches, axis=-1).reshape(x.shape[0] * rows * columns, -1)
-            return (flat @ kernel.reshape(flat.shape[1], -1)).reshape(x.shape[0], rows, columns, -1)
-        return jax.lax.conv_general_dilated(
-            x, kernel, (stride, stride), [(pad, pad)] * 2, dimension_numbers=("NHWC", "HWIO", "NHWC")
-        )
+        if rows * columns > 64:
+            return _convolve_on_cpu(x, kernel, stride)
+        flat = _patches(x, self.size, stride)
+        return (flat @ kernel.reshape(flat.shape[1], -1)).reshape(x.shape[0], rows, columns, -1)
 
 
 def _normalised(convolution: Convolution, norm: BatchNorm, x: Array, *, train: bool, momentum: float | Array) -> Array:
@@ -83,6 +120,22 @@ class BasicBlock(nnx.Module):
         return jax.nn.relu(out + x)
 
 
+class PatchStem(nnx.Module):
+    """Pieces of 4×4 pixels to channels by one layer, as in ConvNeXt (Liu et al. 2022), in the place of ResNet's first convolution
+    and pooling: the same size of map for a twentieth of the work."""
+
+    def __init__(self, inputs: int, outputs: int, *, rngs: nnx.Rngs):
+        initial = nnx.initializers.he_normal()
+        self.layer = nnx.Linear(16 * inputs, outputs, use_bias=False, kernel_init=initial, rngs=rngs)
+
+    def __call__(self, x: Float[Array, "batch height width inputs"]) -> Float[Array, "batch rows columns outputs"]:
+        batch, height, width, channels = x.shape
+        if height % 4 or width % 4:
+            raise ValueError(f"patches of 4 pixels do not fill an image of {height}×{width}")
+        pieces = x.reshape(batch, height // 4, 4, width // 4, 4, channels).swapaxes(2, 3)
+        return pieces.reshape(batch, height // 4, width // 4, -1) @ self.layer.kernel[...].astype(x.dtype)
+
+
 class ResNet(nnx.Module):
     """ResNet of basic blocks.
 
@@ -93,6 +146,7 @@ class ResNet(nnx.Module):
         width: channels of the first stage, doubled at each of the three that follow; 64 in the paper.
         standardise: take ImageNet's mean off the three channels and divide by its standard deviation, as torchvision's
             weights expect of images in [0, 1].
+        stem: `convolution` as in the paper, 7×7 and pooling; or `patches` (`PatchStem`), for small images on small machines.
         rngs: source of the initial weights.
         dtype: what the convolutions calculate in, that of the images unless given; weights, batch-norm statistics and the last
             layer keep their own.
@@ -109,6 +163,7 @@ class ResNet(nnx.Module):
         channels: int = 3,
         width: int = 64,
         standardise: bool = False,
+        stem: Literal["convolution", "patches"] = "convolution",
         rngs: nnx.Rngs,
         dtype: jnp.dtype | None = None,
     ):
@@ -119,7 +174,11 @@ class ResNet(nnx.Module):
         self.depth, self.classes, self.channels, self.width = depth, classes, channels, width
         self.standardise, self.dtype = standardise, dtype
         self.stages = _BLOCKS[depth]
-        self.convolution = Convolution(channels, width, 7, 2, rngs=rngs)
+        self.convolution: Convolution | PatchStem
+        if stem == "convolution":
+            self.convolution = Convolution(channels, width, 7, 2, rngs=rngs)
+        else:
+            self.convolution = PatchStem(channels, width, rngs=rngs)
         self.norm = BatchNorm(width)
         blocks = []
         inputs = width
@@ -145,8 +204,11 @@ class ResNet(nnx.Module):
         if self.standardise:
             x = (x - jnp.array(_IMAGENET_MEAN)) / jnp.array(_IMAGENET_STD)
         exact, x = x.dtype, x.astype(self.dtype or x.dtype)
-        x = jax.nn.relu(_normalised(self.convolution, self.norm, x, train=train, momentum=momentum))
-        x = nnx.max_pool(x, (3, 3), strides=(2, 2), padding=((1, 1), (1, 1)))
+        if isinstance(self.convolution, PatchStem):
+            x = jax.nn.relu(self.norm(self.convolution(x), train=train, momentum=momentum))
+        else:
+            x = jax.nn.relu(_normalised(self.convolution, self.norm, x, train=train, momentum=momentum))
+            x = nnx.max_pool(x, (3, 3), strides=(2, 2), padding=((1, 1), (1, 1)))
         for block in self.blocks:
             x = block(x, train=train, momentum=momentum)
         return jnp.mean(x, axis=(1, 2), dtype=exact).reshape(*batch, -1)

@@ -1,0 +1,149 @@
+"""The page of `mevs active`: learnt fusion and learnt choice beside every other policy, with intervals."""
+
+from __future__ import annotations
+
+import html
+from pathlib import Path
+from typing import Any
+
+from data_pipeline.builder import DatasetStatistics
+from data_pipeline.files import write_text
+from eval import figures
+from eval.ladder import KNOWS
+from eval.page import ReportInputs, difference, document, image, percent, span, table
+
+METHOD = "learnt_gain"
+"""The policy that the page is about."""
+
+
+def _accuracy(share: float, interval: list[float]) -> str:
+    return f"{percent(share)}<br><small class='note'>{span(interval)}</small>"
+
+
+def _ladder(found: dict[str, Any]) -> str:
+    rows, known = [], None
+    steps = len(found["policies"]["random"]["after_views"])
+    for name, policy in found["policies"].items():
+        if policy["knows"] != known:
+            known = policy["knows"]
+            rows.append([f'<b class="note">Knows {html.escape(KNOWS[known])}</b>'])
+        cells = [_accuracy(*cell) for cell in zip(policy["after_views"], policy["interval"], strict=True)]
+        closed = found["gap_closed"].get(name)
+        shares = (
+            "" if closed is None else " / ".join("–" if share is None else f"{100 * share:.0f}" for share in closed)
+        )
+        rows.append([html.escape(policy["title"]), *cells, *[""] * (steps - len(cells)), shares])
+    header = ["next view chosen by", *map(str, range(1, steps + 1)), "% of the gap closed"]
+    return (
+        '<div class="wide">' + table(header, rows) + "</div>"
+        "<p class='note'>Accuracy (%) after exactly so many views, with 95 % intervals over objects. Gap: of the way from random "
+        "to the label-free oracle after 2 / 3 / 4 views; the label oracle finds views that are right by luck.</p>"
+    )
+
+
+def _against(found: dict[str, Any]) -> str:
+    titles = {name: policy["title"] for name, policy in found["policies"].items()}
+    rows = []
+    for name, title in titles.items():
+        if found["policies"][name]["knows"] in ("nothing", "truth"):
+            continue
+        row = [html.escape(title)]
+        for against in found["against"].values():
+            gain = against.get(name)
+            for step in (1, 2, 3):
+                known = gain is not None and step < len(gain["difference"])
+                row.append(difference(gain["difference"][step], gain["interval"][step]) if known else "")
+        rows.append(row)
+    header = ["points above", *(f"{titles[base]}, {step} views" for base in found["against"] for step in (2, 3, 4))]
+    return '<div class="wide">' + table(header, rows) + "</div>"
+
+
+def _sets(found: dict[str, Any]) -> str:
+    rows = [
+        [
+            str(row["views"]),
+            *(_accuracy(row[name]["accuracy"], row[name]["interval"]) for name in ("sum", "learnt")),
+            difference(row["difference"], row["difference_interval"]),
+            *(percent(row[name]["calibration_error"]) for name in ("sum", "learnt")),
+        ]
+        for row in found["random_sets"]
+    ]
+    header = ["random views", "sum of logits", "set fusion", "difference", "ECE, sum", "ECE, set fusion"]
+    return table(header, rows)
+
+
+def _confidence(found: dict[str, Any]) -> str:
+    policy = found["policies"][METHOD]
+    errors = [[str(step + 1), percent(error)] for step, error in enumerate(policy["calibration_error"])]
+    rows = [
+        [
+            f"{100 * row['risk']:g} %",
+            percent(row["sure"]),
+            "–" if row["error"] is None else percent(row["error"]),
+            percent(row["accuracy"]),
+            f"{row['views']:.2f}",
+        ]
+        for row in policy["stopping"]
+    ]
+    return (
+        table(["views", "calibration error (%)"], errors)
+        + "<p>Stopping once the calibrated risk is at most so much, or at the last view.</p>"
+        + table(["risk", "sure (%)", "of those wrong (%)", "accuracy (%)", "views"], rows)
+    )
+
+
+def _lead(found: dict[str, Any]) -> str:
+    method, random = (found["policies"][name]["after_views"] for name in (METHOD, "random"))
+    gain = found["against"]["random"][METHOD]
+    every = found["random_sets"][-1]
+    return (
+        f'<p class="lead">Two views are recognised with {percent(method[1])} % accuracy where the second is chosen, '
+        f"{percent(random[1])} % where it is drawn: {difference(gain['difference'][1], gain['interval'][1])} points. One view "
+        f"alone: {percent(found['single_view'])} %; all {every['views']} fused: {percent(every['learnt']['accuracy'])} %, "
+        f"summed: {percent(every['sum']['accuracy'])} %.</p>"
+        f'<p class="note">Over {found["objects"]} test objects and every start view; all policies share fusion, objects and '
+        f"starts. Everything fitted or chosen is so on {found['validation_objects']} validation objects. The views of these "
+        "lattices were never trained on: training saw other directions around other objects.</p>"
+    )
+
+
+def _seeds(metrics: dict[str, Any], views: str) -> str:
+    if len(metrics["seeds"]) < 2:
+        return ""
+    rows = [
+        [str(seed), *(percent(share) for share in found["lattices"][views]["policies"][name]["after_views"][:4])]
+        for name in ("random", METHOD)
+        for seed, found in enumerate(metrics["seeds"])
+    ]
+    return "<h2>Other random weights</h2>" + table(["seed", "1 view", "2", "3", "4"], rows)
+
+
+def active_section(inputs: ReportInputs) -> str:
+    """For the report of the whole run; empty where `mevs active` was not run."""
+    if inputs.active is None:
+        return ""
+    found = next(iter(inputs.active["seeds"][0]["lattices"].values()))
+    return "<h2>Learning to fuse and to choose</h2>" + _lead(found) + _ladder(found)
+
+
+def write_active_page(metrics: dict[str, Any], statistics: DatasetStatistics, path: Path) -> None:
+    """Writes the page; it needs no other file. Numbers are of the first seed, unless said otherwise."""
+    parts = []
+    for number, (views, found) in enumerate(metrics["seeds"][0]["lattices"].items()):
+        titles = {name: policy["title"] for name, policy in found["policies"].items()}
+        curves = {name: policy for name, policy in found["policies"].items() if name != "label_oracle"}
+        parts.append((_lead(found) if not number else "") + f"<h2>{views} candidate views</h2>" + _ladder(found))
+        parts.append(
+            image(
+                figures.accuracy_of_choices(curves, titles, found["random_sets"][-1]["learnt"]["accuracy"]),
+                "Accuracy by number of views, all starts; bands: 95 % intervals over objects.",
+            )
+        )
+        parts.append(_against(found))
+        if not number:
+            parts.append("<h2>Fusing random views</h2>" + _sets(found))
+            parts.append("<h2>How sure it may be</h2>" + _confidence(found))
+            parts.append(_seeds(metrics, views))
+    left_out = f"<p>{statistics.left_out_count} objects were left out for lack of a surface.</p>"
+    title = f"Learning where to look next: {html.escape(statistics.source)}"
+    write_text(path, document(title, "".join(parts) + left_out))

@@ -1,0 +1,404 @@
+"""How well views are chosen where a learnt fusion makes the belief: walks of every object from every start, and what they say.
+
+All policies share starts, fusion and objects, so every difference is paired. Temperatures are fitted once more for each
+policy, on its own walks over validation objects: one that picks telling views makes beliefs of another kind than one that draws.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from flax import nnx
+from jaxtyping import Array, Float, Int
+
+from data_pipeline.progress import console
+from eval.comparison import intervals
+from eval.confidence import stopping
+from eval.knowledge import class_view_table
+from mevs_jax.arrays import AnyArray
+from mevs_jax.calibration import expected_calibration_error, fit_temperature, negative_log_likelihood
+from mevs_jax.fusion import CalibratedFusion
+from mevs_jax.models import ViewPolicy
+from mevs_jax.policies import POLICIES, Knowledge, Policy, fused_oracle, learnt
+from mevs_jax.selection import ViewTable, adding, by_attention, select_from_table
+from mevs_jax.viewpoints import ViewGraph
+from train.chunks import in_chunks
+from train.fusion import Features, sets_of_size
+
+_WALKS_AT_ONCE = 2**11
+
+
+@dataclass(frozen=True)
+class OnLattice:
+    """Objects of a split on one lattice of candidate views.
+
+    Attributes:
+        features: of every view.
+        utility: (objects, views, views) what the entropy predictor says of every view after each, if it was asked.
+        entropy: (objects, views) true normalised entropies, if known.
+    """
+
+    features: Features
+    utility: np.ndarray | None = None
+    entropy: np.ndarray | None = None
+
+    def table(self, with_features: bool) -> ViewTable:
+        utility, entropy = (None if known is None else jnp.asarray(known) for known in (self.utility, self.entropy))
+        features = self.features.features if with_features else None
+        return ViewTable(self.features.logits, utility, entropy, self.features.labels, features=features)
+
+
+@dataclass(frozen=True)
+class Contender:
+    """A policy in the study.
+
+    Attributes:
+        name: in `metrics.json`.
+        title: in the report.
+        knows: as in `eval.ladder.KNOWS`.
+        policy_of: parameters to the policy.
+        believes: whether it looks at the belief; one that does not walks without fusing.
+        draws: walks from each start.
+        max_views: views of its walks, where fewer than the study's.
+    """
+
+    name: str
+    title: str
+    knows: str
+    policy_of: Callable[[Any], Policy]
+    believes: bool = True
+    draws: int = 1
+    max_views: int = 0
+
+
+def _named(_: Any, name: str) -> Policy:
+    return POLICIES[name]
+
+
+def _oracle(fusion: CalibratedFusion, by: Any) -> Policy:
+    return fused_oracle(fusion, by=by)
+
+
+@partial(jax.jit, static_argnames=("contender", "max_views"))
+def _walk_some(
+    some: tuple[Array, ViewTable],
+    contender: Contender,
+    parameters: Any,
+    fusion: CalibratedFusion,
+    graph: ViewGraph,
+    knowledge: Knowledge | None,
+    max_views: int,
+) -> Int[Array, "objects walks steps"]:
+    starts = graph.points.shape[0]
+    policy, fuse = contender.policy_of(parameters), by_attention(fusion) if contender.believes else adding
+
+    def of_object(key: Array, table: ViewTable) -> Array:
+        scene = table.scene(graph, knowledge)
+
+        def run(key: Array, start: Array) -> Array:
+            return select_from_table(key, table, scene, policy, start, max_views=max_views, fuse=fuse).views
+
+        keys = jax.random.split(key, starts * contender.draws)
+        return jax.vmap(run)(keys, jnp.arange(starts).repeat(contender.draws))
+
+    return jax.vmap(of_object)(*some)
+
+
+def walk_all(
+    key: Array,
+    contender: Contender,
+    parameters: Any,
+    fusion: CalibratedFusion,
+    tables: ViewTable,
+    graph: ViewGraph,
+    knowledge: Knowledge | None,
+    max_views: int,
+) -> Int[np.ndarray, "objects walks steps"]:
+    """The views of walks from every start, `contender.draws` from each."""
+    keys = jax.vmap(jax.random.fold_in, (None, 0))(key, jnp.arange(len(tables.label)))
+    rest = contender, parameters, fusion, graph, knowledge, max_views
+    at_once = max(1, _WALKS_AT_ONCE // (len(graph.points) * contender.draws))
+    return in_chunks(lambda some: _walk_some(some, *rest), (keys, tables), at_once)
+
+
+@jax.jit
+def _beliefs_of_some(fusion: CalibratedFusion, some: tuple[Features, Array]) -> Array:
+    steps = some[1].shape[-1]
+    present = jnp.tril(jnp.ones((steps, steps), bool))
+
+    def of_walk(one: Features, order: Array) -> Array:
+        seen = jnp.broadcast_to(one.features[order], (steps, steps, one.features.shape[-1]))
+        return fusion(seen, jnp.broadcast_to(one.directions[order], (steps, steps, 3)), present)
+
+    return jax.vmap(lambda one, orders: jax.vmap(lambda order: of_walk(one, order))(orders))(*some)
+
+
+def beliefs_of(
+    fusion: CalibratedFusion, data: Features, views: Int[np.ndarray, "objects walks steps"]
+) -> Float[np.ndarray, "objects walks steps classes"]:
+    """Log-probabilities after each view of each walk."""
+    return in_chunks(partial(_beliefs_of_some, fusion), (data, views), max(1, 1024 // views.shape[1]))
+
+
+@jax.jit
+def _refit(beliefs: Array, labels: Array) -> Float[Array, "steps"]:
+    flat = beliefs.reshape(-1, *beliefs.shape[2:])
+    return jax.vmap(fit_temperature, (1, None))(flat, jnp.repeat(labels, beliefs.shape[1]))
+
+
+def judged(
+    beliefs: Float[AnyArray, "objects walks steps classes"],
+    labels: Int[AnyArray, "objects"],
+    fitting: Float[AnyArray, "others walks steps classes"],
+    fitting_labels: Int[AnyArray, "others"],
+) -> tuple[dict[str, Any], np.ndarray]:
+    """One policy's numbers, and its share of right answers (steps, objects)."""
+    temperatures = _refit(fitting, fitting_labels)
+    beliefs = jax.nn.log_softmax(beliefs / temperatures[:, None], axis=-1)
+    right = np.asarray(jnp.argmax(beliefs, axis=-1) == labels[:, None, None])
+    confidence = np.asarray(jnp.exp(jnp.max(beliefs, axis=-1)))
+    after = right.mean(axis=1).T
+    flat = beliefs.reshape(-1, *beliefs.shape[2:])
+    truth = jnp.repeat(labels, beliefs.shape[1])
+    steps = range(beliefs.shape[2])
+    return {
+        "after_views": after.mean(axis=1).tolist(),
+        "interval": intervals(after),
+        "temperatures": np.asarray(temperatures).tolist(),
+        "calibration_error": [
+            float(expected_calibration_error(confidence[:, :, step].reshape(-1), right[:, :, step].reshape(-1)))
+            for step in steps
+        ],
+        "negative_log_likelihood": [float(negative_log_likelihood(flat[:, step], truth)) for step in steps],
+        "stopping": stopping(confidence, right),
+    }, after
+
+
+def greedy_order(
+    fusion: CalibratedFusion, data: Features, most: int, starts: int = 8, objects: int = 300
+) -> np.ndarray:
+    """Scores of the fixed order that does best on some validation objects from some starts, the first `most` of it; the rest
+    follows by how far it is from those before."""
+    some = jnp.asarray(np.unique(np.linspace(0, len(data.labels) - 1, objects).astype(int)))
+    data = jax.tree.map(lambda leaf: leaf[some], data)
+    views = data.features.shape[1]
+    begin = np.unique(np.linspace(0, views - 1, starts).astype(int))
+
+    @jax.jit
+    def right_with(seen: Array) -> Array:
+        """Share right with the views (sets, slots) seen, −1 for none."""
+
+        def of_set(one: Array) -> Array:
+            beliefs = fusion(
+                data.features[:, one], data.directions[:, one], jnp.broadcast_to(one >= 0, (len(some), len(one)))
+            )
+            own = jnp.take_along_axis(beliefs, data.labels[:, None], axis=1)
+            return jnp.mean(jnp.all(beliefs <= own, axis=1))
+
+        return jax.lax.map(of_set, seen)
+
+    order: list[int] = []
+    for _ in range(most):
+        sets = np.full((views, len(begin), most + 1), -1)
+        for view in range(views):
+            for row, start in enumerate(begin):
+                members = list(dict.fromkeys([int(start), *order, view]))
+                sets[view, row, : len(members)] = members
+        share = np.asarray(right_with(jnp.asarray(sets.reshape(-1, most + 1)))).reshape(views, -1).mean(axis=1)
+        share[order] = -1
+        order.append(int(share.argmax()))
+    points = np.asarray(data.directions[0])
+    while len(order) < views:
+        near = (points @ points[order].T).max(axis=1)
+        near[order] = 2
+        order.append(int(near.argmin()))
+    scores = np.zeros(views, np.float32)
+    scores[order] = np.arange(views, 0, -1)
+    return scores
+
+
+def learn(fusion: CalibratedFusion, data: Features, most: int) -> Knowledge:
+    """What `fixed_order` and `information_gain` know, from validation objects on the lattice."""
+    logits = jax.nn.log_softmax(data.logits / fusion.single, axis=-1)
+    return Knowledge(jnp.asarray(greedy_order(fusion, data, most)), class_view_table(logits, data.labels))
+
+
+BASELINES = ("random", "farthest", "fixed_order")
+"""What a policy that learns is compared with."""
+_GAP = 3
+"""The gap between random and the label-free oracle is read after 2 views and the next, up to so many further ones."""
+
+
+def contenders(policies: dict[str, ViewPolicy], draws: int, oracle_views: int, entropies: bool) -> list[Contender]:
+    """All policies of the study, in the order in which they are shown.
+
+    Args:
+        policies: trained ones, by title.
+        draws: walks from each start of those that draw.
+        oracle_views: how far oracles walk, which try every candidate.
+        entropies: whether predicted and true depth entropies are known.
+    """
+    found = [
+        Contender("random", "random", "nothing", partial(_named, name="random"), False, draws),
+        Contender("farthest", "farthest from those seen", "nothing", partial(_named, name="farthest"), False),
+    ]
+    if entropies:
+        named = partial(_named, name="predicted_entropy")
+        found.append(Contender("predicted_entropy", "PointNet++ entropy (thesis)", "networks", named, False))
+    found += [
+        Contender("fixed_order", "best fixed order", "others", partial(_named, name="fixed_order"), False),
+        Contender(
+            "information_gain", "information gain by a table", "others", partial(_named, name="information_gain")
+        ),
+    ]
+    for title, network in policies.items():
+        for by, called in (("gain", "expected gain"), ("information", "expected information")):
+            policy_of = partial(_learnt, structure=nnx.graphdef(network), by=by)
+            found.append(Contender(f"{title}_{by}", f"{title.replace('_', ' ')}: {called}", "learnt", policy_of))
+    if entropies:
+        found.append(
+            Contender(
+                "oracle_entropy", "entropy oracle (thesis)", "truth", partial(_named, name="oracle_entropy"), False
+            )
+        )
+    for by, title in (("belief", "label-free oracle"), ("label", "greedy label oracle")):
+        oracle = Contender(f"{by}_oracle", title, "truth", partial(_oracle, by=by), True, 1, oracle_views)
+        found.append(oracle)
+    return found
+
+
+def _learnt(given: tuple[nnx.State, Array], structure: nnx.GraphDef, by: Any) -> Policy:
+    weights, temperature = given
+    return learnt(nnx.merge(structure, weights), temperature, by=by)
+
+
+def random_sets_study(
+    fusion: CalibratedFusion, validation: Features, test: Features, draws: int = 8
+) -> list[dict[str, Any]]:
+    """How accurate and how well calibrated random sets of every size are, by the sum of logits and by the learnt fusion.
+
+    The same sets for both. The fusion's temperatures are its own; the sum's are fitted here, on validation objects.
+    """
+    views = test.features.shape[1]
+
+    def summed(data: Features, present: Array) -> Array:
+        return jnp.einsum("dov,ovc->doc", present.astype(jnp.float32), data.logits)
+
+    @jax.jit
+    def fuse_some(some: tuple[Features, Array]) -> Array:
+        data, sets = some
+        return jax.vmap(lambda present: fusion(data.features, data.directions, present), 1, 1)(sets)
+
+    def fused(data: Features, present: Array) -> np.ndarray:
+        return in_chunks(fuse_some, (data, present.swapaxes(0, 1)), 16).swapaxes(0, 1)
+
+    rows = []
+    for size in sorted({*range(1, min(views, 12) + 1), *(size for size in (16, 20, 40, views) if size <= views)}):
+        sets = [
+            sets_of_size(len(data.labels), views, size, 1 if size == views else draws) for data in (validation, test)
+        ]
+        temperature = _refit(jnp.moveaxis(summed(validation, sets[0]), 0, 1)[:, :, None], validation.labels)[0]
+        beliefs = {"sum": summed(test, sets[1]) / temperature, "learnt": fused(test, sets[1])}
+        row: dict[str, Any] = {"views": size}
+        right = {}
+        for name, belief in beliefs.items():
+            probability = np.asarray(jax.nn.softmax(belief, axis=-1))
+            correct = probability.argmax(-1) == np.asarray(test.labels)
+            right[name] = correct.mean(axis=0)
+            row[name] = {
+                "accuracy": float(correct.mean()),
+                "interval": intervals(right[name]),
+                "calibration_error": float(
+                    expected_calibration_error(probability.max(-1).reshape(-1), correct.reshape(-1))
+                ),
+            }
+        gain = right["learnt"] - right["sum"]
+        row |= {"difference": float(gain.mean()), "difference_interval": intervals(gain)}
+        rows.append(row)
+    return rows
+
+
+def study(
+    fusion: CalibratedFusion,
+    policies: dict[str, ViewPolicy],
+    validation: OnLattice,
+    test: OnLattice,
+    *,
+    max_views: int,
+    draws: int,
+    oracle_views: int = 4,
+    seed: int = 0,
+) -> dict[str, Any]:
+    """Every number about one lattice of candidate views.
+
+    Args:
+        fusion: of the recogniser whose features these are.
+        policies: trained view policies, by name; the first is the method, the others ablations.
+        max_views: of a walk.
+        draws: walks from each start of policies that draw.
+        oracle_views: how far oracles walk.
+    """
+    points, labels = test.features.directions[0], test.features.labels
+    graph = ViewGraph.from_points(np.asarray(points, np.float64))
+    max_views, oracle_views = min(max_views, len(points)), min(oracle_views, len(points))
+    knowledge = learn(fusion, validation.features, max_views)
+    found: dict[str, Any] = {
+        "objects": len(labels),
+        "validation_objects": len(validation.features.labels),
+        "views": len(points),
+        "single_view": float(jnp.mean(jnp.argmax(test.features.logits, -1) == labels[:, None])),
+        "random_sets": random_sets_study(fusion, validation.features, test.features, draws),
+        "policies": {},
+    }
+    after: dict[str, np.ndarray] = {}
+    parameters: dict[str, Any] = {"belief_oracle": fusion, "label_oracle": fusion}
+    for title, network in policies.items():
+        given = nnx.state(network, nnx.Param), fusion.single
+        parameters |= {f"{title}_gain": given, f"{title}_information": given}
+    entropies = test.utility is not None and test.entropy is not None
+    for contender in contenders(policies, draws, oracle_views, entropies):
+        beliefs = []
+        for split, data in enumerate((validation, test)):
+            views = walk_all(
+                jax.random.fold_in(jax.random.key(seed), split),
+                contender,
+                parameters.get(contender.name),
+                fusion,
+                data.table(contender.believes),
+                graph,
+                knowledge,
+                contender.max_views or max_views,
+            )
+            beliefs.append(beliefs_of(fusion, data.features, views))
+        judgement, after[contender.name] = judged(beliefs[1], labels, beliefs[0], validation.features.labels)
+        found["policies"][contender.name] = {"title": contender.title, "knows": contender.knows, **judgement}
+        console.print(f"{contender.title}: " + " ".join(f"{100 * share:.1f}" for share in judgement["after_views"]))
+    found["against"] = {
+        base: {name: _difference(mine, after[base]) for name, mine in after.items() if name != base}
+        for base in BASELINES
+    }
+    found["gap_closed"] = {
+        name: _gap_closed(after[name], after["random"], after["belief_oracle"])
+        for name in after
+        if name not in ("random", "belief_oracle", "label_oracle")
+    }
+    return found
+
+
+def _difference(mine: np.ndarray, base: np.ndarray) -> dict[str, Any]:
+    steps = min(len(mine), len(base))
+    gain = mine[:steps] - base[:steps]
+    return {"difference": gain.mean(axis=1).tolist(), "interval": intervals(gain)}
+
+
+def _gap_closed(mine: np.ndarray, random: np.ndarray, oracle: np.ndarray) -> list[float]:
+    """Share of the way from random to the oracle, from 2 views on."""
+    steps = slice(1, min(len(oracle), 1 + _GAP))
+    gap = oracle[steps].mean(axis=1) - random[steps].mean(axis=1)
+    return ((mine[steps].mean(axis=1) - random[steps].mean(axis=1)) / np.where(gap > 0, gap, np.nan)).tolist()

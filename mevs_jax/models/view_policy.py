@@ -1,0 +1,123 @@
+"""ViewPolicy: what looking at each candidate direction would be worth, given what was seen.
+
+A query for each candidate attends to the views seen and to the belief. Candidates are directions, not numbers of a lattice, so a
+lattice that was never trained on will do. It sees what single views say (log-probabilities), not the encoder's features: those
+mean other things in another encoder, and labels of value come from encoders that never saw the object (`train/policy.py`).
+"""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+from flax import nnx
+from jaxtyping import Array, Bool, Float
+
+from mevs_jax.arrays import AnyArray
+
+
+def direction_features(directions: Float[AnyArray, "*batch 3"]) -> Float[Array, "*batch 19"]:
+    """All monomials of degree 1 to 3 of a unit vector: what a layer needs to tell top from side and corner from face."""
+    directions = jnp.asarray(directions)
+    found = [directions[..., i] for i in range(3)]
+    for i in range(3):
+        for j in range(i, 3):
+            found.append(directions[..., i] * directions[..., j])
+    for i in range(3):
+        for j in range(i, 3):
+            for k in range(j, 3):
+                found.append(directions[..., i] * directions[..., j] * directions[..., k])
+    return jnp.stack(found, axis=-1)
+
+
+class _CrossBlock(nnx.Module):
+    """Queries look at what is known, not at each other, so a candidate's worth does not depend on which others there are."""
+
+    def __init__(self, width: int, heads: int, *, rngs: nnx.Rngs):
+        self.norm1, self.norm2 = nnx.LayerNorm(width, rngs=rngs), nnx.LayerNorm(width, rngs=rngs)
+        self.attention = nnx.MultiHeadAttention(heads, width, decode=False, rngs=rngs)
+        self.layer1, self.layer2 = nnx.Linear(width, 2 * width, rngs=rngs), nnx.Linear(2 * width, width, rngs=rngs)
+
+    def __call__(self, queries: Array, known: Array, present: Array) -> Array:
+        queries = queries + self.attention(self.norm1(queries), known, mask=present[..., None, None, :])
+        return queries + self.layer2(jax.nn.gelu(self.layer1(self.norm2(queries))))
+
+
+class ViewPolicy(nnx.Module):
+    """Scores candidate directions.
+
+    Args:
+        classes: of the belief.
+        width: of queries and tokens.
+        heads: of attention.
+        blocks: of attention and layers.
+        clouds: length of the embedding of a partial cloud, beside each view seen; 0 for none.
+        rngs: source of the initial weights.
+    """
+
+    def __init__(
+        self, classes: int, *, width: int = 96, heads: int = 4, blocks: int = 2, clouds: int = 0, rngs: nnx.Rngs
+    ):
+        self.classes = classes
+        self.direction = nnx.Linear(19, width, rngs=rngs)
+        self.view, self.belief = nnx.Linear(classes, width, rngs=rngs), nnx.Linear(classes + 1, width, rngs=rngs)
+        self.cloud = nnx.Linear(clouds, width, rngs=rngs) if clouds else None
+        self.token1, self.token2 = nnx.Linear(width, 2 * width, rngs=rngs), nnx.Linear(2 * width, width, rngs=rngs)
+        self.blocks = nnx.List([_CrossBlock(width, heads, rngs=rngs) for _ in range(blocks)])
+        self.known_norm, self.last_norm = nnx.LayerNorm(width, rngs=rngs), nnx.LayerNorm(width, rngs=rngs)
+        self.gain = nnx.Linear(width, 1, rngs=rngs)
+        small = nnx.initializers.normal(1e-3)
+        self.evidence = nnx.Linear(width, classes * classes, kernel_init=small, rngs=rngs)
+
+    def __call__(
+        self,
+        belief: Float[AnyArray, "*batch classes"],
+        views: Float[AnyArray, "*batch seen classes"],
+        directions: Float[AnyArray, "*batch seen 3"],
+        present: Bool[AnyArray, "*batch seen"],
+        candidates: Float[AnyArray, "*batch candidates 3"],
+        clouds: Float[AnyArray, "*batch seen embedding"] | None = None,
+    ) -> tuple[Float[Array, "*batch candidates"], Float[Array, "*batch candidates classes classes"]]:
+        """The worth of each candidate, said twice.
+
+        Args:
+            belief: log-probabilities of all that was seen, fused.
+            views: log-probabilities of each view seen alone.
+            directions: unit vectors to the cameras of those.
+            present: which of them there are; the rest is padding.
+            candidates: unit vectors to where the camera may go.
+            clouds: embeddings of the partial clouds seen, where the network takes them.
+
+        Returns:
+            The expected drop in cross-entropy in nats; and [j, y]: the log-probabilities that the belief is expected to have
+            after candidate j if the object is of class y.
+        """
+        belief, views, present = jnp.asarray(belief), jnp.asarray(views), jnp.asarray(present)
+        spare = present[..., None]
+        floor = -12.0  # a belief of 6 in a million is as good as none
+        tokens = self.view(jnp.where(spare, jnp.maximum(views, floor), 0.0))
+        tokens = tokens + self.direction(direction_features(jnp.where(spare, jnp.asarray(directions), 0.0)))
+        if self.cloud is not None:
+            tokens = tokens + self.cloud(jnp.where(spare, jnp.asarray(clouds), 0.0))
+        count = jnp.log(jnp.maximum(jnp.sum(present, axis=-1, keepdims=True), 1).astype(belief.dtype))
+        own = self.belief(jnp.concatenate([jnp.maximum(belief, floor), count], axis=-1))
+        tokens = jnp.concatenate([own[..., None, :], tokens], axis=-2)
+        tokens = self.known_norm(tokens + self.token2(jax.nn.gelu(self.token1(tokens))))
+        there = jnp.concatenate([jnp.ones((*present.shape[:-1], 1), bool), present], axis=-1)
+        queries = self.direction(direction_features(candidates)) + own[..., None, :]
+        for block in self.blocks:
+            queries = block(queries, tokens, there)
+        queries = self.last_norm(queries)
+        evidence = self.evidence(queries).reshape(*queries.shape[:-1], self.classes, self.classes)
+        after = jax.nn.log_softmax(belief[..., None, None, :] + evidence, axis=-1)
+        return self.gain(queries)[..., 0], after
+
+
+def expected_information(
+    belief: Float[AnyArray, "*batch classes"], after: Float[AnyArray, "*batch candidates classes classes"]
+) -> Float[Array, "*batch candidates"]:
+    """Expected drop of the belief's entropy in nats: H(p) − Σ_y p(y) H(after[j, y]), both of log-probabilities."""
+    belief, after = jnp.asarray(belief), jnp.asarray(after)
+    probability = jnp.exp(belief)
+    entropy = -jnp.sum(jnp.exp(after) * after, axis=-1)
+    now = -jnp.sum(probability * belief, axis=-1)
+    return now[..., None] - jnp.einsum("...y,...jy->...j", probability, entropy)

@@ -1,0 +1,281 @@
+"""The view policy: what it may depend on, labels of exact value, the loop with a learnt fusion, and that learning pays."""
+
+from __future__ import annotations
+
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from flax import nnx
+
+from eval.active_study import OnLattice, greedy_order, study
+from mevs_jax import ViewGraph, ViewTable, fibonacci_sphere
+from mevs_jax.fusion import CalibratedFusion, SetFusion
+from mevs_jax.models import ViewPolicy
+from mevs_jax.models.view_policy import direction_features, expected_information
+from mevs_jax.policies import POLICIES, fused_oracle, learnt, random_view
+from mevs_jax.selection import by_attention, select_from_table
+from train.fusion import Features
+from train.policy import PolicyConfig, choices_along, graph_of, train_policy, walk
+
+VIEWS, CLASSES, SEEN = 6, 4, 3
+
+
+def moved(network, scale: float = 0.3):
+    """Weights that begin as zeros or ones would hide mistakes."""
+    leaves, tree = jax.tree.flatten(nnx.state(network, nnx.Param))
+    keys = jax.random.split(jax.random.key(3), len(leaves))
+    nnx.update(
+        network,
+        jax.tree.unflatten(
+            tree, [leaf + scale * jax.random.normal(key, leaf.shape) for leaf, key in zip(leaves, keys, strict=True)]
+        ),
+    )
+    return network
+
+
+def fusion_of(features: int, classes: int) -> CalibratedFusion:
+    network = moved(SetFusion(features, classes, width=8, heads=2, blocks=1, dropout=0.0, rngs=nnx.Rngs(0)))
+    structure, weights = nnx.split(network)
+    return CalibratedFusion(structure, weights, jnp.array([1.5, 1.2, 0.9]), jnp.float32(1.3))
+
+
+@pytest.fixture(scope="module")
+def fusion() -> CalibratedFusion:
+    return fusion_of(5, CLASSES)
+
+
+@pytest.fixture(scope="module")
+def policy() -> ViewPolicy:
+    return moved(ViewPolicy(CLASSES, width=16, heads=2, blocks=2, rngs=nnx.Rngs(1)), 0.1)
+
+
+def some_features(objects: int, seed: int = 0) -> Features:
+    random = np.random.default_rng(seed)
+    directions = np.stack([fibonacci_sphere(VIEWS)] * objects)
+    return Features(
+        jnp.asarray(random.normal(size=(objects, VIEWS, 5)), jnp.float32),
+        jnp.asarray(random.normal(size=(objects, VIEWS, CLASSES)), jnp.float32),
+        jnp.asarray(random.integers(0, CLASSES, objects), jnp.int32),
+        jnp.asarray(directions, jnp.float32),
+    )
+
+
+@nnx.jit
+def asked(policy: ViewPolicy, *arguments):
+    return policy(*arguments)
+
+
+def test_worth_depends_on_what_was_seen_not_on_its_order_nor_on_other_candidates(policy, random):
+    belief = jax.nn.log_softmax(random.normal(size=CLASSES)).astype(np.float32)
+    views = jax.nn.log_softmax(random.normal(size=(SEEN, CLASSES)), axis=-1)
+    points = fibonacci_sphere(VIEWS).astype(np.float32)
+    present = np.array([True, True, False])
+    gain, after = asked(policy, belief, views, points[:SEEN], present, points)
+    assert gain.shape == (VIEWS,)
+    np.testing.assert_allclose(np.exp(after).sum(axis=-1), 1, atol=1e-5)
+    turned = asked(policy, belief, views[jnp.array([1, 0, 2])], points[[1, 0, 2]], present, points)
+    np.testing.assert_allclose(turned[0], gain, atol=1e-5)
+    junk = np.where(present[:, None], np.asarray(views), np.nan).astype(np.float32)
+    np.testing.assert_allclose(asked(policy, belief, junk, points[:SEEN], present, points)[0], gain, atol=1e-5)
+    alone = asked(policy, belief, views, points[:SEEN], present, points[[4, 2]])
+    np.testing.assert_allclose(alone[0], gain[jnp.array([4, 2])], atol=1e-5)
+    np.testing.assert_allclose(alone[1], after[jnp.array([4, 2])], atol=1e-5)
+
+
+def test_directions_become_all_their_monomials():
+    x, y, z = 0.5, -2.0, 3.0
+    found = np.asarray(direction_features(np.array([x, y, z])))
+    assert len(found) == 3 + 6 + 10
+    for expected in (x, y * z, z * z, x * y * z, y**3, x * x * z):
+        assert np.isclose(found, expected).any()
+
+
+def test_expected_information_is_its_sum(random):
+    belief = random.dirichlet(np.ones(CLASSES))
+    after = random.dirichlet(np.ones(CLASSES), size=(VIEWS, CLASSES))
+    entropy = lambda p: -sum(q * np.log(q) for q in p)  # noqa: E731
+    expected = [
+        entropy(belief) - sum(belief[y] * entropy(after[view, y]) for y in range(CLASSES)) for view in range(VIEWS)
+    ]
+    found = expected_information(np.log(belief).astype(np.float32), np.log(after).astype(np.float32))
+    np.testing.assert_allclose(found, expected, rtol=1e-4, atol=1e-5)
+
+
+def test_labels_are_what_each_candidate_does_to_the_cross_entropy(fusion):
+    data, floor = some_features(2), 0.02
+    walks = np.array([[[0, 3, 5], [2, 1, 4]], [[5, 4, 3], [1, 0, 2]]], np.int32)
+    found = choices_along(fusion, data, walks, floor)
+    assert found.gain.shape == (2 * 2 * 3, VIEWS)
+    fuse = jax.jit(lambda features, directions: fusion(features, directions, jnp.ones(len(features), bool)))
+    row = 0
+    for index in range(2):
+        label = int(data.labels[index])
+        for order in walks[index]:
+            for count in range(1, 4):
+                seen = order[:count]
+                belief = fuse(data.features[index, seen], data.directions[index, seen])
+                np.testing.assert_allclose(found.belief[row], belief, atol=1e-4)
+                np.testing.assert_array_equal(found.fresh[row], ~np.isin(np.arange(VIEWS), seen))
+                np.testing.assert_array_equal(found.present[row], np.arange(3) < count)
+                single = jax.nn.log_softmax(data.logits[index, seen] / 1.3, axis=-1)
+                np.testing.assert_allclose(found.views[row, :count], single, atol=1e-5)
+                for candidate in (0, 4):
+                    with_it = np.append(seen, candidate)
+                    after = fuse(data.features[index, with_it], data.directions[index, with_it])
+                    np.testing.assert_allclose(found.after[row, candidate], after, atol=1e-4)
+                    drop = np.log(np.exp(after[label]) + floor) - np.log(np.exp(belief[label]) + floor)
+                    assert found.gain[row, candidate] == pytest.approx(drop, abs=1e-4)
+                row += 1
+
+
+def plain_walk(fusion, data, index, scores, start, steps):
+    """Look, fuse, score, go: in Python."""
+    seen, beliefs = [start], []
+    for _ in range(steps):
+        order = np.array(seen)
+        belief = fusion(data.features[index, order], data.directions[index, order], jnp.ones(len(order), bool))
+        beliefs.append(np.asarray(belief))
+        found = np.array(scores(order, belief), np.float64)
+        found[order] = -np.inf
+        seen.append(int(found.argmax()))
+    return seen[:steps], beliefs
+
+
+@pytest.mark.parametrize("by", ["gain", "information"])
+def test_the_loop_with_a_learnt_fusion_and_policy_is_a_plain_one(fusion, policy, by):
+    data, index = some_features(3, seed=4), 1
+    graph = graph_of(data.directions[index])
+    table = ViewTable(data.logits[index], None, None, data.labels[index], features=data.features[index])
+
+    @jax.jit
+    def looped(start):
+        choose = learnt(policy, fusion.single, by=by)
+        return select_from_table(
+            jax.random.key(0), table, table.scene(graph), choose, start, max_views=4, fuse=by_attention(fusion)
+        )
+
+    def scores(order, belief):
+        views = jax.nn.log_softmax(data.logits[index, order] / fusion.single, axis=-1)
+        points = data.directions[index]
+        gain, after = asked(policy, belief, views, points[order], np.ones(len(order), bool), points)
+        return gain if by == "gain" else expected_information(belief, after)
+
+    for start in (0, 5):
+        views, beliefs = plain_walk(fusion, data, index, scores, start, 4)
+        episode = looped(start)
+        assert episode.views.tolist() == views
+        np.testing.assert_allclose(episode.confidences, [np.exp(belief.max()) for belief in beliefs], atol=1e-4)
+
+
+@pytest.mark.parametrize("by", ["belief", "label"])
+def test_oracles_of_the_fused_belief_try_every_view(fusion, by):
+    data, index = some_features(2, seed=6), 0
+    graph = graph_of(data.directions[index])
+    table = ViewTable(data.logits[index], None, None, data.labels[index], features=data.features[index])
+    episode = select_from_table(
+        jax.random.key(0),
+        table,
+        table.scene(graph),
+        fused_oracle(fusion, by=by),
+        3,
+        max_views=3,
+        fuse=by_attention(fusion),
+    )
+
+    def scores(order, belief):
+        found = []
+        every = fusion(data.features[index], data.directions[index], jnp.ones(VIEWS, bool))
+        for view in range(VIEWS):
+            more = np.append(order, view)
+            after = fusion(data.features[index, more], data.directions[index, more], jnp.ones(len(more), bool))
+            found.append(after[data.labels[index]] if by == "label" else jnp.exp(every) @ after)
+        return found
+
+    assert episode.views.tolist() == plain_walk(fusion, data, index, scores, 3, 3)[0]
+
+
+def test_a_learnt_fusion_says_what_it_lacks(fusion):
+    data = some_features(1)
+    table = ViewTable(data.logits[0], None, None, data.labels[0])
+    scene = table.scene(graph_of(data.directions[0]))
+    with pytest.raises(ValueError, match="needs the features of every look"):
+        select_from_table(jax.random.key(0), table, scene, random_view, 0, max_views=2, fuse=by_attention(fusion))
+    with pytest.raises(ValueError, match=r"needs Scene\.features"):
+        select_from_table(jax.random.key(0), table, scene, fused_oracle(fusion), 0, max_views=2)
+    with pytest.raises(ValueError, match=r"needs Observation\.utility"):
+        select_from_table(jax.random.key(0), table, scene, POLICIES["predicted_entropy"], 0, max_views=2)
+
+
+def telling(objects: int, seed: int) -> Features:
+    """Each class is told apart by one view: at view 0 classes pair up, and which view settles the pair depends on the pair."""
+    random = np.random.default_rng(seed)
+    labels = random.integers(0, 4, objects)
+    logits = random.normal(0, 0.3, (objects, VIEWS, 4))
+    pair = labels // 2
+    for index, label in enumerate(labels):
+        logits[index, 0, 2 * pair[index] : 2 * pair[index] + 2] += 4
+        logits[index, 2 + pair[index], label] += 4
+    directions = np.stack([fibonacci_sphere(VIEWS)] * objects)
+    return Features(
+        *(jnp.asarray(logits, jnp.float32),) * 2, jnp.asarray(labels, jnp.int32), jnp.asarray(directions, jnp.float32)
+    )
+
+
+class _Sum(nnx.Module):
+    """The sum of what was seen, in the place of a fusion that is learnt."""
+
+    def __call__(self, features, directions, present):
+        del directions
+        return jnp.sum(jnp.where(present[..., None], features, 0.0), axis=-2)
+
+
+@pytest.fixture(scope="module")
+def adding() -> CalibratedFusion:
+    structure, weights = nnx.split(_Sum())
+    return CalibratedFusion(structure, weights, jnp.ones(1), jnp.float32(1))
+
+
+def test_what_looking_was_worth_is_learnt_and_the_study_says_so(adding):
+    parts = [(adding, telling(160, seed)) for seed in (0, 1)]
+    validation, test = telling(80, 2), telling(120, 3)
+    config = PolicyConfig(
+        width=16, heads=2, blocks=1, most_seen=3, walks=2, rounds=2, epochs=12, batch_size=64, learning_rate=5e-3
+    )
+    policy, histories = train_policy(config, parts, (adding, validation))
+    assert len(histories) == 2
+    assert histories[-1][-1]["worth"] < 0.7 * histories[0][0]["worth"]
+    found = study(
+        adding, {"learnt": policy}, OnLattice(validation), OnLattice(test), max_views=3, draws=2, oracle_views=3
+    )
+    after = {name: result["after_views"] for name, result in found["policies"].items()}
+    # From view 0 the telling view can be known; random finds it in one case of five.
+    assert after["learnt_gain"][1] > after["random"][1] + 0.05
+    assert after["learnt_gain"][2] > after["random"][2] + 0.1
+    assert found["against"]["random"]["learnt_gain"]["interval"][2][0] > 0
+    assert found["gap_closed"]["learnt_gain"][1] > 0.4
+    assert after["label_oracle"][1] >= after["learnt_gain"][1]
+    assert set(found["policies"]) >= {"farthest", "fixed_order", "information_gain", "belief_oracle"}
+    assert [row["views"] for row in found["random_sets"]] == [1, 2, 3, 4, 5, 6]
+    chosen = walk(
+        jax.random.key(0), adding, test, partial(_learnt, structure=nnx.graphdef(policy)), nnx.state(policy), 3, 4
+    )
+    assert chosen.shape == (120, 4, 3)
+    assert all(len(set(order)) == 3 for order in chosen.reshape(-1, 3).tolist())
+
+
+def _learnt(weights, structure):
+    return learnt(nnx.merge(structure, weights), 1.0)
+
+
+def test_the_fixed_order_begins_with_the_views_that_tell_most(adding):
+    scores = greedy_order(adding, telling(200, 5), 3)
+    assert sorted(np.argsort(-scores)[:3].tolist()) == [0, 2, 3]
+    assert sorted(scores.tolist()) == list(range(1, VIEWS + 1))
+
+
+def test_neighbours_are_not_asked_for():
+    graph, real = graph_of(jnp.asarray(fibonacci_sphere(10), jnp.float32)), ViewGraph.from_points(fibonacci_sphere(10))
+    np.testing.assert_allclose(graph.distances, real.distances, atol=1e-3)

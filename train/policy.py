@@ -1,0 +1,279 @@
+"""Training of the view policy on what looking was worth: exact, and free, since every view of a training object is at hand.
+
+For objects whose features are known from all candidate views, the belief after any set of views and one more is one call of
+the fusion. So for a state (a set seen) each candidate's label is the drop in cross-entropy that it brings. Encoder and fusion
+that trained on an object are sure of it from any view, and there would be nothing to learn: labels of each part of the training
+objects come from a recogniser that was trained without it (cross-fitting). Later rounds add the states to which the policy
+itself leads (DAgger; Ross et al. 2011).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import partial
+from typing import Any
+
+import flax.struct
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+from flax import nnx
+from jaxtyping import Array, Bool, Float, Int
+
+from mevs_jax.fusion import CalibratedFusion
+from mevs_jax.models.view_policy import ViewPolicy
+from mevs_jax.policies import Policy, learnt, random_view
+from mevs_jax.selection import ViewTable, by_attention, select_from_table
+from mevs_jax.viewpoints import ViewGraph
+from train.chunks import in_chunks
+from train.fusion import Features
+
+
+@dataclass(frozen=True)
+class PolicyConfig:
+    """The view policy and its training."""
+
+    width: int = 96
+    """of queries and tokens"""
+    heads: int = 4
+    """of attention"""
+    blocks: int = 2
+    """of attention and layers"""
+    most_seen: int = 6
+    """views in a state at most"""
+    walks: int = 1
+    """walks on each training object in a round, each through states of 1 to most_seen views"""
+    rounds: int = 3
+    """the first walks at random, the others as the policy of the round before says (DAgger)"""
+    epochs: int = 8
+    """looks at each state, in every round"""
+    batch_size: int = 256
+    """states in a batch"""
+    learning_rate: float = 1e-3
+    """of AdamW, at its highest"""
+    weight_decay: float = 0.01
+    """decoupled"""
+    averaging: float = 0.995
+    """share of the running mean of the weights that a step keeps"""
+    floor: float = 0.01
+    """probabilities below count as this in cross-entropies: one object that all are wrong about must not outweigh all others"""
+    seed: int = 0
+    """of weights, walks and batches"""
+
+
+@flax.struct.dataclass
+class Choices:
+    """States, and what each candidate would bring there.
+
+    Attributes:
+        belief: log-probabilities of what was seen.
+        views: log-probabilities of each view seen alone.
+        directions: of the views seen.
+        present: which of them there are.
+        candidates: directions of all candidates.
+        fresh: which of them were not seen.
+        gain: drop in cross-entropy in nats that each brings.
+        after: log-probabilities after each.
+        label: the true class.
+    """
+
+    belief: Float[Array, "states classes"]
+    views: Float[Array, "states seen classes"]
+    directions: Float[Array, "states seen 3"]
+    present: Bool[Array, "states seen"]
+    candidates: Float[Array, "states candidates 3"]
+    fresh: Bool[Array, "states candidates"]
+    gain: Float[Array, "states candidates"]
+    after: Float[Array, "states candidates classes"]
+    label: Int[Array, "states"]
+
+
+def graph_of(directions: Float[Array, "views 3"]) -> ViewGraph:
+    """Candidates without neighbours, which policies that learn do not ask for."""
+    views = directions.shape[0]
+    distances = jnp.arccos(jnp.clip(directions @ directions.T, -1.0, 1.0))
+    return ViewGraph(directions, jnp.zeros((views, views), bool), distances)
+
+
+@partial(jax.jit, static_argnames=("policy_of", "most", "walks"))
+def _walk_some(
+    some: tuple[Array, Features],
+    fusion: CalibratedFusion,
+    policy_of: Callable[..., Policy],
+    parameters: Any,
+    most: int,
+    walks: int,
+) -> Int[Array, "objects walks most"]:
+    policy = policy_of(parameters)
+
+    def of_object(key: Array, one: Features) -> Array:
+        graph = graph_of(one.directions)
+        table = ViewTable(one.logits, None, None, one.labels, features=one.features)
+        starts, keys = jax.random.split(key)
+        start = jax.random.randint(starts, (walks,), 0, one.directions.shape[0])
+
+        def run(key: Array, start: Array) -> Array:
+            scene, fuse = table.scene(graph), by_attention(fusion)
+            return select_from_table(key, table, scene, policy, start, max_views=most, fuse=fuse).views
+
+        return jax.vmap(run)(jax.random.split(keys, walks), start)
+
+    return jax.vmap(of_object)(*some)
+
+
+def walk(
+    key: Array,
+    fusion: CalibratedFusion,
+    data: Features,
+    policy_of: Callable[..., Policy],
+    parameters: Any,
+    most: int,
+    walks: int,
+) -> Int[np.ndarray, "objects walks most"]:
+    """Views along walks from starts drawn at random, by `policy_of(parameters)`."""
+    keys = jax.vmap(jax.random.fold_in, (None, 0))(key, jnp.arange(len(data.labels)))
+    rest = fusion, policy_of, parameters, most, walks
+    return in_chunks(lambda some: _walk_some(some, *rest), (keys, data), 64)
+
+
+@partial(jax.jit, static_argnames="floor")
+def _choices_of_some(
+    fusion: CalibratedFusion, some: tuple[Features, Int[Array, "objects walks most"]], floor: float
+) -> Choices:
+    most = some[1].shape[-1]
+
+    def of_object(one: Features, walks: Array) -> Choices:
+        single = jax.nn.log_softmax(one.logits / fusion.single, axis=-1)
+
+        def of_state(order: Array, count: Array) -> Choices:
+            present = jnp.arange(most) < count
+            features, directions = one.features[order], one.directions[order]
+            belief = fusion(features, directions, present)
+
+            def with_one_more(feature: Array, direction: Array) -> Array:
+                return fusion(
+                    jnp.concatenate([features, feature[None]]),
+                    jnp.concatenate([directions, direction[None]]),
+                    jnp.concatenate([present, jnp.array([True])]),
+                )
+
+            after = jax.vmap(with_one_more)(one.features, one.directions)
+            own = jnp.logaddexp(after[:, one.labels], jnp.log(floor))
+            gain = own - jnp.logaddexp(belief[one.labels], jnp.log(floor))
+            fresh = jnp.all((order[:, None] != jnp.arange(len(after))) | ~present[:, None], axis=0)
+            return Choices(belief, single[order], directions, present, one.directions, fresh, gain, after, one.labels)
+
+        counts = jnp.arange(1, most + 1)
+        return jax.vmap(lambda order: jax.vmap(of_state, (None, 0))(order, counts))(walks)
+
+    return jax.vmap(of_object)(*some)
+
+
+def choices_along(
+    fusion: CalibratedFusion, data: Features, walks: Int[np.ndarray, "objects walks most"], floor: float
+) -> Choices:
+    """Every state along some walks, with what each candidate would bring there; arrays of the host."""
+    found = in_chunks(partial(_choices_of_some, fusion, floor=floor), (data, walks), 8)
+    return jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[3:]), found)
+
+
+def policy_loss(network: ViewPolicy, some: Choices) -> tuple[Array, dict[str, Array]]:
+    """Mean over fresh candidates: Huber of the expected gain, and cross-entropy of the belief after it for the true class."""
+    gain, after = network(some.belief, some.views, some.directions, some.present, some.candidates)
+    own = jnp.take_along_axis(after, some.label[:, None, None, None], axis=2)[:, :, 0]
+    weight = some.fresh / jnp.maximum(jnp.sum(some.fresh), 1)
+    worth = jnp.sum(weight * optax.losses.huber_loss(gain, some.gain, delta=1.0))
+    beliefs = jnp.sum(weight * -jnp.sum(jnp.exp(some.after) * (own - some.after), axis=-1))
+    return worth + beliefs, {"worth": worth, "beliefs": beliefs}
+
+
+def new_policy(config: PolicyConfig, classes: int) -> ViewPolicy:
+    return ViewPolicy(classes, width=config.width, heads=config.heads, blocks=config.blocks, rngs=nnx.Rngs(config.seed))
+
+
+def _fit(config: PolicyConfig, network: ViewPolicy, train: Choices, validation: Choices) -> tuple[ViewPolicy, list]:
+    """The weights of the best epoch, running means."""
+    structure, parameters = nnx.split(network)
+    states = len(train.label)
+    batch = min(config.batch_size, states)
+    steps = states // batch
+    total = steps * config.epochs
+    rate = optax.warmup_cosine_decay_schedule(0.0, config.learning_rate, max(1, total // 20), max(2, total))
+    optimiser = optax.chain(
+        optax.clip_by_global_norm(1.0), optax.adamw(rate, b2=0.98, weight_decay=config.weight_decay)
+    )
+
+    def step(carry, some: Choices):
+        parameters, moments, mean, taken = carry
+        loss, gradient = jax.value_and_grad(lambda p: policy_loss(nnx.merge(structure, p), some)[0])(parameters)
+        update, moments = optimiser.update(gradient, moments, parameters)
+        parameters = optax.apply_updates(parameters, update)
+        keep = jnp.minimum(config.averaging, (taken + 1) / (taken + 10))
+        mean = jax.tree.map(lambda old, new: keep * old + (1 - keep) * new, mean, parameters)
+        return (parameters, moments, mean, taken + 1), loss
+
+    @jax.jit
+    def some_steps(carry, some: Choices):
+        return jax.lax.scan(step, carry, some)
+
+    @jax.jit
+    def check(mean, some: Choices):
+        return policy_loss(nnx.merge(structure, mean), some)[1]
+
+    random = np.random.default_rng(config.seed)
+    carry = parameters, optimiser.init(parameters), parameters, jnp.float32(0)
+    best, best_loss, history = parameters, float("inf"), []
+    for _ in range(config.epochs):
+        order, losses = random.permutation(states)[: steps * batch].reshape(steps, batch), []
+        for first in range(0, steps, 16):
+            index = order[first : first + 16]
+            carry, loss = some_steps(carry, jax.tree.map(lambda leaf, index=index: leaf[index], train))
+            losses.append(np.asarray(loss))
+        parts = np.array_split(np.arange(len(validation.label)), max(1, len(validation.label) // 1024))
+        found = [check(carry[2], jax.tree.map(lambda leaf, part=part: leaf[part], validation)) for part in parts]
+        means = {name: float(np.mean([float(one[name]) for one in found])) for name in found[0]}
+        history.append({"train": float(np.mean(np.concatenate(losses))), **means})
+        if sum(means.values()) < best_loss:
+            best, best_loss = carry[2], sum(means.values())
+    return nnx.merge(structure, best), history
+
+
+def train_policy(
+    config: PolicyConfig,
+    parts: Sequence[tuple[CalibratedFusion, Features]],
+    validation: tuple[CalibratedFusion, Features],
+) -> tuple[ViewPolicy, list[list[dict[str, float]]]]:
+    """The policy after all rounds, and losses by round and epoch.
+
+    Args:
+        parts: of the training objects, each as seen and fused by a recogniser that was trained without it.
+        validation: objects that no recogniser was trained on.
+    """
+    key = jax.random.key(config.seed)
+    policy, histories = new_policy(config, parts[0][1].logits.shape[-1]), []
+    gathered: list[tuple[Choices, Choices]] = []
+    for number in range(config.rounds):
+        structure, weights = nnx.split(policy)
+        policy_of = (lambda _: random_view) if number == 0 else partial(_learnt, structure=structure)
+        found = []
+        for part, (fusion, data) in enumerate([*parts, validation]):
+            given = weights, fusion.single
+            keys = jax.random.fold_in(jax.random.fold_in(key, number), part)
+            views = walk(keys, fusion, data, policy_of, given, config.most_seen, config.walks)
+            found.append(choices_along(fusion, data, views, config.floor))
+        gathered.append((_joined(found[:-1]), found[-1]))
+        train, check = (_joined([one[side] for one in gathered]) for side in (0, 1))
+        policy, history = _fit(config, new_policy(config, parts[0][1].logits.shape[-1]), train, check)
+        histories.append(history)
+    return policy, histories
+
+
+def _learnt(given: tuple[nnx.State, Array], structure: nnx.GraphDef) -> Policy:
+    weights, temperature = given
+    return learnt(nnx.merge(structure, weights), temperature)
+
+
+def _joined(parts: Sequence[Choices]) -> Choices:
+    return jax.tree.map(lambda *leaves: np.concatenate(leaves), *parts)

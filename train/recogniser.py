@@ -1,0 +1,155 @@
+"""The recogniser: single views and any set of them to the class, encoder and set fusion trained together.
+
+Views come from directions all around (a data set made with `dataset.capture.turned`), so that no lattice is special.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import optax
+from flax import nnx
+
+from data_pipeline.batches import ViewBatches
+from data_pipeline.capture import CaptureConfig
+from data_pipeline.inputs import depth_and_normals
+from mevs_jax.models import Recogniser, ResNet
+from train.classifier import ResNetConfig
+from train.fusion import SetFusionConfig, new_fusion, random_sets
+from train.optimiser import OptimiserConfig
+from train.step import Batch, Hyperparameters, Metrics
+
+
+@dataclass(frozen=True)
+class RecogniserConfig:
+    """The recogniser and its training."""
+
+    network: ResNetConfig = ResNetConfig(channels=4, standardise=False)
+    """the encoder, which sees depth and normals: four channels"""
+    fusion: SetFusionConfig = SetFusionConfig()
+    """the set fusion"""
+    shift: int = 3
+    """pixels by which training images are shifted in each direction at most"""
+    optimiser: OptimiserConfig = OptimiserConfig()
+
+
+@dataclass(frozen=True)
+class RecogniserTask:
+    """Cross entropy on every view alone and on a random set of an object's views in the batch, of any size, together."""
+
+    network_config: ResNetConfig
+    fusion_config: SetFusionConfig
+    classes: int
+    camera: CaptureConfig
+    shift: int
+    optimiser: OptimiserConfig
+    fold: tuple[int, int] | None = None
+    """trained without part k of n of the training objects"""
+    name: str = "recogniser"
+
+    @classmethod
+    def of(
+        cls, config: RecogniserConfig, classes: int, camera: CaptureConfig, fold: tuple[int, int] | None = None
+    ) -> RecogniserTask:
+        name = "recogniser" if fold is None else f"recogniser without part {fold[0] + 1} of {fold[1]}"
+        return cls(config.network, config.fusion, classes, camera, config.shift, config.optimiser, fold, name)
+
+    @property
+    def batches(self) -> ViewBatches:
+        config = self.optimiser
+        return ViewBatches(
+            config.batch_size, config.views_per_object, images="depth", seed=config.data_seed, fold=self.fold
+        )
+
+    @property
+    def metrics(self) -> tuple[str, ...]:
+        return ("accuracy", "fused_accuracy", "loss")
+
+    @property
+    def hyperparameters(self) -> Hyperparameters:
+        return Hyperparameters.of(self.optimiser, self.fusion_config.dropout, 1.0)
+
+    def network(self, rngs: nnx.Rngs) -> Recogniser:
+        shape = self.network_config
+        encoder = ResNet(
+            depth=shape.depth,
+            classes=self.classes,
+            channels=4,
+            width=shape.width,
+            stem=shape.stem,
+            dtype=jnp.dtype(self.optimiser.compute),
+            rngs=rngs,
+        )
+        return Recogniser(encoder, new_fusion(self.fusion_config, 8 * shape.width, self.classes, rngs))
+
+    def inputs(self, batch: Batch) -> jax.Array:
+        """Images (views, height, width, 4) of a batch."""
+        return jax.vmap(partial(depth_and_normals, camera=self.camera))(batch["depth"])
+
+    def directions(self, batch: Batch) -> jax.Array:
+        """Unit vectors (views, 3) from the object to the cameras."""
+        position = batch["pose"][:, :3, 3]
+        return position / jnp.linalg.norm(position, axis=-1, keepdims=True)
+
+    def loss(
+        self, network: Recogniser, batch: Batch, key: jax.Array, samples: jax.Array, hyper: Hyperparameters
+    ) -> tuple[jax.Array, Metrics]:
+        del samples, hyper
+        mirror, move, sets, drop = jax.random.split(key, 4)
+        by_object = partial(_by_object, views=self.optimiser.views_per_object)
+        images, directions = by_object(self.inputs(batch)), by_object(self.directions(batch))
+        labels = batch["label"].reshape(images.shape[:2])[:, 0]
+        mirrored = jax.random.bernoulli(mirror, 0.5, (len(images),))
+        images, directions = jax.vmap(mirror_views)(mirrored, images, directions)
+        moves = jax.random.randint(move, (*images.shape[:2], 2), -self.shift, self.shift + 1)
+        images = jax.vmap(jax.vmap(partial(_shifted, pad=self.shift)))(images, moves)
+        present = random_sets(sets, len(images), images.shape[1], images.shape[1])
+        each, together = network(images, directions, present, train=True, key=drop)
+        single = jnp.mean(
+            optax.softmax_cross_entropy_with_integer_labels(each, labels[:, None].repeat(each.shape[1], 1))
+        )
+        fused = jnp.mean(optax.softmax_cross_entropy_with_integer_labels(together, labels))
+        return single + fused, {
+            "loss": single + fused,
+            "accuracy": jnp.mean(jnp.argmax(each, -1) == labels[:, None]),
+            "fused_accuracy": jnp.mean(jnp.argmax(together, -1) == labels),
+        }
+
+    def evaluate(self, network: Recogniser, batch: Batch) -> Metrics:
+        """`fused`: all views of an object in the batch together."""
+        by_object = partial(_by_object, views=self.optimiser.validation_views)
+        images, directions = by_object(self.inputs(batch)), by_object(self.directions(batch))
+        labels = batch["label"].reshape(images.shape[:2])
+        each, together = network(images, directions, jnp.ones(images.shape[:2], bool))
+        together = jnp.broadcast_to(together[:, None], each.shape)
+        losses = (optax.softmax_cross_entropy_with_integer_labels(logits, labels) for logits in (each, together))
+        found = {
+            "accuracy": jnp.argmax(each, -1) == labels,
+            "fused_accuracy": jnp.argmax(together, -1) == labels,
+            "loss": sum(losses),
+        }
+        return {name: jnp.asarray(values, jnp.float32).reshape(-1) for name, values in found.items()}
+
+
+def _by_object(array: jax.Array, views: int) -> jax.Array:
+    return array.reshape(-1, views, *array.shape[1:])
+
+
+def mirror_views(mirrored: jax.Array, images: jax.Array, directions: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Views (views, height, width, 4) and directions of an object's mirror image, if `mirrored`.
+
+    The mirror is the plane x = 0: what a camera sees of the mirrored object from the mirrored direction is its image of the
+    object, left to right. Normals turn their first component over.
+    """
+    flipped = images[:, :, ::-1] * jnp.array([1.0, -1.0, 1.0, 1.0])
+    return jnp.where(mirrored, flipped, images), jnp.where(
+        mirrored, directions * jnp.array([-1.0, 1.0, 1.0]), directions
+    )
+
+
+def _shifted(image: jax.Array, move: jax.Array, pad: int) -> jax.Array:
+    padded = jnp.pad(image, ((pad, pad), (pad, pad), (0, 0)))
+    return jax.lax.dynamic_slice(padded, (pad + move[0], pad + move[1], 0), image.shape)
