@@ -28,7 +28,7 @@ from data_pipeline.meshes import DataError
 from data_pipeline.progress import console
 from eval.active_study import OnLattice, study
 from eval.view_tables import load_view_tables, made_by, network_outputs, objects_of, stored_array
-from mevs_jax.calibration import fit_temperature
+from mevs_jax.calibration import class_weights, fit_temperature
 from mevs_jax.fusion import CalibratedFusion, SetFusion
 from mevs_jax.models import Recogniser, ViewPolicy
 from train.checkpoints import Checkpoints
@@ -48,8 +48,9 @@ class ActiveConfig:
     """parts of the training objects, for labels by recognisers that never saw an object"""
     fold_epochs: int = 0
     """of those recognisers; 0 for as many as the recogniser itself"""
-    fusion: FusionConfig = FusionConfig(largest_set=40)
-    """of the fusion's training on features, after that with the encoder"""
+    fusion: FusionConfig = FusionConfig(largest_set=40, epochs=0)
+    """of the fusion's training on features, after that with the encoder; none by default, since features of objects that the
+    encoder was trained on are surer than those of others: on validation objects it was best before its first epoch"""
     policy: PolicyConfig = PolicyConfig()
     seeds: int = 1
     """whole trainings, each from other random weights"""
@@ -128,7 +129,14 @@ class Stages:
             labels = labels[chosen]
         ends = np.cumsum([both.shape[-1] - len(statistics.classes) - 3, len(statistics.classes)])
         features, logits, directions = map(jnp.asarray, np.split(both, ends, axis=-1))
-        return Features(features, logits, jnp.asarray(labels), directions)
+        return Features(features, logits - self.prior, jnp.asarray(labels), directions)
+
+    @property
+    def prior(self) -> Array:
+        """Log-probabilities of the classes in training. ModelNet10 trains on 883 chairs and 88 bathtubs, and tests on about as
+        many of each; nobody knows how often a robot meets which. So they are taken off all logits."""
+        counts = np.array([self.statistics.counts["train"][name] for name in self.statistics.classes], np.float32)
+        return jnp.log(jnp.asarray(counts / counts.sum()))
 
     def fusion(self, fold: int | None = None) -> CalibratedFusion:
         """The recogniser's fusion; trained on further, with its encoder as it is, where that is of all training objects."""
@@ -139,7 +147,7 @@ class Stages:
         network = recogniser.fusion
         if fold is None and self.config.fusion.epochs:
             network = self._fusion_of_all(network, validation)
-        return calibrated(network, validation)
+        return calibrated(network, validation, self.prior)
 
     def _fusion_of_all(self, start: SetFusion, validation: Features) -> SetFusion:
         folder = self.folder / "fusion"
@@ -161,7 +169,13 @@ class Stages:
         """The view policy, with labels by the recognisers of the parts, or by the one that was trained on every object."""
         folder, folds = self.folder / name, range(self.config.folds)
         made = [self.recogniser_folder(fold) for fold in folds] if cross_fit else []
-        identity = _plain({"made_by": made_by(self.statistics, self.recogniser_folder(), *made), "of": asdict(config)})
+        identity = _plain(
+            {
+                "made_by": made_by(self.statistics, self.recogniser_folder(), *made),
+                "fusion": asdict(self.config.fusion),
+                "of": asdict(config),
+            }
+        )
         path = folder / "summary.json"
         policy = new_policy(replace(config, seed=self.seed), len(self.statistics.classes))
         if path.exists() and read_json(path)["identity"] == identity:
@@ -204,24 +218,31 @@ def _see(network: Recogniser, task: Task, batch: Batch) -> jax.Array:
     return jnp.concatenate([network.see(task.inputs(batch)), task.directions(batch)], axis=-1)
 
 
-def calibrated(network: SetFusion, validation: Features, draws: int = 4) -> CalibratedFusion:
-    """With temperatures fitted on random sets of views of validation objects."""
-    structure, weights = nnx.split(network)
-    views = validation.features.shape[1]
+def calibrated(
+    network: SetFusion, validation: Features, prior: Float[Array, "classes"], draws: int = 4
+) -> CalibratedFusion:
+    """With temperatures fitted on random sets of views of validation objects, every class weighing the same.
+
+    Args:
+        prior: log-probabilities of the classes in training; the validation's logits of single views are without it already.
+        draws: sets of each size for each object.
+    """
+    structure, state = nnx.split(network)
+    objects, views, classes = validation.logits.shape
     sizes = [size for size in _CALIBRATED if size <= views]
-    truth = jnp.tile(validation.labels, draws)
 
     @jax.jit
     def temperature(present: Bool[Array, "draws objects views"]) -> Array:
-        fuse = partial(nnx.merge(structure, weights), validation.features, validation.directions)
-        logits = jax.lax.map(fuse, present)
-        return fit_temperature(logits.reshape(-1, logits.shape[-1]), truth)
+        fuse = partial(nnx.merge(structure, state), validation.features, validation.directions)
+        return fitted(jax.lax.map(fuse, present) - prior, jnp.tile(validation.labels, draws))
 
-    found = [float(temperature(sets_of_size(len(validation.labels), views, size, draws))) for size in sizes]
+    def fitted(logits: Array, truth: Array) -> Array:
+        return fit_temperature(logits.reshape(-1, classes), truth, class_weights(truth, classes))
+
+    found = [float(temperature(sets_of_size(objects, views, size, draws))) for size in sizes]
     every = np.exp(np.interp(np.log(np.arange(1, views + 1)), np.log(sizes), np.log(found)))
-    classes = validation.logits.shape[-1]
-    single = fit_temperature(validation.logits.reshape(-1, classes), jnp.repeat(validation.labels, views))
-    return CalibratedFusion(structure, weights, jnp.asarray(every, jnp.float32), single)
+    single = fitted(validation.logits, jnp.repeat(validation.labels, views))
+    return CalibratedFusion(structure, state, prior, jnp.asarray(every, jnp.float32), single)
 
 
 def lattice_data(dataset: DataConfig, out: Path, views: int) -> Path:
@@ -241,23 +262,45 @@ def train_all(stages: Stages) -> None:
 
 
 def measure(stages: Stages) -> dict[str, Any]:
-    """What one seed's networks reach, on each lattice; kept in `metrics.json` of its folder."""
-    config, path = stages.config, stages.folder / "metrics.json"
-    fusion, policies = stages.fusion(), {"learnt": stages.policy(config.policy)}
-    found: dict[str, Any] = {"lattices": {}}
-    for views in (stages.dataset.capture.views, *config.lattices):
-        data = lattice_data(stages.dataset, stages.out, views)
-        on = {
-            split: OnLattice(
-                stages.features(f"lattice_{views}_{split}", data, split), *_entropies(stages.out, data, split)
-            )
-            for split in ("val", "test")
+    """What one seed's networks reach, by number of candidate views; each lattice's is kept in a file of the seed's folder."""
+    config = stages.config
+    return {
+        "lattices": {
+            str(views): _measure_on(stages, views) for views in (stages.dataset.capture.views, *config.lattices)
         }
-        found["lattices"][str(views)] = study(
-            fusion, policies, on["val"], on["test"], max_views=config.max_views, draws=config.draws, seed=stages.seed
-        )
-    write_json(path, found)
-    return found
+    }
+
+
+def _measure_on(stages: Stages, views: int) -> dict[str, Any]:
+    config, path = stages.config, stages.folder / f"metrics_{views}.json"
+    data = lattice_data(stages.dataset, stages.out, views)
+    with_entropies = _entropies(stages.out, data, "test")[0] is not None
+    identity = _plain(
+        {
+            "made_by": made_by(load_statistics(data), stages.recogniser_folder()),
+            "fusion": asdict(config.fusion),
+            "policy": read_json(stages.folder / "policy" / "summary.json")["identity"],
+            "walks": [config.max_views, config.draws, with_entropies],
+        }
+    )
+    if path.exists() and (found := read_json(path))["identity"] == identity:
+        return found
+    on = {
+        split: OnLattice(stages.features(f"lattice_{views}_{split}", data, split), *_entropies(stages.out, data, split))
+        for split in ("val", "test")
+    }
+    console.print(f"Walking {len(on['test'].features.labels)} test objects, {views} candidate views")
+    found = study(
+        stages.fusion(),
+        {"learnt": stages.policy(config.policy)},
+        on["val"],
+        on["test"],
+        max_views=config.max_views,
+        draws=config.draws,
+        seed=stages.seed,
+    )
+    write_json(path, found | {"identity": identity})
+    return read_json(path)
 
 
 def _entropies(out: Path, data: Path, split: str) -> tuple[np.ndarray | None, np.ndarray | None]:

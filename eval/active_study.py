@@ -22,7 +22,7 @@ from eval.comparison import intervals
 from eval.confidence import stopping
 from eval.knowledge import class_view_table
 from mevs_jax.arrays import AnyArray
-from mevs_jax.calibration import expected_calibration_error, fit_temperature, negative_log_likelihood
+from mevs_jax.calibration import class_weights, expected_calibration_error, fit_temperature, negative_log_likelihood
 from mevs_jax.fusion import CalibratedFusion
 from mevs_jax.models import ViewPolicy
 from mevs_jax.policies import POLICIES, Knowledge, Policy, fused_oracle, learnt
@@ -149,7 +149,8 @@ def beliefs_of(
 @jax.jit
 def _refit(beliefs: Array, labels: Array) -> Float[Array, "steps"]:
     flat = beliefs.reshape(-1, *beliefs.shape[2:])
-    return jax.vmap(fit_temperature, (1, None))(flat, jnp.repeat(labels, beliefs.shape[1]))
+    truth = jnp.repeat(labels, beliefs.shape[1])
+    return jax.vmap(fit_temperature, (1, None, None))(flat, truth, class_weights(truth, flat.shape[-1]))
 
 
 def judged(
@@ -189,6 +190,7 @@ def greedy_order(
     data = jax.tree.map(lambda leaf: leaf[some], data)
     views = data.features.shape[1]
     begin = np.unique(np.linspace(0, views - 1, starts).astype(int))
+    weights = class_weights(data.labels, data.logits.shape[-1])
 
     @jax.jit
     def right_with(seen: Array) -> Array:
@@ -199,7 +201,7 @@ def greedy_order(
                 data.features[:, one], data.directions[:, one], jnp.broadcast_to(one >= 0, (len(some), len(one)))
             )
             own = jnp.take_along_axis(beliefs, data.labels[:, None], axis=1)
-            return jnp.mean(jnp.all(beliefs <= own, axis=1))
+            return jnp.mean(weights * jnp.all(beliefs <= own, axis=1))
 
         return jax.lax.map(of_set, seen)
 

@@ -13,7 +13,15 @@ from mevs_jax.calibration import (
 from mevs_jax.cameras import Camera, cameras_at, look_at_origin, orbit, partial_cloud, pixel_directions, unproject
 from mevs_jax.decisions import Decision, NextView
 from mevs_jax.entropy import depth_entropy, depth_levels, level_entropy, quantise_depth, shannon_entropy
-from mevs_jax.fusion import SetFusion, beliefs_along, confidence, discounted, mean_of_probabilities, sum_of_logits
+from mevs_jax.fusion import (
+    CalibratedFusion,
+    SetFusion,
+    beliefs_along,
+    confidence,
+    discounted,
+    mean_of_probabilities,
+    sum_of_logits,
+)
 from mevs_jax.metrics import (
     accuracy,
     bootstrap_interval,
@@ -22,7 +30,7 @@ from mevs_jax.metrics import (
     confusion_matrix,
     mean_squared_error,
 )
-from mevs_jax.models import Abstraction, PointNet2, ResNet, count_parameters
+from mevs_jax.models import Abstraction, PointNet2, Recogniser, ResNet, ViewPolicy, count_parameters
 from mevs_jax.point_ops import ball_query, farthest_point_sample
 from mevs_jax.policies import (
     POLICIES,
@@ -32,6 +40,8 @@ from mevs_jax.policies import (
     Scene,
     SelectionState,
     candidates,
+    fused_oracle,
+    learnt,
     maxima_first,
     with_movement,
 )
@@ -39,6 +49,7 @@ from mevs_jax.pretrained import pointnet2_from_torch, resnet_from_torch
 from mevs_jax.selection import (
     Episode,
     ViewTable,
+    by_attention,
     select_from_table,
     select_views,
     stop_at,
@@ -58,6 +69,7 @@ __version__ = "0.1.0"
 __all__ = [
     "POLICIES",
     "Abstraction",
+    "CalibratedFusion",
     "Camera",
     "Decision",
     "Episode",
@@ -66,17 +78,20 @@ __all__ = [
     "Observation",
     "PointNet2",
     "Policy",
+    "Recogniser",
     "ResNet",
     "Scene",
     "SelectionState",
     "SetFusion",
     "ViewGraph",
+    "ViewPolicy",
     "ViewTable",
     "accuracy",
     "ball_query",
     "beliefs_along",
     "bootstrap_interval",
     "bootstrap_means",
+    "by_attention",
     "cameras_at",
     "candidates",
     "class_accuracy",
@@ -91,6 +106,8 @@ __all__ = [
     "fibonacci_sphere",
     "fit_exponent",
     "fit_temperature",
+    "fused_oracle",
+    "learnt",
     "level_entropy",
     "local_maxima",
     "look_at_origin",

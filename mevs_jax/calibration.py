@@ -44,8 +44,16 @@ def negative_log_likelihood(beliefs: Float[AnyArray, "n classes"], labels: Int[A
     return -jnp.mean(jnp.take_along_axis(log_probabilities, labels[:, None], axis=-1))
 
 
-def fit_temperature(beliefs: Float[AnyArray, "n classes"], labels: Int[AnyArray, "n"]) -> Float[Array, ""]:
-    """The T that makes softmax(belief / T) most likely, in [0.01, 100].
+def class_weights(labels: Int[AnyArray, "n"], classes: int) -> Float[Array, "n"]:
+    """Weights under which every class that occurs counts the same; their mean is 1."""
+    counts = jnp.bincount(jnp.asarray(labels), length=classes)
+    return len(labels) / jnp.sum(counts > 0) / counts[jnp.asarray(labels)]
+
+
+def fit_temperature(
+    beliefs: Float[AnyArray, "n classes"], labels: Int[AnyArray, "n"], weights: Float[AnyArray, "n"] | float = 1.0
+) -> Float[Array, ""]:
+    """The T that makes softmax(belief / T) most likely, in [0.01, 100]; `weights` say how much each counts.
 
     The likelihood is convex in 1/T, so the root of its derivative is found by bisection.
     """
@@ -53,7 +61,7 @@ def fit_temperature(beliefs: Float[AnyArray, "n classes"], labels: Int[AnyArray,
     centred = beliefs - jnp.take_along_axis(beliefs, labels[:, None], axis=-1)
 
     def slope(log_inverse: Array) -> Array:
-        return jnp.mean(jnp.sum(jax.nn.softmax(jnp.exp(log_inverse) * centred, axis=-1) * centred, axis=-1))
+        return jnp.mean(weights * jnp.sum(jax.nn.softmax(jnp.exp(log_inverse) * centred, axis=-1) * centred, axis=-1))
 
     def halve(_: Array, ends: tuple[Array, Array]) -> tuple[Array, Array]:
         middle = (ends[0] + ends[1]) / 2

@@ -151,12 +151,14 @@ class CalibratedFusion:
     Attributes:
         structure: of the network.
         weights: of the network.
+        prior: (classes,) log-probabilities of the classes in training, which are taken off: here each is as likely as another.
         temperatures: (most,) by number of views, from one view on; the last is also that of more.
         single: temperature of the logits of a view alone.
     """
 
     structure: nnx.GraphDef = flax.struct.field(pytree_node=False)
     weights: nnx.State
+    prior: Float[Array, "classes"]
     temperatures: Float[Array, "most"]
     single: Float[Array, ""]
 
@@ -167,6 +169,6 @@ class CalibratedFusion:
         present: Bool[AnyArray, "*batch views"],
     ) -> Float[Array, "*batch classes"]:
         """Log-probabilities of what was seen, as in `SetFusion`."""
-        logits = nnx.merge(self.structure, self.weights)(features, directions, present)
+        logits = nnx.merge(self.structure, self.weights)(features, directions, present) - self.prior
         count = jnp.clip(jnp.sum(present, axis=-1), 1, len(self.temperatures))
         return jax.nn.log_softmax(logits / self.temperatures[count - 1][..., None], axis=-1)

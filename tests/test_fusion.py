@@ -139,7 +139,7 @@ def test_what_no_view_shows_alone_is_learnt_and_reported():
     network, found = train_fusion(config, train, validation)
     assert len(found["epochs"]) == 25
     assert found["best_loss"] == min(epoch["validation"] for epoch in found["epochs"])
-    fusion = calibrated(network, validation)
+    fusion = calibrated(network, validation, jnp.zeros(2))
     assert fusion.temperatures.shape == (4,)
     rows = {row["views"]: row for row in random_sets_study(fusion, validation, test)}
     assert list(rows) == [1, 2, 3, 4]

@@ -18,7 +18,7 @@ from mevs_jax.models.view_policy import direction_features, expected_information
 from mevs_jax.policies import POLICIES, fused_oracle, learnt, random_view
 from mevs_jax.selection import by_attention, select_from_table
 from train.fusion import Features
-from train.policy import PolicyConfig, choices_along, graph_of, train_policy, walk
+from train.policy import PolicyConfig, choices_along, graph_of, train_policy, unseen, walk
 
 VIEWS, CLASSES, SEEN = 6, 4, 3
 
@@ -39,7 +39,9 @@ def moved(network, scale: float = 0.3):
 def fusion_of(features: int, classes: int) -> CalibratedFusion:
     network = moved(SetFusion(features, classes, width=8, heads=2, blocks=1, dropout=0.0, rngs=nnx.Rngs(0)))
     structure, weights = nnx.split(network)
-    return CalibratedFusion(structure, weights, jnp.array([1.5, 1.2, 0.9]), jnp.float32(1.3))
+    return CalibratedFusion(
+        structure, weights, jnp.linspace(-1, 0, classes), jnp.array([1.5, 1.2, 0.9]), jnp.float32(1.3)
+    )
 
 
 @pytest.fixture(scope="module")
@@ -107,27 +109,30 @@ def test_expected_information_is_its_sum(random):
 def test_labels_are_what_each_candidate_does_to_the_cross_entropy(fusion):
     data, floor = some_features(2), 0.02
     walks = np.array([[[0, 3, 5], [2, 1, 4]], [[5, 4, 3], [1, 0, 2]]], np.int32)
-    found = choices_along(fusion, data, walks, floor)
-    assert found.gain.shape == (2 * 2 * 3, VIEWS)
+    asked = unseen(walks, VIEWS, 2, seed=0)
+    assert asked.shape == (2, 2, 3, 2)
+    found = choices_along(fusion, data, walks, asked, floor)
+    assert found.gain.shape == (2 * 2 * 3, 2)
     fuse = jax.jit(lambda features, directions: fusion(features, directions, jnp.ones(len(features), bool)))
     row = 0
     for index in range(2):
         label = int(data.labels[index])
-        for order in walks[index]:
+        for order, asked_of_walk in zip(walks[index], asked[index], strict=True):
             for count in range(1, 4):
-                seen = order[:count]
+                seen, candidates = order[:count], asked_of_walk[count - 1]
+                assert len(set(candidates) | set(seen)) == count + 2
                 belief = fuse(data.features[index, seen], data.directions[index, seen])
                 np.testing.assert_allclose(found.belief[row], belief, atol=1e-4)
-                np.testing.assert_array_equal(found.fresh[row], ~np.isin(np.arange(VIEWS), seen))
                 np.testing.assert_array_equal(found.present[row], np.arange(3) < count)
                 single = jax.nn.log_softmax(data.logits[index, seen] / 1.3, axis=-1)
                 np.testing.assert_allclose(found.views[row, :count], single, atol=1e-5)
-                for candidate in (0, 4):
+                np.testing.assert_array_equal(found.candidates[row], data.directions[index, candidates])
+                for at, candidate in enumerate(candidates):
                     with_it = np.append(seen, candidate)
                     after = fuse(data.features[index, with_it], data.directions[index, with_it])
-                    np.testing.assert_allclose(found.after[row, candidate], after, atol=1e-4)
+                    np.testing.assert_allclose(found.after[row, at], after, atol=1e-4)
                     drop = np.log(np.exp(after[label]) + floor) - np.log(np.exp(belief[label]) + floor)
-                    assert found.gain[row, candidate] == pytest.approx(drop, abs=1e-4)
+                    assert found.gain[row, at] == pytest.approx(drop, abs=1e-4)
                 row += 1
 
 
@@ -235,7 +240,7 @@ class _Sum(nnx.Module):
 @pytest.fixture(scope="module")
 def adding() -> CalibratedFusion:
     structure, weights = nnx.split(_Sum())
-    return CalibratedFusion(structure, weights, jnp.ones(1), jnp.float32(1))
+    return CalibratedFusion(structure, weights, jnp.zeros(4), jnp.ones(1), jnp.float32(1))
 
 
 def test_what_looking_was_worth_is_learnt_and_the_study_says_so(adding):

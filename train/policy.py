@@ -10,7 +10,7 @@ itself leads (DAgger; Ross et al. 2011).
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
 
@@ -22,6 +22,8 @@ import optax
 from flax import nnx
 from jaxtyping import Array, Bool, Float, Int
 
+from data_pipeline.progress import console
+from mevs_jax.calibration import class_weights
 from mevs_jax.fusion import CalibratedFusion
 from mevs_jax.models.view_policy import ViewPolicy
 from mevs_jax.policies import Policy, learnt, random_view
@@ -45,6 +47,8 @@ class PolicyConfig:
     """views in a state at most"""
     walks: int = 1
     """walks on each training object in a round, each through states of 1 to most_seen views"""
+    candidates: int = 12
+    """views not seen yet that a state is asked about"""
     rounds: int = 3
     """the first walks at random, the others as the policy of the round before says (DAgger)"""
     epochs: int = 8
@@ -72,11 +76,11 @@ class Choices:
         views: log-probabilities of each view seen alone.
         directions: of the views seen.
         present: which of them there are.
-        candidates: directions of all candidates.
-        fresh: which of them were not seen.
+        candidates: directions of some views that were not seen.
         gain: drop in cross-entropy in nats that each brings.
         after: log-probabilities after each.
         label: the true class.
+        weight: how much the state counts.
     """
 
     belief: Float[Array, "states classes"]
@@ -84,10 +88,10 @@ class Choices:
     directions: Float[Array, "states seen 3"]
     present: Bool[Array, "states seen"]
     candidates: Float[Array, "states candidates 3"]
-    fresh: Bool[Array, "states candidates"]
     gain: Float[Array, "states candidates"]
     after: Float[Array, "states candidates classes"]
     label: Int[Array, "states"]
+    weight: Float[Array, "states"]
 
 
 def graph_of(directions: Float[Array, "views 3"]) -> ViewGraph:
@@ -139,53 +143,66 @@ def walk(
 
 
 @partial(jax.jit, static_argnames="floor")
-def _choices_of_some(
-    fusion: CalibratedFusion, some: tuple[Features, Int[Array, "objects walks most"]], floor: float
-) -> Choices:
+def _choices_of_some(fusion: CalibratedFusion, some: tuple[Features, Array, Array], floor: float) -> Choices:
     most = some[1].shape[-1]
 
-    def of_object(one: Features, walks: Array) -> Choices:
+    def of_object(one: Features, walks: Array, asked: Array) -> Choices:
         single = jax.nn.log_softmax(one.logits / fusion.single, axis=-1)
 
-        def of_state(order: Array, count: Array) -> Choices:
+        def of_state(order: Array, count: Array, asked: Array) -> Choices:
             present = jnp.arange(most) < count
             features, directions = one.features[order], one.directions[order]
             belief = fusion(features, directions, present)
 
-            def with_one_more(feature: Array, direction: Array) -> Array:
+            def with_one_more(view: Array) -> Array:
                 return fusion(
-                    jnp.concatenate([features, feature[None]]),
-                    jnp.concatenate([directions, direction[None]]),
+                    jnp.concatenate([features, one.features[view][None]]),
+                    jnp.concatenate([directions, one.directions[view][None]]),
                     jnp.concatenate([present, jnp.array([True])]),
                 )
 
-            after = jax.vmap(with_one_more)(one.features, one.directions)
+            after = jax.vmap(with_one_more)(asked)
             own = jnp.logaddexp(after[:, one.labels], jnp.log(floor))
             gain = own - jnp.logaddexp(belief[one.labels], jnp.log(floor))
-            fresh = jnp.all((order[:, None] != jnp.arange(len(after))) | ~present[:, None], axis=0)
-            return Choices(belief, single[order], directions, present, one.directions, fresh, gain, after, one.labels)
+            known = belief, single[order], directions, present, one.directions[asked]
+            return Choices(*known, gain, after, one.labels, jnp.float32(1))
 
-        counts = jnp.arange(1, most + 1)
-        return jax.vmap(lambda order: jax.vmap(of_state, (None, 0))(order, counts))(walks)
+        of_walk = jax.vmap(of_state, (None, 0, 0))
+        return jax.vmap(of_walk, (0, None, 0))(walks, jnp.arange(1, most + 1), asked)
 
     return jax.vmap(of_object)(*some)
 
 
+def unseen(
+    walks: Int[np.ndarray, "objects walks most"], views: int, candidates: int, seed: int
+) -> Int[np.ndarray, "objects walks most candidates"]:
+    """For every state along some walks a random choice of the views that were not seen yet, fewer where there are fewer."""
+    most = walks.shape[-1]
+    drawn = np.random.default_rng(seed).random((*walks.shape, views))
+    seen = (walks[..., None, :, None] == np.arange(views)) & np.tri(most, dtype=bool)[:, :, None]
+    drawn[seen.any(axis=-2)] = 2
+    return np.argsort(drawn, axis=-1)[..., : min(candidates, views - most)].astype(np.int32)
+
+
 def choices_along(
-    fusion: CalibratedFusion, data: Features, walks: Int[np.ndarray, "objects walks most"], floor: float
+    fusion: CalibratedFusion,
+    data: Features,
+    walks: Int[np.ndarray, "objects walks most"],
+    asked: Int[np.ndarray, "objects walks most candidates"],
+    floor: float,
 ) -> Choices:
-    """Every state along some walks, with what each candidate would bring there; arrays of the host."""
-    found = in_chunks(partial(_choices_of_some, fusion, floor=floor), (data, walks), 8)
+    """Every state along some walks, with what each candidate `asked` about would bring there; arrays of the host."""
+    found = in_chunks(partial(_choices_of_some, fusion, floor=floor), (data, walks, asked), 16)
     return jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[3:]), found)
 
 
 def policy_loss(network: ViewPolicy, some: Choices) -> tuple[Array, dict[str, Array]]:
-    """Mean over fresh candidates: Huber of the expected gain, and cross-entropy of the belief after it for the true class."""
+    """Mean over candidates: Huber of the expected gain, and divergence of the belief expected for the true class."""
     gain, after = network(some.belief, some.views, some.directions, some.present, some.candidates)
     own = jnp.take_along_axis(after, some.label[:, None, None, None], axis=2)[:, :, 0]
-    weight = some.fresh / jnp.maximum(jnp.sum(some.fresh), 1)
-    worth = jnp.sum(weight * optax.losses.huber_loss(gain, some.gain, delta=1.0))
-    beliefs = jnp.sum(weight * -jnp.sum(jnp.exp(some.after) * (own - some.after), axis=-1))
+    weight = some.weight[:, None] / jnp.sum(some.weight)
+    worth = jnp.mean(jnp.sum(weight * optax.losses.huber_loss(gain, some.gain, delta=1.0), axis=0))
+    beliefs = jnp.mean(jnp.sum(weight * jnp.sum(jnp.exp(some.after) * (some.after - own), axis=-1), axis=0))
     return worth + beliefs, {"worth": worth, "beliefs": beliefs}
 
 
@@ -262,17 +279,24 @@ def train_policy(
             given = weights, fusion.single
             keys = jax.random.fold_in(jax.random.fold_in(key, number), part)
             views = walk(keys, fusion, data, policy_of, given, config.most_seen, config.walks)
-            found.append(choices_along(fusion, data, views, config.floor))
+            asked = unseen(views, data.features.shape[1], config.candidates, config.seed + 100 * number + part)
+            found.append(choices_along(fusion, data, views, asked, config.floor))
         gathered.append((_joined(found[:-1]), found[-1]))
-        train, check = (_joined([one[side] for one in gathered]) for side in (0, 1))
+        train, check = (_balanced(_joined([one[side] for one in gathered])) for side in (0, 1))
         policy, history = _fit(config, new_policy(config, parts[0][1].logits.shape[-1]), train, check)
         histories.append(history)
+        console.print(f"Round {number + 1} of {config.rounds}, {len(train.label)} states: {history[-1]}")
     return policy, histories
 
 
 def _learnt(given: tuple[nnx.State, Array], structure: nnx.GraphDef) -> Policy:
     weights, temperature = given
     return learnt(nnx.merge(structure, weights), temperature)
+
+
+def _balanced(choices: Choices) -> Choices:
+    """Weighted so that every class counts the same."""
+    return replace(choices, weight=class_weights(choices.label, choices.belief.shape[-1]))
 
 
 def _joined(parts: Sequence[Choices]) -> Choices:
