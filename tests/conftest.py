@@ -31,6 +31,7 @@ LONG = (
     "test_scaling",
     "test_processes",
     "test_evaluation",
+    "test_policy",
 )
 
 

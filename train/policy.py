@@ -285,7 +285,8 @@ def train_policy(
         train, check = (_balanced(_joined([one[side] for one in gathered])) for side in (0, 1))
         policy, history = _fit(config, new_policy(config, parts[0][1].logits.shape[-1]), train, check)
         histories.append(history)
-        console.print(f"Round {number + 1} of {config.rounds}, {len(train.label)} states: {history[-1]}")
+        last = ", ".join(f"{name} {value:.4f}" for name, value in history[-1].items())
+        console.print(f"Round {number + 1} of {config.rounds}, {len(train.label)} states: {last}")
     return policy, histories
 
 
