@@ -66,6 +66,7 @@ class Contender:
         believes: whether it looks at the belief; one that does not walks without fusing.
         draws: walks from each start.
         max_views: views of its walks, where fewer than the study's.
+        every: it walks from every so many-th start alone.
     """
 
     name: str
@@ -75,6 +76,7 @@ class Contender:
     believes: bool = True
     draws: int = 1
     max_views: int = 0
+    every: int = 1
 
 
 def _named(_: Any, name: str) -> Policy:
@@ -95,7 +97,7 @@ def _walk_some(
     knowledge: Knowledge | None,
     max_views: int,
 ) -> Int[Array, "objects walks steps"]:
-    starts = graph.points.shape[0]
+    starts = jnp.arange(0, graph.points.shape[0], contender.every)
     policy, fuse = contender.policy_of(parameters), by_attention(fusion) if contender.believes else adding
 
     def of_object(key: Array, table: ViewTable) -> Array:
@@ -104,8 +106,8 @@ def _walk_some(
         def run(key: Array, start: Array) -> Array:
             return select_from_table(key, table, scene, policy, start, max_views=max_views, fuse=fuse).views
 
-        keys = jax.random.split(key, starts * contender.draws)
-        return jax.vmap(run)(keys, jnp.arange(starts).repeat(contender.draws))
+        keys = jax.random.split(key, len(starts) * contender.draws)
+        return jax.vmap(run)(keys, starts.repeat(contender.draws))
 
     return jax.vmap(of_object)(*some)
 
@@ -120,10 +122,10 @@ def walk_all(
     knowledge: Knowledge | None,
     max_views: int,
 ) -> Int[np.ndarray, "objects walks steps"]:
-    """The views of walks from every start, `contender.draws` from each."""
+    """The views of walks from every start, or from some, `contender.draws` from each."""
     keys = jax.vmap(jax.random.fold_in, (None, 0))(key, jnp.arange(len(tables.label)))
     rest = contender, parameters, fusion, graph, knowledge, max_views
-    at_once = max(1, _WALKS_AT_ONCE // (len(graph.points) * contender.draws))
+    at_once = max(1, _WALKS_AT_ONCE * contender.every // (len(graph.points) * contender.draws))
     return in_chunks(lambda some: _walk_some(some, *rest), (keys, tables), at_once)
 
 
@@ -159,7 +161,7 @@ def judged(
     fitting: Float[AnyArray, "others walks steps classes"],
     fitting_labels: Int[AnyArray, "others"],
 ) -> tuple[dict[str, Any], np.ndarray]:
-    """One policy's numbers, and its share of right answers (steps, objects)."""
+    """One policy's numbers, and which answers are right (objects, walks, steps)."""
     temperatures = _refit(fitting, fitting_labels)
     beliefs = jax.nn.log_softmax(beliefs / temperatures[:, None], axis=-1)
     right = np.asarray(jnp.argmax(beliefs, axis=-1) == labels[:, None, None])
@@ -178,7 +180,7 @@ def judged(
         ],
         "negative_log_likelihood": [float(negative_log_likelihood(flat[:, step], truth)) for step in steps],
         "stopping": stopping(confidence, right),
-    }, after
+    }, right
 
 
 def greedy_order(
@@ -237,13 +239,15 @@ _GAP = 3
 """The gap between random and the label-free oracle is read after 2 views and the next, up to so many further ones."""
 
 
-def contenders(policies: dict[str, ViewPolicy], draws: int, oracle_views: int, entropies: bool) -> list[Contender]:
+def contenders(
+    policies: dict[str, ViewPolicy], draws: int, oracle_views: int, oracle_starts: int, entropies: bool
+) -> list[Contender]:
     """All policies of the study, in the order in which they are shown.
 
     Args:
         policies: trained ones, by title.
         draws: walks from each start of those that draw.
-        oracle_views: how far oracles walk, which try every candidate.
+        oracle_views, oracle_starts: how far oracles walk, which try every candidate, and from every so many-th start.
         entropies: whether predicted and true depth entropies are known.
     """
     found = [
@@ -270,8 +274,8 @@ def contenders(policies: dict[str, ViewPolicy], draws: int, oracle_views: int, e
             )
         )
     for by, title in (("belief", "label-free oracle"), ("label", "greedy label oracle")):
-        oracle = Contender(f"{by}_oracle", title, "truth", partial(_oracle, by=by), True, 1, oracle_views)
-        found.append(oracle)
+        policy_of, name = partial(_oracle, by=by), f"{by}_oracle"
+        found.append(Contender(name, title, "truth", policy_of, True, 1, oracle_views, oracle_starts))
     return found
 
 
@@ -335,6 +339,7 @@ def study(
     max_views: int,
     draws: int,
     oracle_views: int = 4,
+    oracle_starts: int = 5,
     seed: int = 0,
 ) -> dict[str, Any]:
     """Every number about one lattice of candidate views.
@@ -344,7 +349,7 @@ def study(
         policies: trained view policies, by name; the first is the method, the others ablations.
         max_views: of a walk.
         draws: walks from each start of policies that draw.
-        oracle_views: how far oracles walk.
+        oracle_views, oracle_starts: how far oracles walk, and from every so many-th start.
     """
     points, labels = test.features.directions[0], test.features.labels
     graph = ViewGraph.from_points(np.asarray(points, np.float64))
@@ -359,12 +364,14 @@ def study(
         "policies": {},
     }
     after: dict[str, np.ndarray] = {}
+    from_some: dict[str, np.ndarray] = {}  # accuracy from the oracles' starts
     parameters: dict[str, Any] = {"belief_oracle": fusion, "label_oracle": fusion}
     for title, network in policies.items():
         given = nnx.state(network, nnx.Param), fusion.single
         parameters |= {f"{title}_gain": given, f"{title}_information": given}
     entropies = test.utility is not None and test.entropy is not None
-    for contender in contenders(policies, draws, oracle_views, entropies):
+    some_starts = np.arange(0, len(points), oracle_starts)
+    for contender in contenders(policies, draws, oracle_views, oracle_starts, entropies):
         beliefs = []
         for split, data in enumerate((validation, test)):
             views = walk_all(
@@ -378,15 +385,24 @@ def study(
                 contender.max_views or max_views,
             )
             beliefs.append(beliefs_of(fusion, data.features, views))
-        judgement, after[contender.name] = judged(beliefs[1], labels, beliefs[0], validation.features.labels)
+        judgement, right = judged(beliefs[1], labels, beliefs[0], validation.features.labels)
+        by_start = right.reshape(len(right), -1, contender.draws, right.shape[-1]).mean(axis=2)
+        after[contender.name] = by_start.mean(axis=1).T
+        if contender.every == 1:
+            by_start = by_start[:, some_starts]
+        from_some[contender.name] = by_start.mean(axis=(0, 1))
         found["policies"][contender.name] = {"title": contender.title, "knows": contender.knows, **judgement}
         console.print(f"{contender.title}: " + " ".join(f"{100 * share:.1f}" for share in judgement["after_views"]))
     found["against"] = {
-        base: {name: _difference(mine, after[base]) for name, mine in after.items() if name != base}
+        base: {
+            name: _difference(mine, after[base])
+            for name, mine in after.items()
+            if name not in (base, "belief_oracle", "label_oracle")  # which walk from some starts only
+        }
         for base in BASELINES
     }
     found["gap_closed"] = {
-        name: _gap_closed(after[name], after["random"], after["belief_oracle"])
+        name: _gap_closed(from_some[name], from_some["random"], from_some["belief_oracle"])
         for name in after
         if name not in ("random", "belief_oracle", "label_oracle")
     }
@@ -399,8 +415,8 @@ def _difference(mine: np.ndarray, base: np.ndarray) -> dict[str, Any]:
     return {"difference": gain.mean(axis=1).tolist(), "interval": intervals(gain)}
 
 
-def _gap_closed(mine: np.ndarray, random: np.ndarray, oracle: np.ndarray) -> list[float]:
-    """Share of the way from random to the oracle, from 2 views on."""
+def _gap_closed(mine: np.ndarray, random: np.ndarray, oracle: np.ndarray) -> list[float | None]:
+    """Share of the way from random to the oracle, from 2 views on; None where the oracle is no better."""
     steps = slice(1, min(len(oracle), 1 + _GAP))
-    gap = oracle[steps].mean(axis=1) - random[steps].mean(axis=1)
-    return ((mine[steps].mean(axis=1) - random[steps].mean(axis=1)) / np.where(gap > 0, gap, np.nan)).tolist()
+    gains = zip(mine[steps] - random[steps], oracle[steps] - random[steps], strict=True)
+    return [float(gain / gap) if gap > 0 else None for gain, gap in gains]

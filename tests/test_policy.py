@@ -253,7 +253,14 @@ def test_what_looking_was_worth_is_learnt_and_the_study_says_so(adding):
     assert len(histories) == 2
     assert histories[-1][-1]["worth"] < 0.7 * histories[0][0]["worth"]
     found = study(
-        adding, {"learnt": policy}, OnLattice(validation), OnLattice(test), max_views=3, draws=2, oracle_views=3
+        adding,
+        {"learnt": policy},
+        OnLattice(validation),
+        OnLattice(test),
+        max_views=3,
+        draws=2,
+        oracle_views=3,
+        oracle_starts=1,
     )
     after = {name: result["after_views"] for name, result in found["policies"].items()}
     # From view 0 the telling view can be known; random finds it in one case of five.

@@ -1,13 +1,11 @@
 """Training of the set fusion on cached features: random subsets of an object's views, of every size, to its class.
 
-Features of all objects fit into memory, so an epoch is one program. The weights that are kept are running means (Polyak),
-those of the epoch that is best on the validation objects.
+Features of all objects fit into memory (`train.averaged`).
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import partial
 from typing import Any
 
 import flax.struct
@@ -18,6 +16,7 @@ from flax import nnx
 from jaxtyping import Array, Bool, Float, Int
 
 from mevs_jax.fusion import SetFusion
+from train.averaged import AveragedConfig, fit_averaged
 
 
 @dataclass(frozen=True)
@@ -35,24 +34,16 @@ class SetFusionConfig:
 
 
 @dataclass(frozen=True)
-class FusionConfig:
+class FusionConfig(AveragedConfig):
     """The set fusion's training on features that are there."""
 
+    epochs: int = 60
+    """looks at each object's views"""
+    weight_decay: float = 0.05
+    """decoupled"""
     network: SetFusionConfig = SetFusionConfig()
     largest_set: int = 12
     """views in a training set at most"""
-    epochs: int = 60
-    """looks at each object's views"""
-    batch_size: int = 128
-    """sets in a batch"""
-    learning_rate: float = 1e-3
-    """of AdamW, at its highest"""
-    weight_decay: float = 0.05
-    """decoupled"""
-    averaging: float = 0.995
-    """share of the running mean of the weights that a step keeps"""
-    seed: int = 0
-    """of weights, sets and dropout"""
 
 
 @flax.struct.dataclass
@@ -113,54 +104,23 @@ def train_fusion(
     if start is None:
         start = new_fusion(config.network, train.features.shape[-1], train.logits.shape[-1], nnx.Rngs(config.seed))
     structure, parameters = nnx.split(start)
-    objects, views = train.features.shape[:2]
-    batch = min(config.batch_size, objects)
-    steps = objects // batch
-    total = steps * config.epochs
-    rate = optax.warmup_cosine_decay_schedule(0.0, config.learning_rate, max(1, total // 20), max(2, total))
-    optimiser = optax.chain(
-        optax.clip_by_global_norm(1.0), optax.adamw(rate, b2=0.98, weight_decay=config.weight_decay)
-    )
+    views, largest = train.features.shape[1], config.largest_set
 
-    Carry = tuple[Any, Any, Any, Array]  # weights, moments, mean of weights, steps
-
-    def step(carry: Carry, given: tuple[Array, Array]) -> tuple[Carry, Array]:
-        parameters, moments, mean, taken = carry
-        index, key = given
-        sets, noise = jax.random.split(key)
-        present = random_sets(sets, batch, views, config.largest_set)
-
-        def loss_of(parameters: nnx.State) -> Array:
-            some = jax.tree.map(lambda leaf: leaf[index], train)
-            return jnp.mean(fusion_loss(nnx.merge(structure, parameters), some, present, noise))
-
-        loss, gradient = jax.value_and_grad(loss_of)(parameters)
-        update, moments = optimiser.update(gradient, moments, parameters)
-        parameters = optax.apply_updates(parameters, update)
-        keep = jnp.minimum(config.averaging, (taken + 1) / (taken + 10))
-        mean = jax.tree.map(lambda old, new: keep * old + (1 - keep) * new, mean, parameters)
-        return (parameters, moments, mean, taken + 1), loss
+    def loss_of(parameters: nnx.State, some: Features, key: Array) -> Array:
+        sets, drop = jax.random.split(key)
+        present = random_sets(sets, len(some.labels), views, largest)
+        return jnp.mean(fusion_loss(nnx.merge(structure, parameters), some, present, drop))
 
     @jax.jit
-    def epoch(carry: Carry, key: Array) -> tuple[Carry, Array]:
-        order, keys = jax.random.split(key)
-        index = jax.random.permutation(order, objects)[: steps * batch].reshape(steps, batch)
-        carry, losses = jax.lax.scan(step, carry, (index, jax.random.split(keys, steps)))
-        return carry, jnp.mean(losses)
-
-    @partial(jax.jit, static_argnames="draws")
-    def validate(mean: nnx.State, draws: int = 4) -> Array:
+    def check(mean: nnx.State, validation: Features) -> Array:
         network = nnx.merge(structure, mean)
-        keys = jax.random.split(jax.random.key(1), draws)  # the same sets after every epoch
-        sets = [random_sets(key, len(validation.labels), views, config.largest_set) for key in keys]
+        keys = jax.random.split(jax.random.key(1), 4)  # the same sets after every epoch
+        sets = [random_sets(key, len(validation.labels), views, largest) for key in keys]
         return jnp.mean(jnp.stack([fusion_loss(network, validation, present) for present in sets]))
 
-    carry = parameters, optimiser.init(parameters), parameters, jnp.float32(0)
-    best, best_loss, history = parameters, float("inf"), []
-    for number in range(config.epochs):
-        carry, train_loss = epoch(carry, jax.random.fold_in(jax.random.key(config.seed), number))
-        loss = float(validate(carry[2]))
-        history.append({"train": float(train_loss), "validation": loss})
-        if loss < best_loss:
-            best, best_loss = carry[2], loss
+    def validate(mean: nnx.State) -> dict[str, float]:
+        return {"validation": float(check(mean, validation))}
+
+    best, history = fit_averaged(config, loss_of, parameters, train, validate)
+    best_loss = min((epoch["validation"] for epoch in history), default=None)
     return nnx.merge(structure, best), {"best_loss": best_loss, "epochs": history}

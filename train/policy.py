@@ -29,14 +29,19 @@ from mevs_jax.models.view_policy import ViewPolicy
 from mevs_jax.policies import Policy, learnt, random_view
 from mevs_jax.selection import ViewTable, by_attention, select_from_table
 from mevs_jax.viewpoints import ViewGraph
+from train.averaged import AveragedConfig, fit_averaged
 from train.chunks import in_chunks
 from train.fusion import Features
 
 
 @dataclass(frozen=True)
-class PolicyConfig:
+class PolicyConfig(AveragedConfig):
     """The view policy and its training."""
 
+    epochs: int = 8
+    """looks at each state, in every round"""
+    batch_size: int = 256
+    """states in a batch"""
     width: int = 96
     """of queries and tokens"""
     heads: int = 4
@@ -51,20 +56,8 @@ class PolicyConfig:
     """views not seen yet that a state is asked about"""
     rounds: int = 3
     """the first walks at random, the others as the policy of the round before says (DAgger)"""
-    epochs: int = 8
-    """looks at each state, in every round"""
-    batch_size: int = 256
-    """states in a batch"""
-    learning_rate: float = 1e-3
-    """of AdamW, at its highest"""
-    weight_decay: float = 0.01
-    """decoupled"""
-    averaging: float = 0.995
-    """share of the running mean of the weights that a step keeps"""
     floor: float = 0.01
-    """probabilities below count as this in cross-entropies: one object that all are wrong about must not outweigh all others"""
-    seed: int = 0
-    """of weights, walks and batches"""
+    """added to probabilities in cross-entropies: one object that all are wrong about must not outweigh all others"""
 
 
 @flax.struct.dataclass
@@ -211,49 +204,23 @@ def new_policy(config: PolicyConfig, classes: int) -> ViewPolicy:
 
 
 def _fit(config: PolicyConfig, network: ViewPolicy, train: Choices, validation: Choices) -> tuple[ViewPolicy, list]:
-    """The weights of the best epoch, running means."""
     structure, parameters = nnx.split(network)
-    states = len(train.label)
-    batch = min(config.batch_size, states)
-    steps = states // batch
-    total = steps * config.epochs
-    rate = optax.warmup_cosine_decay_schedule(0.0, config.learning_rate, max(1, total // 20), max(2, total))
-    optimiser = optax.chain(
-        optax.clip_by_global_norm(1.0), optax.adamw(rate, b2=0.98, weight_decay=config.weight_decay)
-    )
 
-    def step(carry, some: Choices):
-        parameters, moments, mean, taken = carry
-        loss, gradient = jax.value_and_grad(lambda p: policy_loss(nnx.merge(structure, p), some)[0])(parameters)
-        update, moments = optimiser.update(gradient, moments, parameters)
-        parameters = optax.apply_updates(parameters, update)
-        keep = jnp.minimum(config.averaging, (taken + 1) / (taken + 10))
-        mean = jax.tree.map(lambda old, new: keep * old + (1 - keep) * new, mean, parameters)
-        return (parameters, moments, mean, taken + 1), loss
+    def loss_of(parameters: nnx.State, some: Choices, key: Array) -> Array:
+        del key
+        return policy_loss(nnx.merge(structure, parameters), some)[0]
 
     @jax.jit
-    def some_steps(carry, some: Choices):
-        return jax.lax.scan(step, carry, some)
-
-    @jax.jit
-    def check(mean, some: Choices):
+    def check(mean: nnx.State, some: Choices) -> dict[str, Array]:
         return policy_loss(nnx.merge(structure, mean), some)[1]
 
-    random = np.random.default_rng(config.seed)
-    carry = parameters, optimiser.init(parameters), parameters, jnp.float32(0)
-    best, best_loss, history = parameters, float("inf"), []
-    for _ in range(config.epochs):
-        order, losses = random.permutation(states)[: steps * batch].reshape(steps, batch), []
-        for first in range(0, steps, 16):
-            index = order[first : first + 16]
-            carry, loss = some_steps(carry, jax.tree.map(lambda leaf, index=index: leaf[index], train))
-            losses.append(np.asarray(loss))
-        parts = np.array_split(np.arange(len(validation.label)), max(1, len(validation.label) // 1024))
-        found = [check(carry[2], jax.tree.map(lambda leaf, part=part: leaf[part], validation)) for part in parts]
-        means = {name: float(np.mean([float(one[name]) for one in found])) for name in found[0]}
-        history.append({"train": float(np.mean(np.concatenate(losses))), **means})
-        if sum(means.values()) < best_loss:
-            best, best_loss = carry[2], sum(means.values())
+    parts = np.array_split(np.arange(len(validation.label)), max(1, len(validation.label) // 1024))
+
+    def validate(mean: nnx.State) -> dict[str, float]:
+        found = [check(mean, jax.tree.map(lambda leaf, part=part: leaf[part], validation)) for part in parts]
+        return {name: float(np.mean([float(one[name]) for one in found])) for name in found[0]}
+
+    best, history = fit_averaged(config, loss_of, parameters, train, validate)
     return nnx.merge(structure, best), history
 
 

@@ -1,0 +1,92 @@
+"""Training of small networks on data that fits into memory: an epoch is one program, and what is kept is a running mean.
+
+AdamW with warm-up and cosine decay; the weights that are validated and returned are a running mean of the trained ones
+(Polyak), those of the epoch that is best on validation data.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, TypeVar
+
+import jax
+import jax.numpy as jnp
+import optax
+from flax import nnx
+from jaxtyping import Array, Float, Int
+
+Data = TypeVar("Data")
+
+
+@dataclass(frozen=True)
+class AveragedConfig:
+    """How such a network is trained."""
+
+    epochs: int = 10
+    """looks at each sample"""
+    batch_size: int = 128
+    """samples in a batch"""
+    learning_rate: float = 1e-3
+    """of AdamW, at its highest"""
+    weight_decay: float = 0.01
+    """decoupled"""
+    averaging: float = 0.995
+    """share of the running mean of the weights that a step keeps"""
+    seed: int = 0
+    """of weights, batches and all that is drawn"""
+
+
+def fit_averaged(
+    config: AveragedConfig,
+    loss_of: Callable[[nnx.State, Data, Array], Float[Array, ""]],
+    parameters: nnx.State,
+    data: Data,
+    validate: Callable[[nnx.State], dict[str, float]],
+) -> tuple[nnx.State, list[dict[str, float]]]:
+    """The mean weights of the best epoch, or those given where there is none, and the losses by epoch.
+
+    Args:
+        loss_of: weights, a batch and a key to the mean loss.
+        data: a tree of arrays with a leading axis of samples.
+        validate: mean weights to losses, whose sum decides.
+    """
+    samples = len(jax.tree.leaves(data)[0])
+    batch = min(config.batch_size, samples)
+    steps = samples // batch
+    total = steps * config.epochs
+    rate = optax.warmup_cosine_decay_schedule(0.0, config.learning_rate, max(1, total // 20), max(2, total))
+    optimiser = optax.chain(
+        optax.clip_by_global_norm(1.0), optax.adamw(rate, b2=0.98, weight_decay=config.weight_decay)
+    )
+
+    Carry = tuple[Any, Any, Any, Array]  # weights, moments, mean of weights, steps
+
+    @jax.jit
+    def epoch(carry: Carry, data: Data, key: Array) -> tuple[Carry, Array]:
+        def step(carry: Carry, given: tuple[Int[Array, "batch"], Array]) -> tuple[Carry, Array]:
+            parameters, moments, mean, taken = carry
+            index, key = given
+            some = jax.tree.map(lambda leaf: leaf[index], data)
+            loss, gradient = jax.value_and_grad(loss_of)(parameters, some, key)
+            update, moments = optimiser.update(gradient, moments, parameters)
+            parameters = optax.apply_updates(parameters, update)
+            keep = jnp.minimum(config.averaging, (taken + 1) / (taken + 10))
+            mean = jax.tree.map(lambda old, new: keep * old + (1 - keep) * new, mean, parameters)
+            return (parameters, moments, mean, taken + 1), loss
+
+        order, keys = jax.random.split(key)
+        index = jax.random.permutation(order, samples)[: steps * batch].reshape(steps, batch)
+        carry, losses = jax.lax.scan(step, carry, (index, jax.random.split(keys, steps)))
+        return carry, jnp.mean(losses)
+
+    carry = parameters, optimiser.init(parameters), parameters, jnp.float32(0)
+    best, best_loss, history = parameters, float("inf"), []
+    data = jax.tree.map(jnp.asarray, data)
+    for number in range(config.epochs):
+        carry, loss = epoch(carry, data, jax.random.fold_in(jax.random.key(config.seed), number))
+        found = validate(carry[2])
+        history.append({"train": float(loss), **found})
+        if sum(found.values()) < best_loss:
+            best, best_loss = carry[2], sum(found.values())
+    return best, history
