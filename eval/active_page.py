@@ -37,8 +37,8 @@ def _ladder(found: dict[str, Any]) -> str:
     return (
         '<div class="wide">' + table(header, rows) + "</div>"
         "<p class='note'>Accuracy (%) after exactly so many views, with 95 % intervals over objects. Gap: of the way from random "
-        "to the label-free oracle after 2 / 3 / 4 views. The oracles try every view and walk from every fifth start, on which the "
-        "gap is read; the label oracle finds views that are right by luck.</p>"
+        "to the label-free oracle after 2 / 3 / 4 views. The oracles try every view and walk from every fifth start, on which "
+        "the gap is read; the label oracle finds views that are right by luck.</p>"
     )
 
 
