@@ -50,17 +50,13 @@ class ViewPolicy(nnx.Module):
         width: of queries and tokens.
         heads: of attention.
         blocks: of attention and layers.
-        clouds: length of the embedding of a partial cloud, beside each view seen; 0 for none.
         rngs: source of the initial weights.
     """
 
-    def __init__(
-        self, classes: int, *, width: int = 96, heads: int = 4, blocks: int = 2, clouds: int = 0, rngs: nnx.Rngs
-    ):
+    def __init__(self, classes: int, *, width: int = 96, heads: int = 4, blocks: int = 2, rngs: nnx.Rngs):
         self.classes = classes
         self.direction = nnx.Linear(19, width, rngs=rngs)
         self.view, self.belief = nnx.Linear(classes, width, rngs=rngs), nnx.Linear(classes + 1, width, rngs=rngs)
-        self.cloud = nnx.Linear(clouds, width, rngs=rngs) if clouds else None
         self.token1, self.token2 = nnx.Linear(width, 2 * width, rngs=rngs), nnx.Linear(2 * width, width, rngs=rngs)
         self.blocks = nnx.List([_CrossBlock(width, heads, rngs=rngs) for _ in range(blocks)])
         self.known_norm, self.last_norm = nnx.LayerNorm(width, rngs=rngs), nnx.LayerNorm(width, rngs=rngs)
@@ -75,7 +71,6 @@ class ViewPolicy(nnx.Module):
         directions: Float[AnyArray, "*batch seen 3"],
         present: Bool[AnyArray, "*batch seen"],
         candidates: Float[AnyArray, "*batch candidates 3"],
-        clouds: Float[AnyArray, "*batch seen embedding"] | None = None,
     ) -> tuple[Float[Array, "*batch candidates"], Float[Array, "*batch candidates classes classes"]]:
         """The worth of each candidate, said twice.
 
@@ -85,7 +80,6 @@ class ViewPolicy(nnx.Module):
             directions: unit vectors to the cameras of those.
             present: which of them there are; the rest is padding.
             candidates: unit vectors to where the camera may go.
-            clouds: embeddings of the partial clouds seen, where the network takes them.
 
         Returns:
             The expected drop in cross-entropy in nats; and [j, y]: the log-probabilities that the belief is expected to have
@@ -96,8 +90,6 @@ class ViewPolicy(nnx.Module):
         floor = -12.0  # a belief of 6 in a million is as good as none
         tokens = self.view(jnp.where(spare, jnp.maximum(views, floor), 0.0))
         tokens = tokens + self.direction(direction_features(jnp.where(spare, jnp.asarray(directions), 0.0)))
-        if self.cloud is not None:
-            tokens = tokens + self.cloud(jnp.where(spare, jnp.asarray(clouds), 0.0))
         count = jnp.log(jnp.maximum(jnp.sum(present, axis=-1, keepdims=True), 1).astype(belief.dtype))
         own = self.belief(jnp.concatenate([jnp.maximum(belief, floor), count], axis=-1))
         tokens = jnp.concatenate([own[..., None, :], tokens], axis=-2)
