@@ -108,16 +108,20 @@ def fold_of(objects: int, folds: int) -> np.ndarray:
     return np.arange(objects) % folds
 
 
+def objects_kept(objects: int, config: ViewBatches) -> np.ndarray:
+    """Which of so many training objects are trained on."""
+    if config.fold is None:
+        return np.arange(objects)
+    part, folds = config.fold
+    return np.flatnonzero(fold_of(objects, folds) != part)
+
+
 class _TrainingObjects:
     """The objects of some splits, one after the other, each with the views that may be trained on."""
 
     def __init__(self, sources: list[Any], config: ViewBatches):
         self._sources, self._config = sources, config
-
-        every = np.arange(sum(map(len, sources)))
-        self._kept = (
-            every if config.fold is None else np.flatnonzero(fold_of(len(every), config.fold[1]) != config.fold[0])
-        )
+        self._kept = objects_kept(sum(map(len, sources)), config)
 
     def __len__(self) -> int:
         return len(self._kept)

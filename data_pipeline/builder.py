@@ -237,7 +237,7 @@ def example_of(entry: ObjectEntry, captures: Path, rig: Rig) -> tuple[str, dict[
         "label": entry.label,
         "depth": capture.depth,
         "image": capture.image,
-        "pose": rig.around(entry.name).poses,
+        "pose": rig.poses_around(entry.name),
         "entropy": view_entropies(capture),
         "extent": capture.extent,
     }

@@ -77,13 +77,13 @@ class Rig:
     field_of_view: float
     turned: bool = False
 
-    def around(self, name: str) -> Rig:
-        """The cameras around the object of this name: these, or where `turned` these after a random turn that its name decides.
+    def poses_around(self, name: str) -> np.ndarray:
+        """The poses around the object of this name: these, or where `turned` these after a random turn that its name decides.
 
         The turn moves the cameras; each then looks at the object with the world's z upwards in its image, as before.
         """
         if not self.turned:
-            return self
+            return self.poses
         turn = Rotation.from_quat(np.random.default_rng(zlib.crc32(name.encode())).normal(size=4)).as_matrix()
         position = self.poses[:, :3, 3] @ turn.T
         forward = -position / np.linalg.norm(position, axis=1, keepdims=True)
@@ -92,9 +92,15 @@ class Rig:
         axes = np.stack([right, np.cross(forward, right), forward], axis=-1)
         poses = np.tile(np.eye(4), (len(axes), 1, 1))
         poses[:, :3, :3], poses[:, :3, 3] = axes, position
-        local = self.directions[0] @ self.poses[0, :3, :3]
-        directions = np.einsum("hwc,vdc->vhwd", local, axes)
-        return Rig(poses.astype(np.float32), directions.astype(np.float32), self.field_of_view)
+        return poses.astype(np.float32)
+
+    def around(self, name: str) -> Rig:
+        """The cameras around the object of this name, with their rays."""
+        if not self.turned:
+            return self
+        poses, local = self.poses_around(name), self.directions[0] @ self.poses[0, :3, :3]
+        directions = np.einsum("hwc,vdc->vhwd", local, poses[:, :3, :3])
+        return Rig(poses, directions.astype(np.float32), self.field_of_view)
 
 
 @dataclass(frozen=True)

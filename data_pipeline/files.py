@@ -48,5 +48,10 @@ def write_json(path: Path, content: Any) -> None:
     write_text(path, json.dumps(content, indent=1, default=_plain, allow_nan=False) + "\n")
 
 
+def as_read(content: Any) -> Any:
+    """Content as `read_json` would give it back: what a stored identity is compared with."""
+    return json.loads(json.dumps(content))
+
+
 def read_json(path: Path) -> Any:
     return json.loads(path.read_text())

@@ -11,9 +11,9 @@ and `active/metrics.json`.
 from __future__ import annotations
 
 from dataclasses import asdict, dataclass, replace
-from functools import partial
+from functools import cached_property, partial
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -23,11 +23,11 @@ from jaxtyping import Array, Bool
 
 from data_pipeline.batches import fold_of
 from data_pipeline.builder import DataConfig, DatasetStatistics, load_statistics, open_split, prepare
-from data_pipeline.files import read_json, write_json
+from data_pipeline.files import as_read, read_json, write_json
 from data_pipeline.meshes import DataError
 from data_pipeline.progress import console
 from eval.active_study import OnLattice, study
-from eval.view_tables import load_view_tables, made_by, network_outputs, objects_of, stored_array
+from eval.view_tables import load_view_tables, made_by, network_outputs, stored_array
 from mevs_jax.calibration import class_weights, fit_temperature
 from mevs_jax.fusion import CalibratedFusion, SetFusion
 from mevs_jax.models import Recogniser, ViewPolicy
@@ -95,7 +95,7 @@ class Stages:
         capture = replace(self.dataset.capture, turned=True)
         prepare(replace(self.dataset, capture=capture), self.turned)
 
-    @property
+    @cached_property
     def statistics(self) -> DatasetStatistics:
         return load_statistics(self.turned)
 
@@ -118,18 +118,16 @@ class Stages:
         self, name: str, data: Path, split: str, fold: int | None = None, chosen: np.ndarray | None = None
     ) -> Features:
         """What the recogniser sees of every view, kept in `features/` under this name."""
-        statistics, task, folder = load_statistics(data), self.task(fold), self.recogniser_folder(fold)
-        labels = objects_of(data, split, statistics)[1]
-        both = stored_array(
+        task, folder, classes = self.task(fold), self.recogniser_folder(fold), len(self.statistics.classes)
+        seen = stored_array(
             self.folder / "features" / f"{name}.npz",
-            made_by(statistics, folder),
+            made_by(load_statistics(data), folder),
             lambda: network_outputs(data, split, task, load_best(task, folder), _see, chosen).astype(np.float32),
         )
-        if chosen is not None:
-            labels = labels[chosen]
-        ends = np.cumsum([both.shape[-1] - len(statistics.classes) - 3, len(statistics.classes)])
-        features, logits, directions = map(jnp.asarray, np.split(both, ends, axis=-1))
-        return Features(features, logits - self.prior, jnp.asarray(labels), directions)
+        ends = np.cumsum([seen.shape[-1] - classes - 4, classes, 3])
+        features, logits, directions, labels = np.split(seen, ends, axis=-1)
+        known = jnp.asarray(labels[:, 0, 0].astype(np.int32))
+        return Features(jnp.asarray(features), jnp.asarray(logits) - self.prior, known, jnp.asarray(directions))
 
     @property
     def prior(self) -> Array:
@@ -150,72 +148,68 @@ class Stages:
         return calibrated(network, validation, self.prior)
 
     def _fusion_of_all(self, start: SetFusion, validation: Features) -> SetFusion:
-        folder = self.folder / "fusion"
-        identity = _plain(
-            {"made_by": made_by(self.statistics, self.recogniser_folder()), "of": asdict(self.config.fusion)}
-        )
-        path = folder / "summary.json"
-        if not path.exists() or read_json(path)["identity"] != identity:
-            train = self.features("turned_train", self.turned, "train")
-            console.print(f"Training the set fusion on {len(train.labels)} objects, {self.config.fusion.epochs} epochs")
-            start, found = train_fusion(replace(self.config.fusion, seed=self.seed), train, validation, start)
-            with Checkpoints(folder) as checkpoints:
-                checkpoints.save("best", 0, nnx.state(start, nnx.Param), found)
-            write_json(path, {"identity": identity, **found})
-            return start
-        return _restored(folder, start)
+        config = replace(self.config.fusion, seed=self.seed)
 
-    def policy(self, config: PolicyConfig, name: str = "policy", cross_fit: bool = True) -> ViewPolicy:
-        """The view policy, with labels by the recognisers of the parts, or by the one that was trained on every object."""
-        folder, folds = self.folder / name, range(self.config.folds)
-        made = [self.recogniser_folder(fold) for fold in folds] if cross_fit else []
-        identity = _plain(
-            {
-                "made_by": made_by(self.statistics, self.recogniser_folder(), *made),
-                "fusion": asdict(self.config.fusion),
-                "of": asdict(config),
-            }
-        )
-        path = folder / "summary.json"
-        policy = new_policy(replace(config, seed=self.seed), len(self.statistics.classes))
-        if path.exists() and read_json(path)["identity"] == identity:
-            return _restored(folder, policy)
-        main = self.fusion(), self.features("turned_val", self.turned, "val")
-        if cross_fit:
-            parts = []
+        def train() -> tuple[SetFusion, dict[str, Any]]:
+            data = self.features("turned_train", self.turned, "train")
+            console.print(f"Training the set fusion on {len(data.labels)} objects, {config.epochs} epochs")
+            return train_fusion(config, data, validation, start)
+
+        identity = {"made_by": made_by(self.statistics, self.recogniser_folder()), "of": asdict(self.config.fusion)}
+        return _made_once(self.folder / "fusion", identity, start, train)
+
+    def policy(self) -> ViewPolicy:
+        """The view policy, with labels by the recognisers of the parts."""
+        config, folds = replace(self.config.policy, seed=self.seed), range(self.config.folds)
+
+        def train() -> tuple[ViewPolicy, dict[str, Any]]:
+            main = self.fusion(), self.features("turned_val", self.turned, "val")
             part_of = fold_of(len(open_split(self.turned, "train")), self.config.folds)
+            parts = []
             for fold in folds:
                 held_out = np.flatnonzero(part_of == fold)
                 data = self.features(f"fold_{fold}_train", self.turned, "train", fold, held_out)
                 parts.append((self.fusion(fold), data))
-        else:
-            parts = [(main[0], self.features("turned_train", self.turned, "train"))]
-        console.print(f"Training the view policy, {config.rounds} rounds")
-        policy, histories = train_policy(replace(config, seed=self.seed), parts, main)
-        with Checkpoints(folder) as checkpoints:
-            checkpoints.save("best", 0, nnx.state(policy, nnx.Param), {})
-        write_json(path, {"identity": identity, "rounds": histories})
-        return policy
+            console.print(f"Training the view policy, {config.rounds} rounds")
+            policy, histories = train_policy(config, parts, main)
+            return policy, {"rounds": histories}
+
+        identity = {
+            "made_by": made_by(
+                self.statistics, self.recogniser_folder(), *(self.recogniser_folder(fold) for fold in folds)
+            ),
+            "fusion": asdict(self.config.fusion),
+            "of": asdict(self.config.policy),
+        }
+        untrained = new_policy(config, len(self.statistics.classes))
+        return _made_once(self.folder / "policy", identity, untrained, train)
 
 
-def _plain(tree: Any) -> Any:
-    import json
-
-    return json.loads(json.dumps(tree))
+Network = TypeVar("Network", bound=nnx.Module)
 
 
-def _restored(folder: Path, network: Any) -> Any:
+def _made_once(
+    folder: Path, identity: dict[str, Any], like: Network, train: Callable[[], tuple[Network, dict[str, Any]]]
+) -> Network:
+    """The network that is kept in the folder under this identity; else the trained one, which is kept with what is told of it."""
+    path, identity = folder / "summary.json", as_read(identity)
     with Checkpoints(folder) as checkpoints:
-        restored = checkpoints.restore("best", nnx.state(network, nnx.Param))
-    assert restored is not None
-    nnx.update(network, restored[0])
+        if path.exists() and read_json(path)["identity"] == identity:
+            restored = checkpoints.restore("best", nnx.state(like, nnx.Param))
+            if restored is not None:
+                nnx.update(like, restored[0])
+                return like
+        network, told = train()
+        checkpoints.save("best", 0, nnx.state(network, nnx.Param), {})
+    write_json(path, {"identity": identity, **told})
     return network
 
 
 def _see(network: Recogniser, task: Task, batch: Batch) -> jax.Array:
-    """Features, logits and direction of every view, side by side."""
+    """Features, logits, direction and label of every view, side by side."""
     assert isinstance(task, RecogniserTask)
-    return jnp.concatenate([network.see(task.inputs(batch)), task.directions(batch)], axis=-1)
+    label = batch["label"][:, None].astype(jnp.float32)
+    return jnp.concatenate([network.see(task.inputs(batch)), task.directions(batch), label], axis=-1)
 
 
 def calibrated(
@@ -258,7 +252,7 @@ def train_all(stages: Stages) -> None:
     stages.prepare()
     for fold in (None, *range(stages.config.folds)):
         stages.train_recogniser(fold)
-    stages.policy(stages.config.policy)
+    stages.policy()
 
 
 def measure(stages: Stages) -> dict[str, Any]:
@@ -275,7 +269,7 @@ def _measure_on(stages: Stages, views: int) -> dict[str, Any]:
     config, path = stages.config, stages.folder / f"metrics_{views}.json"
     data = lattice_data(stages.dataset, stages.out, views)
     with_entropies = _entropies(stages.out, data, "test")[0] is not None
-    identity = _plain(
+    identity = as_read(
         {
             "made_by": made_by(load_statistics(data), stages.recogniser_folder()),
             "fusion": asdict(config.fusion),
@@ -292,7 +286,7 @@ def _measure_on(stages: Stages, views: int) -> dict[str, Any]:
     console.print(f"Walking {len(on['test'].features.labels)} test objects, {views} candidate views")
     found = study(
         stages.fusion(),
-        {"learnt": stages.policy(config.policy)},
+        {"learnt": stages.policy()},
         on["val"],
         on["test"],
         max_views=config.max_views,

@@ -6,7 +6,6 @@ A run directory holds `data/`, `classifier/`, `entropy/`, `tables/`, `metrics.js
 
 from __future__ import annotations
 
-import json
 import os
 from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
@@ -20,7 +19,7 @@ import tyro
 from data_pipeline.augment import CloudAugmentation
 from data_pipeline.builder import DataConfig, DatasetStatistics, load_statistics, prepare, report_left_out
 from data_pipeline.capture import CaptureConfig
-from data_pipeline.files import read_json, write_json
+from data_pipeline.files import as_read, read_json, write_json
 from data_pipeline.meshes import DataError
 from data_pipeline.progress import console
 from eval.active import ActiveConfig, Stages, check_active, measure, train_all
@@ -318,7 +317,7 @@ def evaluate(settings: Settings, out: Path) -> dict[str, Any]:
     climbed = load_climbed(out, statistics, settings.climb)
     if climbed is not None:
         identity["climbed"] = asdict(settings.climb)
-    identity = json.loads(json.dumps(identity))
+    identity = as_read(identity)
     check_evaluation(settings.evaluation)
     path = out / "metrics.json"
     if path.exists() and (metrics := read_json(path))["identity"] == identity:

@@ -6,7 +6,6 @@ view (`outputs/`), `timing.json`, `thesis.json` and the report (`report/`).
 
 from __future__ import annotations
 
-import json
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
@@ -15,7 +14,7 @@ import numpy as np
 from flax import nnx
 
 from data_pipeline.builder import open_objects, prepare, report_left_out
-from data_pipeline.files import read_json, write_json
+from data_pipeline.files import as_read, read_json, write_json
 from data_pipeline.meshes import DataError, load_object
 from data_pipeline.progress import console
 from eval.ascent import METHODS
@@ -132,7 +131,7 @@ def measure(settings: Settings, folder: ThesisFolder, tables: dict[int, LatticeT
     ran_on = machine()
     thesis = settings.thesis
     counts = thesis.timing_runs, thesis.climbing_runs, thesis.climbing_starts
-    identity = json.loads(json.dumps([ran_on, counts, asdict(settings.entropy.network)]))
+    identity = as_read([ran_on, counts, asdict(settings.entropy.network)])
     path = folder.out / "timing.json"
     if path.exists() and (found := read_json(path))["identity"] == identity:
         return found
@@ -183,7 +182,7 @@ def evaluate_thesis(settings: Settings, folder: ThesisFolder) -> FigureInputs:
     test = {views: lattice_tables(settings, folder, views, "test") for views in VIEWS}
     measured = measure(settings, folder, test)
     made = made_by(statistics[40], *folder.networks().values())
-    identity = json.loads(json.dumps([made, asdict(settings.evaluation), measured]))
+    identity = as_read([made, asdict(settings.evaluation), measured])
     path = folder.out / "thesis.json"
     results = read_json(path) if path.exists() else {"identity": None}
     if results["identity"] != identity:

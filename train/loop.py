@@ -21,9 +21,16 @@ from flax import nnx
 from jax.sharding import Mesh
 from tensorboardX import SummaryWriter
 
-from data_pipeline.batches import steps_per_epoch, train_batches, training_splits, validation_batches, validation_splits
+from data_pipeline.batches import (
+    objects_kept,
+    steps_per_epoch,
+    train_batches,
+    training_splits,
+    validation_batches,
+    validation_splits,
+)
 from data_pipeline.builder import DatasetStatistics
-from data_pipeline.files import read_json, write_json, write_text
+from data_pipeline.files import as_read, read_json, write_json, write_text
 from data_pipeline.meshes import DataError
 from data_pipeline.progress import console, progress_bar
 from train.checkpoints import Checkpoints
@@ -50,8 +57,7 @@ class Lead:
 def steps_of_an_epoch(task: Task, statistics: DatasetStatistics) -> int:
     """Steps between two validations: a whole number of passes over the training objects' views."""
     config, objects = task.optimiser, statistics.objects_of(training_splits(task.batches))
-    if task.batches.fold is not None:
-        objects -= objects // task.batches.fold[1]
+    objects = len(objects_kept(objects, task.batches))
     return steps_per_epoch(objects * (config.epoch_views or statistics.views) // config.views_per_object, task.batches)
 
 
@@ -120,9 +126,7 @@ class MetricsLog:
 
 def identity_of(task: Task, statistics: DatasetStatistics, start: StartingWeights | None = None) -> dict[str, Any]:
     """What makes a run this one and no other, as `config.json` holds it."""
-    return json.loads(
-        json.dumps({"task": asdict(task), "data": statistics.fingerprint, "start": start and start.name})  # type: ignore[call-overload]
-    )
+    return as_read({"task": asdict(task), "data": statistics.fingerprint, "start": start and start.name})  # type: ignore[call-overload]
 
 
 def fit(
@@ -246,7 +250,7 @@ def load_best(task: Task, folder: Path) -> nnx.Module:
         raise DataError(f"no trained {task.name} in {folder}; train one with: mevs train")
     structure, like = initial_state(task, task.optimiser.seed)
     saved = read_json(folder / "config.json")["task"]
-    wanted = json.loads(json.dumps(asdict(task)))  # type: ignore[call-overload]
+    wanted = as_read(asdict(task))  # type: ignore[call-overload]
     for name in ("views", "classes"):
         if name in saved and saved[name] != wanted[name]:
             raise DataError(

@@ -13,6 +13,7 @@ import jax.numpy as jnp
 import optax
 from flax import nnx
 
+from data_pipeline.augment import ImageAugmentation, augment_image
 from data_pipeline.batches import ViewBatches
 from data_pipeline.capture import CaptureConfig
 from data_pipeline.inputs import depth_and_normals
@@ -104,8 +105,9 @@ class RecogniserTask:
         labels = batch["label"].reshape(images.shape[:2])[:, 0]
         mirrored = jax.random.bernoulli(mirror, 0.5, (len(images),))
         images, directions = jax.vmap(mirror_views)(mirrored, images, directions)
-        moves = jax.random.randint(move, (*images.shape[:2], 2), -self.shift, self.shift + 1)
-        images = jax.vmap(jax.vmap(partial(_shifted, pad=self.shift)))(images, moves)
+        shift = ImageAugmentation(mirror=False, shift=self.shift)
+        moves = jax.random.split(move, images.shape[:2])
+        images = jax.vmap(jax.vmap(partial(augment_image, config=shift)))(moves, images)
         present = random_sets(sets, len(images), images.shape[1], images.shape[1])
         each, together = network(images, directions, present, train=True, key=drop)
         single = jnp.mean(
@@ -148,8 +150,3 @@ def mirror_views(mirrored: jax.Array, images: jax.Array, directions: jax.Array) 
     return jnp.where(mirrored, flipped, images), jnp.where(
         mirrored, directions * jnp.array([-1.0, 1.0, 1.0]), directions
     )
-
-
-def _shifted(image: jax.Array, move: jax.Array, pad: int) -> jax.Array:
-    padded = jnp.pad(image, ((pad, pad), (pad, pad), (0, 0)))
-    return jax.lax.dynamic_slice(padded, (pad + move[0], pad + move[1], 0), image.shape)

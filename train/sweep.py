@@ -22,7 +22,7 @@ from scipy.stats import qmc
 
 from data_pipeline.batches import train_batches
 from data_pipeline.builder import DatasetStatistics
-from data_pipeline.files import read_json, write_json, write_text
+from data_pipeline.files import as_read, read_json, write_json, write_text
 from data_pipeline.meshes import DataError
 from data_pipeline.progress import console, progress_bar
 from train.checkpoints import Checkpoints
@@ -149,7 +149,7 @@ def sweep(
         DataError: for a configuration that cannot be drawn or shared out, or a folder with another sweep.
         Preempted: after SIGTERM, at the end of an epoch.
     """
-    identity = json.loads(json.dumps({"task": asdict(task), "sweep": asdict(config), "data": statistics.fingerprint}))
+    identity = as_read({"task": asdict(task), "sweep": asdict(config), "data": statistics.fingerprint})
     if (folder / "config.json").exists() and read_json(folder / "config.json") != identity:
         raise DataError(f"{folder} holds a sweep made with other settings; choose another --out, or delete that folder")
     members = draw_members(config, task)
