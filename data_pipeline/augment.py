@@ -6,11 +6,16 @@ that stay in the object's own order of views, and is off.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import jax
 import jax.numpy as jnp
+from jax.scipy.spatial.transform import Rotation
 from jaxtyping import Array, Float
+
+from data_pipeline.capture import CaptureConfig
+from mevs_jax.cameras import look_at_origin
 
 
 @dataclass(frozen=True)
@@ -99,3 +104,69 @@ def augment_image(
         row, column = pad + jnp.round(drawn).astype(jnp.int32)
         image = jax.lax.dynamic_slice(padded, (row, column, 0), image.shape)
     return image
+
+
+@dataclass(frozen=True)
+class ViewAugmentation:
+    """Which changes an object goes through whose views make a training set."""
+
+    mirror: bool = True
+    """half of the time, in the plane x = 0: an object and its mirror image are of one class"""
+    stretch: float = 0.0
+    """along each axis by a factor drawn log-uniformly from at most this much above or below 1: 0.2 for 1/1.2 to 1.2"""
+    turn: bool = False
+    """by any rotation, for objects that do not stand"""
+
+
+def object_changes(key: Array, objects: int, config: ViewAugmentation) -> Float[Array, "objects 3 3"]:
+    """Matrices that change the points of each object, as `config` has it."""
+    mirror, stretch, turn = jax.random.split(key, 3)
+    factors = (1 + config.stretch) ** jax.random.uniform(stretch, (objects, 3), minval=-1.0)
+    if config.mirror:
+        factors = factors * jnp.where(jax.random.bernoulli(mirror, 0.5, (objects, 1)), jnp.array([-1.0, 1.0, 1.0]), 1.0)
+    changes = jax.vmap(jnp.diag)(factors)
+    if config.turn:
+        changes = Rotation.from_quat(jax.random.normal(turn, (objects, 4))).as_matrix() @ changes
+    return changes
+
+
+def views_after(
+    change: Float[Array, "3 3"],
+    images: Float[Array, "views height width 4"],
+    poses: Float[Array, "views 4 4"],
+    camera: CaptureConfig,
+) -> tuple[Float[Array, "views height width 4"], Float[Array, "views 3"]]:
+    """Views of an object whose points were multiplied by a matrix, and the directions that they are from.
+
+    Lines stay lines and keep their order, so what the camera at c sees of an object is, up to a homography, what a camera at
+    A c sees of the changed one: nothing needs to be rendered. The new camera stands at the old distance and looks at the
+    centre, so a stretched object is also a little larger or smaller, and otherwise in each view. Pixels are those nearest to
+    where the new ones were.
+
+    Args:
+        change: A, not far from a rotation or a reflection.
+        images: as of `data_pipeline.inputs.depth_and_normals`.
+        poses: of the cameras that took them.
+    """
+    side, distance = images.shape[1], camera.distance
+    slope = (jnp.arange(side) + 0.5 - side / 2) * (2 * math.tan(math.radians(camera.field_of_view) / 2) / side)
+    across, down = jnp.meshgrid(slope, slope)
+    rays = jnp.stack([across, down, jnp.ones_like(across)], axis=-1)
+    undo = jnp.linalg.inv(change)
+
+    def of_view(image: Array, pose: Array) -> tuple[Array, Array]:
+        position = change @ pose[:3, 3]
+        scale = distance / jnp.linalg.norm(position)
+        back = pose[:3, :3].T @ undo @ look_at_origin(position)[:3, :3]  # directions, to the old camera's frame
+        old = rays @ back.T
+        place = jnp.floor(old[..., :2] / old[..., 2:] / (slope[1] - slope[0]) + side / 2).astype(jnp.int32)
+        inside = jnp.all((place >= 0) & (place < side), axis=-1)
+        place = jnp.clip(place, 0, side - 1)
+        seen = jnp.where(inside[..., None], image[place[..., 1], place[..., 0]], 0.0)
+        depth = scale * (distance + 1 - 2 * seen[..., 0]) / old[..., 2]
+        nearness = jnp.where(seen[..., 0] > 0, (distance + 1 - depth) / 2, 0.0)
+        normals = seen[..., 1:] @ back  # covectors: by the inverse's transpose
+        normals = normals / jnp.maximum(jnp.linalg.norm(normals, axis=-1, keepdims=True), 1e-12)
+        return jnp.concatenate([nearness[..., None], normals], axis=-1), position / jnp.linalg.norm(position)
+
+    return jax.vmap(of_view)(images, poses)

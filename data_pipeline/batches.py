@@ -36,6 +36,7 @@ class ViewBatches:
         fold: train without part k of n of the training objects, (k, n); all of them unless given.
         validation_by: `object`, the sound way; `view`: train on views of the validation objects too, except for a share
             of every object's views (`views_aside`).
+        balanced: in a pass over the training objects those of rarer classes come more often, so that all classes weigh the same.
     """
 
     batch_size: int
@@ -45,6 +46,7 @@ class ViewBatches:
     seed: int = 0
     fold: tuple[int, int] | None = None
     validation_by: Literal["object", "view"] = "object"
+    balanced: bool = False
 
 
 VIEWS_ASIDE = 0.2
@@ -116,12 +118,22 @@ def objects_kept(objects: int, config: ViewBatches) -> np.ndarray:
     return np.flatnonzero(fold_of(objects, folds) != part)
 
 
+def equally_often(objects: np.ndarray, labels: np.ndarray) -> np.ndarray:
+    """The objects, those of rarer classes repeated until there are as many of each class."""
+    _, members = np.unique(labels, return_inverse=True)
+    largest = int(np.bincount(members).max())
+    return np.concatenate([np.resize(objects[members == one], largest) for one in range(members.max() + 1)])
+
+
 class _TrainingObjects:
     """The objects of some splits, one after the other, each with the views that may be trained on."""
 
     def __init__(self, sources: list[Any], config: ViewBatches):
         self._sources, self._config = sources, config
         self._kept = objects_kept(sum(map(len, sources)), config)
+        if config.balanced:
+            labels = [source[index]["label"] for source in sources for index in range(len(source))]
+            self._kept = equally_often(self._kept, np.array(labels)[self._kept])
 
     def __len__(self) -> int:
         return len(self._kept)

@@ -26,7 +26,7 @@ from data_pipeline.builder import DataConfig, DatasetStatistics, load_statistics
 from data_pipeline.files import as_read, read_json, write_json
 from data_pipeline.meshes import DataError
 from data_pipeline.progress import console
-from eval.active_study import OnLattice, study
+from eval.active_study import Learner, OnLattice, study
 from eval.view_tables import load_view_tables, made_by, network_outputs, stored_array
 from mevs_jax.calibration import class_weights, fit_temperature
 from mevs_jax.fusion import CalibratedFusion, SetFusion
@@ -132,7 +132,10 @@ class Stages:
     @property
     def prior(self) -> Array:
         """Log-probabilities of the classes in training. ModelNet10 trains on 883 chairs and 88 bathtubs, and tests on about as
-        many of each; nobody knows how often a robot meets which. So they are taken off all logits."""
+        many of each; nobody knows how often a robot meets which. So they are taken off all logits. Equal where it is trained on
+        as many of each."""
+        if self.config.recogniser.balanced:
+            return jnp.full(len(self.statistics.classes), -jnp.log(len(self.statistics.classes)))
         counts = np.array([self.statistics.counts["train"][name] for name in self.statistics.classes], np.float32)
         return jnp.log(jnp.asarray(counts / counts.sum()))
 
@@ -284,9 +287,13 @@ def _measure_on(stages: Stages, views: int) -> dict[str, Any]:
         for split in ("val", "test")
     }
     console.print(f"Walking {len(on['test'].features.labels)} test objects, {views} candidate views")
+    policy = stages.policy()
     found = study(
         stages.fusion(),
-        {"learnt": stages.policy()},
+        [
+            Learner("learnt", "view policy", policy),
+            Learner("learnt_state", "… by what it expects of the state as it is", policy, "state"),
+        ],
         on["val"],
         on["test"],
         max_views=config.max_views,

@@ -12,7 +12,7 @@ from eval import figures
 from eval.ladder import KNOWS
 from eval.page import ReportInputs, difference, document, image, percent, span, table
 
-METHOD = "learnt_gain"
+METHOD = "learnt"
 """The policy that the page is about."""
 
 

@@ -6,10 +6,10 @@ policy, on its own walks over validation objects: one that picks telling views m
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
-from typing import Any
+from typing import Any, Literal
 
 import jax
 import jax.numpy as jnp
@@ -77,6 +77,16 @@ class Contender:
     draws: int = 1
     max_views: int = 0
     every: int = 1
+
+
+@dataclass(frozen=True)
+class Learner:
+    """A trained view policy in the study, and how it is asked; the other fields are a contender's."""
+
+    name: str
+    title: str
+    network: ViewPolicy
+    by: Literal["belief", "state"] = "belief"
 
 
 def _named(_: Any, name: str) -> Policy:
@@ -240,12 +250,12 @@ _GAP = 3
 
 
 def contenders(
-    policies: dict[str, ViewPolicy], draws: int, oracle_views: int, oracle_starts: int, entropies: bool
+    learners: Sequence[Learner], draws: int, oracle_views: int, oracle_starts: int, entropies: bool
 ) -> list[Contender]:
     """All policies of the study, in the order in which they are shown.
 
     Args:
-        policies: trained ones, by title.
+        learners: those that were trained.
         draws: walks from each start of those that draw.
         oracle_views, oracle_starts: how far oracles walk, which try every candidate, and from every so many-th start.
         entropies: whether predicted and true depth entropies are known.
@@ -263,10 +273,9 @@ def contenders(
             "information_gain", "information gain by a table", "others", partial(_named, name="information_gain")
         ),
     ]
-    for title, network in policies.items():
-        for by, called in (("gain", "expected gain"), ("information", "expected information")):
-            policy_of = partial(_learnt, structure=nnx.graphdef(network), by=by)
-            found.append(Contender(f"{title}_{by}", f"{title.replace('_', ' ')}: {called}", "learnt", policy_of))
+    for learner in learners:
+        policy_of = partial(_learnt, structure=nnx.graphdef(learner.network), by=learner.by)
+        found.append(Contender(learner.name, learner.title, "learnt", policy_of))
     if entropies:
         found.append(
             Contender(
@@ -332,7 +341,7 @@ def random_sets_study(
 
 def study(
     fusion: CalibratedFusion,
-    policies: dict[str, ViewPolicy],
+    learners: Sequence[Learner],
     validation: OnLattice,
     test: OnLattice,
     *,
@@ -346,7 +355,7 @@ def study(
 
     Args:
         fusion: of the recogniser whose features these are.
-        policies: trained view policies, by name; the first is the method, the others ablations.
+        learners: trained view policies, the method and its ablations.
         max_views: of a walk.
         draws: walks from each start of policies that draw.
         oracle_views, oracle_starts: how far oracles walk, and from every so many-th start.
@@ -366,12 +375,10 @@ def study(
     after: dict[str, np.ndarray] = {}
     from_some: dict[str, np.ndarray] = {}  # accuracy from the oracles' starts
     parameters: dict[str, Any] = {"belief_oracle": fusion, "label_oracle": fusion}
-    for title, network in policies.items():
-        given = nnx.state(network, nnx.Param), fusion.single
-        parameters |= {f"{title}_gain": given, f"{title}_information": given}
+    parameters |= {learner.name: (nnx.state(learner.network, nnx.Param), fusion.single) for learner in learners}
     entropies = test.utility is not None and test.entropy is not None
     some_starts = np.arange(0, len(points), oracle_starts)
-    for contender in contenders(policies, draws, oracle_views, oracle_starts, entropies):
+    for contender in contenders(learners, draws, oracle_views, oracle_starts, entropies):
         beliefs = []
         for split, data in enumerate((validation, test)):
             views = walk_all(

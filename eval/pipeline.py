@@ -16,7 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 import tyro
 
-from data_pipeline.augment import CloudAugmentation
+from data_pipeline.augment import CloudAugmentation, ViewAugmentation
 from data_pipeline.builder import DataConfig, DatasetStatistics, load_statistics, prepare, report_left_out
 from data_pipeline.capture import CaptureConfig
 from data_pipeline.files import as_read, read_json, write_json
@@ -111,17 +111,20 @@ SMALL = Settings(
     active=ActiveConfig(
         recogniser=RecogniserConfig(
             network=ResNetConfig(width=32, channels=4, standardise=False, stem="patches"),
+            augmentation=ViewAugmentation(stretch=0.15),
+            balanced=True,
             optimiser=OptimiserConfig(
-                epochs=8,
-                batch_size=128,
-                epoch_views=20,
+                method="muon",
+                epochs=6,
+                batch_size=256,
+                epoch_views=40,
                 validation_views=8,
-                learning_rate=1.5e-3,
+                learning_rate=5e-3,
                 weight_decay=0.05,
                 schedule="cosine",
             ),
         ),
-        fold_epochs=5,
+        fold_epochs=4,
     ),
 )
 """The same study at 64×64 with narrower networks.

@@ -19,7 +19,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from mevs_jax.fusion import CalibratedFusion
-from mevs_jax.models.view_policy import ViewPolicy, expected_information
+from mevs_jax.models.view_policy import ViewPolicy, expected_gain
 from mevs_jax.viewpoints import ViewGraph, local_maxima
 
 
@@ -204,22 +204,22 @@ def _belief_entropy(belief: Float[Array, "*batch classes"]) -> Float[Array, "*ba
 
 
 def learnt(
-    network: ViewPolicy, temperature: float | Float[Array, ""], *, by: Literal["gain", "information"] = "gain"
+    network: ViewPolicy, temperature: float | Float[Array, ""], *, by: Literal["belief", "state"] = "belief"
 ) -> Policy:
     """The view from which `network` expects most.
 
     Args:
         network: trained by `train.policy`.
         temperature: of the logits of single views.
-        by: the expected drop in cross-entropy, or the expected information gain by the beliefs it expects for each class.
+        by: what it expects for each class, weighed by the belief; or what it expects in this state as it is.
     """
 
     def scores(key: Array, state: SelectionState, scene: Scene) -> Float[Array, "views"]:
         del key
         points, present = scene.graph.points, jnp.arange(len(state.views)) < state.count
         views = jax.nn.log_softmax(state.seen.logits / temperature, axis=-1)
-        gain, after = network(state.belief, views, points[state.views], present, points)
-        return gain if by == "gain" else expected_information(state.belief, after)
+        gain, gain_if = network(state.belief, views, points[state.views], present, points)
+        return gain if by == "state" else expected_gain(state.belief, gain_if)
 
     return scores
 

@@ -11,8 +11,10 @@ import numpy as np
 import pytest
 import trimesh
 from flax import nnx
+from scipy.spatial.transform import Rotation
 
-from data_pipeline.batches import ViewBatches, fold_of, train_batches
+from data_pipeline.augment import ViewAugmentation, object_changes, views_after
+from data_pipeline.batches import ViewBatches, equally_often, fold_of, train_batches
 from data_pipeline.builder import load_statistics, open_split, prepare
 from data_pipeline.capture import DEPTH_SCALE, CaptureConfig, capture, rig_for
 from data_pipeline.inputs import depth_and_normals
@@ -21,7 +23,7 @@ from eval.pipeline import TINY
 from mevs_jax.cameras import Camera, look_at_origin, pixel_directions
 from mevs_jax.models import Recogniser, ResNet
 from train.loop import steps_of_an_epoch
-from train.recogniser import RecogniserTask, mirror_views
+from train.recogniser import RecogniserTask
 
 CAMERA = CaptureConfig(views=6, resolution=48)
 
@@ -101,30 +103,64 @@ def test_turned_views_are_stored_with_their_own_poses(turned):
     assert np.abs(examples[0]["pose"] - examples[1]["pose"]).max() > 0.1
 
 
-def test_a_mirrored_view_is_the_mirrored_objects():
+def seen_from(mesh: Mesh, directions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Images of a mesh from some directions, and the cameras' poses."""
+    poses = np.stack([np.asarray(look_at_origin(2 * direction)) for direction in directions])
+    rays = np.stack([np.asarray(pixel_directions(Camera(jnp.asarray(pose), math.radians(60), 48))) for pose in poses])
+    depth = capture(mesh, replace(rig_for(CAMERA), poses=poses, directions=rays)).depth
+    return np.stack([np.asarray(depth_and_normals(jnp.asarray(one, jnp.int32), CAMERA)) for one in depth]), poses
+
+
+DIRECTIONS = np.array([[0.3, 0.8, 0.5], [-0.7, 0.2, -0.6], [0.1, -0.2, 0.97]], np.float32)
+DIRECTIONS /= np.linalg.norm(DIRECTIONS, axis=1, keepdims=True)
+
+
+def test_views_of_an_object_as_it_is_stay_as_they_are():
+    images, poses = seen_from(lopsided(), DIRECTIONS)
+    same, ways = views_after(jnp.eye(3), jnp.asarray(images), jnp.asarray(poses), CAMERA)
+    np.testing.assert_allclose(same, images, atol=1e-5)
+    np.testing.assert_allclose(ways, DIRECTIONS, atol=1e-6)
+
+
+MIRROR, TURN = np.diag([-1.0, 1.0, 1.0]), Rotation.from_rotvec([0.4, -0.9, 0.5]).as_matrix()
+
+
+@pytest.mark.parametrize(
+    "change", [MIRROR, np.diag([1.2, 0.9, 1.05]), TURN, TURN @ MIRROR @ np.diag([0.85, 1.1, 0.95])]
+)
+def test_views_of_a_changed_object_are_those_that_a_camera_takes_of_it(change):
     mesh = lopsided()
-    mirrored = replace(mesh, vertices=mesh.vertices * np.float32([-1, 1, 1]))
-    positions = np.array([[0.3, 0.8, 0.5], [-0.7, 0.2, -0.6]])
-    directions = (positions / np.linalg.norm(positions, axis=1, keepdims=True)).astype(np.float32)
+    images, poses = seen_from(mesh, DIRECTIONS)
+    found, ways = views_after(jnp.asarray(change, jnp.float32), jnp.asarray(images), jnp.asarray(poses), CAMERA)
+    position = poses[:, :3, 3] @ change.T
+    length = np.linalg.norm(position, axis=1)
+    np.testing.assert_allclose(ways, position / length[:, None], atol=1e-6)
+    for view in range(len(images)):  # at its distance the object's size depends on the view
+        points = (mesh.vertices @ change.T * 2 / length[view]).astype(np.float32)
+        expected = seen_from(replace(mesh, vertices=points), np.asarray(ways[view : view + 1]))[0][0]
+        error = np.abs(np.asarray(found[view]) - expected)
+        # The others are at edges, where the nearest pixel lies on the other side.
+        close = (error.max(axis=-1) < 0.05)[expected[..., 0] > 0].mean()
+        assert close > (0.98 if change is MIRROR else 0.4), view
+        assert (error[..., 0] < 0.02).mean() > 0.96, view
 
-    def seen(mesh: Mesh, directions: np.ndarray) -> np.ndarray:
-        rig = rig_for(CaptureConfig(views=2, resolution=48))
-        poses = np.stack([np.asarray(look_at_origin(2 * direction)) for direction in directions])
-        rays = np.stack(
-            [np.asarray(pixel_directions(Camera(jnp.asarray(pose), math.radians(60), 48))) for pose in poses]
-        )
-        depth = capture(mesh, replace(rig, poses=poses, directions=rays)).depth
-        return np.stack([np.asarray(depth_and_normals(jnp.asarray(one, jnp.int32), CAMERA)) for one in depth])
 
-    images, ways = mirror_views(jnp.array(True), jnp.asarray(seen(mesh, directions)), jnp.asarray(directions))
-    expected = seen(mirrored, np.asarray(ways))
-    np.testing.assert_allclose(ways, directions * [-1, 1, 1])
-    same = (
-        np.abs(np.asarray(images) - expected).max(axis=-1) < 0.02
-    )  # rays through silhouettes and creases may fall either way
-    assert same.mean() > 0.99
-    untouched = mirror_views(jnp.array(False), jnp.asarray(images), ways)
-    np.testing.assert_array_equal(untouched[0], images)
+def test_changes_are_drawn_for_each_object():
+    drawn = np.asarray(object_changes(jax.random.key(0), 4000, ViewAugmentation(stretch=0.25)))
+    factors = np.diagonal(drawn, axis1=1, axis2=2)
+    np.testing.assert_array_equal(drawn, factors[:, :, None] * np.eye(3))
+    assert (factors[:, 1:] > 0).all()
+    assert abs((factors[:, 0] < 0).mean() - 0.5) < 0.03
+    sizes = np.log(np.abs(factors))
+    assert np.abs(sizes).max() <= np.log(1.25) + 1e-6
+    np.testing.assert_allclose(sizes.mean(axis=0), 0, atol=0.01)
+    np.testing.assert_allclose(sizes.std(axis=0), np.log(1.25) / math.sqrt(3), rtol=0.05)
+    turned = np.asarray(object_changes(jax.random.key(0), 2000, ViewAugmentation(mirror=False, turn=True)))
+    np.testing.assert_allclose(turned @ turned.swapaxes(1, 2), np.tile(np.eye(3), (2000, 1, 1)), atol=1e-5)
+    np.testing.assert_allclose(np.linalg.det(turned), 1, atol=1e-4)
+    np.testing.assert_allclose(turned.mean(axis=0), 0, atol=0.05)
+    still = object_changes(jax.random.key(0), 3, ViewAugmentation(mirror=False))
+    np.testing.assert_array_equal(still, np.tile(np.eye(3), (3, 1, 1)))
 
 
 def test_a_part_put_aside_is_never_trained_on(turned):
@@ -138,6 +174,18 @@ def test_a_part_put_aside_is_never_trained_on(turned):
         for x in next(batches)["pose"][:, 0, 3]:
             seen.add(int(np.abs(poses - x).min(axis=1).argmin()))
     assert seen == set(np.flatnonzero(~aside).tolist())
+
+
+def test_rare_classes_come_as_often_as_others(turned):
+    labels = np.array([5, 5, 2, 5, 7, 5, 5, 7])
+    drawn = equally_often(np.arange(10, 18), labels)
+    np.testing.assert_array_equal(np.bincount(labels[drawn - 10])[[2, 5, 7]], [5, 5, 5])
+    assert set(drawn) == set(range(10, 18))
+    np.testing.assert_array_equal(np.sort(drawn[labels[drawn - 10] == 5]), [10, 11, 13, 15, 16])
+    counts = load_statistics(turned).counts["train"].values()
+    batches = train_batches(turned, ViewBatches(20, 2, images="depth", balanced=True))
+    in_a_pass = np.concatenate([next(batches)["label"] for _ in range(max(counts))])
+    np.testing.assert_array_equal(np.bincount(in_a_pass), [2 * max(counts)] * len(counts))
 
 
 def test_an_epoch_without_a_part_is_shorter(turned):

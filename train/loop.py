@@ -11,7 +11,7 @@ import json
 import time
 from collections import deque
 from collections.abc import Callable
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -61,13 +61,26 @@ def steps_of_an_epoch(task: Task, statistics: DatasetStatistics) -> int:
     return steps_per_epoch(objects * (config.epoch_views or statistics.views) // config.views_per_object, task.batches)
 
 
+def class_weights_of(task: Task, statistics: DatasetStatistics) -> np.ndarray:
+    """What a validation view of each class counts."""
+    objects = np.array(
+        [
+            sum(statistics.counts[split][name] for split in validation_splits(task.batches))
+            for name in statistics.classes
+        ]
+    )
+    if not task.batches.balanced:
+        return np.ones(len(objects), np.float32)
+    return (objects.sum() / (np.count_nonzero(objects) * np.maximum(objects, 1))).astype(np.float32)
+
+
 def validation_set(
     task: Task, data: Path, statistics: DatasetStatistics, devices: int
 ) -> list[tuple[dict[str, np.ndarray], np.ndarray]]:
     """This process's part of the validation views, in batches of one size, each with the weights of its views.
 
-    `devices` of all processes share a batch. Weights are 1, and 0 for what fills batches up, so that all of them, in all
-    processes, are of one program.
+    `devices` of all processes share a batch. Weights are 1 (where training is `balanced`, such that every class weighs the same),
+    and 0 for what fills batches up, so that all of them, in all processes, are of one program.
     """
     index, processes = jax.process_index(), jax.process_count()
     objects = statistics.objects_of(validation_splits(task.batches))
@@ -79,7 +92,8 @@ def validation_set(
     size = -(-min(256, most) // own_devices) * own_devices
     count = -(-most // size)
     weights = np.zeros(count * size, np.float32)
-    weights[: len(whole["label"])] = index < objects
+    if index < objects:
+        weights[: len(whole["label"])] = class_weights_of(task, statistics)[whole["label"]]
     whole = {name: np.resize(array, (count * size, *array.shape[1:])) for name, array in whole.items()}
     pieces = [slice(i * size, (i + 1) * size) for i in range(count)]
     return [({name: array[piece] for name, array in whole.items()}, weights[piece]) for piece in pieces]
@@ -248,8 +262,9 @@ def load_best(task: Task, folder: Path) -> nnx.Module:
     """
     if not (folder / "best").is_dir():
         raise DataError(f"no trained {task.name} in {folder}; train one with: mevs train")
-    structure, like = initial_state(task, task.optimiser.seed)
     saved = read_json(folder / "config.json")["task"]
+    optimiser = replace(task.optimiser, method=saved["optimiser"]["method"])  # whose moments lie beside the weights
+    structure, like = initial_state(replace(task, optimiser=optimiser), task.optimiser.seed)  # type: ignore[type-var]
     wanted = as_read(asdict(task))  # type: ignore[call-overload]
     for name in ("views", "classes"):
         if name in saved and saved[name] != wanted[name]:

@@ -9,6 +9,7 @@ from typing import Literal
 import jax
 import jax.numpy as jnp
 import optax
+from optax.contrib import MuonDimensionNumbers, muon
 
 
 @dataclass(frozen=True)
@@ -30,8 +31,11 @@ class OptimiserConfig:
     """views of each training object in an epoch; 0 for all of them"""
     validation_views: int = 0
     """views of each validation object that are looked at after an epoch; 0 for all of them"""
+    method: Literal["adam", "muon"] = "adam"
+    """muon: steps of equal size in all directions of a layer's matrix (Jordan et al. 2024), fewer of them for the same loss,
+    Adam for what is no matrix; else Adam throughout, as the thesis has it"""
     learning_rate: float = 1e-3
-    """of Adam, at the start"""
+    """at the start, or once warm"""
     weight_decay: float = 0.0
     """decoupled (AdamW)"""
     schedule: Literal["constant", "cosine", "steps"] = "constant"
@@ -44,6 +48,28 @@ class OptimiserConfig:
     """of initial weights, augmentation and dropout"""
     data_seed: int = 0
     """of the batches"""
+
+
+_FEWEST = 16  # a matrix with no more rows or columns than this is a head or an embedding, which Muon is not for
+
+
+def _as_matrix(weights: jax.Array) -> MuonDimensionNumbers | None:
+    if weights.ndim == 4:
+        return MuonDimensionNumbers(reduction_axis=(0, 1, 2), output_axis=3)
+    return MuonDimensionNumbers(0, 1) if weights.ndim == 2 and min(weights.shape) > _FEWEST else None
+
+
+def descent(config: OptimiserConfig) -> optax.GradientTransformation:
+    """Gradients to the direction that, times the learning rate, is taken off the weights.
+
+    Muon's is scaled to Adam's usual size (Liu et al. 2025), so that one learning rate does for all weights.
+    """
+    if config.method == "adam":
+        return optax.scale_by_adam()
+    # Optax has Muon only together with the rate, which here may differ between the members of a sweep: −1 leaves the sign.
+    return muon(
+        -1.0, consistent_rms=0.2, muon_weight_dimension_numbers=lambda weights: jax.tree.map(_as_matrix, weights)
+    )
 
 
 def learning_rate(config: OptimiserConfig, steps: int) -> Callable[[jax.Array, jax.Array | float], jax.Array]:

@@ -1,10 +1,10 @@
 """Training of the view policy on what looking was worth: exact, and free, since every view of a training object is at hand.
 
 For objects whose features are known from all candidate views, the belief after any set of views and one more is one call of
-the fusion. So for a state (a set seen) each candidate's label is the drop in cross-entropy that it brings. Encoder and fusion
-that trained on an object are sure of it from any view, and there would be nothing to learn: labels of each part of the training
-objects come from a recogniser that was trained without it (cross-fitting). Later rounds add the states to which the policy
-itself leads (DAgger; Ross et al. 2011).
+the fusion. So for a state (a set seen) each candidate's label is by how much it makes the true class more probable. Encoder and
+fusion that trained on an object are sure of it from any view, and there would be nothing to learn: labels of each part of the
+training objects come from a recogniser that was trained without it (cross-fitting). Later rounds add the states to which the
+policy itself leads (DAgger; Ross et al. 2011).
 """
 
 from __future__ import annotations
@@ -12,13 +12,12 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Any
+from typing import Any, Literal
 
 import flax.struct
 import jax
 import jax.numpy as jnp
 import numpy as np
-import optax
 from flax import nnx
 from jaxtyping import Array, Bool, Float, Int
 
@@ -56,8 +55,10 @@ class PolicyConfig(AveragedConfig):
     """views not seen yet that a state is asked about"""
     rounds: int = 3
     """the first walks at random, the others as the policy of the round before says (DAgger)"""
+    utility: Literal["probability", "log"] = "probability"
+    """what a belief is worth: the true class's probability, or its logarithm"""
     floor: float = 0.01
-    """added to probabilities in cross-entropies: one object that all are wrong about must not outweigh all others"""
+    """added to probabilities in logarithms: one object that all are wrong about must not outweigh all others"""
 
 
 @flax.struct.dataclass
@@ -70,8 +71,7 @@ class Choices:
         directions: of the views seen.
         present: which of them there are.
         candidates: directions of some views that were not seen.
-        gain: drop in cross-entropy in nats that each brings.
-        after: log-probabilities after each.
+        gain: in utility that each brings.
         label: the true class.
         weight: how much the state counts.
     """
@@ -82,7 +82,6 @@ class Choices:
     present: Bool[Array, "states seen"]
     candidates: Float[Array, "states candidates 3"]
     gain: Float[Array, "states candidates"]
-    after: Float[Array, "states candidates classes"]
     label: Int[Array, "states"]
     weight: Float[Array, "states"]
 
@@ -135,9 +134,14 @@ def walk(
     return in_chunks(lambda some: _walk_some(some, *rest), (keys, data), 64)
 
 
-@partial(jax.jit, static_argnames="floor")
-def _choices_of_some(fusion: CalibratedFusion, some: tuple[Features, Array, Array], floor: float) -> Choices:
+@partial(jax.jit, static_argnames="config")
+def _choices_of_some(fusion: CalibratedFusion, some: tuple[Features, Array, Array], config: PolicyConfig) -> Choices:
     most = some[1].shape[-1]
+
+    def worth(log_probability: Array) -> Array:
+        if config.utility == "probability":
+            return jnp.exp(log_probability)
+        return jnp.logaddexp(log_probability, jnp.log(config.floor))
 
     def of_object(one: Features, walks: Array, asked: Array) -> Choices:
         single = jax.nn.log_softmax(one.logits / fusion.single, axis=-1)
@@ -155,10 +159,9 @@ def _choices_of_some(fusion: CalibratedFusion, some: tuple[Features, Array, Arra
                 )
 
             after = jax.vmap(with_one_more)(asked)
-            own = jnp.logaddexp(after[:, one.labels], jnp.log(floor))
-            gain = own - jnp.logaddexp(belief[one.labels], jnp.log(floor))
+            gain = worth(after[:, one.labels]) - worth(belief[one.labels])
             known = belief, single[order], directions, present, one.directions[asked]
-            return Choices(*known, gain, after, one.labels, jnp.float32(1))
+            return Choices(*known, gain, one.labels, jnp.float32(1))
 
         of_walk = jax.vmap(of_state, (None, 0, 0))
         return jax.vmap(of_walk, (0, None, 0))(walks, jnp.arange(1, most + 1), asked)
@@ -182,21 +185,24 @@ def choices_along(
     data: Features,
     walks: Int[np.ndarray, "objects walks most"],
     asked: Int[np.ndarray, "objects walks most candidates"],
-    floor: float,
+    config: PolicyConfig,
 ) -> Choices:
     """Every state along some walks, with what each candidate `asked` about would bring there; arrays of the host."""
-    found = in_chunks(partial(_choices_of_some, fusion, floor=floor), (data, walks, asked), 16)
+    found = in_chunks(partial(_choices_of_some, fusion, config=config), (data, walks, asked), 16)
     return jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[3:]), found)
 
 
 def policy_loss(network: ViewPolicy, some: Choices) -> tuple[Array, dict[str, Array]]:
-    """Mean over candidates: Huber of the expected gain, and divergence of the belief expected for the true class."""
-    gain, after = network(some.belief, some.views, some.directions, some.present, some.candidates)
-    own = jnp.take_along_axis(after, some.label[:, None, None, None], axis=2)[:, :, 0]
+    """Mean over candidates of the squared errors of the gain that is expected, without and with knowing the true class.
+
+    Squared, because the mean is wanted: a telling view changes little most of the time and much now and then.
+    """
+    gain, gain_if = network(some.belief, some.views, some.directions, some.present, some.candidates)
+    own = jnp.take_along_axis(gain_if, some.label[:, None, None], axis=2)[:, :, 0]
     weight = some.weight[:, None] / jnp.sum(some.weight)
-    worth = jnp.mean(jnp.sum(weight * optax.losses.huber_loss(gain, some.gain, delta=1.0), axis=0))
-    beliefs = jnp.mean(jnp.sum(weight * jnp.sum(jnp.exp(some.after) * (some.after - own), axis=-1), axis=0))
-    return worth + beliefs, {"worth": worth, "beliefs": beliefs}
+    known = {"gain": gain, "gain_if": own}
+    errors = {name: jnp.mean(jnp.sum(weight * (found - some.gain) ** 2, axis=0)) for name, found in known.items()}
+    return errors["gain"] + errors["gain_if"], errors
 
 
 def new_policy(config: PolicyConfig, classes: int) -> ViewPolicy:
@@ -247,7 +253,7 @@ def train_policy(
             keys = jax.random.fold_in(jax.random.fold_in(key, number), part)
             views = walk(keys, fusion, data, policy_of, given, config.most_seen, config.walks)
             asked = unseen(views, data.features.shape[1], config.candidates, config.seed + 100 * number + part)
-            found.append(choices_along(fusion, data, views, asked, config.floor))
+            found.append(choices_along(fusion, data, views, asked, config))
         gathered.append((_joined(found[:-1]), found[-1]))
         train, check = (_balanced(_joined([one[side] for one in gathered])) for side in (0, 1))
         policy, history = _fit(config, new_policy(config, parts[0][1].logits.shape[-1]), train, check)

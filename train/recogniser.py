@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import optax
 from flax import nnx
 
-from data_pipeline.augment import ImageAugmentation, augment_image
+from data_pipeline.augment import ImageAugmentation, ViewAugmentation, augment_image, object_changes, views_after
 from data_pipeline.batches import ViewBatches
 from data_pipeline.capture import CaptureConfig
 from data_pipeline.inputs import depth_and_normals
@@ -32,8 +32,12 @@ class RecogniserConfig:
     """the encoder, which sees depth and normals: four channels"""
     fusion: SetFusionConfig = SetFusionConfig()
     """the set fusion"""
+    augmentation: ViewAugmentation = ViewAugmentation()
+    """of training objects"""
     shift: int = 3
     """pixels by which training images are shifted in each direction at most"""
+    balanced: bool = False
+    """train on as many objects of each class, those of rarer ones more often; else as many as there are"""
     optimiser: OptimiserConfig = OptimiserConfig()
 
 
@@ -45,7 +49,9 @@ class RecogniserTask:
     fusion_config: SetFusionConfig
     classes: int
     camera: CaptureConfig
+    augmentation: ViewAugmentation
     shift: int
+    balanced: bool
     optimiser: OptimiserConfig
     fold: tuple[int, int] | None = None
     """trained without part k of n of the training objects"""
@@ -56,13 +62,29 @@ class RecogniserTask:
         cls, config: RecogniserConfig, classes: int, camera: CaptureConfig, fold: tuple[int, int] | None = None
     ) -> RecogniserTask:
         name = "recogniser" if fold is None else f"recogniser without part {fold[0] + 1} of {fold[1]}"
-        return cls(config.network, config.fusion, classes, camera, config.shift, config.optimiser, fold, name)
+        return cls(
+            config.network,
+            config.fusion,
+            classes,
+            camera,
+            config.augmentation,
+            config.shift,
+            config.balanced,
+            config.optimiser,
+            fold,
+            name,
+        )
 
     @property
     def batches(self) -> ViewBatches:
         config = self.optimiser
         return ViewBatches(
-            config.batch_size, config.views_per_object, images="depth", seed=config.data_seed, fold=self.fold
+            config.batch_size,
+            config.views_per_object,
+            images="depth",
+            seed=config.data_seed,
+            fold=self.fold,
+            balanced=self.balanced,
         )
 
     @property
@@ -99,12 +121,12 @@ class RecogniserTask:
         self, network: Recogniser, batch: Batch, key: jax.Array, samples: jax.Array, hyper: Hyperparameters
     ) -> tuple[jax.Array, Metrics]:
         del samples, hyper
-        mirror, move, sets, drop = jax.random.split(key, 4)
+        change, move, sets, drop = jax.random.split(key, 4)
         by_object = partial(_by_object, views=self.optimiser.views_per_object)
-        images, directions = by_object(self.inputs(batch)), by_object(self.directions(batch))
+        images, poses = by_object(self.inputs(batch)), by_object(batch["pose"])
         labels = batch["label"].reshape(images.shape[:2])[:, 0]
-        mirrored = jax.random.bernoulli(mirror, 0.5, (len(images),))
-        images, directions = jax.vmap(mirror_views)(mirrored, images, directions)
+        changes = object_changes(change, len(images), self.augmentation)
+        images, directions = jax.vmap(partial(views_after, camera=self.camera))(changes, images, poses)
         shift = ImageAugmentation(mirror=False, shift=self.shift)
         moves = jax.random.split(move, images.shape[:2])
         images = jax.vmap(jax.vmap(partial(augment_image, config=shift)))(moves, images)
@@ -138,15 +160,3 @@ class RecogniserTask:
 
 def _by_object(array: jax.Array, views: int) -> jax.Array:
     return array.reshape(-1, views, *array.shape[1:])
-
-
-def mirror_views(mirrored: jax.Array, images: jax.Array, directions: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Views (views, height, width, 4) and directions of an object's mirror image, if `mirrored`.
-
-    The mirror is the plane x = 0: what a camera sees of the mirrored object from the mirrored direction is its image of the
-    object, left to right. Normals turn their first component over.
-    """
-    flipped = images[:, :, ::-1] * jnp.array([1.0, -1.0, 1.0, 1.0])
-    return jnp.where(mirrored, flipped, images), jnp.where(
-        mirrored, directions * jnp.array([-1.0, 1.0, 1.0]), directions
-    )

@@ -17,12 +17,11 @@ import optax
 from flax import nnx
 
 from data_pipeline.batches import ViewBatches
-from train.optimiser import OptimiserConfig, learning_rate
+from train.optimiser import OptimiserConfig, descent, learning_rate
 from train.pretrained import StartingWeights
 
 Batch = dict[str, jax.Array]
 Metrics = dict[str, jax.Array]
-_ADAM = optax.scale_by_adam()
 
 
 @flax.struct.dataclass
@@ -94,9 +93,9 @@ class TrainState:
 
     Attributes:
         step: steps done.
-        parameters: what Adam changes.
+        parameters: what is learnt.
         statistics: of batch norm.
-        moments: Adam's.
+        moments: of the gradients, what the optimiser remembers.
         sums: of the metrics, over the steps of this epoch.
     """
 
@@ -116,7 +115,8 @@ def initial_state(
         start.put(network)
     structure, parameters, *rest = nnx.split(network, nnx.Param, ...)
     sums = {name: jnp.zeros(()) for name in task.metrics}
-    return structure, TrainState(jnp.zeros((), jnp.int32), parameters, rest[0], _ADAM.init(parameters), sums)
+    moments = descent(task.optimiser).init(parameters)
+    return structure, TrainState(jnp.zeros((), jnp.int32), parameters, rest[0], moments, sums)
 
 
 def train_step_of(
@@ -127,7 +127,7 @@ def train_step_of(
     The gradient is that of the mean over the whole batch, however many `parts` it comes in.
     """
     config = task.optimiser
-    rate = learning_rate(config, epoch_steps * config.epochs)
+    method, rate = descent(config), learning_rate(config, epoch_steps * config.epochs)
 
     def gradients_of(state: TrainState, statistics: nnx.State, batch: Batch, key: jax.Array, hyper: Hyperparameters):
         def loss_of(parameters: nnx.State):
@@ -160,7 +160,7 @@ def train_step_of(
             gradients, metrics, statistics = gradients_of(state, state.statistics, batch, key, hyper)
         else:
             gradients, metrics, statistics = accumulated(state, batch, key, hyper)
-        direction, moments = _ADAM.update(gradients, state.moments)
+        direction, moments = method.update(gradients, state.moments, state.parameters)
         step_size = rate(state.step, hyper.learning_rate)
         parameters = jax.tree.map(
             lambda old, way: old - step_size * (way + hyper.weight_decay * old), state.parameters, direction

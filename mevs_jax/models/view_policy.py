@@ -61,8 +61,7 @@ class ViewPolicy(nnx.Module):
         self.blocks = nnx.List([_CrossBlock(width, heads, rngs=rngs) for _ in range(blocks)])
         self.known_norm, self.last_norm = nnx.LayerNorm(width, rngs=rngs), nnx.LayerNorm(width, rngs=rngs)
         self.gain = nnx.Linear(width, 1, rngs=rngs)
-        small = nnx.initializers.normal(1e-3)
-        self.evidence = nnx.Linear(width, classes * classes, kernel_init=small, rngs=rngs)
+        self.gain_if = nnx.Linear(width, classes, rngs=rngs)
 
     def __call__(
         self,
@@ -71,7 +70,7 @@ class ViewPolicy(nnx.Module):
         directions: Float[AnyArray, "*batch seen 3"],
         present: Bool[AnyArray, "*batch seen"],
         candidates: Float[AnyArray, "*batch candidates 3"],
-    ) -> tuple[Float[Array, "*batch candidates"], Float[Array, "*batch candidates classes classes"]]:
+    ) -> tuple[Float[Array, "*batch candidates"], Float[Array, "*batch candidates classes"]]:
         """The worth of each candidate, said twice.
 
         Args:
@@ -82,8 +81,8 @@ class ViewPolicy(nnx.Module):
             candidates: unit vectors to where the camera may go.
 
         Returns:
-            The expected drop in cross-entropy in nats; and [j, y]: the log-probabilities that the belief is expected to have
-            after candidate j if the object is of class y.
+            By how much the utility is expected to rise (`train.policy`: the true class's probability or its logarithm); and
+            [j, y]: by how much with candidate j should the class be y.
         """
         belief, views, present = jnp.asarray(belief), jnp.asarray(views), jnp.asarray(present)
         spare = present[..., None]
@@ -99,17 +98,18 @@ class ViewPolicy(nnx.Module):
         for block in self.blocks:
             queries = block(queries, tokens, there)
         queries = self.last_norm(queries)
-        evidence = self.evidence(queries).reshape(*queries.shape[:-1], self.classes, self.classes)
-        after = jax.nn.log_softmax(belief[..., None, None, :] + evidence, axis=-1)
-        return self.gain(queries)[..., 0], after
+        return self.gain(queries)[..., 0], self.gain_if(queries)
 
 
-def expected_information(
-    belief: Float[AnyArray, "*batch classes"], after: Float[AnyArray, "*batch candidates classes classes"]
+def expected_gain(
+    belief: Float[AnyArray, "*batch classes"], gain_if: Float[AnyArray, "*batch candidates classes"]
 ) -> Float[Array, "*batch candidates"]:
-    """Expected drop of the belief's entropy in nats: H(p) − Σ_y p(y) H(after[j, y]), both of log-probabilities."""
-    belief, after = jnp.asarray(belief), jnp.asarray(after)
-    probability = jnp.exp(belief)
-    entropy = -jnp.sum(jnp.exp(after) * after, axis=-1)
-    now = -jnp.sum(probability * belief, axis=-1)
-    return now[..., None] - jnp.einsum("...y,...jy->...j", probability, entropy)
+    """What is expected for each class, weighed by the belief: Σ_y p(y) gain_if[j, y].
+
+    The belief's log-probabilities have to keep their word.
+
+    Of gains in log-probability this is the expected information gain: with p′ the belief after the view,
+    Σ_y p(y) E[log p′(y) | y] + H(p). The mean of logarithms is what is predicted, not the logarithm of a mean belief, whose
+    entropy would be too high.
+    """
+    return jnp.einsum("...y,...jy->...j", jnp.exp(jnp.asarray(belief)), jnp.asarray(gain_if))
