@@ -1,10 +1,10 @@
 """Learnt fusion and learnt choice, on a real data set: what `mevs active` trains, and how it is measured.
 
 Stages, each of which skips what is done: views from turned directions; a recogniser on them, and one for each part of the
-training objects that never saw it; features of every view; the fusion on sets of all sizes; the view policy; walks of every
+training objects that never saw it; features of every view; the view policy; walks of every
 test object from every start. Everything that is chosen or fitted, temperatures among it, is so on validation objects.
 
-In a run's folder: `active/turned/` (data), `active/seed_0/` with `recogniser/`, `fold_0/`, …, `features/`, `fusion/`, `policy/`;
+In a run's folder: `active/turned/` (data), `active/seed_0/` with `recogniser/`, `fold_0/`, …, `features/`, `policy/`;
 and `active/metrics.json`.
 """
 
@@ -32,7 +32,7 @@ from mevs_jax.calibration import class_weights, fit_temperature
 from mevs_jax.fusion import CalibratedFusion, SetFusion
 from mevs_jax.models import Recogniser, ViewPolicy
 from train.checkpoints import Checkpoints
-from train.fusion import Features, FusionConfig, sets_of_size, train_fusion
+from train.fusion import Features, sets_of_size
 from train.loop import fit, load_best
 from train.policy import PolicyConfig, new_policy, train_policy
 from train.recogniser import RecogniserConfig, RecogniserTask
@@ -48,9 +48,6 @@ class ActiveConfig:
     """parts of the training objects, for labels by recognisers that never saw an object"""
     fold_epochs: int = 0
     """of those recognisers; 0 for as many as the recogniser itself"""
-    fusion: FusionConfig = FusionConfig(largest_set=40, epochs=0)
-    """of the fusion's training on features, after that with the encoder; none by default, since features of objects that the
-    encoder was trained on are surer than those of others: on validation objects it was best before its first epoch"""
     policy: PolicyConfig = PolicyConfig()
     seeds: int = 1
     """whole trainings, each from other random weights"""
@@ -139,53 +136,37 @@ class Stages:
         counts = np.array([self.statistics.counts["train"][name] for name in self.statistics.classes], np.float32)
         return jnp.log(jnp.asarray(counts / counts.sum()))
 
-    def fusion(self, fold: int | None = None) -> CalibratedFusion:
-        """The recogniser's fusion; trained on further, with its encoder as it is, where that is of all training objects."""
-        own = self.recogniser_folder(fold)
+    def fusion(self, fold: int | None = None, posed: bool = True) -> CalibratedFusion:
+        """The recogniser's fusion, with temperatures, for objects of known or of unknown pose."""
         validation = self.features("turned_val" if fold is None else f"fold_{fold}_val", self.turned, "val", fold)
-        recogniser = load_best(self.task(fold), own)
+        recogniser = load_best(self.task(fold), self.recogniser_folder(fold))
         assert isinstance(recogniser, Recogniser)
-        network = recogniser.fusion
-        if fold is None and self.config.fusion.epochs:
-            network = self._fusion_of_all(network, validation)
-        return calibrated(network, validation, self.prior)
+        return calibrated(recogniser.fusion, validation, self.prior, posed)
 
-    def _fusion_of_all(self, start: SetFusion, validation: Features) -> SetFusion:
-        config = replace(self.config.fusion, seed=self.seed)
+    def policy_folder(self, posed: bool = True) -> Path:
+        return self.folder / ("policy" if posed else "policy_unposed")
 
-        def train() -> tuple[SetFusion, dict[str, Any]]:
-            data = self.features("turned_train", self.turned, "train")
-            console.print(f"Training the set fusion on {len(data.labels)} objects, {config.epochs} epochs")
-            return train_fusion(config, data, validation, start)
-
-        identity = {"made_by": made_by(self.statistics, self.recogniser_folder()), "of": asdict(self.config.fusion)}
-        return _made_once(self.folder / "fusion", identity, start, train)
-
-    def policy(self) -> ViewPolicy:
-        """The view policy, with labels by the recognisers of the parts."""
+    def policy(self, posed: bool = True) -> ViewPolicy:
+        """The view policy, with labels by the recognisers of the parts, for objects of known or of unknown pose."""
         config, folds = replace(self.config.policy, seed=self.seed), range(self.config.folds)
 
         def train() -> tuple[ViewPolicy, dict[str, Any]]:
-            main = self.fusion(), self.features("turned_val", self.turned, "val")
+            main = self.fusion(posed=posed), self.features("turned_val", self.turned, "val")
             part_of = fold_of(len(open_split(self.turned, "train")), self.config.folds)
             parts = []
             for fold in folds:
                 held_out = np.flatnonzero(part_of == fold)
                 data = self.features(f"fold_{fold}_train", self.turned, "train", fold, held_out)
-                parts.append((self.fusion(fold), data))
+                parts.append((self.fusion(fold, posed), data))
             console.print(f"Training the view policy, {config.rounds} rounds")
             policy, histories = train_policy(config, parts, main)
             return policy, {"rounds": histories}
 
-        identity = {
-            "made_by": made_by(
-                self.statistics, self.recogniser_folder(), *(self.recogniser_folder(fold) for fold in folds)
-            ),
-            "fusion": asdict(self.config.fusion),
-            "of": asdict(self.config.policy),
-        }
-        untrained = new_policy(config, len(self.statistics.classes))
-        return _made_once(self.folder / "policy", identity, untrained, train)
+        made = (self.recogniser_folder(fold) for fold in (None, *folds))
+        identity = {"made_by": made_by(self.statistics, *made), "of": asdict(self.config.policy)}
+        return _made_once(
+            self.policy_folder(posed), identity, new_policy(config, len(self.statistics.classes), posed), train
+        )
 
 
 Network = TypeVar("Network", bound=nnx.Module)
@@ -216,12 +197,13 @@ def _see(network: Recogniser, task: Task, batch: Batch) -> jax.Array:
 
 
 def calibrated(
-    network: SetFusion, validation: Features, prior: Float[Array, "classes"], draws: int = 4
+    network: SetFusion, validation: Features, prior: Float[Array, "classes"], posed: bool = True, draws: int = 4
 ) -> CalibratedFusion:
     """With temperatures fitted on random sets of views of validation objects, every class weighing the same.
 
     Args:
         prior: log-probabilities of the classes in training; the validation's logits of single views are without it already.
+        posed: whether the objects' pose is known.
         draws: sets of each size for each object.
     """
     structure, state = nnx.split(network)
@@ -230,7 +212,7 @@ def calibrated(
 
     @jax.jit
     def temperature(present: Bool[Array, "draws objects views"]) -> Array:
-        fuse = partial(nnx.merge(structure, state), validation.features, validation.directions)
+        fuse = partial(nnx.merge(structure, state), validation.features, validation.directions, posed=posed)
         return fitted(jax.lax.map(fuse, present) - prior, jnp.tile(validation.labels, draws))
 
     def fitted(logits: Array, truth: Array) -> Array:
@@ -239,7 +221,7 @@ def calibrated(
     found = [float(temperature(sets_of_size(objects, views, size, draws))) for size in sizes]
     every = np.exp(np.interp(np.log(np.arange(1, views + 1)), np.log(sizes), np.log(found)))
     single = fitted(validation.logits, jnp.repeat(validation.labels, views))
-    return CalibratedFusion(structure, state, prior, jnp.asarray(every, jnp.float32), single)
+    return CalibratedFusion(structure, state, prior, jnp.asarray(every, jnp.float32), single, posed)
 
 
 def lattice_data(dataset: DataConfig, out: Path, views: int) -> Path:
@@ -255,28 +237,29 @@ def train_all(stages: Stages) -> None:
     stages.prepare()
     for fold in (None, *range(stages.config.folds)):
         stages.train_recogniser(fold)
-    stages.policy()
+    for posed in (True, False):
+        stages.policy(posed)
 
 
 def measure(stages: Stages) -> dict[str, Any]:
-    """What one seed's networks reach, by number of candidate views; each lattice's is kept in a file of the seed's folder."""
-    config = stages.config
+    """What one seed's networks reach: by number of candidate views, and where nobody knows which way the objects face. What is
+    found on a lattice is kept in a file of the seed's folder."""
+    own = stages.dataset.capture.views
     return {
-        "lattices": {
-            str(views): _measure_on(stages, views) for views in (stages.dataset.capture.views, *config.lattices)
-        }
+        "lattices": {str(views): _measure_on(stages, views) for views in (own, *stages.config.lattices)},
+        "unposed": {str(own): _measure_on(stages, own, posed=False)},
     }
 
 
-def _measure_on(stages: Stages, views: int) -> dict[str, Any]:
-    config, path = stages.config, stages.folder / f"metrics_{views}.json"
+def _measure_on(stages: Stages, views: int, posed: bool = True) -> dict[str, Any]:
+    config, path = stages.config, stages.folder / f"metrics_{views}{'' if posed else '_unposed'}.json"
     data = lattice_data(stages.dataset, stages.out, views)
     with_entropies = _entropies(stages.out, data, "test")[0] is not None
+    policy = stages.policy(posed)
     identity = as_read(
         {
             "made_by": made_by(load_statistics(data), stages.recogniser_folder()),
-            "fusion": asdict(config.fusion),
-            "policy": read_json(stages.folder / "policy" / "summary.json")["identity"],
+            "policy": read_json(stages.policy_folder(posed) / "summary.json")["identity"],
             "walks": [config.max_views, config.draws, with_entropies],
         }
     )
@@ -286,10 +269,12 @@ def _measure_on(stages: Stages, views: int) -> dict[str, Any]:
         split: OnLattice(stages.features(f"lattice_{views}_{split}", data, split), *_entropies(stages.out, data, split))
         for split in ("val", "test")
     }
-    console.print(f"Walking {len(on['test'].features.labels)} test objects, {views} candidate views")
-    policy = stages.policy()
+    console.print(
+        f"Walking {len(on['test'].features.labels)} test objects, {views} candidate views"
+        + ("" if posed else ", which way they face unknown")
+    )
     found = study(
-        stages.fusion(),
+        stages.fusion(posed=posed),
         [
             Learner("learnt", "view policy", policy),
             Learner("learnt_state", "… by what it expects of the state as it is", policy, "state"),

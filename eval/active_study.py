@@ -250,7 +250,7 @@ _GAP = 3
 
 
 def contenders(
-    learners: Sequence[Learner], draws: int, oracle_views: int, oracle_starts: int, entropies: bool
+    learners: Sequence[Learner], draws: int, oracle_views: int, oracle_starts: int, entropies: bool, posed: bool
 ) -> list[Contender]:
     """All policies of the study, in the order in which they are shown.
 
@@ -259,6 +259,7 @@ def contenders(
         draws: walks from each start of those that draw.
         oracle_views, oracle_starts: how far oracles walk, which try every candidate, and from every so many-th start.
         entropies: whether predicted and true depth entropies are known.
+        posed: whether the objects' pose is, without which no view of the lattice is known to be a good one.
     """
     found = [
         Contender("random", "random", "nothing", partial(_named, name="random"), False, draws),
@@ -267,12 +268,14 @@ def contenders(
     if entropies:
         named = partial(_named, name="predicted_entropy")
         found.append(Contender("predicted_entropy", "PointNet++ entropy (thesis)", "networks", named, False))
-    found += [
+    known = [
         Contender("fixed_order", "best fixed order", "others", partial(_named, name="fixed_order"), False),
         Contender(
             "information_gain", "information gain by a table", "others", partial(_named, name="information_gain")
         ),
     ]
+    if posed:
+        found += known
     for learner in learners:
         policy_of = partial(_learnt, structure=nnx.graphdef(learner.network), by=learner.by)
         found.append(Contender(learner.name, learner.title, "learnt", policy_of))
@@ -363,7 +366,7 @@ def study(
     points, labels = test.features.directions[0], test.features.labels
     graph = ViewGraph.from_points(np.asarray(points, np.float64))
     max_views, oracle_views = min(max_views, len(points)), min(oracle_views, len(points))
-    knowledge = learn(fusion, validation.features, max_views)
+    knowledge = learn(fusion, validation.features, max_views) if fusion.posed else None
     found: dict[str, Any] = {
         "objects": len(labels),
         "validation_objects": len(validation.features.labels),
@@ -376,9 +379,9 @@ def study(
     from_some: dict[str, np.ndarray] = {}  # accuracy from the oracles' starts
     parameters: dict[str, Any] = {"belief_oracle": fusion, "label_oracle": fusion}
     parameters |= {learner.name: (nnx.state(learner.network, nnx.Param), fusion.single) for learner in learners}
-    entropies = test.utility is not None and test.entropy is not None
+    entropies = fusion.posed and test.utility is not None and test.entropy is not None
     some_starts = np.arange(0, len(points), oracle_starts)
-    for contender in contenders(learners, draws, oracle_views, oracle_starts, entropies):
+    for contender in contenders(learners, draws, oracle_views, oracle_starts, entropies, fusion.posed):
         beliefs = []
         for split, data in enumerate((validation, test)):
             views = walk_all(
@@ -407,6 +410,7 @@ def study(
             if name not in (base, "belief_oracle", "label_oracle")  # which walk from some starts only
         }
         for base in BASELINES
+        if base in after
     }
     found["gap_closed"] = {
         name: _gap_closed(from_some[name], from_some["random"], from_some["belief_oracle"])

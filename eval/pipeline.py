@@ -41,7 +41,7 @@ from mevs_jax.policies import POLICIES
 from mevs_jax.viewpoints import ViewGraph
 from train.classifier import ClassifierConfig, ClassifierTask, ResNetConfig
 from train.entropy import EntropyConfig, EntropyTask, PointNet2Config
-from train.fusion import FusionConfig, SetFusionConfig
+from train.fusion import SetFusionConfig
 from train.loop import fit, load_best
 from train.optimiser import OptimiserConfig
 from train.policy import PolicyConfig
@@ -160,7 +160,6 @@ TINY = Settings(
             fusion=_TRIFLING_SETS,
             optimiser=replace(_TRIFLE, validation_views=2),
         ),
-        fusion=FusionConfig(network=_TRIFLING_SETS, epochs=2, batch_size=16),
         policy=PolicyConfig(width=16, heads=2, blocks=1, most_seen=3, walks=1, rounds=2, epochs=2, batch_size=32),
         max_views=4,
         draws=2,

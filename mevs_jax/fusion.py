@@ -82,11 +82,30 @@ class _Block(nnx.Module):
         return x + _drop_out(keys[1], self.dropout, hidden)
 
 
+def about_the_first(
+    directions: Float[AnyArray, "*batch views 3"], present: Bool[AnyArray, "*batch views"]
+) -> tuple[Float[Array, "*batch views 3"], Float[Array, "*batch 3 3"]]:
+    """Directions turned about the vertical so that the first present one points to azimuth 0, and the turn.
+
+    What is known of directions where nobody knows which way the object faces: the same however it is turned about the vertical.
+    """
+    directions, present = jnp.asarray(directions), jnp.asarray(present)
+    first = jnp.take_along_axis(directions, jnp.argmax(present, axis=-1)[..., None, None], axis=-2)[..., 0, :2]
+    length = jnp.linalg.norm(first, axis=-1, keepdims=True)
+    x, y = jnp.moveaxis(jnp.where(length > 1e-6, first / jnp.maximum(length, 1e-6), jnp.array([1.0, 0.0])), -1, 0)
+    nothing, one = jnp.zeros_like(x), jnp.ones_like(x)
+    turn = jnp.stack([x, y, nothing, -y, x, nothing, nothing, nothing, one], axis=-1).reshape(*x.shape, 3, 3)
+    return directions @ jnp.swapaxes(turn, -1, -2), turn
+
+
 class SetFusion(nnx.Module):
     """What several views say together: a small set transformer over features and viewing directions.
 
     Any subset of views in any order, also none: a token of its own attends to those that are there, and becomes the belief. As
     in Set Transformer (Lee et al. 2019) and ViewFormer (Sun et al. 2023), with directions, which the latter leaves out.
+
+    It can do without knowing which way the object faces: directions then are relative to the first view's (`about_the_first`), so
+    only which view comes first matters of their order.
 
     Args:
         features: length of a view's feature vector.
@@ -113,7 +132,7 @@ class SetFusion(nnx.Module):
         self.dropout = dropout
         self.view = nnx.Linear(features, width, rngs=rngs)
         self.direction = nnx.Linear(3, width, rngs=rngs)
-        self.object = nnx.Param(0.02 * jax.random.normal(rngs.params(), (width,)))
+        self.object, self.unposed = (nnx.Param(0.02 * jax.random.normal(rngs.params(), (width,))) for _ in range(2))
         self.blocks = nnx.List([_Block(width, heads, dropout, rngs=rngs) for _ in range(blocks)])
         self.last_norm = nnx.LayerNorm(width, rngs=rngs)
         self.head = nnx.Linear(width, classes, rngs=rngs)
@@ -124,6 +143,8 @@ class SetFusion(nnx.Module):
         directions: Float[AnyArray, "*batch views 3"],
         present: Bool[AnyArray, "*batch views"],
         key: Array | None = None,
+        *,
+        posed: bool = True,
     ) -> Float[Array, "*batch classes"]:
         """Logits of what was seen.
 
@@ -131,12 +152,16 @@ class SetFusion(nnx.Module):
             directions: unit vectors from the object to the cameras.
             present: which views were looked at; what the others hold does not matter.
             key: for dropout, in training; nothing is dropped without.
+            posed: whether directions are in the object's own frame, else in one that is turned about the vertical.
         """
         features, directions, present = jnp.asarray(features), jnp.asarray(directions), jnp.asarray(present)
+        if not posed:
+            directions = about_the_first(directions, present)[0]
         keys = [None] * (len(self.blocks) + 1) if key is None else list(jax.random.split(key, len(self.blocks) + 1))
         known = _drop_out(keys[-1], self.dropout, self.norm(jnp.where(present[..., None], features, 0.0)))
         tokens = self.view(known) + self.direction(directions)
-        own = jnp.broadcast_to(self.object[...], (*tokens.shape[:-2], 1, tokens.shape[-1]))
+        own = self.object[...] if posed else self.unposed[...]
+        own = jnp.broadcast_to(own, (*tokens.shape[:-2], 1, tokens.shape[-1]))
         x = jnp.concatenate([own, tokens], axis=-2)
         there = jnp.concatenate([jnp.ones((*present.shape[:-1], 1), bool), present], axis=-1)
         for block, drops in zip(self.blocks, keys[:-1], strict=True):
@@ -154,6 +179,7 @@ class CalibratedFusion:
         prior: (classes,) log-probabilities of the classes in training, which are taken off: here each is as likely as another.
         temperatures: (most,) by number of views, from one view on; the last is also that of more.
         single: temperature of the logits of a view alone.
+        posed: whether the objects' pose is known; see `SetFusion`.
     """
 
     structure: nnx.GraphDef = flax.struct.field(pytree_node=False)
@@ -161,6 +187,7 @@ class CalibratedFusion:
     prior: Float[Array, "classes"]
     temperatures: Float[Array, "most"]
     single: Float[Array, ""]
+    posed: bool = flax.struct.field(pytree_node=False, default=True)
 
     def __call__(
         self,
@@ -169,6 +196,7 @@ class CalibratedFusion:
         present: Bool[AnyArray, "*batch views"],
     ) -> Float[Array, "*batch classes"]:
         """Log-probabilities of what was seen, as in `SetFusion`."""
-        logits = nnx.merge(self.structure, self.weights)(features, directions, present) - self.prior
+        network = nnx.merge(self.structure, self.weights)
+        logits = network(features, directions, present, posed=self.posed) - self.prior
         count = jnp.clip(jnp.sum(present, axis=-1), 1, len(self.temperatures))
         return jax.nn.log_softmax(logits / self.temperatures[count - 1][..., None], axis=-1)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import partial
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -10,7 +12,7 @@ from flax import nnx
 
 from eval.active import calibrated
 from eval.active_study import random_sets_study
-from mevs_jax.fusion import SetFusion
+from mevs_jax.fusion import SetFusion, about_the_first
 from train.fusion import Features, FusionConfig, SetFusionConfig, random_sets, sets_of_size, train_fusion
 
 VIEWS, FEATURES, CLASSES = 5, 12, 3
@@ -97,6 +99,34 @@ def test_order_and_padding_do_not_matter_and_no_view_is_a_belief_too(network, se
     assert np.isfinite(fused(network, features, directions, nothing)).all()
     both = fused(network, *(np.stack([array, array]) for array in (features, directions)), np.stack([present, nothing]))
     np.testing.assert_allclose(both[0], belief, atol=1e-5)
+
+
+def test_directions_are_told_from_the_first_view_on():
+    directions = np.array([[0, 0, 1], [0, 0.6, 0.8], [0.8, 0, -0.6], [-1, 0, 0]], np.float32)
+    found, turn = about_the_first(directions, np.array([False, True, False, True]))
+    np.testing.assert_allclose(found, [[0, 0, 1], [0.6, 0, 0.8], [0, -0.8, -0.6], [0, 1, 0]], atol=1e-6)
+    np.testing.assert_allclose(directions @ np.asarray(turn).T, found, atol=1e-6)
+    for present in (
+        np.array([True, False, False, False]),
+        np.zeros(4, bool),
+    ):  # from straight above there is no azimuth
+        np.testing.assert_allclose(about_the_first(directions, present)[0], directions, atol=1e-6)
+
+
+def test_without_a_pose_objects_may_face_any_way(network, seen):
+    features, directions, present = seen
+    blind = nnx.jit(partial(SetFusion.__call__, posed=False))
+    belief = blind(network, features, directions, present)
+    angle = 2.1
+    turn = np.array([[np.cos(angle), -np.sin(angle), 0], [np.sin(angle), np.cos(angle), 0], [0, 0, 1]], np.float32)
+    np.testing.assert_allclose(blind(network, features, directions @ turn.T, present), belief, atol=1e-5)
+    assert np.abs(fused(network, features, directions @ turn.T, present) - fused(network, *seen)).max() > 1e-3
+    order = np.array([0, 3, 4, 2, 1])  # the first stays the first
+    np.testing.assert_allclose(blind(network, features[order], directions[order], present[order]), belief, atol=1e-5)
+    relative = np.asarray(about_the_first(directions, present)[0])
+    like = nnx.clone(network)
+    like.object[...] = network.unposed[...]
+    np.testing.assert_allclose(belief, plain(like, features, relative, present), atol=2e-5)
 
 
 def test_training_sets_have_every_size_as_often_and_views_as_often():

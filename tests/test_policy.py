@@ -19,6 +19,7 @@ from mevs_jax.policies import POLICIES, fused_oracle, learnt, random_view
 from mevs_jax.selection import by_attention, select_from_table
 from train.fusion import Features
 from train.policy import PolicyConfig, choices_along, graph_of, train_policy, unseen, walk
+from train.q_learning import QLearningConfig, temporal_difference, train_by_q_learning, transitions_along
 
 VIEWS, CLASSES, SEEN = 6, 4, 3
 
@@ -85,6 +86,17 @@ def test_worth_depends_on_what_was_seen_not_on_its_order_nor_on_other_candidates
     alone = asked(policy, belief, views, points[:SEEN], present, points[[4, 2]])
     np.testing.assert_allclose(alone[0], gain[jnp.array([4, 2])], atol=1e-5)
     np.testing.assert_allclose(alone[1], gain_if[jnp.array([4, 2])], atol=1e-5)
+
+
+def test_without_a_pose_worth_is_the_same_whichever_way_an_object_faces(random):
+    policy = moved(ViewPolicy(CLASSES, width=16, heads=2, blocks=2, posed=False, rngs=nnx.Rngs(1)), 0.1)
+    belief = jax.nn.log_softmax(random.normal(size=CLASSES)).astype(np.float32)
+    views = jax.nn.log_softmax(random.normal(size=(SEEN, CLASSES)), axis=-1)
+    points, present = fibonacci_sphere(VIEWS).astype(np.float32), np.array([True, True, False])
+    turn = np.array([[0.6, -0.8, 0], [0.8, 0.6, 0], [0, 0, 1]], np.float32)
+    found = [asked(policy, belief, views, there[1 : 1 + SEEN], present, there) for there in (points, points @ turn.T)]
+    np.testing.assert_allclose(*(gain for gain, _ in found), atol=1e-5)
+    np.testing.assert_allclose(*(gain_if for _, gain_if in found), atol=1e-5)
 
 
 def test_directions_become_all_their_monomials():
@@ -234,8 +246,8 @@ def telling(objects: int, seed: int) -> Features:
 class _Sum(nnx.Module):
     """The sum of what was seen, in the place of a fusion that is learnt."""
 
-    def __call__(self, features, directions, present):
-        del directions
+    def __call__(self, features, directions, present, *, posed=True):
+        del directions, posed
         return jnp.sum(jnp.where(present[..., None], features, 0.0), axis=-2)
 
 
@@ -281,7 +293,46 @@ def test_what_looking_was_worth_is_learnt_and_the_study_says_so(adding):
 
 
 def _learnt(weights, structure):
-    return learnt(nnx.merge(structure, weights), 1.0)
+    return learnt(nnx.merge(structure, weights), 1.0, by="state")
+
+
+def test_temporal_differences_are_those_of_a_plain_loop(fusion, policy, random):
+    data, config = some_features(2, seed=8), QLearningConfig(utility="log", floor=0.02)
+    walks = np.array([[[0, 3, 5], [2, 1, 4]], [[5, 4, 3], [1, 0, 2]]], np.int32)
+    some = transitions_along(fusion, data, walks, config)
+    target = moved(ViewPolicy(CLASSES, width=16, heads=2, blocks=2, rngs=nnx.Rngs(7)), 0.1)
+    found = nnx.jit(partial(temporal_difference, discount=0.9))(policy, target, some)
+    assert found.shape == (4, 2)
+
+    def belief_after(index, seen):
+        return fusion(data.features[index, seen], data.directions[index, seen], jnp.ones(len(seen), bool))
+
+    def value(network, index, seen):
+        views = jax.nn.log_softmax(data.logits[index, seen] / fusion.single, axis=-1)
+        points = data.directions[index]
+        belief = belief_after(index, seen)
+        return np.asarray(asked(network, belief, views, points[seen], np.ones(len(seen), bool), points)[0])
+
+    for row, (index, number) in enumerate(np.ndindex(2, 2)):
+        order = walks[index, number]
+        label = data.labels[index]
+        for step in range(2):
+            seen, more = order[: step + 1], order[: step + 2]
+            worth = [np.log(np.exp(belief_after(index, one)[label]) + 0.02) for one in (seen, more)]
+            ahead = np.delete(value(target, index, more), more).max() if step == 0 else 0.0
+            expected = value(policy, index, seen)[order[step + 1]] - (worth[1] - worth[0] + 0.9 * ahead)
+            assert found[row, step] == pytest.approx(expected, abs=1e-4)
+
+
+def test_q_learning_finds_the_telling_view_too(adding):
+    config = QLearningConfig(width=16, heads=2, blocks=1, most_seen=2, walks=4, rounds=3, epochs=6, learning_rate=5e-3)
+    network, histories = train_by_q_learning(config, [(adding, telling(160, 0))], (adding, telling(80, 1)))
+    assert len(histories) == 3
+    data, key = telling(120, 2), jax.random.key(0)
+    chosen = walk(key, adding, data, partial(_learnt, structure=nnx.graphdef(network)), nnx.state(network), 2, 4)
+    told = 2 + np.asarray(data.labels)[:, None] // 2
+    from_the_first = chosen[..., 0] == 0  # where the pair is known, and so which view settles it
+    assert (chosen[..., 1] == told)[from_the_first].mean() > 0.8
 
 
 def test_the_fixed_order_begins_with_the_views_that_tell_most(adding):

@@ -12,7 +12,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Any, Literal
+from typing import Any, Literal, TypeVar
 
 import flax.struct
 import jax
@@ -31,6 +31,8 @@ from mevs_jax.viewpoints import ViewGraph
 from train.averaged import AveragedConfig, fit_averaged
 from train.chunks import in_chunks
 from train.fusion import Features
+
+Tree = TypeVar("Tree")
 
 
 @dataclass(frozen=True)
@@ -134,14 +136,16 @@ def walk(
     return in_chunks(lambda some: _walk_some(some, *rest), (keys, data), 64)
 
 
+def worth(log_probability: Float[Array, "*any"], config: PolicyConfig) -> Float[Array, "*any"]:
+    """The utility of a belief that gives the true class this log-probability."""
+    if config.utility == "probability":
+        return jnp.exp(log_probability)
+    return jnp.logaddexp(log_probability, jnp.log(config.floor))
+
+
 @partial(jax.jit, static_argnames="config")
 def _choices_of_some(fusion: CalibratedFusion, some: tuple[Features, Array, Array], config: PolicyConfig) -> Choices:
     most = some[1].shape[-1]
-
-    def worth(log_probability: Array) -> Array:
-        if config.utility == "probability":
-            return jnp.exp(log_probability)
-        return jnp.logaddexp(log_probability, jnp.log(config.floor))
 
     def of_object(one: Features, walks: Array, asked: Array) -> Choices:
         single = jax.nn.log_softmax(one.logits / fusion.single, axis=-1)
@@ -159,7 +163,7 @@ def _choices_of_some(fusion: CalibratedFusion, some: tuple[Features, Array, Arra
                 )
 
             after = jax.vmap(with_one_more)(asked)
-            gain = worth(after[:, one.labels]) - worth(belief[one.labels])
+            gain = worth(after[:, one.labels], config) - worth(belief[one.labels], config)
             known = belief, single[order], directions, present, one.directions[asked]
             return Choices(*known, gain, one.labels, jnp.float32(1))
 
@@ -205,8 +209,9 @@ def policy_loss(network: ViewPolicy, some: Choices) -> tuple[Array, dict[str, Ar
     return errors["gain"] + errors["gain_if"], errors
 
 
-def new_policy(config: PolicyConfig, classes: int) -> ViewPolicy:
-    return ViewPolicy(classes, width=config.width, heads=config.heads, blocks=config.blocks, rngs=nnx.Rngs(config.seed))
+def new_policy(config: PolicyConfig, classes: int, posed: bool = True) -> ViewPolicy:
+    shape = {"width": config.width, "heads": config.heads, "blocks": config.blocks}
+    return ViewPolicy(classes, **shape, posed=posed, rngs=nnx.Rngs(config.seed))
 
 
 def _fit(config: PolicyConfig, network: ViewPolicy, train: Choices, validation: Choices) -> tuple[ViewPolicy, list]:
@@ -242,7 +247,8 @@ def train_policy(
         validation: objects that no recogniser was trained on.
     """
     key = jax.random.key(config.seed)
-    policy, histories = new_policy(config, parts[0][1].logits.shape[-1]), []
+    untrained = partial(new_policy, config, parts[0][1].logits.shape[-1], validation[0].posed)
+    policy, histories = untrained(), []
     gathered: list[tuple[Choices, Choices]] = []
     for number in range(config.rounds):
         structure, weights = nnx.split(policy)
@@ -254,9 +260,9 @@ def train_policy(
             views = walk(keys, fusion, data, policy_of, given, config.most_seen, config.walks)
             asked = unseen(views, data.features.shape[1], config.candidates, config.seed + 100 * number + part)
             found.append(choices_along(fusion, data, views, asked, config))
-        gathered.append((_joined(found[:-1]), found[-1]))
-        train, check = (_balanced(_joined([one[side] for one in gathered])) for side in (0, 1))
-        policy, history = _fit(config, new_policy(config, parts[0][1].logits.shape[-1]), train, check)
+        gathered.append((joined(found[:-1]), found[-1]))
+        train, check = (_balanced(joined([one[side] for one in gathered])) for side in (0, 1))
+        policy, history = _fit(config, untrained(), train, check)
         histories.append(history)
         last = ", ".join(f"{name} {value:.4f}" for name, value in history[-1].items())
         console.print(f"Round {number + 1} of {config.rounds}, {len(train.label)} states: {last}")
@@ -273,5 +279,6 @@ def _balanced(choices: Choices) -> Choices:
     return replace(choices, weight=class_weights(choices.label, choices.belief.shape[-1]))
 
 
-def _joined(parts: Sequence[Choices]) -> Choices:
+def joined(parts: Sequence[Tree]) -> Tree:
+    """Trees of arrays of the host, one behind the other."""
     return jax.tree.map(lambda *leaves: np.concatenate(leaves), *parts)

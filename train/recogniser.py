@@ -43,7 +43,8 @@ class RecogniserConfig:
 
 @dataclass(frozen=True)
 class RecogniserTask:
-    """Cross entropy on every view alone and on a random set of an object's views in the batch, of any size, together."""
+    """Cross entropy on every view alone, and on a random set of an object's views in the batch, of any size: half with the
+    object's pose known, half without."""
 
     network_config: ResNetConfig
     fusion_config: SetFusionConfig
@@ -89,7 +90,7 @@ class RecogniserTask:
 
     @property
     def metrics(self) -> tuple[str, ...]:
-        return ("accuracy", "fused_accuracy", "loss")
+        return ("accuracy", "fused_accuracy", "unposed_accuracy", "loss")
 
     @property
     def hyperparameters(self) -> Hyperparameters:
@@ -131,31 +132,30 @@ class RecogniserTask:
         moves = jax.random.split(move, images.shape[:2])
         images = jax.vmap(jax.vmap(partial(augment_image, config=shift)))(moves, images)
         present = random_sets(sets, len(images), images.shape[1], images.shape[1])
-        each, together = network(images, directions, present, train=True, key=drop)
-        single = jnp.mean(
-            optax.softmax_cross_entropy_with_integer_labels(each, labels[:, None].repeat(each.shape[1], 1))
-        )
-        fused = jnp.mean(optax.softmax_cross_entropy_with_integer_labels(together, labels))
-        return single + fused, {
-            "loss": single + fused,
-            "accuracy": jnp.mean(jnp.argmax(each, -1) == labels[:, None]),
-            "fused_accuracy": jnp.mean(jnp.argmax(together, -1) == labels),
-        }
+        found = _judged(*network(images, directions, present, train=True, key=drop), labels)
+        means = {name: jnp.mean(values) for name, values in found.items()}
+        return means["loss"], means
 
     def evaluate(self, network: Recogniser, batch: Batch) -> Metrics:
         """`fused`: all views of an object in the batch together."""
         by_object = partial(_by_object, views=self.optimiser.validation_views)
         images, directions = by_object(self.inputs(batch)), by_object(self.directions(batch))
-        labels = batch["label"].reshape(images.shape[:2])
-        each, together = network(images, directions, jnp.ones(images.shape[:2], bool))
-        together = jnp.broadcast_to(together[:, None], each.shape)
-        losses = (optax.softmax_cross_entropy_with_integer_labels(logits, labels) for logits in (each, together))
-        found = {
-            "accuracy": jnp.argmax(each, -1) == labels,
-            "fused_accuracy": jnp.argmax(together, -1) == labels,
-            "loss": sum(losses),
-        }
-        return {name: jnp.asarray(values, jnp.float32).reshape(-1) for name, values in found.items()}
+        labels = batch["label"].reshape(images.shape[:2])[:, 0]
+        found = _judged(*network(images, directions, jnp.ones(images.shape[:2], bool)), labels)
+        return {name: values.reshape(-1) for name, values in found.items()}
+
+
+def _judged(each: jax.Array, posed: jax.Array, unposed: jax.Array, labels: jax.Array) -> Metrics:
+    """Metrics of every view, (objects, views), from logits of single views and of the objects."""
+    labels = jnp.broadcast_to(labels[:, None], each.shape[:2])
+    posed, unposed = (jnp.broadcast_to(logits[:, None], each.shape) for logits in (posed, unposed))
+    single, fused, blind = (
+        optax.softmax_cross_entropy_with_integer_labels(logits, labels) for logits in (each, posed, unposed)
+    )
+    right = {"accuracy": each, "fused_accuracy": posed, "unposed_accuracy": unposed}
+    return {"loss": single + (fused + blind) / 2} | {
+        name: (jnp.argmax(logits, -1) == labels).astype(jnp.float32) for name, logits in right.items()
+    }
 
 
 def _by_object(array: jax.Array, views: int) -> jax.Array:

@@ -30,8 +30,8 @@ class Recogniser(nnx.Module):
         *,
         train: bool = False,
         key: Array | None = None,
-    ) -> tuple[Float[Array, "*batch views classes"], Float[Array, "*batch classes"]]:
-        """Logits of every view alone, and of those of each object that are `present` together.
+    ) -> tuple[Float[Array, "*batch views classes"], Float[Array, "*batch classes"], Float[Array, "*batch classes"]]:
+        """Logits of every view alone, and of those of each object that are `present` together: its pose known, and unknown.
 
         Args:
             directions: unit vectors from the object to the cameras.
@@ -39,7 +39,8 @@ class Recogniser(nnx.Module):
             key: for dropout in the fusion; nothing is dropped without.
         """
         features = self.encoder.features(images, train=train)
-        return self.encoder.head(features), self.fusion(features, directions, present, key=key)
+        posed, unposed = (self.fusion(features, directions, present, key, posed=known) for known in (True, False))
+        return self.encoder.head(features), posed, unposed
 
     def see(self, images: Float[AnyArray, "*batch height width channels"]) -> Float[Array, "*batch both"]:
         """Features and logits of single views, side by side: what is kept of a view."""

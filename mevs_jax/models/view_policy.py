@@ -13,6 +13,7 @@ from flax import nnx
 from jaxtyping import Array, Bool, Float
 
 from mevs_jax.arrays import AnyArray
+from mevs_jax.fusion import about_the_first
 
 
 def direction_features(directions: Float[AnyArray, "*batch 3"]) -> Float[Array, "*batch 19"]:
@@ -50,11 +51,21 @@ class ViewPolicy(nnx.Module):
         width: of queries and tokens.
         heads: of attention.
         blocks: of attention and layers.
+        posed: whether directions are in the object's own frame, else in one that is turned about the vertical.
         rngs: source of the initial weights.
     """
 
-    def __init__(self, classes: int, *, width: int = 96, heads: int = 4, blocks: int = 2, rngs: nnx.Rngs):
-        self.classes = classes
+    def __init__(
+        self,
+        classes: int,
+        *,
+        width: int = 96,
+        heads: int = 4,
+        blocks: int = 2,
+        posed: bool = True,
+        rngs: nnx.Rngs,
+    ):
+        self.classes, self.posed = classes, posed
         self.direction = nnx.Linear(19, width, rngs=rngs)
         self.view, self.belief = nnx.Linear(classes, width, rngs=rngs), nnx.Linear(classes + 1, width, rngs=rngs)
         self.token1, self.token2 = nnx.Linear(width, 2 * width, rngs=rngs), nnx.Linear(2 * width, width, rngs=rngs)
@@ -85,6 +96,9 @@ class ViewPolicy(nnx.Module):
             [j, y]: by how much with candidate j should the class be y.
         """
         belief, views, present = jnp.asarray(belief), jnp.asarray(views), jnp.asarray(present)
+        if not self.posed:
+            directions, turn = about_the_first(directions, present)
+            candidates = jnp.asarray(candidates) @ jnp.swapaxes(turn, -1, -2)
         spare = present[..., None]
         floor = -12.0  # a belief of 6 in a million is as good as none
         tokens = self.view(jnp.where(spare, jnp.maximum(views, floor), 0.0))
