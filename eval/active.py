@@ -10,10 +10,10 @@ and `active/metrics.json`.
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property, partial
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, Literal, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -26,15 +26,16 @@ from data_pipeline.builder import DataConfig, DatasetStatistics, load_statistics
 from data_pipeline.files import as_read, read_json, write_json
 from data_pipeline.meshes import DataError
 from data_pipeline.progress import console
-from eval.active_study import Learner, OnLattice, study
-from eval.view_tables import load_view_tables, made_by, network_outputs, stored_array
+from eval.active_study import Learner
+from eval.view_tables import made_by, network_outputs, stored_array
 from mevs_jax.calibration import class_weights, fit_temperature
 from mevs_jax.fusion import CalibratedFusion, SetFusion
 from mevs_jax.models import Recogniser, ViewPolicy
 from train.checkpoints import Checkpoints
 from train.fusion import Features, sets_of_size
 from train.loop import fit, load_best
-from train.policy import PolicyConfig, new_policy, train_policy
+from train.policy import PolicyConfig, Seen, new_policy, train_policy
+from train.q_learning import QLearningConfig, train_by_q_learning
 from train.recogniser import RecogniserConfig, RecogniserTask
 from train.step import Batch, Task
 
@@ -49,6 +50,8 @@ class ActiveConfig:
     fold_epochs: int = 0
     """of those recognisers; 0 for as many as the recogniser itself"""
     policy: PolicyConfig = PolicyConfig()
+    q_learning: QLearningConfig = QLearningConfig()
+    """of the policy that learns from walks alone, to compare with"""
     seeds: int = 1
     """whole trainings, each from other random weights"""
     max_views: int = 8
@@ -57,8 +60,46 @@ class ActiveConfig:
     """walks per object and start of policies that draw"""
     lattices: tuple[int, ...] = (10,)
     """further numbers of candidate views to test on, never trained on"""
+    ablations: tuple[str, ...] = ()
+    """variants of the policy to compare with, with the first seed: as_it_is, information, random_states, uncrossed, q_learning"""
+    novel: int = 0
+    """pairs of classes that a policy is trained without and then tested on, with the first seed"""
 
 
+@dataclass(frozen=True)
+class Variant:
+    """A way to train the view policy, or to ask it.
+
+    Attributes:
+        title: in the report.
+        posed: whether the objects' pose is known.
+        by: how it is asked; see `mevs_jax.policies.learnt`.
+        network: of the variant whose network it asks; its own unless given.
+        crossed: labels come from recognisers that were trained without the object, else from one that knows it.
+        q_learning: learnt from walks alone.
+        settings: what is set otherwise than for the method.
+    """
+
+    title: str
+    posed: bool = True
+    by: Literal["belief", "state"] = "belief"
+    network: str = ""
+    crossed: bool = True
+    q_learning: bool = False
+    settings: dict[str, Any] = field(default_factory=dict)
+
+
+VARIANTS = {
+    "learnt": Variant("view policy"),
+    "learnt_unposed": Variant("view policy", posed=False),
+    "as_it_is": Variant("… by what it expects of the state as it is", by="state", network="learnt"),
+    "information": Variant("… by expected information", settings={"utility": "log"}),
+    "random_states": Variant("… trained on random walks alone", settings={"rounds": 1}),
+    "uncrossed": Variant("… labels by a recogniser that knows the object", crossed=False),
+    "q_learning": Variant("… Q-learning (as MVSelect)", by="state", q_learning=True),
+}
+"""The method, and what it is compared with to see what each part of it is good for."""
+ABLATIONS = ("as_it_is", "information", "random_states", "uncrossed", "q_learning")
 _CALIBRATED = (1, 2, 3, 4, 5, 6, 8, 12, 16, 24, 32, 40)
 """Numbers of views at which a temperature is fitted; between them it is interpolated."""
 
@@ -67,6 +108,9 @@ def check_active(config: ActiveConfig, views: int) -> None:
     """Raises `DataError` for a study that cannot be made."""
     if config.folds < 2 or config.seeds < 1:
         raise DataError("--active.folds must be at least 2, and --active.seeds at least 1")
+    for name in config.ablations:
+        if name not in ABLATIONS:
+            raise DataError(f"unknown ablation {name!r} (--active.ablations); it is one of {', '.join(ABLATIONS)}")
     most, batch = max(config.policy.most_seen, config.max_views), config.recogniser.optimiser
     if not 2 <= most < views:
         raise DataError(
@@ -143,30 +187,48 @@ class Stages:
         assert isinstance(recogniser, Recogniser)
         return calibrated(recogniser.fusion, validation, self.prior, posed)
 
-    def policy_folder(self, posed: bool = True) -> Path:
-        return self.folder / ("policy" if posed else "policy_unposed")
+    def parts(self, posed: bool = True) -> list[Seen]:
+        """The training objects in parts, each as seen by the recogniser that was trained without it."""
+        part_of, found = fold_of(len(open_split(self.turned, "train")), self.config.folds), []
+        for fold in range(self.config.folds):
+            held_out = np.flatnonzero(part_of == fold)
+            data = self.features(f"fold_{fold}_train", self.turned, "train", fold, held_out)
+            found.append((self.fusion(fold, posed), data))
+        return found
 
-    def policy(self, posed: bool = True) -> ViewPolicy:
-        """The view policy, with labels by the recognisers of the parts, for objects of known or of unknown pose."""
-        config, folds = replace(self.config.policy, seed=self.seed), range(self.config.folds)
+    def policy_folder(self, name: str = "learnt") -> Path:
+        return self.folder / "policies" / name
+
+    def policy(self, name: str = "learnt", without: tuple[int, ...] = ()) -> ViewPolicy:
+        """The view policy, as the variant of this name has it; `without` objects of some classes."""
+        variant = VARIANTS[name]
+        config = replace(self.config.policy, seed=self.seed, **variant.settings)
+        if variant.q_learning:
+            config = replace(self.config.q_learning, seed=self.seed)
 
         def train() -> tuple[ViewPolicy, dict[str, Any]]:
-            main = self.fusion(posed=posed), self.features("turned_val", self.turned, "val")
-            part_of = fold_of(len(open_split(self.turned, "train")), self.config.folds)
-            parts = []
-            for fold in folds:
-                held_out = np.flatnonzero(part_of == fold)
-                data = self.features(f"fold_{fold}_train", self.turned, "train", fold, held_out)
-                parts.append((self.fusion(fold, posed), data))
-            console.print(f"Training the view policy, {config.rounds} rounds")
-            policy, histories = train_policy(config, parts, main)
+            check = self.fusion(posed=variant.posed), self.features("turned_val", self.turned, "val")
+            if variant.crossed:
+                parts = self.parts(variant.posed)
+            else:
+                parts = [(check[0], self.features("turned_train", self.turned, "train"))]
+            *parts, check = ((fusion, data.without(without)) for fusion, data in (*parts, check))
+            console.print(f"Training the view policy ({name}) on {sum(len(data.labels) for _, data in parts)} objects")
+            if isinstance(config, QLearningConfig):
+                policy, histories = train_by_q_learning(config, parts, check)
+            else:
+                policy, histories = train_policy(config, parts, check)
             return policy, {"rounds": histories}
 
-        made = (self.recogniser_folder(fold) for fold in (None, *folds))
-        identity = {"made_by": made_by(self.statistics, *made), "of": asdict(self.config.policy)}
-        return _made_once(
-            self.policy_folder(posed), identity, new_policy(config, len(self.statistics.classes), posed), train
-        )
+        made = (self.recogniser_folder(fold) for fold in (None, *range(self.config.folds)))
+        identity = {"made_by": made_by(self.statistics, *made), "of": asdict(config)}
+        folder = self.policy_folder("_".join(map(str, (name, *(f"without_{label}" for label in without)))))
+        return _made_once(folder, identity, new_policy(config, len(self.statistics.classes), variant.posed), train)
+
+    def learner(self, name: str) -> Learner:
+        variant = VARIANTS[name]
+        made_as = variant.network or name
+        return Learner(name, variant.title, self.policy(made_as), variant.by, made_as)
 
 
 Network = TypeVar("Network", bound=nnx.Module)
@@ -230,69 +292,3 @@ def lattice_data(dataset: DataConfig, out: Path, views: int) -> Path:
     folder = out / "data" if own else out / "active" / f"lattice_{views}"
     prepare(replace(dataset, capture=replace(dataset.capture, views=views)), folder)
     return folder
-
-
-def train_all(stages: Stages) -> None:
-    """Every network of one seed."""
-    stages.prepare()
-    for fold in (None, *range(stages.config.folds)):
-        stages.train_recogniser(fold)
-    for posed in (True, False):
-        stages.policy(posed)
-
-
-def measure(stages: Stages) -> dict[str, Any]:
-    """What one seed's networks reach: by number of candidate views, and where nobody knows which way the objects face. What is
-    found on a lattice is kept in a file of the seed's folder."""
-    own = stages.dataset.capture.views
-    return {
-        "lattices": {str(views): _measure_on(stages, views) for views in (own, *stages.config.lattices)},
-        "unposed": {str(own): _measure_on(stages, own, posed=False)},
-    }
-
-
-def _measure_on(stages: Stages, views: int, posed: bool = True) -> dict[str, Any]:
-    config, path = stages.config, stages.folder / f"metrics_{views}{'' if posed else '_unposed'}.json"
-    data = lattice_data(stages.dataset, stages.out, views)
-    with_entropies = _entropies(stages.out, data, "test")[0] is not None
-    policy = stages.policy(posed)
-    identity = as_read(
-        {
-            "made_by": made_by(load_statistics(data), stages.recogniser_folder()),
-            "policy": read_json(stages.policy_folder(posed) / "summary.json")["identity"],
-            "walks": [config.max_views, config.draws, with_entropies],
-        }
-    )
-    if path.exists() and (found := read_json(path))["identity"] == identity:
-        return found
-    on = {
-        split: OnLattice(stages.features(f"lattice_{views}_{split}", data, split), *_entropies(stages.out, data, split))
-        for split in ("val", "test")
-    }
-    console.print(
-        f"Walking {len(on['test'].features.labels)} test objects, {views} candidate views"
-        + ("" if posed else ", which way they face unknown")
-    )
-    found = study(
-        stages.fusion(posed=posed),
-        [
-            Learner("learnt", "view policy", policy),
-            Learner("learnt_state", "… by what it expects of the state as it is", policy, "state"),
-        ],
-        on["val"],
-        on["test"],
-        max_views=config.max_views,
-        draws=config.draws,
-        seed=stages.seed,
-    )
-    write_json(path, found | {"identity": identity})
-    return read_json(path)
-
-
-def _entropies(out: Path, data: Path, split: str) -> tuple[np.ndarray | None, np.ndarray | None]:
-    """What the entropy predictor of the run says of every view, and the true entropies, where `mevs run` has made them."""
-    path = out / "tables" / f"{split}.npz"
-    if data != out / "data" or not path.exists():
-        return None, None
-    tables = load_view_tables(path)
-    return tables.utility, tables.entropy

@@ -108,6 +108,52 @@ def _lead(found: dict[str, Any]) -> str:
     )
 
 
+def _unposed(metrics: dict[str, Any]) -> str:
+    """Where it is unknown which way the objects face, beside where it is known, on the same starts."""
+    (views, blind), *_ = metrics["seeds"][0]["unposed"].items()
+    posed = metrics["seeds"][0]["lattices"][views]["policies"]
+    rows = []
+    for name, policy in blind["policies"].items():
+        if policy["knows"] != "truth":
+            for title, found in ((policy["title"], policy), ("… pose known", posed[name])):
+                cells = zip(found["after_views"], found["interval"], strict=True)
+                rows.append([html.escape(title), *(_accuracy(*cell) for cell in cells)])
+    gain = blind["against"]["random"][METHOD]
+    return (
+        "<h2>Facing any way</h2>"
+        "<p>Objects are turned about the vertical by an angle that nobody knows: fusion and policy are told directions "
+        "relative to the first view's alone. After two views the policy is "
+        f"{difference(gain['difference'][1], gain['interval'][1])} points above random. What is learnt of single views of a lattice, as in the best fixed order, is of no use here.</p>"
+        + table(["next view chosen by", *(str(step + 1) for step in range(len(rows[0]) - 1))], rows)
+    )
+
+
+def _novel(metrics: dict[str, Any], classes: list[str]) -> str:
+    found = metrics["seeds"][0].get("novel")
+    if found is None:
+        return ""
+    steps = range(1, min(4, len(found["gain"]["trained_with"]["difference"])))
+    rows = []
+    for name, title in (("trained_without", "never saw these classes"), ("trained_with", "saw all")):
+        gain = found["gain"][name]
+        rows.append([title, *(difference(gain["difference"][step], gain["interval"][step]) for step in steps)])
+    each = [
+        [
+            html.escape(" and ".join(classes[label] for label in pair["classes"])),
+            str(pair["objects"]),
+            *(percent(pair[name][1]) for name in ("random", "trained_without", "trained_with")),
+        ]
+        for pair in found["pairs"]
+    ]
+    return (
+        "<h2>Classes never chosen for</h2>"
+        f"<p>Points above random on the {found['objects']} test objects of pairs of classes that a policy was trained without; "
+        "encoder and fusion were trained on all classes.</p>"
+        + table(["policy", *(f"{step + 1} views" for step in steps)], rows)
+        + table(["classes", "objects", "random, 2 views", "never saw these", "saw all"], each)
+    )
+
+
 def _seeds(metrics: dict[str, Any], views: str) -> str:
     if len(metrics["seeds"]) < 2:
         return ""
@@ -144,7 +190,7 @@ def write_active_page(metrics: dict[str, Any], statistics: DatasetStatistics, pa
         if not number:
             parts.append("<h2>Fusing random views</h2>" + _sets(found))
             parts.append("<h2>How sure it may be</h2>" + _confidence(found))
-            parts.append(_seeds(metrics, views))
+            parts.append(_unposed(metrics) + _novel(metrics, statistics.classes) + _seeds(metrics, views))
     left_out = f"<p>{statistics.left_out_count} objects were left out for lack of a surface.</p>"
     title = f"Learning where to look next: {html.escape(statistics.source)}"
     write_text(path, document(title, "".join(parts) + left_out))

@@ -87,6 +87,8 @@ class Learner:
     title: str
     network: ViewPolicy
     by: Literal["belief", "state"] = "belief"
+    made_as: str = ""
+    """name of the variant whose network it is"""
 
 
 def _named(_: Any, name: str) -> Policy:
@@ -418,6 +420,48 @@ def study(
         if name not in ("random", "belief_oracle", "label_oracle")
     }
     return found
+
+
+def novel_classes(
+    fusion: CalibratedFusion,
+    policies: Sequence[tuple[tuple[int, ...], ViewPolicy]],
+    whole: ViewPolicy,
+    test: Features,
+    max_views: int,
+    draws: int,
+    seed: int = 0,
+) -> dict[str, Any]:
+    """How policies do on objects of classes that they were trained without, beside random and beside one that knows all classes.
+
+    Args:
+        policies: the classes that each was trained without, and the policy.
+        whole: the policy that was trained on all.
+    """
+    graph = ViewGraph.from_points(np.asarray(test.directions[0], np.float64))
+    after: dict[str, list[np.ndarray]] = {"random": [], "trained_without": [], "trained_with": []}
+    rows = []
+    for classes, policy in policies:
+        some = test.some(np.flatnonzero(np.isin(test.labels, classes)))
+        walkers = (
+            (Contender("random", "random", "nothing", partial(_named, name="random"), False, draws), None),
+            *(
+                (
+                    Contender(name, name, "learnt", partial(_learnt, structure=nnx.graphdef(network), by="belief")),
+                    (nnx.state(network, nnx.Param), fusion.single),
+                )
+                for name, network in (("trained_without", policy), ("trained_with", whole))
+            ),
+        )
+        for contender, given in walkers:
+            table, key = OnLattice(some).table(contender.believes), jax.random.key(seed)
+            views = walk_all(key, contender, given, fusion, table, graph, None, max_views)
+            right = beliefs_of(fusion, some, views).argmax(axis=-1) == np.asarray(some.labels)[:, None, None]
+            after[contender.name].append(right.mean(axis=1).T)
+        row = {"classes": list(classes), "objects": len(some.labels)}
+        rows.append(row | {name: found[-1].mean(axis=1).tolist() for name, found in after.items()})
+    every = {name: np.concatenate(found, axis=1) for name, found in after.items()}
+    gains = {name: _difference(mine, every["random"]) for name, mine in every.items() if name != "random"}
+    return {"objects": every["random"].shape[1], "pairs": rows, "gain": gains}
 
 
 def _difference(mine: np.ndarray, base: np.ndarray) -> dict[str, Any]:

@@ -22,7 +22,8 @@ from data_pipeline.capture import CaptureConfig
 from data_pipeline.files import as_read, read_json, write_json
 from data_pipeline.meshes import DataError
 from data_pipeline.progress import console
-from eval.active import ActiveConfig, Stages, check_active, measure, train_all
+from eval.active import ABLATIONS, ActiveConfig, Stages, check_active
+from eval.active_measure import measure, train_all
 from eval.active_page import write_active_page
 from eval.ascent import AscentConfig
 from eval.climbing import ClimbConfig, climb_objects, climbing_study, load_climbed
@@ -125,6 +126,8 @@ SMALL = Settings(
             ),
         ),
         fold_epochs=4,
+        ablations=ABLATIONS,
+        novel=5,
     ),
 )
 """The same study at 64×64 with narrower networks.
@@ -164,6 +167,8 @@ TINY = Settings(
         max_views=4,
         draws=2,
         lattices=(),
+        ablations=("as_it_is",),
+        novel=1,
     ),
     climb=ClimbConfig(objects=1, starts=2, resolution=16, faces=64),
 )

@@ -223,10 +223,11 @@ def test_compat_climbs_and_learning_fill_their_tables(whole, tmp_path):
     shutil.copytree(whole, out)
     assert "mevs compat" in (out / "report" / "index.html").read_text()
     page = learn_to_choose(TINY, out).read_text()
-    made_once = (out / "active" / "seed_0" / "policy" / "summary.json").stat().st_mtime_ns
+    made_once = (out / "active" / "seed_0" / "policies" / "learnt" / "summary.json").stat().st_mtime_ns
     assert learn_to_choose(TINY, out).read_text() == page
-    assert (out / "active" / "seed_0" / "policy" / "summary.json").stat().st_mtime_ns == made_once
-    for said in ("6 candidate views", "PointNet++ entropy (thesis)", "learnt: expected gain", "label-free oracle"):
+    assert (out / "active" / "seed_0" / "policies" / "learnt" / "summary.json").stat().st_mtime_ns == made_once
+    sections = "6 candidate views", "Facing any way", "Classes never chosen for"
+    for said in (*sections, "PointNet++ entropy (thesis)", "view policy", "label-free oracle"):
         assert html.escape(said) in page
     climb_on_objects(TINY, out)
     assert mevs("compat", "--preset", "tiny", "--out", out).returncode == 0

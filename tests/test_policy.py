@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from flax import nnx
 
-from eval.active_study import Learner, OnLattice, greedy_order, study
+from eval.active_study import Learner, OnLattice, greedy_order, novel_classes, study
 from mevs_jax import ViewGraph, ViewTable, fibonacci_sphere
 from mevs_jax.fusion import CalibratedFusion, SetFusion
 from mevs_jax.models import ViewPolicy
@@ -285,6 +285,11 @@ def test_what_looking_was_worth_is_learnt_and_the_study_says_so(adding):
     assert after["label_oracle"][1] >= after["learnt"][1]
     assert set(found["policies"]) >= {"farthest", "fixed_order", "information_gain", "belief_oracle"}
     assert [row["views"] for row in found["random_sets"]] == [1, 2, 3, 4, 5, 6]
+    without = novel_classes(adding, [((0, 2), policy), ((1, 3), policy)], policy, test, max_views=3, draws=2)
+    assert without["objects"] == 120
+    gain = np.array(after["learnt"]) - after["random"]
+    for found_without in without["gain"].values():  # the same policy: what is found on all objects
+        np.testing.assert_allclose(found_without["difference"], gain, atol=0.02)
     chosen = walk(
         jax.random.key(0), adding, test, partial(_learnt, structure=nnx.graphdef(policy)), nnx.state(policy), 3, 4
     )

@@ -11,6 +11,7 @@ from typing import Any
 import flax.struct
 import jax
 import jax.numpy as jnp
+import numpy as np
 import optax
 from flax import nnx
 from jaxtyping import Array, Bool, Float, Int
@@ -61,6 +62,14 @@ class Features:
     logits: Float[Array, "objects views classes"]
     labels: Int[Array, "objects"]
     directions: Float[Array, "objects views 3"]
+
+    def some(self, chosen: Int[np.ndarray, "some"]) -> Features:
+        """Those of some objects."""
+        return jax.tree.map(lambda leaf: leaf[chosen], self)
+
+    def without(self, classes: tuple[int, ...]) -> Features:
+        """Those of objects of other classes; all of them where none is given."""
+        return self.some(np.flatnonzero(~np.isin(self.labels, classes))) if classes else self
 
 
 def new_fusion(shape: SetFusionConfig, features: int, classes: int, rngs: nnx.Rngs) -> SetFusion:

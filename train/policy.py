@@ -33,6 +33,8 @@ from train.chunks import in_chunks
 from train.fusion import Features
 
 Tree = TypeVar("Tree")
+Seen = tuple[CalibratedFusion, Features]
+"""Objects, as a recogniser sees and fuses them."""
 
 
 @dataclass(frozen=True)
@@ -237,8 +239,8 @@ def _fit(config: PolicyConfig, network: ViewPolicy, train: Choices, validation: 
 
 def train_policy(
     config: PolicyConfig,
-    parts: Sequence[tuple[CalibratedFusion, Features]],
-    validation: tuple[CalibratedFusion, Features],
+    parts: Sequence[Seen],
+    validation: Seen,
 ) -> tuple[ViewPolicy, list[list[dict[str, float]]]]:
     """The policy after all rounds, and losses by round and epoch.
 

@@ -30,7 +30,7 @@ from mevs_jax.policies import Policy, learnt
 from train.averaged import fit_averaged
 from train.chunks import in_chunks
 from train.fusion import Features
-from train.policy import PolicyConfig, joined, new_policy, walk, worth
+from train.policy import PolicyConfig, Seen, joined, new_policy, walk, worth
 
 
 @dataclass(frozen=True)
@@ -140,8 +140,8 @@ def exploring(given: tuple[nnx.State, Array], structure: nnx.GraphDef, share: fl
 
 def train_by_q_learning(
     config: QLearningConfig,
-    parts: Sequence[tuple[CalibratedFusion, Features]],
-    validation: tuple[CalibratedFusion, Features],
+    parts: Sequence[Seen],
+    validation: Seen,
 ) -> tuple[ViewPolicy, list[list[dict[str, float]]]]:
     """The network after all rounds, to be asked `by="state"`, and losses by round and epoch; arguments as of `train_policy`."""
     network = new_policy(config, parts[0][1].logits.shape[-1], validation[0].posed)
