@@ -123,7 +123,8 @@ def _unposed(metrics: dict[str, Any]) -> str:
         "<h2>Facing any way</h2>"
         "<p>Objects are turned about the vertical by an angle that nobody knows: fusion and policy are told directions "
         "relative to the first view's alone. After two views the policy is "
-        f"{difference(gain['difference'][1], gain['interval'][1])} points above random. What is learnt of single views of a lattice, as in the best fixed order, is of no use here.</p>"
+        f"{difference(gain['difference'][1], gain['interval'][1])} points above random. What is learnt of single views of a "
+        "lattice, as in the best fixed order, is of no use here.</p>"
         + table(["next view chosen by", *(str(step + 1) for step in range(len(rows[0]) - 1))], rows)
     )
 
