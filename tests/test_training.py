@@ -20,7 +20,7 @@ from data_pipeline.meshes import DataError
 from eval.pipeline import TINY, tasks
 from train.checkpoints import Checkpoints
 from train.loop import fit, load_best
-from train.optimiser import OptimiserConfig, learning_rate
+from train.optimiser import OptimiserConfig, descent, learning_rate
 from train.pretrained import weights_from_network
 
 SETTINGS = replace(
@@ -58,6 +58,24 @@ def trained(data, tmp_path_factory) -> Path:
     for task, name in zip(tasks(SETTINGS, statistics), ("classifier", "entropy"), strict=True):
         fit(task, data, statistics, folder / name)
     return folder
+
+
+def test_muon_steps_are_as_long_in_all_directions_of_a_matrix(random):
+    """Against the singular value decomposition, and Adam for what is no matrix."""
+    shapes = {"kernel": (3, 3, 8, 32), "matrix": (40, 24), "head": (40, 10), "bias": (24,)}
+    gradients = {name: jnp.asarray(random.normal(size=shape), jnp.float32) for name, shape in shapes.items()}
+    weights = jax.tree.map(jnp.ones_like, gradients)
+    muon, adam = (descent(OptimiserConfig(method=method)) for method in ("muon", "adam"))
+    found, expected = (method.update(gradients, method.init(weights), weights)[0] for method in (muon, adam))
+    for name in ("head", "bias"):
+        np.testing.assert_allclose(found[name], expected[name], rtol=1e-5)
+    for name, rows in (("kernel", 72), ("matrix", 40)):
+        step, gradient = (np.asarray(tree[name]).reshape(rows, -1) for tree in (found, gradients))
+        left, _, right = np.linalg.svd(gradient, full_matrices=False)
+        along = left.T @ step @ right.T / (0.2 * np.sqrt(rows))
+        assert (0.6 < np.diag(along)).all()  # Newton and Schulz's five steps come near 1, not closer
+        assert (np.diag(along) < 1.3).all()
+        np.testing.assert_allclose(along - np.diag(np.diag(along)), 0, atol=0.02)
 
 
 def test_training_learns(trained):
