@@ -33,7 +33,7 @@ class OptimiserConfig:
     """views of each validation object that are looked at after an epoch; 0 for all of them"""
     method: Literal["adam", "muon"] = "adam"
     """muon: steps of equal size in all directions of a layer's matrix (Jordan et al. 2024), fewer of them for the same loss,
-    Adam for what is no matrix; else Adam throughout, as the thesis has it"""
+    Nesterov's Adam for what is no matrix; else Adam throughout, as the thesis has it"""
     learning_rate: float = 1e-3
     """at the start, or once warm"""
     weight_decay: float = 0.0
