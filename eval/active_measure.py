@@ -7,17 +7,29 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
+import jax
+import jax.numpy as jnp
 import numpy as np
+from flax import nnx
+from jaxtyping import Array
 
-from data_pipeline.builder import load_statistics
+from data_pipeline.builder import load_statistics, open_split
 from data_pipeline.files import as_read, read_json, write_json
+from data_pipeline.inputs import depth_and_normals
 from data_pipeline.progress import console
 from eval.active import ABLATIONS, Stages, lattice_data
 from eval.active_study import OnLattice, novel_classes, study
+from eval.thesis_results import machine
+from eval.timing import milliseconds
 from eval.view_tables import load_view_tables, made_by
+from mevs_jax.models import Recogniser
+from mevs_jax.models.view_policy import expected_gain
+from mevs_jax.viewpoints import viewpoint_lattice
+from train.loop import load_best
 
 
 def train_all(stages: Stages) -> None:
@@ -41,6 +53,8 @@ def measure(stages: Stages) -> dict[str, Any]:
     }
     if first and stages.config.novel:
         found["novel"] = _novel(stages)
+    if first:
+        found["decision"] = _decision(stages)
     return found
 
 
@@ -107,6 +121,54 @@ def _novel(stages: Stages) -> dict[str, Any]:
         )
 
     return _kept(stages.folder / "metrics_novel.json", identity, walk)
+
+
+def _decision(stages: Stages, calls: int = 200) -> dict[str, Any]:
+    """Time of one decision among all candidate views (ms), from features that are there and from the newest depth image on."""
+    task, camera, most = stages.task(), stages.dataset.capture, stages.config.max_views
+    recogniser = load_best(task, stages.recogniser_folder())
+    assert isinstance(recogniser, Recogniser)
+    structure, weights = nnx.split((recogniser, stages.policy()))
+    fusion, classes = stages.fusion(), len(stages.statistics.classes)
+    candidates = jnp.asarray(viewpoint_lattice(camera.views, camera.lattice), jnp.float32)
+    seen, present = candidates[:most], jnp.arange(most) < most - 1
+
+    @jax.jit
+    def from_features(weights: nnx.State, given: tuple[Array, Array]) -> Array:
+        features, logits = given
+        belief = fusion(features, seen, present)
+        views = jax.nn.log_softmax(logits / fusion.single, axis=-1)
+        gain_if = nnx.merge(structure, weights)[1](belief, views, seen, present, candidates)[1]
+        return jnp.argmax(expected_gain(belief, gain_if).at[:most].set(-jnp.inf))
+
+    @jax.jit
+    def from_image(weights: nnx.State, given: tuple[Array, Array, Array]) -> Array:
+        image, features, logits = given
+        newest = nnx.merge(structure, weights)[0].see(depth_and_normals(image, camera))
+        features, logits = features.at[most - 2].set(newest[:-classes]), logits.at[most - 2].set(newest[-classes:])
+        return from_features(weights, (features, logits))
+
+    depth = open_split(stages.turned, "test")[0]["depth"]
+    random = np.random.default_rng(0)
+    width = recogniser.encoder.head.in_features
+    inputs = [
+        (depth[i % len(depth)], *(random.normal(size=(most, n)).astype(np.float32) for n in (width, classes)))
+        for i in range(calls)
+    ]
+
+    def time() -> dict[str, Any]:
+        times = {
+            "from_features": milliseconds(partial(from_features, weights), [given[1:] for given in inputs]),
+            "from_image": milliseconds(partial(from_image, weights), inputs),
+        }
+        return {
+            name: {f"p{share}": float(np.percentile(taken, share)) for share in (50, 99)}
+            for name, taken in times.items()
+        }
+
+    policy = read_json(stages.policy_folder() / "summary.json")["identity"]
+    identity = {"policy": policy, "machine": machine(), "candidates": camera.views}
+    return _kept(stages.folder / "decision.json", identity, time)
 
 
 def _entropies(out: Path, data: Path, split: str) -> tuple[np.ndarray | None, np.ndarray | None]:

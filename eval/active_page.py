@@ -155,6 +155,19 @@ def _novel(metrics: dict[str, Any], classes: list[str]) -> str:
     )
 
 
+def _decision(metrics: dict[str, Any]) -> str:
+    found = metrics["seeds"][0]["decision"]
+    ran_on = found["identity"]["machine"]
+    features, image = (
+        (f"{found[name][share]:.1f}" for share in ("p50", "p99")) for name in ("from_features", "from_image")
+    )
+    return (
+        f"<p>One decision among {found['identity']['candidates']} candidates takes {' ms (99 %: '.join(features)} ms) from what was "
+        f"seen so far, {' ms ('.join(image)} ms) from the newest depth image on: {html.escape(ran_on['cpu'])}, "
+        f"{ran_on['cores']} cores; {html.escape(ran_on['device'])}.</p>"
+    )
+
+
 def _seeds(metrics: dict[str, Any], views: str) -> str:
     if len(metrics["seeds"]) < 2:
         return ""
@@ -191,7 +204,9 @@ def write_active_page(metrics: dict[str, Any], statistics: DatasetStatistics, pa
         if not number:
             parts.append("<h2>Fusing random views</h2>" + _sets(found))
             parts.append("<h2>How sure it may be</h2>" + _confidence(found))
-            parts.append(_unposed(metrics) + _novel(metrics, statistics.classes) + _seeds(metrics, views))
+            parts.append(
+                _decision(metrics) + _unposed(metrics) + _novel(metrics, statistics.classes) + _seeds(metrics, views)
+            )
     left_out = f"<p>{statistics.left_out_count} objects were left out for lack of a surface.</p>"
     title = f"Learning where to look next: {html.escape(statistics.source)}"
     write_text(path, document(title, "".join(parts) + left_out))
