@@ -159,12 +159,13 @@ def _decision(metrics: dict[str, Any]) -> str:
     found = metrics["seeds"][0]["decision"]
     ran_on = found["identity"]["machine"]
     features, image = (
-        (f"{found[name][share]:.1f}" for share in ("p50", "p99")) for name in ("from_features", "from_image")
+        "{:.1f} ms (99 %: {:.1f})".format(*(found[name][share] for share in ("p50", "p99")))
+        for name in ("from_features", "from_image")
     )
     return (
-        f"<p>One decision among {found['identity']['candidates']} candidates takes {' ms (99 %: '.join(features)} ms) from what was "
-        f"seen so far, {' ms ('.join(image)} ms) from the newest depth image on: {html.escape(ran_on['cpu'])}, "
-        f"{ran_on['cores']} cores; {html.escape(ran_on['device'])}.</p>"
+        f"<p>One decision among {found['identity']['candidates']} candidates takes {features} from what was seen so far, "
+        f"{image} from the newest depth image on: {html.escape(ran_on['cpu'])}, {ran_on['cores']} cores; "
+        f"{html.escape(ran_on['device'])}.</p>"
     )
 
 
