@@ -164,7 +164,7 @@ TINY = Settings(
             fusion=_TRIFLING_SETS,
             optimiser=replace(_TRIFLE, validation_views=2),
         ),
-        policy=PolicyConfig(width=16, heads=2, blocks=1, most_seen=3, walks=1, rounds=2, epochs=2, batch_size=32),
+        policy=PolicyConfig(width=16, heads=2, blocks=1, most_seen=3, walks=1, rounds=1, epochs=2, batch_size=32),
         max_views=4,
         draws=2,
         lattices=(),

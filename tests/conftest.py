@@ -6,6 +6,7 @@ import atexit
 import os
 import shutil
 import tempfile
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -48,6 +49,16 @@ def open3d_or_skip() -> None:
         import open3d  # noqa: F401
     except (ImportError, OSError) as error:
         pytest.skip(f"Open3D cannot be loaded here: {error}")
+
+
+@pytest.fixture
+def lightly_compiled() -> Iterator[None]:
+    """For tests that compile much and run little: a third less time."""
+    import jax
+
+    jax.config.update("jax_disable_most_optimizations", True)
+    yield
+    jax.config.update("jax_disable_most_optimizations", False)
 
 
 @pytest.fixture

@@ -216,7 +216,7 @@ def test_networks_for_another_number_of_views_are_refused(whole, tmp_path, refus
     assert "was trained for 6 views, the data set has 8" in refuses("eval", "--preset", "tiny", "--out", tmp_path)
 
 
-def test_compat_climbs_and_learning_fill_their_tables(whole, tmp_path):
+def test_compat_climbs_and_learning_fill_their_tables(whole, tmp_path, lightly_compiled):
     """One evaluation of what `mevs compat`, `climb` and `active` add to a run."""
     open3d_or_skip()
     out = tmp_path / "run"

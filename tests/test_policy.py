@@ -22,6 +22,7 @@ from train.policy import PolicyConfig, choices_along, graph_of, train_policy, un
 from train.q_learning import QLearningConfig, temporal_difference, train_by_q_learning, transitions_along
 
 VIEWS, CLASSES, SEEN = 6, 4, 3
+pytestmark = pytest.mark.usefixtures("lightly_compiled")
 
 
 def moved(network, scale: float = 0.3):
@@ -150,12 +151,17 @@ def test_labels_are_what_each_candidate_does_to_the_cross_entropy(fusion):
                 row += 1
 
 
+@jax.jit
+def fused(fusion, features, directions):
+    return fusion(features, directions, jnp.ones(len(features), bool))
+
+
 def plain_walk(fusion, data, index, scores, start, steps):
     """Look, fuse, score, go: in Python."""
     seen, beliefs = [start], []
     for _ in range(steps):
         order = np.array(seen)
-        belief = fusion(data.features[index, order], data.directions[index, order], jnp.ones(len(order), bool))
+        belief = fused(fusion, data.features[index, order], data.directions[index, order])
         beliefs.append(np.asarray(belief))
         found = np.array(scores(order, belief), np.float64)
         found[order] = -np.inf
@@ -206,10 +212,10 @@ def test_oracles_of_the_fused_belief_try_every_view(fusion, by):
 
     def scores(order, belief):
         found = []
-        every = fusion(data.features[index], data.directions[index], jnp.ones(VIEWS, bool))
+        every = fused(fusion, data.features[index], data.directions[index])
         for view in range(VIEWS):
             more = np.append(order, view)
-            after = fusion(data.features[index, more], data.directions[index, more], jnp.ones(len(more), bool))
+            after = fused(fusion, data.features[index, more], data.directions[index, more])
             found.append(after[data.labels[index]] if by == "label" else jnp.exp(every) @ after)
         return found
 
@@ -310,7 +316,7 @@ def test_temporal_differences_are_those_of_a_plain_loop(fusion, policy, random):
     assert found.shape == (4, 2)
 
     def belief_after(index, seen):
-        return fusion(data.features[index, seen], data.directions[index, seen], jnp.ones(len(seen), bool))
+        return fused(fusion, data.features[index, seen], data.directions[index, seen])
 
     def value(network, index, seen):
         views = jax.nn.log_softmax(data.logits[index, seen] / fusion.single, axis=-1)
@@ -330,9 +336,9 @@ def test_temporal_differences_are_those_of_a_plain_loop(fusion, policy, random):
 
 
 def test_q_learning_finds_the_telling_view_too(adding):
-    config = QLearningConfig(width=16, heads=2, blocks=1, most_seen=2, walks=4, rounds=3, epochs=6, learning_rate=5e-3)
+    config = QLearningConfig(width=16, heads=2, blocks=1, most_seen=2, walks=4, rounds=2, epochs=6, learning_rate=5e-3)
     network, histories = train_by_q_learning(config, [(adding, telling(160, 0))], (adding, telling(80, 1)))
-    assert len(histories) == 3
+    assert len(histories) == 2
     data, key = telling(120, 2), jax.random.key(0)
     chosen = walk(key, adding, data, partial(_learnt, structure=nnx.graphdef(network)), nnx.state(network), 2, 4)
     told = 2 + np.asarray(data.labels)[:, None] // 2
