@@ -21,7 +21,7 @@ from data_pipeline.builder import load_statistics, open_split
 from data_pipeline.files import as_read, read_json, write_json
 from data_pipeline.inputs import depth_and_normals
 from data_pipeline.progress import console
-from eval.active import ABLATIONS, Stages, lattice_data
+from eval.active import Stages, lattice_data
 from eval.active_study import OnLattice, novel_classes, study
 from eval.thesis_results import machine
 from eval.timing import milliseconds
@@ -42,14 +42,21 @@ def train_all(stages: Stages) -> None:
 
 
 def measure(stages: Stages) -> dict[str, Any]:
-    """What one seed's networks reach: by number of candidate views, and where nobody knows which way the objects face."""
+    """What one seed's networks reach: by number of candidate views, among directions of their own around every object, and where
+    nobody knows which way the objects face."""
     own, first = stages.dataset.capture.views, stages.seed == 0
+
+    def on_lattice(views: int, **given: Any) -> dict[str, Any]:
+        data = lattice_data(stages.dataset, stages.out, views)
+        return _walks(stages, f"lattice_{views}", data, **given)
+
     found = {
         "lattices": {
-            str(views): _on_lattice(stages, views, ABLATIONS if first and views == own else ())
+            str(views): on_lattice(views, ablations=stages.config.ablations if first and views == own else ())
             for views in (own, *stages.config.lattices)
         },
-        "unposed": {str(own): _on_lattice(stages, own, posed=False)},
+        "scattered": {str(own): _walks(stages, "turned", stages.turned)},
+        "unposed": {str(own): on_lattice(own, posed=False)},
     }
     if first and stages.config.novel:
         found["novel"] = _novel(stages)
@@ -66,20 +73,24 @@ def _kept(path: Path, identity: dict[str, Any], find: Callable[[], dict[str, Any
     return read_json(path)
 
 
-def _on_lattice(stages: Stages, views: int, ablations: tuple[str, ...] = (), posed: bool = True) -> dict[str, Any]:
+def _walks(
+    stages: Stages, views: str, data: Path, ablations: tuple[str, ...] = (), posed: bool = True
+) -> dict[str, Any]:
+    """Every policy's walks among the views of a data set, which the features kept are named after."""
     config, method = stages.config, "learnt" if posed else "learnt_unposed"
-    data = lattice_data(stages.dataset, stages.out, views)
     on = {
-        split: OnLattice(stages.features(f"lattice_{views}_{split}", data, split), *_entropies(stages.out, data, split))
+        split: OnLattice(stages.features(f"{views}_{split}", data, split), *_entropies(stages.out, data, split))
         for split in ("val", "test")
     }
-    names = (method, *(name for name in ablations if name in config.ablations))
+    names = (method, *ablations)
     learners = [stages.learner(name) for name in names]
     learners[0] = replace(learners[0], name="learnt")
 
     def walk() -> dict[str, Any]:
         known = "" if posed else ", which way they face unknown"
-        console.print(f"Walking {len(on['test'].features.labels)} test objects, {views} candidate views{known}")
+        objects, count, _ = on["test"].features.logits.shape
+        around = " of its own around each" if data == stages.turned else ""
+        console.print(f"Walking {objects} test objects, {count} candidate views{around}{known}")
         return study(
             stages.fusion(posed=posed),
             learners,
@@ -97,7 +108,7 @@ def _on_lattice(stages: Stages, views: int, ablations: tuple[str, ...] = (), pos
         ],
         "walks": [names, config.max_views, config.draws, on["test"].entropy is not None],
     }
-    return _kept(stages.folder / f"metrics_{views}{'' if posed else '_unposed'}.json", identity, walk)
+    return _kept(stages.folder / f"walks_{views}{'' if posed else '_unposed'}.json", identity, walk)
 
 
 def _novel(stages: Stages) -> dict[str, Any]:
@@ -120,7 +131,7 @@ def _novel(stages: Stages) -> dict[str, Any]:
             stages.fusion(), policies, stages.policy(), test, stages.config.max_views, stages.config.draws, stages.seed
         )
 
-    return _kept(stages.folder / "metrics_novel.json", identity, walk)
+    return _kept(stages.folder / "walks_novel.json", identity, walk)
 
 
 def _decision(stages: Stages, calls: int = 200) -> dict[str, Any]:

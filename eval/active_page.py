@@ -129,6 +129,18 @@ def _unposed(metrics: dict[str, Any]) -> str:
     )
 
 
+def _scattered(metrics: dict[str, Any]) -> str:
+    """Where every object has candidate directions of its own."""
+    ((views, found),) = metrics["seeds"][0]["scattered"].items()
+    gain = found["against"]["random"][METHOD]
+    return (
+        "<h2>Candidates anywhere</h2>"
+        f"<p>Each object has {views} candidate directions of its own, a lattice turned at random, none of them twice. After two "
+        f"views the policy is {difference(gain['difference'][1], gain['interval'][1])} points above random.</p>"
+        + _ladder(found)
+    )
+
+
 def _novel(metrics: dict[str, Any], classes: list[str]) -> str:
     found = metrics["seeds"][0].get("novel")
     if found is None:
@@ -206,7 +218,11 @@ def write_active_page(metrics: dict[str, Any], statistics: DatasetStatistics, pa
             parts.append("<h2>Fusing random views</h2>" + _sets(found))
             parts.append("<h2>How sure it may be</h2>" + _confidence(found))
             parts.append(
-                _decision(metrics) + _unposed(metrics) + _novel(metrics, statistics.classes) + _seeds(metrics, views)
+                _decision(metrics)
+                + _scattered(metrics)
+                + _unposed(metrics)
+                + _novel(metrics, statistics.classes)
+                + _seeds(metrics, views)
             )
     left_out = f"<p>{statistics.left_out_count} objects were left out for lack of a surface.</p>"
     title = f"Learning where to look next: {html.escape(statistics.source)}"

@@ -7,7 +7,7 @@ policy, on its own walks over validation objects: one that picks telling views m
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any, Literal
 
@@ -101,7 +101,7 @@ def _oracle(fusion: CalibratedFusion, by: Any) -> Policy:
 
 @partial(jax.jit, static_argnames=("contender", "max_views"))
 def _walk_some(
-    some: tuple[Array, ViewTable],
+    some: tuple[Array, ViewTable, Array],
     contender: Contender,
     parameters: Any,
     fusion: CalibratedFusion,
@@ -112,8 +112,8 @@ def _walk_some(
     starts = jnp.arange(0, graph.points.shape[0], contender.every)
     policy, fuse = contender.policy_of(parameters), by_attention(fusion) if contender.believes else adding
 
-    def of_object(key: Array, table: ViewTable) -> Array:
-        scene = table.scene(graph, knowledge)
+    def of_object(key: Array, table: ViewTable, directions: Array) -> Array:
+        scene = table.scene(replace(graph, points=directions), knowledge)
 
         def run(key: Array, start: Array) -> Array:
             return select_from_table(key, table, scene, policy, start, max_views=max_views, fuse=fuse).views
@@ -130,15 +130,20 @@ def walk_all(
     parameters: Any,
     fusion: CalibratedFusion,
     tables: ViewTable,
-    graph: ViewGraph,
+    directions: Float[AnyArray, "objects views 3"],
     knowledge: Knowledge | None,
     max_views: int,
 ) -> Int[np.ndarray, "objects walks steps"]:
-    """The views of walks from every start, or from some, `contender.draws` from each."""
+    """The views of walks from every start, or from some, `contender.draws` from each.
+
+    Args:
+        directions: to the views, which stand to each other in the same way around every object.
+    """
+    graph = ViewGraph.from_points(np.asarray(directions[0], np.float64))
     keys = jax.vmap(jax.random.fold_in, (None, 0))(key, jnp.arange(len(tables.label)))
     rest = contender, parameters, fusion, graph, knowledge, max_views
     at_once = max(1, _WALKS_AT_ONCE * contender.every // (len(graph.points) * contender.draws))
-    return in_chunks(lambda some: _walk_some(some, *rest), (keys, tables), at_once)
+    return in_chunks(lambda some: _walk_some(some, *rest), (keys, tables, directions), at_once)
 
 
 @jax.jit
@@ -252,7 +257,7 @@ _GAP = 3
 
 
 def contenders(
-    learners: Sequence[Learner], draws: int, oracle_views: int, oracle_starts: int, entropies: bool, posed: bool
+    learners: Sequence[Learner], draws: int, oracle_views: int, oracle_starts: int, entropies: bool, shared: bool
 ) -> list[Contender]:
     """All policies of the study, in the order in which they are shown.
 
@@ -261,7 +266,7 @@ def contenders(
         draws: walks from each start of those that draw.
         oracle_views, oracle_starts: how far oracles walk, which try every candidate, and from every so many-th start.
         entropies: whether predicted and true depth entropies are known.
-        posed: whether the objects' pose is, without which no view of the lattice is known to be a good one.
+        shared: whether all objects have the same candidates in a known pose, so that some are known to be good ones.
     """
     found = [
         Contender("random", "random", "nothing", partial(_named, name="random"), False, draws),
@@ -276,7 +281,7 @@ def contenders(
             "information_gain", "information gain by a table", "others", partial(_named, name="information_gain")
         ),
     ]
-    if posed:
+    if shared:
         found += known
     for learner in learners:
         policy_of = partial(_learnt, structure=nnx.graphdef(learner.network), by=learner.by)
@@ -366,9 +371,9 @@ def study(
         oracle_views, oracle_starts: how far oracles walk, and from every so many-th start.
     """
     points, labels = test.features.directions[0], test.features.labels
-    graph = ViewGraph.from_points(np.asarray(points, np.float64))
+    shared = fusion.posed and bool(jnp.allclose(test.features.directions, points, atol=1e-4))
     max_views, oracle_views = min(max_views, len(points)), min(oracle_views, len(points))
-    knowledge = learn(fusion, validation.features, max_views) if fusion.posed else None
+    knowledge = learn(fusion, validation.features, max_views) if shared else None
     found: dict[str, Any] = {
         "objects": len(labels),
         "validation_objects": len(validation.features.labels),
@@ -381,9 +386,9 @@ def study(
     from_some: dict[str, np.ndarray] = {}  # accuracy from the oracles' starts
     parameters: dict[str, Any] = {"belief_oracle": fusion, "label_oracle": fusion}
     parameters |= {learner.name: (nnx.state(learner.network, nnx.Param), fusion.single) for learner in learners}
-    entropies = fusion.posed and test.utility is not None and test.entropy is not None
+    entropies = shared and test.utility is not None and test.entropy is not None
     some_starts = np.arange(0, len(points), oracle_starts)
-    for contender in contenders(learners, draws, oracle_views, oracle_starts, entropies, fusion.posed):
+    for contender in contenders(learners, draws, oracle_views, oracle_starts, entropies, shared):
         beliefs = []
         for split, data in enumerate((validation, test)):
             views = walk_all(
@@ -392,7 +397,7 @@ def study(
                 parameters.get(contender.name),
                 fusion,
                 data.table(contender.believes),
-                graph,
+                data.features.directions,
                 knowledge,
                 contender.max_views or max_views,
             )
@@ -437,7 +442,6 @@ def novel_classes(
         policies: the classes that each was trained without, and the policy.
         whole: the policy that was trained on all.
     """
-    graph = ViewGraph.from_points(np.asarray(test.directions[0], np.float64))
     after: dict[str, list[np.ndarray]] = {"random": [], "trained_without": [], "trained_with": []}
     rows = []
     for classes, policy in policies:
@@ -454,7 +458,7 @@ def novel_classes(
         )
         for contender, given in walkers:
             table, key = OnLattice(some).table(contender.believes), jax.random.key(seed)
-            views = walk_all(key, contender, given, fusion, table, graph, None, max_views)
+            views = walk_all(key, contender, given, fusion, table, some.directions, None, max_views)
             right = beliefs_of(fusion, some, views).argmax(axis=-1) == np.asarray(some.labels)[:, None, None]
             after[contender.name].append(right.mean(axis=1).T)
         row = {"classes": list(classes), "objects": len(some.labels)}
