@@ -26,7 +26,7 @@ from data_pipeline.builder import DataConfig, DatasetStatistics, load_statistics
 from data_pipeline.files import as_read, read_json, write_json
 from data_pipeline.meshes import DataError
 from data_pipeline.progress import console
-from eval.active_study import Learner
+from eval.active_walks import Learner
 from eval.view_tables import made_by, network_outputs, stored_array
 from mevs_jax.calibration import class_weights, fit_temperature
 from mevs_jax.fusion import CalibratedFusion, SetFusion

@@ -22,7 +22,8 @@ from data_pipeline.files import as_read, read_json, write_json
 from data_pipeline.inputs import depth_and_normals
 from data_pipeline.progress import console
 from eval.active import Stages, lattice_data
-from eval.active_study import OnLattice, novel_classes, study
+from eval.active_study import novel_classes, study
+from eval.active_walks import OnLattice
 from eval.thesis_results import machine
 from eval.timing import milliseconds
 from eval.view_tables import load_view_tables, made_by

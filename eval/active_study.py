@@ -6,10 +6,8 @@ policy, on its own walks over validation objects: one that picks telling views m
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
-from functools import partial
-from typing import Any, Literal
+from collections.abc import Sequence
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -18,6 +16,7 @@ from flax import nnx
 from jaxtyping import Array, Float, Int
 
 from data_pipeline.progress import console
+from eval.active_walks import Contender, Learner, OnLattice, beliefs_of, contenders, random_walker, walk_all, walker
 from eval.comparison import intervals
 from eval.confidence import stopping
 from eval.knowledge import class_view_table
@@ -25,144 +24,9 @@ from mevs_jax.arrays import AnyArray
 from mevs_jax.calibration import class_weights, expected_calibration_error, fit_temperature, negative_log_likelihood
 from mevs_jax.fusion import CalibratedFusion
 from mevs_jax.models import ViewPolicy
-from mevs_jax.policies import POLICIES, Knowledge, Policy, fused_oracle, learnt
-from mevs_jax.selection import ViewTable, adding, by_attention, select_from_table
-from mevs_jax.viewpoints import ViewGraph
+from mevs_jax.policies import Knowledge
 from train.chunks import in_chunks
 from train.fusion import Features, sets_of_size
-
-_WALKS_AT_ONCE = 2**11
-
-
-@dataclass(frozen=True)
-class OnLattice:
-    """Objects of a split on one lattice of candidate views.
-
-    Attributes:
-        features: of every view.
-        utility: (objects, views, views) what the entropy predictor says of every view after each, if it was asked.
-        entropy: (objects, views) true normalised entropies, if known.
-    """
-
-    features: Features
-    utility: np.ndarray | None = None
-    entropy: np.ndarray | None = None
-
-    def table(self, with_features: bool) -> ViewTable:
-        utility, entropy = (None if known is None else jnp.asarray(known) for known in (self.utility, self.entropy))
-        features = self.features.features if with_features else None
-        return ViewTable(self.features.logits, utility, entropy, self.features.labels, features=features)
-
-
-@dataclass(frozen=True)
-class Contender:
-    """A policy in the study.
-
-    Attributes:
-        name: in `metrics.json`.
-        title: in the report.
-        knows: as in `eval.ladder.KNOWS`.
-        policy_of: parameters to the policy.
-        believes: whether it looks at the belief; one that does not walks without fusing.
-        draws: walks from each start.
-        max_views: views of its walks, where fewer than the study's.
-        every: it walks from every so many-th start alone.
-    """
-
-    name: str
-    title: str
-    knows: str
-    policy_of: Callable[[Any], Policy]
-    believes: bool = True
-    draws: int = 1
-    max_views: int = 0
-    every: int = 1
-
-
-@dataclass(frozen=True)
-class Learner:
-    """A trained view policy in the study, and how it is asked; the other fields are a contender's."""
-
-    name: str
-    title: str
-    network: ViewPolicy
-    by: Literal["belief", "state"] = "belief"
-    made_as: str = ""
-    """name of the variant whose network it is"""
-
-
-def _named(_: Any, name: str) -> Policy:
-    return POLICIES[name]
-
-
-def _oracle(fusion: CalibratedFusion, by: Any) -> Policy:
-    return fused_oracle(fusion, by=by)
-
-
-@partial(jax.jit, static_argnames=("contender", "max_views"))
-def _walk_some(
-    some: tuple[Array, ViewTable, Array],
-    contender: Contender,
-    parameters: Any,
-    fusion: CalibratedFusion,
-    graph: ViewGraph,
-    knowledge: Knowledge | None,
-    max_views: int,
-) -> Int[Array, "objects walks steps"]:
-    starts = jnp.arange(0, graph.points.shape[0], contender.every)
-    policy, fuse = contender.policy_of(parameters), by_attention(fusion) if contender.believes else adding
-
-    def of_object(key: Array, table: ViewTable, directions: Array) -> Array:
-        scene = table.scene(replace(graph, points=directions), knowledge)
-
-        def run(key: Array, start: Array) -> Array:
-            return select_from_table(key, table, scene, policy, start, max_views=max_views, fuse=fuse).views
-
-        keys = jax.random.split(key, len(starts) * contender.draws)
-        return jax.vmap(run)(keys, starts.repeat(contender.draws))
-
-    return jax.vmap(of_object)(*some)
-
-
-def walk_all(
-    key: Array,
-    contender: Contender,
-    parameters: Any,
-    fusion: CalibratedFusion,
-    tables: ViewTable,
-    directions: Float[AnyArray, "objects views 3"],
-    knowledge: Knowledge | None,
-    max_views: int,
-) -> Int[np.ndarray, "objects walks steps"]:
-    """The views of walks from every start, or from some, `contender.draws` from each.
-
-    Args:
-        directions: to the views, which stand to each other in the same way around every object.
-    """
-    graph = ViewGraph.from_points(np.asarray(directions[0], np.float64))
-    keys = jax.vmap(jax.random.fold_in, (None, 0))(key, jnp.arange(len(tables.label)))
-    rest = contender, parameters, fusion, graph, knowledge, max_views
-    at_once = max(1, _WALKS_AT_ONCE * contender.every // (len(graph.points) * contender.draws))
-    return in_chunks(lambda some: _walk_some(some, *rest), (keys, tables, directions), at_once)
-
-
-@jax.jit
-def _beliefs_of_some(fusion: CalibratedFusion, some: tuple[Features, Array]) -> Array:
-    steps = some[1].shape[-1]
-    present = jnp.tril(jnp.ones((steps, steps), bool))
-
-    def of_walk(one: Features, order: Array) -> Array:
-        seen = jnp.broadcast_to(one.features[order], (steps, steps, one.features.shape[-1]))
-        return fusion(seen, jnp.broadcast_to(one.directions[order], (steps, steps, 3)), present)
-
-    return jax.vmap(lambda one, orders: jax.vmap(lambda order: of_walk(one, order))(orders))(*some)
-
-
-def beliefs_of(
-    fusion: CalibratedFusion, data: Features, views: Int[np.ndarray, "objects walks steps"]
-) -> Float[np.ndarray, "objects walks steps classes"]:
-    """Log-probabilities after each view of each walk."""
-    return in_chunks(partial(_beliefs_of_some, fusion), (data, views), max(1, 1024 // views.shape[1]))
 
 
 @jax.jit
@@ -254,53 +118,6 @@ BASELINES = ("random", "farthest", "fixed_order")
 """What a policy that learns is compared with."""
 _GAP = 3
 """The gap between random and the label-free oracle is read after 2 views and the next, up to so many further ones."""
-
-
-def contenders(
-    learners: Sequence[Learner], draws: int, oracle_views: int, oracle_starts: int, entropies: bool, shared: bool
-) -> list[Contender]:
-    """All policies of the study, in the order in which they are shown.
-
-    Args:
-        learners: those that were trained.
-        draws: walks from each start of those that draw.
-        oracle_views, oracle_starts: how far oracles walk, which try every candidate, and from every so many-th start.
-        entropies: whether predicted and true depth entropies are known.
-        shared: whether all objects have the same candidates in a known pose, so that some are known to be good ones.
-    """
-    found = [
-        Contender("random", "random", "nothing", partial(_named, name="random"), False, draws),
-        Contender("farthest", "farthest from those seen", "nothing", partial(_named, name="farthest"), False),
-    ]
-    if entropies:
-        named = partial(_named, name="predicted_entropy")
-        found.append(Contender("predicted_entropy", "PointNet++ entropy (thesis)", "networks", named, False))
-    known = [
-        Contender("fixed_order", "best fixed order", "others", partial(_named, name="fixed_order"), False),
-        Contender(
-            "information_gain", "information gain by a table", "others", partial(_named, name="information_gain")
-        ),
-    ]
-    if shared:
-        found += known
-    for learner in learners:
-        policy_of = partial(_learnt, structure=nnx.graphdef(learner.network), by=learner.by)
-        found.append(Contender(learner.name, learner.title, "learnt", policy_of))
-    if entropies:
-        found.append(
-            Contender(
-                "oracle_entropy", "entropy oracle (thesis)", "truth", partial(_named, name="oracle_entropy"), False
-            )
-        )
-    for by, title in (("belief", "label-free oracle"), ("label", "greedy label oracle")):
-        policy_of, name = partial(_oracle, by=by), f"{by}_oracle"
-        found.append(Contender(name, title, "truth", policy_of, True, 1, oracle_views, oracle_starts))
-    return found
-
-
-def _learnt(given: tuple[nnx.State, Array], structure: nnx.GraphDef, by: Any) -> Policy:
-    weights, temperature = given
-    return learnt(nnx.merge(structure, weights), temperature, by=by)
 
 
 def random_sets_study(
@@ -446,16 +263,9 @@ def novel_classes(
     rows = []
     for classes, policy in policies:
         some = test.some(np.flatnonzero(np.isin(test.labels, classes)))
-        walkers = (
-            (Contender("random", "random", "nothing", partial(_named, name="random"), False, draws), None),
-            *(
-                (
-                    Contender(name, name, "learnt", partial(_learnt, structure=nnx.graphdef(network), by="belief")),
-                    (nnx.state(network, nnx.Param), fusion.single),
-                )
-                for name, network in (("trained_without", policy), ("trained_with", whole))
-            ),
-        )
+        learners = Learner("trained_without", "", policy), Learner("trained_with", "", whole)
+        walkers: list[tuple[Contender, Any]] = [(random_walker(draws), None)]
+        walkers += [(walker(one), (nnx.state(one.network, nnx.Param), fusion.single)) for one in learners]
         for contender, given in walkers:
             table, key = OnLattice(some).table(contender.believes), jax.random.key(seed)
             views = walk_all(key, contender, given, fusion, table, some.directions, None, max_views)

@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 from flax import nnx
 
-from eval.active_study import Learner, OnLattice, greedy_order, novel_classes, study
+from eval.active_study import greedy_order, novel_classes, study
+from eval.active_walks import Learner, OnLattice
 from mevs_jax import ViewGraph, ViewTable, fibonacci_sphere
 from mevs_jax.fusion import CalibratedFusion, SetFusion
 from mevs_jax.models import ViewPolicy
