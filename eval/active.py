@@ -30,8 +30,9 @@ from eval.active_walks import Learner
 from eval.view_tables import made_by, network_outputs, stored_array
 from mevs_jax.calibration import class_weights, fit_temperature
 from mevs_jax.fusion import CalibratedFusion, SetFusion
-from mevs_jax.models import Recogniser, ViewPolicy
+from mevs_jax.models import PointNet2, Recogniser, ViewPolicy
 from train.checkpoints import Checkpoints
+from train.entropy import EntropyConfig, EntropyTask
 from train.fusion import Features, sets_of_size
 from train.loop import fit, load_best
 from train.policy import PolicyConfig, Seen, new_policy, train_policy
@@ -61,7 +62,8 @@ class ActiveConfig:
     lattices: tuple[int, ...] = (10,)
     """further numbers of candidate views to test on, never trained on"""
     ablations: tuple[str, ...] = ()
-    """variants of the policy to compare with, with the first seed: as_it_is, information, random_states, uncrossed, q_learning"""
+    """variants of the policy to compare with, with the first seed: as_it_is, information, random_states,
+    uncrossed, cloud (where `mevs train` has made PointNet++), q_learning"""
     novel: int = 0
     """pairs of classes that a policy is trained without and then tested on, with the first seed"""
 
@@ -76,6 +78,7 @@ class Variant:
         by: how it is asked; see `mevs_jax.policies.learnt`.
         network: of the variant whose network it asks; its own unless given.
         crossed: labels come from recognisers that were trained without the object, else from one that knows it.
+        cloud: it sees PointNet++'s embedding of every partial cloud too.
         q_learning: learnt from walks alone.
         settings: what is set otherwise than for the method.
     """
@@ -85,6 +88,7 @@ class Variant:
     by: Literal["belief", "state"] = "belief"
     network: str = ""
     crossed: bool = True
+    cloud: bool = False
     q_learning: bool = False
     settings: dict[str, Any] = field(default_factory=dict)
 
@@ -96,10 +100,11 @@ VARIANTS = {
     "information": Variant("… by expected information", settings={"utility": "log"}),
     "random_states": Variant("… trained on random walks alone", settings={"rounds": 1}),
     "uncrossed": Variant("… labels by a recogniser that knows the object", crossed=False),
+    "cloud": Variant("… with PointNet++'s embedding of the clouds", cloud=True),
     "q_learning": Variant("… Q-learning (as MVSelect)", by="state", q_learning=True),
 }
 """The method, and what it is compared with to see what each part of it is good for."""
-ABLATIONS = ("as_it_is", "information", "random_states", "uncrossed", "q_learning")
+ABLATIONS = ("as_it_is", "information", "random_states", "uncrossed", "cloud", "q_learning")
 _CALIBRATED = (1, 2, 3, 4, 5, 6, 8, 12, 16, 24, 32, 40)
 """Numbers of views at which a temperature is fitted; between them it is interpolated."""
 
@@ -126,8 +131,10 @@ def check_active(config: ActiveConfig, views: int) -> None:
 class Stages:
     """One seed of the study in its folder: every stage, made or found."""
 
-    def __init__(self, config: ActiveConfig, dataset: DataConfig, out: Path, seed: int = 0):
-        self.config, self.dataset, self.out, self.seed = config, dataset, out, seed
+    def __init__(
+        self, config: ActiveConfig, dataset: DataConfig, out: Path, seed: int = 0, entropy: EntropyConfig | None = None
+    ):
+        self.config, self.dataset, self.out, self.seed, self.entropy = config, dataset, out, seed, entropy
         self.turned = out / "active" / "turned"
         self.folder = out / "active" / f"seed_{seed}"
 
@@ -187,12 +194,32 @@ class Stages:
         assert isinstance(recogniser, Recogniser)
         return calibrated(recogniser.fusion, validation, self.prior, posed)
 
-    def parts(self, posed: bool = True) -> list[Seen]:
+    @property
+    def has_clouds(self) -> bool:
+        """Whether there is a PointNet++ to embed them."""
+        return self.entropy is not None and (self.out / "entropy" / "summary.json").exists()
+
+    def clouds(self, data: Path, split: str) -> Float[Array, "objects views embedding"]:
+        """PointNet++'s embedding of the partial cloud of every view, kept in `active/clouds/` for all seeds."""
+        folder, statistics = self.out / "entropy", load_statistics(self.out / "data")
+        assert self.entropy is not None
+        task = EntropyTask.of(self.entropy, statistics.views, statistics.entropy_max, statistics.camera)
+        found = stored_array(
+            self.out / "active" / "clouds" / f"{data.name}_{split}.npz",
+            made_by(load_statistics(data), folder),
+            lambda: network_outputs(data, split, task, load_best(task, folder), _embed).astype(np.float32),
+        )
+        return jnp.asarray(found)
+
+    def parts(self, posed: bool = True, cloud: bool = False) -> list[Seen]:
         """The training objects in parts, each as seen by the recogniser that was trained without it."""
         part_of, found = fold_of(len(open_split(self.turned, "train")), self.config.folds), []
+        clouds = self.clouds(self.turned, "train") if cloud else None
         for fold in range(self.config.folds):
             held_out = np.flatnonzero(part_of == fold)
             data = self.features(f"fold_{fold}_train", self.turned, "train", fold, held_out)
+            if clouds is not None:
+                data = replace(data, clouds=clouds[held_out])
             found.append((self.fusion(fold, posed), data))
         return found
 
@@ -207,9 +234,12 @@ class Stages:
             config = replace(self.config.q_learning, seed=self.seed)
 
         def train() -> tuple[ViewPolicy, dict[str, Any]]:
-            check = self.fusion(posed=variant.posed), self.features("turned_val", self.turned, "val")
+            seen = self.features("turned_val", self.turned, "val")
+            if variant.cloud:
+                seen = replace(seen, clouds=self.clouds(self.turned, "val"))
+            check = self.fusion(posed=variant.posed), seen
             if variant.crossed:
-                parts = self.parts(variant.posed)
+                parts = self.parts(variant.posed, variant.cloud)
             else:
                 parts = [(check[0], self.features("turned_train", self.turned, "train"))]
             *parts, check = ((fusion, data.without(without)) for fusion, data in (*parts, check))
@@ -220,10 +250,15 @@ class Stages:
                 policy, histories = train_policy(config, parts, check)
             return policy, {"rounds": histories}
 
-        made = (self.recogniser_folder(fold) for fold in (None, *range(self.config.folds)))
+        made = [self.recogniser_folder(fold) for fold in (None, *range(self.config.folds))]
+        cloud = 0
+        if variant.cloud:
+            assert self.entropy is not None
+            made, cloud = [*made, self.out / "entropy"], self.entropy.network.global_layers[-1]
         identity = {"made_by": made_by(self.statistics, *made), "of": asdict(config)}
         folder = self.policy_folder("_".join(map(str, (name, *(f"without_{label}" for label in without)))))
-        return _made_once(folder, identity, new_policy(config, len(self.statistics.classes), variant.posed), train)
+        untrained = new_policy(config, len(self.statistics.classes), variant.posed, cloud)
+        return _made_once(folder, identity, untrained, train)
 
     def learner(self, name: str) -> Learner:
         variant = VARIANTS[name]
@@ -256,6 +291,11 @@ def _see(network: Recogniser, task: Task, batch: Batch) -> jax.Array:
     assert isinstance(task, RecogniserTask)
     label = batch["label"][:, None].astype(jnp.float32)
     return jnp.concatenate([network.see(task.inputs(batch)), task.directions(batch), label], axis=-1)
+
+
+def _embed(network: PointNet2, task: Task, batch: Batch) -> jax.Array:
+    assert isinstance(task, EntropyTask)
+    return network.embed(task.inputs(batch))
 
 
 def calibrated(

@@ -83,7 +83,17 @@ def _walks(
         split: OnLattice(stages.features(f"{views}_{split}", data, split), *_entropies(stages.out, data, split))
         for split in ("val", "test")
     }
-    names = (method, *ablations)
+    names = [method, *ablations]
+    if "cloud" in names and not stages.has_clouds:
+        console.print(
+            f"Left out: the view policy that sees clouds; PointNet++ is trained by: mevs train --out {stages.out}"
+        )
+        names.remove("cloud")
+    if "cloud" in names:
+        on = {
+            split: replace(one, features=replace(one.features, clouds=stages.clouds(data, split)))
+            for split, one in on.items()
+        }
     learners = [stages.learner(name) for name in names]
     learners[0] = replace(learners[0], name="learnt")
 

@@ -42,7 +42,8 @@ class OnLattice:
     def table(self, with_features: bool) -> ViewTable:
         utility, entropy = (None if known is None else jnp.asarray(known) for known in (self.utility, self.entropy))
         features = self.features.features if with_features else None
-        return ViewTable(self.features.logits, utility, entropy, self.features.labels, features=features)
+        data = self.features
+        return ViewTable(data.logits, utility, entropy, data.labels, features=features, clouds=data.clouds)
 
 
 @dataclass(frozen=True)

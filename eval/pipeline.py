@@ -187,7 +187,7 @@ TINY = Settings(
         max_views=4,
         draws=2,
         lattices=(),
-        ablations=("as_it_is",),
+        ablations=("as_it_is", "cloud"),
         novel=1,
     ),
     climb=ClimbConfig(objects=1, starts=2, resolution=16, faces=64),
@@ -377,7 +377,7 @@ def learn_to_choose(settings: Settings, out: Path) -> Path:
     config, found = settings.active, []
     check_active(config, settings.dataset.capture.views)
     for seed in range(config.seeds):
-        stages = Stages(config, settings.dataset, out, seed)
+        stages = Stages(config, settings.dataset, out, seed, settings.entropy)
         train_all(stages)
         found.append(measure(stages))
     metrics = {"seeds": found, "settings": asdict(config)}

@@ -25,12 +25,13 @@ from mevs_jax.viewpoints import ViewGraph, local_maxima
 
 @flax.struct.dataclass
 class Observation:
-    """What one look gives: logits (classes,); the entropy predictor's word on every view (views,), where it is asked; and the
-    encoder's features (features,), where they are fused."""
+    """What one look gives: logits (classes,); the entropy predictor's word on every view (views,), where it is asked; the
+    encoder's features (features,), where they are fused; and PointNet++'s embedding of the partial cloud, where it is used."""
 
     logits: Float[Array, "*batch classes"]
     utility: Float[Array, "*batch views"] | None = None
     features: Float[Array, "*batch features"] | None = None
+    cloud: Float[Array, "*batch embedding"] | None = None
 
 
 @flax.struct.dataclass
@@ -218,7 +219,7 @@ def learnt(
         del key
         points, present = scene.graph.points, jnp.arange(len(state.views)) < state.count
         views = jax.nn.log_softmax(state.seen.logits / temperature, axis=-1)
-        gain, gain_if = network(state.belief, views, points[state.views], present, points)
+        gain, gain_if = network(state.belief, views, points[state.views], present, points, state.seen.cloud)
         return gain if by == "state" else expected_gain(state.belief, gain_if)
 
     return scores

@@ -33,6 +33,7 @@ class ViewTable:
         label: the true class.
         climbed: (views, views) by policy; row i is where differentiable rendering would look after seeing view i.
         features: (views, features) of the encoder, for a learnt fusion.
+        clouds: (views, embedding) of the partial clouds, for a policy that uses them.
     """
 
     logits: Float[Array, "*batch_and_backbones views classes"]
@@ -41,12 +42,14 @@ class ViewTable:
     label: Int[Array, "*batch"]
     climbed: dict[str, Float[Array, "*batch views views"]] | None = None
     features: Float[Array, "*batch views features"] | None = None
+    clouds: Float[Array, "*batch views embedding"] | None = None
 
     def observe(self, view: Int[Array, ""]) -> Observation:
         return Observation(
             self.logits[view],
             None if self.utility is None else self.utility[view],
             None if self.features is None else self.features[view],
+            None if self.clouds is None else self.clouds[view],
         )
 
     def scene(

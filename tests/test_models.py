@@ -182,7 +182,14 @@ def test_directions_stand_in_the_place_of_the_normals(random):
     cloud = random.normal(0, 0.4, (600, 3)).astype(np.float32)
     directions = random.normal(0, 1, (600, 3)).astype(np.float32)
     nothing = network(np.concatenate([cloud, np.zeros_like(cloud)], axis=1))
-    np.testing.assert_allclose(network(cloud), nothing, rtol=1e-5, atol=1e-6)
+    found = network(cloud)
+    np.testing.assert_allclose(found, nothing, rtol=1e-5, atol=1e-6)
+    embedded = network.embed(cloud)
+    assert embedded.shape == (1024,)
+    hidden = embedded
+    for weights, bias in network.head.folded():
+        hidden = jax.nn.relu(hidden @ weights + bias)
+    np.testing.assert_allclose(network.out(hidden), found, rtol=1e-4, atol=1e-6)
     assert np.abs(np.asarray(network(np.concatenate([cloud, directions], axis=1)) - nothing)).max() > 1e-3
 
 

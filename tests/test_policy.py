@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import partial
 
 import jax
@@ -99,6 +100,24 @@ def test_without_a_pose_worth_is_the_same_whichever_way_an_object_faces(random):
     found = [asked(policy, belief, views, there[1 : 1 + SEEN], present, there) for there in (points, points @ turn.T)]
     np.testing.assert_allclose(*(gain for gain, _ in found), atol=1e-5)
     np.testing.assert_allclose(*(gain_if for _, gain_if in found), atol=1e-5)
+
+
+def test_clouds_are_told_beside_their_views(random):
+    policy = moved(ViewPolicy(CLASSES, width=16, heads=2, blocks=1, cloud=7, rngs=nnx.Rngs(1)), 0.1)
+    belief = jax.nn.log_softmax(random.normal(size=CLASSES)).astype(np.float32)
+    views = jax.nn.log_softmax(random.normal(size=(SEEN, CLASSES)), axis=-1)
+    points, present = fibonacci_sphere(VIEWS).astype(np.float32), np.array([True, True, False])
+    clouds = random.normal(size=(SEEN, 7)).astype(np.float32)
+    known = policy, belief, views, points[:SEEN], present, points
+    gain, _ = asked(*known, clouds)
+    assert np.abs(gain - asked(*known, clouds[[1, 0, 2]])[0]).max() > 1e-4
+    np.testing.assert_allclose(asked(*known, np.where(present[:, None], clouds, np.nan))[0], gain, atol=1e-6)
+    with pytest.raises(ValueError, match="needs the embeddings of partial clouds"):
+        asked(*known)
+    data = replace(some_features(12), clouds=jnp.asarray(random.normal(size=(12, VIEWS, 7)), jnp.float32))
+    config = PolicyConfig(width=16, heads=2, blocks=1, most_seen=2, rounds=1, epochs=1, batch_size=8)
+    trained, _ = train_policy(config, [(fusion_of(5, CLASSES), data)], (fusion_of(5, CLASSES), data))
+    assert trained.cloud is not None
 
 
 def test_directions_become_all_their_monomials():

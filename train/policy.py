@@ -78,6 +78,7 @@ class Choices:
         gain: in utility that each brings.
         label: the true class.
         weight: how much the state counts.
+        clouds: embeddings of the partial clouds of the views seen, where they are used.
     """
 
     belief: Float[Array, "states classes"]
@@ -88,6 +89,7 @@ class Choices:
     gain: Float[Array, "states candidates"]
     label: Int[Array, "states"]
     weight: Float[Array, "states"]
+    clouds: Float[Array, "states seen embedding"] | None = None
 
 
 def graph_of(directions: Float[Array, "views 3"]) -> ViewGraph:
@@ -110,7 +112,7 @@ def _walk_some(
 
     def of_object(key: Array, one: Features) -> Array:
         graph = graph_of(one.directions)
-        table = ViewTable(one.logits, None, None, one.labels, features=one.features)
+        table = ViewTable(one.logits, None, None, one.labels, features=one.features, clouds=one.clouds)
         starts, keys = jax.random.split(key)
         start = jax.random.randint(starts, (walks,), 0, one.directions.shape[0])
 
@@ -167,7 +169,8 @@ def _choices_of_some(fusion: CalibratedFusion, some: tuple[Features, Array, Arra
             after = jax.vmap(with_one_more)(asked)
             gain = worth(after[:, one.labels], config) - worth(belief[one.labels], config)
             known = belief, single[order], directions, present, one.directions[asked]
-            return Choices(*known, gain, one.labels, jnp.float32(1))
+            clouds = None if one.clouds is None else one.clouds[order]
+            return Choices(*known, gain, one.labels, jnp.float32(1), clouds)
 
         of_walk = jax.vmap(of_state, (None, 0, 0))
         return jax.vmap(of_walk, (0, None, 0))(walks, jnp.arange(1, most + 1), asked)
@@ -203,7 +206,7 @@ def policy_loss(network: ViewPolicy, some: Choices) -> tuple[Array, dict[str, Ar
 
     Squared, because the mean is wanted: a telling view changes little most of the time and much now and then.
     """
-    gain, gain_if = network(some.belief, some.views, some.directions, some.present, some.candidates)
+    gain, gain_if = network(some.belief, some.views, some.directions, some.present, some.candidates, some.clouds)
     own = jnp.take_along_axis(gain_if, some.label[:, None, None], axis=2)[:, :, 0]
     weight = some.weight[:, None] / jnp.sum(some.weight)
     known = {"gain": gain, "gain_if": own}
@@ -211,8 +214,8 @@ def policy_loss(network: ViewPolicy, some: Choices) -> tuple[Array, dict[str, Ar
     return errors["gain"] + errors["gain_if"], errors
 
 
-def new_policy(config: PolicyConfig, classes: int, posed: bool = True) -> ViewPolicy:
-    shape = {"width": config.width, "heads": config.heads, "blocks": config.blocks}
+def new_policy(config: PolicyConfig, classes: int, posed: bool = True, cloud: int = 0) -> ViewPolicy:
+    shape = {"width": config.width, "heads": config.heads, "blocks": config.blocks, "cloud": cloud}
     return ViewPolicy(classes, **shape, posed=posed, rngs=nnx.Rngs(config.seed))
 
 
@@ -249,7 +252,9 @@ def train_policy(
         validation: objects that no recogniser was trained on.
     """
     key = jax.random.key(config.seed)
-    untrained = partial(new_policy, config, parts[0][1].logits.shape[-1], validation[0].posed)
+    data = parts[0][1]
+    cloud = 0 if data.clouds is None else data.clouds.shape[-1]
+    untrained = partial(new_policy, config, data.logits.shape[-1], validation[0].posed, cloud)
     policy, histories = untrained(), []
     gathered: list[tuple[Choices, Choices]] = []
     for number in range(config.rounds):

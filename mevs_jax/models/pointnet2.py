@@ -226,7 +226,7 @@ class PointNet2(nnx.Module):
         batch, dtype = points.shape[:-2], self.dtype or points.dtype
         clouds = points.reshape(-1, *points.shape[-2:])
         if not train:
-            embedded = self._embed(clouds[..., :3], clouds[..., 3:].astype(dtype))
+            embedded = self._embed(clouds)
             return self.out(_infer(self.head.folded(), embedded).astype(points.dtype)).reshape(*batch, self.views)
         if key is None:
             raise ValueError("PointNet2 in training needs a key for its dropout")
@@ -248,10 +248,15 @@ class PointNet2(nnx.Module):
         hidden = jnp.where(jax.random.bernoulli(key, kept, hidden.shape), hidden / kept, 0.0)
         return self.out(hidden).reshape(*batch, self.views)
 
-    def _embed(
-        self, points: Float[Array, "clouds points 3"], features: Float[Array, "clouds points channels"]
-    ) -> Float[Array, "clouds embedding"]:
+    def embed(self, points: Float[AnyArray, "*batch points columns"]) -> Float[Array, "*batch embedding"]:
+        """The vector of each cloud from which the entropies are predicted, in inference; arguments as of a call."""
+        points = jnp.asarray(points)
+        embedded = self._embed(points.reshape(-1, *points.shape[-2:])).astype(points.dtype)
+        return embedded.reshape(*points.shape[:-2], -1)
+
+    def _embed(self, clouds: Float[Array, "clouds points columns"]) -> Float[Array, "clouds embedding"]:
         """Clouds to the vectors before the head, by the running statistics."""
+        points, features = clouds[..., :3], clouds[..., 3:].astype(self.dtype or clouds.dtype)
         for level, perceptron in zip(self.levels, self.perceptrons, strict=True):
             sample = partial(farthest_point_sample, k=level.centres)
             chosen = _map(sample, points, at_once=4) if jax.default_backend() == "cpu" else jax.vmap(sample)(points)

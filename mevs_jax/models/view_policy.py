@@ -51,6 +51,7 @@ class ViewPolicy(nnx.Module):
         width: of queries and tokens.
         heads: of attention.
         blocks: of attention and layers.
+        cloud: length of the vector beside each view, PointNet++'s embedding of its partial cloud; 0 for none.
         posed: whether directions are in the object's own frame, else in one that is turned about the vertical.
         rngs: source of the initial weights.
     """
@@ -62,6 +63,7 @@ class ViewPolicy(nnx.Module):
         width: int = 96,
         heads: int = 4,
         blocks: int = 2,
+        cloud: int = 0,
         posed: bool = True,
         rngs: nnx.Rngs,
     ):
@@ -73,6 +75,9 @@ class ViewPolicy(nnx.Module):
         self.known_norm, self.last_norm = nnx.LayerNorm(width, rngs=rngs), nnx.LayerNorm(width, rngs=rngs)
         self.gain = nnx.Linear(width, 1, rngs=rngs)
         self.gain_if = nnx.Linear(width, classes, rngs=rngs)
+        self.cloud = (
+            nnx.Sequential(nnx.LayerNorm(cloud, rngs=rngs), nnx.Linear(cloud, width, rngs=rngs)) if cloud else None
+        )
 
     def __call__(
         self,
@@ -81,6 +86,7 @@ class ViewPolicy(nnx.Module):
         directions: Float[AnyArray, "*batch seen 3"],
         present: Bool[AnyArray, "*batch seen"],
         candidates: Float[AnyArray, "*batch candidates 3"],
+        clouds: Float[AnyArray, "*batch seen embedding"] | None = None,
     ) -> tuple[Float[Array, "*batch candidates"], Float[Array, "*batch candidates classes"]]:
         """The worth of each candidate, said twice.
 
@@ -90,11 +96,17 @@ class ViewPolicy(nnx.Module):
             directions: unit vectors to the cameras of those.
             present: which of them there are; the rest is padding.
             candidates: unit vectors to where the camera may go.
+            clouds: an embedding of the partial cloud of each view seen, for a network that was made with `cloud`.
 
         Returns:
             By how much the utility is expected to rise (`train.policy`: the true class's probability or its logarithm); and
             [j, y]: by how much with candidate j should the class be y.
+
+        Raises:
+            ValueError: where the network wants clouds and is given none.
         """
+        if self.cloud is not None and clouds is None:
+            raise ValueError("this view policy needs the embeddings of partial clouds, which are not given")
         belief, views, present = jnp.asarray(belief), jnp.asarray(views), jnp.asarray(present)
         if not self.posed:
             directions, turn = about_the_first(directions, present)
@@ -103,6 +115,8 @@ class ViewPolicy(nnx.Module):
         floor = -12.0  # a belief of 6 in a million is as good as none
         tokens = self.view(jnp.where(spare, jnp.maximum(views, floor), 0.0))
         tokens = tokens + self.direction(direction_features(jnp.where(spare, jnp.asarray(directions), 0.0)))
+        if self.cloud is not None:
+            tokens = tokens + self.cloud(jnp.where(spare, jnp.asarray(clouds), 0.0))
         count = jnp.log(jnp.maximum(jnp.sum(present, axis=-1, keepdims=True), 1).astype(belief.dtype))
         own = self.belief(jnp.concatenate([jnp.maximum(belief, floor), count], axis=-1))
         tokens = jnp.concatenate([own[..., None, :], tokens], axis=-2)
