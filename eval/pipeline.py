@@ -116,7 +116,7 @@ SMALL = Settings(
             balanced=True,
             optimiser=OptimiserConfig(
                 method="muon",
-                epochs=4,
+                epochs=6,
                 batch_size=256,
                 views_per_object=8,
                 epoch_views=40,
@@ -126,7 +126,7 @@ SMALL = Settings(
                 schedule="cosine",
             ),
         ),
-        fold_epochs=3,
+        fold_epochs=4,
         ablations=ABLATIONS,
         novel=5,
     ),
