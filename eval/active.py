@@ -116,11 +116,14 @@ def check_active(config: ActiveConfig, views: int) -> None:
     for name in config.ablations:
         if name not in ABLATIONS:
             raise DataError(f"unknown ablation {name!r} (--active.ablations); it is one of {', '.join(ABLATIONS)}")
-    most, batch = max(config.policy.most_seen, config.max_views), config.recogniser.optimiser
+    walks = [config.policy.most_seen, config.max_views]
+    if "q_learning" in config.ablations:
+        walks.append(config.q_learning.most_seen)
+    most, batch = max(walks), config.recogniser.optimiser
     if not 2 <= most < views:
         raise DataError(
-            f"walks of {most} views (--active.max-views, --active.policy.most-seen) need more than {most} candidate views, "
-            f"and at least 2; there are {views}"
+            f"walks of {most} views (--active.max-views, --active.policy.most-seen, --active.q-learning.most-seen) need more "
+            f"than {most} candidate views, and at least 2; there are {views}"
         )
     if not batch.validation_views or 256 % batch.validation_views or batch.validation_views > views:
         raise DataError(
