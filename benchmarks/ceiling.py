@@ -17,20 +17,18 @@ from typing import Annotated, Literal
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
-import jax
 import matplotlib.pyplot as plt
 import numpy as np
 import tyro
-from jaxtyping import Array
 from scipy.ndimage import label as connected
 
 from data_pipeline.builder import open_split
 from data_pipeline.files import write_text
 from eval.active import Stages
+from eval.active_walks import beliefs_of_sets
 from eval.comparison import intervals
 from eval.pipeline import PRESETS
 from mevs_jax.fusion import CalibratedFusion
-from train.chunks import in_chunks
 from train.fusion import Features, sets_of_size
 
 RESULTS = Path(__file__).parent / "results"
@@ -70,13 +68,8 @@ def nearest(some: np.ndarray, others: np.ndarray) -> tuple[np.ndarray, np.ndarra
 def answers(fusion: CalibratedFusion, data: Features, size: int, draws: int = 8) -> np.ndarray:
     """The class that random sets of so many views are taken for, (objects, draws)."""
     views = data.features.shape[1]
-    sets = sets_of_size(len(data.labels), views, size, 1 if size == views else draws).swapaxes(0, 1)
-
-    @jax.jit
-    def fuse(some: tuple[Features, Array]) -> Array:
-        return jax.vmap(lambda present: fusion(some[0].features, some[0].directions, present), 1, 1)(some[1])
-
-    return in_chunks(fuse, (data, np.asarray(sets)), 16).argmax(axis=-1)
+    sets = sets_of_size(len(data.labels), views, size, 1 if size == views else draws)
+    return beliefs_of_sets(fusion, data, sets).argmax(axis=-1).T
 
 
 def draw(path: Path, views: list[np.ndarray], titles: list[str], columns: int = 8) -> None:
@@ -101,9 +94,8 @@ def main(options: Options) -> None:
     objects = [source[index] for index in range(len(source))]
     with np.load(options.archive) as archive:
         train, train_labels = archive["X_train"] > 0, archive["y_train"]
-        from_split = (
-            "test" if options.split == "test" else "train"
-        )  # validation objects are of the official training split
+        # Validation objects are of the official training split.
+        from_split = "test" if options.split == "test" else "train"
         grids = archive[f"X_{from_split}"] > 0
     number = np.array([int(example["name"].decode().rsplit("_", 1)[1]) for example in objects])
     grids, labels = grids[number], np.asarray(data.labels)

@@ -15,7 +15,7 @@ from jax.scipy.spatial.transform import Rotation
 from jaxtyping import Array, Float
 
 from data_pipeline.capture import CaptureConfig
-from mevs_jax.cameras import look_at_origin
+from mevs_jax.cameras import Camera, look_at_origin, pixel_directions
 
 
 @dataclass(frozen=True)
@@ -149,9 +149,8 @@ def views_after(
         poses: of the cameras that took them.
     """
     side, distance = images.shape[1], camera.distance
-    slope = (jnp.arange(side) + 0.5 - side / 2) * (2 * math.tan(math.radians(camera.field_of_view) / 2) / side)
-    across, down = jnp.meshgrid(slope, slope)
-    rays = jnp.stack([across, down, jnp.ones_like(across)], axis=-1)
+    pinhole = Camera(jnp.eye(4), math.radians(camera.field_of_view), side)
+    rays = pixel_directions(pinhole)
     undo = jnp.linalg.inv(change)
 
     def of_view(image: Array, pose: Array) -> tuple[Array, Array]:
@@ -159,7 +158,7 @@ def views_after(
         scale = distance / jnp.linalg.norm(position)
         back = pose[:3, :3].T @ undo @ look_at_origin(position)[:3, :3]  # directions, to the old camera's frame
         old = rays @ back.T
-        place = jnp.floor(old[..., :2] / old[..., 2:] / (slope[1] - slope[0]) + side / 2).astype(jnp.int32)
+        place = jnp.floor(old[..., :2] / old[..., 2:] * pinhole.focal_length + side / 2).astype(jnp.int32)
         inside = jnp.all((place >= 0) & (place < side), axis=-1)
         place = jnp.clip(place, 0, side - 1)
         seen = jnp.where(inside[..., None], image[place[..., 1], place[..., 0]], 0.0)

@@ -9,7 +9,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from data_pipeline.builder import metric_depth
 from data_pipeline.capture import CaptureConfig
-from mevs_jax.cameras import Camera, unproject
+from mevs_jax.cameras import Camera, pixel_directions, unproject
 
 
 def image_input(
@@ -36,9 +36,7 @@ def depth_and_normals(view: Int[Array, "height width"], camera: CaptureConfig) -
     """
     metric = metric_depth(view)
     side, hit = len(view), metric > 0
-    slope = (jnp.arange(side) + 0.5 - side / 2) * (2 * math.tan(math.radians(camera.field_of_view) / 2) / side)
-    x, y = jnp.meshgrid(slope, slope)
-    points = jnp.stack([x, y, jnp.ones_like(x)], axis=-1) * metric[..., None]
+    points = pixel_directions(Camera(jnp.eye(4), math.radians(camera.field_of_view), side)) * metric[..., None]
 
     def step(axis: int) -> tuple[Float[Array, "height width 3"], Bool[Array, "height width"]]:
         """Towards the next pixel along an axis, by way of the nearer neighbour."""

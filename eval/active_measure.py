@@ -79,34 +79,32 @@ def _walks(
 ) -> dict[str, Any]:
     """Every policy's walks among the views of a data set, which the features kept are named after."""
     config, method = stages.config, "learnt" if posed else "learnt_unposed"
-    on = {
-        split: OnLattice(stages.features(f"{views}_{split}", data, split), *_entropies(stages.out, data, split))
-        for split in ("val", "test")
-    }
     names = [method, *ablations]
     if "cloud" in names and not stages.has_clouds:
         console.print(
             f"Left out: the view policy that sees clouds; PointNet++ is trained by: mevs train --out {stages.out}"
         )
         names.remove("cloud")
-    if "cloud" in names:
-        on = {
-            split: replace(one, features=replace(one.features, clouds=stages.clouds(data, split)))
-            for split, one in on.items()
-        }
     learners = [stages.learner(name) for name in names]
     learners[0] = replace(learners[0], name="learnt")
 
+    def objects_of(split: str) -> OnLattice:
+        features = stages.features(f"{views}_{split}", data, split)
+        if "cloud" in names:
+            features = replace(features, clouds=stages.clouds(data, split))
+        return OnLattice(features, *_entropies(stages.out, data, split))
+
     def walk() -> dict[str, Any]:
+        validation, test = map(objects_of, ("val", "test"))
         known = "" if posed else ", which way they face unknown"
-        objects, count, _ = on["test"].features.logits.shape
+        objects, count, _ = test.features.logits.shape
         around = " of its own around each" if data == stages.turned else ""
         console.print(f"Walking {objects} test objects, {count} candidate views{around}{known}")
         return study(
             stages.fusion(posed=posed),
             learners,
-            on["val"],
-            on["test"],
+            validation,
+            test,
             max_views=config.max_views,
             draws=config.draws,
             seed=stages.seed,
@@ -117,7 +115,7 @@ def _walks(
         "policies": [
             read_json(stages.policy_folder(learner.made_as) / "summary.json")["identity"] for learner in learners
         ],
-        "walks": [names, config.max_views, config.draws, on["test"].entropy is not None],
+        "walks": [names, config.max_views, config.draws, _entropy_tables(stages.out, data, "test") is not None],
     }
     return _kept(stages.folder / f"walks_{views}{'' if posed else '_unposed'}.json", identity, walk)
 
@@ -126,7 +124,6 @@ def _novel(stages: Stages) -> dict[str, Any]:
     """How policies do on the classes that they were trained without; encoder and fusion know all."""
     views, classes = stages.dataset.capture.views, len(stages.statistics.classes)
     data = lattice_data(stages.dataset, stages.out, views)
-    test = stages.features(f"lattice_{views}_test", data, "test")
     half = classes // 2
     pairs = [(first, first + half) for first in range(min(stages.config.novel, half))]
     policies = [(pair, stages.policy(without=pair)) for pair in pairs]
@@ -137,6 +134,7 @@ def _novel(stages: Stages) -> dict[str, Any]:
     }
 
     def walk() -> dict[str, Any]:
+        test = stages.features(f"lattice_{views}_test", data, "test")
         console.print(f"Walking test objects of {2 * len(pairs)} classes that a policy was trained without")
         return novel_classes(
             stages.fusion(), policies, stages.policy(), test, stages.config.max_views, stages.config.draws, stages.seed
@@ -145,7 +143,13 @@ def _novel(stages: Stages) -> dict[str, Any]:
     return _kept(stages.folder / "walks_novel.json", identity, walk)
 
 
-def _decision(stages: Stages, calls: int = 200) -> dict[str, Any]:
+def _decision(stages: Stages) -> dict[str, Any]:
+    policy = read_json(stages.policy_folder() / "summary.json")["identity"]
+    identity = {"policy": policy, "machine": machine(), "candidates": stages.dataset.capture.views}
+    return _kept(stages.folder / "decision.json", identity, partial(_decision_times, stages))
+
+
+def _decision_times(stages: Stages, calls: int = 200) -> dict[str, Any]:
     """Time of one decision among all candidate views (ms), from features that are there and from the newest depth image on."""
     task, camera, most = stages.task(), stages.dataset.capture, stages.config.max_views
     recogniser = load_best(task, stages.recogniser_folder())
@@ -177,26 +181,25 @@ def _decision(stages: Stages, calls: int = 200) -> dict[str, Any]:
         (depth[i % len(depth)], *(random.normal(size=(most, n)).astype(np.float32) for n in (width, classes)))
         for i in range(calls)
     ]
+    times = {
+        "from_features": milliseconds(partial(from_features, weights), [given[1:] for given in inputs]),
+        "from_image": milliseconds(partial(from_image, weights), inputs),
+    }
+    return {
+        name: {f"p{share}": float(np.percentile(taken, share)) for share in (50, 99)} for name, taken in times.items()
+    }
 
-    def time() -> dict[str, Any]:
-        times = {
-            "from_features": milliseconds(partial(from_features, weights), [given[1:] for given in inputs]),
-            "from_image": milliseconds(partial(from_image, weights), inputs),
-        }
-        return {
-            name: {f"p{share}": float(np.percentile(taken, share)) for share in (50, 99)}
-            for name, taken in times.items()
-        }
 
-    policy = read_json(stages.policy_folder() / "summary.json")["identity"]
-    identity = {"policy": policy, "machine": machine(), "candidates": camera.views}
-    return _kept(stages.folder / "decision.json", identity, time)
+def _entropy_tables(out: Path, data: Path, split: str) -> Path | None:
+    """Where `mevs run` has put what the entropy predictor says of this data set, if it has."""
+    path = out / "tables" / f"{split}.npz"
+    return path if data == out / "data" and path.exists() else None
 
 
 def _entropies(out: Path, data: Path, split: str) -> tuple[np.ndarray | None, np.ndarray | None]:
-    """What the entropy predictor of the run says of every view, and the true entropies, where `mevs run` has made them."""
-    path = out / "tables" / f"{split}.npz"
-    if data != out / "data" or not path.exists():
+    """What the entropy predictor of the run says of every view, and the true entropies, where they are known."""
+    path = _entropy_tables(out, data, split)
+    if path is None:
         return None, None
     tables = load_view_tables(path)
     return tables.utility, tables.entropy

@@ -12,11 +12,21 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from flax import nnx
 from jaxtyping import Array, Float, Int
 
 from data_pipeline.progress import console
-from eval.active_walks import Contender, Learner, OnLattice, beliefs_of, contenders, random_walker, walk_all, walker
+from eval.active_walks import (
+    Contender,
+    Learner,
+    OnLattice,
+    beliefs_of,
+    beliefs_of_sets,
+    contenders,
+    given_to,
+    random_walker,
+    walk_all,
+    walker,
+)
 from eval.comparison import intervals
 from eval.confidence import stopping
 from eval.knowledge import class_view_table
@@ -25,7 +35,6 @@ from mevs_jax.calibration import class_weights, expected_calibration_error, fit_
 from mevs_jax.fusion import CalibratedFusion
 from mevs_jax.models import ViewPolicy
 from mevs_jax.policies import Knowledge
-from train.chunks import in_chunks
 from train.fusion import Features, sets_of_size
 
 
@@ -132,21 +141,13 @@ def random_sets_study(
     def summed(data: Features, present: Array) -> Array:
         return jnp.einsum("dov,ovc->doc", present.astype(jnp.float32), data.logits)
 
-    @jax.jit
-    def fuse_some(some: tuple[Features, Array]) -> Array:
-        data, sets = some
-        return jax.vmap(lambda present: fusion(data.features, data.directions, present), 1, 1)(sets)
-
-    def fused(data: Features, present: Array) -> np.ndarray:
-        return in_chunks(fuse_some, (data, present.swapaxes(0, 1)), 16).swapaxes(0, 1)
-
     rows = []
     for size in sorted({*range(1, min(views, 12) + 1), *(size for size in (16, 20, 40, views) if size <= views)}):
         sets = [
             sets_of_size(len(data.labels), views, size, 1 if size == views else draws) for data in (validation, test)
         ]
         temperature = _refit(jnp.moveaxis(summed(validation, sets[0]), 0, 1)[:, :, None], validation.labels)[0]
-        beliefs = {"sum": summed(test, sets[1]) / temperature, "learnt": fused(test, sets[1])}
+        beliefs = {"sum": summed(test, sets[1]) / temperature, "learnt": beliefs_of_sets(fusion, test, sets[1])}
         row: dict[str, Any] = {"views": size}
         right = {}
         for name, belief in beliefs.items():
@@ -202,7 +203,7 @@ def study(
     after: dict[str, np.ndarray] = {}
     from_some: dict[str, np.ndarray] = {}  # accuracy from the oracles' starts
     parameters: dict[str, Any] = {"belief_oracle": fusion, "label_oracle": fusion}
-    parameters |= {learner.name: (nnx.state(learner.network, nnx.Param), fusion.single) for learner in learners}
+    parameters |= {learner.name: given_to(learner, fusion) for learner in learners}
     entropies = shared and test.utility is not None and test.entropy is not None
     some_starts = np.arange(0, len(points), oracle_starts)
     for contender in contenders(learners, draws, oracle_views, oracle_starts, entropies, shared):
@@ -265,7 +266,7 @@ def novel_classes(
         some = test.some(np.flatnonzero(np.isin(test.labels, classes)))
         learners = Learner("trained_without", "", policy), Learner("trained_with", "", whole)
         walkers: list[tuple[Contender, Any]] = [(random_walker(draws), None)]
-        walkers += [(walker(one), (nnx.state(one.network, nnx.Param), fusion.single)) for one in learners]
+        walkers += [(walker(one), given_to(one, fusion)) for one in learners]
         for contender, given in walkers:
             table, key = OnLattice(some).table(contender.believes), jax.random.key(seed)
             views = walk_all(key, contender, given, fusion, table, some.directions, None, max_views)

@@ -11,16 +11,17 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from flax import nnx
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from mevs_jax.arrays import AnyArray
 from mevs_jax.fusion import CalibratedFusion
 from mevs_jax.models import ViewPolicy
-from mevs_jax.policies import POLICIES, Knowledge, Policy, fused_oracle, learnt
+from mevs_jax.policies import POLICIES, Knowledge, Policy, fused_oracle
 from mevs_jax.selection import ViewTable, adding, by_attention, select_from_table
 from mevs_jax.viewpoints import ViewGraph
 from train.chunks import in_chunks
 from train.fusion import Features
+from train.policy import learnt_policy
 
 _WALKS_AT_ONCE = 2**11
 
@@ -41,8 +42,8 @@ class OnLattice:
 
     def table(self, with_features: bool) -> ViewTable:
         utility, entropy = (None if known is None else jnp.asarray(known) for known in (self.utility, self.entropy))
-        features = self.features.features if with_features else None
         data = self.features
+        features = data.features if with_features else None
         return ViewTable(data.logits, utility, entropy, data.labels, features=features, clouds=data.clouds)
 
 
@@ -95,15 +96,15 @@ def random_walker(draws: int) -> Contender:
     return replace(_by_name("random", "random", "nothing", believes=False), draws=draws)
 
 
-def _learnt(given: tuple[nnx.State, Array], structure: nnx.GraphDef, by: Literal["belief", "state"]) -> Policy:
-    weights, temperature = given
-    return learnt(nnx.merge(structure, weights), temperature, by=by)
-
-
 def walker(learner: Learner) -> Contender:
-    """Whose parameters are the network's weights, and the temperature of single views."""
-    policy_of = partial(_learnt, structure=nnx.graphdef(learner.network), by=learner.by)
+    """Whose parameters are `given_to` it."""
+    policy_of = partial(learnt_policy, structure=nnx.graphdef(learner.network), by=learner.by)
     return Contender(learner.name, learner.title, "learnt", policy_of)
+
+
+def given_to(learner: Learner, fusion: CalibratedFusion) -> tuple[nnx.State, Array]:
+    """The network's weights, and the temperature of single views."""
+    return nnx.state(learner.network, nnx.Param), fusion.single
 
 
 def _oracle(fusion: CalibratedFusion, by: Any) -> Policy:
@@ -174,6 +175,20 @@ def beliefs_of(
 ) -> Float[np.ndarray, "objects walks steps classes"]:
     """Log-probabilities after each view of each walk."""
     return in_chunks(partial(_beliefs_of_some, fusion), (data, views), max(1, 1024 // views.shape[1]))
+
+
+@jax.jit
+def _beliefs_of_some_sets(fusion: CalibratedFusion, some: tuple[Features, Array]) -> Array:
+    data, sets = some
+    return jax.vmap(lambda present: fusion(data.features, data.directions, present), 1, 1)(sets)
+
+
+def beliefs_of_sets(
+    fusion: CalibratedFusion, data: Features, present: Bool[AnyArray, "draws objects views"]
+) -> Float[np.ndarray, "draws objects classes"]:
+    """Log-probabilities after each set of views."""
+    sets = np.asarray(present).swapaxes(0, 1)
+    return in_chunks(partial(_beliefs_of_some_sets, fusion), (data, sets), 16).swapaxes(0, 1)
 
 
 def contenders(

@@ -12,6 +12,7 @@ from typing import Any, TypeVar
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 import optax
 from flax import nnx
 from jaxtyping import Array, Float, Int
@@ -35,6 +36,20 @@ class AveragedConfig:
     """share of the running mean of the weights that a step keeps"""
     seed: int = 0
     """of weights, batches and all that is drawn"""
+
+
+def mean_losses(
+    losses_of: Callable[[nnx.State, Data], dict[str, Array]], data: Data, size: int
+) -> Callable[[nnx.State], dict[str, float]]:
+    """For `fit_averaged` to validate with: means of the losses of some weights over parts of about so many samples."""
+    samples = len(jax.tree.leaves(data)[0])
+    parts = np.array_split(np.arange(samples), max(1, samples // size))
+
+    def validate(weights: nnx.State) -> dict[str, float]:
+        found = [losses_of(weights, jax.tree.map(lambda leaf, part=part: leaf[part], data)) for part in parts]
+        return {name: float(np.mean([float(one[name]) for one in found])) for name in found[0]}
+
+    return validate
 
 
 def fit_averaged(

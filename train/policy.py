@@ -28,7 +28,7 @@ from mevs_jax.models.view_policy import ViewPolicy
 from mevs_jax.policies import Policy, learnt, random_view
 from mevs_jax.selection import ViewTable, by_attention, select_from_table
 from mevs_jax.viewpoints import ViewGraph
-from train.averaged import AveragedConfig, fit_averaged
+from train.averaged import AveragedConfig, fit_averaged, mean_losses
 from train.chunks import in_chunks
 from train.fusion import Features
 
@@ -214,6 +214,14 @@ def policy_loss(network: ViewPolicy, some: Choices) -> tuple[Array, dict[str, Ar
     return errors["gain"] + errors["gain_if"], errors
 
 
+def learnt_policy(
+    given: tuple[nnx.State, Array], structure: nnx.GraphDef, by: Literal["belief", "state"] = "belief"
+) -> Policy:
+    """`learnt` of a network's weights and the temperature of single views, which a compiled program takes as arguments."""
+    weights, temperature = given
+    return learnt(nnx.merge(structure, weights), temperature, by=by)
+
+
 def new_policy(config: PolicyConfig, classes: int, posed: bool = True, cloud: int = 0) -> ViewPolicy:
     shape = {"width": config.width, "heads": config.heads, "blocks": config.blocks, "cloud": cloud}
     return ViewPolicy(classes, **shape, posed=posed, rngs=nnx.Rngs(config.seed))
@@ -230,12 +238,7 @@ def _fit(config: PolicyConfig, network: ViewPolicy, train: Choices, validation: 
     def check(mean: nnx.State, some: Choices) -> dict[str, Array]:
         return policy_loss(nnx.merge(structure, mean), some)[1]
 
-    parts = np.array_split(np.arange(len(validation.label)), max(1, len(validation.label) // 1024))
-
-    def validate(mean: nnx.State) -> dict[str, float]:
-        found = [check(mean, jax.tree.map(lambda leaf, part=part: leaf[part], validation)) for part in parts]
-        return {name: float(np.mean([float(one[name]) for one in found])) for name in found[0]}
-
+    validate = mean_losses(check, validation, 1024)
     best, history = fit_averaged(config, loss_of, parameters, train, validate)
     return nnx.merge(structure, best), history
 
@@ -259,7 +262,7 @@ def train_policy(
     gathered: list[tuple[Choices, Choices]] = []
     for number in range(config.rounds):
         structure, weights = nnx.split(policy)
-        policy_of = (lambda _: random_view) if number == 0 else partial(_learnt, structure=structure)
+        policy_of = (lambda _: random_view) if number == 0 else partial(learnt_policy, structure=structure)
         found = []
         for part, (fusion, data) in enumerate([*parts, validation]):
             given = weights, fusion.single
@@ -274,11 +277,6 @@ def train_policy(
         last = ", ".join(f"{name} {value:.4f}" for name, value in history[-1].items())
         console.print(f"Round {number + 1} of {config.rounds}, {len(train.label)} states: {last}")
     return policy, histories
-
-
-def _learnt(given: tuple[nnx.State, Array], structure: nnx.GraphDef) -> Policy:
-    weights, temperature = given
-    return learnt(nnx.merge(structure, weights), temperature)
 
 
 def _balanced(choices: Choices) -> Choices:

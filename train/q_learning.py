@@ -26,11 +26,11 @@ from jaxtyping import Array, Float, Int
 from data_pipeline.progress import console
 from mevs_jax.fusion import CalibratedFusion
 from mevs_jax.models.view_policy import ViewPolicy
-from mevs_jax.policies import Policy, learnt
-from train.averaged import fit_averaged
+from mevs_jax.policies import Policy
+from train.averaged import fit_averaged, mean_losses
 from train.chunks import in_chunks
 from train.fusion import Features
-from train.policy import PolicyConfig, Seen, joined, new_policy, walk, worth
+from train.policy import PolicyConfig, Seen, joined, learnt_policy, new_policy, walk, worth
 
 
 @dataclass(frozen=True)
@@ -127,8 +127,7 @@ def temporal_difference(
 
 def exploring(given: tuple[nnx.State, Array], structure: nnx.GraphDef, share: float) -> Policy:
     """Now and then any view, otherwise that of the highest value."""
-    weights, temperature = given
-    greedy = learnt(nnx.merge(structure, weights), temperature, by="state")
+    greedy = learnt_policy(given, structure, by="state")
 
     def scores(key: Array, state: Any, scene: Any) -> Array:
         whether, drawn = jax.random.split(key)
@@ -181,11 +180,8 @@ def _fit(
         network, old = (nnx.merge(structure, weights) for weights in (parameters, target))
         return jnp.mean(temporal_difference(network, old, some, discount) ** 2)
 
-    checked = jax.jit(loss_of)
-    parts = np.array_split(np.arange(len(check.order)), max(1, len(check.order) // 256))
+    @jax.jit
+    def error(mean: nnx.State, some: Transitions) -> dict[str, Array]:
+        return {"error": loss_of(mean, some)}
 
-    def validate(mean: nnx.State) -> dict[str, float]:
-        found = [float(checked(mean, jax.tree.map(lambda leaf, part=part: leaf[part], check))) for part in parts]
-        return {"error": float(np.mean(found))}
-
-    return fit_averaged(config, loss_of, target, train, validate)
+    return fit_averaged(config, loss_of, target, train, mean_losses(error, check, 256))
