@@ -4,8 +4,8 @@ Stages, each of which skips what is done: views from turned directions; a recogn
 training objects that never saw it; features of every view; the view policy; walks of every
 test object from every start. Everything that is chosen or fitted, temperatures among it, is so on validation objects.
 
-In a run's folder: `active/turned/` (data), `active/seed_0/` with `recogniser/`, `fold_0/`, …, `features/`, `policy/`;
-and `active/metrics.json`.
+In a run's folder: `active/turned/` (data), `active/seed_0/` with `recogniser/`, `fold_0/`, …, `features/`, `policies/`;
+`active/seed_0_rotated/`, the same for objects turned anyhow; and `active/metrics.json`.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from __future__ import annotations
 from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property, partial
 from pathlib import Path
-from typing import Any, Literal, TypeVar
+from typing import Any, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -21,6 +21,7 @@ import numpy as np
 from flax import nnx
 from jaxtyping import Array, Bool
 
+from data_pipeline.augment import views_after
 from data_pipeline.batches import fold_of
 from data_pipeline.builder import DataConfig, DatasetStatistics, load_statistics, open_split, prepare
 from data_pipeline.files import as_read, read_json, write_json
@@ -29,13 +30,15 @@ from data_pipeline.progress import console
 from eval.active_walks import Learner
 from eval.view_tables import made_by, network_outputs, stored_array
 from mevs_jax.calibration import class_weights, fit_temperature
-from mevs_jax.fusion import CalibratedFusion, SetFusion
+from mevs_jax.fusion import CalibratedFusion, SetFusion, SumFusion
 from mevs_jax.models import PointNet2, Recogniser, ViewPolicy
+from mevs_jax.viewpoints import viewpoint_lattice
 from train.checkpoints import Checkpoints
 from train.entropy import EntropyConfig, EntropyTask
 from train.fusion import Features, sets_of_size
 from train.loop import fit, load_best
-from train.policy import PolicyConfig, Seen, new_policy, train_policy
+from train.policy import By, PolicyConfig, Seen, new_policy, train_policy
+from train.pretrained import StartingWeights
 from train.q_learning import QLearningConfig, train_by_q_learning
 from train.recogniser import RecogniserConfig, RecogniserTask
 from train.step import Batch, Task
@@ -62,10 +65,13 @@ class ActiveConfig:
     lattices: tuple[int, ...] = (10,)
     """further numbers of candidate views to test on, never trained on"""
     ablations: tuple[str, ...] = ()
-    """variants of the policy to compare with, with the first seed: as_it_is, information, random_states,
-    uncrossed, cloud (where `mevs train` has made PointNet++), q_learning"""
+    """variants of the policy to compare with, with the first seed: as_it_is, look_ahead, information,
+    random_states, uncrossed, summed, cloud (where `mevs train` has made PointNet++), q_learning"""
     novel: int = 0
     """pairs of classes that a policy is trained without and then tested on, with the first seed"""
+    rotation_epochs: int = 0
+    """further training of the recognisers, on objects turned by any rotation, which are then tested on too, with
+    the first seed; 0 for neither"""
 
 
 @dataclass(frozen=True)
@@ -75,20 +81,22 @@ class Variant:
     Attributes:
         title: in the report.
         posed: whether the objects' pose is known.
-        by: how it is asked; see `mevs_jax.policies.learnt`.
+        by: how it is asked; see `train.policy.By`.
         network: of the variant whose network it asks; its own unless given.
         crossed: labels come from recognisers that were trained without the object, else from one that knows it.
         cloud: it sees PointNet++'s embedding of every partial cloud too.
+        summed: beliefs are sums of logits, in training and on its walks.
         q_learning: learnt from walks alone.
         settings: what is set otherwise than for the method.
     """
 
     title: str
     posed: bool = True
-    by: Literal["belief", "state"] = "belief"
+    by: By = "belief"
     network: str = ""
     crossed: bool = True
     cloud: bool = False
+    summed: bool = False
     q_learning: bool = False
     settings: dict[str, Any] = field(default_factory=dict)
 
@@ -97,16 +105,20 @@ VARIANTS = {
     "learnt": Variant("view policy"),
     "learnt_unposed": Variant("view policy", posed=False),
     "as_it_is": Variant("… by what it expects of the state as it is", by="state", network="learnt"),
+    "look_ahead": Variant("… two views ahead", by="ahead", network="learnt"),
     "information": Variant("… by expected information", settings={"utility": "log"}),
     "random_states": Variant("… trained on random walks alone", settings={"rounds": 1}),
     "uncrossed": Variant("… labels by a recogniser that knows the object", crossed=False),
+    "summed": Variant("… with the sum of logits for a fusion", summed=True),
     "cloud": Variant("… with PointNet++'s embedding of the clouds", cloud=True),
     "q_learning": Variant("… Q-learning (as MVSelect)", by="state", q_learning=True),
 }
 """The method, and what it is compared with to see what each part of it is good for."""
-ABLATIONS = ("as_it_is", "information", "random_states", "uncrossed", "cloud", "q_learning")
+ABLATIONS = ("as_it_is", "look_ahead", "information", "random_states", "uncrossed", "summed", "cloud", "q_learning")
 _CALIBRATED = (1, 2, 3, 4, 5, 6, 8, 12, 16, 24, 32, 40)
 """Numbers of views at which a temperature is fitted; between them it is interpolated."""
+_FURTHER = 0.4
+"""Learning rate of further training, beside that of the first."""
 
 
 def check_active(config: ActiveConfig, views: int) -> None:
@@ -132,14 +144,27 @@ def check_active(config: ActiveConfig, views: int) -> None:
 
 
 class Stages:
-    """One seed of the study in its folder: every stage, made or found."""
+    """One seed of the study in its folder: every stage, made or found.
+
+    `upright` are the same stages, for stages where objects are turned by any rotation: there recognisers go on from these, and
+    see the views of each object as if it, and not the lattice around it, had been turned.
+    """
 
     def __init__(
-        self, config: ActiveConfig, dataset: DataConfig, out: Path, seed: int = 0, entropy: EntropyConfig | None = None
+        self,
+        config: ActiveConfig,
+        dataset: DataConfig,
+        out: Path,
+        seed: int = 0,
+        entropy: EntropyConfig | None = None,
+        upright: Stages | None = None,
     ):
         self.config, self.dataset, self.out, self.seed, self.entropy = config, dataset, out, seed, entropy
-        self.turned = out / "active" / "turned"
-        self.folder = out / "active" / f"seed_{seed}"
+        self.turned, self.upright = out / "active" / "turned", upright
+        self.folder = out / "active" / (f"seed_{seed}" if upright is None else f"seed_{seed}_rotated")
+
+    def rotated(self) -> Stages:
+        return Stages(self.config, self.dataset, self.out, self.seed, self.entropy, upright=self)
 
     def prepare(self) -> None:
         """The views from turned directions."""
@@ -155,25 +180,42 @@ class Stages:
         optimiser = replace(config.recogniser.optimiser, seed=self.seed, data_seed=self.seed)
         if fold is not None and config.fold_epochs:
             optimiser = replace(optimiser, epochs=config.fold_epochs)
+        augmentation = config.recogniser.augmentation
+        if self.upright is not None:
+            rate = _FURTHER * optimiser.learning_rate
+            optimiser = replace(optimiser, epochs=config.rotation_epochs, learning_rate=rate)
+            augmentation = replace(augmentation, turn=True)
         part = None if fold is None else (fold, config.folds)
-        recogniser = replace(config.recogniser, optimiser=optimiser)
+        recogniser = replace(config.recogniser, optimiser=optimiser, augmentation=augmentation)
         return RecogniserTask.of(recogniser, len(statistics.classes), statistics.camera, part)
 
     def recogniser_folder(self, fold: int | None = None) -> Path:
         return self.folder / ("recogniser" if fold is None else f"fold_{fold}")
 
     def train_recogniser(self, fold: int | None = None) -> None:
-        fit(self.task(fold), self.turned, self.statistics, self.recogniser_folder(fold))
+        fit(self.task(fold), self.turned, self.statistics, self.recogniser_folder(fold), self._start(fold))
+
+    def _start(self, fold: int | None) -> StartingWeights | None:
+        """What a recogniser goes on from, if from any."""
+        if self.upright is None:
+            return None
+        task, folder = self.upright.task(fold), self.upright.recogniser_folder(fold)
+
+        def put(network: nnx.Module) -> None:
+            nnx.update(network, nnx.state(load_best(task, folder)))
+
+        return StartingWeights(f"{task.name} {made_by(self.statistics, folder)}", put)
 
     def features(
         self, name: str, data: Path, split: str, fold: int | None = None, chosen: np.ndarray | None = None
     ) -> Features:
         """What the recogniser sees of every view, kept in `features/` under this name."""
         task, folder, classes = self.task(fold), self.recogniser_folder(fold), len(self.statistics.classes)
+        ask = _see if self.upright is None else _see_rotated
         seen = stored_array(
             self.folder / "features" / f"{name}.npz",
             made_by(load_statistics(data), folder),
-            lambda: network_outputs(data, split, task, load_best(task, folder), _see, chosen).astype(np.float32),
+            lambda: network_outputs(data, split, task, load_best(task, folder), ask, chosen).astype(np.float32),
         )
         ends = np.cumsum([seen.shape[-1] - classes - 4, classes, 3])
         features, logits, directions, labels = np.split(seen, ends, axis=-1)
@@ -190,12 +232,13 @@ class Stages:
         counts = np.array([self.statistics.counts["train"][name] for name in self.statistics.classes], np.float32)
         return jnp.log(jnp.asarray(counts / counts.sum()))
 
-    def fusion(self, fold: int | None = None, posed: bool = True) -> CalibratedFusion:
-        """The recogniser's fusion, with temperatures, for objects of known or of unknown pose."""
+    def fusion(self, fold: int | None = None, posed: bool = True, summed: bool = False) -> CalibratedFusion:
+        """The recogniser's fusion, or the sum of its logits, with temperatures; for objects of known or of unknown pose."""
         validation = self.features("turned_val" if fold is None else f"fold_{fold}_val", self.turned, "val", fold)
         recogniser = load_best(self.task(fold), self.recogniser_folder(fold))
         assert isinstance(recogniser, Recogniser)
-        return calibrated(recogniser.fusion, validation, self.prior, posed)
+        network = SumFusion(recogniser.encoder.head, self.prior) if summed else recogniser.fusion
+        return calibrated(network, validation, self.prior, posed)
 
     @property
     def has_clouds(self) -> bool:
@@ -214,7 +257,7 @@ class Stages:
         )
         return jnp.asarray(found)
 
-    def parts(self, posed: bool = True, cloud: bool = False) -> list[Seen]:
+    def parts(self, posed: bool = True, cloud: bool = False, summed: bool = False) -> list[Seen]:
         """The training objects in parts, each as seen by the recogniser that was trained without it."""
         part_of, found = fold_of(len(open_split(self.turned, "train")), self.config.folds), []
         clouds = self.clouds(self.turned, "train") if cloud else None
@@ -223,7 +266,7 @@ class Stages:
             data = self.features(f"fold_{fold}_train", self.turned, "train", fold, held_out)
             if clouds is not None:
                 data = replace(data, clouds=clouds[held_out])
-            found.append((self.fusion(fold, posed), data))
+            found.append((self.fusion(fold, posed, summed), data))
         return found
 
     def policy_folder(self, name: str = "learnt") -> Path:
@@ -240,9 +283,9 @@ class Stages:
             seen = self.features("turned_val", self.turned, "val")
             if variant.cloud:
                 seen = replace(seen, clouds=self.clouds(self.turned, "val"))
-            check = self.fusion(posed=variant.posed), seen
+            check = self.fusion(posed=variant.posed, summed=variant.summed), seen
             if variant.crossed:
-                parts = self.parts(variant.posed, variant.cloud)
+                parts = self.parts(variant.posed, variant.cloud, variant.summed)
             else:
                 parts = [(check[0], self.features("turned_train", self.turned, "train"))]
             *parts, check = ((fusion, data.without(without)) for fusion, data in (*parts, check))
@@ -266,7 +309,8 @@ class Stages:
     def learner(self, name: str) -> Learner:
         variant = VARIANTS[name]
         made_as = variant.network or name
-        return Learner(name, variant.title, self.policy(made_as), variant.by, made_as)
+        fusion = self.fusion(posed=variant.posed, summed=True) if variant.summed else None
+        return Learner(name, variant.title, self.policy(made_as), variant.by, made_as, fusion)
 
 
 Network = TypeVar("Network", bound=nnx.Module)
@@ -296,13 +340,40 @@ def _see(network: Recogniser, task: Task, batch: Batch) -> jax.Array:
     return jnp.concatenate([network.see(task.inputs(batch)), task.directions(batch), label], axis=-1)
 
 
+def _see_rotated(network: Recogniser, task: Task, batch: Batch) -> jax.Array:
+    """`_see` of turned views after the object was turned, by the rotation after which its cameras stand as in the lattice again.
+
+    Turns are drawn evenly among all rotations, and so are these.
+    """
+    assert isinstance(task, RecogniserTask)
+    views, lattice = task.camera.views, viewpoint_lattice(task.camera.views, task.camera.lattice)
+    images, poses, directions = (
+        array.reshape(-1, views, *array.shape[1:])
+        for array in (task.inputs(batch), batch["pose"], task.directions(batch))
+    )
+
+    def of_object(images: Array, poses: Array, directions: Array) -> tuple[Array, Array]:
+        turn = jnp.linalg.solve(directions.T @ directions, directions.T @ jnp.asarray(lattice, jnp.float32)).T
+        return views_after(turn, images, poses, task.camera)
+
+    images, directions = (
+        array.reshape(-1, *array.shape[2:]) for array in jax.vmap(of_object)(images, poses, directions)
+    )
+    label = batch["label"][:, None].astype(jnp.float32)
+    return jnp.concatenate([network.see(images), directions, label], axis=-1)
+
+
 def _embed(network: PointNet2, task: Task, batch: Batch) -> jax.Array:
     assert isinstance(task, EntropyTask)
     return network.embed(task.inputs(batch))
 
 
 def calibrated(
-    network: SetFusion, validation: Features, prior: Float[Array, "classes"], posed: bool = True, draws: int = 4
+    network: SetFusion | SumFusion,
+    validation: Features,
+    prior: Float[Array, "classes"],
+    posed: bool = True,
+    draws: int = 4,
 ) -> CalibratedFusion:
     """With temperatures fitted on random sets of views of validation objects, every class weighing the same.
 

@@ -40,11 +40,16 @@ def train_all(stages: Stages) -> None:
         stages.train_recogniser(fold)
     for name in ("learnt", "learnt_unposed"):
         stages.policy(name)
+    if stages.seed == 0 and stages.config.rotation_epochs:
+        turned_anyhow = stages.rotated()
+        for fold in (None, *range(stages.config.folds)):
+            turned_anyhow.train_recogniser(fold)
+        turned_anyhow.policy("learnt_unposed")
 
 
 def measure(stages: Stages) -> dict[str, Any]:
-    """What one seed's networks reach: by number of candidate views, among directions of their own around every object, and where
-    nobody knows which way the objects face."""
+    """What one seed's networks reach: by number of candidate views, among directions of their own around every object, where
+    nobody knows which way the objects face, and where they are turned anyhow."""
     own, first = stages.dataset.capture.views, stages.seed == 0
 
     def on_lattice(views: int, **given: Any) -> dict[str, Any]:
@@ -59,6 +64,8 @@ def measure(stages: Stages) -> dict[str, Any]:
         "scattered": {str(own): _walks(stages, "turned", stages.turned)},
         "unposed": {str(own): on_lattice(own, posed=False)},
     }
+    if first and stages.config.rotation_epochs:
+        found["rotated"] = {str(own): _walks(stages.rotated(), "turned", stages.turned, posed=False)}
     if first and stages.config.novel:
         found["novel"] = _novel(stages)
     if first:
@@ -87,6 +94,7 @@ def _walks(
         names.remove("cloud")
     learners = [stages.learner(name) for name in names]
     learners[0] = replace(learners[0], name="learnt")
+    costs = posed and data == stages.out / "data"
 
     def objects_of(split: str) -> OnLattice:
         features = stages.features(f"{views}_{split}", data, split)
@@ -99,6 +107,7 @@ def _walks(
         known = "" if posed else ", which way they face unknown"
         objects, count, _ = test.features.logits.shape
         around = " of its own around each" if data == stages.turned else ""
+        around = ", objects turned anyhow" if stages.upright is not None else around
         console.print(f"Walking {objects} test objects, {count} candidate views{around}{known}")
         return study(
             stages.fusion(posed=posed),
@@ -108,6 +117,7 @@ def _walks(
             max_views=config.max_views,
             draws=config.draws,
             seed=stages.seed,
+            costs=costs,
         )
 
     identity = {
@@ -115,7 +125,7 @@ def _walks(
         "policies": [
             read_json(stages.policy_folder(learner.made_as) / "summary.json")["identity"] for learner in learners
         ],
-        "walks": [names, config.max_views, config.draws, _entropy_tables(stages.out, data, "test") is not None],
+        "walks": [names, config.max_views, config.draws, _entropy_tables(stages.out, data, "test") is not None, costs],
     }
     return _kept(stages.folder / f"walks_{views}{'' if posed else '_unposed'}.json", identity, walk)
 

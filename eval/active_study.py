@@ -7,6 +7,7 @@ policy, on its own walks over validation objects: one that picks telling views m
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any
 
 import jax
@@ -15,6 +16,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from data_pipeline.progress import console
+from eval.active_stopping import Signal, Told, confidences, what_it_costs
 from eval.active_walks import (
     Contender,
     Learner,
@@ -46,21 +48,20 @@ def _refit(beliefs: Array, labels: Array) -> Float[Array, "steps"]:
 
 
 def judged(
-    beliefs: Float[AnyArray, "objects walks steps classes"],
-    labels: Int[AnyArray, "objects"],
-    fitting: Float[AnyArray, "others walks steps classes"],
-    fitting_labels: Int[AnyArray, "others"],
-) -> tuple[dict[str, Any], np.ndarray]:
-    """One policy's numbers, and which answers are right (objects, walks, steps)."""
-    temperatures = _refit(fitting, fitting_labels)
-    beliefs = jax.nn.log_softmax(beliefs / temperatures[:, None], axis=-1)
-    right = np.asarray(jnp.argmax(beliefs, axis=-1) == labels[:, None, None])
-    confidence = np.asarray(jnp.exp(jnp.max(beliefs, axis=-1)))
+    beliefs: Sequence[Float[AnyArray, "objects walks steps classes"]], labels: Sequence[Int[AnyArray, "objects"]]
+) -> tuple[dict[str, Any], list[Signal]]:
+    """One policy's numbers, and its confidence, on walks over validation objects, where temperatures are fitted, and over test
+    objects."""
+    temperatures = _refit(beliefs[0], labels[0])
+    signals = [
+        confidences(belief / temperatures[:, None], known) for belief, known in zip(beliefs, labels, strict=True)
+    ]
+    confidence, right = signals[1].value, signals[1].right
     after = right.mean(axis=1).T
-    flat = beliefs.reshape(-1, *beliefs.shape[2:])
-    truth = jnp.repeat(labels, beliefs.shape[1])
-    steps = range(beliefs.shape[2])
-    return {
+    flat = (beliefs[1] / temperatures[:, None]).reshape(-1, *beliefs[1].shape[2:])
+    truth = jnp.repeat(labels[1], right.shape[1])
+    steps = range(right.shape[2])
+    found = {
         "after_views": after.mean(axis=1).tolist(),
         "interval": intervals(after),
         "temperatures": np.asarray(temperatures).tolist(),
@@ -70,7 +71,8 @@ def judged(
         ],
         "negative_log_likelihood": [float(negative_log_likelihood(flat[:, step], truth)) for step in steps],
         "stopping": stopping(confidence, right),
-    }, right
+    }
+    return found, signals
 
 
 def greedy_order(
@@ -125,6 +127,8 @@ def learn(fusion: CalibratedFusion, data: Features, most: int) -> Knowledge:
 
 BASELINES = ("random", "farthest", "fixed_order")
 """What a policy that learns is compared with."""
+_FITTING_STARTS = 4
+"""Temperatures are fitted on walks from every so many-th start."""
 _GAP = 3
 """The gap between random and the label-free oracle is read after 2 views and the next, up to so many further ones."""
 
@@ -178,15 +182,17 @@ def study(
     oracle_views: int = 4,
     oracle_starts: int = 5,
     seed: int = 0,
+    costs: bool = False,
 ) -> dict[str, Any]:
     """Every number about one lattice of candidate views.
 
     Args:
         fusion: of the recogniser whose features these are.
-        learners: trained view policies, the method and its ablations.
+        learners: trained view policies, the method first and then its ablations.
         max_views: of a walk.
         draws: walks from each start of policies that draw.
         oracle_views, oracle_starts: how far oracles walk, and from every so many-th start.
+        costs: whether to tell too when the method would stop and what it does where the way has a price.
     """
     points, labels = test.features.directions[0], test.features.labels
     shared = fusion.posed and bool(jnp.allclose(test.features.directions, points, atol=1e-4))
@@ -204,30 +210,39 @@ def study(
     from_some: dict[str, np.ndarray] = {}  # accuracy from the oracles' starts
     parameters: dict[str, Any] = {"belief_oracle": fusion, "label_oracle": fusion}
     parameters |= {learner.name: given_to(learner, fusion) for learner in learners}
+    fusions = {learner.name: learner.fusion or fusion for learner in learners}
+    told: dict[str, Told] = {}
     entropies = shared and test.utility is not None and test.entropy is not None
     some_starts = np.arange(0, len(points), oracle_starts)
     for contender in contenders(learners, draws, oracle_views, oracle_starts, entropies, shared):
-        beliefs = []
+        name, own, walks, beliefs = contender.name, fusions.get(contender.name, fusion), [], []
         for split, data in enumerate((validation, test)):
+            every = contender.every if data is test else max(contender.every, _FITTING_STARTS)
             views = walk_all(
                 jax.random.fold_in(jax.random.key(seed), split),
-                contender,
-                parameters.get(contender.name),
-                fusion,
+                replace(contender, every=every),
+                parameters.get(name),
+                own,
                 data.table(contender.believes),
                 data.features.directions,
                 knowledge,
                 contender.max_views or max_views,
             )
-            beliefs.append(beliefs_of(fusion, data.features, views))
-        judgement, right = judged(beliefs[1], labels, beliefs[0], validation.features.labels)
+            walks.append(views)
+            beliefs.append(beliefs_of(own, data.features, views))
+        judgement, signals = judged(beliefs, [data.features.labels for data in (validation, test)])
+        right = signals[1].right
+        told[name] = Told(walks, beliefs, signals)
         by_start = right.reshape(len(right), -1, contender.draws, right.shape[-1]).mean(axis=2)
-        after[contender.name] = by_start.mean(axis=1).T
+        after[name] = by_start.mean(axis=1).T
         if contender.every == 1:
             by_start = by_start[:, some_starts]
-        from_some[contender.name] = by_start.mean(axis=(0, 1))
-        found["policies"][contender.name] = {"title": contender.title, "knows": contender.knows, **judgement}
+        from_some[name] = by_start.mean(axis=(0, 1))
+        found["policies"][name] = {"title": contender.title, "knows": contender.knows, **judgement}
         console.print(f"{contender.title}: " + " ".join(f"{100 * share:.1f}" for share in judgement["after_views"]))
+    if costs:
+        key, method = jax.random.key(seed), learners[0]
+        found["costs"] = what_it_costs(key, method, fusion, validation, test, knowledge, told, max_views)
     found["against"] = {
         base: {
             name: _difference(mine, after[base])

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Any, Literal
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -21,7 +21,7 @@ from mevs_jax.selection import ViewTable, adding, by_attention, select_from_tabl
 from mevs_jax.viewpoints import ViewGraph
 from train.chunks import in_chunks
 from train.fusion import Features
-from train.policy import learnt_policy
+from train.policy import By, learnt_policy
 
 _WALKS_AT_ONCE = 2**11
 
@@ -79,9 +79,11 @@ class Learner:
     name: str
     title: str
     network: ViewPolicy
-    by: Literal["belief", "state"] = "belief"
+    by: By = "belief"
     made_as: str = ""
     """name of the variant whose network it is"""
+    fusion: CalibratedFusion | None = None
+    """its own, where it is not the study's"""
 
 
 def _named(_: Any, name: str) -> Policy:

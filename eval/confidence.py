@@ -88,6 +88,11 @@ def _score(log_probabilities: Array, labels: Array) -> dict[str, Array]:
     }
 
 
+def stops_at(enough: np.ndarray) -> np.ndarray:
+    """The first step (…) of walks (…, steps) where it is enough, else their last."""
+    return np.where(enough.any(axis=-1), enough.argmax(axis=-1), enough.shape[-1] - 1)
+
+
 def stopping(confidence: np.ndarray, right: np.ndarray) -> list[dict[str, Any]]:
     """Stops at the first step whose risk, 1 − confidence, is at most each of `RISKS`; else goes to the end of the walk.
 
@@ -96,8 +101,7 @@ def stopping(confidence: np.ndarray, right: np.ndarray) -> list[dict[str, Any]]:
     rows = []
     for risk in RISKS:
         sure = confidence >= 1 - risk
-        stops = sure.any(axis=-1)
-        at = np.where(stops, sure.argmax(axis=-1), confidence.shape[-1] - 1)
+        stops, at = sure.any(axis=-1), stops_at(sure)
         answer = np.take_along_axis(right, at[..., None], axis=-1)[..., 0]
         by_object = np.stack([(stops & ~answer).mean(axis=1), stops.mean(axis=1)])
         rows.append(

@@ -129,6 +129,7 @@ SMALL = Settings(
         fold_epochs=4,
         ablations=ABLATIONS,
         novel=5,
+        rotation_epochs=3,
     ),
 )
 """The same study at 64×64 with narrower networks.
@@ -187,8 +188,9 @@ TINY = Settings(
         max_views=4,
         draws=2,
         lattices=(),
-        ablations=("as_it_is", "cloud"),
+        ablations=("as_it_is", "look_ahead", "summed", "cloud"),
         novel=1,
+        rotation_epochs=1,
     ),
     climb=ClimbConfig(objects=1, starts=2, resolution=16, faces=64),
 )

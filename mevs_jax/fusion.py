@@ -169,9 +169,35 @@ class SetFusion(nnx.Module):
         return self.head(self.last_norm(x[..., 0, :]))
 
 
+class SumFusion(nnx.Module):
+    """The thesis's sum of logits in the place of a `SetFusion`, to compare with: it knows no directions.
+
+    Args:
+        head: from a view's features to its logits.
+        prior: (classes,) log-probabilities of the classes in training, which count once, not with every view.
+    """
+
+    def __init__(self, head: nnx.Linear, prior: Float[Array, "classes"]):
+        self.head, self.prior = head, nnx.Variable(prior)
+
+    def __call__(
+        self,
+        features: Float[AnyArray, "*batch views features"],
+        directions: Float[AnyArray, "*batch views 3"],
+        present: Bool[AnyArray, "*batch views"],
+        *,
+        posed: bool = True,
+    ) -> Float[Array, "*batch classes"]:
+        """Logits of what was seen."""
+        del directions, posed
+        present, prior = jnp.asarray(present), self.prior[...]
+        logits = self.head(jnp.where(present[..., None], jnp.asarray(features), 0.0)) - prior
+        return jnp.sum(jnp.where(present[..., None], logits, 0.0), axis=-2) + prior
+
+
 @flax.struct.dataclass
 class CalibratedFusion:
-    """A trained set fusion whose log-probabilities can be taken at their word.
+    """A trained set fusion, or the sum of logits, whose log-probabilities can be taken at their word.
 
     Attributes:
         structure: of the network.

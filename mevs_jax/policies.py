@@ -225,6 +225,50 @@ def learnt(
     return scores
 
 
+def looking_ahead(
+    network: ViewPolicy, temperature: float | Float[Array, ""], *, shortlist: int = 4, classes: int = 3
+) -> Policy:
+    """`learnt` by the belief, two views ahead: what a view is expected to bring, and what the best one after it would.
+
+    A view is imagined to show an object of class y what it shows of others (`Knowledge.expected_logits`, log-probabilities of
+    single views), as if independent of what was seen: p′ ∝ p · softmax(M[y, j]).
+
+    Args:
+        network, temperature: as for `learnt`.
+        shortlist: how many views are looked behind, those that promise most by themselves; no other is taken.
+        classes: how many of the likeliest classes are imagined.
+    """
+
+    def scores(key: Array, state: SelectionState, scene: Scene) -> Float[Array, "views"]:
+        del key
+        expected = jax.nn.log_softmax(_given(scene.knowledge, "Scene.knowledge").expected_logits, axis=-1)
+        points, slots = scene.graph.points, jnp.arange(len(state.views))
+        views = jax.nn.log_softmax(state.seen.logits / temperature, axis=-1)
+        allowed = candidates(state, scene)
+
+        def gains(belief: Array, views: Array, order: Array, count: Array) -> Float[Array, "views"]:
+            gain_if = network(belief, views, points[order], slots < count, points, state.seen.cloud)[1]
+            return expected_gain(belief, gain_if)
+
+        now = gains(state.belief, views, state.views, state.count)
+        best = jax.lax.top_k(jnp.where(allowed, now, -jnp.inf), min(shortlist, len(points)))[1]
+        likeliest = jax.lax.top_k(state.belief, min(classes, len(state.belief)))[1]
+
+        def afterwards(view: Array, label: Array) -> Float[Array, ""]:
+            shown = expected[label, view]
+            belief = jax.nn.log_softmax(state.belief + shown)
+            found = gains(
+                belief, views.at[state.count].set(shown), state.views.at[state.count].set(view), state.count + 1
+            )
+            return jnp.max(jnp.where(allowed & (jnp.arange(len(points)) != view), found, -jnp.inf))
+
+        then = jax.vmap(jax.vmap(afterwards, (None, 0)), (0, None))(best, likeliest)
+        then = then @ jax.nn.softmax(state.belief[likeliest])
+        return jnp.full(len(points), -jnp.inf).at[best].set(now[best] + jnp.where(jnp.isfinite(then), then, 0.0))
+
+    return scores
+
+
 # Knowing what a surface or a volume made from the latest view would look like from elsewhere.
 
 

@@ -12,7 +12,7 @@ from flax import nnx
 
 from eval.active import calibrated
 from eval.active_study import random_sets_study
-from mevs_jax.fusion import SetFusion, about_the_first
+from mevs_jax.fusion import SetFusion, SumFusion, about_the_first
 from train.fusion import Features, FusionConfig, SetFusionConfig, random_sets, sets_of_size, train_fusion
 
 VIEWS, FEATURES, CLASSES = 5, 12, 3
@@ -127,6 +127,15 @@ def test_without_a_pose_objects_may_face_any_way(network, seen):
     like = nnx.clone(network)
     like.object[...] = network.unposed[...]
     np.testing.assert_allclose(belief, plain(like, features, relative, present), atol=2e-5)
+
+
+def test_the_sum_in_its_place_adds_logits_and_counts_the_prior_once(seen):
+    features, directions, present = seen
+    head, prior = nnx.Linear(FEATURES, CLASSES, rngs=nnx.Rngs(2)), jnp.asarray([-0.5, -1.5, -1.7])
+    logits = np.asarray(head(features)) - np.asarray(prior)
+    padded = np.where(present[:, None], features, np.nan)
+    found = SumFusion(head, prior)(padded, directions, present, posed=False)
+    np.testing.assert_allclose(found, logits[present].sum(axis=0) + prior, atol=1e-5)
 
 
 def test_training_sets_have_every_size_small_ones_more_often_and_views_as_often():

@@ -11,13 +11,15 @@ import numpy as np
 import pytest
 from flax import nnx
 
+from eval.active_stopping import Signal, beside
 from eval.active_study import greedy_order, novel_classes, study
 from eval.active_walks import Learner, OnLattice
+from eval.confidence import stops_at
 from mevs_jax import ViewGraph, ViewTable, fibonacci_sphere
 from mevs_jax.fusion import CalibratedFusion, SetFusion
 from mevs_jax.models import ViewPolicy
 from mevs_jax.models.view_policy import direction_features, expected_gain
-from mevs_jax.policies import POLICIES, fused_oracle, learnt, random_view
+from mevs_jax.policies import POLICIES, Knowledge, fused_oracle, learnt, looking_ahead, random_view
 from mevs_jax.selection import by_attention, select_from_table
 from train.fusion import Features
 from train.policy import PolicyConfig, choices_along, graph_of, train_policy, unseen, walk
@@ -215,6 +217,43 @@ def test_the_loop_with_a_learnt_fusion_and_policy_is_a_plain_one(fusion, policy,
         np.testing.assert_allclose(episode.confidences, [np.exp(belief.max()) for belief in beliefs], atol=1e-4)
 
 
+def test_looking_ahead_is_a_plain_loop_over_views_classes_and_views(fusion, policy):
+    data, index = some_features(3, seed=5), 2
+    points, graph = data.directions[index], graph_of(data.directions[index])
+    table = ViewTable(data.logits[index], None, None, data.labels[index], features=data.features[index])
+    expected = jnp.asarray(np.random.default_rng(8).normal(0, 2, (CLASSES, VIEWS, CLASSES)), jnp.float32)
+    scene = table.scene(graph, Knowledge(jnp.zeros(VIEWS), expected))
+
+    @jax.jit
+    def looped(start):
+        choose = looking_ahead(policy, fusion.single, shortlist=3, classes=2)
+        return select_from_table(jax.random.key(0), table, scene, choose, start, max_views=4, fuse=by_attention(fusion))
+
+    def gains(belief, views, order):
+        gain_if = asked(policy, belief, views, points[order], np.ones(len(order), bool), points)[1]
+        found = np.array(expected_gain(belief, gain_if), np.float64)
+        found[order] = -np.inf
+        return found
+
+    def scores(order, belief):
+        views = jax.nn.log_softmax(data.logits[index, np.array(order)] / fusion.single, axis=-1)
+        now = gains(belief, views, np.array(order))
+        found = np.full(VIEWS, -np.inf)
+        likeliest = np.argsort(-np.asarray(belief))[:2]
+        chance = np.exp(np.asarray(belief, np.float64)[likeliest])
+        for view in np.argsort(-now)[:3]:
+            then = []
+            for label in likeliest:
+                shown = jax.nn.log_softmax(expected[label, view])
+                after = jax.nn.log_softmax(belief + shown)
+                then.append(gains(after, jnp.concatenate([views, shown[None]]), np.array([*order, view])).max())
+            found[view] = now[view] + np.dot(chance / chance.sum(), then)
+        return found
+
+    for start in (1, 4):
+        assert looped(start).views.tolist() == plain_walk(fusion, data, index, scores, start, 4)[0]
+
+
 @pytest.mark.parametrize("by", ["belief", "label"])
 def test_oracles_of_the_fused_belief_try_every_view(fusion, by):
     data, index = some_features(2, seed=6), 0
@@ -294,13 +333,19 @@ def test_what_looking_was_worth_is_learnt_and_the_study_says_so(adding):
     assert histories[-1][-1]["gain"] < 0.7 * histories[0][0]["gain"]
     found = study(
         adding,
-        [Learner("learnt", "view policy", policy), Learner("as_it_is", "without belief", policy, "state")],
+        [
+            Learner("learnt", "view policy", policy),
+            Learner("as_it_is", "without belief", policy, "state"),
+            Learner("look_ahead", "two ahead", policy, "ahead"),
+            Learner("unsure", "another fusion", policy, fusion=replace(adding, temperatures=jnp.full(1, 50.0))),
+        ],
         OnLattice(validation),
         OnLattice(test),
         max_views=3,
         draws=2,
         oracle_views=3,
         oracle_starts=1,
+        costs=True,
     )
     after = {name: result["after_views"] for name, result in found["policies"].items()}
     # From view 0 the telling view can be known; random finds it in one case of five.
@@ -309,6 +354,18 @@ def test_what_looking_was_worth_is_learnt_and_the_study_says_so(adding):
     assert found["against"]["random"]["learnt"]["interval"][2][0] > 0
     assert found["gap_closed"]["learnt"][1] > 0.4
     assert after["label_oracle"][1] >= after["learnt"][1]
+    assert after["look_ahead"][2] > after["random"][2] + 0.1
+    first = found["policies"]["unsure"]["temperatures"][0] / found["policies"]["learnt"]["temperatures"][0]
+    assert first == pytest.approx(1 / 50, rel=1e-3)  # of a fusion of its own
+    costs = found["costs"]
+    assert costs["thesis_walks"] == "random"
+    ways = [row["way"] for row in costs["moving"]]
+    assert ways[0][0] == 0
+    assert ways[-1][1] <= ways[0][1]
+    np.testing.assert_allclose(costs["moving"][0]["after_views"], after["learnt"], atol=1e-6)  # nothing paid: as it was
+    paying = [row["views"] for row in costs["not_paying"]]
+    assert paying == sorted(paying)  # the cheaper a view, the more
+    assert paying[0] < paying[-1]
     assert set(found["policies"]) >= {"farthest", "fixed_order", "information_gain", "belief_oracle"}
     assert [row["views"] for row in found["random_sets"]] == [1, 2, 3, 4, 5, 6]
     without = novel_classes(adding, [((0, 2), policy), ((1, 3), policy)], policy, test, max_views=3, draws=2)
@@ -321,6 +378,25 @@ def test_what_looking_was_worth_is_learnt_and_the_study_says_so(adding):
     )
     assert chosen.shape == (120, 4, 3)
     assert all(len(set(order)) == 3 for order in chosen.reshape(-1, 3).tolist())
+
+
+def test_rules_are_compared_where_they_are_as_accurate():
+    """A walk is right from its second view on; one rule knows that, the other is as sure of the first view."""
+    objects, right = 40, np.array([False, True, True])
+    knows = Signal(np.tile([0.2, 0.9, 0.95], (objects, 2, 1)), np.tile(right, (objects, 2, 1)), np.ones(objects))
+    sure_late = replace(knows, value=np.tile([0.2, 0.3, 0.9], (objects, 2, 1)))
+    assert stops_at(knows.value >= 0.9).tolist() == [[1, 1]] * objects
+    assert stops_at(knows.value >= 0.99).tolist() == [[2, 2]] * objects  # never: to the end
+    assert [share.mean() for share in knows.stopped(0.1)] == [0, 1]
+    (row,) = beside([sure_late] * 2, [knows] * 2, [0.8])
+    assert (row["accuracy"], row["views"]) == (1, 3)
+    assert (row["ours"]["accuracy"], row["ours"]["views"]) == (1, 2)
+    assert row["ours"]["views_difference"] == {"difference": -1, "interval": [-1, -1]}
+    never = replace(knows, right=np.zeros_like(knows.right))
+    assert beside([sure_late] * 2, [never] * 2, [0.8])[0]["ours"] is None
+    half = replace(knows, right=knows.right & (np.arange(objects) % 2 == 0)[:, None, None])
+    weighed = replace(half, weight=np.where(np.arange(objects) % 2 == 0, 2.0, 0.0))
+    assert (half.accuracy(0.5), weighed.accuracy(0.5)) == (0.5, 1)
 
 
 def _learnt(weights, structure):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from itertools import islice
 
 import jax
 import jax.numpy as jnp
@@ -14,15 +15,17 @@ from flax import nnx
 from scipy.spatial.transform import Rotation
 
 from data_pipeline.augment import ViewAugmentation, object_changes, views_after
-from data_pipeline.batches import ViewBatches, equally_often, fold_of, train_batches
+from data_pipeline.batches import ViewBatches, equally_often, evaluation_batches, fold_of, train_batches
 from data_pipeline.builder import load_statistics, open_split, prepare
 from data_pipeline.capture import DEPTH_SCALE, CaptureConfig, capture, rig_for
 from data_pipeline.inputs import depth_and_normals
 from data_pipeline.meshes import Mesh
+from eval.active import Stages, _see_rotated
 from eval.pipeline import TINY
 from mevs_jax.cameras import Camera, look_at_origin, pixel_directions
 from mevs_jax.models import Recogniser, ResNet
-from train.loop import steps_of_an_epoch
+from mevs_jax.viewpoints import viewpoint_lattice
+from train.loop import load_best, steps_of_an_epoch
 from train.recogniser import RecogniserTask
 
 CAMERA = CaptureConfig(views=6, resolution=48)
@@ -143,6 +146,57 @@ def test_views_of_a_changed_object_are_those_that_a_camera_takes_of_it(change):
         close = (error.max(axis=-1) < 0.05)[expected[..., 0] > 0].mean()
         assert close > (0.98 if change is MIRROR else 0.4), view
         assert (error[..., 0] < 0.02).mean() > 0.96, view
+
+
+def test_objects_turned_anyhow_are_seen_from_the_lattice_itself(turned):
+    """Undoing the turn of an object's cameras turns the object instead."""
+    statistics = load_statistics(turned)
+    task = RecogniserTask.of(TINY.active.recogniser, 10, statistics.camera)
+    network = task.network(nnx.Rngs(0))
+    batches = list(islice(evaluation_batches(turned, "train", images="depth"), 2))
+    features = network.encoder.head.in_features
+    together = {name: np.concatenate([batch[name] for batch in batches]) for name in batches[0]}
+    lattice = viewpoint_lattice(task.camera.views, task.camera.lattice)
+    for index, found in enumerate(np.split(np.asarray(_see_rotated(network, task, together)), 2)):
+        np.testing.assert_allclose(found[:, features + 10 : -1], lattice, atol=1e-4)
+        np.testing.assert_array_equal(found[:, -1], batches[index]["label"])
+        before = np.asarray(task.directions(batches[index]))
+        turn = Rotation.align_vectors(lattice, before)[0].as_matrix().astype(np.float32)
+        images, _ = views_after(
+            jnp.asarray(turn), task.inputs(batches[index]), jnp.asarray(batches[index]["pose"]), task.camera
+        )
+        expected = np.asarray(network.see(images))
+        # A ray that falls between two pixels may fall to the other one after rounding.
+        assert np.median(np.abs(found[:, : features + 10] - expected)) < 1e-4
+        assert np.abs(turn - np.eye(3)).max() > 0.1
+
+
+@pytest.mark.usefixtures("lightly_compiled")
+def test_recognisers_of_objects_turned_anyhow_go_on_from_the_others(turned, tmp_path):
+    config = replace(TINY.active, rotation_epochs=1)
+    stages = Stages(config, TINY.dataset, tmp_path)
+    stages.turned = turned
+    stages.train_recogniser()
+    rotated = stages.rotated()
+    rotated.turned = turned
+    task, start = rotated.task(), rotated._start(None)
+    assert task.augmentation.turn
+    assert not stages.task().augmentation.turn
+    assert task.optimiser.epochs == 1
+    assert rotated.recogniser_folder() != stages.recogniser_folder()
+    begun = task.network(nnx.Rngs(5))
+    assert start is not None
+    start.put(begun)
+    jax.tree.map(
+        np.testing.assert_array_equal,
+        nnx.state(begun),
+        nnx.state(load_best(stages.task(), stages.recogniser_folder())),
+    )
+    batch = next(evaluation_batches(turned, "val", images="depth"))
+    pair = {name: array[:2] for name, array in batch.items()}
+    found = [RecogniserTask.evaluate(one, begun, pair)["loss"] for one in (task, task, stages.task())]
+    np.testing.assert_array_equal(found[0], found[1])  # the same turn every time
+    assert np.abs(np.asarray(found[0] - found[2])).max() > 1e-6
 
 
 def test_changes_are_drawn_for_each_object():

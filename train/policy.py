@@ -25,7 +25,7 @@ from data_pipeline.progress import console
 from mevs_jax.calibration import class_weights
 from mevs_jax.fusion import CalibratedFusion
 from mevs_jax.models.view_policy import ViewPolicy
-from mevs_jax.policies import Policy, learnt, random_view
+from mevs_jax.policies import Policy, learnt, looking_ahead, random_view
 from mevs_jax.selection import ViewTable, by_attention, select_from_table
 from mevs_jax.viewpoints import ViewGraph
 from train.averaged import AveragedConfig, fit_averaged, mean_losses
@@ -214,12 +214,15 @@ def policy_loss(network: ViewPolicy, some: Choices) -> tuple[Array, dict[str, Ar
     return errors["gain"] + errors["gain_if"], errors
 
 
-def learnt_policy(
-    given: tuple[nnx.State, Array], structure: nnx.GraphDef, by: Literal["belief", "state"] = "belief"
-) -> Policy:
-    """`learnt` of a network's weights and the temperature of single views, which a compiled program takes as arguments."""
-    weights, temperature = given
-    return learnt(nnx.merge(structure, weights), temperature, by=by)
+By = Literal["belief", "state", "ahead"]
+"""How a view policy is asked: as `learnt` has it, or two views ahead."""
+
+
+def learnt_policy(given: tuple[nnx.State, Array], structure: nnx.GraphDef, by: By = "belief") -> Policy:
+    """`learnt` or `looking_ahead` of a network's weights and the temperature of single views, which a compiled program takes as
+    arguments."""
+    network, temperature = nnx.merge(structure, given[0]), given[1]
+    return looking_ahead(network, temperature) if by == "ahead" else learnt(network, temperature, by=by)
 
 
 def new_policy(config: PolicyConfig, classes: int, posed: bool = True, cloud: int = 0) -> ViewPolicy:

@@ -137,9 +137,15 @@ class RecogniserTask:
         return means["loss"], means
 
     def evaluate(self, network: Recogniser, batch: Batch) -> Metrics:
-        """`fused`: all views of an object in the batch together."""
+        """`fused`: all views of an object in the batch together. Where objects are turned in training, they are so here, each the
+        same way every time."""
         by_object = partial(_by_object, views=self.optimiser.validation_views)
         images, directions = by_object(self.inputs(batch)), by_object(self.directions(batch))
+        if self.augmentation.turn:
+            turns = object_changes(jax.random.key(1), len(images), ViewAugmentation(mirror=False, turn=True))
+            images, directions = jax.vmap(partial(views_after, camera=self.camera))(
+                turns, images, by_object(batch["pose"])
+            )
         labels = batch["label"].reshape(images.shape[:2])[:, 0]
         found = _judged(*network(images, directions, jnp.ones(images.shape[:2], bool)), labels)
         return {name: values.reshape(-1) for name, values in found.items()}
