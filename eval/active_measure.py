@@ -34,42 +34,37 @@ from train.loop import load_best
 
 
 def train_all(stages: Stages) -> None:
-    """Every network of one seed, but those of ablations."""
+    """Every network of one seed, but those that only one part of what is measured asks for."""
     stages.prepare()
     for fold in (None, *range(stages.config.folds)):
         stages.train_recogniser(fold)
     for name in ("learnt", "learnt_unposed"):
         stages.policy(name)
-    if stages.seed == 0 and stages.config.rotation_epochs:
-        turned_anyhow = stages.rotated()
-        for fold in (None, *range(stages.config.folds)):
-            turned_anyhow.train_recogniser(fold)
-        turned_anyhow.policy("learnt_unposed")
 
 
 def measure(stages: Stages) -> dict[str, Any]:
-    """What one seed's networks reach: by number of candidate views, among directions of their own around every object, where
-    nobody knows which way the objects face, and where they are turned anyhow."""
-    own, first = stages.dataset.capture.views, stages.seed == 0
+    """What one seed's networks reach: by number of candidate views, among directions of their own around every object, and where
+    nobody knows which way the objects face; with the first seed, also ablations, classes never chosen for, and objects turned
+    anyhow."""
+    own, config = stages.dataset.capture.views, stages.config
 
     def on_lattice(views: int, **given: Any) -> dict[str, Any]:
         data = lattice_data(stages.dataset, stages.out, views)
         return _walks(stages, f"lattice_{views}", data, **given)
 
     found = {
-        "lattices": {
-            str(views): on_lattice(views, ablations=stages.config.ablations if first and views == own else ())
-            for views in (own, *stages.config.lattices)
-        },
-        "scattered": {str(own): _walks(stages, "turned", stages.turned)},
+        "lattices": {str(views): on_lattice(views) for views in (own, *config.lattices)},
         "unposed": {str(own): on_lattice(own, posed=False)},
+        "scattered": {str(own): _walks(stages, "turned", stages.turned)},
     }
-    if first and stages.config.rotation_epochs:
-        found["rotated"] = {str(own): _walks(stages.rotated(), "turned", stages.turned, posed=False)}
-    if first and stages.config.novel:
-        found["novel"] = _novel(stages)
-    if first:
+    if stages.seed == 0:
         found["decision"] = _decision(stages)
+        if config.ablations:
+            found["ablations"] = {str(own): on_lattice(own, ablations=config.ablations)}
+        if config.novel:
+            found["novel"] = _novel(stages)
+        if config.rotation_epochs:
+            found["rotated"] = {str(own): _rotated(stages)}
     return found
 
 
@@ -84,7 +79,8 @@ def _kept(path: Path, identity: dict[str, Any], find: Callable[[], dict[str, Any
 def _walks(
     stages: Stages, views: str, data: Path, ablations: tuple[str, ...] = (), posed: bool = True
 ) -> dict[str, Any]:
-    """Every policy's walks among the views of a data set, which the features kept are named after."""
+    """Every policy's walks among the views of a data set, which the features kept are named after; or those of the method and its
+    ablations."""
     config, method = stages.config, "learnt" if posed else "learnt_unposed"
     names = [method, *ablations]
     if "cloud" in names and not stages.has_clouds:
@@ -94,7 +90,7 @@ def _walks(
         names.remove("cloud")
     learners = [stages.learner(name) for name in names]
     learners[0] = replace(learners[0], name="learnt")
-    costs = posed and data == stages.out / "data"
+    costs = posed and not ablations and data == stages.out / "data"
 
     def objects_of(split: str) -> OnLattice:
         features = stages.features(f"{views}_{split}", data, split)
@@ -108,7 +104,9 @@ def _walks(
         objects, count, _ = test.features.logits.shape
         around = " of its own around each" if data == stages.turned else ""
         around = ", objects turned anyhow" if stages.upright is not None else around
-        console.print(f"Walking {objects} test objects, {count} candidate views{around}{known}")
+        console.print(
+            f"Walking {objects} test objects, {count} candidate views{around}{known}{', ablations' * bool(ablations)}"
+        )
         return study(
             stages.fusion(posed=posed),
             learners,
@@ -118,6 +116,7 @@ def _walks(
             draws=config.draws,
             seed=stages.seed,
             costs=costs,
+            others=not ablations,
         )
 
     identity = {
@@ -127,7 +126,16 @@ def _walks(
         ],
         "walks": [names, config.max_views, config.draws, _entropy_tables(stages.out, data, "test") is not None, costs],
     }
-    return _kept(stages.folder / f"walks_{views}{'' if posed else '_unposed'}.json", identity, walk)
+    kind = ("" if posed else "_unposed") + ("_ablations" if ablations else "")
+    return _kept(stages.folder / f"walks_{views}{kind}.json", identity, walk)
+
+
+def _rotated(stages: Stages) -> dict[str, Any]:
+    """Walks around objects turned by any rotation, which recognisers were trained further on."""
+    turned_anyhow = stages.rotated()
+    for fold in (None, *range(stages.config.folds)):
+        turned_anyhow.train_recogniser(fold)
+    return _walks(turned_anyhow, "turned", stages.turned, posed=False)
 
 
 def _novel(stages: Stages) -> dict[str, Any]:

@@ -10,6 +10,7 @@ from typing import Any
 from data_pipeline.builder import DatasetStatistics
 from data_pipeline.files import write_text
 from eval import figures
+from eval.active_study import BASELINES
 from eval.ladder import KNOWS
 from eval.page import ReportInputs, difference, document, image, percent, span, table
 
@@ -22,42 +23,56 @@ def _accuracy(share: float, interval: list[float]) -> str:
 
 
 def _ladder(found: dict[str, Any]) -> str:
-    rows, known = [], None
+    rows, known, with_gap = [], None, bool(found["gap_closed"])
     steps = len(found["policies"]["random"]["after_views"])
     for name, policy in found["policies"].items():
         if policy["knows"] != known:
             known = policy["knows"]
             rows.append([f'<b class="note">Knows {html.escape(KNOWS[known])}</b>'])
         cells = [_accuracy(*cell) for cell in zip(policy["after_views"], policy["interval"], strict=True)]
-        closed = found["gap_closed"].get(name)
-        shares = (
-            "" if closed is None else " / ".join("–" if share is None else f"{100 * share:.0f}" for share in closed)
+        closed = ["–" if share is None else f"{100 * share:.0f}" for share in found["gap_closed"].get(name, ())]
+        rows.append(
+            [html.escape(policy["title"]), *cells, *[""] * (steps - len(cells)), *[" / ".join(closed)] * with_gap]
         )
-        rows.append([html.escape(policy["title"]), *cells, *[""] * (steps - len(cells)), shares])
-    header = ["next view chosen by", *map(str, range(1, steps + 1)), "% of the gap closed"]
+    header = ["next view chosen by", *map(str, range(1, steps + 1)), *["% of the gap closed"] * with_gap]
+    note = (
+        "Gap: of the way from random to the label-free oracle after 2 / 3 / 4 views. The oracles try every view and walk from "
+        "every fifth start, on which the gap is read; the label oracle finds views that are right by luck."
+    )
     return (
         '<div class="wide">' + table(header, rows) + "</div>"
-        "<p class='note'>Accuracy (%) after exactly so many views, with 95 % intervals over objects. Gap: of the way from random "
-        "to the label-free oracle after 2 / 3 / 4 views. The oracles try every view and walk from every fifth start, on which "
-        "the gap is read; the label oracle finds views that are right by luck.</p>"
+        "<p class='note'>Accuracy (%) after exactly so many views, with 95 % intervals over objects. "
+        f"{note * with_gap}</p>"
     )
 
 
-def _against(found: dict[str, Any]) -> str:
+def _against(found: dict[str, Any], bases: tuple[str, ...] = BASELINES) -> str:
     titles = {name: policy["title"] for name, policy in found["policies"].items()}
-    rows = []
+    rows, bases = [], tuple(base for base in bases if base in titles)
     for name, title in titles.items():
         if found["policies"][name]["knows"] in ("nothing", "truth"):
             continue
         row = [html.escape(title)]
-        for against in found["against"].values():
-            gain = against.get(name)
+        for base in bases:
+            gain = found["against"][base].get(name)
             for step in (1, 2, 3):
                 known = gain is not None and step < len(gain["difference"])
                 row.append(difference(gain["difference"][step], gain["interval"][step]) if known else "")
         rows.append(row)
-    header = ["points above", *(f"{titles[base]}, {step} views" for base in found["against"] for step in (2, 3, 4))]
+    header = ["points above", *(f"{titles[base]}, {step} views" for base in bases for step in (2, 3, 4))]
     return '<div class="wide">' + table(header, rows) + "</div>"
+
+
+def _ablations(metrics: dict[str, Any]) -> str:
+    """What each part of the method is good for."""
+    if "ablations" not in metrics["seeds"][0]:
+        return ""
+    ((_, found),) = metrics["seeds"][0]["ablations"].items()
+    return (
+        "<h2>What each part is good for</h2><p>The view policy, and the same with one thing done otherwise; same starts.</p>"
+        + _ladder(found)
+        + _against(found, ("random", METHOD))
+    )
 
 
 def _sets(found: dict[str, Any]) -> str:
@@ -285,8 +300,9 @@ def write_active_page(metrics: dict[str, Any], statistics: DatasetStatistics, pa
             parts.append("<h2>How sure it may be</h2>" + _confidence(found) + _costs(found))
             parts.append(
                 _decision(metrics)
-                + _scattered(metrics)
+                + _ablations(metrics)
                 + _unposed(metrics)
+                + _scattered(metrics)
                 + _rotated(metrics)
                 + _novel(metrics, statistics.classes)
                 + _seeds(metrics, views)

@@ -183,6 +183,7 @@ def study(
     oracle_starts: int = 5,
     seed: int = 0,
     costs: bool = False,
+    others: bool = True,
 ) -> dict[str, Any]:
     """Every number about one lattice of candidate views.
 
@@ -193,6 +194,7 @@ def study(
         draws: walks from each start of policies that draw.
         oracle_views, oracle_starts: how far oracles walk, and from every so many-th start.
         costs: whether to tell too when the method would stop and what it does where the way has a price.
+        others: whether policies but these and random selection walk, and random sets are fused.
     """
     points, labels = test.features.directions[0], test.features.labels
     shared = fusion.posed and bool(jnp.allclose(test.features.directions, points, atol=1e-4))
@@ -203,9 +205,10 @@ def study(
         "validation_objects": len(validation.features.labels),
         "views": len(points),
         "single_view": float(jnp.mean(jnp.argmax(test.features.logits, -1) == labels[:, None])),
-        "random_sets": random_sets_study(fusion, validation.features, test.features, draws),
         "policies": {},
     }
+    if others:
+        found["random_sets"] = random_sets_study(fusion, validation.features, test.features, draws)
     after: dict[str, np.ndarray] = {}
     from_some: dict[str, np.ndarray] = {}  # accuracy from the oracles' starts
     parameters: dict[str, Any] = {"belief_oracle": fusion, "label_oracle": fusion}
@@ -214,7 +217,8 @@ def study(
     told: dict[str, Told] = {}
     entropies = shared and test.utility is not None and test.entropy is not None
     some_starts = np.arange(0, len(points), oracle_starts)
-    for contender in contenders(learners, draws, oracle_views, oracle_starts, entropies, shared):
+    asked = contenders(learners, draws, oracle_views, oracle_starts, entropies, shared)
+    for contender in asked if others else [random_walker(draws), *map(walker, learners)]:
         name, own, walks, beliefs = contender.name, fusions.get(contender.name, fusion), [], []
         for split, data in enumerate((validation, test)):
             every = contender.every if data is test else max(contender.every, _FITTING_STARTS)
@@ -249,13 +253,13 @@ def study(
             for name, mine in after.items()
             if name not in (base, "belief_oracle", "label_oracle")  # which walk from some starts only
         }
-        for base in BASELINES
+        for base in (*BASELINES, learners[0].name)
         if base in after
     }
     found["gap_closed"] = {
         name: _gap_closed(from_some[name], from_some["random"], from_some["belief_oracle"])
         for name in after
-        if name not in ("random", "belief_oracle", "label_oracle")
+        if "belief_oracle" in after and name not in ("random", "belief_oracle", "label_oracle")
     }
     return found
 
