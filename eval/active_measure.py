@@ -38,13 +38,12 @@ def train_all(stages: Stages) -> None:
     stages.prepare()
     for fold in (None, *range(stages.config.folds)):
         stages.train_recogniser(fold)
-    for name in ("learnt", "learnt_unposed"):
-        stages.policy(name)
+    stages.policy("learnt")
 
 
 def measure(stages: Stages) -> dict[str, Any]:
-    """What one seed's networks reach: by number of candidate views, among directions of their own around every object, and where
-    nobody knows which way the objects face; with the first seed, also ablations, classes never chosen for, and objects turned
+    """What one seed's networks reach by number of candidate views. With the first seed, also where nobody knows which way the
+    objects face, among directions of their own around every object, ablations, classes never chosen for, and objects turned
     anyhow."""
     own, config = stages.dataset.capture.views, stages.config
 
@@ -52,19 +51,18 @@ def measure(stages: Stages) -> dict[str, Any]:
         data = lattice_data(stages.dataset, stages.out, views)
         return _walks(stages, f"lattice_{views}", data, **given)
 
-    found = {
-        "lattices": {str(views): on_lattice(views) for views in (own, *config.lattices)},
-        "unposed": {str(own): on_lattice(own, posed=False)},
-        "scattered": {str(own): _walks(stages, "turned", stages.turned)},
-    }
-    if stages.seed == 0:
-        found["decision"] = _decision(stages)
-        if config.ablations:
-            found["ablations"] = {str(own): on_lattice(own, ablations=config.ablations)}
-        if config.novel:
-            found["novel"] = _novel(stages)
-        if config.rotation_epochs:
-            found["rotated"] = {str(own): _rotated(stages)}
+    found = {"lattices": {str(views): on_lattice(views) for views in (own, *config.lattices)}}
+    if stages.seed:
+        return found
+    found["decision"] = _decision(stages)
+    found["unposed"] = {str(own): on_lattice(own, posed=False)}
+    found["scattered"] = {str(own): _walks(stages, "turned", stages.turned)}
+    if config.ablations:
+        found["ablations"] = {str(own): on_lattice(own, ablations=config.ablations)}
+    if config.novel:
+        found["novel"] = _novel(stages)
+    if config.rotation_epochs:
+        found["rotated"] = {str(own): _rotated(stages)}
     return found
 
 

@@ -263,14 +263,29 @@ def _decision(metrics: dict[str, Any]) -> str:
 
 
 def _seeds(metrics: dict[str, Any], views: str) -> str:
+    """The main rows of every seed, and what the method is above others."""
     if len(metrics["seeds"]) < 2:
         return ""
-    rows = [
-        [str(seed), *(percent(share) for share in found["lattices"][views]["policies"][name]["after_views"][:4])]
-        for name in ("random", METHOD)
-        for seed, found in enumerate(metrics["seeds"])
-    ]
-    return "<h2>Other random weights</h2>" + table(["seed", "1 view", "2", "3", "4"], rows)
+    each = [found["lattices"][views] for found in metrics["seeds"]]
+    titles = {name: each[0]["policies"][name]["title"] for name in ("random", "farthest", "fixed_order", METHOD)}
+    rows = []
+    for name, title in titles.items():
+        after = [found["policies"][name]["after_views"][:4] for found in each]
+        rows += [[html.escape(title), str(seed), *map(percent, shares)] for seed, shares in enumerate(after)]
+        rows.append(
+            ["", "mean", *(f"<b>{percent(sum(shares) / len(after))}</b>" for shares in zip(*after, strict=True))]
+        )
+    gains = []
+    for base in ("random", "farthest", "fixed_order"):
+        for seed, found in enumerate(each):
+            gain = found["against"][base][METHOD]
+            cells = zip(gain["difference"][1:4], gain["interval"][1:4], strict=True)
+            gains.append([html.escape(titles[base]), str(seed), *(difference(*cell) for cell in cells)])
+    return (
+        "<h2>Other random weights</h2><p>Everything trained anew from other weights and batches.</p>"
+        + table(["next view chosen by", "seed", "1 view", "2", "3", "4"], rows)
+        + table(["view policy above", "seed", "2 views", "3", "4"], gains)
+    )
 
 
 def active_section(inputs: ReportInputs) -> str:

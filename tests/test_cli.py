@@ -17,6 +17,8 @@ import numpy as np
 import pytest
 import trimesh
 
+from data_pipeline.builder import load_statistics
+from eval.active_page import write_active_page
 from eval.pipeline import TINY, climb_on_objects, learn_to_choose
 from mevs_jax import cli
 from tests.conftest import open3d_or_skip
@@ -226,9 +228,19 @@ def test_compat_climbs_and_learning_fill_their_tables(whole, tmp_path, lightly_c
     made_once = (out / "active" / "seed_0" / "policies" / "learnt" / "summary.json").stat().st_mtime_ns
     assert learn_to_choose(TINY, out).read_text() == page
     assert (out / "active" / "seed_0" / "policies" / "learnt" / "summary.json").stat().st_mtime_ns == made_once
-    sections = "6 candidate views", "Facing any way", "Classes never chosen for"
+    sections = (
+        "6 candidate views",
+        "Facing any way",
+        "Classes never chosen for",
+        "Turned anyhow",
+        "Until it does not pay",
+    )
     for said in (*sections, "PointNet++ entropy (thesis)", "view policy", "label-free oracle"):
         assert html.escape(said) in page
+    found = json.loads((out / "active" / "metrics.json").read_text())
+    twice = found | {"seeds": [found["seeds"][0], {"lattices": found["seeds"][0]["lattices"]}]}
+    write_active_page(twice, load_statistics(out / "data"), tmp_path / "twice.html")
+    assert "Other random weights" in (tmp_path / "twice.html").read_text()
     climb_on_objects(TINY, out)
     assert mevs("compat", "--preset", "tiny", "--out", out).returncode == 0
     metrics = json.loads((out / "metrics.json").read_text())
