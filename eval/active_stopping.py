@@ -62,7 +62,7 @@ class Signal:
 
     def threshold_for(self, accuracy: float) -> float | None:
         """The least threshold, of a hundred, with which it is so accurate; None where none is."""
-        for threshold in [*np.unique(np.quantile(self.value, np.linspace(0, 1, 101))), np.inf]:
+        for threshold in [*np.unique(np.quantile(self.value, np.linspace(0, 1, 101))), self.value.max() + 1]:
             if self.accuracy(threshold) >= accuracy:
                 return float(threshold)
         return None
