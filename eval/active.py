@@ -62,6 +62,8 @@ class ActiveConfig:
     """views of a walk"""
     draws: int = 8
     """walks per object and start of policies that draw"""
+    fitting_starts: int = 1
+    """temperatures are fitted on walks from every so many-th start"""
     lattices: tuple[int, ...] = (10,)
     """further numbers of candidate views to test on, never trained on"""
     ablations: tuple[str, ...] = ()

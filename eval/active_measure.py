@@ -112,6 +112,7 @@ def _walks(
             test,
             max_views=config.max_views,
             draws=config.draws,
+            fitting_starts=config.fitting_starts,
             seed=stages.seed,
             costs=costs,
             others=not ablations,
@@ -122,7 +123,14 @@ def _walks(
         "policies": [
             read_json(stages.policy_folder(learner.made_as) / "summary.json")["identity"] for learner in learners
         ],
-        "walks": [names, config.max_views, config.draws, _entropy_tables(stages.out, data, "test") is not None, costs],
+        "walks": [
+            names,
+            config.max_views,
+            config.draws,
+            config.fitting_starts,
+            _entropy_tables(stages.out, data, "test") is not None,
+            costs,
+        ],
     }
     kind = ("" if posed else "_unposed") + ("_ablations" if ablations else "")
     return _kept(stages.folder / f"walks_{views}{kind}.json", identity, walk)

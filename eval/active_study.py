@@ -127,8 +127,6 @@ def learn(fusion: CalibratedFusion, data: Features, most: int) -> Knowledge:
 
 BASELINES = ("random", "farthest", "fixed_order")
 """What a policy that learns is compared with."""
-_FITTING_STARTS = 4
-"""Temperatures are fitted on walks from every so many-th start."""
 _GAP = 3
 """The gap between random and the label-free oracle is read after 2 views and the next, up to so many further ones."""
 
@@ -181,6 +179,7 @@ def study(
     draws: int,
     oracle_views: int = 4,
     oracle_starts: int = 5,
+    fitting_starts: int = 1,
     seed: int = 0,
     costs: bool = False,
     others: bool = True,
@@ -193,6 +192,7 @@ def study(
         max_views: of a walk.
         draws: walks from each start of policies that draw.
         oracle_views, oracle_starts: how far oracles walk, and from every so many-th start.
+        fitting_starts: temperatures are fitted on walks from every so many-th start.
         costs: whether to tell too when the method would stop and what it does where the way has a price.
         others: whether policies but these and random selection walk, and random sets are fused.
     """
@@ -221,7 +221,7 @@ def study(
     for contender in asked if others else [random_walker(draws), *map(walker, learners)]:
         name, own, walks, beliefs = contender.name, fusions.get(contender.name, fusion), [], []
         for split, data in enumerate((validation, test)):
-            every = contender.every if data is test else max(contender.every, _FITTING_STARTS)
+            every = contender.every if data is test else max(contender.every, fitting_starts)
             views = walk_all(
                 jax.random.fold_in(jax.random.key(seed), split),
                 replace(contender, every=every),
