@@ -61,6 +61,14 @@ def lightly_compiled() -> Iterator[None]:
     jax.config.update("jax_disable_most_optimizations", False)
 
 
+@pytest.fixture(scope="module")
+def lightly_compiled_commands() -> Iterator[None]:
+    """The same for commands that tests start, all of a module: what they say may then be compared to the last bit."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("JAX_DISABLE_MOST_OPTIMIZATIONS", "1")
+        yield
+
+
 @pytest.fixture
 def random() -> np.random.Generator:
     return np.random.default_rng(0)

@@ -269,7 +269,7 @@ def test_memory_grows_with_the_networks(statistics):
 # --------------------------------------------------------------------------------------------------------- the whole command
 
 
-def test_the_whole_command_makes_everything_and_goes_on(tmp_path):
+def test_the_whole_command_makes_everything_and_goes_on(tmp_path, lightly_compiled_commands):
     command = [sys.executable, "-m", "mevs_jax", "thesis", "--preset", "tiny", "--out", str(tmp_path)]
     command += ["--dataset.train-per-class", "3", "--dataset.test-per-class", "1"]
     for _ in range(2):  # the second time everything is there
