@@ -338,8 +338,12 @@ def _made_once(
 def _see(network: Recogniser, task: Task, batch: Batch) -> jax.Array:
     """Features, logits, direction and label of every view, side by side."""
     assert isinstance(task, RecogniserTask)
+    return _seen(network, task.inputs(batch), task.directions(batch), batch)
+
+
+def _seen(network: Recogniser, images: Array, directions: Array, batch: Batch) -> jax.Array:
     label = batch["label"][:, None].astype(jnp.float32)
-    return jnp.concatenate([network.see(task.inputs(batch)), task.directions(batch), label], axis=-1)
+    return jnp.concatenate([network.see(images), directions, label], axis=-1)
 
 
 def _see_rotated(network: Recogniser, task: Task, batch: Batch) -> jax.Array:
@@ -361,8 +365,7 @@ def _see_rotated(network: Recogniser, task: Task, batch: Batch) -> jax.Array:
     images, directions = (
         array.reshape(-1, *array.shape[2:]) for array in jax.vmap(of_object)(images, poses, directions)
     )
-    label = batch["label"][:, None].astype(jnp.float32)
-    return jnp.concatenate([network.see(images), directions, label], axis=-1)
+    return _seen(network, images, directions, batch)
 
 
 def _embed(network: PointNet2, task: Task, batch: Batch) -> jax.Array:

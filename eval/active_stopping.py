@@ -20,16 +20,16 @@ from jaxtyping import Array, Bool, Float, Int
 
 from eval.active_walks import Contender, Learner, OnLattice, beliefs_of, given_to, walk_all
 from eval.comparison import intervals
-from eval.confidence import stops_at
+from eval.confidence import stops_at, walked
 from eval.grid import THRESHOLDS
 from mevs_jax.arrays import AnyArray
 from mevs_jax.calibration import class_weights
-from mevs_jax.fusion import CalibratedFusion
+from mevs_jax.fusion import CalibratedFusion, beliefs_along
 from mevs_jax.models.view_policy import expected_gain
 from mevs_jax.policies import Knowledge, Policy, with_movement
 from train.chunks import in_chunks
 from train.fusion import Features
-from train.policy import learnt_policy
+from train.policy import graph_of, learnt_policy
 
 PRICES_OF_A_VIEW = (0.05, 0.02, 0.01, 0.005, 0.002, 0.001)
 """What a view costs, as rise of the true class's probability."""
@@ -171,11 +171,11 @@ def moving(
     """Accuracy and way (radians) after each number of views, by price of the way."""
     contender = Contender("priced", "", "learnt", partial(_priced, structure=nnx.graphdef(learner.network)))
     directions, rows = test.features.directions, []
+    distances = np.asarray(graph_of(directions[0]).distances)
     for price in PRICES_OF_THE_WAY:
         given = given_to(learner, fusion), jnp.float32(price)
         views = walk_all(key, contender, given, fusion, test.table(True), directions, knowledge, max_views)
-        points = np.asarray(directions[0], np.float64)[views]
-        steps = np.arccos(np.clip(np.sum(points[:, :, 1:] * points[:, :, :-1], axis=-1), -1, 1))
+        steps = distances[views[:, :, :-1], views[:, :, 1:]]
         way = np.concatenate([np.zeros_like(steps[..., :1]), np.cumsum(steps, axis=-1)], axis=-1)
         right = (
             beliefs_of(fusion, test.features, views).argmax(axis=-1) == np.asarray(test.features.labels)[:, None, None]
@@ -190,14 +190,6 @@ def moving(
             }
         )
     return rows
-
-
-def summed_along(
-    data: Features, views: Int[np.ndarray, "objects walks steps"]
-) -> Float[np.ndarray, "objects walks steps classes"]:
-    """Sums of the logits of the views seen so far."""
-    logits = np.asarray(data.logits)
-    return np.cumsum(logits[np.arange(len(logits))[:, None, None], views], axis=2)
 
 
 def what_it_costs(
@@ -218,7 +210,7 @@ def what_it_costs(
     walked_by = next(name for name in ("predicted_entropy", "random") if name in told)
     both, method = (validation.features, test.features), told[learner.name]
     thesis = [
-        confidences(summed_along(data, views), data.labels)
+        confidences(jax.vmap(jax.vmap(beliefs_along))(walked(jnp.asarray(views), data.logits)), data.labels)
         for data, views in zip(both, told[walked_by].views, strict=True)
     ]
     gains = [
