@@ -114,9 +114,10 @@ SMALL = Settings(
             network=ResNetConfig(width=32, channels=4, standardise=False, stem="patches"),
             augmentation=ViewAugmentation(stretch=0.15),
             balanced=True,
+            half_epochs=6,
             optimiser=OptimiserConfig(
                 method="muon",
-                epochs=6,
+                epochs=3,
                 batch_size=256,
                 views_per_object=8,
                 epoch_views=40,
@@ -126,7 +127,8 @@ SMALL = Settings(
                 schedule="cosine",
             ),
         ),
-        fold_epochs=4,
+        fold_epochs=1,
+        fold_half_epochs=4,
         fitting_starts=4,
         ablations=ABLATIONS,
         novel=5,
@@ -148,6 +150,7 @@ BEST = replace(
         ),
         folds=4,
         fold_epochs=0,
+        fold_half_epochs=0,
         seeds=3,
         lattices=(10, 60),
     ),
@@ -183,9 +186,12 @@ TINY = Settings(
         recogniser=RecogniserConfig(
             network=ResNetConfig(width=8, channels=4, standardise=False, stem="patches"),
             fusion=_TRIFLING_SETS,
+            half_epochs=1,
             optimiser=replace(_TRIFLE, validation_views=2),
         ),
-        policy=PolicyConfig(width=16, heads=2, blocks=1, most_seen=3, walks=1, rounds=1, epochs=2, batch_size=32),
+        policy=PolicyConfig(
+            width=16, heads=2, blocks=1, most_seen=3, rounds=1, epochs=2, batch_size=32, tuning_walks=1
+        ),
         max_views=4,
         draws=2,
         lattices=(),

@@ -57,14 +57,14 @@ def fit_averaged(
     loss_of: Callable[[nnx.State, Data, Array], Float[Array, ""]],
     parameters: nnx.State,
     data: Data,
-    validate: Callable[[nnx.State], dict[str, float]],
+    validate: Callable[[nnx.State], dict[str, float]] | None,
 ) -> tuple[nnx.State, list[dict[str, float]]]:
-    """The mean weights of the best epoch, or those given where there is none, and the losses by epoch.
+    """The mean weights of the best epoch, or those given where there is no epoch, and the losses by epoch.
 
     Args:
         loss_of: weights, a batch and a key to the mean loss.
         data: a tree of arrays with a leading axis of samples.
-        validate: mean weights to losses, whose sum decides.
+        validate: mean weights to losses, whose sum decides which epoch is best; without, the last is.
     """
     samples = len(jax.tree.leaves(data)[0])
     batch = min(config.batch_size, samples)
@@ -100,8 +100,8 @@ def fit_averaged(
     data = jax.tree.map(jnp.asarray, data)
     for number in range(config.epochs):
         carry, loss = epoch(carry, data, jax.random.fold_in(jax.random.key(config.seed), number))
-        found = validate(carry[2])
+        found = validate(carry[2]) if validate else {}
         history.append({"train": float(loss), **found})
-        if sum(found.values()) < best_loss:
+        if not validate or sum(found.values()) < best_loss:
             best, best_loss = carry[2], sum(found.values())
     return best, history

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
+from functools import cache, partial
 from typing import Any, Literal, TypeVar
 
 import flax.struct
@@ -61,6 +61,12 @@ class PolicyConfig(AveragedConfig):
     """the first walks at random, the others as the policy of the round before says (DAgger)"""
     utility: Literal["probability", "log"] = "probability"
     """what a belief is worth: the true class's probability, or its logarithm"""
+    tuning_epochs: int = 3
+    """looks, after all rounds, at states of validation objects as the recogniser itself sees them; 0 for none"""
+    tuning_walks: int = 6
+    """walks on each of those at random, and as many as the policy of the last round says"""
+    tuning_rate: float = 1e-3
+    """learning rate of tuning, at its highest"""
     floor: float = 0.01
     """added to probabilities in logarithms: one object that all are wrong about must not outweigh all others"""
 
@@ -230,7 +236,10 @@ def new_policy(config: PolicyConfig, classes: int, posed: bool = True, cloud: in
     return ViewPolicy(classes, **shape, posed=posed, rngs=nnx.Rngs(config.seed))
 
 
-def _fit(config: PolicyConfig, network: ViewPolicy, train: Choices, validation: Choices) -> tuple[ViewPolicy, list]:
+def _fit(
+    config: PolicyConfig, network: ViewPolicy, train: Choices, validation: Choices | None
+) -> tuple[ViewPolicy, list]:
+    """The weights of the best epoch, or of the last where there are no validation states."""
     structure, parameters = nnx.split(network)
 
     def loss_of(parameters: nnx.State, some: Choices, key: Array) -> Array:
@@ -241,7 +250,7 @@ def _fit(config: PolicyConfig, network: ViewPolicy, train: Choices, validation: 
     def check(mean: nnx.State, some: Choices) -> dict[str, Array]:
         return policy_loss(nnx.merge(structure, mean), some)[1]
 
-    validate = mean_losses(check, validation, 1024)
+    validate = None if validation is None else mean_losses(check, validation, 1024)
     best, history = fit_averaged(config, loss_of, parameters, train, validate)
     return nnx.merge(structure, best), history
 
@@ -257,29 +266,57 @@ def train_policy(
         parts: of the training objects, each as seen and fused by a recogniser that was trained without it.
         validation: objects that no recogniser was trained on.
     """
-    key = jax.random.key(config.seed)
     data = parts[0][1]
     cloud = 0 if data.clouds is None else data.clouds.shape[-1]
     untrained = partial(new_policy, config, data.logits.shape[-1], validation[0].posed, cloud)
     policy, histories = untrained(), []
     gathered: list[tuple[Choices, Choices]] = []
     for number in range(config.rounds):
-        structure, weights = nnx.split(policy)
-        policy_of = (lambda _: random_view) if number == 0 else partial(learnt_policy, structure=structure)
-        found = []
-        for part, (fusion, data) in enumerate([*parts, validation]):
-            given = weights, fusion.single
-            keys = jax.random.fold_in(jax.random.fold_in(key, number), part)
-            views = walk(keys, fusion, data, policy_of, given, config.most_seen, config.walks)
-            asked = unseen(views, data.features.shape[1], config.candidates, config.seed + 100 * number + part)
-            found.append(choices_along(fusion, data, views, asked, config))
+        guide = policy if number else None
+        found = [_gather(seen, guide, config, (number, part)) for part, seen in enumerate([*parts, validation])]
         gathered.append((joined(found[:-1]), found[-1]))
         train, check = (_balanced(joined([one[side] for one in gathered])) for side in (0, 1))
         policy, history = _fit(config, untrained(), train, check)
         histories.append(history)
         last = ", ".join(f"{name} {value:.4f}" for name, value in history[-1].items())
         console.print(f"Round {number + 1} of {config.rounds}, {len(train.label)} states: {last}")
-    return policy, histories
+    return tuned(config, policy, validation) if config.tuning_epochs else policy, histories
+
+
+def _gather(seen: Seen, guide: ViewPolicy | None, config: PolicyConfig, number: tuple[int, int]) -> Choices:
+    """Every state along walks on some objects, as a policy says or at random, and what candidates would bring there.
+
+    Args:
+        number: of the round and the part, so that others draw other walks and candidates.
+    """
+    (fusion, data), (turn, part) = seen, number
+    key = jax.random.fold_in(jax.random.fold_in(jax.random.key(config.seed), turn), part)
+    policy_of: Callable[..., Policy] = _at_random if guide is None else _guided(nnx.graphdef(guide))
+    given = None if guide is None else nnx.state(guide), fusion.single
+    views = walk(key, fusion, data, policy_of, given, config.most_seen, config.walks)
+    asked = unseen(views, data.features.shape[1], config.candidates, config.seed + 100 * turn + part)
+    return choices_along(fusion, data, views, asked, config)
+
+
+def _at_random(_: Any) -> Policy:
+    return random_view
+
+
+@cache
+def _guided(structure: nnx.GraphDef) -> Callable[..., Policy]:
+    """One function for all weights: walks are compiled for each."""
+    return partial(learnt_policy, structure=structure)
+
+
+def tuned(config: PolicyConfig, policy: ViewPolicy, validation: Seen) -> ViewPolicy:
+    """The policy after some more epochs on objects as the recogniser that will be used sees them.
+
+    Recognisers that saw only parts of the training objects are weaker, and other directions tell them most. Validation objects
+    are few, but it did not learn from them what it sees of them. Nothing is left to say when to stop, so the last is kept.
+    """
+    config = replace(config, walks=config.tuning_walks, epochs=config.tuning_epochs, learning_rate=config.tuning_rate)
+    states = [_gather(validation, guide, config, (config.rounds + at, 0)) for at, guide in enumerate((None, policy))]
+    return _fit(config, policy, _balanced(joined(states)), None)[0]
 
 
 def _balanced(choices: Choices) -> Choices:
