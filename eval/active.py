@@ -38,7 +38,7 @@ from train.checkpoints import Checkpoints
 from train.entropy import EntropyConfig, EntropyTask
 from train.fusion import Features, sets_of_size
 from train.loop import fit, load_best
-from train.policy import By, PolicyConfig, Seen, new_policy, train_policy
+from train.policy import By, PolicyConfig, Seen, new_policy, train_policy, tuned
 from train.pretrained import StartingWeights
 from train.q_learning import QLearningConfig, train_by_q_learning
 from train.recogniser import RecogniserConfig, RecogniserTask
@@ -70,8 +70,8 @@ class ActiveConfig:
     lattices: tuple[int, ...] = (10,)
     """further numbers of candidate views to test on, never trained on"""
     ablations: tuple[str, ...] = ()
-    """variants of the policy to compare with, with the first seed: as_it_is, look_ahead, information,
-    random_states, uncrossed, summed, cloud (where `mevs train` has made PointNet++), q_learning"""
+    """variants of the policy to compare with, with the first seed: as_it_is, look_ahead, untuned,
+    information, random_states, uncrossed, summed, cloud (where `mevs train` has made PointNet++), q_learning"""
     novel: int = 0
     """pairs of classes that a policy is trained without and then tested on, with the first seed"""
     rotation_epochs: int = 0
@@ -92,6 +92,7 @@ class Variant:
         cloud: it sees PointNet++'s embedding of every partial cloud too.
         summed: beliefs are sums of logits, in training and on its walks.
         q_learning: learnt from walks alone.
+        tunes: the variant whose network it is tuned from; else it is trained whole.
         settings: what is set otherwise than for the method.
     """
 
@@ -103,14 +104,16 @@ class Variant:
     cloud: bool = False
     summed: bool = False
     q_learning: bool = False
+    tunes: str = ""
     settings: dict[str, Any] = field(default_factory=dict)
 
 
 VARIANTS = {
-    "learnt": Variant("view policy"),
+    "learnt": Variant("view policy", tunes="untuned"),
     "learnt_unposed": Variant("view policy", posed=False),
     "as_it_is": Variant("… by what it expects of the state as it is", by="state", network="learnt"),
     "look_ahead": Variant("… two views ahead", by="ahead", network="learnt"),
+    "untuned": Variant("… not tuned on validation objects", settings={"tuning_epochs": 0}),
     "information": Variant("… by expected information", settings={"utility": "log"}),
     "random_states": Variant("… trained on random walks alone", settings={"rounds": 1}),
     "uncrossed": Variant("… labels by a recogniser that knows the object", crossed=False),
@@ -119,7 +122,7 @@ VARIANTS = {
     "q_learning": Variant("… Q-learning (as MVSelect)", by="state", q_learning=True),
 }
 """The method, and what it is compared with to see what each part of it is good for."""
-ABLATIONS = ("as_it_is", "look_ahead", "information", "random_states", "uncrossed", "summed", "cloud", "q_learning")
+ABLATIONS = tuple(name for name in VARIANTS if not name.startswith("learnt"))
 _CALIBRATED = (1, 2, 3, 4, 5, 6, 8, 12, 16, 24, 32, 40)
 """Numbers of views at which a temperature is fitted; between them it is interpolated."""
 _FURTHER = 0.4
@@ -299,6 +302,10 @@ class Stages:
             if variant.cloud:
                 seen = replace(seen, clouds=self.clouds(self.turned, "val"))
             check = self.fusion(posed=variant.posed, summed=variant.summed), seen
+            if variant.tunes:
+                begun, seen_without = self.policy(variant.tunes, without), seen.without(without)
+                console.print(f"Tuning the view policy ({name}) on {len(seen_without.labels)} validation objects")
+                return tuned(config, begun, (check[0], seen_without)), {}
             if variant.crossed:
                 parts = self.parts(variant.posed, variant.cloud, variant.summed)
             else:

@@ -114,7 +114,7 @@ SMALL = Settings(
             network=ResNetConfig(width=32, channels=4, standardise=False, stem="patches"),
             augmentation=ViewAugmentation(stretch=0.15),
             balanced=True,
-            half_epochs=6,
+            half_epochs=4,
             optimiser=OptimiserConfig(
                 method="muon",
                 epochs=3,
@@ -128,7 +128,8 @@ SMALL = Settings(
             ),
         ),
         fold_epochs=1,
-        fold_half_epochs=4,
+        fold_half_epochs=3,
+        draws=2,
         fitting_starts=4,
         ablations=ABLATIONS,
         novel=5,
@@ -186,7 +187,6 @@ TINY = Settings(
         recogniser=RecogniserConfig(
             network=ResNetConfig(width=8, channels=4, standardise=False, stem="patches"),
             fusion=_TRIFLING_SETS,
-            half_epochs=1,
             optimiser=replace(_TRIFLE, validation_views=2),
         ),
         policy=PolicyConfig(

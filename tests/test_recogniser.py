@@ -184,7 +184,7 @@ def _assert_starts_as(stages: Stages, expected: nnx.Module) -> nnx.Module:
 def test_recognisers_go_on_from_half_the_resolution_and_those_of_objects_turned_anyhow_from_the_others(
     turned, tmp_path
 ):
-    config = replace(TINY.active, rotation_epochs=1)
+    config = replace(TINY.active, recogniser=replace(TINY.active.recogniser, half_epochs=1), rotation_epochs=1)
     stages = Stages(config, TINY.dataset, tmp_path)
     stages.turned = turned
     stages.train_recogniser()

@@ -73,7 +73,7 @@ class RecogniserTask:
     ) -> RecogniserTask:
         name = "recogniser" if fold is None else f"recogniser without part {fold[0] + 1} of {fold[1]}"
         if halved:
-            name = f"{name}, at half the resolution,"
+            name = f"{name} at half the resolution"
         return cls(
             config.network,
             config.fusion,
