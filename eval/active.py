@@ -4,8 +4,7 @@ Stages, each of which skips what is done: views from turned directions; a recogn
 training objects that never saw it; features of every view; the view policy; walks of every
 test object from every start. Everything that is chosen or fitted, temperatures among it, is so on validation objects.
 
-In a run's folder: `active/turned/` (data), `active/seed_0/` with `recogniser/`, `fold_0/`, …, `features/`, `policies/`, and
-`recogniser_half/`, …, what recognisers began with on images of half the resolution;
+In a run's folder: `active/turned/` (data), `active/seed_0/` with `recogniser/`, `fold_0/`, …, `features/`, `policies/`;
 `active/seed_0_rotated/`, the same for objects turned anyhow; and `active/metrics.json`.
 """
 
@@ -54,8 +53,6 @@ class ActiveConfig:
     """parts of the training objects, for labels by recognisers that never saw an object"""
     fold_epochs: int = 0
     """of those recognisers; 0 for as many as the recogniser itself"""
-    fold_half_epochs: int = 0
-    """of those at half the resolution; 0 for as many as the recogniser itself"""
     policy: PolicyConfig = PolicyConfig()
     q_learning: QLearningConfig = QLearningConfig()
     """of the policy that learns from walks alone, to compare with"""
@@ -183,14 +180,11 @@ class Stages:
     def statistics(self) -> DatasetStatistics:
         return load_statistics(self.turned)
 
-    def task(self, fold: int | None = None, halved: bool = False) -> RecogniserTask:
+    def task(self, fold: int | None = None) -> RecogniserTask:
         config, statistics = self.config, self.statistics
         optimiser = replace(config.recogniser.optimiser, seed=self.seed, data_seed=self.seed)
-        if halved:
-            optimiser = replace(optimiser, epochs=config.recogniser.half_epochs, schedule="warm")
-        of_folds = config.fold_half_epochs if halved else config.fold_epochs
-        if fold is not None and of_folds:
-            optimiser = replace(optimiser, epochs=of_folds)
+        if fold is not None and config.fold_epochs:
+            optimiser = replace(optimiser, epochs=config.fold_epochs)
         augmentation = config.recogniser.augmentation
         if self.upright is not None:
             rate = _FURTHER * optimiser.learning_rate
@@ -198,26 +192,19 @@ class Stages:
             augmentation = replace(augmentation, turn=True)
         part = None if fold is None else (fold, config.folds)
         recogniser = replace(config.recogniser, optimiser=optimiser, augmentation=augmentation)
-        return RecogniserTask.of(recogniser, len(statistics.classes), statistics.camera, part, halved)
+        return RecogniserTask.of(recogniser, len(statistics.classes), statistics.camera, part)
 
-    def recogniser_folder(self, fold: int | None = None, halved: bool = False) -> Path:
-        return self.folder / (("recogniser" if fold is None else f"fold_{fold}") + "_half" * halved)
+    def recogniser_folder(self, fold: int | None = None) -> Path:
+        return self.folder / ("recogniser" if fold is None else f"fold_{fold}")
 
     def train_recogniser(self, fold: int | None = None) -> None:
-        if self._begins_halved:
-            fit(self.task(fold, True), self.turned, self.statistics, self.recogniser_folder(fold, True))
         fit(self.task(fold), self.turned, self.statistics, self.recogniser_folder(fold), self._start(fold))
-
-    @property
-    def _begins_halved(self) -> bool:
-        return self.upright is None and self.config.recogniser.half_epochs > 0
 
     def _start(self, fold: int | None) -> StartingWeights | None:
         """What a recogniser goes on from, if from any."""
-        if self.upright is None and not self._begins_halved:
+        if self.upright is None:
             return None
-        before = self.upright or self
-        task, folder = before.task(fold, self._begins_halved), before.recogniser_folder(fold, self._begins_halved)
+        task, folder = self.upright.task(fold), self.upright.recogniser_folder(fold)
 
         def put(network: nnx.Module) -> None:
             nnx.update(network, nnx.state(load_best(task, folder)))
@@ -318,7 +305,8 @@ class Stages:
                 policy, histories = train_policy(config, parts, check)
             return policy, {"rounds": histories}
 
-        made = [self.recogniser_folder(fold) for fold in (None, *range(self.config.folds))]
+        folds = range(self.config.folds) if variant.crossed else ()
+        made = [self.recogniser_folder(fold) for fold in (None, *folds)]
         cloud = 0
         if variant.cloud:
             assert self.entropy is not None

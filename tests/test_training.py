@@ -182,10 +182,6 @@ def test_schedules():
     assert float(steps(jnp.int32(20_000 // 32 - 1), 1e-3)) == pytest.approx(1e-3)
     assert float(steps(jnp.int32(20_000 // 32 + 1), 1e-3)) == pytest.approx(0.7e-3)
     assert float(steps(jnp.int32(10**6), 1e-3)) == pytest.approx(1e-5)
-    warm = learning_rate(OptimiserConfig(schedule="warm"), 1000)
-    assert [float(warm(jnp.int32(step), 1e-3)) for step in (0, 50, 100, 999)] == pytest.approx(
-        [5e-5, 5.25e-4, 1e-3, 1e-3]
-    )
     cosine = learning_rate(OptimiserConfig(schedule="cosine"), 1000)
     assert float(cosine(jnp.int32(1000), 1e-3)) == pytest.approx(0, abs=1e-9)
     assert float(cosine(jnp.int32(100), 1e-3)) == pytest.approx(1e-3)

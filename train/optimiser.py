@@ -38,9 +38,8 @@ class OptimiserConfig:
     """at the start, or once warm"""
     weight_decay: float = 0.0
     """decoupled (AdamW)"""
-    schedule: Literal["constant", "warm", "cosine", "steps"] = "constant"
-    """warm: constant after a warm-up; cosine: to zero over `epochs`, after a warm-up; steps: ×0.7 every
-    20,000 samples, not below 1e-5 (thesis's PointNet++)"""
+    schedule: Literal["constant", "cosine", "steps"] = "constant"
+    """cosine: to zero over `epochs`; steps: ×0.7 every 20,000 samples, not below 1e-5 (thesis's PointNet++)"""
     compute: Literal["float32", "bfloat16"] = "float32"
     """what the layers calculate in; weights, batch-norm statistics, coordinates and losses stay float32"""
     validation_by: Literal["object", "view"] = "object"
@@ -79,11 +78,8 @@ def learning_rate(config: OptimiserConfig, steps: int) -> Callable[[jax.Array, j
     Args:
         steps: of the whole training.
     """
-    warm = max(1, min(200, steps // 10))
-    if config.schedule == "warm":
-        return lambda step, first: first * jnp.minimum(1.0, 1 / 20 + 19 / 20 * step / warm)
     if config.schedule == "cosine":
-        share = optax.warmup_cosine_decay_schedule(1 / 20, 1.0, warm, max(2, steps))
+        share = optax.warmup_cosine_decay_schedule(1 / 20, 1.0, max(1, min(200, steps // 10)), max(2, steps))
         return lambda step, first: first * share(step)
     if config.schedule == "steps":
         return lambda step, first: jnp.maximum(first * 0.7 ** (step * config.batch_size // 20_000), 1e-5)

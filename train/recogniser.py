@@ -38,8 +38,6 @@ class RecogniserConfig:
     """pixels by which training images are shifted in each direction at most"""
     balanced: bool = False
     """train on as many objects of each class, those of rarer ones more often; else as many as there are"""
-    half_epochs: int = 0
-    """epochs on images of half the resolution, a quarter of the work each, at a constant rate, before those of `optimiser`"""
     optimiser: OptimiserConfig = OptimiserConfig()
 
 
@@ -58,22 +56,13 @@ class RecogniserTask:
     optimiser: OptimiserConfig
     fold: tuple[int, int] | None = None
     """trained without part k of n of the training objects"""
-    halved: bool = False
-    """on images of half the resolution: every second pixel of every second row"""
     name: str = "recogniser"
 
     @classmethod
     def of(
-        cls,
-        config: RecogniserConfig,
-        classes: int,
-        camera: CaptureConfig,
-        fold: tuple[int, int] | None = None,
-        halved: bool = False,
+        cls, config: RecogniserConfig, classes: int, camera: CaptureConfig, fold: tuple[int, int] | None = None
     ) -> RecogniserTask:
         name = "recogniser" if fold is None else f"recogniser without part {fold[0] + 1} of {fold[1]}"
-        if halved:
-            name = f"{name} at half the resolution"
         return cls(
             config.network,
             config.fusion,
@@ -84,7 +73,6 @@ class RecogniserTask:
             config.balanced,
             config.optimiser,
             fold,
-            halved,
             name,
         )
 
@@ -123,8 +111,7 @@ class RecogniserTask:
 
     def inputs(self, batch: Batch) -> jax.Array:
         """Images (views, height, width, 4) of a batch."""
-        step = 2 if self.halved else 1
-        return jax.vmap(partial(depth_and_normals, camera=self.camera))(batch["depth"][:, ::step, ::step])
+        return jax.vmap(partial(depth_and_normals, camera=self.camera))(batch["depth"])
 
     def directions(self, batch: Batch) -> jax.Array:
         """Unit vectors (views, 3) from the object to the cameras."""
@@ -141,7 +128,7 @@ class RecogniserTask:
         labels = batch["label"].reshape(images.shape[:2])[:, 0]
         changes = object_changes(change, len(images), self.augmentation)
         images, directions = jax.vmap(partial(views_after, camera=self.camera))(changes, images, poses)
-        shift = ImageAugmentation(mirror=False, shift=self.shift // 2 if self.halved else self.shift)
+        shift = ImageAugmentation(mirror=False, shift=self.shift)
         moves = jax.random.split(move, images.shape[:2])
         images = jax.vmap(jax.vmap(partial(augment_image, config=shift)))(moves, images)
         present = random_sets(sets, len(images), images.shape[1], images.shape[1])
