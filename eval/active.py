@@ -1,10 +1,10 @@
 """Learnt fusion and learnt choice, on a real data set: what `mevs active` trains, and how it is measured.
 
-Stages, each of which skips what is done: views from turned directions; a recogniser on them, and one for each part of the
-training objects that never saw it; features of every view; the view policy; walks of every
-test object from every start. Everything that is chosen or fitted, temperatures among it, is so on validation objects.
+Stages, each of which skips what is done: views from turned directions; a recogniser on them; features of every view; the view
+policy; walks of every test object from every start. Everything that is chosen, fitted or learnt from what the recogniser
+says, temperatures and policies among it, is so from validation objects.
 
-In a run's folder: `active/turned/` (data), `active/seed_0/` with `recogniser/`, `fold_0/`, …, `features/`, `policies/`;
+In a run's folder: `active/turned/` (data), `active/seed_0/` with `recogniser/`, `features/`, `policies/`, `fold_0/`, …;
 `active/seed_0_rotated/`, the same for objects turned anyhow; and `active/metrics.json`.
 """
 
@@ -13,7 +13,7 @@ from __future__ import annotations
 from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property, partial
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, Literal, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -37,7 +37,7 @@ from train.checkpoints import Checkpoints
 from train.entropy import EntropyConfig, EntropyTask
 from train.fusion import Features, sets_of_size
 from train.loop import fit, load_best
-from train.policy import By, PolicyConfig, Seen, new_policy, train_policy, tuned
+from train.policy import By, PolicyConfig, Seen, new_policy, train_policy
 from train.pretrained import StartingWeights
 from train.q_learning import QLearningConfig, train_by_q_learning
 from train.recogniser import RecogniserConfig, RecogniserTask
@@ -50,7 +50,7 @@ class ActiveConfig:
 
     recogniser: RecogniserConfig = RecogniserConfig()
     folds: int = 2
-    """parts of the training objects, for labels by recognisers that never saw an object"""
+    """parts of the training objects, for the ablation that learns from them by recognisers that never saw a part"""
     fold_epochs: int = 0
     """of those recognisers; 0 for as many as the recogniser itself"""
     policy: PolicyConfig = PolicyConfig()
@@ -67,8 +67,8 @@ class ActiveConfig:
     lattices: tuple[int, ...] = (10,)
     """further numbers of candidate views to test on, never trained on"""
     ablations: tuple[str, ...] = ()
-    """variants of the policy to compare with, with the first seed: as_it_is, look_ahead, untuned,
-    information, random_states, uncrossed, summed, cloud (where `mevs train` has made PointNet++), q_learning"""
+    """variants of the policy to compare with, with the first seed: as_it_is, look_ahead, information,
+    random_states, crossed, known, summed, cloud (where `mevs train` has made PointNet++), q_learning"""
     novel: int = 0
     """pairs of classes that a policy is trained without and then tested on, with the first seed"""
     rotation_epochs: int = 0
@@ -85,11 +85,11 @@ class Variant:
         posed: whether the objects' pose is known.
         by: how it is asked; see `train.policy.By`.
         network: of the variant whose network it asks; its own unless given.
-        crossed: labels come from recognisers that were trained without the object, else from one that knows it.
+        learns_from: validation objects; training objects in parts, each seen by a recogniser that was trained without it; or
+            training objects seen by the one that was trained on them.
         cloud: it sees PointNet++'s embedding of every partial cloud too.
         summed: beliefs are sums of logits, in training and on its walks.
         q_learning: learnt from walks alone.
-        tunes: the variant whose network it is tuned from; else it is trained whole.
         settings: what is set otherwise than for the method.
     """
 
@@ -97,23 +97,27 @@ class Variant:
     posed: bool = True
     by: By = "belief"
     network: str = ""
-    crossed: bool = True
+    learns_from: Literal["validation", "parts", "training"] = "validation"
     cloud: bool = False
     summed: bool = False
     q_learning: bool = False
-    tunes: str = ""
     settings: dict[str, Any] = field(default_factory=dict)
 
 
+_FEW = {"walks": 2}  # on training objects: about as many states as on validation objects
 VARIANTS = {
-    "learnt": Variant("view policy", tunes="untuned"),
+    "learnt": Variant("view policy"),
     "learnt_unposed": Variant("view policy", posed=False),
     "as_it_is": Variant("… by what it expects of the state as it is", by="state", network="learnt"),
     "look_ahead": Variant("… two views ahead", by="ahead", network="learnt"),
-    "untuned": Variant("… not tuned on validation objects", settings={"tuning_epochs": 0}),
     "information": Variant("… by expected information", settings={"utility": "log"}),
     "random_states": Variant("… trained on random walks alone", settings={"rounds": 1}),
-    "uncrossed": Variant("… labels by a recogniser that knows the object", crossed=False),
+    "crossed": Variant(
+        "… learnt from training objects, by recognisers without them", learns_from="parts", settings=_FEW
+    ),
+    "known": Variant(
+        "… learnt from training objects, by the one that knows them", learns_from="training", settings=_FEW
+    ),
     "summed": Variant("… with the sum of logits for a fusion", summed=True),
     "cloud": Variant("… with PointNet++'s embedding of the clouds", cloud=True),
     "q_learning": Variant("… Q-learning (as MVSelect)", by="state", q_learning=True),
@@ -262,16 +266,12 @@ class Stages:
         )
         return jnp.asarray(found)
 
-    def parts(self, posed: bool = True, cloud: bool = False, summed: bool = False) -> list[Seen]:
+    def parts(self) -> list[Seen]:
         """The training objects in parts, each as seen by the recogniser that was trained without it."""
         part_of, found = fold_of(len(open_split(self.turned, "train")), self.config.folds), []
-        clouds = self.clouds(self.turned, "train") if cloud else None
         for fold in range(self.config.folds):
             held_out = np.flatnonzero(part_of == fold)
-            data = self.features(f"fold_{fold}_train", self.turned, "train", fold, held_out)
-            if clouds is not None:
-                data = replace(data, clouds=clouds[held_out])
-            found.append((self.fusion(fold, posed, summed), data))
+            found.append((self.fusion(fold), self.features(f"fold_{fold}_train", self.turned, "train", fold, held_out)))
         return found
 
     def policy_folder(self, name: str = "learnt") -> Path:
@@ -288,16 +288,13 @@ class Stages:
             seen = self.features("turned_val", self.turned, "val")
             if variant.cloud:
                 seen = replace(seen, clouds=self.clouds(self.turned, "val"))
-            check = self.fusion(posed=variant.posed, summed=variant.summed), seen
-            if variant.tunes:
-                begun, seen_without = self.policy(variant.tunes, without), seen.without(without)
-                console.print(f"Tuning the view policy ({name}) on {len(seen_without.labels)} validation objects")
-                return tuned(config, begun, (check[0], seen_without)), {}
-            if variant.crossed:
-                parts = self.parts(variant.posed, variant.cloud, variant.summed)
-            else:
-                parts = [(check[0], self.features("turned_train", self.turned, "train"))]
-            *parts, check = ((fusion, data.without(without)) for fusion, data in (*parts, check))
+            fusion = self.fusion(posed=variant.posed, summed=variant.summed)
+            validation = fusion, seen.without(without)
+            parts, check = [validation], None
+            if variant.learns_from == "parts":
+                parts, check = self.parts(), validation
+            elif variant.learns_from == "training":
+                parts, check = [(fusion, self.features("turned_train", self.turned, "train"))], validation
             console.print(f"Training the view policy ({name}) on {sum(len(data.labels) for _, data in parts)} objects")
             if isinstance(config, QLearningConfig):
                 policy, histories = train_by_q_learning(config, parts, check)
@@ -305,8 +302,11 @@ class Stages:
                 policy, histories = train_policy(config, parts, check)
             return policy, {"rounds": histories}
 
-        folds = range(self.config.folds) if variant.crossed else ()
-        made = [self.recogniser_folder(fold) for fold in (None, *folds)]
+        made = [self.recogniser_folder()]
+        if variant.learns_from == "parts":
+            for fold in range(self.config.folds):
+                self.train_recogniser(fold)
+                made.append(self.recogniser_folder(fold))
         cloud = 0
         if variant.cloud:
             assert self.entropy is not None

@@ -36,8 +36,7 @@ from train.loop import load_best
 def train_all(stages: Stages) -> None:
     """Every network of one seed, but those that only one part of what is measured asks for."""
     stages.prepare()
-    for fold in (None, *range(stages.config.folds)):
-        stages.train_recogniser(fold)
+    stages.train_recogniser()
     stages.policy("learnt")
 
 
@@ -139,8 +138,7 @@ def _walks(
 def _rotated(stages: Stages) -> dict[str, Any]:
     """Walks around objects turned by any rotation, which recognisers were trained further on."""
     turned_anyhow = stages.rotated()
-    for fold in (None, *range(stages.config.folds)):
-        turned_anyhow.train_recogniser(fold)
+    turned_anyhow.train_recogniser()
     return _walks(turned_anyhow, "turned", stages.turned, posed=False)
 
 

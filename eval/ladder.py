@@ -11,7 +11,7 @@ KNOWS: dict[Knows, str] = {
     "nothing": "nothing of the object",
     "networks": "what the entropy predictor says of the views seen",
     "others": "what views show of other (validation) objects",
-    "learnt": "what looking was worth on training objects, by recognisers that never saw them",
+    "learnt": "what looking was worth on validation objects",
     "rendering": "what a surface or volume through the latest view's points would look like from elsewhere",
     "truth": "the object itself, which no robot does",
 }

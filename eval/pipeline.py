@@ -186,13 +186,11 @@ TINY = Settings(
             fusion=_TRIFLING_SETS,
             optimiser=replace(_TRIFLE, validation_views=2),
         ),
-        policy=PolicyConfig(
-            width=16, heads=2, blocks=1, most_seen=3, rounds=1, epochs=2, batch_size=32, tuning_walks=1
-        ),
+        policy=PolicyConfig(width=16, heads=2, blocks=1, most_seen=3, walks=1, rounds=1, epochs=2, batch_size=32),
         max_views=4,
         draws=2,
         lattices=(),
-        ablations=("look_ahead", "summed", "cloud"),
+        ablations=("look_ahead", "crossed", "summed", "cloud"),
         novel=1,
         rotation_epochs=1,
     ),

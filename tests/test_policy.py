@@ -22,7 +22,7 @@ from mevs_jax.models.view_policy import direction_features, expected_gain
 from mevs_jax.policies import POLICIES, Knowledge, fused_oracle, learnt, looking_ahead, random_view
 from mevs_jax.selection import by_attention, select_from_table
 from train.fusion import Features
-from train.policy import PolicyConfig, choices_along, graph_of, policy_loss, train_policy, tuned, unseen, walk
+from train.policy import PolicyConfig, choices_along, graph_of, train_policy, unseen, walk
 from train.q_learning import QLearningConfig, temporal_difference, train_by_q_learning, transitions_along
 
 VIEWS, CLASSES, SEEN = 6, 4, 3
@@ -335,7 +335,6 @@ def test_what_looking_was_worth_is_learnt_and_the_study_says_so(adding):
         epochs=12,
         batch_size=64,
         learning_rate=5e-3,
-        tuning_epochs=0,
     )
     policy, histories = train_policy(config, parts, (adding, validation))
     assert len(histories) == 2
@@ -387,33 +386,6 @@ def test_what_looking_was_worth_is_learnt_and_the_study_says_so(adding):
     )
     assert chosen.shape == (120, 4, 3)
     assert all(len(set(order)) == 3 for order in chosen.reshape(-1, 3).tolist())
-
-
-def test_tuning_unlearns_what_other_recognisers_taught(adding):
-    """For those, the telling views lie elsewhere."""
-    config = PolicyConfig(
-        width=16,
-        heads=2,
-        blocks=1,
-        most_seen=2,
-        rounds=1,
-        epochs=8,
-        batch_size=64,
-        learning_rate=5e-3,
-        tuning_epochs=0,
-        tuning_walks=2,
-    )
-    elsewhere = telling(160, 0)
-    elsewhere = replace(elsewhere, features=elsewhere.features[:, ::-1], logits=elsewhere.logits[:, ::-1])
-    validation, test = telling(80, 2), telling(80, 3)
-    policy, _ = train_policy(config, [(adding, elsewhere)], (adding, validation))
-    before = jax.tree.map(np.asarray, nnx.state(policy))
-    better = tuned(replace(config, tuning_epochs=8, tuning_rate=5e-3), policy, (adding, validation))
-    assert all(map(np.array_equal, jax.tree.leaves(before), jax.tree.leaves(nnx.state(policy))))  # it is left as it was
-    order = np.tile(np.array([[0, 1]]), (80, 1, 1))
-    choices = choices_along(adding, test, order, unseen(order, VIEWS, 4, 0), config)
-    was, now = (float(policy_loss(network, choices)[0]) for network in (policy, better))
-    assert now < 0.8 * was
 
 
 def test_rules_are_compared_where_they_are_as_accurate():

@@ -2,9 +2,8 @@
 
 For objects whose features are known from all candidate views, the belief after any set of views and one more is one call of
 the fusion. So for a state (a set seen) each candidate's label is by how much it makes the true class more probable. Encoder and
-fusion that trained on an object are sure of it from any view, and there would be nothing to learn: labels of each part of the
-training objects come from a recogniser that was trained without it (cross-fitting). Later rounds add the states to which the
-policy itself leads (DAgger; Ross et al. 2011).
+fusion that trained on an object are sure of it from any view, and there would be little to learn: labels are of objects that
+they were not trained on. Later rounds add the states to which the policy itself leads (DAgger; Ross et al. 2011).
 """
 
 from __future__ import annotations
@@ -53,20 +52,14 @@ class PolicyConfig(AveragedConfig):
     """of attention and layers"""
     most_seen: int = 6
     """views in a state at most"""
-    walks: int = 1
-    """walks on each training object in a round, each through states of 1 to most_seen views"""
+    walks: int = 6
+    """walks on each object in a round, each through states of 1 to most_seen views"""
     candidates: int = 12
     """views not seen yet that a state is asked about"""
-    rounds: int = 3
+    rounds: int = 2
     """the first walks at random, the others as the policy of the round before says (DAgger)"""
     utility: Literal["probability", "log"] = "probability"
     """what a belief is worth: the true class's probability, or its logarithm"""
-    tuning_epochs: int = 3
-    """looks, after all rounds, at states of validation objects as the recogniser itself sees them; 0 for none"""
-    tuning_walks: int = 6
-    """walks on each of those at random, and as many as the policy of the last round says"""
-    tuning_rate: float = 1e-3
-    """learning rate of tuning, at its highest"""
     floor: float = 0.01
     """added to probabilities in logarithms: one object that all are wrong about must not outweigh all others"""
 
@@ -258,29 +251,32 @@ def _fit(
 def train_policy(
     config: PolicyConfig,
     parts: Sequence[Seen],
-    validation: Seen,
+    validation: Seen | None = None,
 ) -> tuple[ViewPolicy, list[list[dict[str, float]]]]:
     """The policy after all rounds, and losses by round and epoch.
 
     Args:
-        parts: of the training objects, each as seen and fused by a recogniser that was trained without it.
-        validation: objects that no recogniser was trained on.
+        parts: objects to learn from, each part as seen and fused by a recogniser that was trained without it.
+        validation: other objects, that say which epoch is best; without, the last is.
     """
-    data = parts[0][1]
+    fusion, data = parts[0]
     cloud = 0 if data.clouds is None else data.clouds.shape[-1]
-    untrained = partial(new_policy, config, data.logits.shape[-1], validation[0].posed, cloud)
+    untrained = partial(new_policy, config, data.logits.shape[-1], fusion.posed, cloud)
     policy, histories = untrained(), []
-    gathered: list[tuple[Choices, Choices]] = []
+    gathered: list[Choices] = []
+    gathered_for_check: list[Choices] = []
     for number in range(config.rounds):
         guide = policy if number else None
-        found = [_gather(seen, guide, config, (number, part)) for part, seen in enumerate([*parts, validation])]
-        gathered.append((joined(found[:-1]), found[-1]))
-        train, check = (_balanced(joined([one[side] for one in gathered])) for side in (0, 1))
+        gathered += [_gather(seen, guide, config, (number, part)) for part, seen in enumerate(parts)]
+        if validation is not None:
+            gathered_for_check.append(_gather(validation, guide, config, (number, len(parts))))
+        train, check = (_balanced(joined(some)) if some else None for some in (gathered, gathered_for_check))
+        assert train is not None
         policy, history = _fit(config, untrained(), train, check)
         histories.append(history)
         last = ", ".join(f"{name} {value:.4f}" for name, value in history[-1].items())
         console.print(f"Round {number + 1} of {config.rounds}, {len(train.label)} states: {last}")
-    return tuned(config, policy, validation) if config.tuning_epochs else policy, histories
+    return policy, histories
 
 
 def _gather(seen: Seen, guide: ViewPolicy | None, config: PolicyConfig, number: tuple[int, int]) -> Choices:
@@ -306,17 +302,6 @@ def _at_random(_: Any) -> Policy:
 def _guided(structure: nnx.GraphDef) -> Callable[..., Policy]:
     """One function for all weights: walks are compiled for each."""
     return partial(learnt_policy, structure=structure)
-
-
-def tuned(config: PolicyConfig, policy: ViewPolicy, validation: Seen) -> ViewPolicy:
-    """The policy after some more epochs on objects as the recogniser that will be used sees them.
-
-    Recognisers that saw only parts of the training objects are weaker, and other directions tell them most. Validation objects
-    are few, but it did not learn from them what it sees of them. Nothing is left to say when to stop, so the last is kept.
-    """
-    config = replace(config, walks=config.tuning_walks, epochs=config.tuning_epochs, learning_rate=config.tuning_rate)
-    states = [_gather(validation, guide, config, (config.rounds + at, 0)) for at, guide in enumerate((None, policy))]
-    return _fit(config, policy, _balanced(joined(states)), None)[0]
 
 
 def _balanced(choices: Choices) -> Choices:

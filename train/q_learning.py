@@ -140,24 +140,24 @@ def exploring(given: tuple[nnx.State, Array], structure: nnx.GraphDef, share: fl
 def train_by_q_learning(
     config: QLearningConfig,
     parts: Sequence[Seen],
-    validation: Seen,
+    validation: Seen | None = None,
 ) -> tuple[ViewPolicy, list[list[dict[str, float]]]]:
     """The network after all rounds, to be asked `by="state"`, and losses by round and epoch; arguments as of `train_policy`."""
-    network = new_policy(config, parts[0][1].logits.shape[-1], validation[0].posed)
+    network = new_policy(config, parts[0][1].logits.shape[-1], parts[0][0].posed)
     structure, weights = nnx.split(network)
-    replay: list[tuple[Transitions, Transitions]] = []
+    replay: list[Transitions] = []
+    replay_for_check: list[Transitions] = []
     histories = []
     for number in range(config.rounds):
         share = config.exploration if number else 1.0
         policy_of: Callable[..., Policy] = partial(exploring, structure=structure, share=share)
-        found = []
-        for part, (fusion, data) in enumerate([*parts, validation]):
+        for part, (fusion, data) in enumerate(parts if validation is None else [*parts, validation]):
             key = jax.random.fold_in(jax.random.fold_in(jax.random.key(config.seed), number), part)
             given = weights, fusion.single
             walks = walk(key, fusion, data, policy_of, given, config.most_seen + 1, config.walks)
-            found.append(transitions_along(fusion, data, walks, config))
-        replay.append((joined(found[:-1]), found[-1]))
-        train, check = (joined([one[side] for one in replay]) for side in (0, 1))
+            to = replay if part < len(parts) else replay_for_check
+            to.append(transitions_along(fusion, data, walks, config))
+        train, check = joined(replay), joined(replay_for_check) if replay_for_check else None
         weights, history = _fit(config, structure, weights, number > 0, train, check)
         histories.append(history)
         console.print(f"Round {number + 1} of {config.rounds}, {len(train.order)} walks: {history[-1]}")
@@ -170,7 +170,7 @@ def _fit(
     target: nnx.State,
     ahead: bool,
     train: Transitions,
-    check: Transitions,
+    check: Transitions | None,
 ) -> tuple[nnx.State, list[dict[str, float]]]:
     """From the target's weights on; the first round looks no further than the next view, since its target knows nothing."""
     discount = config.discount if ahead else 0.0
@@ -184,4 +184,5 @@ def _fit(
     def error(mean: nnx.State, some: Transitions) -> dict[str, Array]:
         return {"error": loss_of(mean, some)}
 
-    return fit_averaged(config, loss_of, target, train, mean_losses(error, check, 256))
+    validate = None if check is None else mean_losses(error, check, 256)
+    return fit_averaged(config, loss_of, target, train, validate)

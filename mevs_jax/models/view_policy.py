@@ -2,7 +2,7 @@
 
 A query for each candidate attends to the views seen and to the belief. Candidates are directions, not numbers of a lattice, so a
 lattice that was never trained on will do. It sees what single views say (log-probabilities), not the encoder's features: those
-mean other things in another encoder, and labels of value come from encoders that never saw the object (`train/policy.py`).
+mean other things in another encoder, which the policy would not do for.
 """
 
 from __future__ import annotations
