@@ -270,8 +270,8 @@ def train_policy(
         gathered += [_gather(seen, guide, config, (number, part)) for part, seen in enumerate(parts)]
         if validation is not None:
             gathered_for_check.append(_gather(validation, guide, config, (number, len(parts))))
-        train, check = (_balanced(joined(some)) if some else None for some in (gathered, gathered_for_check))
-        assert train is not None
+        train = _balanced(joined(gathered))
+        check = _balanced(joined(gathered_for_check)) if gathered_for_check else None
         policy, history = _fit(config, untrained(), train, check)
         histories.append(history)
         last = ", ".join(f"{name} {value:.4f}" for name, value in history[-1].items())
