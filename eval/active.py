@@ -290,11 +290,13 @@ class Stages:
                 seen = replace(seen, clouds=self.clouds(self.turned, "val"))
             fusion = self.fusion(posed=variant.posed, summed=variant.summed)
             validation = fusion, seen.without(without)
-            parts, check = [validation], None
-            if variant.learns_from == "parts":
+            if variant.learns_from == "validation":
+                parts, check = [validation], None
+            elif variant.learns_from == "parts":
                 parts, check = self.parts(), validation
-            elif variant.learns_from == "training":
+            else:
                 parts, check = [(fusion, self.features("turned_train", self.turned, "train"))], validation
+            parts = [(fusion, data.without(without)) for fusion, data in parts]
             console.print(f"Training the view policy ({name}) on {sum(len(data.labels) for _, data in parts)} objects")
             if isinstance(config, QLearningConfig):
                 policy, histories = train_by_q_learning(config, parts, check)

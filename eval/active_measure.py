@@ -136,7 +136,7 @@ def _walks(
 
 
 def _rotated(stages: Stages) -> dict[str, Any]:
-    """Walks around objects turned by any rotation, which recognisers were trained further on."""
+    """Walks around objects turned by any rotation, which the recogniser was trained further on."""
     turned_anyhow = stages.rotated()
     turned_anyhow.train_recogniser()
     return _walks(turned_anyhow, "turned", stages.turned, posed=False)

@@ -288,7 +288,7 @@ def _gather(seen: Seen, guide: ViewPolicy | None, config: PolicyConfig, number: 
     (fusion, data), (turn, part) = seen, number
     key = jax.random.fold_in(jax.random.fold_in(jax.random.key(config.seed), turn), part)
     policy_of: Callable[..., Policy] = _at_random if guide is None else _guided(nnx.graphdef(guide))
-    given = None if guide is None else nnx.state(guide), fusion.single
+    given = (None if guide is None else nnx.state(guide)), fusion.single
     views = walk(key, fusion, data, policy_of, given, config.most_seen, config.walks)
     asked = unseen(views, data.features.shape[1], config.candidates, config.seed + 100 * turn + part)
     return choices_along(fusion, data, views, asked, config)
