@@ -33,7 +33,7 @@ from eval.comparison import intervals
 from eval.confidence import stopping
 from eval.knowledge import class_view_table
 from mevs_jax.arrays import AnyArray
-from mevs_jax.calibration import class_weights, expected_calibration_error, fit_temperature, negative_log_likelihood
+from mevs_jax.calibration import class_weights, expected_calibration_error, fit_temperature
 from mevs_jax.fusion import CalibratedFusion
 from mevs_jax.models import ViewPolicy
 from mevs_jax.policies import Knowledge
@@ -49,17 +49,18 @@ def _refit(beliefs: Array, labels: Array) -> Float[Array, "steps"]:
 
 def judged(
     beliefs: Sequence[Float[AnyArray, "objects walks steps classes"]], labels: Sequence[Int[AnyArray, "objects"]]
-) -> tuple[dict[str, Any], list[Signal]]:
+) -> tuple[dict[str, Any], list[Signal], Float[np.ndarray, "steps objects"]]:
     """One policy's numbers, and its confidence, on walks over validation objects, where temperatures are fitted, and over test
-    objects."""
+    objects; and the log-probability that it gives the class of each test object, a mean over its walks."""
     temperatures = _refit(beliefs[0], labels[0])
     signals = [
         confidences(belief / temperatures[:, None], known) for belief, known in zip(beliefs, labels, strict=True)
     ]
     confidence, right = signals[1].value, signals[1].right
     after = right.mean(axis=1).T
-    flat = (beliefs[1] / temperatures[:, None]).reshape(-1, *beliefs[1].shape[2:])
-    truth = jnp.repeat(labels[1], right.shape[1])
+    own = jnp.asarray(labels[1])[:, None, None, None]
+    log_probability = jnp.take_along_axis(jax.nn.log_softmax(beliefs[1] / temperatures[:, None], axis=-1), own, axis=-1)
+    likelihood = np.asarray(log_probability[..., 0].mean(axis=1).T)
     steps = range(right.shape[2])
     found = {
         "after_views": after.mean(axis=1).tolist(),
@@ -69,10 +70,10 @@ def judged(
             float(expected_calibration_error(confidence[:, :, step].reshape(-1), right[:, :, step].reshape(-1)))
             for step in steps
         ],
-        "negative_log_likelihood": [float(negative_log_likelihood(flat[:, step], truth)) for step in steps],
+        "negative_log_likelihood": (-likelihood.mean(axis=1)).tolist(),
         "stopping": stopping(confidence, right),
     }
-    return found, signals
+    return found, signals, likelihood
 
 
 def greedy_order(
@@ -210,6 +211,7 @@ def study(
     if others:
         found["random_sets"] = random_sets_study(fusion, validation.features, test.features, draws)
     after: dict[str, np.ndarray] = {}
+    likelihoods: dict[str, np.ndarray] = {}
     from_some: dict[str, np.ndarray] = {}  # accuracy from the oracles' starts
     parameters: dict[str, Any] = {"belief_oracle": fusion, "label_oracle": fusion}
     parameters |= {learner.name: given_to(learner, fusion) for learner in learners}
@@ -234,7 +236,7 @@ def study(
             )
             walks.append(views)
             beliefs.append(beliefs_of(own, data.features, views))
-        judgement, signals = judged(beliefs, [data.features.labels for data in (validation, test)])
+        judgement, signals, likelihoods[name] = judged(beliefs, [data.features.labels for data in (validation, test)])
         right = signals[1].right
         told[name] = Told(walks, beliefs, signals)
         by_start = right.reshape(len(right), -1, contender.draws, right.shape[-1]).mean(axis=2)
@@ -249,7 +251,7 @@ def study(
         found["costs"] = what_it_costs(key, method, fusion, validation, test, knowledge, told, max_views)
     found["against"] = {
         base: {
-            name: _difference(mine, after[base])
+            name: _difference(mine, after[base]) | {"likelihood": _difference(likelihoods[name], likelihoods[base])}
             for name, mine in after.items()
             if name not in (base, "belief_oracle", "label_oracle")  # which walk from some starts only
         }

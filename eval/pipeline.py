@@ -160,7 +160,7 @@ _TRIFLING_SETS = SetFusionConfig(width=16, heads=2, blocks=1)
 _TRIFLE = OptimiserConfig(epochs=2, batch_size=16, views_per_object=2, epoch_views=4, schedule="cosine")
 
 TINY = Settings(
-    dataset=DataConfig(train_per_class=4, test_per_class=2, capture=CaptureConfig(views=6, resolution=32)),
+    dataset=DataConfig(train_per_class=4, test_per_class=1, capture=CaptureConfig(views=6, resolution=32)),
     classifier=ClassifierConfig(
         network=ResNetConfig(width=8, channels=1, standardise=False),
         optimiser=_TRIFLE,
@@ -178,8 +178,17 @@ TINY = Settings(
         optimiser=_TRIFLE,
     ),
     evaluation=GridConfig(draws=2),
-    live=LiveConfig(objects=12, at_once=8, max_views=4),
-    thesis=ThesisConfig(_TRIFLE, _TRIFLE, _TRIFLE, resnet34_width=8, timing_runs=3, climbing_runs=1, climbing_starts=2),
+    live=LiveConfig(objects=10, at_once=8, max_views=4),
+    thesis=ThesisConfig(
+        _TRIFLE,
+        _TRIFLE,
+        _TRIFLE,
+        resnet34_width=8,
+        timing_runs=3,
+        climbing_runs=1,
+        climbing_starts=2,
+        climbing_resolution=16,
+    ),
     active=ActiveConfig(
         recogniser=RecogniserConfig(
             network=ResNetConfig(width=8, channels=4, standardise=False, stem="patches"),

@@ -36,7 +36,7 @@ from eval.thesis_networks import (
 )
 from eval.thesis_page import write_thesis_report
 from eval.thesis_results import NO_ACCELERATOR, LatticeTables, all_results, machine
-from eval.timing import CLIMBING_SIDE, decision_memory_alone, time_climbing, time_local_maxima, time_predictor
+from eval.timing import decision_memory_alone, time_climbing, time_local_maxima, time_predictor
 from eval.view_tables import made_by, network_outputs, objects_of, stored_array
 from train.classifier import ClassifierTask
 from train.entropy import EntropyTask
@@ -114,7 +114,8 @@ def _timing(settings: Settings, folder: ThesisFolder, tables: dict[int, LatticeT
 
 
 def _climbing(settings: Settings, tables: LatticeTables, classes: list[str]) -> dict[str, Any]:
-    runs, starts = settings.thesis.climbing_runs, settings.thesis.climbing_starts
+    thesis = settings.thesis
+    runs, starts, resolution = thesis.climbing_runs, thesis.climbing_starts, thesis.climbing_resolution
     meshes = {}
     entries = {entry.name: entry for entry in open_objects(settings.dataset).entries}
     for label, name in enumerate(classes):
@@ -122,15 +123,15 @@ def _climbing(settings: Settings, tables: LatticeTables, classes: list[str]) -> 
         evenly = np.unique(np.linspace(0, len(members) - 1, min(runs, len(members))).round().astype(int))
         if len(members):
             meshes[name] = [load_object(entries[tables.names[members[at]]]) for at in evenly]
-    methods = {name: time_climbing(method, meshes, starts) for name, method in METHODS.items()}
-    return {"runs": runs, "starts": starts, "resolution": CLIMBING_SIDE, **methods}
+    methods = {name: time_climbing(method, meshes, starts, resolution) for name, method in METHODS.items()}
+    return {"runs": runs, "starts": starts, "resolution": resolution, **methods}
 
 
 def measure(settings: Settings, folder: ThesisFolder, tables: dict[int, LatticeTables]) -> dict[str, Any]:
     """Machine, times and memory; measured once, and again on another machine or with networks of another size."""
     ran_on = machine()
     thesis = settings.thesis
-    counts = thesis.timing_runs, thesis.climbing_runs, thesis.climbing_starts
+    counts = thesis.timing_runs, thesis.climbing_runs, thesis.climbing_starts, thesis.climbing_resolution
     identity = as_read([ran_on, counts, asdict(settings.entropy.network)])
     path = folder.out / "timing.json"
     if path.exists() and (found := read_json(path))["identity"] == identity:
@@ -204,12 +205,16 @@ def reproduce(settings: Settings, preset: str, out: Path, pretrained: tuple[Path
     if settings.evaluation.lowest_elevation > -90:
         raise DataError("mevs thesis walks from every view; leave --evaluation.lowest-elevation as it is")
     check_evaluation(settings.evaluation)
-    if settings.thesis.climbing_runs < 1 or settings.thesis.climbing_starts < 2:
-        raise DataError("--thesis.climbing-runs must be at least 1 and --thesis.climbing-starts at least 2")
-    first = first_weights(settings.classifier, settings.thesis, pretrained)
+    thesis = settings.thesis
+    if thesis.climbing_runs < 1 or thesis.climbing_starts < 2 or thesis.climbing_resolution < 8:
+        raise DataError(
+            "--thesis.climbing-runs must be at least 1, --thesis.climbing-starts at least 2 and "
+            "--thesis.climbing-resolution at least 8"
+        )
+    first = first_weights(settings.classifier, thesis, pretrained)
     folder = ThesisFolder(out)
     make_thesis_data(settings, folder)
-    train_thesis(folder, settings.classifier, settings.entropy, settings.thesis, first)
+    train_thesis(folder, settings.classifier, settings.entropy, thesis, first)
     inputs = evaluate_thesis(settings, folder)
     results, statistics = inputs.results, inputs.statistics[40]
     ran_on = results["machine"]

@@ -69,6 +69,8 @@ class ThesisConfig:
     """objects of each class that are climbed on, for the thesis's Table 2"""
     climbing_starts: int = 8
     """viewpoints to climb from; the thesis's times are of one"""
+    climbing_resolution: int = 64
+    """pixels along each side of what is rendered on the way"""
 
 
 @dataclass(frozen=True)

@@ -31,8 +31,6 @@ from train.classifier import ClassifierTask
 from train.entropy import EntropyTask
 
 _WARM_UP = 3
-CLIMBING_SIDE = 64
-"""Pixels along each side of what is rendered for Table 2."""
 
 
 def milliseconds(call: Callable[[Any], Any], inputs: Sequence[Any]) -> np.ndarray:
@@ -82,11 +80,11 @@ def time_local_maxima(views: int, runs: int = 200, objects: int = 1000) -> dict[
     }
 
 
-def time_climbing(method: Method, meshes: dict[str, list[Mesh]], starts: int) -> dict[str, Any]:
+def time_climbing(method: Method, meshes: dict[str, list[Mesh]], starts: int, resolution: int) -> dict[str, Any]:
     """Seconds of climbs on each class's objects, mean and standard deviation, and megabytes planned for one object."""
     things = {name: [jnp.asarray(method.prepare(mesh)) for mesh in some] for name, some in meshes.items()}
     first = next(iter(things.values()))[0]
-    compiled = jax.jit(lambda thing: climb(method, thing, starts, CLIMBING_SIDE).values).lower(first).compile()
+    compiled = jax.jit(lambda thing: climb(method, thing, starts, resolution).values).lower(first).compile()
     jax.block_until_ready(compiled(first))
     seconds: dict[str, np.ndarray] = {}
     for name, some in things.items():

@@ -51,9 +51,9 @@ def open3d_or_skip() -> None:
         pytest.skip(f"Open3D cannot be loaded here: {error}")
 
 
-@pytest.fixture
+@pytest.fixture(scope="module")
 def lightly_compiled() -> Iterator[None]:
-    """For tests that compile much and run little: a third less time."""
+    """For modules whose tests compile much and run little: a third less time."""
     import jax
 
     jax.config.update("jax_disable_most_optimizations", True)

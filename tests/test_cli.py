@@ -185,7 +185,7 @@ def whole(tmp_path_factory, lightly_compiled_commands) -> Path:
 
 def test_the_job_leaves_a_report_and_metrics(whole):
     metrics = json.loads((whole / "metrics.json").read_text())
-    assert metrics["objects"] == 20
+    assert metrics["objects"] == 10
     assert metrics["views"] == 6
     page = (whole / "report" / "index.html").read_text()
     assert "http" not in page.replace("http://www.w3.org", "").replace("https://www.w3.org", "")  # needs no other file

@@ -324,7 +324,7 @@ def adding() -> CalibratedFusion:
 
 def test_what_looking_was_worth_is_learnt_and_the_study_says_so(adding):
     parts = [(adding, telling(160, seed)) for seed in (0, 1)]
-    validation, test = telling(80, 2), telling(120, 3)
+    validation, test = telling(120, 2), telling(120, 3)
     config = PolicyConfig(
         width=16, heads=2, blocks=1, most_seen=3, walks=2, rounds=2, epochs=12, batch_size=64, learning_rate=5e-3
     )

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from functools import partial
 from itertools import islice
 
 import jax
@@ -152,20 +153,20 @@ def test_objects_turned_anyhow_are_seen_from_the_lattice_itself(turned):
     """Undoing the turn of an object's cameras turns the object instead."""
     statistics = load_statistics(turned)
     task = RecogniserTask.of(TINY.active.recogniser, 10, statistics.camera)
-    network = task.network(nnx.Rngs(0))
+    network = nnx.jit(lambda: task.network(nnx.Rngs(0)))()
     batches = list(islice(evaluation_batches(turned, "train", images="depth"), 2))
     features = network.encoder.head.in_features
     together = {name: np.concatenate([batch[name] for batch in batches]) for name in batches[0]}
     lattice = viewpoint_lattice(task.camera.views, task.camera.lattice)
-    for index, found in enumerate(np.split(np.asarray(_see_rotated(network, task, together)), 2)):
+    see, after = nnx.jit(Recogniser.see), jax.jit(partial(views_after, camera=task.camera))
+    turned_back = nnx.jit(partial(_see_rotated, task=task))(network, batch=together)
+    for index, found in enumerate(np.split(np.asarray(turned_back), 2)):
         np.testing.assert_allclose(found[:, features + 10 : -1], lattice, atol=1e-4)
         np.testing.assert_array_equal(found[:, -1], batches[index]["label"])
         before = np.asarray(task.directions(batches[index]))
         turn = Rotation.align_vectors(lattice, before)[0].as_matrix().astype(np.float32)
-        images, _ = views_after(
-            jnp.asarray(turn), task.inputs(batches[index]), jnp.asarray(batches[index]["pose"]), task.camera
-        )
-        expected = np.asarray(network.see(images))
+        images, _ = after(jnp.asarray(turn), task.inputs(batches[index]), jnp.asarray(batches[index]["pose"]))
+        expected = np.asarray(see(network, images))
         # A ray that falls between two pixels may fall to the other one after rounding.
         assert np.median(np.abs(found[:, : features + 10] - expected)) < 1e-4
         assert np.abs(turn - np.eye(3)).max() > 0.1
@@ -184,7 +185,7 @@ def test_recognisers_of_objects_turned_anyhow_go_on_from_the_others(turned, tmp_
     assert not stages.task().augmentation.turn
     assert task.optimiser.epochs == 1
     assert rotated.recogniser_folder() != stages.recogniser_folder()
-    begun = task.network(nnx.Rngs(5))
+    begun = nnx.jit(lambda: task.network(nnx.Rngs(5)))()
     assert start is not None
     start.put(begun)
     jax.tree.map(
@@ -194,7 +195,8 @@ def test_recognisers_of_objects_turned_anyhow_go_on_from_the_others(turned, tmp_
     )
     batch = next(evaluation_batches(turned, "val", images="depth"))
     pair = {name: array[:2] for name, array in batch.items()}
-    found = [RecogniserTask.evaluate(one, begun, pair)["loss"] for one in (task, task, stages.task())]
+    losses = [nnx.jit(partial(RecogniserTask.evaluate, one)) for one in (task, stages.task())]
+    found = [np.asarray(losses[which](begun, pair)["loss"]) for which in (0, 0, 1)]
     np.testing.assert_array_equal(found[0], found[1])  # the same turn every time
     assert np.abs(np.asarray(found[0] - found[2])).max() > 1e-6
 

@@ -16,7 +16,7 @@ def in_chunks(function: Callable[[Any], Any], objects: Any, size: int) -> Any:
         function: treats objects one by one, so that it may be given `size` of them; the last chunk is filled up with its first.
     """
     count = len(jax.tree.leaves(objects)[0])
-    done = []
+    size, done = min(size, count), []
     for first in range(0, count, size):
         index = np.resize(np.arange(first, min(first + size, count)), size)
         found = function(jax.tree.map(lambda leaf, index=index: leaf[index], objects))
