@@ -67,10 +67,10 @@ def _differences(
             continue
         row = [html.escape(title)]
         for base in bases:
-            gain = found["against"][base].get(name)
-            gain = None if gain is None else of(gain)
+            against = found["against"][base].get(name)
+            gain = of(against) if against else {"difference": []}
             for step in (1, 2, 3):
-                known = gain is not None and step < len(gain["difference"])
+                known = step < len(gain["difference"])
                 row.append(difference(gain["difference"][step], gain["interval"][step]) if known else "")
         rows.append(row)
     header = [corner, *(f"{titles[base]}, {step} views" for base in bases for step in (2, 3, 4))]
