@@ -29,6 +29,7 @@ from mevs_jax.viewpoints import viewpoint_lattice
 from train.loop import load_best, steps_of_an_epoch
 from train.recogniser import RecogniserTask
 
+pytestmark = pytest.mark.usefixtures("lightly_compiled")
 CAMERA = CaptureConfig(views=6, resolution=48)
 
 
@@ -172,7 +173,6 @@ def test_objects_turned_anyhow_are_seen_from_the_lattice_itself(turned):
         assert np.abs(turn - np.eye(3)).max() > 0.1
 
 
-@pytest.mark.usefixtures("lightly_compiled")
 def test_recognisers_of_objects_turned_anyhow_go_on_from_the_others(turned, tmp_path):
     config = replace(TINY.active, rotation_epochs=1)
     stages = Stages(config, TINY.dataset, tmp_path)
