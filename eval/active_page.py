@@ -157,7 +157,8 @@ def _costs(found: dict[str, Any]) -> str:
         "less than a view costs; and by risk, at equal accuracy on validation objects.</p>"
         + table(["cost of a view", *header], paying)
         + "<h2>Going there</h2><p>Accuracy and way of the camera, where a radian costs so much of the probability that a view "
-        "brings.</p>" + table(["price", *(title for step in steps for title in (f"{step + 1} views", "way"))], ways)
+        "brings; from every fifth start.</p>"
+        + table(["price", *(title for step in steps for title in (f"{step + 1} views", "way"))], ways)
     )
 
 

@@ -167,9 +167,11 @@ def moving(
     test: OnLattice,
     knowledge: Knowledge | None,
     max_views: int,
+    every: int,
 ) -> list[dict[str, Any]]:
-    """Accuracy and way (radians) after each number of views, by price of the way."""
-    contender = Contender("priced", "", "learnt", partial(_priced, structure=nnx.graphdef(learner.network)))
+    """Accuracy and way (radians) after each number of views, by price of the way; from every so many-th start."""
+    policy_of = partial(_priced, structure=nnx.graphdef(learner.network))
+    contender = Contender("priced", "", "learnt", policy_of, every=every)
     directions, rows = test.features.directions, []
     distances = np.asarray(graph_of(directions[0]).distances)
     for price in PRICES_OF_THE_WAY:
@@ -201,11 +203,12 @@ def what_it_costs(
     knowledge: Knowledge | None,
     told: dict[str, Told],
     max_views: int,
+    every: int,
 ) -> dict[str, Any]:
     """When the method stops, beside the thesis's rule and beside what the next view would bring; and how far it goes.
 
     The thesis's rule: walks by predicted entropy (at random, where there is none), sums of logits, and a threshold on their
-    confidence as it is.
+    confidence as it is. Where the way has a price, walks begin at every so many-th start.
     """
     walked_by = next(name for name in ("predicted_entropy", "random") if name in told)
     both, method = (validation.features, test.features), told[learner.name]
@@ -221,5 +224,5 @@ def what_it_costs(
         "thesis_walks": walked_by,
         "beside_thesis": beside(thesis, method.confidence),
         "not_paying": beside(gains, method.confidence, [-price for price in PRICES_OF_A_VIEW]),
-        "moving": moving(key, learner, fusion, test, knowledge, max_views),
+        "moving": moving(key, learner, fusion, test, knowledge, max_views, every),
     }

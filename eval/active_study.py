@@ -192,7 +192,8 @@ def study(
         learners: trained view policies, the method first and then its ablations.
         max_views: of a walk.
         draws: walks from each start of policies that draw.
-        oracle_views, oracle_starts: how far oracles walk, and from every so many-th start.
+        oracle_views: how far oracles walk.
+        oracle_starts: they walk from every so many-th start, and so do those for whom the way has a price.
         fitting_starts: temperatures are fitted on walks from every so many-th start.
         costs: whether to tell too when the method would stop and what it does where the way has a price.
         others: whether policies but these and random selection walk, and random sets are fused.
@@ -248,7 +249,7 @@ def study(
         console.print(f"{contender.title}: " + " ".join(f"{100 * share:.1f}" for share in judgement["after_views"]))
     if costs:
         key, method = jax.random.key(seed), learners[0]
-        found["costs"] = what_it_costs(key, method, fusion, validation, test, knowledge, told, max_views)
+        found["costs"] = what_it_costs(key, method, fusion, validation, test, knowledge, told, max_views, oracle_starts)
     found["against"] = {
         base: {
             name: _difference(mine, after[base]) | {"likelihood": _difference(likelihoods[name], likelihoods[base])}

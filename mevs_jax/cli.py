@@ -29,7 +29,7 @@ COMMANDS = {
     "live": "walk test objects with the networks in the loop; compare with the tables",
 }
 
-_HELP = """usage: mevs COMMAND [--preset small|thesis] [--data PATH] [--views N] [--out DIR] [SETTINGS]
+_HELP = """usage: mevs COMMAND [--preset small|best|thesis] [--data PATH] [--views N] [--out DIR] [SETTINGS]
 
 Where should a camera look next? Trains the networks of maximum entropy viewpoint selection and
 measures how much choosing the next view helps.
@@ -38,8 +38,10 @@ commands:
 {commands}
 
 common options:
-  --preset small|thesis   small (default): 64×64 views, narrow networks, for a CPU; thesis: the
-                          thesis's sizes, for an accelerator; tiny: to see it all run in a minute
+  --preset small|best|thesis
+                          small (default): 64×64 views, narrow networks, for a CPU; best: 128×128
+                          and wide ones for mevs active, thesis: the thesis's sizes, both for an
+                          accelerator; tiny: to see it all run in a minute
   --data PATH             furniture10 (default, built in), modelnet10 or modelnet40 (downloaded), a
                           folder <class>/{{train,test}}/ of .off, .obj, .stl, .ply or .glb, a zip of
                           that layout, or an .npz of voxel grids

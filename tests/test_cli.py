@@ -18,7 +18,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from data_pipeline.builder import load_statistics
+from data_pipeline.builder import load_statistics, prepare
 from eval.active_page import write_active_page
 from eval.pipeline import TINY, climb_on_objects, learn_to_choose
 from mevs_jax import cli
@@ -33,10 +33,10 @@ def mevs(*arguments: str | Path, cwd: Path | None = None) -> subprocess.Complete
 
 
 @pytest.fixture
-def refuses(monkeypatch, capfd):
-    """`mevs` in this process, which imports nothing anew, where it is to refuse something: the sentence that it says."""
+def at_once(monkeypatch, capfd):
+    """`mevs` in this process, which imports nothing anew, where it ends before it works."""
 
-    def run(*arguments: str | Path) -> str:
+    def run(*arguments: str | Path) -> subprocess.CompletedProcess:
         handlers = {sign: signal.getsignal(sign) for sign in (signal.SIGINT, signal.SIGALRM)}
         monkeypatch.setattr(sys, "argv", ["test", *map(str, arguments)])  # not `mevs`, which would begin again
         capfd.readouterr()
@@ -46,9 +46,15 @@ def refuses(monkeypatch, capfd):
         finally:
             for sign, handler in handlers.items():
                 signal.signal(sign, handler)
-        return refused(subprocess.CompletedProcess([], ended.value.code, "", capfd.readouterr().err))
+        return subprocess.CompletedProcess([], ended.value.code, *capfd.readouterr())
 
     return run
+
+
+@pytest.fixture
+def refuses(at_once):
+    """The sentence with which it refuses something."""
+    return lambda *arguments: refused(at_once(*arguments))
 
 
 def cube_off() -> str:
@@ -156,21 +162,21 @@ def test_bad_input_gets_one_sentence_and_exit_code_2(tmp_path, make, message, re
     assert re.search(message, refuses("run", "--preset", "tiny", *arguments))
 
 
-def test_unknown_words_are_refused_and_help_reads_well(tmp_path, refuses):
+def test_unknown_words_are_refused_and_help_reads_well(tmp_path, refuses, at_once):
     assert "unknown command 'fly'" in refused(mevs("fly"))
     assert "unknown preset 'huge'" in refuses("run", "--preset", "huge")
-    assert mevs("run", "--no-such-option").returncode == 2
+    assert at_once("run", "--no-such-option").returncode == 2
     assert "of 10 and of 40 views" in refuses("thesis", "--views", "5", "--out", tmp_path / "thesis")
     assert "no data set in" in refuses("train", "--out", tmp_path)
     assert "go with mevs train alone" in refuses("run", "--distributed", "--out", tmp_path)
     assert "--beam goes with mevs data alone" in refuses("run", "--beam", "", "--out", tmp_path)
     assert "cannot join the other processes" in refused(mevs("train", "--distributed", "--out", tmp_path))
-    shown = mevs("--help")
+    shown = at_once("--help")
     assert shown.returncode == 0
     for word in ("run", "data", "train", "eval", "report", "--preset", "--data", "--views", "--out"):
         assert word in shown.stdout
     assert max(map(len, shown.stdout.splitlines())) <= 100
-    assert "--classifier.optimiser.epochs" in mevs("run", "--help").stdout
+    assert "--classifier.optimiser.epochs" in at_once("run", "--help").stdout
 
 
 @pytest.fixture(scope="module")
@@ -214,7 +220,7 @@ def test_a_second_run_redoes_nothing(whole):
 
 
 def test_networks_for_another_number_of_views_are_refused(whole, tmp_path, refuses):
-    assert mevs("data", "--preset", "tiny", "--views", "8", "--out", tmp_path).returncode == 0
+    prepare(replace(TINY.dataset, capture=replace(TINY.dataset.capture, views=8)), tmp_path / "data")
     for name in ("classifier", "entropy"):
         shutil.copytree(whole / name, tmp_path / name)
     assert "was trained for 6 views, the data set has 8" in refuses("eval", "--preset", "tiny", "--out", tmp_path)
