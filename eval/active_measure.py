@@ -5,7 +5,7 @@ What is found is kept in files of the seed's folder; what is there is not measur
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -18,11 +18,11 @@ from flax import nnx
 from jaxtyping import Array
 
 from data_pipeline.builder import load_statistics, open_split
-from data_pipeline.files import as_read, read_json, write_json
+from data_pipeline.files import as_read, read_json, write_json, write_npz
 from data_pipeline.inputs import depth_and_normals
 from data_pipeline.progress import console
 from eval.active import Stages, lattice_data
-from eval.active_study import novel_classes, study
+from eval.active_study import ByObject, novel_classes, seeds_together, study
 from eval.active_walks import OnLattice
 from eval.thesis_results import machine
 from eval.timing import milliseconds
@@ -31,6 +31,9 @@ from mevs_jax.models import Recogniser
 from mevs_jax.models.view_policy import expected_gain
 from mevs_jax.viewpoints import viewpoint_lattice
 from train.loop import load_best
+
+_FORM = 2
+"""Of what is kept of walks; with another one they are walked again."""
 
 
 def train_all(stages: Stages) -> None:
@@ -63,6 +66,20 @@ def measure(stages: Stages) -> dict[str, Any]:
     if config.rotation_epochs:
         found["rotated"] = {str(own): _rotated(stages)}
     return found
+
+
+def together(seeds: Sequence[Stages], found: Sequence[dict[str, Any]]) -> dict[str, Any]:
+    """What all seeds reach on average, by number of candidate views; `found` is what `measure` gave for each."""
+    lattices = {}
+    for views, first in found[0]["lattices"].items():
+        each = []
+        for stages in seeds:
+            with np.load(stages.folder / f"walks_lattice_{views}.npz") as kept:
+                each.append(
+                    {name: ByObject(kept[f"{name} right"], kept[f"{name} likelihood"]) for name in first["policies"]}
+                )
+        lattices[views] = seeds_together(first, each, "learnt")
+    return lattices
 
 
 def _kept(path: Path, identity: dict[str, Any], find: Callable[[], dict[str, Any]]) -> dict[str, Any]:
@@ -104,7 +121,7 @@ def _walks(
         console.print(
             f"Walking {objects} test objects, {count} candidate views{around}{known}{', ablations' * bool(ablations)}"
         )
-        return study(
+        found, each = study(
             stages.fusion(posed=posed),
             learners,
             validation,
@@ -116,8 +133,12 @@ def _walks(
             costs=costs,
             others=not ablations,
         )
+        arrays = {f"{name} {key}": value for name, policy in each.items() for key, value in vars(policy).items()}
+        write_npz(path.with_suffix(".npz"), **arrays)
+        return found
 
     identity = {
+        "form": _FORM,
         "made_by": made_by(load_statistics(data), stages.recogniser_folder()),
         "policies": [
             read_json(stages.policy_folder(learner.made_as) / "summary.json")["identity"] for learner in learners
@@ -132,7 +153,8 @@ def _walks(
         ],
     }
     kind = ("" if posed else "_unposed") + ("_ablations" if ablations else "")
-    return _kept(stages.folder / f"walks_{views}{kind}.json", identity, walk)
+    path = stages.folder / f"walks_{views}{kind}.json"
+    return _kept(path, identity, walk)
 
 
 def _rotated(stages: Stages) -> dict[str, Any]:

@@ -278,7 +278,7 @@ def _decision(metrics: dict[str, Any]) -> str:
 
 
 def _seeds(metrics: dict[str, Any], views: str) -> str:
-    """The main rows of every seed, and what the method is above others."""
+    """The mean of all seeds, the main rows of every one, and what the method is above others."""
     if len(metrics["seeds"]) < 2:
         return ""
     each = [found["lattices"][views] for found in metrics["seeds"]]
@@ -287,9 +287,6 @@ def _seeds(metrics: dict[str, Any], views: str) -> str:
     for name, title in titles.items():
         after = [found["policies"][name]["after_views"][:4] for found in each]
         rows += [[html.escape(title), str(seed), *map(percent, shares)] for seed, shares in enumerate(after)]
-        rows.append(
-            ["", "mean", *(f"<b>{percent(sum(shares) / len(after))}</b>" for shares in zip(*after, strict=True))]
-        )
     gains = []
     for base in ("random", "farthest", "fixed_order"):
         for seed, found in enumerate(each):
@@ -297,7 +294,11 @@ def _seeds(metrics: dict[str, Any], views: str) -> str:
             cells = zip(gain["difference"][1:4], gain["interval"][1:4], strict=True)
             gains.append([html.escape(titles[base]), str(seed), *(difference(*cell) for cell in cells)])
     return (
-        "<h2>Other random weights</h2><p>Everything trained anew from other weights and batches.</p>"
+        "<h2>Other random weights</h2><p>Everything trained anew from other weights and batches. Means of "
+        f"{len(each)} seeds, taken of each object first:</p>"
+        + _ladder(metrics["together"][views])
+        + _against(metrics["together"][views])
+        + "<p>Each seed:</p>"
         + table(["next view chosen by", "seed", "1 view", "2", "3", "4"], rows)
         + table(["view policy above", "seed", "2 views", "3", "4"], gains)
     )

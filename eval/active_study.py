@@ -6,8 +6,8 @@ policy, on its own walks over validation objects: one that picks telling views m
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from typing import Any
 
 import jax
@@ -38,6 +38,19 @@ from mevs_jax.fusion import CalibratedFusion
 from mevs_jax.models import ViewPolicy
 from mevs_jax.policies import Knowledge
 from train.fusion import Features, sets_of_size
+
+
+@dataclass(frozen=True)
+class ByObject:
+    """How a policy does on each test object, a mean over its walks.
+
+    Attributes:
+        right: (steps, objects) share of the walks that are right after so many views.
+        likelihood: (steps, objects) log-probability of the true class.
+    """
+
+    right: Float[np.ndarray, "steps objects"]
+    likelihood: Float[np.ndarray, "steps objects"]
 
 
 @jax.jit
@@ -184,8 +197,8 @@ def study(
     seed: int = 0,
     costs: bool = False,
     others: bool = True,
-) -> dict[str, Any]:
-    """Every number about one lattice of candidate views.
+) -> tuple[dict[str, Any], dict[str, ByObject]]:
+    """Every number about one lattice of candidate views; and each policy's by object.
 
     Args:
         fusion: of the recogniser whose features these are.
@@ -211,8 +224,7 @@ def study(
     }
     if others:
         found["random_sets"] = random_sets_study(fusion, validation.features, test.features, draws)
-    after: dict[str, np.ndarray] = {}
-    likelihoods: dict[str, np.ndarray] = {}
+    each: dict[str, ByObject] = {}
     from_some: dict[str, np.ndarray] = {}  # accuracy from the oracles' starts
     parameters: dict[str, Any] = {"belief_oracle": fusion, "label_oracle": fusion}
     parameters |= {learner.name: given_to(learner, fusion) for learner in learners}
@@ -237,11 +249,11 @@ def study(
             )
             walks.append(views)
             beliefs.append(beliefs_of(own, data.features, views))
-        judgement, signals, likelihoods[name] = judged(beliefs, [data.features.labels for data in (validation, test)])
+        judgement, signals, likelihood = judged(beliefs, [data.features.labels for data in (validation, test)])
         right = signals[1].right
         told[name] = Told(walks, beliefs, signals)
         by_start = right.reshape(len(right), -1, contender.draws, right.shape[-1]).mean(axis=2)
-        after[name] = by_start.mean(axis=1).T
+        each[name] = ByObject(by_start.mean(axis=1).T, likelihood)
         if contender.every == 1:
             by_start = by_start[:, some_starts]
         from_some[name] = by_start.mean(axis=(0, 1))
@@ -250,21 +262,49 @@ def study(
     if costs:
         key, method = jax.random.key(seed), learners[0]
         found["costs"] = what_it_costs(key, method, fusion, validation, test, knowledge, told, max_views, oracle_starts)
-    found["against"] = {
-        base: {
-            name: _difference(mine, after[base]) | {"likelihood": _difference(likelihoods[name], likelihoods[base])}
-            for name, mine in after.items()
-            if name not in (base, "belief_oracle", "label_oracle")  # which walk from some starts only
-        }
-        for base in (*BASELINES, learners[0].name)
-        if base in after
-    }
+    found["against"] = compared(each, learners[0].name)
     found["gap_closed"] = {
         name: _gap_closed(from_some[name], from_some["random"], from_some["belief_oracle"])
-        for name in after
-        if "belief_oracle" in after and name not in ("random", "belief_oracle", "label_oracle")
+        for name in each
+        if "belief_oracle" in each and name not in ("random", "belief_oracle", "label_oracle")
     }
-    return found
+    return found, each
+
+
+def compared(each: Mapping[str, ByObject], method: str) -> dict[str, Any]:
+    """Paired differences of every policy from the baselines and from the method, by baseline."""
+    return {
+        base: {
+            name: _difference(mine.right, each[base].right)
+            | {"likelihood": _difference(mine.likelihood, each[base].likelihood)}
+            for name, mine in each.items()
+            if name not in (base, "belief_oracle", "label_oracle")  # which walk from some starts only
+        }
+        for base in (*BASELINES, method)
+        if base in each
+    }
+
+
+def seeds_together(found: dict[str, Any], seeds: Sequence[Mapping[str, ByObject]], method: str) -> dict[str, Any]:
+    """What the same policies reach on average over several seeds, by object first, since the objects are the same.
+
+    Args:
+        found: what `study` found with one of the seeds.
+        seeds: what each policy does by object, for each seed.
+    """
+    each = {
+        name: ByObject(
+            np.mean([seed[name].right for seed in seeds], axis=0),
+            np.mean([seed[name].likelihood for seed in seeds], axis=0),
+        )
+        for name in found["policies"]
+    }
+    policies = {
+        name: {key: policy[key] for key in ("title", "knows")}
+        | {"after_views": each[name].right.mean(axis=1).tolist(), "interval": intervals(each[name].right)}
+        for name, policy in found["policies"].items()
+    }
+    return {"seeds": len(seeds), "policies": policies, "against": compared(each, method), "gap_closed": {}}
 
 
 def novel_classes(

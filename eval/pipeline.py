@@ -23,7 +23,7 @@ from data_pipeline.files import as_read, read_json, write_json
 from data_pipeline.meshes import DataError
 from data_pipeline.progress import console
 from eval.active import ABLATIONS, ActiveConfig, Stages, check_active
-from eval.active_measure import measure, train_all
+from eval.active_measure import measure, together, train_all
 from eval.active_page import write_active_page
 from eval.ascent import AscentConfig
 from eval.climbing import ClimbConfig, climb_objects, climbing_study, load_climbed
@@ -389,11 +389,11 @@ def learn_to_choose(settings: Settings, out: Path) -> Path:
     """Trains and measures learnt fusion and learnt choice; returns the page."""
     config, found = settings.active, []
     check_active(config, settings.dataset.capture.views)
-    for seed in range(config.seeds):
-        stages = Stages(config, settings.dataset, out, seed, settings.entropy)
+    seeds = [Stages(config, settings.dataset, out, seed, settings.entropy) for seed in range(config.seeds)]
+    for stages in seeds:
         train_all(stages)
         found.append(measure(stages))
-    metrics = {"seeds": found, "settings": asdict(config)}
+    metrics = {"seeds": found, "together": together(seeds, found), "settings": asdict(config)}
     write_json(out / "active" / "metrics.json", metrics)
     page = out / "active" / "index.html"
     write_active_page(metrics, load_statistics(out / "data"), page)

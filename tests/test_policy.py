@@ -12,7 +12,7 @@ import pytest
 from flax import nnx
 
 from eval.active_stopping import Signal, beside
-from eval.active_study import greedy_order, novel_classes, study
+from eval.active_study import ByObject, greedy_order, novel_classes, seeds_together, study
 from eval.active_walks import Learner, OnLattice
 from eval.confidence import stops_at
 from mevs_jax import ViewGraph, ViewTable, fibonacci_sphere
@@ -331,7 +331,7 @@ def test_what_looking_was_worth_is_learnt_and_the_study_says_so(adding):
     policy, histories = train_policy(config, parts, (adding, validation))
     assert len(histories) == 2
     assert histories[-1][-1]["gain"] < 0.7 * histories[0][0]["gain"]
-    found = study(
+    found, each = study(
         adding,
         [
             Learner("learnt", "view policy", policy),
@@ -348,6 +348,14 @@ def test_what_looking_was_worth_is_learnt_and_the_study_says_so(adding):
         costs=True,
     )
     after = {name: result["after_views"] for name, result in found["policies"].items()}
+    same = seeds_together(found, [each, each], "learnt")
+    assert same["against"] == found["against"]  # the mean of two that are alike
+    assert same["policies"]["learnt"]["interval"] == found["policies"]["learnt"]["interval"]
+    better = {name: ByObject(policy.right, policy.likelihood + (name == "learnt")) for name, policy in each.items()}
+    gain = seeds_together(found, [each, better], "learnt")["against"]["random"]["learnt"]["likelihood"]["difference"]
+    np.testing.assert_allclose(
+        gain, 0.5 + np.array(found["against"]["random"]["learnt"]["likelihood"]["difference"]), atol=1e-5
+    )
     # From view 0 the telling view can be known; random finds it in one case of five.
     assert after["learnt"][1] > after["random"][1] + 0.05
     assert after["learnt"][2] > after["random"][2] + 0.1
