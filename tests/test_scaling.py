@@ -28,8 +28,7 @@ from train.step import initial_state, train_step_of
 
 ROOT = Path(__file__).resolve().parents[1]
 CPU = {"JAX_PLATFORMS": "cpu", "PYTHONPATH": str(ROOT), "JAX_DISABLE_MOST_OPTIMIZATIONS": "1"}
-"""Environment of processes of their own, lightly compiled like everything here."""
-pytestmark = pytest.mark.usefixtures("lightly_compiled")
+"""Environment of processes of their own, which compile lightly."""
 
 
 @pytest.fixture(scope="module")
