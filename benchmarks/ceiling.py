@@ -74,7 +74,7 @@ def answers(fusion: CalibratedFusion, data: Features, size: int, draws: int = 8)
 
 def draw(path: Path, views: list[np.ndarray], titles: list[str], columns: int = 8) -> None:
     figure, axes = plt.subplots(
-        -(-len(views) // columns), columns, figsize=(1.5 * columns, 1.7 * -(-len(views) // columns))
+        -(-len(views) // columns), columns, figsize=(1.5 * columns, 1.8 * -(-len(views) // columns))
     )
     for axis in axes.flat:
         axis.axis("off")
@@ -151,7 +151,7 @@ def main(options: Options) -> None:
     draw(
         RESULTS / "ceiling.png",
         [objects[i]["image"][from_above] for i in some],
-        [f"{classes[labels[i]]}, taken for {classes[final[i]]}" for i in some],
+        [f"{classes[labels[i]]},\ntaken for {classes[final[i]]}" for i in some],
     )
 
 
