@@ -105,6 +105,8 @@ def _walks(
     learners = [stages.learner(name) for name in names]
     learners[0] = replace(learners[0], name="learnt")
     costs = posed and not ablations and data == stages.out / "data"
+    kind = ("" if posed else "_unposed") + ("_ablations" if ablations else "")
+    path = stages.folder / f"walks_{views}{kind}.json"
 
     def objects_of(split: str) -> OnLattice:
         features = stages.features(f"{views}_{split}", data, split)
@@ -152,8 +154,6 @@ def _walks(
             costs,
         ],
     }
-    kind = ("" if posed else "_unposed") + ("_ablations" if ablations else "")
-    path = stages.folder / f"walks_{views}{kind}.json"
     return _kept(path, identity, walk)
 
 

@@ -33,7 +33,7 @@ from eval.comparison import intervals
 from eval.confidence import stopping
 from eval.knowledge import class_view_table
 from mevs_jax.arrays import AnyArray
-from mevs_jax.calibration import class_weights, expected_calibration_error, fit_temperature
+from mevs_jax.calibration import class_weights, expected_calibration_error, fit_temperature, log_likelihood
 from mevs_jax.fusion import CalibratedFusion
 from mevs_jax.models import ViewPolicy
 from mevs_jax.policies import Knowledge
@@ -71,9 +71,8 @@ def judged(
     ]
     confidence, right = signals[1].value, signals[1].right
     after = right.mean(axis=1).T
-    own = jnp.asarray(labels[1])[:, None, None, None]
-    log_probability = jnp.take_along_axis(jax.nn.log_softmax(beliefs[1] / temperatures[:, None], axis=-1), own, axis=-1)
-    likelihood = np.asarray(log_probability[..., 0].mean(axis=1).T)
+    truth = jnp.broadcast_to(jnp.asarray(labels[1])[:, None, None], right.shape)
+    likelihood = np.asarray(log_likelihood(beliefs[1] / temperatures[:, None], truth).mean(axis=1).T)
     steps = range(right.shape[2])
     found = {
         "after_views": after.mean(axis=1).tolist(),
@@ -304,7 +303,7 @@ def seeds_together(found: dict[str, Any], seeds: Sequence[Mapping[str, ByObject]
         | {"after_views": each[name].right.mean(axis=1).tolist(), "interval": intervals(each[name].right)}
         for name, policy in found["policies"].items()
     }
-    return {"seeds": len(seeds), "policies": policies, "against": compared(each, method), "gap_closed": {}}
+    return {"policies": policies, "against": compared(each, method), "gap_closed": {}}
 
 
 def novel_classes(

@@ -37,11 +37,15 @@ def expected_calibration_error(
     return jnp.sum(share * jnp.abs(confidence - accuracy))
 
 
+def log_likelihood(beliefs: Float[AnyArray, "*n classes"], labels: Int[AnyArray, "*n"]) -> Float[Array, "*n"]:
+    """log softmax(belief)[label] in nats."""
+    log_probabilities = jax.nn.log_softmax(jnp.asarray(beliefs), axis=-1)
+    return jnp.take_along_axis(log_probabilities, jnp.asarray(labels)[..., None], axis=-1)[..., 0]
+
+
 def negative_log_likelihood(beliefs: Float[AnyArray, "n classes"], labels: Int[AnyArray, "n"]) -> Float[Array, ""]:
     """Mean of −log softmax(belief)[label] in nats."""
-    beliefs, labels = jnp.asarray(beliefs), jnp.asarray(labels)
-    log_probabilities = jax.nn.log_softmax(beliefs, axis=-1)
-    return -jnp.mean(jnp.take_along_axis(log_probabilities, labels[:, None], axis=-1))
+    return -jnp.mean(log_likelihood(beliefs, labels))
 
 
 def class_weights(labels: Int[AnyArray, "n"], classes: int) -> Float[Array, "n"]:
