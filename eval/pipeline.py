@@ -162,7 +162,7 @@ _TRIFLE = OptimiserConfig(epochs=2, batch_size=16, views_per_object=2, epoch_vie
 TINY = Settings(
     dataset=DataConfig(train_per_class=4, test_per_class=1, capture=CaptureConfig(views=6, resolution=32)),
     classifier=ClassifierConfig(
-        network=ResNetConfig(width=8, channels=1, standardise=False),
+        network=ResNetConfig(depth=10, width=8, channels=1, standardise=False),
         optimiser=_TRIFLE,
     ),
     entropy=EntropyConfig(
@@ -191,7 +191,7 @@ TINY = Settings(
     ),
     active=ActiveConfig(
         recogniser=RecogniserConfig(
-            network=ResNetConfig(width=8, channels=4, standardise=False, stem="patches"),
+            network=ResNetConfig(depth=10, width=8, channels=4, standardise=False, stem="patches"),
             fusion=_TRIFLING_SETS,
             optimiser=replace(_TRIFLE, validation_views=2),
         ),

@@ -15,7 +15,7 @@ from eval.confidence import READINGS
 from eval.ladder import KNOWS
 from eval.page import ReportInputs, difference, image, percent, signed, span, table
 from mevs_jax.policies import POLICIES, Scene
-from mevs_jax.selection import select_from_table
+from mevs_jax.selection import Episode, select_from_table
 from mevs_jax.viewpoints import ViewGraph
 
 
@@ -355,7 +355,8 @@ def _example_walk(inputs: ReportInputs) -> str:
     graph = ViewGraph.from_points(np.array(statistics.viewpoints))
     stacked = tables.stacked()
 
-    def walk(index: int, start: int):
+    @jax.jit
+    def walk(index: int, start: int) -> Episode:
         table = jax.tree.map(lambda leaf: leaf[index], stacked)
         steps = min(4, statistics.views)
         return select_from_table(

@@ -69,6 +69,17 @@ def lightly_compiled_commands() -> Iterator[None]:
         yield
 
 
+@pytest.fixture(scope="session")
+def tiny_data(tmp_path_factory) -> Path:
+    """The data set of the preset `tiny`, to be read and not written to."""
+    from data_pipeline.builder import prepare
+    from eval.pipeline import TINY
+
+    folder = tmp_path_factory.mktemp("tiny") / "data"
+    prepare(TINY.dataset, folder)
+    return folder
+
+
 @pytest.fixture
 def random() -> np.random.Generator:
     return np.random.default_rng(0)

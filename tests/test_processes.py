@@ -12,17 +12,13 @@ from pathlib import Path
 
 import pytest
 
-from data_pipeline.builder import prepare
-from tests.scaling_worker import SETTINGS
 from tests.test_scaling import CPU
 from tests.test_training import lines
 
 
 @pytest.fixture(scope="module")
-def data(tmp_path_factory) -> Path:
-    folder = tmp_path_factory.mktemp("processes") / "data"
-    prepare(SETTINGS.dataset, folder)
-    return folder
+def data(tiny_data) -> Path:
+    return tiny_data
 
 
 def start(out: Path, *options: str, processes: int = 1) -> list[subprocess.Popen]:

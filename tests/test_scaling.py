@@ -17,7 +17,7 @@ import pytest
 from flax import nnx
 
 from data_pipeline.batches import train_batches
-from data_pipeline.builder import load_statistics, prepare
+from data_pipeline.builder import load_statistics
 from data_pipeline.meshes import DataError
 from eval.pipeline import tasks
 from tests.scaling_worker import SETTINGS
@@ -32,10 +32,8 @@ CPU = {"JAX_PLATFORMS": "cpu", "PYTHONPATH": str(ROOT), "JAX_DISABLE_MOST_OPTIMI
 
 
 @pytest.fixture(scope="module")
-def data(tmp_path_factory) -> Path:
-    folder = tmp_path_factory.mktemp("scaling") / "data"
-    prepare(SETTINGS.dataset, folder)
-    return folder
+def data(tiny_data) -> Path:
+    return tiny_data
 
 
 def work(**asked) -> subprocess.CompletedProcess:

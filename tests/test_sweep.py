@@ -14,7 +14,7 @@ import pytest
 from flax import nnx
 
 import train.sweep
-from data_pipeline.builder import load_statistics, prepare
+from data_pipeline.builder import load_statistics
 from data_pipeline.meshes import DataError
 from eval.pipeline import tasks, train_sweep
 from eval.sweep_report import sweep_table
@@ -31,9 +31,9 @@ SWEEP = SweepConfig(members=4, learning_rate=(1e-5, 3e-4))
 
 
 @pytest.fixture(scope="module")
-def out(tmp_path_factory) -> Path:
+def out(tmp_path_factory, tiny_data) -> Path:
     folder = tmp_path_factory.mktemp("sweep")
-    prepare(SETTINGS.dataset, folder / "data")
+    (folder / "data").symlink_to(tiny_data)
     return folder
 
 

@@ -7,13 +7,14 @@ import re
 import subprocess
 import sys
 from dataclasses import asdict
+from pathlib import Path
 
 import numpy as np
 import pytest
 from matplotlib.figure import Figure
 
 from data_pipeline.builder import DatasetStatistics
-from data_pipeline.furniture import CLASSES
+from data_pipeline.furniture import CLASSES, furniture
 from eval.grid import THRESHOLDS, GridConfig
 from eval.pipeline import PRESETS
 from eval.thesis_figures import FIGURES, FigureInputs
@@ -269,9 +270,20 @@ def test_memory_grows_with_the_networks(statistics):
 # --------------------------------------------------------------------------------------------------------- the whole command
 
 
-def test_the_whole_command_makes_everything_and_goes_on(tmp_path, lightly_compiled_commands):
+def meshes_of(folder: Path, classes: tuple[str, ...]) -> Path:
+    """Five pieces of furniture of each class to train on and one to test on."""
+    for name in classes:
+        for split, seeds in (("train", range(5)), ("test", (5,))):
+            (folder / name / split).mkdir(parents=True)
+            for seed in seeds:
+                furniture(name, seed).export(folder / name / split / f"{seed}.off")
+    return folder
+
+
+def test_the_whole_command_makes_everything_and_goes_on(tmp_path, tmp_path_factory, lightly_compiled_commands):
+    meshes = meshes_of(tmp_path_factory.mktemp("meshes"), ("bathtub", "chair", "table"))
     command = [sys.executable, "-m", "mevs_jax", "thesis", "--preset", "tiny", "--out", str(tmp_path)]
-    command += ["--dataset.train-per-class", "3", "--dataset.test-per-class", "1"]
+    command += ["--data", str(meshes)]
     for _ in range(2):  # the second time everything is there
         result = subprocess.run(command, capture_output=True, text=True, timeout=900)
         assert result.returncode == 0, result.stderr[-2000:]

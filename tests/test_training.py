@@ -16,7 +16,7 @@ import pytest
 from flax import nnx
 
 import train.loop
-from data_pipeline.builder import load_statistics, prepare
+from data_pipeline.builder import load_statistics
 from data_pipeline.meshes import DataError
 from eval.pipeline import TINY, tasks
 from train.checkpoints import Checkpoints
@@ -42,10 +42,8 @@ SETTINGS = replace(
 
 
 @pytest.fixture(scope="module")
-def data(tmp_path_factory) -> Path:
-    folder = tmp_path_factory.mktemp("run") / "data"
-    prepare(SETTINGS.dataset, folder)
-    return folder
+def data(tiny_data) -> Path:
+    return tiny_data
 
 
 def lines(folder: Path) -> list[dict]:

@@ -27,8 +27,8 @@ from train.step import Batch, Hyperparameters, Metrics
 class ResNetConfig:
     """Shape of the network."""
 
-    depth: Literal[18, 34] = 18
-    """18 or 34"""
+    depth: Literal[10, 18, 34] = 18
+    """18 or 34; 10 has half the blocks of 18"""
     width: int = 64
     """channels of the first stage"""
     channels: int = 3

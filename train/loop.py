@@ -19,7 +19,6 @@ import jax
 import numpy as np
 from flax import nnx
 from jax.sharding import Mesh
-from tensorboardX import SummaryWriter
 
 from data_pipeline.batches import (
     objects_kept,
@@ -123,6 +122,8 @@ class MetricsLog:
         lines = self._path.read_text().splitlines() if self._path.exists() else []
         kept = [line for line in lines if line.endswith("}") and json.loads(line)["step"] <= step]
         write_text(self._path, "".join(line + "\n" for line in kept))
+        from tensorboardX import SummaryWriter  # which imports PyTorch, where that is installed
+
         self._board = SummaryWriter(str(folder / "tensorboard"), purge_step=step + 1)
 
     def write(self, step: int, metrics: dict[str, float]) -> None:
@@ -263,8 +264,6 @@ def load_best(task: Task, folder: Path) -> nnx.Module:
     if not (folder / "best").is_dir():
         raise DataError(f"no trained {task.name} in {folder}; train one with: mevs train")
     saved = read_json(folder / "config.json")["task"]
-    optimiser = replace(task.optimiser, method=saved["optimiser"]["method"])  # whose moments lie beside the weights
-    structure, like = initial_state(replace(task, optimiser=optimiser), task.optimiser.seed)  # type: ignore[type-var]
     wanted = as_read(asdict(task))  # type: ignore[call-overload]
     for name in ("views", "classes"):
         if name in saved and saved[name] != wanted[name]:
@@ -277,6 +276,8 @@ def load_best(task: Task, folder: Path) -> nnx.Module:
         raise DataError(
             f"the {task.name} in {folder} has other layers than asked for; use the settings it was trained with"
         )
+    optimiser = replace(task.optimiser, method=saved["optimiser"]["method"])  # whose moments lie beside the weights
+    structure, like = initial_state(replace(task, optimiser=optimiser), task.optimiser.seed)  # type: ignore[type-var]
     with Checkpoints(folder) as checkpoints:
         restored = checkpoints.restore("best", like)
     if restored is None:

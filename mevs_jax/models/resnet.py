@@ -1,4 +1,4 @@
-"""ResNet-18 and ResNet-34 (He et al., 2016): one view, image or depth, to the logits of its class.
+"""ResNet-18 and ResNet-34 (He et al., 2016), and one of half the blocks: one view, image or depth, to the logits of its class.
 
 Arithmetic, padding and order of layers are torchvision's, so that its weights carry over (`mevs_jax.pretrained`); the
 layout is channels-last. `width` scales all stages, for data sets and machines smaller than the thesis's.
@@ -17,7 +17,7 @@ from jaxtyping import Array, Float
 from mevs_jax.arrays import AnyArray
 from mevs_jax.models.batch_norm import BatchNorm
 
-_BLOCKS = {18: (2, 2, 2, 2), 34: (3, 4, 6, 3)}
+_BLOCKS = {10: (1, 1, 1, 1), 18: (2, 2, 2, 2), 34: (3, 4, 6, 3)}
 _IMAGENET_MEAN, _IMAGENET_STD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
 
 
@@ -140,7 +140,7 @@ class ResNet(nnx.Module):
     """ResNet of basic blocks.
 
     Args:
-        depth: 18 or 34.
+        depth: 18 or 34 as in the paper, or 10, one block a stage.
         classes: number of logits.
         channels: channels of the image; depth is replicated to 3 in the thesis.
         width: channels of the first stage, doubled at each of the three that follow; 64 in the paper.
@@ -168,7 +168,7 @@ class ResNet(nnx.Module):
         dtype: jnp.dtype | None = None,
     ):
         if depth not in _BLOCKS:
-            raise ValueError(f"ResNet has depth 18 or 34, got {depth}")
+            raise ValueError(f"ResNet has depth 10, 18 or 34, got {depth}")
         if standardise and channels != 3:
             raise ValueError(f"ResNet standardises images of 3 channels, got {channels}")
         self.depth, self.classes, self.channels, self.width = depth, classes, channels, width
