@@ -18,6 +18,11 @@ if "PYTEST_XDIST_WORKER" not in os.environ:
     compiled = tempfile.mkdtemp(prefix="mevs_jax-compiled-")
     atexit.register(shutil.rmtree, compiled, ignore_errors=True)
     os.environ |= {"JAX_COMPILATION_CACHE_DIR": compiled, "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0.2"}
+    # Tests compile much and run little: without most optimisations and with XLA's older emitters that takes a third of the time.
+    # What numbers are compared with PyTorch's and with plain loops is compiled as for users (`fully_compiled`).
+    flags = os.environ.get("XLA_FLAGS", "")
+    os.environ["XLA_FLAGS"] = f"{flags} --xla_cpu_use_fusion_emitters=false".strip()
+    os.environ.setdefault("JAX_DISABLE_MOST_OPTIMIZATIONS", "1")
 
 REAL = Path(__file__).resolve().parents[2] / "shared"
 
@@ -52,21 +57,14 @@ def open3d_or_skip() -> None:
 
 
 @pytest.fixture(scope="module")
-def lightly_compiled() -> Iterator[None]:
-    """For modules whose tests compile much and run little: a third less time."""
+def fully_compiled() -> Iterator[None]:
+    """For modules whose programs are to be optimised as they are for users."""
     import jax
 
-    jax.config.update("jax_disable_most_optimizations", True)
-    yield
+    before = jax.config.read("jax_disable_most_optimizations")
     jax.config.update("jax_disable_most_optimizations", False)
-
-
-@pytest.fixture(scope="module")
-def lightly_compiled_commands() -> Iterator[None]:
-    """The same for commands that tests start, all of a module: what they say may then be compared to the last bit."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("JAX_DISABLE_MOST_OPTIMIZATIONS", "1")
-        yield
+    yield
+    jax.config.update("jax_disable_most_optimizations", before)
 
 
 @pytest.fixture(scope="session")

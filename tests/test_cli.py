@@ -24,7 +24,6 @@ from eval.pipeline import TINY, climb_on_objects, learn_to_choose
 from mevs_jax import cli
 from tests.conftest import open3d_or_skip
 
-pytestmark = pytest.mark.usefixtures("lightly_compiled_commands")
 MEVS = [sys.executable, "-m", "mevs_jax"]
 
 
@@ -183,7 +182,7 @@ def test_unknown_words_are_refused_and_help_reads_well(tmp_path, refuses, at_onc
 
 
 @pytest.fixture(scope="module")
-def whole(tmp_path_factory, lightly_compiled_commands) -> Path:
+def whole(tmp_path_factory) -> Path:
     """One run of the whole job, undisturbed."""
     out = tmp_path_factory.mktemp("whole")
     result = mevs("run", "--preset", "tiny", "--out", out)
@@ -230,7 +229,7 @@ def test_networks_for_another_number_of_views_are_refused(whole, tmp_path, refus
     assert "was trained for 8 views, the data set has 6" in refuses("eval", "--preset", "tiny", "--out", tmp_path)
 
 
-def test_compat_climbs_and_learning_fill_their_tables(whole, tmp_path, lightly_compiled):
+def test_compat_climbs_and_learning_fill_their_tables(whole, tmp_path):
     """One evaluation of what `mevs compat`, `climb` and `active` add to a run."""
     open3d_or_skip()
     out = tmp_path / "run"

@@ -234,7 +234,7 @@ np.savez(sys.argv[2], devices=jax.device_count(), **{f"{p}_{n}": getattr(r, n) f
         subprocess.run(
             [sys.executable, "-c", script, tmp_path / "t.npz", path, str(walks)],
             check=True,
-            env=os.environ | {"XLA_FLAGS": f"--xla_force_host_platform_device_count={devices}", "JAX_PLATFORMS": "cpu"},
+            env=os.environ | {"JAX_NUM_CPU_DEVICES": str(devices), "JAX_PLATFORMS": "cpu"},
         )
         with np.load(path) as stored:
             made.append({name: stored[name] for name in stored})

@@ -10,6 +10,8 @@ import pytest
 from mevs_jax import ball_query, farthest_point_sample, point_kernels
 from tests.reference import numpy_rules
 
+pytestmark = pytest.mark.usefixtures("fully_compiled")
+
 
 def clouds_of(kind: str, random: np.random.Generator, count: int, points: int) -> np.ndarray:
     if kind == "lattice":  # ties everywhere

@@ -26,7 +26,6 @@ from train.policy import PolicyConfig, choices_along, graph_of, train_policy, un
 from train.q_learning import QLearningConfig, temporal_difference, train_by_q_learning, transitions_along
 
 VIEWS, CLASSES, SEEN = 6, 4, 3
-pytestmark = pytest.mark.usefixtures("lightly_compiled")
 
 
 def moved(network, scale: float = 0.3):

@@ -28,6 +28,7 @@ from train.pretrained import (
     weights_from_torch,
 )
 
+pytestmark = pytest.mark.usefixtures("fully_compiled")
 REFERENCE = Path(__file__).parent / "reference"
 
 

@@ -29,7 +29,6 @@ from mevs_jax.viewpoints import viewpoint_lattice
 from train.loop import load_best, steps_of_an_epoch
 from train.recogniser import RecogniserTask
 
-pytestmark = pytest.mark.usefixtures("lightly_compiled")
 CAMERA = CaptureConfig(views=6, resolution=48)
 
 

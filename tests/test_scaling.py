@@ -27,8 +27,8 @@ from train.loop import fit, load_best
 from train.step import Task, initial_state, train_step_of
 
 ROOT = Path(__file__).resolve().parents[1]
-CPU = {"JAX_PLATFORMS": "cpu", "PYTHONPATH": str(ROOT), "JAX_DISABLE_MOST_OPTIMIZATIONS": "1"}
-"""Environment of processes of their own, which compile lightly."""
+CPU = {"JAX_PLATFORMS": "cpu", "PYTHONPATH": str(ROOT)}
+"""Environment of processes of their own."""
 
 
 @pytest.fixture(scope="module")

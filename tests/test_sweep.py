@@ -25,7 +25,6 @@ from train.preemption import Preempted
 from train.step import TrainState, evaluate_step_of, initial_state
 from train.sweep import Member, SweepConfig, draw_members, sweep, task_of
 
-pytestmark = pytest.mark.usefixtures("lightly_compiled")
 SWEEP = SweepConfig(members=4, learning_rate=(1e-5, 3e-4))
 """Low rates: what rounding does to a rectified unit grows with the rate."""
 

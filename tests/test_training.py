@@ -24,7 +24,6 @@ from train.loop import fit, load_best
 from train.optimiser import OptimiserConfig, descent, learning_rate
 from train.pretrained import weights_from_network
 
-pytestmark = pytest.mark.usefixtures("lightly_compiled")
 SETTINGS = replace(
     TINY,
     classifier=replace(
