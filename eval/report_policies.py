@@ -15,7 +15,7 @@ from eval.confidence import READINGS
 from eval.ladder import KNOWS
 from eval.page import ReportInputs, difference, image, percent, signed, span, table
 from mevs_jax.policies import POLICIES, Scene
-from mevs_jax.selection import Episode, select_from_table
+from mevs_jax.selection import Episode, ViewTable, select_from_table
 from mevs_jax.viewpoints import ViewGraph
 
 
@@ -356,12 +356,14 @@ def _example_walk(inputs: ReportInputs) -> str:
     stacked = tables.stacked()
 
     @jax.jit
-    def walk(index: int, start: int) -> Episode:
-        table = jax.tree.map(lambda leaf: leaf[index], stacked)
+    def walk_along(table: ViewTable, start: int) -> Episode:
         steps = min(4, statistics.views)
         return select_from_table(
             jax.random.key(0), table, Scene(graph, table.entropy), POLICIES["predicted_entropy"], start, max_views=steps
         )
+
+    def walk(index: int, start: int) -> Episode:
+        return walk_along(jax.tree.map(lambda leaf: leaf[index], stacked), start)
 
     wrong = np.argwhere(tables.logits.argmax(-1) != tables.labels[:, None])
     episode, index = None, 0

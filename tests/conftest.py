@@ -19,7 +19,7 @@ if "PYTEST_XDIST_WORKER" not in os.environ:
     atexit.register(shutil.rmtree, compiled, ignore_errors=True)
     os.environ |= {"JAX_COMPILATION_CACHE_DIR": compiled, "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0.2"}
     # Tests compile much and run little: without most optimisations and with XLA's older emitters that takes a third of the time.
-    # What numbers are compared with PyTorch's and with plain loops is compiled as for users (`fully_compiled`).
+    # Networks and point operations, whose numbers are PyTorch's and plain loops', have all optimisations (`fully_compiled`).
     flags = os.environ.get("XLA_FLAGS", "")
     os.environ["XLA_FLAGS"] = f"{flags} --xla_cpu_use_fusion_emitters=false".strip()
     os.environ.setdefault("JAX_DISABLE_MOST_OPTIMIZATIONS", "1")
@@ -58,7 +58,7 @@ def open3d_or_skip() -> None:
 
 @pytest.fixture(scope="module")
 def fully_compiled() -> Iterator[None]:
-    """For modules whose programs are to be optimised as they are for users."""
+    """For modules whose programs are to have all optimisations, though by the older emitters too."""
     import jax
 
     before = jax.config.read("jax_disable_most_optimizations")
