@@ -16,11 +16,6 @@ from tests.test_scaling import CPU
 from tests.test_training import lines
 
 
-@pytest.fixture(scope="module")
-def data(tiny_data) -> Path:
-    return tiny_data
-
-
 def start(out: Path, *options: str, processes: int = 1) -> list[subprocess.Popen]:
     """`mevs train` in one process, or in several that find each other on this machine."""
     command = [sys.executable, "-m", "mevs_jax", "train", "--preset", "tiny", "--out", str(out), *options]

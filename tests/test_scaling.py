@@ -31,11 +31,6 @@ CPU = {"JAX_PLATFORMS": "cpu", "PYTHONPATH": str(ROOT)}
 """Environment of processes of their own."""
 
 
-@pytest.fixture(scope="module")
-def data(tiny_data) -> Path:
-    return tiny_data
-
-
 def work(**asked) -> subprocess.CompletedProcess:
     asked = {key: str(value) if isinstance(value, Path) else value for key, value in asked.items()}
     return subprocess.run(

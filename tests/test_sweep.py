@@ -30,9 +30,9 @@ SWEEP = SweepConfig(members=4, learning_rate=(1e-5, 3e-4))
 
 
 @pytest.fixture(scope="module")
-def out(tmp_path_factory, tiny_data) -> Path:
+def out(tmp_path_factory, data) -> Path:
     folder = tmp_path_factory.mktemp("sweep")
-    (folder / "data").symlink_to(tiny_data)
+    (folder / "data").symlink_to(data)
     return folder
 
 

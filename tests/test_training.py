@@ -40,11 +40,6 @@ SETTINGS = replace(
 )
 
 
-@pytest.fixture(scope="module")
-def data(tiny_data) -> Path:
-    return tiny_data
-
-
 def lines(folder: Path) -> list[dict]:
     return [json.loads(line) for line in (folder / "metrics.jsonl").read_text().splitlines()]
 
