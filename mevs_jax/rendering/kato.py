@@ -18,6 +18,7 @@ from jaxtyping import Array, Float, Int
 from mevs_jax.arrays import AnyArray
 from mevs_jax.cameras import Camera
 from mevs_jax.rendering.depth import render_depth
+from mevs_jax.rendering.piecewise import limited
 
 _AT_ONCE = 32  # faces
 _NEAREST = 0.5  # pixels: no crossing is taken for nearer, as a pixel's gradient would be without bound
@@ -34,7 +35,7 @@ def render_silhouette(
     """
     triangles = jnp.asarray(triangles)
     corners = (triangles - camera.pose[:3, 3]) @ camera.pose[:3, :3]
-    projected = camera.focal_length * corners[..., :2] / jnp.maximum(corners[..., 2:], 1e-3)
+    projected = camera.focal_length * corners[..., :2] / limited(corners[..., 2:], 1e-3)
     seen = render_depth(jax.lax.stop_gradient(triangles), jax.lax.stop_gradient(camera))
     return _silhouette(projected, seen.face, rises)
 

@@ -19,6 +19,7 @@ from jaxtyping import Array, Float, Int
 
 from mevs_jax.arrays import AnyArray
 from mevs_jax.cameras import Camera
+from mevs_jax.rendering.piecewise import limited, smaller
 
 _NEAREST = 1e-3  # depth of the nearest corner that is seen
 _NOWHERE = -1e6  # σ from its border: a face that is not seen
@@ -120,7 +121,7 @@ def render_mesh(
             empty = empty - jnp.sum(spread, axis=0)  # log(1 − sigmoid(x)) = −softplus(x)
             # With less coverage a face is not seen whatever its nearness, and larger numbers would lose the difference of
             # nearness. log(sigmoid(x)) = x − softplus(x).
-            hidden = jnp.clip(cover - spread + math.log(2), _LEAST, 0)
+            hidden = limited(cover - spread + math.log(2), _LEAST, 0.0)
             weight = jnp.where(cover > _NOWHERE, (hidden + nearness) / softness.nearness, -jnp.inf)
             now = jax.lax.stop_gradient(jnp.maximum(largest, jnp.max(weight, axis=0)))
             weight, before = jax.lax.optimization_barrier((jnp.exp(weight - now), jnp.exp(largest - now)))
@@ -155,7 +156,7 @@ def _faces(
     corners: Float[Array, "faces 3 3"], at: Float[Array, "2 pixels"], focal: float, edge: float
 ) -> tuple[Float[Array, "faces pixels"], Float[Array, "faces pixels"], Float[Array, "faces 3"]]:
     """How far pixels lie inside of some faces, in units of the border's width; 1/depth there; and the faces' normals."""
-    depth = jnp.maximum(corners[..., 2], _NEAREST)
+    depth = limited(corners[..., 2], _NEAREST)
     x, y = (focal * corners[..., axis] / depth for axis in range(2))  # (faces, 3), in pixels from the middle
     before, after = (0, 1, 2), (1, 2, 0)
     area = (x[:, 1] - x[:, 0]) * (y[:, 2] - y[:, 0]) - (x[:, 2] - x[:, 0]) * (y[:, 1] - y[:, 0])
@@ -166,14 +167,14 @@ def _faces(
         along = x[:, j] - x[:, i], y[:, j] - y[:, i]
         over_length = 1 / jnp.where(flat, 1.0, along[0] ** 2 + along[1] ** 2)
         dx, dy = at[0] - x[:, i, None], at[1] - y[:, i, None]
-        part = jnp.clip((dx * along[0][:, None] + dy * along[1][:, None]) * over_length[:, None], 0, 1)
+        part = limited((dx * along[0][:, None] + dy * along[1][:, None]) * over_length[:, None], 0.0, 1.0)
         squares.append(jnp.square(dx - part * along[0][:, None]) + jnp.square(dy - part * along[1][:, None]))
         # The share of the corner across from this edge.
         shares.append((along[0][:, None] * dy - along[1][:, None] * dx) * over_area[:, None])
     inside = (shares[0] >= 0) & (shares[1] >= 0) & (shares[2] >= 0)
-    distance = jnp.sqrt(jnp.minimum(jnp.minimum(squares[0], squares[1]), squares[2]) + 1e-12)
+    distance = jnp.sqrt(smaller(smaller(squares[0], squares[1]), squares[2]) + 1e-12)
     cover = jnp.where(inside, distance, -distance) / edge
-    clipped = [jnp.clip(share, 0, 1) for share in shares]
+    clipped = [limited(share, 0.0, 1.0) for share in shares]
     total = jnp.where(flat[:, None], 1.0, clipped[0] + clipped[1] + clipped[2])
     across = (2, 0, 1)
     nearness = sum(share / depth[:, corner, None] for share, corner in zip(clipped, across, strict=True)) / total

@@ -14,6 +14,7 @@ from jaxtyping import Array, Float
 from mevs_jax.arrays import AnyArray
 from mevs_jax.cameras import Camera
 from mevs_jax.entropy import DEPTH_SCALE, shannon_entropy
+from mevs_jax.rendering.piecewise import limited
 
 _LEVELS = 256
 _GRAZING = 0.05  # the least cosine that a visible area is divided by
@@ -26,8 +27,8 @@ def opacity_entropy(opacity: Float[AnyArray, "height width"]) -> Float[Array, ""
     """
     opacity = jnp.asarray(opacity)
     total = jnp.sum(opacity)
-    p = opacity / jnp.maximum(total, 1e-12)
-    return -jnp.sum(jnp.where(p > 1e-12, p * jnp.log(jnp.maximum(p, 1e-12)), 0.0)) / jnp.log(float(opacity.size))
+    p = opacity / limited(total, 1e-12)
+    return -jnp.sum(jnp.where(p > 1e-12, p * jnp.log(limited(p, 1e-12)), 0.0)) / jnp.log(float(opacity.size))
 
 
 def soft_depth_entropy(

@@ -16,6 +16,7 @@ from jaxtyping import Array, Float
 
 from mevs_jax.arrays import AnyArray
 from mevs_jax.cameras import Camera, pixel_directions
+from mevs_jax.rendering.piecewise import limited
 
 
 @flax.struct.dataclass
@@ -110,7 +111,7 @@ def _sample(cells: Float[Array, "cells 8"], points: Float[Array, "points 3"]) ->
     side = round(len(cells) ** (1 / 3))  # cells along an edge: one more than nodes
     position = (points + 1) / 2 * (side - 1) + 0.5
     cell = jnp.clip(jnp.floor(jax.lax.stop_gradient(position)), 0, side - 1)
-    share = jnp.clip(position - cell, 0, 1)
+    share = limited(position - cell, 0.0, 1.0)
     index = cell.astype(jnp.int32)
     corners = cells[(index[:, 0] * side + index[:, 1]) * side + index[:, 2]]
     for axis in range(3):
