@@ -28,16 +28,17 @@ class _Reader:
 
     def put(self, variable: nnx.Variable | None, name: str, *axes: int) -> None:
         assert variable is not None  # biases are there where the names say so
+        like = variable.get_value()  # an array, or the shape of one in a network whose weights were not drawn
         if name not in self.state:
             raise ValueError(f"the state dict has no {name!r}; is it of this network?")
         array = np.asarray(self.state[name])
         array = array.transpose(axes) if axes else array
-        if array.shape[:2] == (1, 1) and variable[...].ndim == 2:  # a 1×1 convolution over points is a linear layer
+        if array.shape[:2] == (1, 1) and like.ndim == 2:  # a 1×1 convolution over points is a linear layer
             array = array[0, 0]
-        if array.shape != variable[...].shape:
-            raise ValueError(f"{name} has shape {array.shape} in the state dict, the network has {variable[...].shape}")
+        if array.shape != like.shape:
+            raise ValueError(f"{name} has shape {array.shape} in the state dict, the network has {like.shape}")
         self.left.discard(name)
-        variable[...] = jnp.asarray(array, variable[...].dtype)
+        variable.set_value(jnp.asarray(array, like.dtype))
 
     def norm(self, norm: BatchNorm, name: str) -> None:
         self.put(norm.scale, f"{name}.weight")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import atexit
+import gc
 import os
 import shutil
 import tempfile
@@ -23,6 +24,9 @@ if "PYTEST_XDIST_WORKER" not in os.environ:
     flags = os.environ.get("XLA_FLAGS", "")
     os.environ["XLA_FLAGS"] = f"{flags} --xla_cpu_use_fusion_emitters=false".strip()
     os.environ.setdefault("JAX_DISABLE_MOST_OPTIMIZATIONS", "1")
+
+# Tracing leaves many small objects that live: looking through them all as often as Python does takes a tenth of the time.
+gc.set_threshold(100_000, 50, 100)
 
 REAL = Path(__file__).resolve().parents[2] / "shared"
 
@@ -56,9 +60,9 @@ def open3d_or_skip() -> None:
         pytest.skip(f"Open3D cannot be loaded here: {error}")
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture
 def fully_compiled() -> Iterator[None]:
-    """For modules whose programs are to have all optimisations, though by the older emitters too."""
+    """For tests whose programs are to have all optimisations, though by the older emitters too."""
     import jax
 
     before = jax.config.read("jax_disable_most_optimizations")

@@ -28,7 +28,6 @@ from train.pretrained import (
     weights_from_torch,
 )
 
-pytestmark = pytest.mark.usefixtures("fully_compiled")
 REFERENCE = Path(__file__).parent / "reference"
 
 
@@ -132,6 +131,7 @@ def weights(tmp_path_factory) -> Path:
     return path
 
 
+@pytest.mark.usefixtures("fully_compiled")
 def test_weights_from_a_file_give_pytorchs_outputs(weights):
     """Features are compared, since the head stays new: the stored logits are the file's head on them."""
     network = ResNet(depth=18, rngs=nnx.Rngs(0))

@@ -37,7 +37,7 @@ from train.devices import DATA, check_batch, device_mesh, is_first, parameter_sh
 from train.optimiser import learning_rate
 from train.preemption import Preempted, Preemption
 from train.pretrained import StartingWeights
-from train.step import Metrics, Task, TrainState, evaluate_step_of, initial_state, train_step_of
+from train.step import Metrics, Task, TrainState, abstract_state, evaluate_step_of, initial_state, train_step_of
 
 
 class Lead:
@@ -277,7 +277,7 @@ def load_best(task: Task, folder: Path) -> nnx.Module:
             f"the {task.name} in {folder} has other layers than asked for; use the settings it was trained with"
         )
     optimiser = replace(task.optimiser, method=saved["optimiser"]["method"])  # whose moments lie beside the weights
-    structure, like = initial_state(replace(task, optimiser=optimiser), task.optimiser.seed)  # type: ignore[type-var]
+    structure, like = abstract_state(replace(task, optimiser=optimiser))  # type: ignore[type-var]
     with Checkpoints(folder) as checkpoints:
         restored = checkpoints.restore("best", like)
     if restored is None:

@@ -119,6 +119,13 @@ def initial_state(
     return structure, TrainState(jnp.zeros((), jnp.int32), parameters, rest[0], moments, sums)
 
 
+def abstract_state(task: Task) -> tuple[nnx.GraphDef, TrainState]:
+    """As `initial_state`, with shapes and a place for arrays: what a checkpoint is read into. Nothing is drawn."""
+    structure, state = jax.eval_shape(lambda: initial_state(task, 0))
+    here = jax.sharding.SingleDeviceSharding(jax.local_devices()[0])
+    return structure, jax.tree.map(lambda leaf: jax.ShapeDtypeStruct(leaf.shape, leaf.dtype, sharding=here), state)
+
+
 def train_step_of(
     task: Task, structure: nnx.GraphDef, epoch_steps: int
 ) -> Callable[[TrainState, Batch, Hyperparameters], tuple[TrainState, jax.Array]]:

@@ -31,7 +31,7 @@ from train.devices import DATA, device_mesh
 from train.entropy import EntropyTask
 from train.loop import Lead, identity_of, steps_of_an_epoch, validation_set, weighted_means
 from train.preemption import Preempted, Preemption
-from train.step import Hyperparameters, TrainState, evaluate_step_of, initial_state, train_step_of
+from train.step import abstract_state, Hyperparameters, TrainState, evaluate_step_of, initial_state, train_step_of
 
 SweepTask = ClassifierTask | EntropyTask
 Range = tuple[float, float]
@@ -163,7 +163,7 @@ def sweep(
     optimiser = task.optimiser
     epoch_steps = steps_of_an_epoch(task, statistics)
     hyper = jax.tree.map(lambda *numbers: np.stack(numbers), *(task_of(task, m).hyperparameters for m in members))
-    structure, _ = initial_state(task, 0)
+    structure, _ = abstract_state(task)
     apart = NamedSharding(mesh, PartitionSpec(DATA))
 
     def over_members(function: Callable, arguments: str) -> Callable:
