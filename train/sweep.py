@@ -31,7 +31,7 @@ from train.devices import DATA, device_mesh
 from train.entropy import EntropyTask
 from train.loop import Lead, identity_of, steps_of_an_epoch, validation_set, weighted_means
 from train.preemption import Preempted, Preemption
-from train.step import abstract_state, Hyperparameters, TrainState, evaluate_step_of, initial_state, train_step_of
+from train.step import Hyperparameters, TrainState, abstract_state, evaluate_step_of, initial_state, train_step_of
 
 SweepTask = ClassifierTask | EntropyTask
 Range = tuple[float, float]
