@@ -171,6 +171,7 @@ class Stages:
         self.config, self.dataset, self.out, self.seed, self.entropy = config, dataset, out, seed, entropy
         self.turned, self.upright = out / "active" / "turned", upright
         self.folder = out / "active" / (f"seed_{seed}" if upright is None else f"seed_{seed}_rotated")
+        self._fusions: dict[tuple, CalibratedFusion] = {}
 
     def rotated(self) -> Stages:
         return Stages(self.config, self.dataset, self.out, self.seed, self.entropy, upright=self)
@@ -243,11 +244,14 @@ class Stages:
 
     def fusion(self, fold: int | None = None, posed: bool = True, summed: bool = False) -> CalibratedFusion:
         """The recogniser's fusion, or the sum of its logits, with temperatures; for objects of known or of unknown pose."""
-        validation = self.features("turned_val" if fold is None else f"fold_{fold}_val", self.turned, "val", fold)
-        recogniser = load_best(self.task(fold), self.recogniser_folder(fold))
-        assert isinstance(recogniser, Recogniser)
-        network = SumFusion(recogniser.encoder.head, self.prior) if summed else recogniser.fusion
-        return calibrated(network, validation, self.prior, posed)
+        asked = fold, posed, summed
+        if asked not in self._fusions:
+            validation = self.features("turned_val" if fold is None else f"fold_{fold}_val", self.turned, "val", fold)
+            recogniser = load_best(self.task(fold), self.recogniser_folder(fold))
+            assert isinstance(recogniser, Recogniser)
+            network = SumFusion(recogniser.encoder.head, self.prior) if summed else recogniser.fusion
+            self._fusions[asked] = calibrated(network, validation, self.prior, posed)
+        return self._fusions[asked]
 
     @property
     def has_clouds(self) -> bool:
