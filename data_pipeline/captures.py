@@ -6,7 +6,8 @@ import multiprocessing
 import os
 import signal
 import threading
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from multiprocessing.pool import ThreadPool
 from pathlib import Path
 
@@ -63,6 +64,9 @@ def left_out_of(entries: Sequence[ObjectEntry], folder: Path) -> dict[str, str]:
     return {name: path.read_text() for name, path in paths.items() if path.exists()}
 
 
+_FEW = 64
+"""Objects for which no processes are started: each begins after some five seconds, in which this one captures a hundred or two
+of small meshes."""
 _worker: tuple[Rig, Path, str, bool] | None = None
 
 
@@ -76,6 +80,21 @@ def _start_worker(rig: Rig, folder: Path, backend: str, skip_damaged: bool) -> N
 def _work(entry: ObjectEntry) -> str | None:
     assert _worker is not None
     return capture_entry(entry, *_worker)
+
+
+@contextmanager
+def _captured(
+    todo: Sequence[ObjectEntry], workers: int, rig: Rig, folder: Path, backend: str, skip_damaged: bool
+) -> Iterator[Iterator[str | None]]:
+    """What `capture_entry` returns for each object, in their order."""
+    given = rig, folder, backend, skip_damaged
+    if workers == 1 and backend == "raycast":
+        yield (capture_entry(entry, *given) for entry in todo)
+        return
+    # What rasterises is one program on one device; threads read meshes for it and write captures.
+    make_pool = ThreadPool if backend == "rasterise" else multiprocessing.get_context("spawn").Pool
+    with make_pool(workers, _start_worker, given) as pool:
+        yield pool.imap(_work, todo, chunksize=4)
 
 
 def say_damaged(damage: str) -> DamagedMesh:
@@ -93,6 +112,7 @@ def capture_all(
 ) -> dict[str, str]:
     """Captures every object into `folder`, several at a time, and returns the objects left out with the reason.
 
+    Casting rays at a few objects takes less time than starting processes for it, and happens in this one, as with one worker.
     Objects whose capture is there already are not captured again, so an interrupted run goes on where it stopped.
 
     Raises:
@@ -100,17 +120,11 @@ def capture_all(
     """
     todo = still_to_capture(entries, folder)
     if todo:
-        workers = workers or os.cpu_count() or 1
-        # What rasterises is one program on one device; threads read meshes for it and write captures.
-        make_pool = ThreadPool if config.backend == "rasterise" else multiprocessing.get_context("spawn").Pool
-        with (
-            progress_bar("objects") as bar,
-            make_pool(
-                min(workers, len(todo)), _start_worker, (rig_for(config), folder, config.backend, skip_damaged)
-            ) as pool,
-        ):
+        workers = workers or (1 if len(todo) <= _FEW else os.cpu_count() or 1)
+        given = rig_for(config), folder, config.backend, skip_damaged
+        with progress_bar("objects") as bar, _captured(todo, min(workers, len(todo)), *given) as captured:
             task = bar.add_task("Capturing", total=len(entries), completed=len(entries) - len(todo), note="")
-            for damage in pool.imap(_work, todo, chunksize=4):
+            for damage in captured:
                 if damage:
                     raise say_damaged(damage)
                 bar.advance(task)

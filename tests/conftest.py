@@ -20,12 +20,12 @@ if "PYTEST_XDIST_WORKER" not in os.environ:
     atexit.register(shutil.rmtree, compiled, ignore_errors=True)
     os.environ |= {"JAX_COMPILATION_CACHE_DIR": compiled, "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0.2"}
     # Tests compile much and run little: without most optimisations and with XLA's older emitters that takes a third of the time.
-    # Networks and point operations, whose numbers are PyTorch's and plain loops', have all optimisations (`fully_compiled`).
+    # What is compared with PyTorch and plain loops, and what runs long, has all optimisations (`fully_compiled`).
     flags = os.environ.get("XLA_FLAGS", "")
     os.environ["XLA_FLAGS"] = f"{flags} --xla_cpu_use_fusion_emitters=false".strip()
     os.environ.setdefault("JAX_DISABLE_MOST_OPTIMIZATIONS", "1")
 
-# Tracing leaves many small objects that live: looking through them all as often as Python does takes a tenth of the time.
+# Tracing leaves many small objects that live: looking through them all as often as Python does takes up to a tenth of the time.
 gc.set_threshold(100_000, 50, 100)
 
 REAL = Path(__file__).resolve().parents[2] / "shared"

@@ -262,6 +262,7 @@ def test_the_class_view_table_is_a_mean_and_the_order_is_greedy(tables):
         chosen.append(best)
 
 
+@pytest.mark.usefixtures("fully_compiled")
 def test_95_percent_intervals_cover_the_truth_95_times_in_100(graph):
     """Samples of objects from a population whose true gain over a baseline is known, 1,000 times."""
     random = np.random.default_rng(6)

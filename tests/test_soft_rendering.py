@@ -32,6 +32,7 @@ from mevs_jax.rendering import (
 from mevs_jax.rendering import mesh as mesh_renderer
 from tests.conftest import open3d_or_skip
 
+pytestmark = pytest.mark.usefixtures("fully_compiled")
 NAMES = ("chair", "bathtub", "desk", "toilet", "sofa")
 POLES = np.array([[0.0, 0, 1], [0, 0, -1]])
 
