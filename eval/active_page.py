@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import html
 import math
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -13,10 +12,12 @@ from data_pipeline.files import write_text
 from eval import figures
 from eval.active_study import BASELINES
 from eval.ladder import KNOWS
-from eval.page import ReportInputs, difference, document, image, percent, span, table
+from eval.page import ReportInputs, difference, document, image, percent, signed, span, table
 
 METHOD = "learnt"
 """The policy that the page is about."""
+_SHOWN = (0, 1, 2, 3, 5, 7)
+"""Steps of walks in tables, from the first view."""
 
 
 def _accuracy(share: float, interval: list[float]) -> str:
@@ -25,56 +26,51 @@ def _accuracy(share: float, interval: list[float]) -> str:
 
 def _ladder(found: dict[str, Any]) -> str:
     rows, known, with_gap = [], None, bool(found["gap_closed"])
-    steps = len(found["policies"]["random"]["after_views"])
+    steps = [step for step in _SHOWN if step < len(found["policies"]["random"]["after_views"])]
     for name, policy in found["policies"].items():
         if policy["knows"] != known:
             known = policy["knows"]
             rows.append([f'<b class="note">Knows {html.escape(KNOWS[known])}</b>'])
         cells = [_accuracy(*cell) for cell in zip(policy["after_views"], policy["interval"], strict=True)]
-        closed = ["–" if share is None else f"{100 * share:.0f}" for share in found["gap_closed"].get(name, ())]
+        closed = ["–" if share is None else signed(share, 0).lstrip("+") for share in found["gap_closed"].get(name, ())]
         rows.append(
-            [html.escape(policy["title"]), *cells, *[""] * (steps - len(cells)), *[" / ".join(closed)] * with_gap]
+            [
+                html.escape(policy["title"]),
+                *(cells[step] if step < len(cells) else "" for step in steps),
+                *[" / ".join(closed)] * with_gap,
+            ]
         )
-    header = ["next view chosen by", *map(str, range(1, steps + 1)), *["% of the gap closed"] * with_gap]
+    header = ["next view chosen by", *(str(step + 1) for step in steps), *["% of the gap"] * with_gap]
     note = (
         "Gap: of the way from random to the label-free oracle after 2 / 3 / 4 views. The oracles try every view and walk from "
         "every fifth start, on which the gap is read; the label oracle finds views that are right by luck."
     )
-    return (
-        '<div class="wide">' + table(header, rows) + "</div>"
-        "<p class='note'>Accuracy (%) after exactly so many views, with 95 % intervals over objects. "
-        f"{note * with_gap}</p>"
+    return table(header, rows) + (
+        f"<p class='note'>Accuracy (%) after exactly so many views, with 95 % intervals over objects. {note * with_gap}</p>"
     )
 
 
 def _against(found: dict[str, Any], bases: tuple[str, ...] = BASELINES) -> str:
     """Paired differences, in accuracy and in what beliefs say of the true class."""
-    return (
-        _differences(found, bases, "points above", lambda gain: gain)
-        + _differences(found, bases, "1/100 nat above", lambda gain: gain["likelihood"])
-        + "<p class='note'>Above: differences in accuracy. Below: in the log-probability of the true class, which tells smaller "
+    rows, steps = [], (1, 2, 3)
+    for base in bases:
+        if base not in found["policies"]:
+            continue
+        rows.append([f'<b class="note">Above “{html.escape(found["policies"][base]["title"])}”</b>'])
+        for name, policy in found["policies"].items():
+            if name not in found["against"][base] or policy["knows"] in ("nothing", "truth"):
+                continue
+            gain = found["against"][base][name]
+            rows.append([html.escape(policy["title"])])
+            for of in (gain, gain["likelihood"]):
+                known = zip(of["difference"], of["interval"], strict=True)
+                cells = [difference(*cell) for cell in known][1 : len(steps) + 1]
+                rows[-1] += cells + [""] * (len(steps) - len(cells))
+    header = [f"{step + 1} views{unit}" for unit in ("", ", nat/100") for step in steps]
+    return table(["next view chosen by", *header], rows) + (
+        "<p class='note'>Left: differences in accuracy. Right: in the log-probability of the true class, which tells smaller "
         "ones apart. With 95 % intervals over objects; faint where they hold zero.</p>"
     )
-
-
-def _differences(
-    found: dict[str, Any], bases: tuple[str, ...], corner: str, of: Callable[[dict[str, Any]], dict[str, Any]]
-) -> str:
-    titles = {name: policy["title"] for name, policy in found["policies"].items()}
-    rows, bases = [], tuple(base for base in bases if base in titles)
-    for name, title in titles.items():
-        if found["policies"][name]["knows"] in ("nothing", "truth"):
-            continue
-        row = [html.escape(title)]
-        for base in bases:
-            against = found["against"][base].get(name)
-            gain = of(against) if against else {"difference": []}
-            for step in (1, 2, 3):
-                known = step < len(gain["difference"])
-                row.append(difference(gain["difference"][step], gain["interval"][step]) if known else "")
-        rows.append(row)
-    header = [corner, *(f"{titles[base]}, {step} views" for base in bases for step in (2, 3, 4))]
-    return '<div class="wide">' + table(header, rows) + "</div>"
 
 
 def _ablations(metrics: dict[str, Any]) -> str:
@@ -169,7 +165,7 @@ def _both_rules(row: dict[str, Any]) -> list[str]:
         return [*cells, "–", "–", "–"]
     gain = own["views_difference"]
     low, high = gain["interval"]
-    fewer = f"{-gain['difference']:.2f}<br><small class='note'>{-high:.2f} to {-low:.2f}</small>"
+    fewer = difference(-gain["difference"] / 100, [-high / 100, -low / 100], 2)  # a number, not a share
     return [*cells, percent(own["accuracy"]), f"{own['views']:.2f}", fewer]
 
 
@@ -214,26 +210,25 @@ def _rotated(metrics: dict[str, Any]) -> str:
     if "rotated" not in metrics["seeds"][0]:
         return ""
     ((_, found),) = metrics["seeds"][0]["rotated"].items()
-    gain = found["against"]["random"][METHOD]
     every = found["random_sets"][-1]
     return (
         "<h2>Turned anyhow</h2>"
         "<p>Objects are turned by any rotation, which nobody knows: they lie, stand on their heads, lean. The recognisers were "
-        "trained some epochs further on objects turned so. After two views the policy is "
-        f"{difference(gain['difference'][1], gain['interval'][1])} points above random; all {every['views']} views fused: "
-        f"{percent(every['learnt']['accuracy'])} %.</p>" + _ladder(found)
+        "trained some epochs further on objects turned so. "
+        f"All {every['views']} views fused: {percent(every['learnt']['accuracy'])} %.</p>"
+        + _ladder(found)
+        + _against(found)
     )
 
 
 def _scattered(metrics: dict[str, Any]) -> str:
     """Where every object has candidate directions of its own."""
     ((views, found),) = metrics["seeds"][0]["scattered"].items()
-    gain = found["against"]["random"][METHOD]
     return (
         "<h2>Candidates anywhere</h2>"
-        f"<p>Each object has {views} candidate directions of its own, a lattice turned at random, none of them twice. After two "
-        f"views the policy is {difference(gain['difference'][1], gain['interval'][1])} points above random.</p>"
+        f"<p>Each object has {views} candidate directions of its own, a lattice turned at random, none of them twice.</p>"
         + _ladder(found)
+        + _against(found)
     )
 
 

@@ -71,7 +71,7 @@ def accuracy_of_choices(policies: dict[str, dict[str, Any]], titles: dict[str, s
         axis.fill_between(steps, low, high, color=colour, alpha=0.05, linewidth=0)
     axis.axhline(100 * all_views, color="#111827", linestyle=":", linewidth=1, label="all views fused")
     axis.set(xlabel="views looked at", ylabel="test accuracy (%)", title="Accuracy by number of views")
-    axis.set_xticks(steps)
+    axis.set_xticks(range(1, 1 + max(len(policy["after_views"]) for policy in policies.values())))
     axis.legend(frameon=False, fontsize=8, loc="lower right")
     return figure
 
