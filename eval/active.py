@@ -319,7 +319,7 @@ class Stages:
             made, cloud = [*made, self.out / "entropy"], self.entropy.network.global_layers[-1]
         identity = {"made_by": made_by(self.statistics, *made), "of": asdict(config)}
         folder = self.policy_folder("_".join(map(str, (name, *(f"without_{label}" for label in without)))))
-        untrained = new_policy(config, len(self.statistics.classes), variant.posed, cloud)
+        untrained = nnx.eval_shape(lambda: new_policy(config, len(self.statistics.classes), variant.posed, cloud))
         return _made_once(folder, identity, untrained, train)
 
     def learner(self, name: str) -> Learner:
@@ -335,7 +335,8 @@ Network = TypeVar("Network", bound=nnx.Module)
 def _made_once(
     folder: Path, identity: dict[str, Any], like: Network, train: Callable[[], tuple[Network, dict[str, Any]]]
 ) -> Network:
-    """The network that is kept in the folder under this identity; else the trained one, which is kept with what is told of it."""
+    """The network that is kept in the folder under this identity, shaped as `like`, whose weights need not be drawn; else the
+    trained one, which is kept with what is told of it."""
     path, identity = folder / "summary.json", as_read(identity)
     with Checkpoints(folder) as checkpoints:
         if path.exists() and read_json(path)["identity"] == identity:

@@ -20,6 +20,14 @@ from train.preemption import interrupts_held
 logging.getLogger("absl").setLevel(logging.ERROR)  # Orbax tells every step of every save
 
 
+def _placed(leaf: Any) -> Any:
+    """A shape without a place is on a device of this process; arrays are where they are."""
+    if isinstance(leaf, jax.ShapeDtypeStruct) and leaf.sharding is None:
+        here = jax.sharding.SingleDeviceSharding(jax.local_devices()[0])
+        return jax.ShapeDtypeStruct(leaf.shape, leaf.dtype, sharding=here)
+    return leaf
+
+
 class Checkpoints:
     """Two slots, `latest` and `best`, each holding one (state, progress): a tree of arrays, and plain numbers."""
 
@@ -44,12 +52,12 @@ class Checkpoints:
         )
 
     def restore(self, slot: str, like: Any) -> tuple[Any, dict[str, Any]] | None:
-        """The newest of a slot, shaped and placed as `like`; None where nothing was saved."""
+        """The newest of a slot, shaped and placed as `like`, which may be shapes alone; None where nothing was saved."""
         manager = self._slots[slot]
         step = manager.latest_step()
         if step is None:
             return None
-        abstract = jax.tree.map(ocp.utils.to_shape_dtype_struct, like)
+        abstract = jax.tree.map(lambda leaf: ocp.utils.to_shape_dtype_struct(_placed(leaf)), like)
         restored = manager.restore(
             step, args=ocp.args.Composite(state=ocp.args.StandardRestore(abstract), progress=ocp.args.JsonRestore())
         )
