@@ -11,7 +11,7 @@ In a run's folder: `active/turned/` (data), `active/seed_0/` with `recogniser/`,
 from __future__ import annotations
 
 from dataclasses import asdict, dataclass, field, replace
-from functools import cached_property, partial
+from functools import cached_property
 from pathlib import Path
 from typing import Any, Literal, TypeVar
 
@@ -19,7 +19,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from flax import nnx
-from jaxtyping import Array, Bool
+from jaxtyping import Array
 
 from data_pipeline.augment import views_after
 from data_pipeline.batches import fold_of
@@ -27,8 +27,9 @@ from data_pipeline.builder import DataConfig, DatasetStatistics, load_statistics
 from data_pipeline.files import as_read, read_json, write_json
 from data_pipeline.meshes import DataError
 from data_pipeline.progress import console
-from eval.active_walks import Learner
+from eval.active_walks import Learner, beliefs_of_sets
 from eval.view_tables import made_by, network_outputs, stored_array
+from mevs_jax.arrays import AnyArray
 from mevs_jax.calibration import class_weights, fit_temperature
 from mevs_jax.fusion import CalibratedFusion, SetFusion, SumFusion
 from mevs_jax.models import PointNet2, Recogniser, ViewPolicy
@@ -402,22 +403,21 @@ def calibrated(
         posed: whether the objects' pose is known.
         draws: sets of each size for each object.
     """
-    structure, state = nnx.split(network)
+    structure, weights = nnx.split(network)
     objects, views, classes = validation.logits.shape
     sizes = [size for size in _CALIBRATED if size <= views]
+    as_it_is = CalibratedFusion(structure, weights, prior, jnp.ones(1), jnp.float32(1), posed)
 
-    @jax.jit
-    def temperature(present: Bool[Array, "draws objects views"]) -> Array:
-        fuse = partial(nnx.merge(structure, state), validation.features, validation.directions, posed=posed)
-        return fitted(jax.lax.map(fuse, present) - prior, jnp.tile(validation.labels, draws))
+    def fitted(beliefs: AnyArray, truth: Array) -> Array:
+        return fit_temperature(beliefs.reshape(-1, classes), truth, class_weights(truth, classes))
 
-    def fitted(logits: Array, truth: Array) -> Array:
-        return fit_temperature(logits.reshape(-1, classes), truth, class_weights(truth, classes))
+    def temperature(size: int) -> float:
+        beliefs = beliefs_of_sets(as_it_is, validation, sets_of_size(objects, views, size, draws))
+        return float(fitted(beliefs, jnp.tile(validation.labels, draws)))
 
-    found = [float(temperature(sets_of_size(objects, views, size, draws))) for size in sizes]
-    every = np.exp(np.interp(np.log(np.arange(1, views + 1)), np.log(sizes), np.log(found)))
+    every = np.exp(np.interp(np.log(np.arange(1, views + 1)), np.log(sizes), np.log([*map(temperature, sizes)])))
     single = fitted(validation.logits, jnp.repeat(validation.labels, views))
-    return CalibratedFusion(structure, state, prior, jnp.asarray(every, jnp.float32), single, posed)
+    return replace(as_it_is, temperatures=jnp.asarray(every, jnp.float32), single=single)
 
 
 def lattice_data(dataset: DataConfig, out: Path, views: int) -> Path:

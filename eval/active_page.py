@@ -101,7 +101,8 @@ def _sets(found: dict[str, Any]) -> str:
 
 def _confidence(found: dict[str, Any]) -> str:
     policy = found["policies"][METHOD]
-    errors = [[str(step + 1), percent(error)] for step, error in enumerate(policy["calibration_error"])]
+    known = zip(policy["calibration_error"], policy["calibration_error_by_chance"], strict=True)
+    errors = [[str(step + 1), *map(percent, (error, *chance))] for step, (error, chance) in enumerate(known)]
     rows = [
         [
             f"{100 * row['risk']:g} %",
@@ -113,7 +114,8 @@ def _confidence(found: dict[str, Any]) -> str:
         for row in policy["stopping"]
     ]
     return (
-        table(["views", "calibration error (%)"], errors)
+        table(["views", "calibration error (%)", "by chance", "95 of 100 below"], errors)
+        + "<p class='note'>By chance: what would be measured, on so many objects, of someone whose confidence is never off.</p>"
         + "<p>Stopping once the calibrated risk is at most so much, or at the last view.</p>"
         + table(["risk", "sure (%)", "of those wrong (%)", "accuracy (%)", "views"], rows)
     )

@@ -33,7 +33,13 @@ from eval.comparison import intervals
 from eval.confidence import stopping
 from eval.knowledge import class_view_table
 from mevs_jax.arrays import AnyArray
-from mevs_jax.calibration import class_weights, expected_calibration_error, fit_temperature, log_likelihood
+from mevs_jax.calibration import (
+    calibration_error_by_chance,
+    class_weights,
+    expected_calibration_error,
+    fit_temperature,
+    log_likelihood,
+)
 from mevs_jax.fusion import CalibratedFusion
 from mevs_jax.models import ViewPolicy
 from mevs_jax.policies import Knowledge
@@ -81,6 +87,9 @@ def judged(
         "calibration_error": [
             float(expected_calibration_error(confidence[:, :, step].reshape(-1), right[:, :, step].reshape(-1)))
             for step in steps
+        ],
+        "calibration_error_by_chance": [
+            calibration_error_by_chance(confidence[:, :, step], right[:, :, step]).tolist() for step in steps
         ],
         "negative_log_likelihood": (-likelihood.mean(axis=1)).tolist(),
         "stopping": stopping(confidence, right),

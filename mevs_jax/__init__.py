@@ -4,6 +4,7 @@ Everything takes *one* object, cloud or view; put `jax.vmap` on for many. No fil
 """
 
 from mevs_jax.calibration import (
+    calibration_error_by_chance,
     expected_calibration_error,
     fit_exponent,
     fit_temperature,
@@ -92,6 +93,7 @@ __all__ = [
     "bootstrap_interval",
     "bootstrap_means",
     "by_attention",
+    "calibration_error_by_chance",
     "cameras_at",
     "candidates",
     "class_accuracy",

@@ -11,6 +11,7 @@ from scipy.optimize import minimize, minimize_scalar
 from eval.confidence import RISKS, confidence_of, stopping
 from mevs_jax import (
     beliefs_along,
+    calibration_error_by_chance,
     discounted,
     expected_calibration_error,
     fit_exponent,
@@ -50,6 +51,32 @@ def test_the_calibration_error_is_the_textbooks(bins):
     assert float(jnp.sum(share)) == pytest.approx(1)
     assert float(jnp.sum(share * accuracy)) == pytest.approx(right.mean(), abs=1e-5)
     assert float(jnp.sum(share * confidence)) == pytest.approx(confidences.mean(), abs=1e-5)
+
+
+@pytest.mark.parametrize("together", [True, False])
+def test_chance_alone_makes_this_much_calibration_error(together):
+    """One measurement tells what many worlds measure in which every confidence is kept."""
+    random = np.random.default_rng(0)
+    objects, walks = 500, 8
+    sure = random.beta(4, 1, (objects, 1)) + random.normal(0, 0.05, (objects, walks))
+    sure = np.clip(sure, 0.1, 1).astype(np.float32)
+
+    def world() -> np.ndarray:
+        luck = random.uniform(0, 1, (objects, 1 if together else walks))
+        return luck < sure
+
+    measured = [numpy_rules.expected_calibration_error(sure.ravel(), world().ravel(), 15) for _ in range(1000)]
+    told = np.mean([calibration_error_by_chance(sure, world()) for _ in range(10)], axis=0)
+    np.testing.assert_allclose(told, [np.mean(measured), np.quantile(measured, 0.95)], rtol=0.08)
+
+
+def test_chance_is_told_apart_from_what_is_wrong():
+    random = np.random.default_rng(1)
+    sure = random.uniform(0.5, 1, (800, 4)).astype(np.float32)
+    right = random.uniform(0, 1, (800, 1)) < 0.8 * sure
+    error = float(expected_calibration_error(sure.ravel(), right.ravel()))
+    assert error == pytest.approx(0.15, abs=0.03)
+    assert float(calibration_error_by_chance(sure, right)[1]) < 0.06
 
 
 def test_the_temperature_is_the_most_likely_one():
