@@ -230,10 +230,11 @@ def evaluation_batches(
     chosen: np.ndarray | None = None,
 ) -> Iterator[dict[str, np.ndarray]]:
     """Every view of every object of a split, or of those at the `chosen` positions, one object a batch, in the order of the
-    shards; the same at every call."""
+    shards; the same at every call. `position`, for each view, is that of its object in the split."""
     source = open_split(folder, split)
     for index in range(len(source)) if chosen is None else map(int, chosen):
         example = source[index]
         views = np.arange(len(example["entropy"]))
         random = np.random.default_rng([seed, index])
-        yield select_views(example, views, points=points, images=images, random=random)
+        batch = select_views(example, views, points=points, images=images, random=random)
+        yield batch | {"position": np.full(len(views), index, np.int32)}

@@ -11,7 +11,7 @@ In a run's folder: `active/turned/` (data), `active/seed_0/` with `recogniser/`,
 from __future__ import annotations
 
 from dataclasses import asdict, dataclass, field, replace
-from functools import cached_property
+from functools import cache, cached_property
 from pathlib import Path
 from typing import Any, Literal, TypeVar
 
@@ -21,14 +21,14 @@ import numpy as np
 from flax import nnx
 from jaxtyping import Array
 
-from data_pipeline.augment import views_after
+from data_pipeline.augment import object_changes, views_after
 from data_pipeline.batches import fold_of
 from data_pipeline.builder import DataConfig, DatasetStatistics, load_statistics, open_split, prepare
 from data_pipeline.files import as_read, read_json, write_json
 from data_pipeline.meshes import DataError
 from data_pipeline.progress import console
 from eval.active_walks import Learner, beliefs_of_sets
-from eval.view_tables import made_by, network_outputs, stored_array
+from eval.view_tables import Ask, made_by, network_outputs, stored_array
 from mevs_jax.arrays import AnyArray
 from mevs_jax.calibration import class_weights, fit_temperature
 from mevs_jax.fusion import CalibratedFusion, SetFusion, SumFusion
@@ -54,6 +54,8 @@ class ActiveConfig:
     """parts of the training objects, for the ablation that learns from them by recognisers that never saw a part"""
     fold_epochs: int = 0
     """of those recognisers; 0 for as many as the recogniser itself"""
+    changed: int = 3
+    """further looks of a policy at each object that it learns from, mirrored and stretched as in the recogniser's training"""
     policy: PolicyConfig = PolicyConfig()
     q_learning: QLearningConfig = QLearningConfig()
     """of the policy that learns from walks alone, to compare with"""
@@ -69,7 +71,7 @@ class ActiveConfig:
     """further numbers of candidate views to test on, never trained on"""
     ablations: tuple[str, ...] = ()
     """variants of the policy to compare with, with the first seed: as_it_is, look_ahead, information,
-    random_states, crossed, known, summed, cloud (where `mevs train` has made PointNet++), q_learning"""
+    random_states, unchanged, crossed, known, summed, cloud (where `mevs train` has made PointNet++), q_learning"""
     novel: int = 0
     """pairs of classes that a policy is trained without and then tested on, with the first seed"""
     rotation_epochs: int = 0
@@ -86,6 +88,7 @@ class Variant:
         posed: whether the objects' pose is known.
         by: how it is asked; see `train.policy.By`.
         network: of the variant whose network it asks; its own unless given.
+        changed: it learns from objects that are mirrored and stretched, too.
         learns_from: validation objects; training objects in parts, each seen by a recogniser that was trained without it; or
             training objects seen by the one that was trained on them.
         cloud: it sees PointNet++'s embedding of every partial cloud too.
@@ -98,6 +101,7 @@ class Variant:
     posed: bool = True
     by: By = "belief"
     network: str = ""
+    changed: bool = True
     learns_from: Literal["validation", "parts", "training"] = "validation"
     cloud: bool = False
     summed: bool = False
@@ -113,6 +117,7 @@ VARIANTS = {
     "look_ahead": Variant("… two views ahead", by="ahead", network="learnt"),
     "information": Variant("… by expected information", settings={"utility": "log"}),
     "random_states": Variant("… trained on random walks alone", settings={"rounds": 1}),
+    "unchanged": Variant("… learnt from objects as they are", changed=False),
     "crossed": Variant(
         "… learnt from training objects, by recognisers without them", learns_from="parts", settings=_FEW
     ),
@@ -120,7 +125,7 @@ VARIANTS = {
         "… learnt from training objects, by the one that knows them", learns_from="training", settings=_FEW
     ),
     "summed": Variant("… with the sum of logits for a fusion", summed=True),
-    "cloud": Variant("… with PointNet++'s embedding of the clouds", cloud=True),
+    "cloud": Variant("… and with PointNet++'s embedding of their clouds", cloud=True, changed=False),
     "q_learning": Variant("… Q-learning (as MVSelect)", by="state", q_learning=True),
 }
 """The method, and what it is compared with to see what each part of it is good for."""
@@ -218,11 +223,17 @@ class Stages:
         return StartingWeights(f"{task.name} {made_by(self.statistics, folder)}", put)
 
     def features(
-        self, name: str, data: Path, split: str, fold: int | None = None, chosen: np.ndarray | None = None
+        self,
+        name: str,
+        data: Path,
+        split: str,
+        fold: int | None = None,
+        chosen: np.ndarray | None = None,
+        ask: Ask | None = None,
     ) -> Features:
         """What the recogniser sees of every view, kept in `features/` under this name."""
         task, folder, classes = self.task(fold), self.recogniser_folder(fold), len(self.statistics.classes)
-        ask = _see if self.upright is None else _see_rotated
+        ask = ask or (_see if self.upright is None else _see_rotated)
         seen = stored_array(
             self.folder / "features" / f"{name}.npz",
             made_by(load_statistics(data), folder),
@@ -232,6 +243,13 @@ class Stages:
         features, logits, directions, labels = np.split(seen, ends, axis=-1)
         known = jnp.asarray(labels[:, 0, 0].astype(np.int32))
         return Features(jnp.asarray(features), jnp.asarray(logits) - self.prior, known, jnp.asarray(directions))
+
+    def changed(self, count: int) -> list[Features]:
+        """The validation objects so many times, changed as in training, with the views that a policy learns from."""
+        return [
+            self.features(f"turned_val_changed_{number}", self.turned, "val", ask=_see_changed(number))
+            for number in range(count)
+        ]
 
     @property
     def prior(self) -> Array:
@@ -288,6 +306,7 @@ class Stages:
         config = replace(self.config.policy, seed=self.seed, **variant.settings)
         if variant.q_learning:
             config = replace(self.config.q_learning, seed=self.seed)
+        changed = self.config.changed if variant.changed and variant.learns_from == "validation" else 0
 
         def train() -> tuple[ViewPolicy, dict[str, Any]]:
             seen = self.features("turned_val", self.turned, "val")
@@ -296,7 +315,7 @@ class Stages:
             fusion = self.fusion(posed=variant.posed, summed=variant.summed)
             validation = fusion, seen.without(without)
             if variant.learns_from == "validation":
-                parts, check = [validation], None
+                parts, check = [validation, *((fusion, look) for look in self.changed(changed))], None
             elif variant.learns_from == "parts":
                 parts, check = self.parts(), validation
             else:
@@ -318,7 +337,7 @@ class Stages:
         if variant.cloud:
             assert self.entropy is not None
             made, cloud = [*made, self.out / "entropy"], self.entropy.network.global_layers[-1]
-        identity = {"made_by": made_by(self.statistics, *made), "of": asdict(config)}
+        identity = {"made_by": made_by(self.statistics, *made), "of": asdict(config), "changed": changed}
         folder = self.policy_folder("_".join(map(str, (name, *(f"without_{label}" for label in without)))))
         untrained = nnx.eval_shape(lambda: new_policy(config, len(self.statistics.classes), variant.posed, cloud))
         return _made_once(folder, identity, untrained, train)
@@ -382,6 +401,26 @@ def _see_rotated(network: Recogniser, task: Task, batch: Batch) -> jax.Array:
         array.reshape(-1, *array.shape[2:]) for array in jax.vmap(of_object)(images, poses, directions)
     )
     return _seen(network, images, directions, batch)
+
+
+@cache
+def _see_changed(number: int) -> Ask:
+    """`_see` of objects that are changed as in the recogniser's training, each in a way of its own, and otherwise by number."""
+
+    def see(network: Recogniser, task: Task, batch: Batch) -> jax.Array:
+        assert isinstance(task, RecogniserTask)
+        views, drawn = task.camera.views, jax.random.fold_in(jax.random.key(1), number)
+        arrays = task.inputs(batch), batch["pose"], batch["position"]
+        images, poses, positions = (array.reshape(-1, views, *array.shape[1:]) for array in arrays)
+
+        def of_object(position: Array, images: Array, poses: Array) -> tuple[Array, Array]:
+            change = object_changes(jax.random.fold_in(drawn, position), 1, task.augmentation)[0]
+            return views_after(change, images, poses, task.camera)
+
+        images, directions = jax.vmap(of_object)(positions[:, 0], images, poses)
+        return _seen(network, images.reshape(-1, *images.shape[2:]), directions.reshape(-1, 3), batch)
+
+    return see
 
 
 def _embed(network: PointNet2, task: Task, batch: Batch) -> jax.Array:

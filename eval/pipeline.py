@@ -196,6 +196,7 @@ TINY = Settings(
             optimiser=replace(_TRIFLE, validation_views=2),
         ),
         policy=PolicyConfig(width=16, heads=2, blocks=1, most_seen=3, walks=1, rounds=1, epochs=2, batch_size=32),
+        changed=1,
         max_views=4,
         draws=2,
         lattices=(),

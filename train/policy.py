@@ -23,7 +23,7 @@ from jaxtyping import Array, Bool, Float, Int
 from data_pipeline.progress import console
 from mevs_jax.calibration import class_weights
 from mevs_jax.fusion import CalibratedFusion
-from mevs_jax.models.view_policy import ViewPolicy
+from mevs_jax.models.view_policy import Utility, ViewPolicy, expected_gain, worth
 from mevs_jax.policies import Policy, learnt, looking_ahead, random_view
 from mevs_jax.selection import ViewTable, by_attention, select_from_table
 from mevs_jax.viewpoints import ViewGraph
@@ -58,7 +58,9 @@ class PolicyConfig(AveragedConfig):
     """views not seen yet that a state is asked about"""
     rounds: int = 2
     """the first walks at random, the others as the policy of the round before says (DAgger)"""
-    utility: Literal["probability", "log"] = "probability"
+    differences: float = 30.0
+    """how much errors of differences between candidates count, on which the choice depends, beside those of what each brings"""
+    utility: Utility = "probability"
     """what a belief is worth: the true class's probability, or its logarithm"""
     floor: float = 0.01
     """added to probabilities in logarithms: one object that all are wrong about must not outweigh all others"""
@@ -139,16 +141,9 @@ def walk(
     return in_chunks(lambda some: _walk_some(some, *rest), (keys, data), 64)
 
 
-def worth(log_probability: Float[Array, "*any"], config: PolicyConfig) -> Float[Array, "*any"]:
-    """The utility of a belief that gives the true class this log-probability."""
-    if config.utility == "probability":
-        return jnp.exp(log_probability)
-    return jnp.logaddexp(log_probability, jnp.log(config.floor))
-
-
 @partial(jax.jit, static_argnames="config")
 def _choices_of_some(fusion: CalibratedFusion, some: tuple[Features, Array, Array], config: PolicyConfig) -> Choices:
-    most = some[1].shape[-1]
+    most, by = some[1].shape[-1], (config.utility, config.floor)
 
     def of_object(one: Features, walks: Array, asked: Array) -> Choices:
         single = jax.nn.log_softmax(one.logits / fusion.single, axis=-1)
@@ -166,7 +161,7 @@ def _choices_of_some(fusion: CalibratedFusion, some: tuple[Features, Array, Arra
                 )
 
             after = jax.vmap(with_one_more)(asked)
-            gain = worth(after[:, one.labels], config) - worth(belief[one.labels], config)
+            gain = worth(after[:, one.labels], *by) - worth(belief[one.labels], *by)
             known = belief, single[order], directions, present, one.directions[asked]
             clouds = None if one.clouds is None else one.clouds[order]
             return Choices(*known, gain, one.labels, jnp.float32(1), clouds)
@@ -200,17 +195,31 @@ def choices_along(
     return jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[3:]), found)
 
 
-def policy_loss(network: ViewPolicy, some: Choices) -> tuple[Array, dict[str, Array]]:
-    """Mean over candidates of the squared errors of the gain that is expected, without and with knowing the true class.
+def policy_loss(network: ViewPolicy, some: Choices, differences: float) -> dict[str, Array]:
+    """The parts of the loss, to be added: means over candidates of squared errors.
 
-    Squared, because the mean is wanted: a telling view changes little most of the time and much now and then.
+    Of the gain that is expected, without and with knowing the true class; and, so many times, of how much more each candidate
+    brings than all do on average, with knowing it and by the belief. Squared, because the mean is wanted: a telling view changes
+    little most of the time and much now and then. Most of a gain's variance is how hard the object is, whichever view comes next:
+    without the differences that is what a network learns first.
     """
     gain, gain_if = network(some.belief, some.views, some.directions, some.present, some.candidates, some.clouds)
     own = jnp.take_along_axis(gain_if, some.label[:, None, None], axis=2)[:, :, 0]
     weight = some.weight[:, None] / jnp.sum(some.weight)
-    known = {"gain": gain, "gain_if": own}
-    errors = {name: jnp.mean(jnp.sum(weight * (found - some.gain) ** 2, axis=0)) for name, found in known.items()}
-    return errors["gain"] + errors["gain_if"], errors
+
+    def error(found: Array, true: Array) -> Array:
+        return jnp.mean(jnp.sum(weight * (found - true) ** 2, axis=0))
+
+    def beside_the_mean(gain: Array) -> Array:
+        return gain - jnp.mean(gain, axis=1, keepdims=True)
+
+    true = beside_the_mean(some.gain)
+    compared = [error(beside_the_mean(found), true) for found in (own, expected_gain(some.belief, gain_if))]
+    return {
+        "gain": error(gain, some.gain),
+        "gain_if": error(own, some.gain),
+        "differences": differences * (compared[0] + compared[1]),
+    }
 
 
 By = Literal["belief", "state", "ahead"]
@@ -225,8 +234,17 @@ def learnt_policy(given: tuple[nnx.State, Array], structure: nnx.GraphDef, by: B
 
 
 def new_policy(config: PolicyConfig, classes: int, posed: bool = True, cloud: int = 0) -> ViewPolicy:
-    shape = {"width": config.width, "heads": config.heads, "blocks": config.blocks, "cloud": cloud}
-    return ViewPolicy(classes, **shape, posed=posed, rngs=nnx.Rngs(config.seed))
+    return ViewPolicy(
+        classes,
+        width=config.width,
+        heads=config.heads,
+        blocks=config.blocks,
+        cloud=cloud,
+        posed=posed,
+        utility=config.utility,
+        floor=config.floor,
+        rngs=nnx.Rngs(config.seed),
+    )
 
 
 def _fit(
@@ -237,11 +255,12 @@ def _fit(
 
     def loss_of(parameters: nnx.State, some: Choices, key: Array) -> Array:
         del key
-        return policy_loss(nnx.merge(structure, parameters), some)[0]
+        errors = policy_loss(nnx.merge(structure, parameters), some, config.differences)
+        return sum(errors.values(), jnp.float32(0))
 
     @jax.jit
     def check(mean: nnx.State, some: Choices) -> dict[str, Array]:
-        return policy_loss(nnx.merge(structure, mean), some)[1]
+        return policy_loss(nnx.merge(structure, mean), some, config.differences)
 
     validate = None if validation is None else mean_losses(check, validation, 1024)
     best, history = fit_averaged(config, loss_of, parameters, train, validate)

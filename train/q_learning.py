@@ -25,12 +25,12 @@ from jaxtyping import Array, Float, Int
 
 from data_pipeline.progress import console
 from mevs_jax.fusion import CalibratedFusion
-from mevs_jax.models.view_policy import ViewPolicy
+from mevs_jax.models.view_policy import ViewPolicy, worth
 from mevs_jax.policies import Policy
 from train.averaged import fit_averaged, mean_losses
 from train.chunks import in_chunks
 from train.fusion import Features
-from train.policy import PolicyConfig, Seen, joined, learnt_policy, new_policy, walk, worth
+from train.policy import PolicyConfig, Seen, joined, learnt_policy, new_policy, walk
 
 
 @dataclass(frozen=True)
@@ -80,7 +80,7 @@ def _transitions_of_some(
         def of_walk(order: Array) -> Transitions:
             seen = one.features[order], one.directions[order]
             beliefs = jax.vmap(lambda count: fusion(*seen, jnp.arange(steps) < count))(jnp.arange(1, steps + 1))
-            reward = jnp.diff(worth(beliefs[:, one.labels], config))
+            reward = jnp.diff(worth(beliefs[:, one.labels], config.utility, config.floor))
             return Transitions(beliefs, single[order], order, one.directions, reward)
 
         return jax.vmap(of_walk)(walks)

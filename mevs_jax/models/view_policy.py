@@ -2,10 +2,13 @@
 
 A query for each candidate attends to the views seen and to the belief. Candidates are directions, not numbers of a lattice, so a
 lattice that was never trained on will do. It sees what single views say (log-probabilities), not the encoder's features: those
-mean other things in another encoder, which the policy would not do for.
+mean other things in another encoder, which the policy would not do for. Should the object be of some class, a view moves that
+class's log-odds by so much: that is what is learnt, and probabilities stay probabilities.
 """
 
 from __future__ import annotations
+
+from typing import Literal
 
 import jax
 import jax.numpy as jnp
@@ -14,6 +17,18 @@ from jaxtyping import Array, Bool, Float
 
 from mevs_jax.arrays import AnyArray
 from mevs_jax.fusion import about_the_first
+
+Utility = Literal["probability", "log"]
+"""What a belief is worth: the true class's probability, or its logarithm."""
+
+
+def worth(
+    log_probability: Float[AnyArray, "*any"], utility: Utility = "probability", floor: float = 0.01
+) -> Float[Array, "*any"]:
+    """The utility of a belief that gives the true class this log-probability; in a logarithm, `floor` is added first."""
+    if utility == "probability":
+        return jnp.exp(jnp.asarray(log_probability))
+    return jnp.logaddexp(jnp.asarray(log_probability), jnp.log(floor))
 
 
 def direction_features(directions: Float[AnyArray, "*batch 3"]) -> Float[Array, "*batch 19"]:
@@ -53,6 +68,7 @@ class ViewPolicy(nnx.Module):
         blocks: of attention and layers.
         cloud: length of the vector beside each view, PointNet++'s embedding of its partial cloud; 0 for none.
         posed: whether directions are in the object's own frame, else in one that is turned about the vertical.
+        utility, floor: what it expects to rise; see `worth`.
         rngs: source of the initial weights.
     """
 
@@ -65,16 +81,19 @@ class ViewPolicy(nnx.Module):
         blocks: int = 2,
         cloud: int = 0,
         posed: bool = True,
+        utility: Utility = "probability",
+        floor: float = 0.01,
         rngs: nnx.Rngs,
     ):
-        self.classes, self.posed = classes, posed
+        self.classes, self.posed, self.utility, self.floor = classes, posed, utility, floor
         self.direction = nnx.Linear(19, width, rngs=rngs)
         self.view, self.belief = nnx.Linear(classes, width, rngs=rngs), nnx.Linear(classes + 1, width, rngs=rngs)
         self.token1, self.token2 = nnx.Linear(width, 2 * width, rngs=rngs), nnx.Linear(2 * width, width, rngs=rngs)
         self.blocks = nnx.List([_CrossBlock(width, heads, rngs=rngs) for _ in range(blocks)])
         self.known_norm, self.last_norm = nnx.LayerNorm(width, rngs=rngs), nnx.LayerNorm(width, rngs=rngs)
-        self.gain = nnx.Linear(width, 1, rngs=rngs)
-        self.gain_if = nnx.Linear(width, classes, rngs=rngs)
+        nothing = nnx.initializers.zeros_init()  # is expected, to begin with
+        self.gain = nnx.Linear(width, 1, kernel_init=nothing, rngs=rngs)
+        self.log_odds_if = nnx.Linear(width, classes, kernel_init=nothing, rngs=rngs)
         self.cloud = (
             nnx.Sequential(nnx.LayerNorm(cloud, rngs=rngs), nnx.Linear(cloud, width, rngs=rngs)) if cloud else None
         )
@@ -99,8 +118,7 @@ class ViewPolicy(nnx.Module):
             clouds: an embedding of the partial cloud of each view seen, for a network that was made with `cloud`.
 
         Returns:
-            By how much the utility is expected to rise (`train.policy`: the true class's probability or its logarithm); and
-            [j, y]: by how much with candidate j should the class be y.
+            By how much the utility is expected to rise; and [j, y]: by how much with candidate j should the class be y.
 
         Raises:
             ValueError: where the network wants clouds and is given none.
@@ -126,7 +144,10 @@ class ViewPolicy(nnx.Module):
         for block in self.blocks:
             queries = block(queries, tokens, there)
         queries = self.last_norm(queries)
-        return self.gain(queries)[..., 0], self.gain_if(queries)
+        before = jnp.clip(belief, floor, -1e-5)[..., None, :]
+        after = jax.nn.log_sigmoid(before - jnp.log(-jnp.expm1(before)) + self.log_odds_if(queries))
+        gain_if = worth(after, self.utility, self.floor) - worth(before, self.utility, self.floor)
+        return self.gain(queries)[..., 0], gain_if
 
 
 def expected_gain(
