@@ -18,11 +18,11 @@ from eval.confidence import stops_at
 from mevs_jax import ViewGraph, ViewTable, fibonacci_sphere
 from mevs_jax.fusion import CalibratedFusion, SetFusion
 from mevs_jax.models import ViewPolicy
-from mevs_jax.models.view_policy import direction_features, expected_gain
+from mevs_jax.models.view_policy import direction_features, expected_gain, worth
 from mevs_jax.policies import POLICIES, Knowledge, fused_oracle, learnt, looking_ahead, random_view
 from mevs_jax.selection import by_attention, select_from_table
 from train.fusion import Features
-from train.policy import PolicyConfig, choices_along, graph_of, train_policy, unseen, walk
+from train.policy import Choices, PolicyConfig, choices_along, graph_of, policy_loss, train_policy, unseen, walk
 from train.q_learning import QLearningConfig, temporal_difference, train_by_q_learning, transitions_along
 
 VIEWS, CLASSES, SEEN = 6, 4, 3
@@ -119,6 +119,62 @@ def test_clouds_are_told_beside_their_views(random):
     config = PolicyConfig(width=16, heads=2, blocks=1, most_seen=2, rounds=1, epochs=1, batch_size=8)
     trained, _ = train_policy(config, [(fusion_of(5, CLASSES), data)], (fusion_of(5, CLASSES), data))
     assert trained.cloud is not None
+
+
+@pytest.mark.parametrize("utility", ["probability", "log"])
+def test_what_is_expected_for_a_class_leaves_its_probability_a_probability(random, utility):
+    make = partial(ViewPolicy, CLASSES, width=16, heads=2, blocks=1, utility=utility, floor=0.01, rngs=nnx.Rngs(1))
+    belief = np.log(np.array([1 - 2e-7, 1e-7, 1e-7, 0.0]) + 1e-30).astype(np.float32)
+    views = jax.nn.log_softmax(random.normal(size=(SEEN, CLASSES)), axis=-1)
+    points, present = fibonacci_sphere(VIEWS).astype(np.float32), np.array([True, True, False])
+    known = views, points[:SEEN], present, points
+    for gain in asked(make(), belief, *known):
+        np.testing.assert_allclose(gain, 0, atol=1e-6)  # untrained, it expects nothing
+    sure = moved(make(), 3.0)
+    for held in (belief, np.log(np.array([0.4, 0.3, 0.2, 0.1], np.float32))):
+        _, gain_if = asked(sure, held, *known)
+        before = worth(np.clip(held, -12, -1e-5), utility)
+        low, high = (0.0, 1.0) if utility == "probability" else (np.log(0.01), np.log(1.01))
+        after = np.asarray(before + gain_if)
+        assert (after >= low - 1e-5).all()
+        assert (after <= high + 1e-5).all()
+    assert after.max() - after.min() > 0.5
+
+
+def test_the_loss_compares_candidates_with_each_other(policy, random):
+    states, candidates = 7, 5
+    belief = np.asarray(jax.nn.log_softmax(random.normal(size=(states, CLASSES)), axis=-1), np.float32)
+    views = np.asarray(jax.nn.log_softmax(random.normal(size=(states, SEEN, CLASSES)), axis=-1), np.float32)
+    points = random.normal(size=(states, SEEN + candidates, 3)).astype(np.float32)
+    points /= np.linalg.norm(points, axis=-1, keepdims=True)
+    gain, weight = random.normal(size=(states, candidates)).astype(np.float32), random.uniform(0.5, 2, states)
+    label = random.integers(0, CLASSES, states)
+    some = Choices(
+        belief,
+        views,
+        points[:, :SEEN],
+        np.ones((states, SEEN), bool),
+        points[:, SEEN:],
+        gain,
+        label,
+        weight.astype(np.float32),
+    )
+    found = nnx.jit(policy_loss, static_argnames="differences")(policy, some, differences=3.0)
+    expected = {"gain": 0.0, "gain_if": 0.0, "differences": 0.0}
+    for state in range(states):
+        one = jax.tree.map(lambda leaf, state=state: leaf[state], some)
+        as_it_is, gain_if = asked(policy, one.belief, one.views, one.directions, one.present, one.candidates)
+        own, by_belief = np.asarray(gain_if)[:, label[state]], np.asarray(gain_if) @ np.exp(belief[state])
+        share = weight[state] / weight.sum() / candidates
+        for candidate in range(candidates):
+            expected["gain"] += share * (as_it_is[candidate] - gain[state, candidate]) ** 2
+            expected["gain_if"] += share * (own[candidate] - gain[state, candidate]) ** 2
+            true = gain[state, candidate] - gain[state].mean()
+            for said in (own, by_belief):
+                expected["differences"] += 3 * share * (said[candidate] - said.mean() - true) ** 2
+    assert found.keys() == expected.keys()
+    for name, value in expected.items():
+        assert float(found[name]) == pytest.approx(float(value), rel=1e-4)
 
 
 def test_directions_become_all_their_monomials():

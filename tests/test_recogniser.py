@@ -21,7 +21,7 @@ from data_pipeline.builder import load_statistics, open_split, prepare
 from data_pipeline.capture import DEPTH_SCALE, CaptureConfig, capture, rig_for
 from data_pipeline.inputs import depth_and_normals
 from data_pipeline.meshes import Mesh
-from eval.active import Stages, _see_rotated
+from eval.active import Stages, _see_changed, _see_rotated
 from eval.pipeline import TINY
 from mevs_jax.cameras import Camera, look_at_origin, pixel_directions
 from mevs_jax.models import Recogniser, ResNet
@@ -170,6 +170,30 @@ def test_objects_turned_anyhow_are_seen_from_the_lattice_itself(turned):
         # A ray that falls between two pixels may fall to the other one after rounding.
         assert np.median(np.abs(found[:, : features + 10] - expected)) < 1e-4
         assert np.abs(turn - np.eye(3)).max() > 0.1
+
+
+def test_changed_objects_are_each_changed_in_a_way_of_their_own_and_the_same_every_time(turned):
+    task = RecogniserTask.of(TINY.active.recogniser, 10, load_statistics(turned).camera)
+    network = nnx.jit(lambda: task.network(nnx.Rngs(0)))()
+    batches = list(islice(evaluation_batches(turned, "val", images="depth"), 5))
+    features, changes = network.encoder.head.in_features, []
+    asked = [nnx.jit(partial(_see_changed(number), task=task)) for number in (0, 1)]
+    after = jax.jit(partial(views_after, camera=task.camera))
+    for position, batch in enumerate(batches):
+        found, other = (np.asarray(ask(network, batch=batch)) for ask in asked)
+        before = np.asarray(task.directions(batch))
+        mirrored = [np.abs(np.abs(one[:, features + 10 : -1]) - np.abs(before)).max() < 1e-5 for one in (found, other)]
+        assert all(mirrored)  # in x, or not at all: TINY does not stretch
+        changes.append([bool(np.sign(one[0, features + 10] * before[0, 0]) < 0) for one in (found, other)])
+        assert (batch["position"] == position).all()
+        change = jnp.diag(jnp.array([-1.0 if changes[-1][0] else 1.0, 1.0, 1.0]))
+        images, _ = after(change, task.inputs(batch), jnp.asarray(batch["pose"]))
+        expected = np.asarray(nnx.jit(Recogniser.see)(network, images))
+        assert np.median(np.abs(found[:, : features + 10] - expected)) < 1e-4
+    alone = np.asarray(asked[0](network, batch=batches[3]))
+    both = {name: np.concatenate([batches[0][name], batches[3][name]]) for name in batches[0]}
+    np.testing.assert_allclose(np.split(np.asarray(asked[0](network, batch=both)), 2)[1], alone, atol=1e-4)
+    assert len({tuple(one) for one in changes}) > 1
 
 
 def test_recognisers_of_objects_turned_anyhow_go_on_from_the_others(turned, tmp_path):
