@@ -109,7 +109,6 @@ class Variant:
     settings: dict[str, Any] = field(default_factory=dict)
 
 
-_FEW = {"walks": 2}  # on training objects: about as many states as on validation objects
 VARIANTS = {
     "learnt": Variant("view policy"),
     "learnt_unposed": Variant("view policy", posed=False),
@@ -118,12 +117,8 @@ VARIANTS = {
     "information": Variant("… by expected information", settings={"utility": "log"}),
     "random_states": Variant("… trained on random walks alone", settings={"rounds": 1}),
     "unchanged": Variant("… learnt from objects as they are", changed=False),
-    "crossed": Variant(
-        "… learnt from training objects, by recognisers without them", learns_from="parts", settings=_FEW
-    ),
-    "known": Variant(
-        "… learnt from training objects, by the one that knows them", learns_from="training", settings=_FEW
-    ),
+    "crossed": Variant("… learnt from training objects, by recognisers without them", learns_from="parts"),
+    "known": Variant("… learnt from training objects, by the one that knows them", learns_from="training"),
     "summed": Variant("… with the sum of logits for a fusion", summed=True),
     "cloud": Variant("… and with PointNet++'s embedding of their clouds", cloud=True, changed=False),
     "q_learning": Variant("… Q-learning (as MVSelect)", by="state", q_learning=True),

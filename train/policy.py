@@ -52,7 +52,7 @@ class PolicyConfig(AveragedConfig):
     """of attention and layers"""
     most_seen: int = 6
     """views in a state at most"""
-    walks: int = 6
+    walks: int = 3
     """walks on each object in a round, each through states of 1 to most_seen views"""
     candidates: int = 12
     """views not seen yet that a state is asked about"""
