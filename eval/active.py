@@ -135,6 +135,8 @@ def check_active(config: ActiveConfig, views: int) -> None:
     """Raises `DataError` for a study that cannot be made."""
     if config.folds < 2 or config.seeds < 1:
         raise DataError("--active.folds must be at least 2, and --active.seeds at least 1")
+    if config.changed < 0:
+        raise DataError(f"--active.changed must be at least 0, got {config.changed}")
     for name in config.ablations:
         if name not in ABLATIONS:
             raise DataError(f"unknown ablation {name!r} (--active.ablations); it is one of {', '.join(ABLATIONS)}")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from dataclasses import replace
 from functools import partial
 from itertools import islice
@@ -20,8 +21,8 @@ from data_pipeline.batches import ViewBatches, equally_often, evaluation_batches
 from data_pipeline.builder import load_statistics, open_split, prepare
 from data_pipeline.capture import DEPTH_SCALE, CaptureConfig, capture, rig_for
 from data_pipeline.inputs import depth_and_normals
-from data_pipeline.meshes import Mesh
-from eval.active import Stages, _see_changed, _see_rotated
+from data_pipeline.meshes import DataError, Mesh
+from eval.active import Stages, _see_changed, _see_rotated, check_active
 from eval.pipeline import TINY
 from mevs_jax.cameras import Camera, look_at_origin, pixel_directions
 from mevs_jax.models import Recogniser, ResNet
@@ -321,3 +322,19 @@ def test_gradients_of_convolutions_are_those_of_jax(size, stride, random):
     )
     for mine, theirs in zip(found, expected, strict=True):
         np.testing.assert_allclose(mine, theirs, rtol=1e-4, atol=1e-4)
+
+
+@pytest.mark.parametrize(
+    ("changes", "said"),
+    [
+        ({"folds": 1}, "--active.folds must be at least 2"),
+        ({"seeds": 0}, "--active.seeds at least 1"),
+        ({"changed": -1}, "--active.changed must be at least 0, got -1"),
+        ({"ablations": ("magic",)}, "unknown ablation 'magic'"),
+        ({"max_views": 6}, "need more than 6 candidate views, and at least 2; there are 6"),
+    ],
+)
+def test_a_study_that_cannot_be_made_is_refused(changes, said):
+    check_active(TINY.active, 6)
+    with pytest.raises(DataError, match=re.escape(said)):
+        check_active(replace(TINY.active, **changes), 6)

@@ -130,13 +130,13 @@ class ViewPolicy(nnx.Module):
             directions, turn = about_the_first(directions, present)
             candidates = jnp.asarray(candidates) @ jnp.swapaxes(turn, -1, -2)
         spare = present[..., None]
-        floor = -12.0  # a belief of 6 in a million is as good as none
-        tokens = self.view(jnp.where(spare, jnp.maximum(views, floor), 0.0))
+        least = -12.0  # a belief of 6 in a million is as good as none
+        tokens = self.view(jnp.where(spare, jnp.maximum(views, least), 0.0))
         tokens = tokens + self.direction(direction_features(jnp.where(spare, jnp.asarray(directions), 0.0)))
         if self.cloud is not None:
             tokens = tokens + self.cloud(jnp.where(spare, jnp.asarray(clouds), 0.0))
         count = jnp.log(jnp.maximum(jnp.sum(present, axis=-1, keepdims=True), 1).astype(belief.dtype))
-        own = self.belief(jnp.concatenate([jnp.maximum(belief, floor), count], axis=-1))
+        own = self.belief(jnp.concatenate([jnp.maximum(belief, least), count], axis=-1))
         tokens = jnp.concatenate([own[..., None, :], tokens], axis=-2)
         tokens = self.known_norm(tokens + self.token2(jax.nn.gelu(self.token1(tokens))))
         there = jnp.concatenate([jnp.ones((*present.shape[:-1], 1), bool), present], axis=-1)
@@ -144,7 +144,7 @@ class ViewPolicy(nnx.Module):
         for block in self.blocks:
             queries = block(queries, tokens, there)
         queries = self.last_norm(queries)
-        before = jnp.clip(belief, floor, -1e-5)[..., None, :]
+        before = jnp.clip(belief, least, -1e-5)[..., None, :]
         after = jax.nn.log_sigmoid(before - jnp.log(-jnp.expm1(before)) + self.log_odds_if(queries))
         gain_if = worth(after, self.utility, self.floor) - worth(before, self.utility, self.floor)
         return self.gain(queries)[..., 0], gain_if
