@@ -362,7 +362,8 @@ def _made_once(
                 nnx.update(like, restored[0])
                 return like
         network, told = train()
-        checkpoints.save("best", 0, nnx.state(network, nnx.Param), {})
+        path.unlink(missing_ok=True)  # the weights are never under another's identity
+        checkpoints.save("best", checkpoints.latest_step("best") + 1, nnx.state(network, nnx.Param), {})
     write_json(path, {"identity": identity, **told})
     return network
 
