@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from flax import nnx
 
+from eval.active import _made_once
 from eval.active_stopping import Signal, beside
 from eval.active_study import ByObject, greedy_order, novel_classes, seeds_together, study
 from eval.active_walks import Learner, OnLattice
@@ -175,6 +176,30 @@ def test_the_loss_compares_candidates_with_each_other(policy, random):
     assert found.keys() == expected.keys()
     for name, value in expected.items():
         assert float(found[name]) == pytest.approx(float(value), rel=1e-4)
+
+
+def test_a_policy_learnt_otherwise_takes_the_place_of_the_one_before(tmp_path):
+    def made(seed: int) -> ViewPolicy:
+        return ViewPolicy(CLASSES, width=4, heads=1, blocks=1, rngs=nnx.Rngs(seed))
+
+    def asked_for(seed: int, forget: bool = False) -> ViewPolicy:
+        def train():
+            trained.append(seed)
+            if forget:
+                raise KeyboardInterrupt
+            return made(seed), {"rounds": []}
+
+        return _made_once(tmp_path, {"seed": seed}, nnx.eval_shape(lambda: made(0)), train)
+
+    trained: list[int] = []
+    for seed in (1, 1, 2, 2, 1):
+        found, expected = (nnx.state(one, nnx.Param) for one in (asked_for(seed), made(seed)))
+        jax.tree.map(np.testing.assert_array_equal, found, expected)
+    assert trained == [1, 2, 1]
+    with pytest.raises(KeyboardInterrupt):
+        asked_for(3, forget=True)
+    jax.tree.map(np.testing.assert_array_equal, *(nnx.state(one, nnx.Param) for one in (asked_for(1), made(1))))
+    assert trained == [1, 2, 1, 3]
 
 
 def test_directions_become_all_their_monomials():
