@@ -11,7 +11,7 @@ In a run's folder: `active/turned/` (data), `active/seed_0/` with `recogniser/`,
 from __future__ import annotations
 
 from dataclasses import asdict, dataclass, field, replace
-from functools import cache, cached_property
+from functools import cache, cached_property, partial
 from pathlib import Path
 from typing import Any, Literal, TypeVar
 
@@ -41,7 +41,7 @@ from train.loop import fit, load_best
 from train.policy import By, PolicyConfig, Seen, new_policy, train_policy
 from train.pretrained import StartingWeights
 from train.q_learning import QLearningConfig, train_by_q_learning
-from train.recogniser import RecogniserConfig, RecogniserTask
+from train.recogniser import RecogniserConfig, RecogniserTask, views_by_object
 from train.step import Batch, Task
 
 
@@ -379,26 +379,26 @@ def _seen(network: Recogniser, images: Array, directions: Array, batch: Batch) -
     return jnp.concatenate([network.see(images), directions, label], axis=-1)
 
 
+def _seen_after(changes: Array, network: Recogniser, task: RecogniserTask, batch: Batch) -> jax.Array:
+    """`_see` of objects whose points were multiplied by these matrices, one for each."""
+    images, poses = (views_by_object(array, task.camera.views) for array in (task.inputs(batch), batch["pose"]))
+    images, directions = jax.vmap(partial(views_after, camera=task.camera))(changes, images, poses)
+    return _seen(network, images.reshape(-1, *images.shape[2:]), directions.reshape(-1, 3), batch)
+
+
 def _see_rotated(network: Recogniser, task: Task, batch: Batch) -> jax.Array:
     """`_see` of turned views after the object was turned, by the rotation after which its cameras stand as in the lattice again.
 
     Turns are drawn evenly among all rotations, and so are these.
     """
     assert isinstance(task, RecogniserTask)
-    views, lattice = task.camera.views, viewpoint_lattice(task.camera.views, task.camera.lattice)
-    images, poses, directions = (
-        array.reshape(-1, views, *array.shape[1:])
-        for array in (task.inputs(batch), batch["pose"], task.directions(batch))
-    )
+    lattice = jnp.asarray(viewpoint_lattice(task.camera.views, task.camera.lattice), jnp.float32)
 
-    def of_object(images: Array, poses: Array, directions: Array) -> tuple[Array, Array]:
-        turn = jnp.linalg.solve(directions.T @ directions, directions.T @ jnp.asarray(lattice, jnp.float32)).T
-        return views_after(turn, images, poses, task.camera)
+    def turn_back(directions: Array) -> Array:
+        return jnp.linalg.solve(directions.T @ directions, directions.T @ lattice).T
 
-    images, directions = (
-        array.reshape(-1, *array.shape[2:]) for array in jax.vmap(of_object)(images, poses, directions)
-    )
-    return _seen(network, images, directions, batch)
+    turns = jax.vmap(turn_back)(views_by_object(task.directions(batch), task.camera.views))
+    return _seen_after(turns, network, task, batch)
 
 
 @cache
@@ -407,16 +407,10 @@ def _see_changed(number: int) -> Ask:
 
     def see(network: Recogniser, task: Task, batch: Batch) -> jax.Array:
         assert isinstance(task, RecogniserTask)
-        views, drawn = task.camera.views, jax.random.fold_in(jax.random.key(1), number)
-        arrays = task.inputs(batch), batch["pose"], batch["position"]
-        images, poses, positions = (array.reshape(-1, views, *array.shape[1:]) for array in arrays)
-
-        def of_object(position: Array, images: Array, poses: Array) -> tuple[Array, Array]:
-            change = object_changes(jax.random.fold_in(drawn, position), 1, task.augmentation)[0]
-            return views_after(change, images, poses, task.camera)
-
-        images, directions = jax.vmap(of_object)(positions[:, 0], images, poses)
-        return _seen(network, images.reshape(-1, *images.shape[2:]), directions.reshape(-1, 3), batch)
+        drawn, augmentation = jax.random.fold_in(jax.random.key(1), number), task.augmentation
+        positions = views_by_object(batch["position"], task.camera.views)[:, 0]
+        changes = jax.vmap(lambda position: object_changes(jax.random.fold_in(drawn, position), 1, augmentation)[0])
+        return _seen_after(changes(positions), network, task, batch)
 
     return see
 

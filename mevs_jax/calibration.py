@@ -17,13 +17,17 @@ BINS = 15
 """Of the expected calibration error (Guo et al. 2017)."""
 
 
+def _bin_of(confidences: Array, bins: int) -> Int[Array, "..."]:
+    """Of bins (0, 1/bins], …"""
+    return jnp.clip(jnp.ceil(confidences * bins).astype(jnp.int32) - 1, 0, bins - 1)
+
+
 def reliability(
     confidences: Float[AnyArray, "n"], right: Bool[AnyArray, "n"], bins: int = BINS
 ) -> tuple[Float[Array, "{bins}"], Float[Array, "{bins}"], Float[Array, "{bins}"]]:
     """By bin of confidence, (0, 1/bins], …: mean confidence, accuracy, and the share of answers; 0 where there are none."""
     confidences, right = jnp.asarray(confidences), jnp.asarray(right)
-    index = jnp.clip(jnp.ceil(confidences * bins).astype(jnp.int32) - 1, 0, bins - 1)
-    member = index == jnp.arange(bins)[:, None]
+    member = _bin_of(confidences, bins) == jnp.arange(bins)[:, None]
     count = jnp.sum(member, axis=1)
     mean = [jnp.sum(jnp.where(member, values, 0.0), axis=1) / jnp.maximum(count, 1) for values in (confidences, right)]
     return mean[0], mean[1], count / confidences.shape[0]
@@ -53,7 +57,7 @@ def calibration_error_by_chance(
     """
     confidences, right = jnp.asarray(confidences), jnp.asarray(right)
     objects, walks = confidences.shape
-    member = jax.nn.one_hot(jnp.clip(jnp.ceil(confidences * bins).astype(jnp.int32) - 1, 0, bins - 1), bins)
+    member = jax.nn.one_hot(_bin_of(confidences, bins), bins)
     share = jnp.einsum("owb,ow->ob", member, confidences - right) / (objects * walks)
     luck = jax.random.normal(jax.random.key(0), (draws, objects)) @ (share - jnp.mean(share, axis=0))
     errors = jnp.sum(jnp.abs(luck), axis=1)

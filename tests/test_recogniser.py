@@ -179,7 +179,7 @@ def test_changed_objects_are_each_changed_in_a_way_of_their_own_and_the_same_eve
     batches = list(islice(evaluation_batches(turned, "val", images="depth"), 5))
     features, changes = network.encoder.head.in_features, []
     asked = [nnx.jit(partial(_see_changed(number), task=task)) for number in (0, 1)]
-    after = jax.jit(partial(views_after, camera=task.camera))
+    see, after = nnx.jit(Recogniser.see), jax.jit(partial(views_after, camera=task.camera))
     for position, batch in enumerate(batches):
         found, other = (np.asarray(ask(network, batch=batch)) for ask in asked)
         before = np.asarray(task.directions(batch))
@@ -189,7 +189,7 @@ def test_changed_objects_are_each_changed_in_a_way_of_their_own_and_the_same_eve
         assert (batch["position"] == position).all()
         change = jnp.diag(jnp.array([-1.0 if changes[-1][0] else 1.0, 1.0, 1.0]))
         images, _ = after(change, task.inputs(batch), jnp.asarray(batch["pose"]))
-        expected = np.asarray(nnx.jit(Recogniser.see)(network, images))
+        expected = np.asarray(see(network, images))
         assert np.median(np.abs(found[:, : features + 10] - expected)) < 1e-4
     alone = np.asarray(asked[0](network, batch=batches[3]))
     both = {name: np.concatenate([batches[0][name], batches[3][name]]) for name in batches[0]}

@@ -123,7 +123,7 @@ class RecogniserTask:
     ) -> tuple[jax.Array, Metrics]:
         del samples, hyper
         change, move, sets, drop = jax.random.split(key, 4)
-        by_object = partial(_by_object, views=self.optimiser.views_per_object)
+        by_object = partial(views_by_object, views=self.optimiser.views_per_object)
         images, poses = by_object(self.inputs(batch)), by_object(batch["pose"])
         labels = batch["label"].reshape(images.shape[:2])[:, 0]
         changes = object_changes(change, len(images), self.augmentation)
@@ -139,7 +139,7 @@ class RecogniserTask:
     def evaluate(self, network: Recogniser, batch: Batch) -> Metrics:
         """`fused`: all views of an object in the batch together. Where objects are turned in training, they are so here, each the
         same way every time."""
-        by_object = partial(_by_object, views=self.optimiser.validation_views)
+        by_object = partial(views_by_object, views=self.optimiser.validation_views)
         images, directions = by_object(self.inputs(batch)), by_object(self.directions(batch))
         if self.augmentation.turn:
             turns = object_changes(jax.random.key(1), len(images), ViewAugmentation(mirror=False, turn=True))
@@ -164,5 +164,6 @@ def _judged(each: jax.Array, posed: jax.Array, unposed: jax.Array, labels: jax.A
     }
 
 
-def _by_object(array: jax.Array, views: int) -> jax.Array:
+def views_by_object(array: jax.Array, views: int) -> jax.Array:
+    """Of views one behind the other, so many for each object: (objects, views, …)."""
     return array.reshape(-1, views, *array.shape[1:])
