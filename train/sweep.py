@@ -18,7 +18,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
-from scipy.stats import qmc
 
 from data_pipeline.batches import train_batches
 from data_pipeline.builder import DatasetStatistics
@@ -100,6 +99,8 @@ def draw_members(config: SweepConfig, task: SweepTask) -> list[Member]:
     for name, (low, high) in shares.items():
         if not 0 <= low <= high <= 1 or (name == "dropout" and high == 1):
             raise DataError(f"--sweep.{name} {low} {high} must go up within 0 and 1")
+    from scipy.stats import qmc  # which takes a third of a second to import
+
     low, high = np.array([*(np.log(pair) for pair in ranges.values()), *shares.values()]).T
     drawn = qmc.Sobol(len(low), seed=config.seed).random_base2(int(np.ceil(np.log2(config.members))))
     members = []
