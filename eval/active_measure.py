@@ -32,7 +32,7 @@ from mevs_jax.models.view_policy import expected_gain
 from mevs_jax.viewpoints import viewpoint_lattice
 from train.loop import load_best
 
-_FORM = 3
+_FORM = 4
 """Of what is kept of walks; with another one they are walked again."""
 
 

@@ -41,13 +41,14 @@ def _ladder(found: dict[str, Any]) -> str:
             ]
         )
     header = ["next view chosen by", *(str(step + 1) for step in steps), *["% of the gap"] * with_gap]
-    note = (
-        "Gap: of the way from random to the label-free oracle after 2 / 3 / 4 views. The oracles try every view and walk from "
-        "every fifth start, on which the gap is read; the label oracle finds views that are right by luck."
-    )
-    return table(header, rows) + (
-        f"<p class='note'>Accuracy (%) after exactly so many views, with 95 % intervals over objects. {note * with_gap}</p>"
-    )
+    note = "Accuracy (%) after exactly so many views, with 95 % intervals over objects."
+    if with_gap:
+        note += (
+            " Gap: of the way from random to the label-free oracle after 2 / 3 / 4 views. The oracles try every view and walk "
+            f"from {found['trying_starts']} of the {found['views']} starts, on which the gap is read; the label oracle finds "
+            "views that are right by luck."
+        )
+    return table(header, rows) + f"<p class='note'>{note}</p>"
 
 
 def _against(found: dict[str, Any], bases: tuple[str, ...] = BASELINES) -> str:
@@ -155,7 +156,7 @@ def _costs(found: dict[str, Any]) -> str:
         "less than a view costs; and by risk, at equal accuracy on validation objects.</p>"
         + table(["cost of a view", *header], paying)
         + "<h2>Going there</h2><p>Accuracy and way of the camera, where a radian costs so much of the probability that a view "
-        "brings; from every fifth start.</p>"
+        "brings; from some of the starts, as the oracles.</p>"
         + table(["price", *(title for step in steps for title in (f"{step + 1} views", "way"))], ways)
     )
 

@@ -149,6 +149,8 @@ def learn(fusion: CalibratedFusion, data: Features, most: int) -> Knowledge:
 
 BASELINES = ("random", "farthest", "fixed_order")
 """What a policy that learns is compared with."""
+_TRYING_STARTS = 8
+"""Those who try every candidate walk from about so many views, spread over the lattice, and so do those who pay for the way."""
 _GAP = 3
 """The gap between random and the label-free oracle is read after 2 views and the next, up to so many further ones."""
 
@@ -200,7 +202,6 @@ def study(
     max_views: int,
     draws: int,
     oracle_views: int = 4,
-    oracle_starts: int = 5,
     fitting_starts: int = 1,
     seed: int = 0,
     costs: bool = False,
@@ -214,7 +215,6 @@ def study(
         max_views: of a walk.
         draws: walks from each start of policies that draw.
         oracle_views: how far oracles walk.
-        oracle_starts: they walk from every so many-th start, and so do those for whom the way has a price.
         fitting_starts: temperatures are fitted on walks from every so many-th start.
         costs: whether to tell too when the method would stop and what it does where the way has a price.
         others: whether policies but these and random selection walk, and random sets are fused.
@@ -223,8 +223,10 @@ def study(
     shared = fusion.posed and bool(jnp.allclose(test.features.directions, points, atol=1e-4))
     max_views, oracle_views = min(max_views, len(points)), min(oracle_views, len(points))
     knowledge = learn(fusion, validation.features, max_views) if shared else None
+    apart = max(1, len(points) // _TRYING_STARTS)
     found: dict[str, Any] = {
         "objects": len(labels),
+        "trying_starts": len(range(0, len(points), apart)),
         "validation_objects": len(validation.features.labels),
         "views": len(points),
         "single_view": float(jnp.mean(jnp.argmax(test.features.logits, -1) == labels[:, None])),
@@ -239,8 +241,8 @@ def study(
     fusions = {learner.name: learner.fusion or fusion for learner in learners}
     told: dict[str, Told] = {}
     entropies = shared and test.utility is not None and test.entropy is not None
-    some_starts = np.arange(0, len(points), oracle_starts)
-    asked = contenders(learners, draws, oracle_views, oracle_starts, entropies, shared)
+    some_starts = np.arange(0, len(points), apart)
+    asked = contenders(learners, draws, oracle_views, apart, entropies, shared)
     for contender in asked if others else [random_walker(draws), *map(walker, learners)]:
         name, own, walks, beliefs = contender.name, fusions.get(contender.name, fusion), [], []
         for split, data in enumerate((validation, test)):
@@ -269,7 +271,7 @@ def study(
         console.print(f"{contender.title}: " + " ".join(f"{100 * share:.1f}" for share in judgement["after_views"]))
     if costs:
         key, method = jax.random.key(seed), learners[0]
-        found["costs"] = what_it_costs(key, method, fusion, validation, test, knowledge, told, max_views, oracle_starts)
+        found["costs"] = what_it_costs(key, method, fusion, validation, test, knowledge, told, max_views, apart)
     found["against"] = compared(each, learners[0].name)
     found["gap_closed"] = {
         name: _gap_closed(from_some[name], from_some["random"], from_some["belief_oracle"])
