@@ -224,9 +224,10 @@ def study(
     max_views, oracle_views = min(max_views, len(points)), min(oracle_views, len(points))
     knowledge = learn(fusion, validation.features, max_views) if shared else None
     apart = max(1, len(points) // _TRYING_STARTS)
+    some_starts = np.arange(0, len(points), apart)
     found: dict[str, Any] = {
         "objects": len(labels),
-        "trying_starts": len(range(0, len(points), apart)),
+        "trying_starts": len(some_starts),
         "validation_objects": len(validation.features.labels),
         "views": len(points),
         "single_view": float(jnp.mean(jnp.argmax(test.features.logits, -1) == labels[:, None])),
@@ -241,7 +242,6 @@ def study(
     fusions = {learner.name: learner.fusion or fusion for learner in learners}
     told: dict[str, Told] = {}
     entropies = shared and test.utility is not None and test.entropy is not None
-    some_starts = np.arange(0, len(points), apart)
     asked = contenders(learners, draws, oracle_views, apart, entropies, shared)
     for contender in asked if others else [random_walker(draws), *map(walker, learners)]:
         name, own, walks, beliefs = contender.name, fusions.get(contender.name, fusion), [], []
