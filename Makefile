@@ -3,6 +3,9 @@ PYTHON ?= python3
 BIN := .venv/bin
 READY := .venv/.ready
 OUT ?= runs/demo
+# Packages are installed without bytecode, which each keeps once it was imported, unless told not to: then every start of `mevs`
+# would compile them again, for 12 seconds.
+unexport PYTHONDONTWRITEBYTECODE
 
 .PHONY: demo test lint bench clean
 
