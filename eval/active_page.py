@@ -179,8 +179,8 @@ def _lead(found: dict[str, Any]) -> str:
     return (
         f'<p class="lead">Two views are recognised with {percent(method[1])} % accuracy where the second is chosen, '
         f"{percent(random[1])} % where it is drawn: {difference(gain['difference'][1], gain['interval'][1])} points. One view "
-        f"alone: {percent(found['single_view'])} %; all {every['views']} fused: {percent(every['learnt']['accuracy'])} %, "
-        f"summed: {percent(every['sum']['accuracy'])} %.</p>"
+        f"alone: {percent(random[0])} %, by its own logits {percent(found['single_view'])} %; all {every['views']} fused: "
+        f"{percent(every['learnt']['accuracy'])} %, summed: {percent(every['sum']['accuracy'])} %.</p>"
         f'<p class="note">Over {found["objects"]} test objects and every start view; all policies share fusion, objects and '
         f"starts. Everything fitted or chosen is so on {found['validation_objects']} validation objects. The views of these "
         "lattices were never trained on: training saw other directions around other objects.</p>"
