@@ -97,7 +97,7 @@ def judged(
     return found, signals, likelihood
 
 
-def greedy_order(
+def fixed_order_scores(
     fusion: CalibratedFusion, data: Features, most: int, starts: int = 8, objects: int = 300
 ) -> np.ndarray:
     """Scores of the fixed order that does best on some validation objects from some starts, the first `most` of it; the rest
@@ -144,7 +144,7 @@ def greedy_order(
 def learn(fusion: CalibratedFusion, data: Features, most: int) -> Knowledge:
     """What `fixed_order` and `information_gain` know, from validation objects on the lattice."""
     logits = jax.nn.log_softmax(data.logits / fusion.single, axis=-1)
-    return Knowledge(jnp.asarray(greedy_order(fusion, data, most)), class_view_table(logits, data.labels))
+    return Knowledge(jnp.asarray(fixed_order_scores(fusion, data, most)), class_view_table(logits, data.labels))
 
 
 BASELINES = ("random", "farthest", "fixed_order")

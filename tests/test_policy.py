@@ -13,7 +13,7 @@ from flax import nnx
 
 from eval.active import _made_once
 from eval.active_stopping import Signal, beside
-from eval.active_study import ByObject, greedy_order, novel_classes, seeds_together, study
+from eval.active_study import ByObject, fixed_order_scores, novel_classes, seeds_together, study
 from eval.active_walks import Learner, OnLattice
 from eval.confidence import stops_at
 from mevs_jax import ViewGraph, ViewTable, fibonacci_sphere
@@ -532,7 +532,7 @@ def test_q_learning_finds_the_telling_view_too(adding):
 
 
 def test_the_fixed_order_begins_with_the_views_that_tell_most(adding):
-    scores = greedy_order(adding, telling(200, 5), 3)
+    scores = fixed_order_scores(adding, telling(200, 5), 3)
     assert sorted(np.argsort(-scores)[:3].tolist()) == [0, 2, 3]
     assert sorted(scores.tolist()) == list(range(1, VIEWS + 1))
 
