@@ -112,6 +112,7 @@ class Variant:
 VARIANTS = {
     "learnt": Variant("view policy"),
     "learnt_unposed": Variant("view policy", posed=False),
+    "learnt_and_table": Variant("view policy and table", by="table", network="learnt"),
     "as_it_is": Variant("… by what it expects of the state as it is", by="state", network="learnt"),
     "look_ahead": Variant("… two views ahead", by="ahead", network="learnt"),
     "information": Variant("… by expected information", settings={"utility": "log"}),

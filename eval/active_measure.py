@@ -96,7 +96,8 @@ def _walks(
     """Every policy's walks among the views of a data set, which the features kept are named after; or those of the method and its
     ablations."""
     config, method = stages.config, "learnt" if posed else "learnt_unposed"
-    names = [method, *ablations]
+    shared = posed and data != stages.turned
+    names = [method, *ablations, *["learnt_and_table"] * (shared and not ablations)]
     if "cloud" in names and not stages.has_clouds:
         console.print(
             f"Left out: the view policy that sees clouds; PointNet++ is trained by: mevs train --out {stages.out}"

@@ -211,7 +211,7 @@ def study(
 
     Args:
         fusion: of the recogniser whose features these are.
-        learners: trained view policies, the method first and then its ablations.
+        learners: trained view policies, the method first and then what it is compared with.
         max_views: of a walk.
         draws: walks from each start of policies that draw.
         oracle_views: how far oracles walk.

@@ -19,7 +19,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from mevs_jax.fusion import CalibratedFusion
-from mevs_jax.models.view_policy import ViewPolicy, expected_gain
+from mevs_jax.models.view_policy import ViewPolicy, expected_gain, worth
 from mevs_jax.viewpoints import ViewGraph, local_maxima
 
 
@@ -205,14 +205,15 @@ def _belief_entropy(belief: Float[Array, "*batch classes"]) -> Float[Array, "*ba
 
 
 def learnt(
-    network: ViewPolicy, temperature: float | Float[Array, ""], *, by: Literal["belief", "state"] = "belief"
+    network: ViewPolicy, temperature: float | Float[Array, ""], *, by: Literal["belief", "state", "table"] = "belief"
 ) -> Policy:
     """The view from which `network` expects most.
 
     Args:
         network: trained by `train.policy`.
         temperature: of the logits of single views.
-        by: what it expects for each class, weighed by the belief; or what it expects in this state as it is.
+        by: what it expects for each class, weighed by the belief; or what it expects in this state as it is; or the first, and
+            as much what these views showed of other objects (`Knowledge.expected_logits`, log-probabilities of single views).
     """
 
     def scores(key: Array, state: SelectionState, scene: Scene) -> Float[Array, "views"]:
@@ -220,9 +221,27 @@ def learnt(
         points, present = scene.graph.points, jnp.arange(len(state.views)) < state.count
         views = jax.nn.log_softmax(state.seen.logits / temperature, axis=-1)
         gain, gain_if = network(state.belief, views, points[state.views], present, points, state.seen.cloud)
-        return gain if by == "state" else expected_gain(state.belief, gain_if)
+        if by == "state":
+            return gain
+        if by == "table":
+            gain_if = (gain_if + _gain_by_table(network, state.belief, _given(scene.knowledge, "Scene.knowledge"))) / 2
+        return expected_gain(state.belief, gain_if)
 
     return scores
+
+
+_TOLD_BY_A_VIEW = 0.5
+"""How much of what a view shows of a class by itself counts beside views seen before, from which it is not independent."""
+
+
+def _gain_by_table(
+    network: ViewPolicy, belief: Float[Array, "classes"], knowledge: Knowledge
+) -> Float[Array, "views classes"]:
+    """[j, y]: by how much the utility that `network` expects would rise, should view j show half of what it shows of others of
+    class y."""
+    after = jax.nn.log_softmax(belief + _TOLD_BY_A_VIEW * knowledge.expected_logits, axis=-1)
+    own = jnp.diagonal(after, axis1=0, axis2=2)
+    return worth(own, network.utility, network.floor) - worth(belief, network.utility, network.floor)
 
 
 def looking_ahead(

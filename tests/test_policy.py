@@ -271,24 +271,33 @@ def plain_walk(fusion, data, index, scores, start, steps):
     return seen[:steps], beliefs
 
 
-@pytest.mark.parametrize("by", ["belief", "state"])
+@pytest.mark.parametrize("by", ["belief", "state", "table"])
 def test_the_loop_with_a_learnt_fusion_and_policy_is_a_plain_one(fusion, policy, by):
     data, index = some_features(3, seed=4), 1
     graph = graph_of(data.directions[index])
     table = ViewTable(data.logits[index], None, None, data.labels[index], features=data.features[index])
+    shown = np.random.default_rng(9).normal(0, 2, (CLASSES, VIEWS, CLASSES))
+    scene = table.scene(graph, Knowledge(jnp.zeros(VIEWS), jnp.asarray(shown, jnp.float32)))
 
     @jax.jit
     def looped(start):
         choose = learnt(policy, fusion.single, by=by)
-        return select_from_table(
-            jax.random.key(0), table, table.scene(graph), choose, start, max_views=4, fuse=by_attention(fusion)
-        )
+        return select_from_table(jax.random.key(0), table, scene, choose, start, max_views=4, fuse=by_attention(fusion))
+
+    def rise(belief, label, view):
+        """Of the probability of a class, where a view shows half of what it shows of others."""
+        after = belief + shown[label, view] / 2
+        return np.exp(after[label]) / np.exp(after).sum() - np.exp(belief[label])
 
     def scores(order, belief):
         views = jax.nn.log_softmax(data.logits[index, order] / fusion.single, axis=-1)
         points = data.directions[index]
         gain, gain_if = asked(policy, belief, views, points[order], np.ones(len(order), bool), points)
-        return gain if by == "state" else expected_gain(belief, gain_if)
+        if by == "state":
+            return gain
+        belief = np.asarray(belief, np.float64)
+        by_table = [sum(np.exp(belief[y]) * rise(belief, y, view) for y in range(CLASSES)) for view in range(VIEWS)]
+        return expected_gain(belief, gain_if) + (np.array(by_table) if by == "table" else 0)
 
     for start in (0, 5):
         views, beliefs = plain_walk(fusion, data, index, scores, start, 4)
@@ -417,6 +426,7 @@ def test_what_looking_was_worth_is_learnt_and_the_study_says_so(adding):
             Learner("learnt", "view policy", policy),
             Learner("as_it_is", "without belief", policy, "state"),
             Learner("look_ahead", "two ahead", policy, "ahead"),
+            Learner("learnt_and_table", "with a table", policy, "table"),
             Learner("unsure", "another fusion", policy, fusion=replace(adding, temperatures=jnp.full(1, 50.0))),
         ],
         OnLattice(validation),
@@ -444,6 +454,7 @@ def test_what_looking_was_worth_is_learnt_and_the_study_says_so(adding):
     assert found["trying_starts"] == 6  # all of them, where there are so few
     assert after["label_oracle"][1] >= after["learnt"][1]
     assert after["look_ahead"][2] > after["random"][2] + 0.1
+    assert after["learnt_and_table"][2] > after["random"][2] + 0.1
     first = found["policies"]["unsure"]["temperatures"][0] / found["policies"]["learnt"]["temperatures"][0]
     assert first == pytest.approx(1 / 50, rel=1e-3)  # of a fusion of its own
     costs = found["costs"]

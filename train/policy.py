@@ -222,7 +222,7 @@ def policy_loss(network: ViewPolicy, some: Choices, differences: float) -> dict[
     }
 
 
-By = Literal["belief", "state", "ahead"]
+By = Literal["belief", "state", "table", "ahead"]
 """How a view policy is asked: as `learnt` has it, or two views ahead."""
 
 
