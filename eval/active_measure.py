@@ -6,7 +6,7 @@ What is found is kept in files of the seed's folder; what is there is not measur
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import replace
+from dataclasses import fields, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -32,7 +32,7 @@ from mevs_jax.models.view_policy import expected_gain
 from mevs_jax.viewpoints import viewpoint_lattice
 from train.loop import load_best
 
-_FORM = 4
+_FORM = 5
 """Of what is kept of walks; with another one they are walked again."""
 
 
@@ -76,9 +76,12 @@ def together(seeds: Sequence[Stages], found: Sequence[dict[str, Any]]) -> dict[s
         for stages in seeds:
             with np.load(stages.folder / f"walks_lattice_{views}.npz") as kept:
                 each.append(
-                    {name: ByObject(kept[f"{name} right"], kept[f"{name} likelihood"]) for name in first["policies"]}
+                    {
+                        name: ByObject(**{field.name: kept[f"{name} {field.name}"] for field in fields(ByObject)})
+                        for name in first["policies"]
+                    }
                 )
-        lattices[views] = seeds_together(first, each, "learnt")
+        lattices[views] = seeds_together([one["lattices"][views] for one in found], each, "learnt")
     return lattices
 
 

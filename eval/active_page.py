@@ -281,7 +281,7 @@ def _seeds(metrics: dict[str, Any], views: str) -> str:
         return ""
     each = [found["lattices"][views] for found in metrics["seeds"]]
     titles = {name: each[0]["policies"][name]["title"] for name in ("random", "farthest", "fixed_order", METHOD)}
-    rows = []
+    errors, rows = metrics["together"][views]["policies"][METHOD]["calibration_error"], []
     for name, title in titles.items():
         after = [found["policies"][name]["after_views"][:4] for found in each]
         rows += [[html.escape(title), str(seed), *map(percent, shares)] for seed, shares in enumerate(after)]
@@ -296,7 +296,8 @@ def _seeds(metrics: dict[str, Any], views: str) -> str:
         f"{len(each)} seeds, taken of each object first:</p>"
         + _ladder(metrics["together"][views])
         + _against(metrics["together"][views])
-        + "<p>Each seed:</p>"
+        + f"<p>Calibration error (%) of the view policy after 1 to {len(errors)} views, mean of the seeds: "
+        + f"{', '.join(map(percent, errors))}.</p><p>Each seed:</p>"
         + table(["next view chosen by", "seed", "1 view", "2", "3", "4"], rows)
         + table(["view policy above", "seed", "2 views", "3", "4"], gains)
     )

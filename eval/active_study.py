@@ -53,10 +53,12 @@ class ByObject:
     Attributes:
         right: (steps, objects) share of the walks that are right after so many views.
         likelihood: (steps, objects) log-probability of the true class.
+        from_some: (steps, objects) `right` of the walks from the starts that oracles walk from.
     """
 
     right: Float[np.ndarray, "steps objects"]
     likelihood: Float[np.ndarray, "steps objects"]
+    from_some: Float[np.ndarray, "steps objects"]
 
 
 @jax.jit
@@ -236,7 +238,6 @@ def study(
     if others:
         found["random_sets"] = random_sets_study(fusion, validation.features, test.features, draws)
     each: dict[str, ByObject] = {}
-    from_some: dict[str, np.ndarray] = {}  # accuracy from the oracles' starts
     parameters: dict[str, Any] = {"belief_oracle": fusion, "label_oracle": fusion}
     parameters |= {learner.name: given_to(learner, fusion) for learner in learners}
     fusions = {learner.name: learner.fusion or fusion for learner in learners}
@@ -263,27 +264,21 @@ def study(
         right = signals[1].right
         told[name] = Told(walks, beliefs, signals)
         by_start = right.reshape(len(right), -1, contender.draws, right.shape[-1]).mean(axis=2)
-        each[name] = ByObject(by_start.mean(axis=1).T, likelihood)
-        if contender.every == 1:
-            by_start = by_start[:, some_starts]
-        from_some[name] = by_start.mean(axis=(0, 1))
+        from_some = by_start if contender.every > 1 else by_start[:, some_starts]
+        each[name] = ByObject(by_start.mean(axis=1).T, likelihood, from_some.mean(axis=1).T)
         found["policies"][name] = {"title": contender.title, "knows": contender.knows, **judgement}
         console.print(f"{contender.title}: " + " ".join(f"{100 * share:.1f}" for share in judgement["after_views"]))
     if costs:
         key, method = jax.random.key(seed), learners[0]
         found["costs"] = what_it_costs(key, method, fusion, validation, test, knowledge, told, max_views, apart)
-    found["against"] = compared(each, learners[0].name)
-    found["gap_closed"] = {
-        name: _gap_closed(from_some[name], from_some["random"], from_some["belief_oracle"])
-        for name in each
-        if "belief_oracle" in each and name not in ("random", "belief_oracle", "label_oracle")
-    }
-    return found, each
+    return found | compared(each, learners[0].name), each
 
 
 def compared(each: Mapping[str, ByObject], method: str) -> dict[str, Any]:
-    """Paired differences of every policy from the baselines and from the method, by baseline."""
-    return {
+    """Paired differences of every policy from the baselines and from the method, by baseline; and how much of the way from
+    random to the label-free oracle each goes."""
+    from_some = {name: policy.from_some.mean(axis=1) for name, policy in each.items()}
+    against = {
         base: {
             name: _difference(mine.right, each[base].right)
             | {"likelihood": _difference(mine.likelihood, each[base].likelihood)}
@@ -293,28 +288,42 @@ def compared(each: Mapping[str, ByObject], method: str) -> dict[str, Any]:
         for base in (*BASELINES, method)
         if base in each
     }
+    gap_closed = {
+        name: _gap_closed(mine, from_some["random"], from_some["belief_oracle"])
+        for name, mine in from_some.items()
+        if "belief_oracle" in each and name not in ("random", "belief_oracle", "label_oracle")
+    }
+    return {"against": against, "gap_closed": gap_closed}
 
 
-def seeds_together(found: dict[str, Any], seeds: Sequence[Mapping[str, ByObject]], method: str) -> dict[str, Any]:
+def seeds_together(
+    found: Sequence[dict[str, Any]], seeds: Sequence[Mapping[str, ByObject]], method: str
+) -> dict[str, Any]:
     """What the same policies reach on average over several seeds, by object first, since the objects are the same.
 
     Args:
-        found: what `study` found with one of the seeds.
+        found: what `study` found with each seed.
         seeds: what each policy does by object, for each seed.
     """
-    each = {
-        name: ByObject(
-            np.mean([seed[name].right for seed in seeds], axis=0),
-            np.mean([seed[name].likelihood for seed in seeds], axis=0),
-        )
-        for name in found["policies"]
-    }
+
+    def mean(name: str) -> ByObject:
+        values = [vars(seed[name]) for seed in seeds]
+        return ByObject(**{key: np.mean([value[key] for value in values], axis=0) for key in values[0]})
+
+    each, first = {name: mean(name) for name in found[0]["policies"]}, found[0]
     policies = {
         name: {key: policy[key] for key in ("title", "knows")}
-        | {"after_views": each[name].right.mean(axis=1).tolist(), "interval": intervals(each[name].right)}
-        for name, policy in found["policies"].items()
+        | {
+            "after_views": each[name].right.mean(axis=1).tolist(),
+            "interval": intervals(each[name].right),
+            "calibration_error": np.mean(
+                [one["policies"][name]["calibration_error"] for one in found], axis=0
+            ).tolist(),
+        }
+        for name, policy in first["policies"].items()
     }
-    return {"policies": policies, "against": compared(each, method), "gap_closed": {}}
+    same = {key: first[key] for key in ("views", "trying_starts")}
+    return same | {"policies": policies} | compared(each, method)
 
 
 def novel_classes(

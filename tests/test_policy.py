@@ -13,7 +13,7 @@ from flax import nnx
 
 from eval.active import _made_once
 from eval.active_stopping import Signal, beside
-from eval.active_study import ByObject, fixed_order_scores, novel_classes, seeds_together, study
+from eval.active_study import fixed_order_scores, novel_classes, seeds_together, study
 from eval.active_walks import Learner, OnLattice
 from eval.confidence import stops_at
 from mevs_jax import ViewGraph, ViewTable, fibonacci_sphere
@@ -437,12 +437,15 @@ def test_what_looking_was_worth_is_learnt_and_the_study_says_so(adding):
         costs=True,
     )
     after = {name: result["after_views"] for name, result in found["policies"].items()}
-    same = seeds_together(found, [each, each], "learnt")
+    same = seeds_together([found, found], [each, each], "learnt")
     close = partial(np.testing.assert_allclose, atol=1e-6)
     jax.tree.map(close, same["against"], found["against"])  # the mean of two that are alike
-    close(same["policies"]["learnt"]["interval"], found["policies"]["learnt"]["interval"])
-    better = {name: ByObject(policy.right, policy.likelihood + (name == "learnt")) for name, policy in each.items()}
-    gain = seeds_together(found, [each, better], "learnt")["against"]["random"]["learnt"]["likelihood"]["difference"]
+    jax.tree.map(close, same["gap_closed"], found["gap_closed"])
+    for key in ("interval", "calibration_error"):
+        close(same["policies"]["learnt"][key], found["policies"]["learnt"][key])
+    better = {name: replace(policy, likelihood=policy.likelihood + (name == "learnt")) for name, policy in each.items()}
+    both = seeds_together([found, found], [each, better], "learnt")
+    gain = both["against"]["random"]["learnt"]["likelihood"]["difference"]
     np.testing.assert_allclose(
         gain, 0.5 + np.array(found["against"]["random"]["learnt"]["likelihood"]["difference"]), atol=1e-5
     )
