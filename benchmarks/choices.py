@@ -1,0 +1,158 @@
+"""What every way to choose views did for each test object: `python benchmarks/choices.py [RUN]`.
+
+RUN is a directory in which `mevs active` was run; its walks are kept in `benchmarks/results/choices/`, a file for each seed and
+kind of candidates, beside those that are there. From all that are kept come the tables of `benchmarks/results/choices.md`:
+means over seeds, taken of each object first, with 95 % intervals over objects.
+
+Whoever has another policy can compare it object by object. Such a file has `names` of the objects in their order, and for
+each policy `right`, shares of its walks that are right after 1, 2, … views, in 240ths (so that they are exact for 10, 40 or 60
+starts, once or twice each); `from_some`, the same of the starts that oracles walk from; and `likelihood`, the mean
+log-probability of the true class, in half precision.
+"""
+
+from __future__ import annotations
+
+import io
+import json
+import re
+import sys
+from collections import defaultdict
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+
+import numpy as np
+import tyro
+
+from data_pipeline.builder import open_split
+from data_pipeline.files import read_json, write_bytes, write_text
+from eval.active_study import BASELINES, ByObject, seeds_together
+
+RESULTS = Path(__file__).parent / "results"
+KEPT = RESULTS / "choices"
+METHODS = {"learnt": "view policy", "learnt_and_table": "view policy and table"}
+_WHOLE = 240
+_TOLD = ("objects", "views", "trying_starts", "single_view")
+_TOLD_OF_EACH = ("title", "knows", "calibration_error")
+_SHOWN = (0, 1, 2, 3, 5, 7)
+"""Steps of walks in tables, from the first view."""
+
+
+@dataclass(frozen=True)
+class Options:
+    run: Annotated[Path | None, tyro.conf.Positional] = None
+    """where `mevs active` was run"""
+
+
+def keep(run: Path) -> None:
+    """Keeps what the walks of a run say of each object."""
+    names = np.array([one["name"].decode() for one in open_split(run / "data", "test")])
+    for path in sorted((run / "active").glob("seed_*/walks_*.npz")):
+        found = read_json(path.with_suffix(".json"))
+        told: dict[str, Any] = {key: found[key] for key in _TOLD}
+        told["policies"] = {
+            name: {key: policy[key] for key in _TOLD_OF_EACH} for name, policy in found["policies"].items()
+        }
+        with np.load(path) as walks:
+            arrays = {key: _packed(key, walks[key]) for key in walks.files}
+        kind = path.stem.removeprefix("walks_")
+        buffer = io.BytesIO()
+        np.savez_compressed(buffer, told=json.dumps(told), names=names, **arrays)
+        write_bytes(KEPT / f"{path.parent.name}_{kind}.npz", buffer.getvalue())
+
+
+def _packed(key: str, values: np.ndarray) -> np.ndarray:
+    if key.endswith(" likelihood"):
+        return values.astype(np.float16)
+    counts = np.round(values * _WHOLE)
+    if np.abs(counts - values * _WHOLE).max() > 1e-2:
+        raise ValueError(f"{key}: shares of a number of walks that does not divide {_WHOLE}")
+    return counts.astype(np.uint8)
+
+
+def kept(path: Path) -> tuple[dict[str, Any], dict[str, ByObject]]:
+    """What `study` found of one seed, as far as it is kept, and what each policy does by object."""
+    with np.load(path) as arrays:
+        told = json.loads(str(arrays["told"]))
+        each = {
+            name: ByObject(
+                right=arrays[f"{name} right"] / _WHOLE,
+                likelihood=arrays[f"{name} likelihood"].astype(np.float32),
+                from_some=arrays[f"{name} from_some"] / _WHOLE,
+            )
+            for name in told["policies"]
+        }
+    return told, each
+
+
+def _row(cells: list[str]) -> str:
+    return f"| {' | '.join(cells)} |\n"
+
+
+def _difference(difference: float, interval: list[float]) -> str:
+    low, high = interval
+    cell = f"{100 * difference:+.1f} [{100 * low:+.1f}, {100 * high:+.1f}]".replace("-", "−")
+    return f"**{cell}**" if low > 0 or high < 0 else cell
+
+
+def _table(header: list[str], rows: list[list[str]]) -> str:
+    return _row(header) + _row(["---"] * len(header)) + "".join(map(_row, rows)) + "\n"
+
+
+def tables(found: dict[str, Any]) -> str:
+    """The tables of what `seeds_together` says."""
+    policies, steps = found["policies"], [str(step + 1) for step in _SHOWN]
+
+    def shown(values: list[str]) -> list[str]:
+        return [values[step] if step < len(values) else "" for step in _SHOWN]
+
+    rows = []
+    for name, policy in policies.items():
+        closed = found["gap_closed"].get(name, [])
+        rows.append(
+            [
+                policy["title"],
+                *shown([f"{100 * share:.1f}" for share in policy["after_views"]]),
+                ", ".join("–" if share is None else f"{100 * share:.0f}" for share in closed),
+                f"{100 * max(policy['calibration_error']):.1f}",
+            ]
+        )
+    text = _table(["next view chosen by", *steps, "% of the gap, 2–4", "ECE at most"], rows)
+    for method in METHODS:
+        rows = []
+        for base in (*BASELINES, "learnt"):
+            gains = found["against"].get(base, {}).get(method)
+            if gains is not None:
+                for of, unit in ((gains, ""), (gains["likelihood"], ", nat/100")):
+                    known = [_difference(*cell) for cell in zip(of["difference"], of["interval"], strict=True)]
+                    rows.append([policies[base]["title"] + unit, *shown(known)[1:]])
+        if rows:
+            text += _table([f"{METHODS[method]} above", *steps[1:]], rows)
+    return text
+
+
+def main(options: Options) -> None:
+    if options.run is not None:
+        keep(options.run)
+    kinds = defaultdict(list)
+    for path in sorted(KEPT.glob("*.npz")):
+        seed, kind = re.fullmatch(r"seed_(\d+(?:_rotated)?)_(.*)", path.stem).groups()
+        kinds[kind + "_rotated" * seed.endswith("rotated")].append((seed, *kept(path)))
+    text = "Written by `benchmarks/choices.py`; accuracy in %, differences in points.\n\n"
+    for kind, seeds in kinds.items():
+        numbers, found, each = zip(*seeds, strict=True)
+        text += (
+            f"## {kind}: {found[0]['views']} candidates, {found[0]['objects']} objects, seeds {', '.join(numbers)}\n\n"
+        )
+        text += tables(seeds_together(found, each, "learnt"))
+        if len(seeds) > 1:
+            for number, one, own in seeds:
+                text += f"### seed {number}\n\n" + tables(seeds_together([one], [own], "learnt"))
+    write_text(RESULTS / "choices.md", text)
+    print(text)
+
+
+if __name__ == "__main__":
+    main(tyro.cli(Options, description=__doc__.splitlines()[0]))

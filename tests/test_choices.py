@@ -1,0 +1,56 @@
+"""What `benchmarks/choices.py` keeps of walks is what they said."""
+
+import json
+from dataclasses import fields
+
+import numpy as np
+import pytest
+
+from benchmarks import choices
+from eval.active_study import BASELINES, ByObject, compared, seeds_together
+
+POLICIES = (*BASELINES, "learnt", "belief_oracle")
+OBJECTS, STARTS = 30, 40
+
+
+def test_what_is_kept_says_what_the_walks_said(tmp_path, monkeypatch, random):
+    folder = tmp_path / "run" / "active" / "seed_0"
+    folder.mkdir(parents=True)
+    each = {
+        name: ByObject(
+            random.integers(0, STARTS + 1, (4, OBJECTS)) / STARTS,
+            random.normal(-0.5, 0.3, (4, OBJECTS)).astype(np.float32),
+            random.integers(0, 9, (4, OBJECTS)) / 8,
+        )
+        for name in POLICIES
+    }
+    policies = {
+        name: {"title": name, "knows": "views", "calibration_error": [0.01] * 4, "interval": []} for name in POLICIES
+    }
+    found = {"objects": OBJECTS, "views": STARTS, "trying_starts": 8, "single_view": 0.8, "policies": policies}
+    arrays = {f"{name} {field.name}": getattr(one, field.name) for name, one in each.items() for field in fields(one)}
+    np.savez(folder / "walks_lattice_40.npz", **arrays)
+    (folder / "walks_lattice_40.json").write_text(json.dumps(found))
+    monkeypatch.setattr(
+        choices, "open_split", lambda folder, split: [{"name": b"chair_%d" % i} for i in range(OBJECTS)]
+    )
+    monkeypatch.setattr(choices, "RESULTS", tmp_path)
+    monkeypatch.setattr(choices, "KEPT", tmp_path / "choices")
+    choices.main(choices.Options(tmp_path / "run"))
+
+    told, mine = choices.kept(tmp_path / "choices" / "seed_0_lattice_40.npz")
+    for name, one in each.items():
+        np.testing.assert_allclose(mine[name].right, one.right, atol=1e-12)
+        np.testing.assert_allclose(mine[name].from_some, one.from_some, atol=1e-12)
+        np.testing.assert_allclose(mine[name].likelihood, one.likelihood, atol=1e-3)
+    again = seeds_together([told], [mine], "learnt")
+    gain = compared(each, "learnt")["against"]["random"]["learnt"]
+    np.testing.assert_allclose(again["against"]["random"]["learnt"]["interval"], gain["interval"], atol=1e-6)
+    page = (tmp_path / "choices.md").read_text()
+    low, high = gain["interval"][1]
+    assert f"{100 * gain['difference'][1]:+.1f} [{100 * low:+.1f}, {100 * high:+.1f}]".replace("-", "−") in page
+
+
+def test_shares_that_would_not_be_exact_are_refused():
+    with pytest.raises(ValueError, match="does not divide 240"):
+        choices._packed("random right", np.array([1 / 7]))
