@@ -115,7 +115,7 @@ def tables(found: dict[str, Any]) -> str:
             [
                 policy["title"],
                 *shown([f"{100 * share:.1f}" for share in policy["after_views"]]),
-                ", ".join("–" if share is None else f"{100 * share:.0f}" for share in closed),
+                ", ".join("–" if share is None else f"{100 * share:.0f}" for share in closed).replace("-", "−"),
                 f"{100 * max(policy['calibration_error']):.1f}",
             ]
         )
