@@ -5,9 +5,9 @@ kind of candidates, beside those that are there. From all that are kept come the
 means over seeds, taken of each object first, with 95 % intervals over objects.
 
 Whoever has another policy can compare it object by object. Such a file has `names` of the objects in their order, and for
-each policy `right`, shares of its walks that are right after 1, 2, … views, in 240ths (so that they are exact for 10, 40 or 60
-starts, once or twice each); `from_some`, the same of the starts that oracles walk from; and `likelihood`, the mean
-log-probability of the true class, in half precision.
+each policy `right`, shares of its walks that are right after 1, 2, … views, in 240ths if in bytes and else in 720ths (so that
+they are exact for 8, 9, 10, 40 or 60 starts, once or twice each); `from_some`, the same of the starts that oracles walk from; and
+`likelihood`, the mean log-probability of the true class, in half precision.
 """
 
 from __future__ import annotations
@@ -33,7 +33,8 @@ from eval.active_study import BASELINES, ByObject, seeds_together
 RESULTS = Path(__file__).parent / "results"
 KEPT = RESULTS / "choices"
 METHODS = {"learnt": "view policy", "learnt_and_table": "view policy and table"}
-_WHOLE = 240
+_WHOLES: dict[type[np.unsignedinteger], int] = {np.uint8: 240, np.uint16: 720}
+"""What a share of 1 is stored as."""
 _TOLD = ("objects", "views", "trying_starts", "single_view")
 _TOLD_OF_EACH = ("title", "knows", "calibration_error")
 _SHOWN = (0, 1, 2, 3, 5, 7)
@@ -66,10 +67,15 @@ def keep(run: Path) -> None:
 def _packed(key: str, values: np.ndarray) -> np.ndarray:
     if key.endswith(" likelihood"):
         return values.astype(np.float16)
-    counts = np.round(values * _WHOLE)
-    if np.abs(counts - values * _WHOLE).max() > 1e-2:
-        raise ValueError(f"{key}: shares of a number of walks that does not divide {_WHOLE}")
-    return counts.astype(np.uint8)
+    for kind, whole in _WHOLES.items():
+        counts = np.round(values * whole)
+        if np.abs(counts - values * whole).max() <= 1e-2:
+            return counts.astype(kind)
+    raise ValueError(f"{key}: shares of a number of walks that divides none of {list(_WHOLES.values())}")
+
+
+def _shares(counts: np.ndarray) -> np.ndarray:
+    return counts / _WHOLES[counts.dtype.type]
 
 
 def kept(path: Path) -> tuple[dict[str, Any], dict[str, ByObject]]:
@@ -78,9 +84,9 @@ def kept(path: Path) -> tuple[dict[str, Any], dict[str, ByObject]]:
         told = json.loads(str(arrays["told"]))
         each = {
             name: ByObject(
-                right=arrays[f"{name} right"] / _WHOLE,
+                right=_shares(arrays[f"{name} right"]),
                 likelihood=arrays[f"{name} likelihood"].astype(np.float32),
-                from_some=arrays[f"{name} from_some"] / _WHOLE,
+                from_some=_shares(arrays[f"{name} from_some"]),
             )
             for name in told["policies"]
         }

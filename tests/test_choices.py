@@ -52,5 +52,11 @@ def test_what_is_kept_says_what_the_walks_said(tmp_path, monkeypatch, random):
 
 
 def test_shares_that_would_not_be_exact_are_refused():
-    with pytest.raises(ValueError, match="does not divide 240"):
+    with pytest.raises(ValueError, match="divides none of"):
         choices._packed("random right", np.array([1 / 7]))
+
+
+def test_shares_of_nine_starts_are_exact_in_two_bytes():
+    packed = choices._packed("random from_some", np.arange(10) / 9)
+    assert packed.dtype == np.uint16
+    np.testing.assert_allclose(choices._shares(packed), np.arange(10) / 9, atol=1e-12)
