@@ -5,6 +5,7 @@ from __future__ import annotations
 import html
 import math
 from pathlib import Path
+from statistics import fmean
 from typing import Any
 
 from data_pipeline.builder import DatasetStatistics
@@ -172,17 +173,23 @@ def _both_rules(row: dict[str, Any]) -> list[str]:
     return [*cells, percent(own["accuracy"]), f"{own['views']:.2f}", fewer]
 
 
-def _lead(found: dict[str, Any]) -> str:
-    method, random = (found["policies"][name]["after_views"] for name in (METHOD, "random"))
-    gain = found["against"]["random"][METHOD]
-    every = found["random_sets"][-1]
+def _lead(metrics: dict[str, Any], views: str) -> str:
+    """What it comes to, the mean of all seeds."""
+    each, together = [seed["lattices"][views] for seed in metrics["seeds"]], metrics["together"][views]
+    method, random = (together["policies"][name]["after_views"] for name in (METHOD, "random"))
+    gain, first = together["against"]["random"][METHOD], each[0]
+    single = fmean(found["single_view"] for found in each)
+    every, summed = (fmean(found["random_sets"][-1][name]["accuracy"] for found in each) for name in ("learnt", "sum"))
+    trainings = f" Means of {len(each)} trainings; what follows is of the first, unless said otherwise." * (
+        len(each) > 1
+    )
     return (
         f'<p class="lead">Two views are recognised with {percent(method[1])} % accuracy where the second is chosen, '
         f"{percent(random[1])} % where it is drawn: {difference(gain['difference'][1], gain['interval'][1])} points. One view "
-        f"alone: {percent(random[0])} %, by its own logits {percent(found['single_view'])} %; all {every['views']} fused: "
-        f"{percent(every['learnt']['accuracy'])} %, summed: {percent(every['sum']['accuracy'])} %.</p>"
-        f'<p class="note">Over {found["objects"]} test objects and every start view; all policies share fusion, objects and '
-        f"starts. Everything fitted or chosen is so on {found['validation_objects']} validation objects. The views of these "
+        f"alone: {percent(random[0])} %, by its own logits {percent(single)} %; all {first['random_sets'][-1]['views']} fused: "
+        f"{percent(every)} %, summed: {percent(summed)} %.{trainings}</p>"
+        f'<p class="note">Over {first["objects"]} test objects and every start view; all policies share fusion, objects and '
+        f"starts. Everything fitted or chosen is so on {first['validation_objects']} validation objects. The views of these "
         "lattices were never trained on: training saw other directions around other objects.</p>"
     )
 
@@ -307,8 +314,8 @@ def active_section(inputs: ReportInputs) -> str:
     """For the report of the whole run; empty where `mevs active` was not run."""
     if inputs.active is None:
         return ""
-    found = next(iter(inputs.active["seeds"][0]["lattices"].values()))
-    return "<h2>Learning to fuse and to choose</h2>" + _lead(found) + _ladder(found)
+    views, found = next(iter(inputs.active["seeds"][0]["lattices"].items()))
+    return "<h2>Learning to fuse and to choose</h2>" + _lead(inputs.active, views) + _ladder(found)
 
 
 def write_active_page(metrics: dict[str, Any], statistics: DatasetStatistics, path: Path) -> None:
@@ -317,7 +324,9 @@ def write_active_page(metrics: dict[str, Any], statistics: DatasetStatistics, pa
     for number, (views, found) in enumerate(metrics["seeds"][0]["lattices"].items()):
         titles = {name: policy["title"] for name, policy in found["policies"].items()}
         curves = {name: policy for name, policy in found["policies"].items() if name != "label_oracle"}
-        parts.append((_lead(found) if not number else "") + f"<h2>{views} candidate views</h2>" + _ladder(found))
+        parts.append(
+            (_lead(metrics, views) if not number else "") + f"<h2>{views} candidate views</h2>" + _ladder(found)
+        )
         parts.append(
             image(
                 figures.accuracy_of_choices(curves, titles, found["random_sets"][-1]["learnt"]["accuracy"]),
