@@ -70,7 +70,7 @@ class ActiveConfig:
     lattices: tuple[int, ...] = (10,)
     """further numbers of candidate views to test on, never trained on"""
     ablations: tuple[str, ...] = ()
-    """variants of the policy to compare with, with the first seed: as_it_is, look_ahead, information,
+    """variants of the policy to compare with, with the first seed: as_it_is, look_ahead, probability,
     random_states, unchanged, crossed, known, summed, cloud (where `mevs train` has made PointNet++), q_learning"""
     novel: int = 0
     """pairs of classes that a policy is trained without and then tested on, with the first seed"""
@@ -115,7 +115,9 @@ VARIANTS = {
     "learnt_and_table": Variant("view policy and table", by="table", network="learnt"),
     "as_it_is": Variant("… by what it expects of the state as it is", by="state", network="learnt"),
     "look_ahead": Variant("… two views ahead", by="ahead", network="learnt"),
-    "information": Variant("… by expected information", settings={"utility": "log"}),
+    "probability": Variant(
+        "… by the rise of the probability, not of its logarithm", settings={"utility": "probability"}
+    ),
     "random_states": Variant("… trained on random walks alone", settings={"rounds": 1}),
     "unchanged": Variant("… learnt from objects as they are", changed=False),
     "crossed": Variant("… learnt from training objects, by recognisers without them", learns_from="parts"),

@@ -153,11 +153,11 @@ def _costs(found: dict[str, Any]) -> str:
         "the view policy, stopping at the calibrated risk with which it is as accurate on validation objects; – where it never "
         "is.</p>"
         + table(["threshold", *header], thesis)
-        + "<h3>Until it does not pay</h3><p>Stopping once the best view left is expected to make the true class more probable by "
-        "less than a view costs; and by risk, at equal accuracy on validation objects.</p>"
+        + "<h3>Until it does not pay</h3><p>Stopping once the best view left is expected to raise the true class's "
+        "log-probability by less than a view costs (nats); and by risk, at equal accuracy on validation objects.</p>"
         + table(["cost of a view", *header], paying)
-        + "<h2>Going there</h2><p>Accuracy and way of the camera, where a radian costs so much of the probability that a view "
-        "brings; from some of the starts, as the oracles.</p>"
+        + "<h2>Going there</h2><p>Accuracy and way of the camera, where a radian costs so much of the log-probability (nats) "
+        "that a view brings; from some of the starts, as the oracles.</p>"
         + table(["price", *(title for step in steps for title in (f"{step + 1} views", "way"))], ways)
     )
 

@@ -1,8 +1,8 @@
 """Training of the view policy on what looking was worth: exact, and free, since every view of a training object is at hand.
 
 For objects whose features are known from all candidate views, the belief after any set of views and one more is one call of
-the fusion. So for a state (a set seen) each candidate's label is by how much it makes the true class more probable. Encoder and
-fusion that trained on an object are sure of it from any view, and there would be little to learn: labels are of objects that
+the fusion. So for a state (a set seen) each candidate's label is by how much it raises the true class's log-probability. Encoder
+and fusion that trained on an object are sure of it from any view, and there would be little to learn: labels are of objects that
 they were not trained on. Later rounds add the states to which the policy itself leads (DAgger; Ross et al. 2011).
 """
 
@@ -60,7 +60,7 @@ class PolicyConfig(AveragedConfig):
     """the first walks at random, the others as the policy of the round before says (DAgger)"""
     differences: float = 30.0
     """how much errors of differences between candidates count, on which the choice depends, beside those of what each brings"""
-    utility: Utility = "probability"
+    utility: Utility = "log"
     """what a belief is worth: the true class's probability, or its logarithm"""
     floor: float = 0.01
     """added to probabilities in logarithms: one object that all are wrong about must not outweigh all others"""
