@@ -31,7 +31,7 @@ from train.chunks import in_chunks
 from train.fusion import Features
 from train.policy import graph_of, learnt_policy
 
-PRICES_OF_A_VIEW = (0.05, 0.02, 0.01, 0.005, 0.002, 0.001)
+PRICES_OF_A_VIEW = (0.2, 0.1, 0.05, 0.02, 0.01, 0.005)
 """What a view costs, in the policy's utility: nats of the true class's log-probability, unless it was trained otherwise."""
 PRICES_OF_THE_WAY = (0.0, 0.002, 0.005, 0.01, 0.02, 0.05)
 """What a radian costs, in the same unit."""
