@@ -177,7 +177,14 @@ def _lead(metrics: dict[str, Any], views: str) -> str:
     """What it comes to, the mean of all seeds."""
     each, together = [seed["lattices"][views] for seed in metrics["seeds"]], metrics["together"][views]
     method, random = (together["policies"][name]["after_views"] for name in (METHOD, "random"))
-    gain, first = together["against"]["random"][METHOD], each[0]
+    gains, first = together["against"]["random"], each[0]
+    gain, tabled = gains[METHOD], ""
+    if "learnt_and_table" in gains:
+        known, more = together["policies"]["learnt_and_table"]["after_views"], gains["learnt_and_table"]
+        tabled = (
+            f" Joined with a table of what views of each class show, the policy reaches {percent(known[1])} %: "
+            f"{difference(more['difference'][1], more['interval'][1])}."
+        )
     single = fmean(found["single_view"] for found in each)
     every, summed = (fmean(found["random_sets"][-1][name]["accuracy"] for found in each) for name in ("learnt", "sum"))
     trainings = f" Means of {len(each)} trainings; what follows is of the first, unless said otherwise." * (
@@ -185,9 +192,9 @@ def _lead(metrics: dict[str, Any], views: str) -> str:
     )
     return (
         f'<p class="lead">Two views are recognised with {percent(method[1])} % accuracy where the second is chosen, '
-        f"{percent(random[1])} % where it is drawn: {difference(gain['difference'][1], gain['interval'][1])} points. One view "
-        f"alone: {percent(random[0])} %, by its own logits {percent(single)} %; all {first['random_sets'][-1]['views']} fused: "
-        f"{percent(every)} %, summed: {percent(summed)} %.{trainings}</p>"
+        f"{percent(random[1])} % where it is drawn: {difference(gain['difference'][1], gain['interval'][1])} points.{tabled} "
+        f"One view alone: {percent(random[0])} %, by its own logits {percent(single)} %; all "
+        f"{first['random_sets'][-1]['views']} fused: {percent(every)} %, summed: {percent(summed)} %.{trainings}</p>"
         f'<p class="note">Over {first["objects"]} test objects and every start view; all policies share fusion, objects and '
         f"starts. Everything fitted or chosen is so on {first['validation_objects']} validation objects. The views of these "
         "lattices were never trained on: training saw other directions around other objects.</p>"

@@ -252,7 +252,7 @@ def test_compat_climbs_and_learning_fill_their_tables(whole, tmp_path):
     first = found["seeds"][0]
     more = found | {"seeds": [first | {"rotated": first["unposed"]}, {"lattices": first["lattices"]}]}
     write_active_page(more, load_statistics(out / "data"), tmp_path / "more.html")
-    for said in ("Means of 2 trainings", "Other random weights", "Turned anyhow"):
+    for said in ("Means of 2 trainings", "Joined with a table", "Other random weights", "Turned anyhow"):
         assert said in (tmp_path / "more.html").read_text()
     climb_on_objects(TINY, out)
     assert mevs("compat", "--preset", "tiny", "--out", out).returncode == 0
