@@ -22,6 +22,7 @@ from data_pipeline.files import as_read, read_json, write_json, write_npz
 from data_pipeline.inputs import depth_and_normals
 from data_pipeline.progress import console
 from eval.active import Stages, lattice_data
+from eval.active_stopping import PRICES_OF_A_VIEW, PRICES_OF_THE_WAY
 from eval.active_study import ByObject, novel_classes, seeds_together, study
 from eval.active_walks import OnLattice
 from eval.thesis_results import machine
@@ -155,7 +156,7 @@ def _walks(
             config.draws,
             config.fitting_starts,
             _entropy_tables(stages.out, data, "test") is not None,
-            costs,
+            costs and [PRICES_OF_A_VIEW, PRICES_OF_THE_WAY],
         ],
     }
     return _kept(path, identity, walk)

@@ -173,17 +173,22 @@ def _both_rules(row: dict[str, Any]) -> list[str]:
     return [*cells, percent(own["accuracy"]), f"{own['views']:.2f}", fewer]
 
 
+def _gain_of_two(against: dict[str, Any], method: str = METHOD) -> str:
+    """Points of two views above those of another policy."""
+    gain = against[method]
+    return difference(gain["difference"][1], gain["interval"][1])
+
+
 def _lead(metrics: dict[str, Any], views: str) -> str:
     """What it comes to, the mean of all seeds."""
     each, together = [seed["lattices"][views] for seed in metrics["seeds"]], metrics["together"][views]
     method, random = (together["policies"][name]["after_views"] for name in (METHOD, "random"))
-    gains, first = together["against"]["random"], each[0]
-    gain, tabled = gains[METHOD], ""
+    gains, first, tabled = together["against"]["random"], each[0], ""
     if "learnt_and_table" in gains:
-        known, more = together["policies"]["learnt_and_table"]["after_views"], gains["learnt_and_table"]
+        known = together["policies"]["learnt_and_table"]["after_views"]
         tabled = (
             f" Joined with a table of what views of each class show, the policy reaches {percent(known[1])} %: "
-            f"{difference(more['difference'][1], more['interval'][1])}."
+            f"{_gain_of_two(gains, 'learnt_and_table')}."
         )
     single = fmean(found["single_view"] for found in each)
     every, summed = (fmean(found["random_sets"][-1][name]["accuracy"] for found in each) for name in ("learnt", "sum"))
@@ -192,7 +197,7 @@ def _lead(metrics: dict[str, Any], views: str) -> str:
     )
     return (
         f'<p class="lead">Two views are recognised with {percent(method[1])} % accuracy where the second is chosen, '
-        f"{percent(random[1])} % where it is drawn: {difference(gain['difference'][1], gain['interval'][1])} points.{tabled} "
+        f"{percent(random[1])} % where it is drawn: {_gain_of_two(gains)} points.{tabled} "
         f"One view alone: {percent(random[0])} %, by its own logits {percent(single)} %; all "
         f"{first['random_sets'][-1]['views']} fused: {percent(every)} %, summed: {percent(summed)} %.{trainings}</p>"
         f'<p class="note">Over {first["objects"]} test objects and every start view; all policies share fusion, objects and '
@@ -211,12 +216,11 @@ def _unposed(metrics: dict[str, Any]) -> str:
             for title, found in ((policy["title"], policy), ("… pose known", posed[name])):
                 cells = zip(found["after_views"], found["interval"], strict=True)
                 rows.append([html.escape(title), *(_accuracy(*cell) for cell in cells)])
-    gain = blind["against"]["random"][METHOD]
     return (
         "<h2>Facing any way</h2>"
         "<p>Objects are turned about the vertical by an angle that nobody knows: fusion and policy are told directions "
         "relative to the first view's alone. After two views the policy is "
-        f"{difference(gain['difference'][1], gain['interval'][1])} points above random. What is learnt of single views of a "
+        f"{_gain_of_two(blind['against']['random'])} points above random. What is learnt of single views of a "
         "lattice, as in the best fixed order, is of no use here.</p>"
         + table(["next view chosen by", *(str(step + 1) for step in range(len(rows[0]) - 1))], rows)
     )
