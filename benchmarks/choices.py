@@ -57,7 +57,7 @@ def keep(run: Path) -> None:
             name: {key: policy[key] for key in _TOLD_OF_EACH} for name, policy in found["policies"].items()
         }
         with np.load(path) as walks:
-            arrays = {key: _packed(key, walks[key]) for key in walks.files}
+            arrays: dict[str, Any] = {key: _packed(key, walks[key]) for key in walks.files}
         kind = path.stem.removeprefix("walks_")
         buffer = io.BytesIO()
         np.savez_compressed(buffer, told=json.dumps(told), names=names, **arrays)
@@ -143,8 +143,11 @@ def main(options: Options) -> None:
     if options.run is not None:
         keep(options.run)
     kinds = defaultdict(list)
-    for path in sorted(KEPT.glob("*.npz")):
-        seed, kind = re.fullmatch(r"seed_(\d+(?:_rotated)?)_(.*)", path.stem).groups()
+    for path in sorted(KEPT.glob("seed_*.npz")):
+        parts = re.fullmatch(r"seed_(\d+(?:_rotated)?)_(.*)", path.stem)
+        if parts is None:
+            sys.exit(f"{path} is not named after a seed and a kind of candidates, such as seed_0_lattice_40.npz")
+        seed, kind = parts.groups()
         kinds[kind + "_rotated" * seed.endswith("rotated")].append((seed, *kept(path)))
     text = "Written by `benchmarks/choices.py`; accuracy in %, differences in points.\n\n"
     for kind, seeds in kinds.items():

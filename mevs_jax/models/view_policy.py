@@ -23,7 +23,7 @@ Utility = Literal["probability", "log"]
 
 
 def worth(
-    log_probability: Float[AnyArray, "*any"], utility: Utility = "probability", floor: float = 0.01
+    log_probability: Float[AnyArray, "*any"], utility: Utility = "log", floor: float = 0.01
 ) -> Float[Array, "*any"]:
     """The utility of a belief that gives the true class this log-probability; in a logarithm, `floor` is added first."""
     if utility == "probability":
@@ -81,7 +81,7 @@ class ViewPolicy(nnx.Module):
         blocks: int = 2,
         cloud: int = 0,
         posed: bool = True,
-        utility: Utility = "probability",
+        utility: Utility = "log",
         floor: float = 0.01,
         rngs: nnx.Rngs,
     ):
