@@ -285,9 +285,9 @@ def test_the_loop_with_a_learnt_fusion_and_policy_is_a_plain_one(fusion, policy,
         return select_from_table(jax.random.key(0), table, scene, choose, start, max_views=4, fuse=by_attention(fusion))
 
     def rise(belief, label, view):
-        """Of the probability of a class, where a view shows half of what it shows of others."""
+        """Of the logarithm of a class's probability and 0.01, where a view shows half of what it shows of others."""
         after = belief + shown[label, view] / 2
-        return np.exp(after[label]) / np.exp(after).sum() - np.exp(belief[label])
+        return np.log(np.exp(after[label]) / np.exp(after).sum() + 0.01) - np.log(np.exp(belief[label]) + 0.01)
 
     def scores(order, belief):
         views = jax.nn.log_softmax(data.logits[index, order] / fusion.single, axis=-1)
