@@ -143,10 +143,11 @@ def main(options: Options) -> None:
     if options.run is not None:
         keep(options.run)
     kinds = defaultdict(list)
-    for path in sorted(KEPT.glob("seed_*.npz")):
+    for path in sorted(KEPT.glob("*.npz")):
         parts = re.fullmatch(r"seed_(\d+(?:_rotated)?)_(.*)", path.stem)
         if parts is None:
-            sys.exit(f"{path} is not named after a seed and a kind of candidates, such as seed_0_lattice_40.npz")
+            print(f"{path} is not named after a seed and candidates, as seed_0_lattice_40.npz is", file=sys.stderr)
+            sys.exit(2)
         seed, kind = parts.groups()
         kinds[kind + "_rotated" * seed.endswith("rotated")].append((seed, *kept(path)))
     text = "Written by `benchmarks/choices.py`; accuracy in %, differences in points.\n\n"
