@@ -23,9 +23,10 @@ import jax.numpy as jnp
 import numpy as np
 import trimesh
 
+from data_pipeline.errors import EmptyMesh
 from data_pipeline.files import read_json, write_json
-from data_pipeline.meshes import EmptyMesh, load_object, open_source
-from eval.ascent import METHODS, climb, look_everywhere
+from data_pipeline.objects.sources import load_object, open_source
+from eval.rendering.ascent import METHODS, climb, look_everywhere
 
 RESULTS = Path(__file__).parent / "results"
 SIDE, STARTS = 64, 40

@@ -25,11 +25,13 @@ import jax.numpy as jnp
 import numpy as np
 import trimesh
 
-from data_pipeline import capture as casting
-from data_pipeline.capture import CaptureConfig, capture, rig_for, save_capture
-from data_pipeline.captures import capture_all
+from data_pipeline.capture import casting as casting
+from data_pipeline.capture.casting import CaptureConfig, capture, rig_for, save_capture
+from data_pipeline.capture.workers import capture_all
 from data_pipeline.files import write_json, write_text
-from data_pipeline.meshes import FurniturePiece, Mesh, ObjectEntry, load_object
+from data_pipeline.objects.mesh import Mesh, ObjectEntry
+from data_pipeline.objects.recipes import FurniturePiece
+from data_pipeline.objects.sources import load_object
 from mevs_jax import Camera
 from mevs_jax.rendering import pad_triangles, render_depth
 

@@ -22,14 +22,14 @@ import numpy as np
 import tyro
 from scipy.ndimage import label as connected
 
-from data_pipeline.builder import open_split
+from data_pipeline.dataset.builder import open_split
 from data_pipeline.files import write_text
-from eval.active import Stages
-from eval.active_walks import beliefs_of_sets
-from eval.comparison import intervals
-from eval.pipeline import PRESETS
-from mevs_jax.fusion import CalibratedFusion
-from train.fusion import Features, sets_of_size
+from eval.numbers.comparison import intervals
+from eval.settings import PRESETS
+from mevs_jax.beliefs import CalibratedFusion
+from train.choosing.calibrated import beliefs_of_sets
+from train.choosing.features import Features, sets_of_size
+from train.choosing.stages import Stages
 
 RESULTS = Path(__file__).parent / "results"
 WHOLE = 0.9

@@ -26,9 +26,9 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 import numpy as np
 import tyro
 
-from data_pipeline.builder import open_split
+from data_pipeline.dataset.builder import open_split
 from data_pipeline.files import read_json, write_bytes, write_text
-from eval.active_study import BASELINES, ByObject, seeds_together
+from eval.learned.study import BASELINES, ByObject, seeds_together
 
 RESULTS = Path(__file__).parent / "results"
 KEPT = RESULTS / "choices"

@@ -21,8 +21,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from data_pipeline.files import write_json
-from eval.grid import FIRST_MV, LAST_MV, THRESHOLDS, run_grid
-from eval.ladder import Rung
+from eval.walks.grid import FIRST_MV, LAST_MV, THRESHOLDS, run_grid
+from eval.walks.ladder import Rung
 from mevs_jax import Knowledge, ViewGraph, ViewTable, fibonacci_sphere
 from tests.reference import numpy_rules
 

@@ -32,7 +32,7 @@ from flax import nnx
 from scipy.spatial import cKDTree
 
 from data_pipeline.files import read_json, write_json, write_text
-from eval.timing import time_local_maxima
+from eval.numbers.timing import time_local_maxima
 from mevs_jax import (
     NextView,
     PointNet2,

@@ -22,13 +22,15 @@ import jax.numpy as jnp
 import numpy as np
 from flax import nnx
 
-from data_pipeline.builder import load_statistics
+from data_pipeline.dataset.builder import load_statistics
 from data_pipeline.files import write_text
-from eval.pipeline import PRESETS, tasks
-from eval.view_tables import network_outputs, objects_of
+from eval.settings import PRESETS
+from eval.stages import tasks
+from eval.tables import objects_of
 from mevs_jax import ViewGraph, bootstrap_interval, maxima_first
 from mevs_jax.models.batch_norm import BatchNorm
 from train.loop import load_best
+from train.outputs import network_outputs
 
 RESULTS = Path(__file__).parent / "results" / "precision.md"
 

@@ -25,10 +25,11 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 import jax
 import numpy as np
 
-from data_pipeline.batches import train_batches
-from data_pipeline.builder import DatasetStatistics, load_statistics, prepare
+from data_pipeline.dataset.batches import train_batches
+from data_pipeline.dataset.builder import DatasetStatistics, load_statistics, prepare
 from data_pipeline.files import write_json
-from eval.pipeline import SMALL, THESIS, tasks
+from eval.settings import SMALL, THESIS
+from eval.stages import tasks
 from train.devices import device_mesh, join_processes, parameter_sharding, place, place_batch
 from train.step import Task, initial_state, train_step_of
 

@@ -19,14 +19,15 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 import jax
 import numpy as np
 
-from data_pipeline.batches import train_batches
-from data_pipeline.builder import DatasetStatistics, prepare
+from data_pipeline.dataset.batches import train_batches
+from data_pipeline.dataset.builder import DatasetStatistics, prepare
 from data_pipeline.files import write_json
-from eval.pipeline import SMALL, TINY, tasks
-from train.entropy import EntropyTask
+from eval.settings import SMALL, TINY
+from eval.stages import tasks
 from train.loop import fit
 from train.step import initial_state, train_step_of
 from train.sweep import SweepConfig, draw_members, sweep, task_of
+from train.tasks.entropy import EntropyTask
 
 MEMBERS = 16
 SWEEP = SweepConfig(members=MEMBERS, learning_rate=(1e-5, 1e-4))  # low: rounding grows with it, and is no news here

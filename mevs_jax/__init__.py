@@ -3,6 +3,14 @@
 Everything takes *one* object, cloud or view; put `jax.vmap` on for many. No files, no printing, no globals.
 """
 
+from mevs_jax.beliefs import (
+    CalibratedFusion,
+    beliefs_along,
+    confidence,
+    discounted,
+    mean_of_probabilities,
+    sum_of_logits,
+)
 from mevs_jax.calibration import (
     calibration_error_by_chance,
     expected_calibration_error,
@@ -14,15 +22,6 @@ from mevs_jax.calibration import (
 from mevs_jax.cameras import Camera, cameras_at, look_at_origin, orbit, partial_cloud, pixel_directions, unproject
 from mevs_jax.decisions import Decision, NextView
 from mevs_jax.entropy import depth_entropy, depth_levels, level_entropy, quantise_depth, shannon_entropy
-from mevs_jax.fusion import (
-    CalibratedFusion,
-    SetFusion,
-    beliefs_along,
-    confidence,
-    discounted,
-    mean_of_probabilities,
-    sum_of_logits,
-)
 from mevs_jax.metrics import (
     accuracy,
     bootstrap_interval,
@@ -32,21 +31,22 @@ from mevs_jax.metrics import (
     mean_squared_error,
 )
 from mevs_jax.models import Abstraction, PointNet2, Recogniser, ResNet, ViewPolicy, count_parameters
-from mevs_jax.point_ops import ball_query, farthest_point_sample
-from mevs_jax.policies import (
-    POLICIES,
+from mevs_jax.models.pretrained import pointnet2_from_torch, resnet_from_torch
+from mevs_jax.models.set_fusion import SetFusion
+from mevs_jax.points.ops import ball_query, farthest_point_sample
+from mevs_jax.policies.base import (
     Knowledge,
     Observation,
     Policy,
     Scene,
     SelectionState,
     candidates,
-    fused_oracle,
-    learnt,
     maxima_first,
     with_movement,
 )
-from mevs_jax.pretrained import pointnet2_from_torch, resnet_from_torch
+from mevs_jax.policies.learned import learnt
+from mevs_jax.policies.oracles import fused_oracle
+from mevs_jax.policies.registry import POLICIES
 from mevs_jax.selection import (
     Episode,
     ViewTable,

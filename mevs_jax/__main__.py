@@ -1,4 +1,4 @@
-from mevs_jax.cli import main
+from mevs_jax.cli.main import main
 
 if __name__ == "__main__":
     main()

@@ -18,7 +18,7 @@ from flax import nnx
 from jaxtyping import Array, Bool, Float
 
 from mevs_jax.models import PointNet2
-from mevs_jax.policies import maxima_first
+from mevs_jax.policies.base import maxima_first
 from mevs_jax.viewpoints import ViewGraph
 
 

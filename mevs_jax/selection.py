@@ -17,8 +17,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from mevs_jax.fusion import CalibratedFusion, confidence, sum_of_logits
-from mevs_jax.policies import Knowledge, Observation, Policy, Scene, SelectionState, candidates
+from mevs_jax.beliefs import CalibratedFusion, confidence, sum_of_logits
+from mevs_jax.policies.base import Knowledge, Observation, Policy, Scene, SelectionState, candidates
 from mevs_jax.viewpoints import ViewGraph
 
 

@@ -77,8 +77,8 @@ def fully_compiled() -> Iterator[None]:
 @pytest.fixture(scope="session")
 def data(tmp_path_factory) -> Path:
     """The data set of the preset `tiny`, to be read and not written to, where a module has no other of this name."""
-    from data_pipeline.builder import prepare
-    from eval.pipeline import TINY
+    from data_pipeline.dataset.builder import prepare
+    from eval.settings import TINY
 
     folder = tmp_path_factory.mktemp("tiny") / "data"
     prepare(TINY.dataset, folder)

@@ -15,9 +15,10 @@ import jax
 from jax.sharding import Mesh
 
 import train.loop
-from data_pipeline.batches import train_batches
-from data_pipeline.builder import load_statistics
-from eval.pipeline import TINY, tasks
+from data_pipeline.dataset.batches import train_batches
+from data_pipeline.dataset.builder import load_statistics
+from eval.settings import TINY
+from eval.stages import tasks
 from train.devices import DATA, MODEL, device_mesh, parameter_sharding, place, place_batch
 from train.preemption import Preempted
 from train.step import initial_state, train_step_of

@@ -14,11 +14,12 @@ import numpy as np
 import pytest
 import trimesh
 
-from data_pipeline import archives, builder
-from data_pipeline.archives import ARCHIVES, Archive, download, local
-from data_pipeline.builder import DataConfig, load_statistics, open_split, prepare
-from data_pipeline.capture import CaptureConfig
-from data_pipeline.meshes import DataError
+from data_pipeline.capture.casting import CaptureConfig
+from data_pipeline.dataset import builder
+from data_pipeline.dataset.builder import DataConfig, load_statistics, open_split, prepare
+from data_pipeline.errors import DataError
+from data_pipeline.objects import archives
+from data_pipeline.objects.archives import ARCHIVES, Archive, download, local
 
 
 def off(mesh: trimesh.Trimesh, header: str) -> str:

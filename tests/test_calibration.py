@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy.optimize import minimize, minimize_scalar
 
-from eval.confidence import RISKS, confidence_of, stopping
+from eval.numbers.confidence import RISKS, confidence_of, stopping
 from mevs_jax import (
     beliefs_along,
     calibration_error_by_chance,

@@ -12,8 +12,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from data_pipeline.builder import view_entropies
-from data_pipeline.capture import (
+from data_pipeline.capture.casting import (
     CaptureConfig,
     Rig,
     capture,
@@ -24,8 +23,13 @@ from data_pipeline.capture import (
     rig_for,
     save_capture,
 )
-from data_pipeline.captures import capture_all, capture_path
-from data_pipeline.meshes import DamagedMesh, FurniturePiece, MeshFile, ObjectEntry, VoxelGrid, load_object, normalise
+from data_pipeline.capture.workers import capture_all, capture_path
+from data_pipeline.dataset.builder import view_entropies
+from data_pipeline.errors import DamagedMesh
+from data_pipeline.objects.mesh import ObjectEntry, normalise
+from data_pipeline.objects.recipes import FurniturePiece, MeshFile
+from data_pipeline.objects.sources import load_object
+from data_pipeline.objects.voxels import VoxelGrid
 from mevs_jax import Camera, partial_cloud
 from tests.conftest import open3d_or_skip
 

@@ -18,10 +18,11 @@ import numpy as np
 import pytest
 import trimesh
 
-from data_pipeline.builder import load_statistics
-from eval.active_page import write_active_page
-from eval.pipeline import TINY, climb_on_objects, learn_to_choose
-from mevs_jax import cli
+from data_pipeline.dataset.builder import load_statistics
+from eval.learned.page import write_active_page
+from eval.settings import TINY
+from eval.stages import climb_on_objects, learn_to_choose
+from mevs_jax.cli import main as cli
 from tests.conftest import open3d_or_skip
 
 MEVS = [sys.executable, "-m", "mevs_jax"]

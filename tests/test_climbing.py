@@ -5,9 +5,11 @@ from __future__ import annotations
 import jax.numpy as jnp
 import numpy as np
 
-from data_pipeline.meshes import FurniturePiece, Mesh, ObjectEntry, load_object
-from eval.climbing import ClimbConfig, chosen_objects, scores_of_object, view_scores
-from eval.ladder import CLIMBED
+from data_pipeline.objects.mesh import Mesh, ObjectEntry
+from data_pipeline.objects.recipes import FurniturePiece
+from data_pipeline.objects.sources import load_object
+from eval.rendering.policies import ClimbConfig, chosen_objects, scores_of_object, view_scores
+from eval.walks.ladder import CLIMBED
 from mevs_jax import cameras_at, fibonacci_sphere
 from mevs_jax.rendering import render_depth
 from tests.conftest import open3d_or_skip

@@ -13,8 +13,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from data_pipeline.augment import CloudAugmentation, ImageAugmentation, augment_cloud, augment_image
-from data_pipeline.batches import (
+from data_pipeline.capture.casting import CaptureConfig, capture, rig_for
+from data_pipeline.dataset.augment import CloudAugmentation, ImageAugmentation, augment_cloud, augment_image
+from data_pipeline.dataset.batches import (
     ViewBatches,
     evaluation_batches,
     sample_pixels,
@@ -22,7 +23,7 @@ from data_pipeline.batches import (
     train_batches,
     validation_batches,
 )
-from data_pipeline.builder import (
+from data_pipeline.dataset.builder import (
     SPLITS,
     DataConfig,
     load_statistics,
@@ -31,9 +32,9 @@ from data_pipeline.builder import (
     split_objects,
     view_entropies,
 )
-from data_pipeline.capture import CaptureConfig, capture, rig_for
-from data_pipeline.inputs import cloud_input, image_input
-from data_pipeline.meshes import DataError, load_object, open_source
+from data_pipeline.dataset.inputs import cloud_input, image_input
+from data_pipeline.errors import DataError
+from data_pipeline.objects.sources import load_object, open_source
 from mevs_jax import Camera, depth_entropy, partial_cloud
 
 CONFIG = DataConfig(train_per_class=5, test_per_class=2, capture=CaptureConfig(views=8, resolution=32))
@@ -133,7 +134,7 @@ def test_more_records_than_memory_are_sorted_on_disk(tmp_path, data):
     """TFDS keeps 1 GiB of records in memory; beyond that its own code wants TensorFlow, and ours must do without."""
     from tensorflow_datasets.core import shuffle
 
-    from data_pipeline.builder import _builder_class
+    from data_pipeline.dataset.builder import _builder_class
 
     _builder_class()
     limit = shuffle.MAX_MEM_BUFFER_SIZE

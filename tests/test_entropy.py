@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from skimage.measure import shannon_entropy as skimage_entropy
 
-from data_pipeline import capture
+from data_pipeline.capture import casting as capture
 from mevs_jax import depth_entropy, depth_levels, quantise_depth, shannon_entropy
 from mevs_jax.entropy import DEPTH_SCALE
 

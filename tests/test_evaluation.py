@@ -15,14 +15,14 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from data_pipeline.builder import DatasetStatistics
-from eval.comparison import class_mean, first_reaching
-from eval.exact import expected_random
-from eval.grid import FIRST_MV, THRESHOLDS, GridConfig, run_grid
-from eval.knowledge import learn
-from eval.ladder import CLIMBED, Rung
-from eval.study import entropy_errors, exactly_random, reachable_views, run_study, single_view
-from eval.view_tables import ViewTables, load_view_tables, save_view_tables
+from data_pipeline.dataset.builder import DatasetStatistics
+from eval.numbers.comparison import class_mean, first_reaching
+from eval.numbers.study import entropy_errors, exactly_random, reachable_views, run_study, single_view
+from eval.tables import ViewTables, load_view_tables, save_view_tables
+from eval.walks.exact import expected_random
+from eval.walks.grid import FIRST_MV, THRESHOLDS, GridConfig, run_grid
+from eval.walks.knowledge import learn
+from eval.walks.ladder import CLIMBED, Rung
 from mevs_jax import POLICIES, ViewGraph, bootstrap_interval, fibonacci_sphere, select_from_table
 from tests.reference import numpy_rules
 

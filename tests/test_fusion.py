@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 from flax import nnx
 
-from eval.active import calibrated
-from eval.active_study import random_sets_study
-from mevs_jax.fusion import SetFusion, SumFusion, about_the_first
-from train.fusion import Features, FusionConfig, SetFusionConfig, random_sets, sets_of_size, train_fusion
+from eval.learned.study import random_sets_study
+from mevs_jax.models.set_fusion import SetFusion, SumFusion, about_the_first
+from train.choosing.calibrated import calibrated
+from train.choosing.features import Features, FusionConfig, SetFusionConfig, random_sets, sets_of_size, train_fusion
 
 VIEWS, FEATURES, CLASSES = 5, 12, 3
 

@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 from flax import nnx
 
-from data_pipeline.capture import CaptureConfig
-from eval.knowledge import learn
-from eval.live import Captures, LiveWalker, Networks
+from data_pipeline.capture.casting import CaptureConfig
+from eval.walks.knowledge import learn
+from eval.walks.live import Captures, LiveWalker, Networks
 from mevs_jax import POLICIES, ViewGraph, ViewTable, fibonacci_sphere, select_from_table
-from train.classifier import ClassifierConfig, ClassifierTask, ResNetConfig
-from train.entropy import EntropyConfig, EntropyTask, PointNet2Config
+from train.tasks.classifier import ClassifierConfig, ClassifierTask, ResNetConfig
+from train.tasks.entropy import EntropyConfig, EntropyTask, PointNet2Config
 
 OBJECTS, VIEWS, CLASSES, SIDE, POINTS = 512, 8, 4, 8, 24
 CAMERA = CaptureConfig(views=VIEWS, resolution=SIDE)

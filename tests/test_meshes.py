@@ -10,18 +10,12 @@ import numpy as np
 import pytest
 import trimesh
 
-from data_pipeline.furniture import CLASSES, VARIANTS, furniture
-from data_pipeline.meshes import (
-    DamagedMesh,
-    DataError,
-    EmptyMesh,
-    VoxelGrid,
-    load_object,
-    normalise,
-    open_source,
-    parse_mesh,
-    parse_off,
-)
+from data_pipeline.errors import DamagedMesh, DataError, EmptyMesh
+from data_pipeline.objects.formats import parse_mesh, parse_off
+from data_pipeline.objects.furniture import CLASSES, VARIANTS, furniture
+from data_pipeline.objects.mesh import normalise
+from data_pipeline.objects.sources import load_object, open_source
+from data_pipeline.objects.voxels import VoxelGrid
 
 CUBE = trimesh.creation.box((1, 1, 1))
 

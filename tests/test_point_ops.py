@@ -7,7 +7,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from mevs_jax import ball_query, farthest_point_sample, point_kernels
+from mevs_jax import ball_query, farthest_point_sample
+from mevs_jax.points import kernels as point_kernels
 from tests.reference import numpy_rules
 
 pytestmark = pytest.mark.usefixtures("fully_compiled")

@@ -11,20 +11,34 @@ import numpy as np
 import pytest
 from flax import nnx
 
-from eval.active import _made_once
-from eval.active_stopping import Signal, beside
-from eval.active_study import fixed_order_scores, novel_classes, seeds_together, study
-from eval.active_walks import Learner, OnLattice
-from eval.confidence import stops_at
+from eval.learned.stopping import Signal, beside
+from eval.learned.study import fixed_order_scores, novel_classes, seeds_together, study
+from eval.learned.walks import Learner, OnLattice
+from eval.numbers.confidence import stops_at
 from mevs_jax import ViewGraph, ViewTable, fibonacci_sphere
-from mevs_jax.fusion import CalibratedFusion, SetFusion
+from mevs_jax.beliefs import CalibratedFusion
 from mevs_jax.models import ViewPolicy
+from mevs_jax.models.set_fusion import SetFusion
 from mevs_jax.models.view_policy import direction_features, expected_gain, worth
-from mevs_jax.policies import POLICIES, Knowledge, fused_oracle, learnt, looking_ahead, random_view
+from mevs_jax.policies.base import Knowledge
+from mevs_jax.policies.learned import learnt, looking_ahead
+from mevs_jax.policies.oracles import fused_oracle
+from mevs_jax.policies.registry import POLICIES
+from mevs_jax.policies.uninformed import random_view
 from mevs_jax.selection import by_attention, select_from_table
-from train.fusion import Features
-from train.policy import Choices, PolicyConfig, choices_along, graph_of, policy_loss, train_policy, unseen, walk
-from train.q_learning import QLearningConfig, temporal_difference, train_by_q_learning, transitions_along
+from train.choosing.features import Features
+from train.choosing.policy import (
+    Choices,
+    PolicyConfig,
+    choices_along,
+    graph_of,
+    policy_loss,
+    train_policy,
+    unseen,
+    walk,
+)
+from train.choosing.q_learning import QLearningConfig, temporal_difference, train_by_q_learning, transitions_along
+from train.kept import _made_once
 
 VIEWS, CLASSES, SEEN = 6, 4, 3
 

@@ -15,11 +15,11 @@ import pytest
 from flax import nnx
 from safetensors.numpy import save_file
 
-from data_pipeline.meshes import DataError
+from data_pipeline.errors import DataError
 from mevs_jax import ResNet
 from tests.reference.weights import made_up_inputs, made_up_weights, small_state
 from tests.test_models import GOLDEN, golden_shapes
-from train.pretrained import (
+from train.starting_weights import (
     _Storage,
     _Tensor,
     read_state_dict,

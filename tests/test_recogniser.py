@@ -16,19 +16,21 @@ import trimesh
 from flax import nnx
 from scipy.spatial.transform import Rotation
 
-from data_pipeline.augment import ViewAugmentation, object_changes, views_after
-from data_pipeline.batches import ViewBatches, equally_often, evaluation_batches, fold_of, train_batches
-from data_pipeline.builder import load_statistics, open_split, prepare
-from data_pipeline.capture import DEPTH_SCALE, CaptureConfig, capture, rig_for
-from data_pipeline.inputs import depth_and_normals
-from data_pipeline.meshes import DataError, Mesh
-from eval.active import Stages, _see_changed, _see_rotated, check_active
-from eval.pipeline import TINY
+from data_pipeline.capture.casting import DEPTH_SCALE, CaptureConfig, capture, rig_for
+from data_pipeline.dataset.augment import ViewAugmentation, object_changes, views_after
+from data_pipeline.dataset.batches import ViewBatches, equally_often, evaluation_batches, fold_of, train_batches
+from data_pipeline.dataset.builder import load_statistics, open_split, prepare
+from data_pipeline.dataset.inputs import depth_and_normals
+from data_pipeline.errors import DataError
+from data_pipeline.objects.mesh import Mesh
+from eval.settings import TINY
 from mevs_jax.cameras import Camera, look_at_origin, pixel_directions
 from mevs_jax.models import Recogniser, ResNet
 from mevs_jax.viewpoints import viewpoint_lattice
+from train.choosing.looks import _see_changed, _see_rotated
+from train.choosing.stages import Stages, check_active
 from train.loop import load_best, steps_of_an_epoch
-from train.recogniser import RecogniserTask
+from train.tasks.recogniser import RecogniserTask
 
 CAMERA = CaptureConfig(views=6, resolution=48)
 

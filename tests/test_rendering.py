@@ -7,10 +7,12 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from data_pipeline.capture import CaptureConfig, capture, rig_for
-from data_pipeline.captures import capture_all, capture_path
-from data_pipeline.meshes import FurniturePiece, Mesh, ObjectEntry, load_object, open_source
-from data_pipeline.rasterise import capture_by_rasterising
+from data_pipeline.capture.casting import CaptureConfig, capture, rig_for
+from data_pipeline.capture.rasterise import capture_by_rasterising
+from data_pipeline.capture.workers import capture_all, capture_path
+from data_pipeline.objects.mesh import Mesh, ObjectEntry
+from data_pipeline.objects.recipes import FurniturePiece
+from data_pipeline.objects.sources import load_object, open_source
 from mevs_jax import Camera, look_at_origin
 from mevs_jax.rendering import pad_triangles, render_depth
 
@@ -41,7 +43,7 @@ def test_rasterising_sees_real_meshes_and_voxels_as_rays_do(real_meshes, real_vo
         if path.suffix:
             entries = open_source(str(path), train_per_class=0, test_per_class=0).entries
         else:
-            from data_pipeline.meshes import MeshFile
+            from data_pipeline.objects.recipes import MeshFile
 
             entries = [ObjectEntry(file.stem, 0, "train", MeshFile(str(file))) for file in sorted(path.glob("*.off"))]
         for index in np.linspace(0, len(entries) - 1, count).astype(int):
@@ -92,7 +94,7 @@ def test_a_data_set_can_be_captured_by_rasterising(tmp_path):
     by_rays, drawn = (CaptureConfig(views=4, resolution=32, backend=kind) for kind in ("raycast", "rasterise"))
     for config in (by_rays, drawn):
         assert capture_all(entries, config, tmp_path / config.backend, workers=2) == {}
-    from data_pipeline.capture import load_capture
+    from data_pipeline.capture.casting import load_capture
 
     for entry in entries:
         a, b = (load_capture(capture_path(tmp_path / kind, entry)) for kind in ("raycast", "rasterise"))

@@ -16,10 +16,10 @@ import optax
 import pytest
 from flax import nnx
 
-from data_pipeline.batches import train_batches
-from data_pipeline.builder import load_statistics
-from data_pipeline.meshes import DataError
-from eval.pipeline import tasks
+from data_pipeline.dataset.batches import train_batches
+from data_pipeline.dataset.builder import load_statistics
+from data_pipeline.errors import DataError
+from eval.stages import tasks
 from tests.scaling_worker import SETTINGS
 from tests.test_training import lines
 from train.devices import check_batch, device_mesh, is_lost_process, parameter_sharding

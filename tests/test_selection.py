@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from eval.ladder import CLIMBED
+from eval.walks.ladder import CLIMBED
 from mevs_jax import (
     POLICIES,
     Knowledge,

@@ -9,8 +9,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from data_pipeline.meshes import DataError, FurniturePiece, Mesh, ObjectEntry, load_object
-from data_pipeline.volumes import decimate, reconstruct, voxelise, voxelise_cloud
+from data_pipeline.errors import DataError
+from data_pipeline.objects.mesh import Mesh, ObjectEntry
+from data_pipeline.objects.recipes import FurniturePiece
+from data_pipeline.objects.reconstruction import decimate, reconstruct, voxelise, voxelise_cloud
+from data_pipeline.objects.sources import load_object
 from mevs_jax import Camera, depth_entropy, fibonacci_sphere, look_at_origin, orbit, partial_cloud
 from mevs_jax.rendering import (
     Softness,
@@ -384,8 +387,8 @@ def test_a_surface_is_reconstructed_through_what_was_seen():
 def test_the_command_climbs_and_draws(method, tmp_path):
     from PIL import Image
 
-    from data_pipeline.builder import DataConfig
-    from eval.ascent import AscentConfig, ascend_on
+    from data_pipeline.dataset.builder import DataConfig
+    from eval.rendering.ascent import AscentConfig, ascend_on
 
     data = DataConfig(source="furniture10")
     config = AscentConfig(object="chair_test_0001", method=method, starts=2, resolution=16)

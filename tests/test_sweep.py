@@ -14,10 +14,10 @@ import pytest
 from flax import nnx
 
 import train.sweep
-from data_pipeline.builder import load_statistics
-from data_pipeline.meshes import DataError
-from eval.pipeline import tasks, train_sweep
-from eval.sweep_report import sweep_table
+from data_pipeline.dataset.builder import load_statistics
+from data_pipeline.errors import DataError
+from eval.report.sweep import sweep_table
+from eval.stages import tasks, train_sweep
 from tests.scaling_worker import SETTINGS
 from train.devices import device_mesh
 from train.loop import fit, load_best, validate, validation_set

@@ -13,18 +13,18 @@ import numpy as np
 import pytest
 from matplotlib.figure import Figure
 
-from data_pipeline.builder import DatasetStatistics
-from data_pipeline.furniture import CLASSES, furniture
-from eval.grid import THRESHOLDS, GridConfig
-from eval.pipeline import PRESETS
-from eval.thesis_figures import FIGURES, FigureInputs
-from eval.thesis_networks import BACKBONES, FRAMES, PIPELINE, VIEWS, ThesisFolder, backbone_task, entropy_task
-from eval.thesis_page import CHAPTERS
-from eval.thesis_results import LatticeTables, all_results, best_cells, machine
-from eval.thesis_tables import all_tables, markdown, thesis_numbers
-from eval.timing import decision_memory, milliseconds, time_local_maxima
+from data_pipeline.dataset.builder import DatasetStatistics
+from data_pipeline.objects.furniture import CLASSES, furniture
+from eval.numbers.timing import decision_memory, milliseconds, time_local_maxima
+from eval.settings import PRESETS
+from eval.thesis.figures import FIGURES, FigureInputs
+from eval.thesis.page import CHAPTERS
+from eval.thesis.results import LatticeTables, all_results, best_cells, machine
+from eval.thesis.tables import all_tables, markdown, thesis_numbers
+from eval.walks.grid import THRESHOLDS, GridConfig
 from mevs_jax.viewpoints import ViewGraph, fibonacci_sphere
 from tests.reference.policies import maxima_first
+from train.thesis_networks import BACKBONES, FRAMES, PIPELINE, VIEWS, ThesisFolder, backbone_task, entropy_task
 
 OBJECTS = 20
 

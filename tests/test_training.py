@@ -16,13 +16,14 @@ import pytest
 from flax import nnx
 
 import train.loop
-from data_pipeline.builder import load_statistics
-from data_pipeline.meshes import DataError
-from eval.pipeline import TINY, tasks
+from data_pipeline.dataset.builder import load_statistics
+from data_pipeline.errors import DataError
+from eval.settings import TINY
+from eval.stages import tasks
 from train.checkpoints import Checkpoints
 from train.loop import fit, load_best
 from train.optimiser import OptimiserConfig, descent, learning_rate
-from train.pretrained import weights_from_network
+from train.starting_weights import weights_from_network
 
 SETTINGS = replace(
     TINY,

@@ -8,7 +8,7 @@ from typing import get_args, get_type_hints
 import numpy as np
 import pytest
 
-from data_pipeline.capture import CaptureConfig
+from data_pipeline.capture.casting import CaptureConfig
 from mevs_jax import (
     ViewGraph,
     fibonacci_sphere,

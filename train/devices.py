@@ -14,7 +14,7 @@ import jax
 import numpy as np
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
-from data_pipeline.meshes import DataError
+from data_pipeline.errors import DataError
 from train.step import Task
 
 DATA, MODEL = "data", "model"

@@ -20,7 +20,7 @@ import numpy as np
 from flax import nnx
 from jax.sharding import Mesh
 
-from data_pipeline.batches import (
+from data_pipeline.dataset.batches import (
     objects_kept,
     steps_per_epoch,
     train_batches,
@@ -28,15 +28,15 @@ from data_pipeline.batches import (
     validation_batches,
     validation_splits,
 )
-from data_pipeline.builder import DatasetStatistics
+from data_pipeline.dataset.builder import DatasetStatistics
+from data_pipeline.errors import DataError
 from data_pipeline.files import as_read, read_json, write_json, write_text
-from data_pipeline.meshes import DataError
 from data_pipeline.progress import console, progress_bar
 from train.checkpoints import Checkpoints
 from train.devices import DATA, check_batch, device_mesh, is_first, parameter_sharding, place, place_batch, summed_over
 from train.optimiser import learning_rate
 from train.preemption import Preempted, Preemption
-from train.pretrained import StartingWeights
+from train.starting_weights import StartingWeights
 from train.step import Metrics, Task, TrainState, abstract_state, evaluate_step_of, initial_state, train_step_of
 
 

@@ -16,9 +16,9 @@ import numpy as np
 import optax
 from flax import nnx
 
-from data_pipeline.batches import ViewBatches
+from data_pipeline.dataset.batches import ViewBatches
 from train.optimiser import OptimiserConfig, descent, learning_rate
-from train.pretrained import StartingWeights
+from train.starting_weights import StartingWeights
 
 Batch = dict[str, jax.Array]
 Metrics = dict[str, jax.Array]

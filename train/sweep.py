@@ -19,18 +19,18 @@ import jax.numpy as jnp
 import numpy as np
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
-from data_pipeline.batches import train_batches
-from data_pipeline.builder import DatasetStatistics
+from data_pipeline.dataset.batches import train_batches
+from data_pipeline.dataset.builder import DatasetStatistics
+from data_pipeline.errors import DataError
 from data_pipeline.files import as_read, read_json, write_json, write_text
-from data_pipeline.meshes import DataError
 from data_pipeline.progress import console, progress_bar
 from train.checkpoints import Checkpoints
-from train.classifier import ClassifierTask
 from train.devices import DATA, device_mesh
-from train.entropy import EntropyTask
 from train.loop import Lead, identity_of, steps_of_an_epoch, validation_set, weighted_means
 from train.preemption import Preempted, Preemption
 from train.step import Hyperparameters, TrainState, abstract_state, evaluate_step_of, initial_state, train_step_of
+from train.tasks.classifier import ClassifierTask
+from train.tasks.entropy import EntropyTask
 
 SweepTask = ClassifierTask | EntropyTask
 Range = tuple[float, float]

@@ -21,7 +21,7 @@ from jaxtyping import Array, Float, Int
 from mevs_jax.arrays import AnyArray
 from mevs_jax.models.batch_norm import BatchNorm
 from mevs_jax.models.product import product
-from mevs_jax.point_ops import ball_query, farthest_point_sample
+from mevs_jax.points.ops import ball_query, farthest_point_sample
 
 
 @dataclass(frozen=True)

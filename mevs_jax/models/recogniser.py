@@ -7,8 +7,8 @@ from flax import nnx
 from jaxtyping import Array, Bool, Float
 
 from mevs_jax.arrays import AnyArray
-from mevs_jax.fusion import SetFusion
 from mevs_jax.models.resnet import ResNet
+from mevs_jax.models.set_fusion import SetFusion
 
 
 class Recogniser(nnx.Module):

@@ -16,7 +16,7 @@ from flax import nnx
 from jaxtyping import Array, Bool, Float
 
 from mevs_jax.arrays import AnyArray
-from mevs_jax.fusion import about_the_first
+from mevs_jax.models.set_fusion import about_the_first
 
 Utility = Literal["probability", "log"]
 """What a belief is worth: the true class's probability, or its logarithm."""

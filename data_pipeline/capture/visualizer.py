@@ -1,0 +1,72 @@
+"""The thesis's own way to capture (§4.1): Open3D's `Visualizer`, a window that an OpenGL driver draws into.
+
+It needs a display (on a server, `xvfb-run -a mevs data --dataset.capture.backend visualizer`) and about a quarter of a second a
+view in software. Ray casting sees the same (`data_pipeline.capture`), so this is here to show that, and for those who want it.
+Unlike the thesis's script it moves the camera, not the mesh, and sets its distance itself instead of having it follow the
+bounding box, so no view depends on the one before.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from data_pipeline.capture.casting import Capture, Rig, store_depth
+from data_pipeline.errors import DataError
+from data_pipeline.objects.mesh import Mesh
+
+
+def capture_with_visualizer(mesh: Mesh, rig: Rig) -> Capture:
+    """Depth and shaded image of `mesh` from every camera of `rig`, rasterised.
+
+    Raises:
+        DataError: without Open3D's system libraries, or without a display.
+    """
+    try:
+        import open3d
+    except (ImportError, OSError) as error:
+        raise DataError(
+            f"the visualizer backend needs Open3D, which cannot be loaded here ({error}); use --dataset.capture.backend raycast"
+        ) from error
+
+    views, side = rig.directions.shape[:2]
+    focal = side / 2 / math.tan(rig.field_of_view / 2)
+    visualizer = open3d.visualization.Visualizer()
+    if not visualizer.create_window(width=side, height=side, visible=False):
+        raise DataError(
+            "the visualizer backend needs a display; run it under xvfb-run -a, or use --dataset.capture.backend raycast"
+        )
+    try:
+        surface = open3d.geometry.TriangleMesh(
+            open3d.utility.Vector3dVector(mesh.vertices.astype(np.float64)), open3d.utility.Vector3iVector(mesh.faces)
+        )
+        surface.compute_triangle_normals()
+        visualizer.add_geometry(surface)
+        options = visualizer.get_render_option()
+        options.background_color = np.zeros(3)
+        options.mesh_show_back_face = True  # the faces of CAD models point either way
+        control = visualizer.get_view_control()
+        depth, image = np.zeros((views, side, side), np.float32), np.zeros((views, side, side), np.uint8)
+        for view in range(views):
+            camera = open3d.camera.PinholeCameraParameters()
+            # Open3D wants the principal point here, half a pixel off; what it draws is centred all the same.
+            camera.intrinsic = open3d.camera.PinholeCameraIntrinsic(
+                side, side, focal, focal, side / 2 - 0.5, side / 2 - 0.5
+            )
+            camera.extrinsic = np.linalg.inv(rig.poses[view].astype(np.float64))
+            if not control.convert_from_pinhole_camera_parameters(camera, allow_arbitrary=True):
+                raise DataError(
+                    f"Open3D's window did not take a camera of {side}×{side} pixels; use another resolution"
+                )
+            distance = float(np.linalg.norm(rig.poses[view, :3, 3]))
+            control.set_constant_z_near(max(distance - 1.01, 0.01))
+            control.set_constant_z_far(distance + 1.01)
+            visualizer.poll_events()
+            visualizer.update_renderer()
+            depth[view] = np.asarray(visualizer.capture_depth_float_buffer(do_render=True))
+            shaded = np.asarray(visualizer.capture_screen_float_buffer(do_render=True)).mean(axis=-1)
+            image[view] = np.where(depth[view] > 0, np.round(255 * shaded), 0)
+    finally:
+        visualizer.destroy_window()
+    return Capture(store_depth(np.where(depth > 0, depth, np.inf)), image, mesh.extent)

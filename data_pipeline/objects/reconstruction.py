@@ -1,0 +1,107 @@
+"""Meshes and clouds become what a camera can be optimised on: fewer faces, surfaces through points, grids of densities.
+
+By Open3D, as the thesis proposes (§4.2.1): quadric decimation, Poisson reconstruction, voxelisation.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from data_pipeline.errors import DataError
+from data_pipeline.objects.mesh import Mesh
+
+
+def _open3d() -> Any:
+    try:
+        import open3d
+    except (ImportError, OSError) as error:
+        raise DataError(
+            f"reconstruction and voxelisation need Open3D, which cannot be loaded here ({error}); install libusb-1.0 and libgl1"
+        ) from error
+    return open3d
+
+
+def _surface(mesh: Mesh) -> Any:
+    utility = _open3d().utility
+    return _open3d().geometry.TriangleMesh(
+        utility.Vector3dVector(mesh.vertices.astype(np.float64)), utility.Vector3iVector(mesh.faces)
+    )
+
+
+def _cloud(points: np.ndarray) -> Any:
+    return _open3d().geometry.PointCloud(_open3d().utility.Vector3dVector(points.astype(np.float64)))
+
+
+def decimate(mesh: Mesh, faces: int) -> Mesh:
+    """The mesh with at most about `faces` triangles, as it is where it has no more."""
+    if len(mesh.faces) <= faces:
+        return mesh
+    surface = _surface(mesh)
+    surface.merge_close_vertices(1e-6)  # else every face of a CAD model is an island that cannot be simplified
+    simpler = surface.simplify_quadric_decimation(faces)
+    return Mesh(np.asarray(simpler.vertices, np.float32), np.asarray(simpler.triangles, np.int32), mesh.extent)
+
+
+def normals_towards(points: np.ndarray, camera: np.ndarray) -> np.ndarray:
+    """Normals (points, 3) of a surface seen from the position `camera`, from each point's neighbours.
+
+    Raises:
+        DataError: where there are too few points for a plane.
+    """
+    if len(points) < 3:
+        raise DataError(f"normals need at least 3 points, got {len(points)}")
+    open3d, cloud = _open3d(), _cloud(points)
+    cloud.estimate_normals(open3d.geometry.KDTreeSearchParamKNN(12))
+    cloud.orient_normals_towards_camera_location(camera.astype(np.float64))
+    return np.asarray(cloud.normals, np.float32)
+
+
+def reconstruct(points: np.ndarray, normals: np.ndarray, faces: int, *, depth: int = 6) -> Mesh:
+    """The surface through a cloud by Poisson reconstruction, without what lies far from every point, decimated.
+
+    Args:
+        points: (points, 3) in the unit sphere.
+        normals: (points, 3) outwards; their lengths do not matter.
+        faces: at most about so many.
+        depth: of the octree: 2^depth cells along an edge.
+
+    Raises:
+        DataError: where there are too few points for a surface.
+    """
+    if len(points) < 16:
+        raise DataError(f"a surface needs at least 16 points, got {len(points)}")
+    open3d, cloud = _open3d(), _cloud(points)
+    unit = normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
+    cloud.normals = open3d.utility.Vector3dVector(unit.astype(np.float64))
+    surface, support = open3d.geometry.TriangleMesh.create_from_point_cloud_poisson(cloud, depth=depth, n_threads=1)
+    # The surface closes itself far from where anything was seen; those parts have little support.
+    surface.remove_vertices_by_mask(np.asarray(support) < np.quantile(np.asarray(support), 0.05))
+    surface = surface.crop(open3d.geometry.AxisAlignedBoundingBox(points.min(0) - 0.1, points.max(0) + 0.1))
+    if len(surface.triangles) == 0:
+        raise DataError(f"{len(points)} points give no surface")
+    vertices, triangles = np.asarray(surface.vertices, np.float32), np.asarray(surface.triangles, np.int32)
+    return decimate(Mesh(vertices, triangles, np.ptp(points, axis=0)), faces)
+
+
+def voxelise(mesh: Mesh, nodes: int = 32) -> np.ndarray:
+    """Density (nodes, nodes, nodes) float32, 1 in every voxel of the cube [−1, 1]³ that the surface passes through."""
+    surface = _surface(mesh)
+    grid = _open3d().geometry.VoxelGrid.create_from_triangle_mesh_within_bounds(
+        surface, 2 / nodes, -np.ones(3), np.ones(3)
+    )
+    return _density([voxel.grid_index for voxel in grid.get_voxels()], nodes)
+
+
+def voxelise_cloud(points: np.ndarray, nodes: int = 32) -> np.ndarray:
+    """The same of a cloud (points, 3): 1 in every voxel that holds a point."""
+    return _density(np.floor((points + 1) / 2 * nodes).astype(int), nodes)
+
+
+def _density(occupied: Any, nodes: int) -> np.ndarray:
+    density = np.zeros((nodes,) * 3, np.float32)
+    index = np.asarray(occupied, int).reshape(-1, 3)
+    inside = ((index >= 0) & (index < nodes)).all(axis=1)
+    density[tuple(index[inside].T)] = 1
+    return density

@@ -1,0 +1,255 @@
+"""What the networks of `mevs active` reach: on each lattice, without a pose, on classes never chosen for, and how fast.
+
+What is found is kept in files of the seed's folder; what is there is not measured again.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import fields, replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from flax import nnx
+from jaxtyping import Array
+
+from data_pipeline.dataset.builder import load_statistics, open_split
+from data_pipeline.dataset.inputs import depth_and_normals
+from data_pipeline.files import as_read, read_json, write_json, write_npz
+from data_pipeline.progress import console
+from eval.learned.stopping import PRICES_OF_A_VIEW, PRICES_OF_THE_WAY
+from eval.learned.study import ByObject, novel_classes, seeds_together, study
+from eval.learned.walks import OnLattice
+from eval.numbers.timing import milliseconds
+from eval.tables import load_view_tables
+from eval.thesis.results import machine
+from mevs_jax.models import Recogniser
+from mevs_jax.models.view_policy import expected_gain
+from mevs_jax.viewpoints import viewpoint_lattice
+from train.choosing.stages import Stages, lattice_data
+from train.kept import made_by
+from train.loop import load_best
+
+_FORM = 5
+"""Of what is kept of walks; with another one they are walked again."""
+
+
+def train_all(stages: Stages) -> None:
+    """Every network of one seed, but those that only one part of what is measured asks for."""
+    stages.prepare()
+    stages.train_recogniser()
+    stages.policy("learnt")
+
+
+def measure(stages: Stages) -> dict[str, Any]:
+    """What one seed's networks reach by number of candidate views. With the first seed, also where nobody knows which way the
+    objects face, among directions of their own around every object, ablations, classes never chosen for, and objects turned
+    anyhow."""
+    own, config = stages.dataset.capture.views, stages.config
+
+    def on_lattice(views: int, **given: Any) -> dict[str, Any]:
+        data = lattice_data(stages.dataset, stages.out, views)
+        return _walks(stages, f"lattice_{views}", data, **given)
+
+    found = {"lattices": {str(views): on_lattice(views) for views in (own, *config.lattices)}}
+    if stages.seed:
+        return found
+    found["decision"] = _decision(stages)
+    found["unposed"] = {str(own): on_lattice(own, posed=False)}
+    found["scattered"] = {str(own): _walks(stages, "turned", stages.turned)}
+    if config.ablations:
+        found["ablations"] = {str(own): on_lattice(own, ablations=config.ablations)}
+    if config.novel:
+        found["novel"] = _novel(stages)
+    if config.rotation_epochs:
+        found["rotated"] = {str(own): _rotated(stages)}
+    return found
+
+
+def together(seeds: Sequence[Stages], found: Sequence[dict[str, Any]]) -> dict[str, Any]:
+    """What all seeds reach on average, by number of candidate views; `found` is what `measure` gave for each."""
+    lattices = {}
+    for views, first in found[0]["lattices"].items():
+        each = []
+        for stages in seeds:
+            with np.load(stages.folder / f"walks_lattice_{views}.npz") as kept:
+                each.append(
+                    {
+                        name: ByObject(**{field.name: kept[f"{name} {field.name}"] for field in fields(ByObject)})
+                        for name in first["policies"]
+                    }
+                )
+        lattices[views] = seeds_together([one["lattices"][views] for one in found], each, "learnt")
+    return lattices
+
+
+def _kept(path: Path, identity: dict[str, Any], find: Callable[[], dict[str, Any]]) -> dict[str, Any]:
+    """What the file holds under this identity, else what is found now."""
+    identity = as_read(identity)
+    if not path.exists() or read_json(path)["identity"] != identity:
+        write_json(path, find() | {"identity": identity})
+    return read_json(path)
+
+
+def _walks(
+    stages: Stages, views: str, data: Path, ablations: tuple[str, ...] = (), posed: bool = True
+) -> dict[str, Any]:
+    """Every policy's walks among the views of a data set, which the features kept are named after; or those of the method and its
+    ablations."""
+    config, method = stages.config, "learnt" if posed else "learnt_unposed"
+    shared = posed and data != stages.turned
+    names = [method, *ablations, *["learnt_and_table"] * (shared and not ablations)]
+    if "cloud" in names and not stages.has_clouds:
+        console.print(
+            f"Left out: the view policy that sees clouds; PointNet++ is trained by: mevs train --out {stages.out}"
+        )
+        names.remove("cloud")
+    learners = [stages.learner(name) for name in names]
+    learners[0] = replace(learners[0], name="learnt")
+    costs = posed and not ablations and data == stages.out / "data"
+    kind = ("" if posed else "_unposed") + ("_ablations" if ablations else "")
+    path = stages.folder / f"walks_{views}{kind}.json"
+
+    def objects_of(split: str) -> OnLattice:
+        features = stages.features(f"{views}_{split}", data, split)
+        if "cloud" in names:
+            features = replace(features, clouds=stages.clouds(data, split))
+        return OnLattice(features, *_entropies(stages.out, data, split))
+
+    def walk() -> dict[str, Any]:
+        validation, test = map(objects_of, ("val", "test"))
+        known = "" if posed else ", which way they face unknown"
+        objects, count, _ = test.features.logits.shape
+        around = " of its own around each" if data == stages.turned else ""
+        around = ", objects turned anyhow" if stages.upright is not None else around
+        console.print(
+            f"Walking {objects} test objects, {count} candidate views{around}{known}{', ablations' * bool(ablations)}"
+        )
+        found, each = study(
+            stages.fusion(posed=posed),
+            learners,
+            validation,
+            test,
+            max_views=config.max_views,
+            draws=config.draws,
+            fitting_starts=config.fitting_starts,
+            seed=stages.seed,
+            costs=costs,
+            others=not ablations,
+        )
+        arrays = {f"{name} {key}": value for name, policy in each.items() for key, value in vars(policy).items()}
+        write_npz(path.with_suffix(".npz"), **arrays)
+        return found
+
+    identity = {
+        "form": _FORM,
+        "made_by": made_by(load_statistics(data), stages.recogniser_folder()),
+        "policies": [
+            read_json(stages.policy_folder(learner.made_as) / "summary.json")["identity"] for learner in learners
+        ],
+        "walks": [
+            names,
+            config.max_views,
+            config.draws,
+            config.fitting_starts,
+            _entropy_tables(stages.out, data, "test") is not None,
+            costs and [PRICES_OF_A_VIEW, PRICES_OF_THE_WAY],
+        ],
+    }
+    return _kept(path, identity, walk)
+
+
+def _rotated(stages: Stages) -> dict[str, Any]:
+    """Walks around objects turned by any rotation, which the recogniser was trained further on."""
+    turned_anyhow = stages.rotated()
+    turned_anyhow.train_recogniser()
+    return _walks(turned_anyhow, "turned", stages.turned, posed=False)
+
+
+def _novel(stages: Stages) -> dict[str, Any]:
+    """How policies do on the classes that they were trained without; encoder and fusion know all."""
+    views, classes = stages.dataset.capture.views, len(stages.statistics.classes)
+    data = lattice_data(stages.dataset, stages.out, views)
+    half = classes // 2
+    pairs = [(first, first + half) for first in range(min(stages.config.novel, half))]
+    policies = [(pair, stages.policy(without=pair)) for pair in pairs]
+    identity = {
+        "made_by": made_by(load_statistics(data), stages.recogniser_folder()),
+        "policy": read_json(stages.policy_folder() / "summary.json")["identity"],
+        "walks": [pairs, stages.config.max_views, stages.config.draws],
+    }
+
+    def walk() -> dict[str, Any]:
+        test = stages.features(f"lattice_{views}_test", data, "test")
+        console.print(f"Walking test objects of {2 * len(pairs)} classes that a policy was trained without")
+        return novel_classes(
+            stages.fusion(), policies, stages.policy(), test, stages.config.max_views, stages.config.draws, stages.seed
+        )
+
+    return _kept(stages.folder / "walks_novel.json", identity, walk)
+
+
+def _decision(stages: Stages) -> dict[str, Any]:
+    policy = read_json(stages.policy_folder() / "summary.json")["identity"]
+    identity = {"policy": policy, "machine": machine(), "candidates": stages.dataset.capture.views}
+    return _kept(stages.folder / "decision.json", identity, partial(_decision_times, stages))
+
+
+def _decision_times(stages: Stages, calls: int = 200) -> dict[str, Any]:
+    """Time of one decision among all candidate views (ms), from features that are there and from the newest depth image on."""
+    task, camera, most = stages.task(), stages.dataset.capture, stages.config.max_views
+    recogniser = load_best(task, stages.recogniser_folder())
+    assert isinstance(recogniser, Recogniser)
+    structure, weights = nnx.split((recogniser, stages.policy()))
+    fusion, classes = stages.fusion(), len(stages.statistics.classes)
+    candidates = jnp.asarray(viewpoint_lattice(camera.views, camera.lattice), jnp.float32)
+    seen, present = candidates[:most], jnp.arange(most) < most - 1
+
+    @jax.jit
+    def from_features(weights: nnx.State, given: tuple[Array, Array]) -> Array:
+        features, logits = given
+        belief = fusion(features, seen, present)
+        views = jax.nn.log_softmax(logits / fusion.single, axis=-1)
+        gain_if = nnx.merge(structure, weights)[1](belief, views, seen, present, candidates)[1]
+        return jnp.argmax(expected_gain(belief, gain_if).at[:most].set(-jnp.inf))
+
+    @jax.jit
+    def from_image(weights: nnx.State, given: tuple[Array, Array, Array]) -> Array:
+        image, features, logits = given
+        newest = nnx.merge(structure, weights)[0].see(depth_and_normals(image, camera))
+        features, logits = features.at[most - 2].set(newest[:-classes]), logits.at[most - 2].set(newest[-classes:])
+        return from_features(weights, (features, logits))
+
+    depth = open_split(stages.turned, "test")[0]["depth"]
+    random = np.random.default_rng(0)
+    width = recogniser.encoder.head.in_features
+    inputs = [
+        (depth[i % len(depth)], *(random.normal(size=(most, n)).astype(np.float32) for n in (width, classes)))
+        for i in range(calls)
+    ]
+    times = {
+        "from_features": milliseconds(partial(from_features, weights), [given[1:] for given in inputs]),
+        "from_image": milliseconds(partial(from_image, weights), inputs),
+    }
+    return {
+        name: {f"p{share}": float(np.percentile(taken, share)) for share in (50, 99)} for name, taken in times.items()
+    }
+
+
+def _entropy_tables(out: Path, data: Path, split: str) -> Path | None:
+    """Where `mevs run` has put what the entropy predictor says of this data set, if it has."""
+    path = out / "tables" / f"{split}.npz"
+    return path if data == out / "data" and path.exists() else None
+
+
+def _entropies(out: Path, data: Path, split: str) -> tuple[np.ndarray | None, np.ndarray | None]:
+    """What the entropy predictor of the run says of every view, and the true entropies, where they are known."""
+    path = _entropy_tables(out, data, split)
+    if path is None:
+        return None, None
+    tables = load_view_tables(path)
+    return tables.utility, tables.entropy

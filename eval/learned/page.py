@@ -1,0 +1,362 @@
+"""The page of `mevs active`: learnt fusion and learnt choice beside every other policy, with intervals."""
+
+from __future__ import annotations
+
+import html
+import math
+from pathlib import Path
+from statistics import fmean
+from typing import Any
+
+from data_pipeline.dataset.builder import DatasetStatistics
+from data_pipeline.files import write_text
+from eval.learned.study import BASELINES
+from eval.report import figures
+from eval.report.html import ReportInputs, difference, document, image, percent, signed, span, table
+from eval.walks.ladder import KNOWS
+
+METHOD = "learnt"
+"""The policy that the page is about."""
+_SHOWN = (0, 1, 2, 3, 5, 7)
+"""Steps of walks in tables, from the first view."""
+
+
+def _accuracy(share: float, interval: list[float]) -> str:
+    return f"{percent(share)}<br><small class='note'>{span(interval)}</small>"
+
+
+def _ladder(found: dict[str, Any]) -> str:
+    rows, known, with_gap = [], None, bool(found["gap_closed"])
+    steps = [step for step in _SHOWN if step < len(found["policies"]["random"]["after_views"])]
+    for name, policy in found["policies"].items():
+        if policy["knows"] != known:
+            known = policy["knows"]
+            rows.append([f'<b class="note">Knows {html.escape(KNOWS[known])}</b>'])
+        cells = [_accuracy(*cell) for cell in zip(policy["after_views"], policy["interval"], strict=True)]
+        closed = ["–" if share is None else signed(share, 0).lstrip("+") for share in found["gap_closed"].get(name, ())]
+        rows.append(
+            [
+                html.escape(policy["title"]),
+                *(cells[step] if step < len(cells) else "" for step in steps),
+                *[" / ".join(closed)] * with_gap,
+            ]
+        )
+    header = ["next view chosen by", *(str(step + 1) for step in steps), *["% of the gap"] * with_gap]
+    note = "Accuracy (%) after exactly so many views, with 95 % intervals over objects."
+    if with_gap:
+        note += (
+            " Gap: of the way from random to the label-free oracle after 2 / 3 / 4 views. The oracles try every view and walk "
+            f"from {found['trying_starts']} of the {found['views']} starts, on which the gap is read; the label oracle finds "
+            "views that are right by luck."
+        )
+    return table(header, rows) + f"<p class='note'>{note}</p>"
+
+
+def _against(found: dict[str, Any], bases: tuple[str, ...] = BASELINES) -> str:
+    """Paired differences, in accuracy and in what beliefs say of the true class."""
+    rows, steps = [], (1, 2, 3)
+    for base in bases:
+        if base not in found["policies"]:
+            continue
+        rows.append([f'<b class="note">Above “{html.escape(found["policies"][base]["title"])}”</b>'])
+        for name, policy in found["policies"].items():
+            if name not in found["against"][base] or policy["knows"] in ("nothing", "truth"):
+                continue
+            gain = found["against"][base][name]
+            rows.append([html.escape(policy["title"])])
+            for of in (gain, gain["likelihood"]):
+                known = zip(of["difference"], of["interval"], strict=True)
+                cells = [difference(*cell) for cell in known][1 : len(steps) + 1]
+                rows[-1] += cells + [""] * (len(steps) - len(cells))
+    header = [f"{step + 1} views{unit}" for unit in ("", ", nat/100") for step in steps]
+    return table(["next view chosen by", *header], rows) + (
+        "<p class='note'>Left: differences in accuracy. Right: in the log-probability of the true class, which tells smaller "
+        "ones apart. With 95 % intervals over objects; faint where they hold zero.</p>"
+    )
+
+
+def _ablations(metrics: dict[str, Any]) -> str:
+    """What each part of the method is good for."""
+    if "ablations" not in metrics["seeds"][0]:
+        return ""
+    ((_, found),) = metrics["seeds"][0]["ablations"].items()
+    return (
+        "<h2>What each part is good for</h2><p>The view policy, and the same with one thing done otherwise; same starts.</p>"
+        + _ladder(found)
+        + _against(found, ("random", METHOD))
+    )
+
+
+def _sets(found: dict[str, Any]) -> str:
+    rows = [
+        [
+            str(row["views"]),
+            *(_accuracy(row[name]["accuracy"], row[name]["interval"]) for name in ("sum", "learnt")),
+            difference(row["difference"], row["difference_interval"]),
+            *(percent(row[name]["calibration_error"]) for name in ("sum", "learnt")),
+        ]
+        for row in found["random_sets"]
+    ]
+    header = ["random views", "sum of logits", "set fusion", "difference", "ECE, sum", "ECE, set fusion"]
+    return table(header, rows)
+
+
+def _confidence(found: dict[str, Any]) -> str:
+    policy = found["policies"][METHOD]
+    known = zip(policy["calibration_error"], policy["calibration_error_by_chance"], strict=True)
+    errors = [[str(step + 1), *map(percent, (error, *chance))] for step, (error, chance) in enumerate(known)]
+    rows = [
+        [
+            f"{100 * row['risk']:g} %",
+            percent(row["sure"]),
+            "–" if row["error"] is None else percent(row["error"]),
+            percent(row["accuracy"]),
+            f"{row['views']:.2f}",
+        ]
+        for row in policy["stopping"]
+    ]
+    return (
+        table(["views", "calibration error (%)", "by chance", "95 of 100 below"], errors)
+        + "<p class='note'>By chance: what would be measured, on so many objects, of someone whose confidence is never off.</p>"
+        + "<p>Stopping once the calibrated risk is at most so much, or at the last view.</p>"
+        + table(["risk", "sure (%)", "of those wrong (%)", "accuracy (%)", "views"], rows)
+    )
+
+
+def _costs(found: dict[str, Any]) -> str:
+    """When to stop and how far to go."""
+    costs = found.get("costs")
+    if costs is None:
+        return ""
+    walks = html.escape(found["policies"][costs["thesis_walks"]]["title"])
+    header = ["accuracy (%)", "views", "by calibrated risk: accuracy (%)", "views", "fewer views"]
+    thesis = [[f"{row['threshold']:g}", *_both_rules(row)] for row in costs["beside_thesis"]]
+    paying = [[f"{-row['threshold']:g}", *_both_rules(row)] for row in costs["not_paying"]]
+    steps = [step for step in (1, 3, 7) if step < len(costs["moving"][0]["way"])]
+    ways = [
+        [
+            f"{row['price']:g}",
+            *(
+                cell
+                for step in steps
+                for cell in (
+                    _accuracy(row["after_views"][step], row["interval"][step]),
+                    f"{math.degrees(row['way'][step]):.0f}°",
+                )
+            ),
+        ]
+        for row in costs["moving"]
+    ]
+    return (
+        "<h3>Beside the thesis's rule</h3>"
+        f"<p>The thesis's rule: walks by “{walks}”, the sum of logits, and a threshold on its confidence as it is. Beside it "
+        "the view policy, stopping at the calibrated risk with which it is as accurate on validation objects; – where it never "
+        "is.</p>"
+        + table(["threshold", *header], thesis)
+        + "<h3>Until it does not pay</h3><p>Stopping once the best view left is expected to raise the true class's "
+        "log-probability by less than a view costs (nats); and by risk, at equal accuracy on validation objects.</p>"
+        + table(["cost of a view", *header], paying)
+        + "<h2>Going there</h2><p>Accuracy and way of the camera, where a radian costs so much of the log-probability (nats) "
+        "that a view brings; from some of the starts, as the oracles.</p>"
+        + table(["price", *(title for step in steps for title in (f"{step + 1} views", "way"))], ways)
+    )
+
+
+def _both_rules(row: dict[str, Any]) -> list[str]:
+    own = row["ours"]
+    cells = [percent(row["accuracy"]), f"{row['views']:.2f}"]
+    if own is None:
+        return [*cells, "–", "–", "–"]
+    gain = own["views_difference"]
+    low, high = gain["interval"]
+    fewer = difference(-gain["difference"] / 100, [-high / 100, -low / 100], 2)  # a number, not a share
+    return [*cells, percent(own["accuracy"]), f"{own['views']:.2f}", fewer]
+
+
+def _gain_of_two(against: dict[str, Any], method: str = METHOD) -> str:
+    """Points of two views above those of another policy."""
+    gain = against[method]
+    return difference(gain["difference"][1], gain["interval"][1])
+
+
+def _lead(metrics: dict[str, Any], views: str) -> str:
+    """What it comes to, the mean of all seeds."""
+    each, together = [seed["lattices"][views] for seed in metrics["seeds"]], metrics["together"][views]
+    method, random = (together["policies"][name]["after_views"] for name in (METHOD, "random"))
+    gains, first, tabled = together["against"]["random"], each[0], ""
+    if "learnt_and_table" in gains:
+        known = together["policies"]["learnt_and_table"]["after_views"]
+        tabled = (
+            f" Joined with a table of what views of each class show, the policy reaches {percent(known[1])} %: "
+            f"{_gain_of_two(gains, 'learnt_and_table')}."
+        )
+    single = fmean(found["single_view"] for found in each)
+    every, summed = (fmean(found["random_sets"][-1][name]["accuracy"] for found in each) for name in ("learnt", "sum"))
+    trainings = f" Means of {len(each)} trainings; what follows is of the first, unless said otherwise." * (
+        len(each) > 1
+    )
+    return (
+        f'<p class="lead">Two views are recognised with {percent(method[1])} % accuracy where the second is chosen, '
+        f"{percent(random[1])} % where it is drawn: {_gain_of_two(gains)} points.{tabled} "
+        f"One view alone: {percent(random[0])} %, by its own logits {percent(single)} %; all "
+        f"{first['random_sets'][-1]['views']} fused: {percent(every)} %, summed: {percent(summed)} %.{trainings}</p>"
+        f'<p class="note">Over {first["objects"]} test objects and every start view; all policies share fusion, objects and '
+        f"starts. Everything fitted or chosen is so on {first['validation_objects']} validation objects. The views of these "
+        "lattices were never trained on: training saw other directions around other objects.</p>"
+    )
+
+
+def _unposed(metrics: dict[str, Any]) -> str:
+    """Where it is unknown which way the objects face, beside where it is known, on the same starts."""
+    (views, blind), *_ = metrics["seeds"][0]["unposed"].items()
+    posed = metrics["seeds"][0]["lattices"][views]["policies"]
+    rows = []
+    for name, policy in blind["policies"].items():
+        if policy["knows"] != "truth":
+            for title, found in ((policy["title"], policy), ("… pose known", posed[name])):
+                cells = zip(found["after_views"], found["interval"], strict=True)
+                rows.append([html.escape(title), *(_accuracy(*cell) for cell in cells)])
+    return (
+        "<h2>Facing any way</h2>"
+        "<p>Objects are turned about the vertical by an angle that nobody knows: fusion and policy are told directions "
+        "relative to the first view's alone. After two views the policy is "
+        f"{_gain_of_two(blind['against']['random'])} points above random. What is learnt of single views of a "
+        "lattice, as in the best fixed order, is of no use here.</p>"
+        + table(["next view chosen by", *(str(step + 1) for step in range(len(rows[0]) - 1))], rows)
+    )
+
+
+def _rotated(metrics: dict[str, Any]) -> str:
+    """Where objects are turned by any rotation."""
+    if "rotated" not in metrics["seeds"][0]:
+        return ""
+    ((_, found),) = metrics["seeds"][0]["rotated"].items()
+    every = found["random_sets"][-1]
+    return (
+        "<h2>Turned anyhow</h2>"
+        "<p>Objects are turned by any rotation, which nobody knows: they lie, stand on their heads, lean. The recognisers were "
+        "trained some epochs further on objects turned so. "
+        f"All {every['views']} views fused: {percent(every['learnt']['accuracy'])} %.</p>"
+        + _ladder(found)
+        + _against(found)
+    )
+
+
+def _scattered(metrics: dict[str, Any]) -> str:
+    """Where every object has candidate directions of its own."""
+    ((views, found),) = metrics["seeds"][0]["scattered"].items()
+    return (
+        "<h2>Candidates anywhere</h2>"
+        f"<p>Each object has {views} candidate directions of its own, a lattice turned at random, none of them twice.</p>"
+        + _ladder(found)
+        + _against(found)
+    )
+
+
+def _novel(metrics: dict[str, Any], classes: list[str]) -> str:
+    found = metrics["seeds"][0].get("novel")
+    if found is None:
+        return ""
+    steps = range(1, min(4, len(found["gain"]["trained_with"]["difference"])))
+    rows = []
+    for name, title in (("trained_without", "never saw these classes"), ("trained_with", "saw all")):
+        gain = found["gain"][name]
+        rows.append([title, *(difference(gain["difference"][step], gain["interval"][step]) for step in steps)])
+    each = [
+        [
+            html.escape(" and ".join(classes[label] for label in pair["classes"])),
+            str(pair["objects"]),
+            *(percent(pair[name][1]) for name in ("random", "trained_without", "trained_with")),
+        ]
+        for pair in found["pairs"]
+    ]
+    return (
+        "<h2>Classes never chosen for</h2>"
+        f"<p>Points above random on the {found['objects']} test objects of pairs of classes that a policy was trained without; "
+        "encoder and fusion were trained on all classes.</p>"
+        + table(["policy", *(f"{step + 1} views" for step in steps)], rows)
+        + table(["classes", "objects", "random, 2 views", "never saw these", "saw all"], each)
+    )
+
+
+def _decision(metrics: dict[str, Any]) -> str:
+    found = metrics["seeds"][0]["decision"]
+    ran_on = found["identity"]["machine"]
+    features, image = (
+        "{:.1f} ms (99 %: {:.1f})".format(*(found[name][share] for share in ("p50", "p99")))
+        for name in ("from_features", "from_image")
+    )
+    return (
+        f"<p>One decision among {found['identity']['candidates']} candidates takes {features} from what was seen so far, "
+        f"{image} from the newest depth image on: {html.escape(ran_on['cpu'])}, {ran_on['cores']} cores; "
+        f"{html.escape(ran_on['device'])}.</p>"
+    )
+
+
+def _seeds(metrics: dict[str, Any], views: str) -> str:
+    """The mean of all seeds, the main rows of every one, and what the method is above others."""
+    if len(metrics["seeds"]) < 2:
+        return ""
+    each = [found["lattices"][views] for found in metrics["seeds"]]
+    titles = {name: each[0]["policies"][name]["title"] for name in ("random", "farthest", "fixed_order", METHOD)}
+    errors, rows = metrics["together"][views]["policies"][METHOD]["calibration_error"], []
+    for name, title in titles.items():
+        after = [found["policies"][name]["after_views"][:4] for found in each]
+        rows += [[html.escape(title), str(seed), *map(percent, shares)] for seed, shares in enumerate(after)]
+    gains = []
+    for base in ("random", "farthest", "fixed_order"):
+        for seed, found in enumerate(each):
+            gain = found["against"][base][METHOD]
+            cells = zip(gain["difference"][1:4], gain["interval"][1:4], strict=True)
+            gains.append([html.escape(titles[base]), str(seed), *(difference(*cell) for cell in cells)])
+    return (
+        "<h2>Other random weights</h2><p>Everything trained anew from other weights and batches. Means of "
+        f"{len(each)} seeds, taken of each object first:</p>"
+        + _ladder(metrics["together"][views])
+        + _against(metrics["together"][views])
+        + f"<p>Calibration error (%) of the view policy after 1 to {len(errors)} views, mean of the seeds: "
+        + f"{', '.join(map(percent, errors))}.</p><p>Each seed:</p>"
+        + table(["next view chosen by", "seed", "1 view", "2", "3", "4"], rows)
+        + table(["view policy above", "seed", "2 views", "3", "4"], gains)
+    )
+
+
+def active_section(inputs: ReportInputs) -> str:
+    """For the report of the whole run; empty where `mevs active` was not run."""
+    if inputs.active is None:
+        return ""
+    views, found = next(iter(inputs.active["seeds"][0]["lattices"].items()))
+    return "<h2>Learning to fuse and to choose</h2>" + _lead(inputs.active, views) + _ladder(found)
+
+
+def write_active_page(metrics: dict[str, Any], statistics: DatasetStatistics, path: Path) -> None:
+    """Writes the page; it needs no other file. Numbers are of the first seed, unless said otherwise."""
+    parts = []
+    for number, (views, found) in enumerate(metrics["seeds"][0]["lattices"].items()):
+        titles = {name: policy["title"] for name, policy in found["policies"].items()}
+        curves = {name: policy for name, policy in found["policies"].items() if name != "label_oracle"}
+        parts.append(
+            (_lead(metrics, views) if not number else "") + f"<h2>{views} candidate views</h2>" + _ladder(found)
+        )
+        parts.append(
+            image(
+                figures.accuracy_of_choices(curves, titles, found["random_sets"][-1]["learnt"]["accuracy"]),
+                "Accuracy by number of views, all starts; bands: 95 % intervals over objects.",
+            )
+        )
+        parts.append(_against(found))
+        if not number:
+            parts.append("<h2>Fusing random views</h2>" + _sets(found))
+            parts.append("<h2>How sure it may be</h2>" + _confidence(found) + _costs(found))
+            parts.append(
+                _decision(metrics)
+                + _ablations(metrics)
+                + _unposed(metrics)
+                + _scattered(metrics)
+                + _rotated(metrics)
+                + _novel(metrics, statistics.classes)
+                + _seeds(metrics, views)
+            )
+    left_out = f"<p>{statistics.left_out_count} objects were left out for lack of a surface.</p>"
+    title = f"Learning where to look next: {html.escape(statistics.source)}"
+    write_text(path, document(title, "".join(parts) + left_out))

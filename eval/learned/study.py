@@ -1,0 +1,373 @@
+"""How well views are chosen where a learnt fusion makes the belief: walks of every object from every start, and what they say.
+
+All policies share starts, fusion and objects, so every difference is paired. Temperatures are fitted once more for each
+policy, on its own walks over validation objects: one that picks telling views makes beliefs of another kind than one that draws.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int
+
+from data_pipeline.progress import console
+from eval.learned.stopping import Signal, Told, confidences, what_it_costs
+from eval.learned.walks import (
+    Contender,
+    Learner,
+    OnLattice,
+    beliefs_of,
+    contenders,
+    given_to,
+    random_walker,
+    walk_all,
+    walker,
+)
+from eval.numbers.comparison import intervals
+from eval.numbers.confidence import stopping
+from eval.walks.knowledge import class_view_table
+from mevs_jax.arrays import AnyArray
+from mevs_jax.beliefs import CalibratedFusion
+from mevs_jax.calibration import (
+    calibration_error_by_chance,
+    class_weights,
+    expected_calibration_error,
+    fit_temperature,
+    log_likelihood,
+)
+from mevs_jax.models import ViewPolicy
+from mevs_jax.policies.base import Knowledge
+from train.choosing.calibrated import beliefs_of_sets
+from train.choosing.features import Features, sets_of_size
+
+
+@dataclass(frozen=True)
+class ByObject:
+    """How a policy does on each test object, a mean over its walks.
+
+    Attributes:
+        right: (steps, objects) share of the walks that are right after so many views.
+        likelihood: (steps, objects) log-probability of the true class.
+        from_some: (steps, objects) `right` of the walks from the starts that oracles walk from.
+    """
+
+    right: Float[np.ndarray, "steps objects"]
+    likelihood: Float[np.ndarray, "steps objects"]
+    from_some: Float[np.ndarray, "steps objects"]
+
+
+@jax.jit
+def _refit(beliefs: Array, labels: Array) -> Float[Array, "steps"]:
+    flat = beliefs.reshape(-1, *beliefs.shape[2:])
+    truth = jnp.repeat(labels, beliefs.shape[1])
+    return jax.vmap(fit_temperature, (1, None, None))(flat, truth, class_weights(truth, flat.shape[-1]))
+
+
+def judged(
+    beliefs: Sequence[Float[AnyArray, "objects walks steps classes"]], labels: Sequence[Int[AnyArray, "objects"]]
+) -> tuple[dict[str, Any], list[Signal], Float[np.ndarray, "steps objects"]]:
+    """One policy's numbers, and its confidence, on walks over validation objects, where temperatures are fitted, and over test
+    objects; and the log-probability that it gives the class of each test object, a mean over its walks."""
+    temperatures = _refit(beliefs[0], labels[0])
+    signals = [
+        confidences(belief / temperatures[:, None], known) for belief, known in zip(beliefs, labels, strict=True)
+    ]
+    confidence, right = signals[1].value, signals[1].right
+    after = right.mean(axis=1).T
+    truth = jnp.broadcast_to(jnp.asarray(labels[1])[:, None, None], right.shape)
+    likelihood = np.asarray(log_likelihood(beliefs[1] / temperatures[:, None], truth).mean(axis=1).T)
+    steps = range(right.shape[2])
+    found = {
+        "after_views": after.mean(axis=1).tolist(),
+        "interval": intervals(after),
+        "temperatures": np.asarray(temperatures).tolist(),
+        "calibration_error": [
+            float(expected_calibration_error(confidence[:, :, step].reshape(-1), right[:, :, step].reshape(-1)))
+            for step in steps
+        ],
+        "calibration_error_by_chance": [
+            calibration_error_by_chance(confidence[:, :, step], right[:, :, step]).tolist() for step in steps
+        ],
+        "negative_log_likelihood": (-likelihood.mean(axis=1)).tolist(),
+        "stopping": stopping(confidence, right),
+    }
+    return found, signals, likelihood
+
+
+def fixed_order_scores(
+    fusion: CalibratedFusion, data: Features, most: int, starts: int = 8, objects: int = 300
+) -> np.ndarray:
+    """Scores of the fixed order that does best on some validation objects from some starts, the first `most` of it; the rest
+    follows by how far it is from those before."""
+    some = jnp.asarray(np.unique(np.linspace(0, len(data.labels) - 1, objects).astype(int)))
+    data = jax.tree.map(lambda leaf: leaf[some], data)
+    views = data.features.shape[1]
+    begin = np.unique(np.linspace(0, views - 1, starts).astype(int))
+    weights = class_weights(data.labels, data.logits.shape[-1])
+
+    @jax.jit
+    def right_with(seen: Array) -> Array:
+        """Share right with the views (sets, slots) seen, −1 for none."""
+
+        def of_set(one: Array) -> Array:
+            beliefs = fusion(
+                data.features[:, one], data.directions[:, one], jnp.broadcast_to(one >= 0, (len(some), len(one)))
+            )
+            own = jnp.take_along_axis(beliefs, data.labels[:, None], axis=1)
+            return jnp.mean(weights * jnp.all(beliefs <= own, axis=1))
+
+        return jax.lax.map(of_set, seen)
+
+    order: list[int] = []
+    for _ in range(most):
+        sets = np.full((views, len(begin), most + 1), -1)
+        for view in range(views):
+            for row, start in enumerate(begin):
+                members = list(dict.fromkeys([int(start), *order, view]))
+                sets[view, row, : len(members)] = members
+        share = np.asarray(right_with(jnp.asarray(sets.reshape(-1, most + 1)))).reshape(views, -1).mean(axis=1)
+        share[order] = -1
+        order.append(int(share.argmax()))
+    points = np.asarray(data.directions[0])
+    while len(order) < views:
+        near = (points @ points[order].T).max(axis=1)
+        near[order] = 2
+        order.append(int(near.argmin()))
+    scores = np.zeros(views, np.float32)
+    scores[order] = np.arange(views, 0, -1)
+    return scores
+
+
+def learn(fusion: CalibratedFusion, data: Features, most: int) -> Knowledge:
+    """What `fixed_order` and `information_gain` know, from validation objects on the lattice."""
+    logits = jax.nn.log_softmax(data.logits / fusion.single, axis=-1)
+    return Knowledge(jnp.asarray(fixed_order_scores(fusion, data, most)), class_view_table(logits, data.labels))
+
+
+BASELINES = ("random", "farthest", "fixed_order")
+"""What a policy that learns is compared with."""
+_TRYING_STARTS = 8
+"""Those who try every candidate walk from about so many views, spread over the lattice, and so do those who pay for the way."""
+_GAP = 3
+"""The gap between random and the label-free oracle is read after 2 views and the next, up to so many further ones."""
+
+
+def random_sets_study(
+    fusion: CalibratedFusion, validation: Features, test: Features, draws: int = 8
+) -> list[dict[str, Any]]:
+    """How accurate and how well calibrated random sets of every size are, by the sum of logits and by the learnt fusion.
+
+    The same sets for both. The fusion's temperatures are its own; the sum's are fitted here, on validation objects.
+    """
+    views = test.features.shape[1]
+
+    def summed(data: Features, present: Array) -> Array:
+        return jnp.einsum("dov,ovc->doc", present.astype(jnp.float32), data.logits)
+
+    rows = []
+    for size in sorted({*range(1, min(views, 12) + 1), *(size for size in (16, 20, 40, views) if size <= views)}):
+        sets = [
+            sets_of_size(len(data.labels), views, size, 1 if size == views else draws) for data in (validation, test)
+        ]
+        temperature = _refit(jnp.moveaxis(summed(validation, sets[0]), 0, 1)[:, :, None], validation.labels)[0]
+        beliefs = {"sum": summed(test, sets[1]) / temperature, "learnt": beliefs_of_sets(fusion, test, sets[1])}
+        row: dict[str, Any] = {"views": size}
+        right = {}
+        for name, belief in beliefs.items():
+            probability = np.asarray(jax.nn.softmax(belief, axis=-1))
+            correct = probability.argmax(-1) == np.asarray(test.labels)
+            right[name] = correct.mean(axis=0)
+            row[name] = {
+                "accuracy": float(correct.mean()),
+                "interval": intervals(right[name]),
+                "calibration_error": float(
+                    expected_calibration_error(probability.max(-1).reshape(-1), correct.reshape(-1))
+                ),
+            }
+        gain = right["learnt"] - right["sum"]
+        row |= {"difference": float(gain.mean()), "difference_interval": intervals(gain)}
+        rows.append(row)
+    return rows
+
+
+def study(
+    fusion: CalibratedFusion,
+    learners: Sequence[Learner],
+    validation: OnLattice,
+    test: OnLattice,
+    *,
+    max_views: int,
+    draws: int,
+    oracle_views: int = 4,
+    fitting_starts: int = 1,
+    seed: int = 0,
+    costs: bool = False,
+    others: bool = True,
+) -> tuple[dict[str, Any], dict[str, ByObject]]:
+    """Every number about one lattice of candidate views; and each policy's by object.
+
+    Args:
+        fusion: of the recogniser whose features these are.
+        learners: trained view policies, the method first and then what it is compared with.
+        max_views: of a walk.
+        draws: walks from each start of policies that draw.
+        oracle_views: how far oracles walk.
+        fitting_starts: temperatures are fitted on walks from every so many-th start.
+        costs: whether to tell too when the method would stop and what it does where the way has a price.
+        others: whether policies but these and random selection walk, and random sets are fused.
+    """
+    points, labels = test.features.directions[0], test.features.labels
+    shared = fusion.posed and bool(jnp.allclose(test.features.directions, points, atol=1e-4))
+    max_views, oracle_views = min(max_views, len(points)), min(oracle_views, len(points))
+    knowledge = learn(fusion, validation.features, max_views) if shared else None
+    apart = max(1, len(points) // _TRYING_STARTS)
+    some_starts = np.arange(0, len(points), apart)
+    found: dict[str, Any] = {
+        "objects": len(labels),
+        "trying_starts": len(some_starts),
+        "validation_objects": len(validation.features.labels),
+        "views": len(points),
+        "single_view": float(jnp.mean(jnp.argmax(test.features.logits, -1) == labels[:, None])),
+        "policies": {},
+    }
+    if others:
+        found["random_sets"] = random_sets_study(fusion, validation.features, test.features, draws)
+    each: dict[str, ByObject] = {}
+    parameters: dict[str, Any] = {"belief_oracle": fusion, "label_oracle": fusion}
+    parameters |= {learner.name: given_to(learner, fusion) for learner in learners}
+    fusions = {learner.name: learner.fusion or fusion for learner in learners}
+    told: dict[str, Told] = {}
+    entropies = shared and test.utility is not None and test.entropy is not None
+    asked = contenders(learners, draws, oracle_views, apart, entropies, shared)
+    for contender in asked if others else [random_walker(draws), *map(walker, learners)]:
+        name, own, walks, beliefs = contender.name, fusions.get(contender.name, fusion), [], []
+        for split, data in enumerate((validation, test)):
+            every = contender.every if data is test else max(contender.every, fitting_starts)
+            views = walk_all(
+                jax.random.fold_in(jax.random.key(seed), split),
+                replace(contender, every=every),
+                parameters.get(name),
+                own,
+                data.table(contender.believes),
+                data.features.directions,
+                knowledge,
+                contender.max_views or max_views,
+            )
+            walks.append(views)
+            beliefs.append(beliefs_of(own, data.features, views))
+        judgement, signals, likelihood = judged(beliefs, [data.features.labels for data in (validation, test)])
+        right = signals[1].right
+        told[name] = Told(walks, beliefs, signals)
+        by_start = right.reshape(len(right), -1, contender.draws, right.shape[-1]).mean(axis=2)
+        from_some = by_start if contender.every > 1 else by_start[:, some_starts]
+        each[name] = ByObject(by_start.mean(axis=1).T, likelihood, from_some.mean(axis=1).T)
+        found["policies"][name] = {"title": contender.title, "knows": contender.knows, **judgement}
+        console.print(f"{contender.title}: " + " ".join(f"{100 * share:.1f}" for share in judgement["after_views"]))
+    if costs:
+        key, method = jax.random.key(seed), learners[0]
+        found["costs"] = what_it_costs(key, method, fusion, validation, test, knowledge, told, max_views, apart)
+    return found | compared(each, learners[0].name), each
+
+
+def compared(each: Mapping[str, ByObject], method: str) -> dict[str, Any]:
+    """Paired differences of every policy from the baselines and from the method, by baseline; and how much of the way from
+    random to the label-free oracle each goes."""
+    from_some = {name: policy.from_some.mean(axis=1) for name, policy in each.items()}
+    against = {
+        base: {
+            name: _difference(mine.right, each[base].right)
+            | {"likelihood": _difference(mine.likelihood, each[base].likelihood)}
+            for name, mine in each.items()
+            if name not in (base, "belief_oracle", "label_oracle")  # which walk from some starts only
+        }
+        for base in (*BASELINES, method)
+        if base in each
+    }
+    gap_closed = {
+        name: _gap_closed(mine, from_some["random"], from_some["belief_oracle"])
+        for name, mine in from_some.items()
+        if "belief_oracle" in each and name not in ("random", "belief_oracle", "label_oracle")
+    }
+    return {"against": against, "gap_closed": gap_closed}
+
+
+def seeds_together(
+    found: Sequence[dict[str, Any]], seeds: Sequence[Mapping[str, ByObject]], method: str
+) -> dict[str, Any]:
+    """What the same policies reach on average over several seeds, by object first, since the objects are the same.
+
+    Args:
+        found: what `study` found with each seed.
+        seeds: what each policy does by object, for each seed.
+    """
+
+    def mean(name: str) -> ByObject:
+        values = [vars(seed[name]) for seed in seeds]
+        return ByObject(**{key: np.mean([value[key] for value in values], axis=0) for key in values[0]})
+
+    each, first = {name: mean(name) for name in found[0]["policies"]}, found[0]
+    policies = {
+        name: {key: policy[key] for key in ("title", "knows")}
+        | {
+            "after_views": each[name].right.mean(axis=1).tolist(),
+            "interval": intervals(each[name].right),
+            "calibration_error": np.mean(
+                [one["policies"][name]["calibration_error"] for one in found], axis=0
+            ).tolist(),
+        }
+        for name, policy in first["policies"].items()
+    }
+    same = {key: first[key] for key in ("views", "trying_starts")}
+    return same | {"policies": policies} | compared(each, method)
+
+
+def novel_classes(
+    fusion: CalibratedFusion,
+    policies: Sequence[tuple[tuple[int, ...], ViewPolicy]],
+    whole: ViewPolicy,
+    test: Features,
+    max_views: int,
+    draws: int,
+    seed: int = 0,
+) -> dict[str, Any]:
+    """How policies do on objects of classes that they were trained without, beside random and beside one that knows all classes.
+
+    Args:
+        policies: the classes that each was trained without, and the policy.
+        whole: the policy that was trained on all.
+    """
+    after: dict[str, list[np.ndarray]] = {"random": [], "trained_without": [], "trained_with": []}
+    rows = []
+    for classes, policy in policies:
+        some = test.some(np.flatnonzero(np.isin(test.labels, classes)))
+        learners = Learner("trained_without", "", policy), Learner("trained_with", "", whole)
+        walkers: list[tuple[Contender, Any]] = [(random_walker(draws), None)]
+        walkers += [(walker(one), given_to(one, fusion)) for one in learners]
+        for contender, given in walkers:
+            table, key = OnLattice(some).table(contender.believes), jax.random.key(seed)
+            views = walk_all(key, contender, given, fusion, table, some.directions, None, max_views)
+            right = beliefs_of(fusion, some, views).argmax(axis=-1) == np.asarray(some.labels)[:, None, None]
+            after[contender.name].append(right.mean(axis=1).T)
+        row = {"classes": list(classes), "objects": len(some.labels)}
+        rows.append(row | {name: found[-1].mean(axis=1).tolist() for name, found in after.items()})
+    every = {name: np.concatenate(found, axis=1) for name, found in after.items()}
+    gains = {name: _difference(mine, every["random"]) for name, mine in every.items() if name != "random"}
+    return {"objects": every["random"].shape[1], "pairs": rows, "gain": gains}
+
+
+def _difference(mine: np.ndarray, base: np.ndarray) -> dict[str, Any]:
+    steps = min(len(mine), len(base))
+    gain = mine[:steps] - base[:steps]
+    return {"difference": gain.mean(axis=1).tolist(), "interval": intervals(gain)}
+
+
+def _gap_closed(mine: np.ndarray, random: np.ndarray, oracle: np.ndarray) -> list[float | None]:
+    """Share of the way from random to the oracle, from 2 views on; None where the oracle is no better."""
+    steps = slice(1, min(len(oracle), 1 + _GAP))
+    gains = zip(mine[steps] - random[steps], oracle[steps] - random[steps], strict=True)
+    return [float(gain / gap) if gap > 0 else None for gain, gap in gains]

@@ -1,0 +1,208 @@
+"""Who walks in the study of learnt choice, and the walks: every policy from every start, by the same fusion."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from flax import nnx
+from jaxtyping import Array, Float, Int
+
+from mevs_jax.arrays import AnyArray
+from mevs_jax.beliefs import CalibratedFusion
+from mevs_jax.models import ViewPolicy
+from mevs_jax.policies.base import Knowledge, Policy
+from mevs_jax.policies.oracles import fused_oracle
+from mevs_jax.policies.registry import POLICIES
+from mevs_jax.selection import ViewTable, adding, by_attention, select_from_table
+from mevs_jax.viewpoints import ViewGraph
+from train.choosing.chunks import in_chunks
+from train.choosing.features import Features
+from train.choosing.policy import By, learnt_policy
+
+_WALKS_AT_ONCE = 2**11
+
+
+@dataclass(frozen=True)
+class OnLattice:
+    """Objects of a split on one lattice of candidate views.
+
+    Attributes:
+        features: of every view.
+        utility: (objects, views, views) what the entropy predictor says of every view after each, if it was asked.
+        entropy: (objects, views) true normalised entropies, if known.
+    """
+
+    features: Features
+    utility: np.ndarray | None = None
+    entropy: np.ndarray | None = None
+
+    def table(self, with_features: bool) -> ViewTable:
+        utility, entropy = (None if known is None else jnp.asarray(known) for known in (self.utility, self.entropy))
+        data = self.features
+        features = data.features if with_features else None
+        return ViewTable(data.logits, utility, entropy, data.labels, features=features, clouds=data.clouds)
+
+
+@dataclass(frozen=True)
+class Contender:
+    """A policy in the study.
+
+    Attributes:
+        name: in `metrics.json`.
+        title: in the report.
+        knows: as in `eval.ladder.KNOWS`.
+        policy_of: parameters to the policy.
+        believes: whether it looks at the belief; one that does not walks without fusing.
+        draws: walks from each start.
+        max_views: views of its walks, where fewer than the study's.
+        every: it walks from every so many-th start alone.
+    """
+
+    name: str
+    title: str
+    knows: str
+    policy_of: Callable[[Any], Policy]
+    believes: bool = True
+    draws: int = 1
+    max_views: int = 0
+    every: int = 1
+
+
+@dataclass(frozen=True)
+class Learner:
+    """A trained view policy in the study, and how it is asked; the other fields are a contender's."""
+
+    name: str
+    title: str
+    network: ViewPolicy
+    by: By = "belief"
+    made_as: str = ""
+    """name of the variant whose network it is"""
+    fusion: CalibratedFusion | None = None
+    """its own, where it is not the study's"""
+
+
+def _named(_: Any, name: str) -> Policy:
+    return POLICIES[name]
+
+
+def _by_name(name: str, title: str, knows: str, believes: bool = True) -> Contender:
+    return Contender(name, title, knows, partial(_named, name=name), believes)
+
+
+def random_walker(draws: int) -> Contender:
+    return replace(_by_name("random", "random", "nothing", believes=False), draws=draws)
+
+
+def walker(learner: Learner) -> Contender:
+    """Whose parameters are `given_to` it."""
+    policy_of = partial(learnt_policy, structure=nnx.graphdef(learner.network), by=learner.by)
+    return Contender(learner.name, learner.title, "learnt", policy_of)
+
+
+def given_to(learner: Learner, fusion: CalibratedFusion) -> tuple[nnx.State, Array]:
+    """The network's weights, and the temperature of single views."""
+    return nnx.state(learner.network, nnx.Param), fusion.single
+
+
+def _oracle(fusion: CalibratedFusion, by: Any) -> Policy:
+    return fused_oracle(fusion, by=by)
+
+
+@partial(jax.jit, static_argnames=("contender", "max_views"))
+def _walk_some(
+    some: tuple[Array, ViewTable, Array],
+    contender: Contender,
+    parameters: Any,
+    fusion: CalibratedFusion,
+    graph: ViewGraph,
+    knowledge: Knowledge | None,
+    max_views: int,
+) -> Int[Array, "objects walks steps"]:
+    starts = jnp.arange(0, graph.points.shape[0], contender.every)
+    policy, fuse = contender.policy_of(parameters), by_attention(fusion) if contender.believes else adding
+
+    def of_object(key: Array, table: ViewTable, directions: Array) -> Array:
+        scene = table.scene(replace(graph, points=directions), knowledge)
+
+        def run(key: Array, start: Array) -> Array:
+            return select_from_table(key, table, scene, policy, start, max_views=max_views, fuse=fuse).views
+
+        keys = jax.random.split(key, len(starts) * contender.draws)
+        return jax.vmap(run)(keys, starts.repeat(contender.draws))
+
+    return jax.vmap(of_object)(*some)
+
+
+def walk_all(
+    key: Array,
+    contender: Contender,
+    parameters: Any,
+    fusion: CalibratedFusion,
+    tables: ViewTable,
+    directions: Float[AnyArray, "objects views 3"],
+    knowledge: Knowledge | None,
+    max_views: int,
+) -> Int[np.ndarray, "objects walks steps"]:
+    """The views of walks from every start, or from some, `contender.draws` from each.
+
+    Args:
+        directions: to the views, which stand to each other in the same way around every object.
+    """
+    graph = ViewGraph.from_points(np.asarray(directions[0], np.float64))
+    keys = jax.vmap(jax.random.fold_in, (None, 0))(key, jnp.arange(len(tables.label)))
+    rest = contender, parameters, fusion, graph, knowledge, max_views
+    at_once = max(1, _WALKS_AT_ONCE * contender.every // (len(graph.points) * contender.draws))
+    return in_chunks(lambda some: _walk_some(some, *rest), (keys, tables, directions), at_once)
+
+
+@jax.jit
+def _beliefs_of_some(fusion: CalibratedFusion, some: tuple[Features, Array]) -> Array:
+    steps = some[1].shape[-1]
+    present = jnp.tril(jnp.ones((steps, steps), bool))
+
+    def of_walk(one: Features, order: Array) -> Array:
+        seen = jnp.broadcast_to(one.features[order], (steps, steps, one.features.shape[-1]))
+        return fusion(seen, jnp.broadcast_to(one.directions[order], (steps, steps, 3)), present)
+
+    return jax.vmap(lambda one, orders: jax.vmap(lambda order: of_walk(one, order))(orders))(*some)
+
+
+def beliefs_of(
+    fusion: CalibratedFusion, data: Features, views: Int[np.ndarray, "objects walks steps"]
+) -> Float[np.ndarray, "objects walks steps classes"]:
+    """Log-probabilities after each view of each walk."""
+    return in_chunks(partial(_beliefs_of_some, fusion), (data, views), max(1, 1024 // views.shape[1]))
+
+
+def contenders(
+    learners: Sequence[Learner], draws: int, oracle_views: int, oracle_starts: int, entropies: bool, shared: bool
+) -> list[Contender]:
+    """All policies of the study, in the order in which they are shown.
+
+    Args:
+        learners: those that were trained.
+        draws: walks from each start of those that draw.
+        oracle_views, oracle_starts: how far oracles walk, which try every candidate, and from every so many-th start.
+        entropies: whether predicted and true depth entropies are known.
+        shared: whether all objects have the same candidates in a known pose, so that some are known to be good ones.
+    """
+    found = [random_walker(draws), _by_name("farthest", "farthest from those seen", "nothing", believes=False)]
+    if entropies:
+        found.append(_by_name("predicted_entropy", "PointNet++ entropy (thesis)", "networks", believes=False))
+    if shared:
+        found.append(_by_name("fixed_order", "best fixed order", "others", believes=False))
+        found.append(_by_name("information_gain", "information gain by a table", "others"))
+    found += map(walker, learners)
+    if entropies:
+        found.append(_by_name("oracle_entropy", "entropy oracle (thesis)", "truth", believes=False))
+    for by, title in (("belief", "label-free oracle"), ("label", "greedy label oracle")):
+        policy_of, name = partial(_oracle, by=by), f"{by}_oracle"
+        found.append(Contender(name, title, "truth", policy_of, True, 1, oracle_views, oracle_starts))
+    return found

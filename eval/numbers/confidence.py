@@ -1,0 +1,151 @@
+"""How sure the fused belief may be: five ways to read it, how well each is calibrated, and stopping by calibrated risk.
+
+Everything that is fitted is fitted on walks over validation objects, for each policy its own: a policy that picks telling views
+makes beliefs of another kind than one that draws.
+"""
+
+from __future__ import annotations
+
+from functools import partial
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int
+
+from eval.numbers.comparison import intervals
+from mevs_jax.beliefs import beliefs_along, discounted, mean_of_probabilities
+from mevs_jax.calibration import (
+    expected_calibration_error,
+    fit_exponent,
+    fit_temperature,
+    negative_log_likelihood,
+    reliability,
+)
+
+RISKS = (0.3, 0.2, 0.15, 0.1, 0.05, 0.02)
+READINGS = {
+    "sum_of_logits": "sum of logits (thesis)",
+    "mean_of_log_probabilities": "mean of log-probabilities",
+    "product_of_experts": "product of experts, fitted exponent",
+    "temperature": "temperature per number of views",
+    "mean_of_probabilities": "mean of probabilities",
+}
+
+
+def walked(views: Int[Array, "objects starts steps"], logits: Float[Array, "objects views classes"]) -> Array:
+    """Logits along every walk, (objects, starts, steps, classes); zeros beyond a walk's end."""
+
+    def one(views: Array, logits: Array) -> Array:
+        return jnp.where(views[..., None] >= 0, logits[views], 0.0)
+
+    return jax.vmap(one)(views, logits)
+
+
+@jax.jit
+def _fit(logits: Array, labels: Array) -> dict[str, Array]:
+    """Temperatures (steps,) of the fitted readings, from walks (objects, starts, steps, classes)."""
+    _, starts, steps, classes = logits.shape
+    beliefs = jax.vmap(beliefs_along)(logits.reshape(-1, steps, classes))
+    truth = jnp.repeat(labels, starts)
+    scale, growth = fit_exponent(beliefs, truth)
+    counts = jnp.arange(1, steps + 1, dtype=jnp.float32)
+    return {
+        "sum_of_logits": jnp.ones(steps),
+        "mean_of_log_probabilities": counts,
+        "product_of_experts": scale * counts**growth,
+        "temperature": jax.vmap(fit_temperature, (1, None))(beliefs, truth),
+    }
+
+
+@jax.jit
+def _mixed(logits: Array) -> Array:
+    """Log-probabilities of the mean of probabilities along walks (objects, starts, steps, classes)."""
+    return jax.vmap(jax.vmap(mean_of_probabilities))(logits)
+
+
+@jax.jit
+def _discounted(logits: Array, temperatures: Array) -> Array:
+    """Log-probabilities of all other readings, which differ in their temperatures (steps,) alone."""
+    return jax.vmap(jax.vmap(lambda walk: discounted(beliefs_along(walk), temperatures)))(logits)
+
+
+@jax.jit
+def _score(log_probabilities: Array, labels: Array) -> dict[str, Array]:
+    """Calibration and, for every walk, confidence and correctness after each number of views."""
+    objects, starts, steps, classes = log_probabilities.shape
+    log_probabilities, truth = log_probabilities.reshape(-1, steps, classes), jnp.repeat(labels, starts)
+    confidence = jnp.exp(jnp.max(log_probabilities, axis=-1))
+    right = jnp.argmax(log_probabilities, axis=-1) == truth[:, None]
+    return {
+        "accuracy": jnp.mean(right, axis=0),
+        "ece": jax.vmap(expected_calibration_error, 1)(confidence, right),
+        "nll": jax.vmap(negative_log_likelihood, (1, None))(log_probabilities, truth),
+        "reliability": jnp.stack(jax.vmap(reliability, 1)(confidence, right)),
+        "confidence": confidence.reshape(objects, starts, steps),
+        "right": right.reshape(objects, starts, steps),
+    }
+
+
+def stops_at(enough: np.ndarray) -> np.ndarray:
+    """The first step (…) of walks (…, steps) where it is enough, else their last."""
+    return np.where(enough.any(axis=-1), enough.argmax(axis=-1), enough.shape[-1] - 1)
+
+
+def stopping(confidence: np.ndarray, right: np.ndarray) -> list[dict[str, Any]]:
+    """Stops at the first step whose risk, 1 − confidence, is at most each of `RISKS`; else goes to the end of the walk.
+
+    A walk that stops so promises a wrong answer at most that often. `error` is how often those answers are wrong.
+    """
+    rows = []
+    for risk in RISKS:
+        sure = confidence >= 1 - risk
+        stops, at = sure.any(axis=-1), stops_at(sure)
+        answer = np.take_along_axis(right, at[..., None], axis=-1)[..., 0]
+        by_object = np.stack([(stops & ~answer).mean(axis=1), stops.mean(axis=1)])
+        rows.append(
+            {
+                "risk": risk,
+                "sure": float(stops.mean()),
+                "error": float(by_object[0].mean() / by_object[1].mean()) if stops.any() else None,
+                # Wrong although sure, minus what was promised, as a share of all walks: above zero is a broken promise.
+                "excess": intervals(by_object[0] - risk * by_object[1]),
+                "accuracy": float(answer.mean()),
+                "views": float((at + 1).mean()),
+            }
+        )
+    return rows
+
+
+def confidence_of(
+    validation_views: np.ndarray,
+    validation_logits: np.ndarray,
+    validation_labels: np.ndarray,
+    views: np.ndarray,
+    logits: np.ndarray,
+    labels: np.ndarray,
+) -> dict[str, Any]:
+    """Everything about the confidence of one policy's walks; views are (objects, starts, steps)."""
+    fitting = walked(jnp.asarray(validation_views), jnp.asarray(validation_logits))
+    testing = walked(jnp.asarray(views), jnp.asarray(logits))
+    temperatures = _fit(fitting, jnp.asarray(validation_labels))
+    out: dict[str, Any] = {"readings": {}}
+    for reading in READINGS:
+        read = partial(_discounted, temperatures=temperatures[reading]) if reading in temperatures else _mixed
+        on_validation = _score(read(fitting), jnp.asarray(validation_labels))
+        on_test = _score(read(testing), jnp.asarray(labels))
+        out["readings"][reading] = {
+            "accuracy": np.asarray(on_test["accuracy"]).tolist(),
+            "ece": np.asarray(on_test["ece"]).tolist(),
+            "nll": np.asarray(on_test["nll"]).tolist(),
+            "validation_ece": np.asarray(on_validation["ece"]).tolist(),
+        }
+        if reading in temperatures:
+            out["readings"][reading]["temperatures"] = np.asarray(temperatures[reading]).tolist()
+        if reading in ("sum_of_logits", "temperature"):
+            out["readings"][reading]["reliability"] = np.asarray(on_test["reliability"]).tolist()
+            out["readings"][reading]["stopping"] = stopping(
+                np.asarray(on_test["confidence"]), np.asarray(on_test["right"])
+            )
+    return out

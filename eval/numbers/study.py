@@ -1,0 +1,263 @@
+"""From view tables to `metrics.json`: all that the report says, as numbers."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from data_pipeline.dataset.builder import DatasetStatistics
+from data_pipeline.progress import console
+from eval.numbers.comparison import cells, difference, intervals, summarise, views_to_reach
+from eval.numbers.confidence import confidence_of
+from eval.numbers.published_code import compatibility
+from eval.tables import ViewTables
+from eval.walks.exact import expected_random
+from eval.walks.grid import FIRST_MV, THRESHOLDS, GridConfig, Results, run_grid
+from eval.walks.knowledge import learn
+from eval.walks.ladder import SCRAMBLED, Rung, ladder
+from mevs_jax.metrics import accuracy, class_accuracy, confusion_matrix
+from mevs_jax.policies.base import Knowledge
+from mevs_jax.viewpoints import ViewGraph
+
+HEADLINE_CT, HEADLINE_MV = 0.99, 4
+"""The cell of the thesis's first test and of its confusion matrices (§5.3)."""
+BASELINE = "random"
+CONFIDENCE_OF = ("random", "predicted_entropy", "information_gain")
+"""Whose confidence is looked into."""
+MOVING = ("predicted_entropy", "information_gain")
+MOVEMENT_COSTS = (0.02, 0.05, 0.1, 0.2, 0.5)
+"""In units of the policy's score (normalised entropy, nats) per radian of the way."""
+
+
+def single_view(tables: ViewTables, classes: int) -> dict[str, Any]:
+    """How well one view is classified, over all views of all objects."""
+    predictions = tables.logits.argmax(-1)
+    right = predictions == tables.labels[:, None]
+    views = predictions.shape[1]
+    confusion = confusion_matrix(
+        jnp.repeat(jnp.asarray(tables.labels), views), jnp.asarray(predictions.reshape(-1)), classes
+    )
+    every = tables.logits.sum(axis=1).argmax(-1) == tables.labels
+    return {
+        "accuracy": float(accuracy(confusion)),
+        "interval": intervals(right.mean(axis=1)),
+        "class_accuracy": float(class_accuracy(confusion)),
+        "by_view": right.mean(axis=0).tolist(),
+        "all_views": float(every.mean()),
+        "all_views_interval": intervals(every),
+    }
+
+
+def entropy_errors(tables: ViewTables, statistics: DatasetStatistics) -> dict[str, Any]:
+    """Squared error of the predicted entropies, beside two predictors that look at nothing.
+
+    The mean map is the training split's mean entropy of each view; the class-mean map is the same by class, told the true
+    class. All on normalised entropies.
+    """
+    true = tables.entropy[:, None, :]  # (objects, 1, views): every view predicts the whole map
+    network = np.square(tables.utility - true).mean(axis=(1, 2))
+    mean_map = np.square(np.array(statistics.mean_map) - tables.entropy).mean(axis=1)
+    class_map = np.square(np.array(statistics.class_mean_maps)[tables.labels] - tables.entropy).mean(axis=1)
+    by_class = {
+        name: float(network[tables.labels == label].mean()) if (tables.labels == label).any() else None
+        for label, name in enumerate(statistics.classes)
+    }
+    variance = float(tables.entropy.var())
+    return {
+        "pointnet2": float(network.mean()),
+        "pointnet2_interval": intervals(network),
+        "mean_map": float(mean_map.mean()),
+        "mean_map_interval": intervals(mean_map),
+        "class_mean_map": float(class_map.mean()),
+        "class_mean_map_interval": intervals(class_map),
+        "better_than_mean_map": intervals(mean_map - network),
+        "by_class": by_class,
+        "explained_variance": 1 - float(network.mean()) / variance if variance else None,
+    }
+
+
+def best_pair(tables: ViewTables, reachable: np.ndarray) -> dict[str, Any]:
+    """The share of objects that the pair of views most in favour of their label gets right.
+
+    It knows the label and is free to start anywhere: about what two views could do at most.
+    """
+    logits = jnp.asarray(tables.logits[:, np.flatnonzero(reachable)])
+
+    def one(logits: jax.Array, label: jax.Array) -> jax.Array:
+        pairs = logits[:, None] + logits[None, :]
+        probability = jnp.where(jnp.eye(len(logits), dtype=bool), -jnp.inf, jax.nn.log_softmax(pairs)[..., label])
+        return jnp.argmax(pairs.reshape(-1, pairs.shape[-1])[jnp.argmax(probability)]) == label
+
+    right = np.asarray(jax.lax.map(lambda item: one(*item), (logits, jnp.asarray(tables.labels)), batch_size=64))
+    return {"accuracy": float(right.mean()), "interval": intervals(right)}
+
+
+def headline_confusion(views: np.ndarray, tables: ViewTables, max_views: int) -> np.ndarray:
+    """Confusion at the headline cell from walks (objects, starts, steps), each object weighing one."""
+    walks = np.take_along_axis(tables.logits[:, None], np.maximum(views, 0)[..., None], axis=2)
+    beliefs = np.cumsum(np.where(views[..., None] >= 0, walks, 0), axis=2)[:, :, :max_views]
+    shifted = np.exp(beliefs - beliefs.max(axis=-1, keepdims=True))
+    sure = 1 / shifted.sum(axis=-1) >= HEADLINE_CT
+    at = np.where(sure.any(axis=-1), sure.argmax(axis=-1), max_views - 1)
+    prediction = np.take_along_axis(beliefs.argmax(axis=-1), at[..., None], axis=-1)[..., 0]
+    starts = prediction.shape[1]
+    labels = np.repeat(tables.labels, starts)
+    weights = np.full(labels.shape, 1 / starts)
+    return np.asarray(confusion_matrix(labels, prediction.reshape(-1), tables.logits.shape[-1], weights))
+
+
+def exactly_random(
+    results: Results, logits: jax.Array, labels: jax.Array, reachable: np.ndarray
+) -> tuple[Results, int]:
+    """`results` of random selection with exact expectations where there are not too many subsets, and up to how many views."""
+    max_views = results.after.shape[-1]
+    right, used, after = expected_random(logits, labels, reachable, THRESHOLDS, max_views)
+    exact = after.shape[-1]
+    skip = FIRST_MV - 1
+    return (
+        replace(
+            results,
+            right=results.right.at[:, :, : exact - skip].set(right[:, :, skip:]),
+            used=results.used.at[:, :, : exact - skip].set(used[:, :, skip:]),
+            after=results.after.at[:, :, :exact].set(after),
+        ),
+        exact,
+    )
+
+
+def accuracy_by_way(results: Results) -> dict[str, list[float]]:
+    """Mean accuracy and mean way after each number of views."""
+    _, _, after, travelled = cells(results)
+    return {"after_views": after.mean(axis=-1).tolist(), "travelled": travelled.mean(axis=-1).tolist()}
+
+
+def reachable_views(viewpoints: np.ndarray, lowest_elevation: float) -> np.ndarray:
+    """Which viewpoints are at least so many degrees above the horizon, (views,) bool.
+
+    Raises:
+        ValueError: where fewer than two are.
+    """
+    elevation = np.degrees(np.arcsin(np.clip(viewpoints[:, 2], -1, 1)))
+    reachable = elevation >= lowest_elevation - 1e-6
+    if reachable.sum() < 2:
+        raise ValueError(
+            f"only {reachable.sum()} of {len(viewpoints)} viewpoints are {lowest_elevation:g}° above the horizon or higher; "
+            f"choose a lower --evaluation.lowest-elevation"
+        )
+    return reachable
+
+
+def _walk(
+    tables: ViewTables, rungs: tuple[Rung, ...], graph: ViewGraph, knowledge: Knowledge, config: GridConfig, **rest: Any
+) -> dict[str, Results]:
+    one_backbone = tables.stacked()
+    stacked = replace(one_backbone, logits=one_backbone.logits[:, None])
+    knowledge = jax.tree.map(lambda leaf: leaf[None], knowledge)
+    return run_grid(jax.random.key(config.seed), stacked, graph, knowledge, rungs, max_views=config.max_views, **rest)
+
+
+def run_study(
+    tables: ViewTables,
+    validation: ViewTables,
+    statistics: DatasetStatistics,
+    config: GridConfig,
+    by_view: ViewTables | None = None,
+    leak: dict[str, dict[str, float]] | None = None,
+) -> dict[str, Any]:
+    """All metrics of the test split.
+
+    Args:
+        tables: of the test objects.
+        validation: of the validation objects, from which policies and temperatures learn.
+        statistics: of the data set.
+        config: what is evaluated.
+        by_view: of the test objects by the classifier that was validated by view, for the compatibility table.
+        leak: accuracy on single views, `validation` and `test`, of both classifiers.
+    """
+    viewpoints = np.array(statistics.viewpoints)
+    can_reach = reachable_views(viewpoints, config.lowest_elevation)
+    config = replace(config, max_views=min(config.max_views, int(can_reach.sum())))
+    graph = ViewGraph.from_points(viewpoints)
+    reachable = None if can_reach.all() else jnp.asarray(can_reach)
+    knowledge = learn(jnp.asarray(validation.logits), jnp.asarray(validation.labels))
+    labels = jnp.asarray(tables.labels)
+
+    rungs = ladder(config.draws)
+    console.print(f"Walking {len(tables.labels)} test objects from {can_reach.sum()} views by {len(rungs)} policies")
+    results = _walk(tables, (*rungs, SCRAMBLED), graph, knowledge, config, reachable=reachable)
+    results[BASELINE], exact = exactly_random(results[BASELINE], jnp.asarray(tables.logits)[:, None], labels, can_reach)
+    shown = {rung.policy: results[rung.policy] for rung in rungs}
+
+    fitting = tuple(replace(rung, draws=1) for rung in rungs if rung.policy in CONFIDENCE_OF)
+    validation_walks = _walk(validation, fitting, graph, knowledge, config, reachable=reachable)
+
+    def starts_of(result: Results) -> np.ndarray:
+        """The kept walks from views in reach, (objects, starts, steps)."""
+        return np.asarray(result.views)[0, :, can_reach, 0].swapaxes(0, 1)
+
+    confidence = {
+        name: confidence_of(
+            starts_of(validation_walks[name]),
+            validation.logits,
+            validation.labels,
+            starts_of(results[name]),
+            tables.logits,
+            tables.labels,
+        )
+        for name in CONFIDENCE_OF
+    }
+
+    movement: dict[str, list[dict[str, Any]]] = {
+        name: [{"cost": 0.0} | accuracy_by_way(results[name])] for name in MOVING
+    }
+    moving = tuple(rung for rung in rungs if rung.policy in MOVING)
+    for cost in MOVEMENT_COSTS:
+        priced = _walk(tables, moving, graph, knowledge, config, reachable=reachable, movement_cost=jnp.float32(cost))
+        for name, result in priced.items():
+            movement[name].append({"cost": cost} | accuracy_by_way(result))
+
+    other = None
+    if by_view is not None:
+        wanted = ("random", "random_with_repetition", "predicted_entropy")
+        switched = (*(rung for rung in rungs if rung.policy in wanted), SCRAMBLED)
+        other = _walk(by_view, switched, graph, knowledge, config, reachable=reachable)
+        other[BASELINE], _ = exactly_random(other[BASELINE], jnp.asarray(by_view.logits)[:, None], labels, can_reach)
+
+    mv = min(HEADLINE_MV, config.max_views)
+    column = THRESHOLDS.index(HEADLINE_CT)
+    return {
+        "objects": len(tables.labels),
+        "validation_objects": len(validation.labels),
+        "left_out": statistics.left_out,
+        "views": statistics.views,
+        "starts": int(can_reach.sum()),
+        "reachable": can_reach.tolist(),
+        "random_draws_per_start": config.draws,
+        "random_exact_up_to": exact,
+        "thresholds": list(THRESHOLDS),
+        "max_views": list(range(FIRST_MV, config.max_views + 1)),
+        "headline": {"threshold": HEADLINE_CT, "max_views": mv},
+        "single_view": single_view(tables, len(statistics.classes)),
+        "entropy": entropy_errors(tables, statistics),
+        "ladder": [{"policy": rung.policy, "title": rung.title, "knows": rung.knows} for rung in rungs],
+        "policies": {
+            name: summarise(result, tables.labels)
+            | {
+                "headline_interval": intervals(cells(result)[0][mv - FIRST_MV, column]),
+                "headline_confusion": headline_confusion(starts_of(result), tables, mv).tolist(),
+            }
+            for name, result in shown.items()
+        },
+        "against_random": {
+            name: difference(result, shown[BASELINE]) for name, result in shown.items() if name != BASELINE
+        },
+        "views_to_reach": views_to_reach(shown, BASELINE),
+        "best_pair": best_pair(tables, can_reach),
+        "confidence": confidence,
+        "movement": movement,
+        "compatibility": compatibility(results, other, statistics.views, leak),
+    }

@@ -1,0 +1,162 @@
+"""Time and memory of one decision (thesis Tables 3 and 9, and the times of Appendix A).
+
+Times are of single calls, device-synchronised, after warming up; they are reports of this machine, not tests. Memory is what
+XLA plans for the program (weights, inputs and all temporaries together), and beside it the device's own peak where the device
+reports one, each measured in a process of its own, since a peak never goes down.
+"""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+import time
+from collections.abc import Callable, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from flax import nnx
+
+from data_pipeline.dataset.batches import select_views
+from data_pipeline.dataset.builder import open_split
+from data_pipeline.objects.mesh import Mesh
+from eval.rendering.ascent import Method, climb
+from mevs_jax.policies.base import maxima_first
+from mevs_jax.viewpoints import ViewGraph, fibonacci_sphere, local_maxima
+from train.tasks.classifier import ClassifierTask
+from train.tasks.entropy import EntropyTask
+
+_WARM_UP = 3
+
+
+def milliseconds(call: Callable[[Any], Any], inputs: Sequence[Any]) -> np.ndarray:
+    """Time of a call with each of the inputs, until its result is there, (inputs,)."""
+    for _ in range(_WARM_UP):
+        jax.block_until_ready(call(inputs[0]))
+    times = np.empty(len(inputs))
+    for run, given in enumerate(inputs):
+        started = time.perf_counter()
+        jax.block_until_ready(call(given))
+        times[run] = 1000 * (time.perf_counter() - started)
+    return times
+
+
+def time_predictor(
+    data: Path, task: EntropyTask, network: nnx.Module, labels: np.ndarray, classes: list[str], runs: int
+) -> dict[str, list[float]]:
+    """Mean and standard deviation (ms) of PointNet++ on one cloud, by class: random test objects from random views."""
+    structure, state = nnx.split(network)
+    predict = jax.jit(lambda state, cloud: nnx.merge(structure, state)(cloud))
+    source, random = open_split(data, "test"), np.random.default_rng(0)
+    out, every = {}, []
+    for label, name in enumerate(classes):
+        members = np.flatnonzero(labels == label)
+        if len(members) == 0:
+            continue
+        clouds = []
+        for index in random.choice(members, runs):
+            views = random.integers(task.views, size=1)
+            chosen = select_views(source[index], views, points=task.network_config.points, images=None, random=random)
+            clouds.append(task.inputs({name: jnp.asarray(array) for name, array in chosen.items()})[0])
+        times = milliseconds(partial(predict, state), clouds)
+        out[name] = [float(times.mean()), float(times.std())]
+        every.append(times)
+    return out | {"all": [float(np.mean(every)), float(np.std(every))]}
+
+
+def time_local_maxima(views: int, runs: int = 200, objects: int = 1000) -> dict[str, float]:
+    """Milliseconds for the local maxima of one object's map, alone and as one of many in a batch."""
+    graph = ViewGraph.from_points(fibonacci_sphere(views))
+    maps = jax.random.uniform(jax.random.key(0), (objects, views))
+    alone = jax.jit(lambda entropies: local_maxima(entropies, graph.neighbours))
+    batched = jax.jit(jax.vmap(lambda entropies: local_maxima(entropies, graph.neighbours)))
+    return {
+        "alone": float(np.median(milliseconds(alone, [maps[0]] * runs))),
+        "batched": float(np.median(milliseconds(batched, [maps] * runs))) / objects,
+    }
+
+
+def time_climbing(method: Method, meshes: dict[str, list[Mesh]], starts: int, resolution: int) -> dict[str, Any]:
+    """Seconds of climbs on each class's objects, mean and standard deviation, and megabytes planned for one object."""
+    things = {name: [jnp.asarray(method.prepare(mesh)) for mesh in some] for name, some in meshes.items()}
+    first = next(iter(things.values()))[0]
+    compiled = jax.jit(lambda thing: climb(method, thing, starts, resolution).values).lower(first).compile()
+    jax.block_until_ready(compiled(first))
+    seconds: dict[str, np.ndarray] = {}
+    for name, some in things.items():
+        times = []
+        for thing in some:
+            begun = time.perf_counter()
+            jax.block_until_ready(compiled(thing))
+            times.append(time.perf_counter() - begun)
+        seconds[name] = np.array(times)
+    seconds["all"] = np.concatenate(list(seconds.values()))
+    return {
+        "seconds": {name: [float(times.mean()), float(times.std())] for name, times in seconds.items()},
+        "memory": {"planned": _planned(compiled), "device_peak": None},
+    }
+
+
+def _planned(compiled: Any) -> float | None:
+    """Megabytes that XLA plans for a program: arguments, results and temporaries."""
+    plan = compiled.memory_analysis()
+    parts = ("argument_size_in_bytes", "output_size_in_bytes", "temp_size_in_bytes")
+    return sum(getattr(plan, part) for part in parts) / 1e6 if plan else None
+
+
+def decision_memory(classify: ClassifierTask, predict: EntropyTask | None) -> dict[str, float | None]:
+    """Megabytes of one decision by networks of these sizes: what they see of a view → logits and the next view.
+
+    Args:
+        predict: None for random selection, which needs no other network than the classifier.
+
+    Returns:
+        `planned` by XLA, and the `device_peak` of this process, None where the device does not tell.
+    """
+    side, views = classify.camera.resolution, predict.views if predict else 40
+    graph = ViewGraph.from_points(fibonacci_sphere(views))
+    classifier = nnx.split(classify.network(nnx.Rngs(0)))
+    predictor = nnx.split(predict.network(nnx.Rngs(0))) if predict else None
+
+    def decide(states: Any, image: jax.Array, cloud: jax.Array, attempted: jax.Array, key: jax.Array):
+        logits = nnx.merge(classifier[0], states[0])(image)
+        scores = jax.random.uniform(key, (views,))
+        if predictor:
+            scores = maxima_first(nnx.merge(predictor[0], states[1])(cloud), ~attempted, graph.neighbours)
+        return logits, jnp.argmax(jnp.where(attempted, -jnp.inf, scores))
+
+    arguments = (
+        (classifier[1], predictor[1] if predictor else None),
+        jnp.zeros((side, side, classify.network_config.channels)),
+        jnp.zeros((predict.network_config.points if predict else 1, 3)),
+        jnp.zeros(views, bool),
+        jax.random.key(0),
+    )
+    compiled = jax.jit(decide).lower(*arguments).compile()
+    for _ in range(_WARM_UP):
+        jax.block_until_ready(compiled(*arguments))
+    reported = jax.devices()[0].memory_stats()
+    return {
+        "planned": _planned(compiled),
+        "device_peak": reported["peak_bytes_in_use"] / 1e6 if reported else None,
+    }
+
+
+def decision_memory_alone(classify: ClassifierTask, predict: EntropyTask | None) -> dict[str, float | None]:
+    """The same in a process of its own where the device reports peaks, which are over all that a process ever did."""
+    if not jax.devices()[0].memory_stats():
+        return decision_memory(classify, predict)
+    before = os.environ.get("XLA_PYTHON_CLIENT_PREALLOCATE")
+    os.environ["XLA_PYTHON_CLIENT_PREALLOCATE"] = "false"  # this process holds most of the device already
+    try:
+        with ProcessPoolExecutor(1, multiprocessing.get_context("spawn")) as pool:
+            return pool.submit(decision_memory, classify, predict).result()
+    finally:
+        if before is None:
+            del os.environ["XLA_PYTHON_CLIENT_PREALLOCATE"]
+        else:
+            os.environ["XLA_PYTHON_CLIENT_PREALLOCATE"] = before

@@ -1,0 +1,170 @@
+"""The report: one self-contained page that says what was done, what came out, and how sure one may be of it."""
+
+from __future__ import annotations
+
+import html
+import json
+import platform
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from data_pipeline.dataset.builder import open_split
+from data_pipeline.files import write_text
+from eval.learned.page import active_section
+from eval.report import figures
+from eval.report.html import ReportInputs, document, image, percent, table
+from eval.report.policies import (
+    climbing_section,
+    compatibility_section,
+    confidence_section,
+    draws,
+    grid_section,
+    ladder_section,
+    lead,
+    movement_section,
+)
+from mevs_jax.viewpoints import ViewGraph, local_maxima
+
+
+def _data_section(inputs: ReportInputs) -> str:
+    statistics = inputs.statistics
+    rows = [
+        [html.escape(name), *(str(statistics.counts[split][name]) for split in ("train", "val", "test"))]
+        for name in statistics.classes
+    ]
+    totals = [f"<b>{sum(statistics.counts[split].values())}</b>" for split in ("train", "val", "test")]
+    camera = statistics.camera
+    source = open_split(inputs.data, "test")
+    chosen: dict[int, int] = {}
+    for index, label in enumerate(inputs.tables.labels):
+        chosen.setdefault(int(label), index)
+    views = np.linspace(0, statistics.views - 1, min(10, statistics.views)).round().astype(int)
+    sheet = np.stack([source[chosen[label]]["image"][views] for label in sorted(chosen)])
+    left_out = [
+        f"<li><code>{html.escape(name)}</code>: {html.escape(why)}</li>"
+        for by_name in statistics.left_out.values()
+        for name, why in by_name.items()
+    ]
+    return (
+        f"<h2>Data</h2><p>{html.escape(statistics.source)}: {statistics.views} views of each object (lattice "
+        f"<code>{camera.lattice}</code>), {camera.resolution}×{camera.resolution} pixels, "
+        f"{camera.field_of_view:g}° field of view from {camera.distance:g} radii away. "
+        f"Points seen per view: {statistics.points_mean:,.0f} ± "
+        f"{statistics.points_std:,.0f}. "
+        f"Entropies are normalised by the training split's largest, {statistics.entropy_max:.2f} bits.</p>"
+        + table(["class", "train", "val", "test"], [*rows, ["<b>all</b>", *totals]])
+        + f"<p>{statistics.left_out_count} objects were left out "
+        + f"({len(statistics.left_out['train'])} of training, {len(statistics.left_out['test'])} of test).</p>"
+        + (f"<details><summary>Which, and why</summary><ul>{''.join(left_out)}</ul></details>" if left_out else "")
+        + image(
+            figures.contact_sheet(sheet, [statistics.classes[label] for label in sorted(chosen)]),
+            f"One test object of each class from {len(views)} of the {statistics.views} viewpoints.",
+            "png",
+        )
+        + image(
+            figures.entropy_histogram(
+                statistics.entropy_histograms["train"], statistics.entropy_mean, statistics.entropy_std
+            ),
+            "The thesis reports a mean of 0.329 and a standard deviation of 0.156 (Fig. 9).",
+        )
+    )
+
+
+def _entropy_section(inputs: ReportInputs) -> str:
+    entropy, statistics, tables = inputs.metrics["entropy"], inputs.statistics, inputs.tables
+    graph = ViewGraph.from_points(np.array(statistics.viewpoints))
+    errors = np.square(tables.utility - tables.entropy[:, None, :]).mean(axis=(1, 2))
+    example = int(np.argsort(errors)[len(errors) // 2])
+    true, predicted = tables.entropy[example], tables.utility[example, 0]
+    limits = (float(min(true.min(), predicted.min())), float(max(true.max(), predicted.max())))
+    maps = [
+        figures.view_map(
+            np.asarray(graph.points),
+            np.asarray(graph.neighbours),
+            weights,
+            np.asarray(local_maxima(jnp.asarray(weights), graph.neighbours)),
+            title,
+            limits,
+        )
+        for weights, title in ((true, "true"), (predicted, "predicted after view 0"))
+    ]
+    low, high = entropy["better_than_mean_map"]
+    gain = "beats" if low > 0 else "does not beat"
+    rows = [[html.escape(name), f"{value:.4f}"] for name, value in entropy["by_class"].items() if value is not None]
+    return (
+        f"<h2>Predicting depth entropy</h2><p>From one partial cloud, PointNet++ predicts the normalised entropy of every view "
+        f"with a mean squared error of {entropy['pointnet2']:.4f} "
+        f"({100 * (entropy['explained_variance'] or 0):.0f} % of the variance explained). It {gain} the mean map, which looks at "
+        f"nothing (difference in error {low:+.4f} to {high:+.4f}). The class-mean map is told the true class.</p>"
+        + image(figures.entropy_errors(entropy), "Test objects, all views as input; 95 % intervals over objects.")
+        + '<div class="figures">'
+        + "".join(
+            image(m, f"{tables.names[example]}, an object of median error. Red rings: local maxima.") for m in maps
+        )
+        + f"</div><details><summary>Error by class</summary>{table(['class', 'MSE'], rows)}</details>"
+    )
+
+
+def _training_section(inputs: ReportInputs) -> str:
+    rows = [
+        [
+            html.escape(name),
+            str(s["best_epoch"]),
+            str(s["epoch"]),
+            f"{s['best_loss']:.4f}",
+            f"{s['seconds'] / 60:.1f} min",
+        ]
+        for name, s in inputs.summaries.items()
+    ]
+    by_view = inputs.metrics["single_view"]["by_view"]
+    return (
+        "<h2>Training</h2>"
+        + table(["network", "best epoch", "epochs", "best validation loss", "time"], rows)
+        + image(figures.losses(inputs.histories), "Validation is on objects never trained on.")
+        + f"<p>Single views: {percent(min(by_view))} % at the worst viewpoint, {percent(max(by_view))} % at the best; class "
+        f"accuracy {percent(inputs.metrics['single_view']['class_accuracy'])} %.</p>"
+    )
+
+
+def _methods_section(inputs: ReportInputs) -> str:
+    settings = html.escape(json.dumps(inputs.settings, indent=1, default=str))
+    device = jax.devices()[0]
+    return (
+        "<h2>How this was made</h2><p>Splits are by object; nothing was chosen on test objects. Every object is walked from "
+        f"every start view that can be reached; policies that draw are averaged over {draws(inputs.metrics)}. "
+        f"What policies may know of other objects, and all temperatures, is learnt on "
+        f"{inputs.metrics['validation_objects']} validation objects. Preset "
+        f"<code>{html.escape(inputs.preset)}</code>, JAX {jax.__version__} on {html.escape(device.device_kind)} "
+        f"({html.escape(platform.machine())}, Python {platform.python_version()}).</p>"
+        f"<details><summary>All settings</summary><pre>{settings}</pre></details>"
+    )
+
+
+def read_history(folder: Path) -> list[dict[str, float]]:
+    return [json.loads(line) for line in (folder / "metrics.jsonl").read_text().splitlines()]
+
+
+_SECTIONS = (
+    lead,
+    ladder_section,
+    climbing_section,
+    active_section,
+    movement_section,
+    confidence_section,
+    grid_section,
+    compatibility_section,
+    _entropy_section,
+    _training_section,
+    _data_section,
+    _methods_section,
+)
+
+
+def write_report(inputs: ReportInputs, path: Path) -> None:
+    """Writes the page; it needs no other file."""
+    body = "".join(section(inputs) for section in _SECTIONS)
+    title = f"Where to look next: {html.escape(inputs.statistics.source)}"
+    write_text(path, document(title, body))

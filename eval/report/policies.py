@@ -1,0 +1,387 @@
+"""The report's sections on choosing views: the ladder first, then what the way costs, confidence, the grid, the switches."""
+
+from __future__ import annotations
+
+import html
+from collections.abc import Sequence
+from typing import Any
+
+import jax
+import numpy as np
+
+from data_pipeline.dataset.builder import open_split
+from eval.numbers.confidence import READINGS
+from eval.report import figures
+from eval.report.html import ReportInputs, difference, image, percent, signed, span, table
+from eval.walks.ladder import KNOWS
+from mevs_jax.policies.base import Scene
+from mevs_jax.policies.registry import POLICIES
+from mevs_jax.selection import Episode, ViewTable, select_from_table
+from mevs_jax.viewpoints import ViewGraph
+
+
+def _verdict(difference: float, interval: Sequence[float]) -> str:
+    if interval[0] > 0:
+        return f"better than random by {100 * difference:.1f} points"
+    if interval[1] < 0:
+        return f"worse than random by {-100 * difference:.1f} points"
+    return f"not distinguishable from random ({signed(difference)} points)"
+
+
+def _titles(metrics: dict[str, Any]) -> dict[str, str]:
+    return {rung["policy"]: rung["title"].lstrip("— ") for rung in metrics["ladder"]}
+
+
+def _steps(metrics: dict[str, Any], wanted: Sequence[int]) -> list[int]:
+    """Those numbers of views that were walked."""
+    return [step for step in wanted if step <= len(metrics["policies"]["random"]["after_views"])]
+
+
+def lead(inputs: ReportInputs) -> str:
+    metrics = inputs.metrics
+    single, policies = metrics["single_view"], metrics["policies"]
+    sentences = [
+        f"One view is recognised with {percent(single['accuracy'])} % accuracy, two random ones with "
+        f"{percent(policies['random']['after_views'][1])} %, all {metrics['views']} summed with "
+        f"{percent(single['all_views'])} %."
+    ]
+    for name, called in (
+        ("predicted_entropy", "The thesis's policy, PointNet++ entropy,"),
+        ("oracle_entropy", "Perfect knowledge of the entropies"),
+        ("information_gain", "Expected information gain"),
+    ):
+        result = metrics["against_random"][name]
+        verdict = _verdict(result["after_views_difference"][1], result["after_views_interval"][1])
+        sentences.append(f"{called} is, at two views, {verdict}.")
+    return (
+        f'<p class="lead">{" ".join(sentences)}</p><p class="note">Over {metrics["objects"]} test objects and '
+        f"{metrics['starts']} start views of each; all policies see the same objects, starts and logits; a difference counts "
+        f"when its 95 % interval, paired by object, leaves out zero.</p>"
+    )
+
+
+def ladder_section(inputs: ReportInputs) -> str:
+    metrics = inputs.metrics
+    policies, against = metrics["policies"], metrics["against_random"]
+    steps = _steps(metrics, (2, 3, 4, 6, 9))
+    reach = metrics["views_to_reach"].get("5") or metrics["views_to_reach"].get("3")
+    rows, details, known = [], [], None
+    for rung in metrics["ladder"]:
+        name, result = rung["policy"], policies[rung["policy"]]
+        if rung["knows"] != known:
+            known = rung["knows"]
+            rows.append([f'<b class="note">Knows {html.escape(KNOWS[known])}</b>'])
+        row = [html.escape(rung["title"])]
+        for step in steps:
+            cell = f"<b>{percent(result['after_views'][step - 1])}</b>"
+            if name in against:
+                gain, interval = (against[name][f"after_views_{key}"][step - 1] for key in ("difference", "interval"))
+                cell += "<br>" + difference(gain, interval)
+            row.append(cell)
+        area = f"<b>{percent(result['area'])}</b>"
+        if name in against:
+            area += "<br>" + difference(against[name]["area_difference"], against[name]["area_interval"])
+        row.append(area)
+        if reach:
+            views = reach["views"][name]
+            low, high = ("∞" if end is None else f"{end:.1f}" for end in reach["interval"][name])
+            row.append(("never" if views is None else f"<b>{views:.1f}</b>") + f"<br><small>[{low}, {high}]</small>")
+        rows.append(row)
+        every = _steps(metrics, range(1, 10))
+        details.append(
+            [html.escape(rung["title"])]
+            + [
+                f"{percent(result['after_views'][step - 1])}<br><small class='note'>"
+                f"{span(result['after_views_interval'][step - 1])}</small>"
+                for step in every
+            ]
+        )
+    header = ["next view chosen by", *(f"{step} views" for step in steps), "area"]
+    if reach:
+        target = next(key for key, value in metrics["views_to_reach"].items() if value is reach)
+        header.append(f"views to reach {percent(reach['accuracy'])} %")
+        reach_note = f" The last column: views it takes to be as accurate as {target} random ones."
+    else:
+        reach_note = ""
+    exact = metrics["random_exact_up_to"]
+    return (
+        "<h2>The ladder: who chooses the next view</h2><p>Accuracy (%) after exactly so many views, and below it the difference "
+        "from random in points with its 95 % interval; <span class='faint'>grey</span> where it cannot be told from zero. "
+        f"Area: mean accuracy over 1 to {len(policies['random']['after_views'])} views.{reach_note}</p>"
+        + table(header, rows)
+        + f"<p class='note'>Random without repetition is an exact expectation up to {exact} views"
+        + ("" if exact >= len(policies["random"]["after_views"]) else f", beyond that a mean over {draws(metrics)}")
+        + ". The label oracles are optimistic: they find views that are right by luck. If two views could be had anywhere and "
+        f"the label were known, {percent(metrics['best_pair']['accuracy'])} % "
+        f"[{span(metrics['best_pair']['interval'])}] would be right.</p>"
+        + image(
+            figures.ladder_gains(against, metrics["ladder"], _steps(metrics, (2, 4)), ("label_oracle", "pair_oracle")),
+            "Hollow: cannot be told from random. Grey knows nothing, blue what the networks say, red other objects, orange the "
+            "truth. The label oracles would be far to the right.",
+        )
+        + image(
+            figures.accuracy_after_views(policies, _titles(metrics), metrics["single_view"]["all_views"]),
+            "Bands: 95 % intervals over objects.",
+        )
+        + "<details><summary>All numbers of views, with intervals</summary>"
+        + table(["policy", *map(str, _steps(metrics, range(1, 10)))], details)
+        + "</details>"
+    )
+
+
+def climbing_section(inputs: ReportInputs) -> str:
+    """Empty where nothing was climbed."""
+    found = inputs.metrics.get("climbing")
+    if found is None:
+        return ""
+    steps = _steps(inputs.metrics, (2, 3, 4, 6))
+    against, rows, known = found["against"], [], None
+    for rung in found["ladder"]:
+        name = rung["policy"]
+        if rung["knows"] != known:
+            known = rung["knows"]
+            rows.append([f'<b class="note">Knows {html.escape(KNOWS[known])}</b>'])
+        row = [html.escape(rung["title"])]
+        for step in steps:
+            cell = f"<b>{percent(found['policies'][name]['after_views'][step - 1])}</b>"
+            for base in against.values():
+                if name in base:
+                    gain, interval = (base[name][f"after_views_{key}"][step - 1] for key in ("difference", "interval"))
+                    cell += "<br>" + difference(gain, interval)
+                else:
+                    cell += "<br>–"
+            row.append(cell)
+        rows.append(row)
+    settings = found["settings"]
+    return (
+        "<h2>Choosing by differentiable rendering</h2><p>The thesis's other two methods: make a volume, or a surface of at most "
+        f"{settings['faces']} faces, of what the latest view shows, and climb over the sphere from {settings['starts']} starts "
+        f"to where it looks best, at {settings['resolution']}×{settings['resolution']} pixels. Distinct optima are looked at in "
+        "the order of their values. Accuracy (%) after so many views; below it the difference from random, and below that from "
+        "the thesis's predicted entropy, both with 95 % intervals.</p>"
+        + table(["next view chosen by", *(f"{step} views" for step in steps)], rows)
+        + f"<p class='note'>{found['objects']} test objects, every start view. {found['views_without_surface']} of "
+        f"{found['views']:,} views show too little for a surface; after those the choice is arbitrary.</p>"
+    )
+
+
+def draws(metrics: dict[str, Any]) -> str:
+    return f"{metrics['random_draws_per_start']} draws for each object and start"
+
+
+def movement_section(inputs: ReportInputs) -> str:
+    metrics = inputs.metrics
+    titles = _titles(metrics)
+    last = _steps(metrics, (4,)) or [len(metrics["policies"]["random"]["after_views"])]
+    rows = [
+        [
+            html.escape(titles[name]),
+            f"{run['cost']:g}",
+            percent(run["after_views"][last[0] - 1]),
+            f"{np.degrees(run['travelled'][last[0] - 1]):.0f}°",
+        ]
+        for name, runs in metrics["movement"].items()
+        for run in runs
+    ]
+    return (
+        "<h2>What the way costs</h2><p>A camera that moves pays for the way. Policies with a price take the view of highest "
+        "score − price × great-circle distance (in radians).</p>"
+        + image(
+            figures.accuracy_by_way(metrics["policies"], titles, metrics["movement"]),
+            "Dots: after 1, 2, 3, … views. Thin lines: the same policy with the price at their end.",
+        )
+        + f"<details><summary>After {last[0]} views, by price</summary>"
+        + table(["policy", "price", "accuracy (%)", "way"], rows)
+        + "</details>"
+    )
+
+
+def confidence_section(inputs: ReportInputs) -> str:
+    metrics = inputs.metrics
+    titles = _titles(metrics)
+    name = "information_gain"
+    readings = metrics["confidence"][name]["readings"]
+    steps = _steps(metrics, (1, 2, 4, 9))
+    rows = [
+        [
+            html.escape(READINGS[reading]),
+            *(f"{100 * values['ece'][step - 1]:.1f}" for step in steps),
+            *(f"{values['nll'][step - 1]:.2f}" for step in steps),
+            percent(values["accuracy"][steps[-1] - 1]),
+        ]
+        for reading, values in readings.items()
+    ]
+    header = ["reading", *(f"ECE, {s}" for s in steps), *(f"NLL, {s}" for s in steps), f"accuracy, {steps[-1]}"]
+    stops = []
+    for plain, mended in zip(readings["sum_of_logits"]["stopping"], readings["temperature"]["stopping"], strict=True):
+        row = [f"{100 * plain['risk']:g}"]
+        for cell in (plain, mended):
+            broken = cell["excess"][0] > 0
+            error = "–" if cell["error"] is None else f"{100 * cell['error']:.1f}"
+            row += [
+                f"<b>{error}</b>" if broken else error,
+                f"{100 * cell['sure']:.0f}",
+                f"{cell['views']:.2f}",
+                percent(cell["accuracy"]),
+            ]
+        stops.append(row)
+    parts = ("wrong when sure", "sure", "views", "accuracy")
+    return (
+        f"<h2>How sure it may be</h2><p>Walks by {html.escape(titles[name])}. Adding logits takes views of one object to be "
+        "independent, so confidence outruns accuracy. A temperature for each number of views, fitted on validation walks, mends "
+        "that and changes no answer; only the mean of probabilities can answer otherwise.</p>"
+        + image(
+            figures.calibration_by_views(readings, READINGS),
+            "Expected calibration error, 15 bins, test objects; temperatures and exponent fitted on validation objects.",
+        )
+        + table(header, rows)
+        + image(figures.reliability_curves(readings, READINGS, steps), "On the dotted line confidence is honest.")
+        + "<p>Stopping as soon as the risk, 1 − confidence, is at most what is asked for (columns in %; <b>bold</b>: wrong more "
+        "often than promised, by its 95 % interval):</p>"
+        + table(
+            ["risk asked for", *(f"{part}, summed" for part in parts), *(f"{part}, calibrated" for part in parts)],
+            stops,
+        )
+    )
+
+
+def compatibility_section(inputs: ReportInputs) -> str:
+    metrics = inputs.metrics
+    made = metrics["compatibility"]
+    column = metrics["thresholds"].index(0.99)
+    limits = [mv for mv in (2, 3, 4, 9) if mv in metrics["max_views"]]
+    thesis, rows = made["thesis"], []
+    if thesis:
+        rows.append(
+            [
+                f"<i>the thesis, Table {thesis['table']}</i>",
+                signed(thesis["mean"], 2),
+                f"{thesis['above_zero']} of 56",
+                *["" for _ in limits],
+            ]
+        )
+    for row in made["rows"].values():
+        if row["difference"] is None:
+            rows.append([html.escape(row["title"]), "<code>mevs compat</code>", "", *["" for _ in limits]])
+            continue
+        cells = [
+            difference(
+                row["difference"][metrics["max_views"].index(mv)][column],
+                row["interval"][metrics["max_views"].index(mv)][column],
+            )
+            for mv in limits
+        ]
+        rows.append(
+            [
+                html.escape(row["title"]),
+                difference(row["mean"], row["mean_interval"], 2),
+                f"{row['above_zero']} of {row['cells']}",
+                *cells,
+            ]
+        )
+    leak = made["single_view_accuracy"]
+    note = ""
+    if leak:
+        ours, theirs = leak["classifier"], leak["classifier_by_view"]
+        note = (
+            f"<p class='note'>Single views, validation and test: {percent(ours['validation'])} % and {percent(ours['test'])} % "
+            f"validated by object, {percent(theirs['validation'])} % and {percent(theirs['test'])} % by view.</p>"
+        )
+    return (
+        "<h2>What the published code changes</h2><p>Gain of the PointNet++ policy over random in the grid above, in "
+        "points: first as the thesis's text has it, then with one thing as in its published code (or, for all "
+        "clouds, otherwise).</p>"
+        + table(["switch", "mean of the grid", "cells above zero", *(f"CT 0.99, MV {mv}" for mv in limits)], rows)
+        + note
+    )
+
+
+def grid_section(inputs: ReportInputs) -> str:
+    metrics = inputs.metrics
+    policies, against, titles = metrics["policies"], metrics["against_random"], _titles(metrics)
+    shown = ("predicted_entropy", "oracle_entropy", "information_gain")
+    parts = [
+        "<h2>The thesis's grid</h2><p>Stop at a confidence threshold (CT, columns) or after the most views (MV, rows).</p>",
+        '<div class="figures">',
+    ]
+    for name in shown:
+        low, high = np.moveaxis(np.array(against[name]["interval"]), -1, 0)
+        parts.append(
+            image(
+                figures.difference_grid(
+                    against[name]["difference"],
+                    against[name]["interval"],
+                    metrics["thresholds"],
+                    metrics["max_views"],
+                    f"{titles[name]} − random",
+                ),
+                f"Percentage points (thesis Tables 7 and 12). Bold where its interval leaves out zero: "
+                f"{((low > 0) | (high < 0)).sum()} of {low.size} cells.",
+            )
+        )
+    parts.append("</div>")
+    for name in ("random", *shown):
+        for key, label, show in (
+            ("accuracy", "accuracy (%)", percent),
+            ("class_accuracy", "class accuracy (%)", percent),
+            ("views_used", "views used", lambda value: f"{value:.2f}"),
+        ):
+            rows = []
+            for row, (mv, values) in enumerate(zip(metrics["max_views"], policies[name][key], strict=True)):
+                cells = [show(value) for value in values]
+                if key == "accuracy":
+                    cells = [
+                        f"{cell}<br><small class='note'>{span(interval)}</small>"
+                        for cell, interval in zip(cells, policies[name]["interval"][row], strict=True)
+                    ]
+                rows.append([str(mv), *cells])
+            shown_cells = table(["MV \\ CT", *(f"{ct:g}" for ct in metrics["thresholds"])], rows)
+            parts.append(f"<details><summary>{titles[name]}: {label}</summary>{shown_cells}</details>")
+    matrices = {
+        titles[name]: np.array(policies[name]["headline_confusion"]) for name in ("random", "predicted_entropy")
+    }
+    headline = metrics["headline"]
+    parts.append(
+        image(
+            figures.confusions(matrices, inputs.statistics.classes),
+            f"Percent of each true class; CT {headline['threshold']}, MV {headline['max_views']} (thesis Fig. 23).",
+        )
+    )
+    return "".join(parts) + _example_walk(inputs)
+
+
+def _example_walk(inputs: ReportInputs) -> str:
+    """The first object that one view gets wrong and the predicted-entropy walk gets right; else the first object."""
+    tables, statistics = inputs.tables, inputs.statistics
+    graph = ViewGraph.from_points(np.array(statistics.viewpoints))
+    stacked = tables.stacked()
+
+    @jax.jit
+    def walk_along(table: ViewTable, start: int) -> Episode:
+        steps = min(4, statistics.views)
+        return select_from_table(
+            jax.random.key(0), table, Scene(graph, table.entropy), POLICIES["predicted_entropy"], start, max_views=steps
+        )
+
+    def walk(index: int, start: int) -> Episode:
+        return walk_along(jax.tree.map(lambda leaf: leaf[index], stacked), start)
+
+    wrong = np.argwhere(tables.logits.argmax(-1) != tables.labels[:, None])
+    episode, index = None, 0
+    for candidate, start in wrong[:: max(1, len(wrong) // 50)]:
+        episode, index = walk(int(candidate), int(start)), int(candidate)
+        if int(episode.predictions[-1]) == tables.labels[index]:
+            break
+    episode = episode or walk(0, 0)
+    images = open_split(inputs.data, "test")[index]["image"]
+    views = np.asarray(episode.views)
+    captions = [
+        f"view {view}: {statistics.classes[int(p)]}\n{100 * float(c):.0f} % sure"
+        for view, p, c in zip(views, episode.predictions, episode.confidences, strict=True)
+    ]
+    title = f"{tables.names[index]}: what the policy looked at, and what it believed"
+    return image(
+        figures.episode_strip([images[view] for view in views], captions, title),
+        "One walk of the PointNet++ policy.",
+        "png",
+    )

@@ -1,0 +1,190 @@
+"""Everything that can be set, and the presets."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+from data_pipeline.capture.casting import CaptureConfig
+from data_pipeline.dataset.augment import CloudAugmentation, ViewAugmentation
+from data_pipeline.dataset.builder import DataConfig
+from eval.rendering.ascent import AscentConfig
+from eval.rendering.policies import ClimbConfig
+from eval.walks.grid import GridConfig
+from eval.walks.live import LiveConfig
+from mevs_jax.models import Abstraction
+from train.choosing.features import SetFusionConfig
+from train.choosing.policy import PolicyConfig
+from train.choosing.stages import ABLATIONS, ActiveConfig
+from train.optimiser import OptimiserConfig
+from train.sweep import SweepConfig
+from train.tasks.classifier import ClassifierConfig, ResNetConfig
+from train.tasks.entropy import EntropyConfig, PointNet2Config
+from train.tasks.recogniser import RecogniserConfig
+from train.thesis_networks import ThesisConfig
+
+
+@dataclass(frozen=True)
+class Settings:
+    """Everything that can be set; the defaults are the thesis's."""
+
+    dataset: DataConfig = DataConfig()
+    classifier: ClassifierConfig = ClassifierConfig()
+    entropy: EntropyConfig = EntropyConfig()
+    evaluation: GridConfig = GridConfig()
+    live: LiveConfig = LiveConfig()
+    thesis: ThesisConfig = ThesisConfig()
+    sweep: SweepConfig = SweepConfig()
+    ascent: AscentConfig = AscentConfig()
+    climb: ClimbConfig = ClimbConfig()
+    active: ActiveConfig = ActiveConfig()
+
+
+THESIS = Settings()
+"""The thesis's sizes: 224×224, 40 views, ResNet-18 on depth, PointNet++ on 4,096 points. For an accelerator: two CPU cores
+train PointNet++ of this size on 7 clouds a second, five hours for one epoch of ModelNet10.
+`mevs run --preset thesis --data ModelNet10.zip`"""
+
+
+_BRIEF = OptimiserConfig(
+    epochs=8, batch_size=64, epoch_views=8, validation_views=4, weight_decay=0.02, schedule="cosine"
+)
+
+
+SMALL = Settings(
+    dataset=DataConfig(capture=CaptureConfig(resolution=64)),
+    classifier=ClassifierConfig(
+        network=ResNetConfig(width=32, channels=1, standardise=False),
+        optimiser=_BRIEF,
+    ),
+    entropy=EntropyConfig(
+        network=PointNet2Config(
+            points=1024,
+            abstractions=(
+                Abstraction(centres=128, radius=0.25, samples=16, layers=(32, 32, 64)),
+                Abstraction(centres=32, radius=0.5, samples=16, layers=(64, 64, 128)),
+            ),
+            dropout=0.0,
+        ),
+        augmentation=CloudAugmentation(scale=False, tilt=False, translate=False, jitter=False, drop=False),
+        optimiser=OptimiserConfig(
+            epochs=8,
+            batch_size=32,
+            views_per_object=2,
+            epoch_views=4,
+            validation_views=2,
+            learning_rate=2e-3,
+            schedule="cosine",
+        ),
+    ),
+    thesis=ThesisConfig(
+        resnet18=replace(_BRIEF, epochs=7, views_per_object=1, learning_rate=2e-3),
+        resnet34=replace(_BRIEF, epochs=9, views_per_object=2, learning_rate=2e-3),
+        fine_tuning=replace(_BRIEF, epochs=4, views_per_object=2),
+        resnet34_width=32,
+    ),
+    active=ActiveConfig(
+        recogniser=RecogniserConfig(
+            network=ResNetConfig(width=32, channels=4, standardise=False, stem="patches"),
+            augmentation=ViewAugmentation(stretch=0.15),
+            balanced=True,
+            optimiser=OptimiserConfig(
+                method="muon",
+                epochs=6,
+                batch_size=256,
+                views_per_object=8,
+                epoch_views=40,
+                validation_views=8,
+                learning_rate=5e-3,
+                weight_decay=0.05,
+                schedule="cosine",
+            ),
+        ),
+        fold_epochs=4,
+        draws=2,
+        fitting_starts=4,
+        ablations=ABLATIONS,
+        novel=5,
+        rotation_epochs=3,
+    ),
+)
+"""The same study at 64×64 with narrower networks.
+`mevs run --data modelnet10_voxels32.npz`: 12 minutes on two cores of an AMD EPYC (Zen 5), `mevs thesis` 40."""
+
+
+BEST = replace(
+    SMALL,
+    dataset=replace(SMALL.dataset, capture=CaptureConfig(resolution=128)),
+    active=replace(
+        SMALL.active,
+        recogniser=replace(
+            SMALL.active.recogniser,
+            network=ResNetConfig(channels=4, standardise=False),
+            optimiser=replace(SMALL.active.recogniser.optimiser, epochs=12, batch_size=512),
+        ),
+        folds=4,
+        fold_epochs=0,
+        seeds=3,
+        lattices=(10, 60),
+    ),
+)
+"""What `mevs active` is meant to have where there is an accelerator: views of 128×128, a ResNet-18 as wide as the paper's, four
+parts, three seeds. It has been run for some steps, never to its end."""
+
+
+_TRIFLING_SETS = SetFusionConfig(width=16, heads=2, blocks=1)
+
+
+_TRIFLE = OptimiserConfig(epochs=2, batch_size=16, views_per_object=2, epoch_views=4, schedule="cosine")
+
+
+TINY = Settings(
+    dataset=DataConfig(train_per_class=4, test_per_class=1, capture=CaptureConfig(views=6, resolution=32)),
+    classifier=ClassifierConfig(
+        network=ResNetConfig(depth=10, width=8, channels=1, standardise=False),
+        optimiser=_TRIFLE,
+    ),
+    entropy=EntropyConfig(
+        network=PointNet2Config(
+            points=64,
+            abstractions=(
+                Abstraction(centres=16, radius=0.4, samples=8, layers=(8, 16)),
+                Abstraction(centres=8, radius=0.8, samples=8, layers=(16, 32)),
+            ),
+            global_layers=(32, 64),
+            head_layers=(32,),
+        ),
+        optimiser=_TRIFLE,
+    ),
+    evaluation=GridConfig(draws=2),
+    live=LiveConfig(objects=10, at_once=8, max_views=4),
+    thesis=ThesisConfig(
+        _TRIFLE,
+        _TRIFLE,
+        _TRIFLE,
+        resnet34_width=8,
+        timing_runs=3,
+        climbing_runs=1,
+        climbing_starts=2,
+        climbing_resolution=16,
+    ),
+    active=ActiveConfig(
+        recogniser=RecogniserConfig(
+            network=ResNetConfig(depth=10, width=8, channels=4, standardise=False, stem="patches"),
+            fusion=_TRIFLING_SETS,
+            optimiser=replace(_TRIFLE, validation_views=2),
+        ),
+        policy=PolicyConfig(width=16, heads=2, blocks=1, most_seen=3, walks=1, rounds=1, epochs=2, batch_size=32),
+        changed=1,
+        max_views=4,
+        draws=2,
+        lattices=(),
+        ablations=("look_ahead", "crossed", "summed", "cloud"),
+        novel=1,
+        rotation_epochs=1,
+    ),
+    climb=ClimbConfig(objects=1, starts=2, resolution=16, faces=64),
+)
+"""Seconds, and no use but to see that everything runs."""
+
+
+PRESETS = {"small": SMALL, "best": BEST, "thesis": THESIS, "tiny": TINY}

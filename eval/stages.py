@@ -1,0 +1,247 @@
+"""The stages of a run: data → networks → tables and metrics → report. Each stage skips what is done.
+
+A run directory holds `data/`, `classifier/`, `entropy/`, `tables/`, `metrics.json` and `report/index.html`; and
+`classifier_by_view/` where the published code's validation is compared too.
+"""
+
+from __future__ import annotations
+
+import os
+from dataclasses import asdict, replace
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from data_pipeline.dataset.builder import DatasetStatistics, load_statistics, prepare, report_left_out
+from data_pipeline.errors import DataError
+from data_pipeline.files import as_read, read_json, write_json
+from data_pipeline.progress import console
+from eval.learned.measure import measure, together, train_all
+from eval.learned.page import write_active_page
+from eval.numbers.study import reachable_views, run_study
+from eval.rendering.policies import climb_objects, climbing_study, load_climbed
+from eval.report.html import ReportInputs
+from eval.report.page import read_history, write_report
+from eval.report.sweep import write_sweep_report
+from eval.settings import Settings
+from eval.tables import ViewTables, compute_view_tables, load_view_tables, save_view_tables
+from eval.walks.grid import FIRST_MV, GridConfig
+from eval.walks.knowledge import learn
+from eval.walks.ladder import CLIMBED
+from eval.walks.live import Agreement, Networks, compare_with_tables
+from mevs_jax.policies.registry import POLICIES
+from mevs_jax.viewpoints import ViewGraph
+from train.choosing.stages import Stages, check_active
+from train.kept import made_by
+from train.loop import fit, load_best
+from train.starting_weights import StartingWeights
+from train.step import Task
+from train.sweep import Member, sweep
+from train.tasks.classifier import ClassifierTask
+from train.tasks.entropy import EntropyTask
+
+
+def check_output(out: Path) -> None:
+    """Raises `DataError` where nothing can be written to `out`."""
+    probe = out / f".probe.{os.getpid()}"
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+        probe.touch()
+        probe.unlink()
+    except OSError as error:
+        raise DataError(f"cannot write to {out} ({error.strerror}); choose another --out") from error
+
+
+def make_data(settings: Settings, out: Path, beam: str | None = None) -> DatasetStatistics:
+    statistics = prepare(settings.dataset, out / "data", beam)
+    report_left_out(statistics)
+    return statistics
+
+
+def tasks(settings: Settings, statistics: DatasetStatistics) -> tuple[ClassifierTask, EntropyTask]:
+    """What is trained on a data set."""
+    camera = statistics.camera
+    return (
+        ClassifierTask.of(settings.classifier, len(statistics.classes), camera),
+        EntropyTask.of(settings.entropy, statistics.views, statistics.entropy_max, camera),
+    )
+
+
+def train(
+    settings: Settings, out: Path, start: StartingWeights | None = None, mesh: jax.sharding.Mesh | None = None
+) -> None:
+    """Trains both networks, the classifier from `start` or random weights, on `mesh` or all devices."""
+    statistics = load_statistics(out / "data")
+    classify, predict = tasks(settings, statistics)
+    planned: list[tuple[Task, str, StartingWeights | None]] = [
+        (classify, "classifier", start),
+        (predict, "entropy", None),
+    ]
+    for task, name, weights in planned:
+        summary = fit(task, out / "data", statistics, out / name, weights, mesh)
+        console.print(
+            f"{task.name}: best epoch {summary['best_epoch']} of {summary['epoch']}, validation "
+            + ", ".join(f"{key} {value:.4f}" for key, value in summary["best"].items())
+            + f", {summary['seconds'] / 60:.1f} min"
+        )
+
+
+def train_sweep(settings: Settings, out: Path, mesh: jax.sharding.Mesh | None = None) -> tuple[Path, list[Member]]:
+    """Trains many configurations of one network together; returns the sweep's folder and its members."""
+    statistics = load_statistics(out / "data")
+    name = settings.sweep.network
+    task = tasks(settings, statistics)[("classifier", "entropy").index(name)]
+    folder = out / "sweep" / name
+    members = sweep(task, out / "data", statistics, folder, settings.sweep, mesh)
+    write_sweep_report(members, folder)
+    return folder, members
+
+
+BY_VIEW = "classifier_by_view"
+
+
+def train_by_view(settings: Settings, out: Path, start: StartingWeights | None = None) -> None:
+    """Trains the classifier once more, validated by view as in the thesis's published code, for the compatibility table."""
+    statistics = load_statistics(out / "data")
+    classify, _ = tasks(settings, statistics)
+    by_view = replace(classify, optimiser=replace(classify.optimiser, validation_by="view"))
+    fit(by_view, out / "data", statistics, out / BY_VIEW, start)
+
+
+def _tables(
+    settings: Settings, out: Path, statistics: DatasetStatistics, split: str, classifier: str = "classifier"
+) -> ViewTables:
+    """The view tables of a split, made anew where the stored ones are of other networks."""
+    made = made_by(statistics, out / classifier, out / "entropy")
+    path = out / "tables" / (f"{split}.npz" if classifier == "classifier" else f"{split}_by_view.npz")
+    if path.exists() and (tables := load_view_tables(path)).made_by == made:
+        return tables
+    classify, predict = tasks(settings, statistics)
+    networks = load_best(classify, out / classifier), load_best(predict, out / "entropy")
+    tables = compute_view_tables(out / "data", split, statistics, classify, networks[0], predict, networks[1])
+    tables = replace(tables, made_by=made)
+    save_view_tables(path, tables)
+    return tables
+
+
+def check_evaluation(config: GridConfig) -> None:
+    """Raises `DataError` for a grid without cells."""
+    if config.max_views < FIRST_MV or config.draws < 1:
+        raise DataError("--evaluation.max-views must be at least 2 and --evaluation.draws at least 1")
+
+
+def evaluate(settings: Settings, out: Path) -> dict[str, Any]:
+    """Metrics of the test split, as written to `metrics.json`."""
+    statistics = load_statistics(out / "data")
+    by_view_made = None
+    if (out / BY_VIEW / "summary.json").exists():
+        by_view_made = made_by(statistics, out / BY_VIEW, out / "entropy")
+    identity = {
+        "evaluation": asdict(settings.evaluation),
+        "made_by": made_by(statistics, out / "classifier", out / "entropy"),
+        "by_view": by_view_made,
+        "climbed": None,
+    }
+    climbed = load_climbed(out, statistics, settings.climb)
+    if climbed is not None:
+        identity["climbed"] = asdict(settings.climb)
+    identity = as_read(identity)
+    check_evaluation(settings.evaluation)
+    path = out / "metrics.json"
+    if path.exists() and (metrics := read_json(path))["identity"] == identity:
+        return metrics
+    try:
+        reachable_views(np.array(statistics.viewpoints), settings.evaluation.lowest_elevation)
+    except ValueError as error:
+        raise DataError(str(error)) from error
+    tables, by_view, leak = _tables(settings, out, statistics, "test"), None, None
+    if by_view_made is not None:
+        by_view = _tables(settings, out, statistics, "test", BY_VIEW)
+        leak = {
+            name: {
+                "validation": float(read_json(out / name / "summary.json")["best"]["accuracy"]),
+                "test": float((made.logits.argmax(-1) == made.labels[:, None]).mean()),
+            }
+            for name, made in (("classifier", tables), (BY_VIEW, by_view))
+        }
+    validation = _tables(settings, out, statistics, "val")
+    metrics = run_study(tables, validation, statistics, settings.evaluation, by_view, leak)
+    if climbed is not None:
+        metrics["climbing"] = climbing_study(tables, statistics, climbed, settings.evaluation)
+    metrics["identity"] = identity
+    write_json(path, metrics)
+    return metrics
+
+
+def learn_to_choose(settings: Settings, out: Path) -> Path:
+    """Trains and measures learnt fusion and learnt choice; returns the page."""
+    config, found = settings.active, []
+    check_active(config, settings.dataset.capture.views)
+    seeds = [Stages(config, settings.dataset, out, seed, settings.entropy) for seed in range(config.seeds)]
+    for stages in seeds:
+        train_all(stages)
+        found.append(measure(stages))
+    metrics = {"seeds": found, "together": together(seeds, found), "settings": asdict(config)}
+    write_json(out / "active" / "metrics.json", metrics)
+    page = out / "active" / "index.html"
+    write_active_page(metrics, load_statistics(out / "data"), page)
+    return page
+
+
+def climb_on_objects(settings: Settings, out: Path) -> None:
+    """Finds where differentiable rendering would look next on many test objects; `evaluate` then compares it."""
+    statistics = load_statistics(out / "data")
+    climb_objects(settings.dataset, statistics, out, settings.climb)
+
+
+def check_live(settings: Settings, out: Path) -> dict[str, Agreement]:
+    """Walks test objects with the networks in the loop and compares with the tables; writes `live.json`."""
+    for policy in settings.live.policies:
+        if policy not in POLICIES:
+            raise DataError(f"unknown policy {policy!r}; it is one of {', '.join(POLICIES)}")
+        if policy in {rung.policy for rung in CLIMBED}:
+            raise DataError(f"{policy} looks into what mevs climb has found; live walks have no such tables")
+    statistics = load_statistics(out / "data")
+    classify, predict = tasks(settings, statistics)
+    networks = Networks(classify, load_best(classify, out / "classifier"), predict, load_best(predict, out / "entropy"))
+    validation = _tables(settings, out, statistics, "val")
+    found = compare_with_tables(
+        out / "data",
+        "test",
+        networks,
+        _tables(settings, out, statistics, "test"),
+        learn(jnp.asarray(validation.logits), jnp.asarray(validation.labels)),
+        ViewGraph.from_points(np.array(statistics.viewpoints)),
+        config=settings.live,
+    )
+    write_json(out / "live.json", {policy: asdict(agreement) for policy, agreement in found.items()})
+    return found
+
+
+def report(settings: Settings, preset: str, out: Path) -> Path:
+    """Writes the page and returns where it is; one that is newer than its metrics is left as it is."""
+    page, metrics, active = out / "report" / "index.html", out / "metrics.json", out / "active" / "metrics.json"
+    if not metrics.exists():
+        raise DataError(f"no metrics in {out}; make them with: mevs eval --out {out}")
+    made_of = [path for path in (metrics, active) if path.exists()]
+    if not page.exists() or page.stat().st_mtime < max(path.stat().st_mtime for path in made_of):
+        statistics = load_statistics(out / "data")
+        networks = {"classifier": out / "classifier", "entropy predictor": out / "entropy"}
+        write_report(
+            ReportInputs(
+                statistics=statistics,
+                metrics=read_json(metrics),
+                tables=load_view_tables(out / "tables" / "test.npz"),
+                data=out / "data",
+                histories={name: read_history(folder) for name, folder in networks.items()},
+                summaries={name: read_json(folder / "summary.json") for name, folder in networks.items()},
+                preset=preset,
+                settings=asdict(settings),
+                active=read_json(active) if active.exists() else None,
+            ),
+            page,
+        )
+    return page

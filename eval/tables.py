@@ -1,0 +1,85 @@
+"""View tables: everything the selection loop needs to know of every object, computed once by the networks."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import flax.nnx as nnx
+import jax.numpy as jnp
+import numpy as np
+
+from data_pipeline.dataset.builder import DatasetStatistics, open_split
+from data_pipeline.files import write_npz
+from mevs_jax.selection import ViewTable
+from train.outputs import network_outputs
+from train.tasks.classifier import ClassifierTask
+from train.tasks.entropy import EntropyTask
+
+
+@dataclass(frozen=True)
+class ViewTables:
+    """The tables of all objects of a split, stacked.
+
+    Attributes:
+        names: of the objects, in the order of the shards.
+        labels: (objects,) int.
+        logits: (objects, views, classes).
+        utility: (objects, views, views) predicted normalised entropies; row i after seeing view i.
+        entropy: (objects, views) true normalised entropies.
+        made_by: names the data set and the networks; tables made by others are stale.
+    """
+
+    names: list[str]
+    labels: np.ndarray
+    logits: np.ndarray
+    utility: np.ndarray
+    entropy: np.ndarray
+    made_by: str = ""
+
+    def stacked(self) -> ViewTable:
+        """As one `ViewTable` with a leading axis of objects, to be vmapped over."""
+        logits, utility, entropy, labels = map(jnp.asarray, (self.logits, self.utility, self.entropy, self.labels))
+        return ViewTable(logits, utility, entropy, labels)
+
+
+def objects_of(data: Path, split: str, statistics: DatasetStatistics) -> tuple[list[str], np.ndarray, np.ndarray]:
+    """Names, labels (objects,) and normalised entropies (objects, views) of a split, in the order of the shards."""
+    source = open_split(data, split)
+    examples = [source[index] for index in range(len(source))]
+    names = [example["name"].decode() for example in examples]
+    labels = np.array([example["label"] for example in examples], np.int32)
+    return names, labels, np.stack([example["entropy"] / statistics.entropy_max for example in examples])
+
+
+def compute_view_tables(
+    data: Path,
+    split: str,
+    statistics: DatasetStatistics,
+    classify: ClassifierTask,
+    classifier: nnx.Module,
+    predict: EntropyTask,
+    predictor: nnx.Module,
+) -> ViewTables:
+    """Runs both networks on every view of every object of a split."""
+    names, labels, entropy = objects_of(data, split, statistics)
+    logits = network_outputs(data, split, classify, classifier)
+    return ViewTables(names, labels, logits, network_outputs(data, split, predict, predictor), entropy)
+
+
+def save_view_tables(path: Path, tables: ViewTables) -> None:
+    write_npz(
+        path,
+        names=np.array(tables.names),
+        labels=tables.labels,
+        logits=tables.logits,
+        utility=tables.utility,
+        entropy=tables.entropy,
+        made_by=np.array(tables.made_by),
+    )
+
+
+def load_view_tables(path: Path) -> ViewTables:
+    with np.load(path) as stored:
+        arrays = {name: stored[name] for name in ("labels", "logits", "utility", "entropy")}
+        return ViewTables(names=[str(name) for name in stored["names"]], **arrays, made_by=str(stored["made_by"]))

@@ -1,0 +1,80 @@
+"""The thesis beside our run, in its own order: a page, the same as Markdown, and every figure as PNG and SVG."""
+
+from __future__ import annotations
+
+import html
+from pathlib import Path
+
+import matplotlib.pyplot as plt
+
+from data_pipeline.files import write_bytes, write_text
+from eval.report.html import document, drawn, embedded, table
+from eval.thesis.figures import FIGURES, FigureInputs, ThesisFigure
+from eval.thesis.tables import ThesisTable, all_tables, markdown, shown_cells
+
+CHAPTERS = (
+    ("The data (§4.1)", ("F5", "F6", "F7", "F8", "F9", "F10", "F11")),
+    ("Computation time (§5.3.1)", ("T1", "T2", "T3")),
+    ("Entropy learning (§5.3.2)", ("F17", "T4")),
+    ("Classification (§5.3.3)", ("T5", "F18", "F19", "T6", "T7", "T8", "F20")),
+    ("Memory (§5.3.4)", ("T9",)),
+    ("Appendices", ("F21", "F22", "F23", "F24", "T10", "F25", "T11", "T12", "T13", "T14", "T15")),
+)
+"""Tables and figures in the order in which the thesis has them."""
+
+
+def _table_html(shown: ThesisTable) -> str:
+    rows = []
+    for row in shown.rows:
+        cells = [html.escape(row.name)]
+        for ours, bold, theirs in shown_cells(row, shown):
+            text = f"<b>{html.escape(ours)}</b>" if bold else html.escape(ours)
+            cells.append(text + (f' <small class="faint">({html.escape(theirs)})</small>' if theirs else ""))
+        rows.append(cells)
+    return (
+        f'<h3 id="table-{shown.number}">Table {shown.number}. {html.escape(shown.title)}</h3>'
+        f'<div class="wide">{table(["", *shown.columns], rows)}</div>'
+        f'<p class="note">{html.escape(shown.note)} In brackets: the thesis.</p>'
+    )
+
+
+def _save_figure(shown: ThesisFigure, inputs: FigureInputs, folder: Path) -> str:
+    """Draws a figure, saves it as PNG and SVG, and returns it for the page."""
+    figure = shown.draw(inputs)
+    files = {kind: drawn(figure, kind) for kind in ("png", "svg")}
+    plt.close(figure)
+    for kind, content in files.items():
+        write_bytes(folder / f"figure_{int(shown.number):02d}.{kind}", content)
+    return embedded(files["svg"], "svg", shown.caption, f"Figure {shown.number}")
+
+
+def write_thesis_report(inputs: FigureInputs, lead: str, folder: Path) -> Path:
+    """Writes `index.html`, `thesis.md` and `figures/` into `folder`; returns the page.
+
+    Args:
+        inputs: what everything is drawn from.
+        lead: what was run, in a sentence.
+        folder: where to.
+    """
+    tables = {f"T{shown.number}": shown for shown in all_tables(inputs.results)}
+    pictures = {f"F{shown.number}": shown for shown in FIGURES}
+    page, text = [], []
+    for chapter, names in CHAPTERS:
+        page.append(f"<h2>{html.escape(chapter)}</h2>")
+        text.append(f"## {chapter}\n")
+        for name in names:
+            if name in tables:
+                page.append(_table_html(tables[name]))
+                text.append(markdown(tables[name]))
+            else:
+                shown = pictures[name]
+                page.append(_save_figure(shown, inputs, folder / "figures"))
+                text.append(
+                    f"![Figure {shown.number}](figures/figure_{int(shown.number):02d}.png)\n\n"
+                    f"**Figure {shown.number}.** {shown.caption}\n"
+                )
+    title = "The thesis, reproduced"
+    write_text(folder / "thesis.md", f"# {title}\n\n{lead}\n\n" + "\n".join(text))
+    path = folder / "index.html"
+    write_text(path, document(title, f'<p class="lead">{html.escape(lead)}</p>' + "".join(page)))
+    return path

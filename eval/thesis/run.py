@@ -1,0 +1,233 @@
+"""`mevs thesis`: every network, table and figure of the thesis, from one run directory; each stage skips what is done.
+
+The directory holds both data sets (`views10/`, `views40/`), the networks (`backbones/`, `entropy/`), what they say of every
+view (`outputs/`), `timing.json`, `thesis.json` and the report (`report/`).
+"""
+
+from __future__ import annotations
+
+from dataclasses import asdict, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from flax import nnx
+
+from data_pipeline.dataset.builder import open_objects, prepare, report_left_out
+from data_pipeline.errors import DataError
+from data_pipeline.files import as_read, read_json, write_json
+from data_pipeline.objects.sources import load_object
+from data_pipeline.progress import console
+from eval.numbers.timing import decision_memory_alone, time_climbing, time_local_maxima, time_predictor
+from eval.rendering.ascent import METHODS
+from eval.report.page import read_history
+from eval.settings import Settings
+from eval.stages import check_evaluation
+from eval.tables import objects_of
+from eval.thesis.figures import FigureInputs
+from eval.thesis.page import write_thesis_report
+from eval.thesis.results import NO_ACCELERATOR, LatticeTables, all_results, machine
+from train.kept import made_by, stored_array
+from train.loop import load_best
+from train.outputs import network_outputs
+from train.tasks.classifier import ClassifierTask
+from train.tasks.entropy import EntropyTask
+from train.thesis_networks import (
+    BACKBONES,
+    FRAMES,
+    PIPELINE,
+    VIEWS,
+    Backbone,
+    Frame,
+    ThesisFolder,
+    backbone_task,
+    entropy_task,
+    first_weights,
+    train_thesis,
+)
+
+
+def make_thesis_data(settings: Settings, folder: ThesisFolder) -> None:
+    """Both data sets, of the same objects and splits."""
+    for views in VIEWS:
+        dataset = replace(settings.dataset, capture=replace(settings.dataset.capture, views=views))
+        report_left_out(prepare(dataset, folder.data(views)))
+
+
+# --------------------------------------------------------------------------------------------------------------- outputs
+
+
+def lattice_tables(
+    settings: Settings,
+    folder: ThesisFolder,
+    views: int,
+    split: str,
+    backbones: tuple[Backbone, ...] = BACKBONES,
+    frames: tuple[Frame, ...] = FRAMES,
+) -> LatticeTables:
+    """What the networks say of one split of one data set."""
+    statistics, data = folder.statistics(views), folder.data(views)
+
+    def outputs(name: str, network: Path, task: ClassifierTask | EntropyTask) -> np.ndarray:
+        return stored_array(
+            folder.out / "outputs" / f"{name}_on_{views}_{split}.npz",
+            made_by(statistics, network),
+            lambda: network_outputs(data, split, task, load_best(task, network)),
+        )
+
+    logits: dict[str, np.ndarray] = {}
+    for backbone in backbones:
+        task = backbone_task(backbone, settings.classifier, settings.thesis, statistics)
+        logits[backbone.name] = outputs(backbone.name, folder.backbone(backbone.name), task)
+    utility: dict[Frame, np.ndarray] = {}
+    for frame in frames:
+        predict = entropy_task(frame, settings.entropy, statistics)
+        utility[frame] = outputs(f"entropy_{frame}", folder.entropy(views, frame), predict)
+    names, labels, entropy = objects_of(data, split, statistics)
+    return LatticeTables(names, labels, entropy, logits, utility)
+
+
+# --------------------------------------------------------------------------------------------------------- time and memory
+
+
+def _memory(settings: Settings, folder: ThesisFolder) -> dict[str, Any]:
+    statistics = {views: folder.statistics(views) for views in VIEWS}
+    out = {}
+    for backbone in (PIPELINE[1], PIPELINE[2]):
+        classify = backbone_task(backbone, settings.classifier, settings.thesis, statistics[40])
+        name = f"ResNet-{backbone.depth}"
+        out[f"{name} + Random view selection"] = decision_memory_alone(classify, None)
+        for views in VIEWS:
+            predict = entropy_task("world", settings.entropy, statistics[views])
+            out[f"{name} + PointNet++ ({views} views)"] = decision_memory_alone(classify, predict)
+    return out
+
+
+def _timing(settings: Settings, folder: ThesisFolder, tables: dict[int, LatticeTables]) -> dict[str, Any]:
+    runs = settings.thesis.timing_runs
+    out: dict[str, Any] = {"runs": runs}
+    for views in VIEWS:
+        statistics, data = folder.statistics(views), folder.data(views)
+        task = entropy_task("world", settings.entropy, statistics)
+        network: nnx.Module = load_best(task, folder.entropy(views, "world"))
+        out[str(views)] = {
+            "by_class": time_predictor(data, task, network, tables[views].labels, statistics.classes, runs),
+            "local_maxima": time_local_maxima(views),
+        }
+    return out
+
+
+def _climbing(settings: Settings, tables: LatticeTables, classes: list[str]) -> dict[str, Any]:
+    thesis = settings.thesis
+    runs, starts, resolution = thesis.climbing_runs, thesis.climbing_starts, thesis.climbing_resolution
+    meshes = {}
+    entries = {entry.name: entry for entry in open_objects(settings.dataset).entries}
+    for label, name in enumerate(classes):
+        members = np.flatnonzero(tables.labels == label)
+        evenly = np.unique(np.linspace(0, len(members) - 1, min(runs, len(members))).round().astype(int))
+        if len(members):
+            meshes[name] = [load_object(entries[tables.names[members[at]]]) for at in evenly]
+    methods = {name: time_climbing(method, meshes, starts, resolution) for name, method in METHODS.items()}
+    return {"runs": runs, "starts": starts, "resolution": resolution, **methods}
+
+
+def measure(settings: Settings, folder: ThesisFolder, tables: dict[int, LatticeTables]) -> dict[str, Any]:
+    """Machine, times and memory; measured once, and again on another machine or with networks of another size."""
+    ran_on = machine()
+    thesis = settings.thesis
+    counts = thesis.timing_runs, thesis.climbing_runs, thesis.climbing_starts, thesis.climbing_resolution
+    identity = as_read([ran_on, counts, asdict(settings.entropy.network)])
+    path = folder.out / "timing.json"
+    if path.exists() and (found := read_json(path))["identity"] == identity:
+        return found
+    console.print(f"Timing {counts[0]} decisions and {counts[1]} climbs a class, and measuring their memory")
+    found = {
+        "identity": identity,
+        "machine": ran_on,
+        "timing": _timing(settings, folder, tables),
+        "memory": _memory(settings, folder),
+        "climbing": _climbing(settings, tables[40], folder.statistics(40).classes),
+    }
+    write_json(path, found)
+    return found
+
+
+# ------------------------------------------------------------------------------------------------------------- everything
+
+
+def _example(tables: LatticeTables, classes: list[str]) -> int:
+    """The first test object of the thesis's example class, bathtubs, or of the first class there is."""
+    label = classes.index("bathtub") if "bathtub" in classes else int(tables.labels[0])
+    return int(np.flatnonzero(tables.labels == label)[0])
+
+
+def _training(folder: ThesisFolder, histories: dict[str, list[dict[str, float]]]) -> dict[str, Any]:
+    """Losses and beginnings of the classifiers (Table 5), and how long every network took."""
+    summaries = {name: read_json(network / "summary.json") for name, network in folder.networks().items()}
+    backbones = {
+        backbone.name: {
+            "train_loss": min(entry["train/loss"] for entry in histories[backbone.name]),
+            "val_loss": summaries[backbone.name]["best_loss"],
+            "epochs": summaries[backbone.name]["epoch"],
+            "best_epoch": summaries[backbone.name]["best_epoch"],
+            "start": summaries[backbone.name]["start"],
+        }
+        for backbone in BACKBONES
+    }
+    return {
+        "backbones": backbones,
+        "training_seconds": {name: summary["seconds"] for name, summary in summaries.items()},
+    }
+
+
+def evaluate_thesis(settings: Settings, folder: ThesisFolder) -> FigureInputs:
+    """All numbers, as written to `thesis.json`, and what else the report is drawn from."""
+    statistics = {views: folder.statistics(views) for views in VIEWS}
+    histories = {name: read_history(network) for name, network in folder.networks().items()}
+    test = {views: lattice_tables(settings, folder, views, "test") for views in VIEWS}
+    measured = measure(settings, folder, test)
+    made = made_by(statistics[40], *folder.networks().values())
+    identity = as_read([made, asdict(settings.evaluation), measured])
+    path = folder.out / "thesis.json"
+    results = read_json(path) if path.exists() else {"identity": None}
+    if results["identity"] != identity:
+        validation = {views: lattice_tables(settings, folder, views, "val", PIPELINE, ("world",)) for views in VIEWS}
+        console.print(f"Walking {len(test[40].labels)} test objects with {len(PIPELINE)} classifiers on two lattices")
+        results = all_results(test, validation, statistics, settings.evaluation) | _training(folder, histories)
+        results |= {name: measured[name] for name in ("machine", "timing", "memory", "climbing")}
+        results |= {"identity": identity, "left_out": {str(v): s.left_out for v, s in statistics.items()}}
+        write_json(path, results)
+    return FigureInputs(folder, results, statistics, test, histories, _example(test[40], statistics[40].classes))
+
+
+def reproduce(settings: Settings, preset: str, out: Path, pretrained: tuple[Path, ...] = ()) -> Path:
+    """Makes data, networks, tables and figures in `out`; returns the page.
+
+    Raises:
+        DataError: settings that the thesis's grid cannot be had with, or a directory that holds another run.
+    """
+    if settings.evaluation.lowest_elevation > -90:
+        raise DataError("mevs thesis walks from every view; leave --evaluation.lowest-elevation as it is")
+    check_evaluation(settings.evaluation)
+    thesis = settings.thesis
+    if thesis.climbing_runs < 1 or thesis.climbing_starts < 2 or thesis.climbing_resolution < 8:
+        raise DataError(
+            "--thesis.climbing-runs must be at least 1, --thesis.climbing-starts at least 2 and "
+            "--thesis.climbing-resolution at least 8"
+        )
+    first = first_weights(settings.classifier, thesis, pretrained)
+    folder = ThesisFolder(out)
+    make_thesis_data(settings, folder)
+    train_thesis(folder, settings.classifier, settings.entropy, thesis, first)
+    inputs = evaluate_thesis(settings, folder)
+    results, statistics = inputs.results, inputs.statistics[40]
+    ran_on = results["machine"]
+    where = f"{ran_on['cores']} CPU cores" if ran_on["device"] == NO_ACCELERATOR else ran_on["device"]
+    minutes = sum(results["training_seconds"].values()) / 60
+    camera = statistics.camera
+    lead = (
+        f"{statistics.source}, preset {preset}: views of {camera.resolution}×{camera.resolution} pixels, "
+        f"{results['objects']['40']} test objects, {statistics.left_out_count} of all objects left out, "
+        f"{minutes:.0f} minutes of training on {where}. Ours first, the thesis's in brackets."
+    )
+    return write_thesis_report(inputs, lead, out / "report")

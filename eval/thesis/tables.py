@@ -1,0 +1,446 @@
+"""The thesis's Tables 1–15: our numbers, its numbers, and in a sentence why they differ."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cache
+from itertools import product
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from eval.rendering.ascent import FACES
+from eval.thesis.results import ORACLE_MV
+from train.thesis_networks import BACKBONES, FRAMES, PIPELINE
+
+Cell = str | float | None
+
+
+@dataclass(frozen=True)
+class Row:
+    """One row: our cells and the thesis's, None where there is none. `bold` marks ours whose interval leaves out zero."""
+
+    name: str
+    ours: Sequence[Cell]
+    thesis: Sequence[Cell] = ()
+    bold: Sequence[bool] = ()
+
+
+@dataclass(frozen=True)
+class ThesisTable:
+    """A table as it is shown: numbers with `digits` behind the point, `signed` for differences."""
+
+    number: int
+    title: str
+    columns: Sequence[str]
+    rows: Sequence[Row]
+    note: str
+    digits: int = 2
+    signed: bool = False
+
+
+@cache
+def thesis_numbers() -> dict[str, Any]:
+    """The tables of the thesis as it prints them; see `numbers.json`."""
+    return json.loads(Path(__file__).with_name("numbers.json").read_text())
+
+
+def _percent(values: Any) -> list[float]:
+    return [100 * value for value in values]
+
+
+def _points(value: float) -> str:
+    """In percentage points, with a sign and a real minus."""
+    return f"{100 * value:+.2f}".replace("-", "−")
+
+
+def _ct(results: dict[str, Any]) -> list[str]:
+    return [f"CT {threshold:g}" for threshold in results["thresholds"]]
+
+
+def _mean_of_backbones(policy: dict[str, Any], name: str) -> np.ndarray:
+    """(MV, CT)."""
+    return np.mean(policy[name], axis=0)
+
+
+# ------------------------------------------------------------------------------------------------------------- the tables
+
+
+def machine_table(results: dict[str, Any]) -> ThesisTable:
+    ours = results["machine"]
+    memory = f"{ours['memory_gib']:.0f} GiB" if ours["memory_gib"] else None
+    return ThesisTable(
+        1,
+        "Machine",
+        ["value"],
+        [
+            Row("Operating system", [ours["operating_system"]], ["Linux Mint 20.3"]),
+            Row("CPU", [f"{ours['cpu']}, {ours['cores']} cores"], ["Intel i7-10875H, 16 threads"]),
+            Row("Device", [ours["device"]], ["NVIDIA GeForce RTX 2060 Max-Q, 6 GB"]),
+            Row("Memory", [memory], ["31,817 MiB"]),
+            Row("Framework", [f"JAX {ours['jax']}"], ["PyTorch 1.7.1, CUDA 11.0"]),
+            Row("Python", [ours["python"]], ["3.7"]),
+        ],
+        "What ran everything below.",
+    )
+
+
+def rendering_times(results: dict[str, Any]) -> ThesisTable:
+    thesis, ours = thesis_numbers()["table_2"], results["climbing"]
+    names = [*results["classes"], "all"]
+    seconds = {method: ours[method]["seconds"] for method in ("mesh", "volume")}
+    rows = [
+        Row(
+            name,
+            [number for of_method in seconds.values() for number in of_method[name]],
+            thesis["rows"].get(name, [None] * 4),
+        )
+        for name in names
+        if name in seconds["mesh"]
+    ]
+    return ThesisTable(
+        2,
+        "Time of the methods by differentiable rendering (s)",
+        thesis["columns"],
+        rows,
+        f"Ours: depth entropy of a soft mesh of at most {FACES} faces, and opacity entropy of a 32³ volume, both at "
+        f"{ours['resolution']}×{ours['resolution']} pixels; all {ours['starts']} starts of an object together, {ours['runs']} "
+        "objects a class, on the machine of Table 1. The thesis: one start, on its GPU.",
+    )
+
+
+def predictor_times(results: dict[str, Any]) -> ThesisTable:
+    thesis, ours = thesis_numbers()["table_3"]["rows"], results["timing"]
+    names = [*results["classes"], "all"]
+    rows = [
+        Row(
+            name,
+            [number for views in ("10", "40") for number in ours[views]["by_class"].get(name, [None, None])],
+            thesis.get(name, [None] * 4),
+        )
+        for name in names
+    ]
+    maxima = ", ".join(
+        f"{ours[views]['local_maxima']['alone']:.3f} ms alone and {1000 * ours[views]['local_maxima']['batched']:.2f} µs each "
+        f"in a batch of 1,000 for {views} views"
+        for views in ("10", "40")
+    )
+    return ThesisTable(
+        3,
+        "Time of PointNet++ by class (ms)",
+        ["10 views, mean", "sd", "40 views, mean", "sd"],
+        rows,
+        f"One cloud, {ours['runs']} runs a class, waiting for the device each time; the network is of the size of this run, on "
+        f"the machine of Table 1. Local maxima (Appendix A; the thesis 0.144 and 0.584 ms): {maxima}.",
+        digits=3,
+    )
+
+
+def entropy_table(results: dict[str, Any]) -> ThesisTable:
+    thesis = thesis_numbers()["table_4"]["rows"]
+    rows = []
+    for name in [*results["classes"], "all"]:
+        ours: list[Cell] = []
+        for views in ("10", "40"):
+            found = results["entropy"][views]
+            frames = {frame: found["frames"][frame]["by_class"].get(name, [None, None]) for frame in FRAMES}
+            blind = [found[predictor].get(name, [None])[0] for predictor in ("mean_map", "class_mean_map")]
+            ours += [*frames["world"], frames["camera"][0], *blind]
+        theirs = thesis.get(name, [None] * 4)
+        rows.append(Row(name, ours, [*theirs[:2], None, None, None, *theirs[2:], None, None, None]))
+    parts = [
+        heading for views in ("10", "40") for heading in (f"{views} views", "sd", "camera", "mean map", "class map")
+    ]
+    shares = "; ".join(
+        f"{views} views: {100 * results['entropy'][views]['frames']['world']['explained_variance']:.1f} % in the world frame, "
+        f"{100 * results['entropy'][views]['frames']['camera']['explained_variance']:.1f} % in the camera's"
+        for views in ("10", "40")
+    )
+    differences = []
+    for views in ("10", "40"):
+        found = results["entropy"][views]["camera_minus_world"]
+        low, high = found["interval"]
+        differences.append(f"{found['mse']:+.4f} [{low:+.4f}, {high:+.4f}] for {views} views".replace("-", "−"))
+    # Where predicting is no better than looking at nothing.
+    above: dict[str, list[str]] = {frame: [] for frame in FRAMES}
+    for frame, views in product(FRAMES, ("10", "40")):
+        found = results["entropy"][views]
+        for name, (error, _) in found["frames"][frame]["by_class"].items():
+            if error >= min(found["mean_map"][name][0], found["class_mean_map"][name][0]):
+                every_side = f" ({found['every_side'][name][0]:.4f} by the mean over clouds from every side)"
+                above[frame].append(f"{name} of {views} views{every_side if frame == 'world' else ''}")
+    return ThesisTable(
+        4,
+        "Squared error of predicted entropies by class",
+        parts,
+        rows,
+        "Test objects, which the thesis chose its checkpoints on and we did not; normalised by each training split's largest "
+        "entropy. The thesis's clouds lose the camera's pose; ours are in the world frame, each point with the "
+        "direction to the camera unless that was switched off, and in the camera's, without, for comparison. "
+        "Mean maps look at nothing; the class map, the mean of a class, is told the true class. Variance explained, "
+        f"{shares}. Error in the camera's frame minus the world's, paired by object: {', '.join(differences)}. Not below both "
+        f"trivial predictors: in the world frame {', '.join(above['world']) or 'none'}; in the camera's "
+        f"{', '.join(above['camera']) or 'none'}. From the thesis's means and its standard "
+        "deviation of 0.156: 51 % and 30 %.",
+        digits=4,
+    )
+
+
+def losses_table(results: dict[str, Any]) -> ThesisTable:
+    thesis = thesis_numbers()["table_5"]["rows"]
+    rows = [
+        Row(
+            b.title,
+            [results["backbones"][b.name]["train_loss"], results["backbones"][b.name]["val_loss"]],
+            thesis[b.title],
+        )
+        for b in BACKBONES
+    ]
+    started = "; ".join(f"{b.title}: {results['backbones'][b.name]['start']}" for b in BACKBONES)
+    return ThesisTable(
+        5,
+        "Best losses of the classifiers",
+        ["training loss", "validation loss"],
+        rows,
+        "Validation is on objects never trained on; the thesis puts aside views, so that an object is on both sides. Training "
+        f"losses are with augmentation. Began with: {started}.",
+        digits=3,
+    )
+
+
+def single_view_table(results: dict[str, Any]) -> ThesisTable:
+    thesis = thesis_numbers()["table_6"]["rows"]
+    rows = []
+    for backbone in BACKBONES:
+        found = results["single_views"][backbone.name]
+        rows.append(Row(backbone.title, _percent(found[v]["accuracy"] for v in ("10", "40")), thesis[backbone.title]))
+    return ThesisTable(
+        6,
+        "Accuracy of the classifiers on single views (%)",
+        ["10-view data", "40-view data"],
+        rows,
+        "All views of all test objects; each classifier on images of the kind that it was trained on.",
+    )
+
+
+def gain_table(number: int, views: str, results: dict[str, Any]) -> ThesisTable:
+    thesis, found = thesis_numbers()[f"table_{number}"], results["pipeline"][views]
+    gain = found["gain"]["text"]
+    rows = [
+        Row(
+            f"MV {mv}",
+            _percent(values),
+            thesis.get(str(mv), ()),
+            [low > 0 or high < 0 for low, high in intervals],
+        )
+        for mv, values, intervals in zip(found["max_views"], gain["difference"], gain["interval"], strict=True)
+    ]
+    switches = {
+        "text": "PointNet++ minus random",
+        "camera": "with clouds in the camera's frame",
+        "repetition": "random with repetition, as in the published code",
+        "published_code": "camera's frame, repetition, and the list sorted in place",
+        "oracle": "the oracle minus random",
+    }
+    means = []
+    for name, title in switches.items():
+        of = found["gain"][name]
+        low, high = map(_points, of["mean_interval"])
+        means.append(f"{title}: {_points(of['mean'])} [{low}, {high}], {of['above_zero']} cells above zero")
+    printed = [value for values in thesis.values() for value in values]
+    above = sum(value > 0 for value in printed)
+    theirs = f"{_points(sum(printed) / len(printed) / 100)}, {above} of {len(printed)} cells above zero"
+    return ThesisTable(
+        number,
+        f"Gain of PointNet++ over random selection, {views} views (points)",
+        _ct(results),
+        rows,
+        "Mean of the three backbones, every start view of every test object; bold where the 95 % interval over objects leaves "
+        f"out zero. Mean of all cells: {'; '.join(means)}. The thesis: {theirs}, from three runs (five for 40 views) in rows 2–5 "
+        "and single runs below.",
+        digits=2,
+        signed=True,
+    )
+
+
+def best_table(results: dict[str, Any]) -> ThesisTable:
+    thesis, rows = thesis_numbers()["table_8"]["rows"], []
+    for backbone in PIPELINE:
+        for views in ("10", "40"):
+            kind = "images" if backbone.images == "image" else backbone.images
+            title = f"ResNet-{backbone.depth} ({kind}) + PointNet++ ({views} views)"
+            found = results["pipeline"][views]["best"][backbone.name]
+            ours: list[Cell] = []
+            for chosen_on in ("test", "validation"):
+                cell = found[chosen_on]
+                ours += [100 * cell["accuracy"], 100 * cell["class_accuracy"]]
+                ours.append(f"MV {cell['max_views']}, CT {cell['threshold']:g}")
+            rows.append(Row(title, ours, [*thesis[title], None, None, None, None]))
+    return ThesisTable(
+        8,
+        "Best cell of every pipeline (%)",
+        ["chosen on test", "by class", "cell", "chosen on validation", "by class", "cell"],
+        rows,
+        "The thesis reports the maximum of its grid over the test objects; so do the first columns. What was chosen on "
+        "validation objects is what one may expect of new ones. By class: mean recall.",
+    )
+
+
+def memory_table(results: dict[str, Any]) -> ThesisTable:
+    thesis, ours = thesis_numbers()["table_9"]["rows"], dict(results["memory"])
+    for name, method in (("Neural Renderer", "mesh"), ("DiffDVR", "volume")):
+        ours[name] = results["climbing"][method]["memory"]
+    rows = [
+        Row(name, [ours[name]["planned"], ours[name]["device_peak"]] if name in ours else [None, None], [*values, None])
+        for name, values in thesis.items()
+    ]
+    return ThesisTable(
+        9,
+        "Memory of one decision (MB)",
+        ["planned by XLA", "device's peak"],
+        rows,
+        "Networks of the sizes of this run; weights, inputs and temporaries of one compiled decision. CPUs report no peak. The "
+        "thesis's are PyTorch's peak on a GPU. Neural Renderer and DiffDVR: all of Table 2's starts on one object.",
+        digits=2,
+    )
+
+
+def _pairs(
+    number: int,
+    title: str,
+    results: dict[str, Any],
+    grids: dict[str, list[list[float]]],
+    max_views: Sequence[int],
+    note: str,
+) -> ThesisTable:
+    """Rows of random and PointNet++ in turn, as the thesis has them."""
+    thesis, rows = thesis_numbers()[f"table_{number}"], []
+    for index, mv in enumerate(max_views):
+        for short, grid in grids.items():
+            rows.append(Row(f"MV {mv} ({short})", grid[index], thesis.get(f"{mv} ({short})", ())))
+    return ThesisTable(number, title, _ct(results), rows, note)
+
+
+def accuracy_table(number: int, views: str, results: dict[str, Any]) -> ThesisTable:
+    found = results["pipeline"][views]
+    grids = {
+        short: (100 * _mean_of_backbones(found["policies"][name], "accuracy")).tolist()
+        for short, name in (("random", "random"), ("pcd", "predicted_entropy"))
+    }
+    note = (
+        "Mean of the three backbones. Every start view of every test object, random selection in exact expectation; the thesis "
+        "draws a start at random, and its random policy may look at a view twice. 'pcd' is PointNet++."
+    )
+    return _pairs(number, f"Accuracy of all pipelines, {views} views (%)", results, grids, found["max_views"], note)
+
+
+def _views_used(results: dict[str, Any], policy: str) -> list[list[float]]:
+    """Mean over backbones and both lattices, (MV, CT), the first row being one view."""
+    lattices = [_mean_of_backbones(found["policies"][policy], "views_used") for found in results["pipeline"].values()]
+    rows = min(map(len, lattices))
+    return [[1.0] * len(results["thresholds"]), *np.mean([lattice[:rows] for lattice in lattices], axis=0).tolist()]
+
+
+def views_table(results: dict[str, Any]) -> ThesisTable:
+    grids = {short: _views_used(results, name) for short, name in (("random", "random"), ("pcd", "predicted_entropy"))}
+    max_views = range(1, len(grids["random"]) + 1)
+    note = "Mean of the three backbones and both lattices."
+    return _pairs(13, "Views looked at", results, grids, max_views, note)
+
+
+def views_gain_table(results: dict[str, Any]) -> ThesisTable:
+    thesis = thesis_numbers()["table_14"]
+    random, predicted = _views_used(results, "random"), _views_used(results, "predicted_entropy")
+    rows = [
+        Row(f"MV {mv}", [b - a for a, b in zip(before, after, strict=True)], thesis.get(str(mv), ()))
+        for mv, (before, after) in enumerate(zip(random, predicted, strict=True), start=1)
+    ]
+    return ThesisTable(
+        14,
+        "Views looked at, PointNet++ minus random",
+        _ct(results),
+        rows,
+        "The thesis's caption says decrease, its numbers are these: below zero means fewer views.",
+        digits=3,
+        signed=True,
+    )
+
+
+def oracle_table(results: dict[str, Any]) -> ThesisTable:
+    thesis, found, rows = thesis_numbers()["table_15"], results["pipeline"]["40"], []
+    for backbone, grid in zip(PIPELINE, found["policies"]["oracle_entropy"]["accuracy"], strict=True):
+        for mv, values in zip(found["max_views"], grid, strict=True):
+            if mv <= ORACLE_MV:
+                title = f"ResNet-{backbone.depth}, {backbone.images}"
+                rows.append(Row(f"MV {mv} ({title})", _percent(values), thesis[f"{mv} ({title})"]))
+    gain = found["gain"]["oracle"]
+    low, high = map(_points, gain["mean_interval"])
+    return ThesisTable(
+        15,
+        "Accuracy of the oracle, 40 views (%)",
+        _ct(results),
+        rows,
+        "Knows the true entropies of all views. Over all cells up to nine views it is "
+        f"{_points(gain['mean'])} [{low}, {high}] points from random selection; the thesis's own Tables 15 and 11 differ by "
+        "−0.72 up to five views.",
+    )
+
+
+def all_tables(results: dict[str, Any]) -> list[ThesisTable]:
+    """Tables 1–15, in order."""
+    return [
+        machine_table(results),
+        rendering_times(results),
+        predictor_times(results),
+        entropy_table(results),
+        losses_table(results),
+        single_view_table(results),
+        gain_table(7, "10", results),
+        best_table(results),
+        memory_table(results),
+        accuracy_table(10, "10", results),
+        accuracy_table(11, "40", results),
+        gain_table(12, "40", results),
+        views_table(results),
+        views_gain_table(results),
+        oracle_table(results),
+    ]
+
+
+# --------------------------------------------------------------------------------------------------------------- as text
+
+
+def cell_text(value: Cell, table: ThesisTable) -> str:
+    """A cell as people read it."""
+    if value is None:
+        return "–"
+    if isinstance(value, str):
+        return value
+    text = f"{value:+.{table.digits}f}" if table.signed else f"{value:.{table.digits}f}"
+    return text.replace("-", "−")
+
+
+def shown_cells(row: Row, table: ThesisTable) -> list[tuple[str, bool, str]]:
+    """Of each cell: ours, whether it is bold, and the thesis's, empty where it has none."""
+    bold = [*row.bold, *[False] * (len(row.ours) - len(row.bold))]
+    thesis = [*row.thesis, *[None] * (len(row.ours) - len(row.thesis))]
+    return [
+        (cell_text(ours, table), marked, "" if theirs is None else cell_text(theirs, table))
+        for ours, marked, theirs in zip(row.ours, bold, thesis, strict=True)
+    ]
+
+
+def markdown(table: ThesisTable) -> str:
+    """The table with the thesis's numbers in brackets behind ours."""
+    lines = [f"**Table {table.number}. {table.title}**", "", f"| | {' | '.join(table.columns)} |"]
+    lines.append("|---" * (len(table.columns) + 1) + "|")
+    for row in table.rows:
+        cells = [
+            (f"**{ours}**" if bold else ours) + (f" ({theirs})" if theirs else "")
+            for ours, bold, theirs in shown_cells(row, table)
+        ]
+        lines.append(f"| {row.name} | {' | '.join(cells)} |")
+    return "\n".join([*lines, "", f"{table.note} In brackets: the thesis.", ""])

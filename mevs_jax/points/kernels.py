@@ -1,0 +1,115 @@
+"""Point operations as kernels for one GPU, in Pallas: the rules of `mevs_jax.point_ops`, which chooses between the two.
+
+What makes them quick is what a compiler of array programs does not do by itself: a cloud's distances stay in the registers of
+one block for all of farthest-point sampling, and a ball query stops at the first points that fill its slots.
+"""
+
+from __future__ import annotations
+
+from functools import partial
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jax.experimental import pallas as pl
+from jax.experimental.pallas import triton
+from jaxtyping import Array, Float, Int
+
+from mevs_jax.points.distances import squared_distance
+
+LARGEST_CLOUD = 16_384
+"""points whose coordinates and distances fit into the registers of one block"""
+_CENTRES, _CHUNK = 16, 128  # of a ball query: centres in a block, points looked at together
+
+
+def _power_of_two(count: int) -> int:
+    return 1 << (count - 1).bit_length()
+
+
+def _columns(points: Float[Array, "points 3"], count: int, fill: float) -> Float[Array, "3 count"]:
+    return jnp.pad(points, ((0, count - points.shape[0]), (0, 0)), constant_values=fill).T
+
+
+def farthest_point_sample(points: Float[Array, "points 3"], k: int, *, interpret: bool = False) -> Int[Array, "{k}"]:
+    """As `point_ops.farthest_point_sample`, of at most `LARGEST_CLOUD` points; `interpret` runs it anywhere, slowly."""
+    count = points.shape[0]
+    columns = _columns(points, _power_of_two(count), 0.0)
+    return pl.pallas_call(
+        partial(_sample, count=count, k=k),
+        out_shape=jax.ShapeDtypeStruct((k,), jnp.int32),
+        compiler_params=triton.CompilerParams(num_warps=min(32, max(4, columns.shape[1] // 512)), num_stages=1),
+        interpret=interpret,
+        name="farthest_point_sample",
+    )(columns)
+
+
+def _sample(points: Any, chosen: Any, *, count: int, k: int) -> None:
+    x, y, z = (points[axis, :] for axis in range(3))
+    index = jnp.arange(x.shape[0], dtype=jnp.int32)
+    nearest = jnp.where(index < count, jnp.inf, -1.0).astype(x.dtype)
+
+    def step(i: Array, carry: tuple[Array, Array]) -> tuple[Array, Array]:
+        nearest, last = carry
+        here = [points[axis, last] for axis in range(3)]
+        nearest = jnp.minimum(nearest, squared_distance(x - here[0], y - here[1], z - here[2]))
+        last = jnp.argmax(nearest).astype(jnp.int32)  # of equal ones the first
+        chosen[i] = last
+        return nearest, last
+
+    chosen[0] = jnp.int32(0)
+    jax.lax.fori_loop(1, k, step, (nearest, jnp.int32(0)))
+
+
+def ball_query(
+    points: Float[Array, "points 3"],
+    centres: Float[Array, "centres 3"],
+    squared_radius: Float[Array, ""],
+    k: int,
+    *,
+    interpret: bool = False,
+) -> Int[Array, "centres {k}"]:
+    """As `point_ops.ball_query`; `interpret` runs it anywhere, slowly."""
+    blocks = -(-centres.shape[0] // _CENTRES)
+    found = pl.pallas_call(
+        partial(_query, k=k),
+        out_shape=jax.ShapeDtypeStruct((blocks * _CENTRES, k + 1), jnp.int32),  # the last is for what is not kept
+        grid=(blocks,),
+        compiler_params=triton.CompilerParams(num_warps=4, num_stages=1),
+        interpret=interpret,
+        name="ball_query",
+    )(
+        _columns(points, -(-points.shape[0] // _CHUNK) * _CHUNK, jnp.inf),
+        _columns(centres, blocks * _CENTRES, 0.0),
+        squared_radius.reshape(1),
+    )
+    return found[: centres.shape[0], :k]
+
+
+def _query(points: Any, centres: Any, squared_radius: Any, found: Any, *, k: int) -> None:
+    rows = pl.program_id(0) * _CENTRES + jnp.arange(_CENTRES, dtype=jnp.int32)
+    centre = [triton.load(centres.at[axis, rows])[:, None] for axis in range(3)]
+    limit = squared_radius[0]
+
+    def keep(slot: Array, index: Array, kept: Array) -> None:
+        row, index = (jnp.broadcast_to(array, slot.shape) for array in (rows[:, None], index))
+        triton.store(found.at[row, jnp.where(kept, slot, k)], index, mask=kept)
+
+    def unfilled(carry: tuple[Array, Array, Array]) -> Array:
+        start, counts, _ = carry
+        return (start < points.shape[1]) & (jnp.min(counts) < k)
+
+    def chunk(carry: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
+        start, counts, first = carry
+        index = start + jnp.arange(_CHUNK, dtype=jnp.int32)
+        offset = [triton.load(points.at[axis, index])[None, :] - centre[axis] for axis in range(3)]
+        hit = squared_distance(*offset) < limit
+        slot = counts[:, None] + jnp.cumsum(hit.astype(jnp.int32), axis=1) - 1
+        keep(slot, index[None, :], hit & (slot < k))
+        first = jnp.minimum(first, jnp.min(jnp.where(hit, index[None, :], points.shape[1]), axis=1))
+        return start + _CHUNK, counts + jnp.sum(hit.astype(jnp.int32), axis=1), first
+
+    none = (jnp.zeros(_CENTRES, jnp.int32), jnp.full(_CENTRES, points.shape[1], jnp.int32))
+    _, counts, first = jax.lax.while_loop(unfilled, chunk, (jnp.int32(0), *none))
+    slot = jnp.broadcast_to(jnp.arange(_power_of_two(k), dtype=jnp.int32)[None, :], (_CENTRES, _power_of_two(k)))
+    filler = jnp.where(first < points.shape[1], first, 0)
+    keep(slot, filler[:, None], (slot >= counts[:, None]) & (slot < k))

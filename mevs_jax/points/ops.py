@@ -1,0 +1,142 @@
+"""Sampling and grouping of points: the two operations every PointNet++ is built on.
+
+Both follow the index rules of the reference CUDA operations (Qi et al., PointNet++, 2017; the `pointnet2_ops` package), so
+that weights trained there mean the same thing here:
+
+* farthest-point sampling starts at point 0, and a tie goes to the smallest index;
+* ball query takes the first `k` points, in index order, that lie strictly within the radius, and fills what is missing
+  with the first of them (with point 0 where there is none).
+
+On one GPU both are kernels (`mevs_jax.point_kernels`); elsewhere, for larger clouds and in float64, array programs. All give the
+same indices, since all compare the same distances (`mevs_jax.distances`).
+"""
+
+from __future__ import annotations
+
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Int, UInt32
+
+from mevs_jax.arrays import AnyArray
+from mevs_jax.points import kernels as point_kernels
+from mevs_jax.points.bits import WORD, bits_until, set_bits
+from mevs_jax.points.distances import square, squared_distance
+
+
+def _on_one_gpu(points: Array) -> bool:
+    """Whether a kernel may be chosen: where a program spans several devices, the compiler could not split it."""
+    return jax.default_backend() == "gpu" and jax.device_count() == 1 and points.dtype == jnp.float32
+
+
+def farthest_point_sample(points: Float[AnyArray, "points 3"], k: int) -> Int[Array, "{k}"]:
+    """Indices of `k` points, each the farthest from those taken before it; the first is point 0.
+
+    Args:
+        points: coordinates, any unit. Duplicates are allowed.
+        k: how many to take, at least 1. Where `k` exceeds the number of distinct points, the rest are 0.
+
+    Returns:
+        (k,) int32 indices.
+
+    Source: PointNet++ §3.3; reference rule of `pointnet2_ops` without its exception for points near the origin.
+    """
+    if k < 1:
+        raise ValueError(f"farthest_point_sample needs k >= 1, got {k}")
+    count = points.shape[0]
+    if count < 1:
+        raise ValueError("farthest_point_sample needs at least one point")
+    points = jax.lax.stop_gradient(jnp.asarray(points))
+    if _on_one_gpu(points) and count <= point_kernels.LARGEST_CLOUD:
+        return jax.lax.platform_dependent(
+            points,
+            cuda=partial(point_kernels.farthest_point_sample, k=k),
+            default=partial(_farthest_of_array, k=k),
+        )
+    return _farthest_of_array(points, k)
+
+
+def _farthest_of_array(points: Float[Array, "points 3"], k: int) -> Int[Array, "{k}"]:
+    # On CPU, XLA vectorises what runs along columns, and neither argmax nor a maximum over everything. So points stand in a grid,
+    # consecutive ones below each other; the maxima of its columns say in which column the farthest is, and then in which row.
+    count = points.shape[0]
+    rows = 1 << max(0, (count.bit_length() - 1) // 2 - 1)
+    padded = jnp.pad(points, ((0, -count % rows), (0, 0)))
+    x, y, z = (padded[:, axis].reshape(-1, rows).T for axis in range(3))
+    columns = x.shape[1]
+    index = jnp.arange(rows * columns).reshape(columns, rows).T
+
+    def step(i: Array, carry: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
+        chosen, nearest, last = carry
+        here = padded[last]
+        nearest = jnp.minimum(nearest, squared_distance(x - here[0], y - here[1], z - here[2]))
+        best = jnp.max(nearest, axis=0)
+        farthest = jnp.max(best)
+        column = _first_equal(best, farthest)
+        row = _first_equal(jax.lax.dynamic_index_in_dim(nearest, column, 1, keepdims=False), farthest)
+        last = jnp.minimum(column * rows + row, count - 1)
+        return chosen.at[i].set(last), nearest, last
+
+    chosen = jnp.zeros(k, jnp.int32)
+    nearest = jnp.where(index < count, jnp.array(jnp.inf, points.dtype), -1)
+    return jax.lax.fori_loop(1, k, step, (chosen, nearest, jnp.int32(0)))[0]
+
+
+def _first_equal(values: Float[Array, "n"], value: Float[Array, ""]) -> Int[Array, ""]:
+    """The smallest index where `values` are equal to `value`, the last where none is."""
+    index = jnp.arange(values.shape[0], dtype=jnp.int32)
+    return jnp.min(jnp.where(values == value, index, index[-1]))
+
+
+def ball_query(
+    points: Float[AnyArray, "points 3"], centres: Float[AnyArray, "centres 3"], radius: float | Float[Array, ""], k: int
+) -> Int[Array, "centres {k}"]:
+    """For each centre, the first `k` points in index order strictly within `radius`.
+
+    Args:
+        points, centres: coordinates in one unit.
+        radius: in that unit; compared as `d² < radius·radius` in float32, as the reference does.
+        k: slots per centre, at least 1. Missing ones repeat the first hit; a centre without any hit gets point 0.
+
+    Returns:
+        (centres, k) int32 indices.
+
+    Source: PointNet++ §3.2; reference rule of `pointnet2_ops`.
+    """
+    if k < 1:
+        raise ValueError(f"ball_query needs k >= 1, got {k}")
+    points, centres = (jax.lax.stop_gradient(jnp.asarray(array)) for array in (points, centres))
+    squared_radius = square(jnp.asarray(radius, points.dtype))
+    arguments = (points, centres, squared_radius)
+    if _on_one_gpu(points):
+        return jax.lax.platform_dependent(
+            *arguments, cuda=partial(point_kernels.ball_query, k=k), default=partial(_query_of_array, k=k)
+        )
+    return _query_of_array(*arguments, k)
+
+
+def _query_of_array(
+    points: Float[Array, "points 3"], centres: Float[Array, "centres 3"], squared_radius: Float[Array, ""], k: int
+) -> Int[Array, "centres {k}"]:
+    """The hits of 32 points become the bits of one word. Prefix sums of popcounts say which word holds the s-th hit, and five
+    halvings find the bit inside it; no pass over the points but the one that measures distances.
+    """
+    padded = jnp.pad(points, ((0, -points.shape[0] % WORD), (0, 0)), constant_values=jnp.inf)
+    # A word's points one below the other, so that words lie side by side and the sum over bits runs along all of them at once.
+    x, y, z = (padded[:, axis].reshape(-1, WORD).T for axis in range(3))
+    hit = (
+        squared_distance(centres[:, 0, None, None] - x, centres[:, 1, None, None] - y, centres[:, 2, None, None] - z)
+        < squared_radius
+    )
+    bit = jnp.uint32(1) << jnp.arange(WORD, dtype=jnp.uint32)
+    words = jnp.sum(jnp.where(hit, bit[:, None], jnp.uint32(0)), axis=1, dtype=jnp.uint32)
+    return jax.vmap(_first_hits, in_axes=(0, None))(words, k)
+
+
+def _first_hits(words: UInt32[Array, "words"], k: int) -> Int[Array, "{k}"]:
+    """Positions of the first `k` set bits, the first one repeated where there are fewer, 0 where there is none."""
+    until = bits_until(words)
+    slot = jnp.arange(k, dtype=jnp.int32)
+    position = set_bits(words, until, jnp.where(slot < until[-1], slot, 0))
+    return jnp.where(until[-1] > 0, position, 0)

@@ -1,0 +1,354 @@
+"""The stages of the learned study that train: views from random directions, a recogniser, features of every view, view policies.
+
+Each stage skips what is done. Everything that is selected, fitted or learned from the recogniser's outputs, temperatures and
+policies among it, uses validation objects.
+
+In a run's folder: `active/turned/` (data), `active/seed_0/` with `recogniser/`, `features/`, `policies/`, `fold_0/`, …; and
+`active/seed_0_rotated/`, the same for objects under any rotation.
+"""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass, field, replace
+from functools import cached_property
+from pathlib import Path
+from typing import Any, Literal
+
+import jax.numpy as jnp
+import numpy as np
+from flax import nnx
+from jaxtyping import Array
+
+from data_pipeline.dataset.batches import fold_of
+from data_pipeline.dataset.builder import DataConfig, DatasetStatistics, load_statistics, open_split, prepare
+from data_pipeline.errors import DataError
+from data_pipeline.progress import console
+from eval.learned.walks import Learner
+from mevs_jax.beliefs import CalibratedFusion
+from mevs_jax.models import Recogniser, ViewPolicy
+from mevs_jax.models.set_fusion import SumFusion
+from train.choosing.calibrated import calibrated
+from train.choosing.features import Features
+from train.choosing.looks import _embed, _see, _see_changed, _see_rotated
+from train.choosing.policy import By, PolicyConfig, Seen, new_policy, train_policy
+from train.choosing.q_learning import QLearningConfig, train_by_q_learning
+from train.kept import _made_once, made_by, stored_array
+from train.loop import fit, load_best
+from train.outputs import Ask, network_outputs
+from train.starting_weights import StartingWeights
+from train.tasks.entropy import EntropyConfig, EntropyTask
+from train.tasks.recogniser import RecogniserConfig, RecogniserTask
+
+
+@dataclass(frozen=True)
+class ActiveConfig:
+    """Learnt fusion and learnt choice."""
+
+    recogniser: RecogniserConfig = RecogniserConfig()
+    folds: int = 2
+    """parts of the training objects, for the ablation that learns from them by recognisers that never saw a part"""
+    fold_epochs: int = 0
+    """of those recognisers; 0 for as many as the recogniser itself"""
+    changed: int = 3
+    """further looks of a policy at each object that it learns from, mirrored and stretched as in the recogniser's training"""
+    policy: PolicyConfig = PolicyConfig()
+    q_learning: QLearningConfig = QLearningConfig()
+    """of the policy that learns from walks alone, to compare with"""
+    seeds: int = 1
+    """whole trainings, each from other random weights"""
+    max_views: int = 8
+    """views of a walk"""
+    draws: int = 8
+    """walks per object and start of policies that draw"""
+    fitting_starts: int = 1
+    """temperatures are fitted on walks from every so many-th start"""
+    lattices: tuple[int, ...] = (10,)
+    """further numbers of candidate views to test on, never trained on"""
+    ablations: tuple[str, ...] = ()
+    """variants of the policy to compare with, with the first seed: as_it_is, look_ahead, probability,
+    random_states, unchanged, crossed, known, summed, cloud (where `mevs train` has made PointNet++), q_learning"""
+    novel: int = 0
+    """pairs of classes that a policy is trained without and then tested on, with the first seed"""
+    rotation_epochs: int = 0
+    """further training of the recognisers, on objects turned by any rotation, which are then tested on too, with
+    the first seed; 0 for neither"""
+
+
+@dataclass(frozen=True)
+class Variant:
+    """A way to train the view policy, or to ask it.
+
+    Attributes:
+        title: in the report.
+        posed: whether the objects' pose is known.
+        by: how it is asked; see `train.policy.By`.
+        network: of the variant whose network it asks; its own unless given.
+        changed: it learns from objects that are mirrored and stretched, too.
+        learns_from: validation objects; training objects in parts, each seen by a recogniser that was trained without it; or
+            training objects seen by the one that was trained on them.
+        cloud: it sees PointNet++'s embedding of every partial cloud too.
+        summed: beliefs are sums of logits, in training and on its walks.
+        q_learning: learnt from walks alone.
+        settings: what is set otherwise than for the method.
+    """
+
+    title: str
+    posed: bool = True
+    by: By = "belief"
+    network: str = ""
+    changed: bool = True
+    learns_from: Literal["validation", "parts", "training"] = "validation"
+    cloud: bool = False
+    summed: bool = False
+    q_learning: bool = False
+    settings: dict[str, Any] = field(default_factory=dict)
+
+
+VARIANTS = {
+    "learnt": Variant("view policy"),
+    "learnt_unposed": Variant("view policy", posed=False),
+    "learnt_and_table": Variant("view policy and table", by="table", network="learnt"),
+    "as_it_is": Variant("… by what it expects of the state as it is", by="state", network="learnt"),
+    "look_ahead": Variant("… two views ahead", by="ahead", network="learnt"),
+    "probability": Variant(
+        "… by the rise of the probability, not of its logarithm", settings={"utility": "probability"}
+    ),
+    "random_states": Variant("… trained on random walks alone", settings={"rounds": 1}),
+    "unchanged": Variant("… learnt from objects as they are", changed=False),
+    "crossed": Variant("… learnt from training objects, by recognisers without them", learns_from="parts"),
+    "known": Variant("… learnt from training objects, by the one that knows them", learns_from="training"),
+    "summed": Variant("… with the sum of logits for a fusion", summed=True),
+    "cloud": Variant("… and with PointNet++'s embedding of their clouds", cloud=True, changed=False),
+    "q_learning": Variant("… Q-learning (as MVSelect)", by="state", q_learning=True),
+}
+"""The method, and what it is compared with to see what each part of it is good for."""
+
+
+ABLATIONS = tuple(name for name in VARIANTS if not name.startswith("learnt"))
+
+
+_FURTHER = 0.4
+"""Learning rate of further training, beside that of the first."""
+
+
+def check_active(config: ActiveConfig, views: int) -> None:
+    """Raises `DataError` for a study that cannot be made."""
+    if config.folds < 2 or config.seeds < 1:
+        raise DataError("--active.folds must be at least 2, and --active.seeds at least 1")
+    if config.changed < 0:
+        raise DataError(f"--active.changed must be at least 0, got {config.changed}")
+    for name in config.ablations:
+        if name not in ABLATIONS:
+            raise DataError(f"unknown ablation {name!r} (--active.ablations); it is one of {', '.join(ABLATIONS)}")
+    walks = [config.policy.most_seen, config.max_views]
+    if "q_learning" in config.ablations:
+        walks.append(config.q_learning.most_seen)
+    most, batch = max(walks), config.recogniser.optimiser
+    if not 2 <= most < views:
+        raise DataError(
+            f"walks of {most} views (--active.max-views, --active.policy.most-seen, --active.q-learning.most-seen) need more "
+            f"than {most} candidate views, and at least 2; there are {views}"
+        )
+    if not batch.validation_views or 256 % batch.validation_views or batch.validation_views > views:
+        raise DataError(
+            f"--active.recogniser.optimiser.validation-views must divide 256 and be at most {views}, got {batch.validation_views}"
+        )
+
+
+class Stages:
+    """One seed of the study in its folder: every stage, made or found.
+
+    `upright` are the same stages, for stages where objects are turned by any rotation: there recognisers go on from these, and
+    see the views of each object as if it, and not the lattice around it, had been turned.
+    """
+
+    def __init__(
+        self,
+        config: ActiveConfig,
+        dataset: DataConfig,
+        out: Path,
+        seed: int = 0,
+        entropy: EntropyConfig | None = None,
+        upright: Stages | None = None,
+    ):
+        self.config, self.dataset, self.out, self.seed, self.entropy = config, dataset, out, seed, entropy
+        self.turned, self.upright = out / "active" / "turned", upright
+        self.folder = out / "active" / (f"seed_{seed}" if upright is None else f"seed_{seed}_rotated")
+        self._fusions: dict[tuple, CalibratedFusion] = {}
+
+    def rotated(self) -> Stages:
+        return Stages(self.config, self.dataset, self.out, self.seed, self.entropy, upright=self)
+
+    def prepare(self) -> None:
+        """The views from turned directions."""
+        capture = replace(self.dataset.capture, turned=True)
+        prepare(replace(self.dataset, capture=capture), self.turned)
+
+    @cached_property
+    def statistics(self) -> DatasetStatistics:
+        return load_statistics(self.turned)
+
+    def task(self, fold: int | None = None) -> RecogniserTask:
+        config, statistics = self.config, self.statistics
+        optimiser = replace(config.recogniser.optimiser, seed=self.seed, data_seed=self.seed)
+        if fold is not None and config.fold_epochs:
+            optimiser = replace(optimiser, epochs=config.fold_epochs)
+        augmentation = config.recogniser.augmentation
+        if self.upright is not None:
+            rate = _FURTHER * optimiser.learning_rate
+            optimiser = replace(optimiser, epochs=config.rotation_epochs, learning_rate=rate)
+            augmentation = replace(augmentation, turn=True)
+        part = None if fold is None else (fold, config.folds)
+        recogniser = replace(config.recogniser, optimiser=optimiser, augmentation=augmentation)
+        return RecogniserTask.of(recogniser, len(statistics.classes), statistics.camera, part)
+
+    def recogniser_folder(self, fold: int | None = None) -> Path:
+        return self.folder / ("recogniser" if fold is None else f"fold_{fold}")
+
+    def train_recogniser(self, fold: int | None = None) -> None:
+        fit(self.task(fold), self.turned, self.statistics, self.recogniser_folder(fold), self._start(fold))
+
+    def _start(self, fold: int | None) -> StartingWeights | None:
+        """What a recogniser goes on from, if from any."""
+        if self.upright is None:
+            return None
+        task, folder = self.upright.task(fold), self.upright.recogniser_folder(fold)
+
+        def put(network: nnx.Module) -> None:
+            nnx.update(network, nnx.state(load_best(task, folder)))
+
+        return StartingWeights(f"{task.name} {made_by(self.statistics, folder)}", put)
+
+    def features(
+        self,
+        name: str,
+        data: Path,
+        split: str,
+        fold: int | None = None,
+        chosen: np.ndarray | None = None,
+        ask: Ask | None = None,
+    ) -> Features:
+        """What the recogniser sees of every view, kept in `features/` under this name."""
+        task, folder, classes = self.task(fold), self.recogniser_folder(fold), len(self.statistics.classes)
+        ask = ask or (_see if self.upright is None else _see_rotated)
+        seen = stored_array(
+            self.folder / "features" / f"{name}.npz",
+            made_by(load_statistics(data), folder),
+            lambda: network_outputs(data, split, task, load_best(task, folder), ask, chosen).astype(np.float32),
+        )
+        ends = np.cumsum([seen.shape[-1] - classes - 4, classes, 3])
+        features, logits, directions, labels = np.split(seen, ends, axis=-1)
+        known = jnp.asarray(labels[:, 0, 0].astype(np.int32))
+        return Features(jnp.asarray(features), jnp.asarray(logits) - self.prior, known, jnp.asarray(directions))
+
+    def changed(self, count: int) -> list[Features]:
+        """The validation objects so many times, changed as in training, with the views that a policy learns from."""
+        return [
+            self.features(f"turned_val_changed_{number}", self.turned, "val", ask=_see_changed(number))
+            for number in range(count)
+        ]
+
+    @property
+    def prior(self) -> Array:
+        """Log-probabilities of the classes in training. ModelNet10 trains on 883 chairs and 88 bathtubs, and tests on about as
+        many of each; nobody knows how often a robot meets which. So they are taken off all logits. Equal where it is trained on
+        as many of each."""
+        if self.config.recogniser.balanced:
+            return jnp.full(len(self.statistics.classes), -jnp.log(len(self.statistics.classes)))
+        counts = np.array([self.statistics.counts["train"][name] for name in self.statistics.classes], np.float32)
+        return jnp.log(jnp.asarray(counts / counts.sum()))
+
+    def fusion(self, fold: int | None = None, posed: bool = True, summed: bool = False) -> CalibratedFusion:
+        """The recogniser's fusion, or the sum of its logits, with temperatures; for objects of known or of unknown pose."""
+        asked = fold, posed, summed
+        if asked not in self._fusions:
+            validation = self.features("turned_val" if fold is None else f"fold_{fold}_val", self.turned, "val", fold)
+            recogniser = load_best(self.task(fold), self.recogniser_folder(fold))
+            assert isinstance(recogniser, Recogniser)
+            network = SumFusion(recogniser.encoder.head, self.prior) if summed else recogniser.fusion
+            self._fusions[asked] = calibrated(network, validation, self.prior, posed)
+        return self._fusions[asked]
+
+    @property
+    def has_clouds(self) -> bool:
+        """Whether there is a PointNet++ to embed them."""
+        return self.entropy is not None and (self.out / "entropy" / "summary.json").exists()
+
+    def clouds(self, data: Path, split: str) -> Float[Array, "objects views embedding"]:
+        """PointNet++'s embedding of the partial cloud of every view, kept in `active/clouds/` for all seeds."""
+        folder, statistics = self.out / "entropy", load_statistics(self.out / "data")
+        assert self.entropy is not None
+        task = EntropyTask.of(self.entropy, statistics.views, statistics.entropy_max, statistics.camera)
+        found = stored_array(
+            self.out / "active" / "clouds" / f"{data.name}_{split}.npz",
+            made_by(load_statistics(data), folder),
+            lambda: network_outputs(data, split, task, load_best(task, folder), _embed).astype(np.float32),
+        )
+        return jnp.asarray(found)
+
+    def parts(self) -> list[Seen]:
+        """The training objects in parts, each as seen by the recogniser that was trained without it."""
+        part_of, found = fold_of(len(open_split(self.turned, "train")), self.config.folds), []
+        for fold in range(self.config.folds):
+            held_out = np.flatnonzero(part_of == fold)
+            found.append((self.fusion(fold), self.features(f"fold_{fold}_train", self.turned, "train", fold, held_out)))
+        return found
+
+    def policy_folder(self, name: str = "learnt") -> Path:
+        return self.folder / "policies" / name
+
+    def policy(self, name: str = "learnt", without: tuple[int, ...] = ()) -> ViewPolicy:
+        """The view policy, as the variant of this name has it; `without` objects of some classes."""
+        variant = VARIANTS[name]
+        config = replace(self.config.policy, seed=self.seed, **variant.settings)
+        if variant.q_learning:
+            config = replace(self.config.q_learning, seed=self.seed)
+        changed = self.config.changed if variant.changed and variant.learns_from == "validation" else 0
+
+        def train() -> tuple[ViewPolicy, dict[str, Any]]:
+            seen = self.features("turned_val", self.turned, "val")
+            if variant.cloud:
+                seen = replace(seen, clouds=self.clouds(self.turned, "val"))
+            fusion = self.fusion(posed=variant.posed, summed=variant.summed)
+            validation = fusion, seen.without(without)
+            if variant.learns_from == "validation":
+                parts, check = [validation, *((fusion, look) for look in self.changed(changed))], None
+            elif variant.learns_from == "parts":
+                parts, check = self.parts(), validation
+            else:
+                parts, check = [(fusion, self.features("turned_train", self.turned, "train"))], validation
+            parts = [(fusion, data.without(without)) for fusion, data in parts]
+            console.print(f"Training the view policy ({name}) on {sum(len(data.labels) for _, data in parts)} objects")
+            if isinstance(config, QLearningConfig):
+                policy, histories = train_by_q_learning(config, parts, check)
+            else:
+                policy, histories = train_policy(config, parts, check)
+            return policy, {"rounds": histories}
+
+        made = [self.recogniser_folder()]
+        if variant.learns_from == "parts":
+            for fold in range(self.config.folds):
+                self.train_recogniser(fold)
+                made.append(self.recogniser_folder(fold))
+        cloud = 0
+        if variant.cloud:
+            assert self.entropy is not None
+            made, cloud = [*made, self.out / "entropy"], self.entropy.network.global_layers[-1]
+        identity = {"made_by": made_by(self.statistics, *made), "of": asdict(config), "changed": changed}
+        folder = self.policy_folder("_".join(map(str, (name, *(f"without_{label}" for label in without)))))
+        untrained = nnx.eval_shape(lambda: new_policy(config, len(self.statistics.classes), variant.posed, cloud))
+        return _made_once(folder, identity, untrained, train)
+
+    def learner(self, name: str) -> Learner:
+        variant = VARIANTS[name]
+        made_as = variant.network or name
+        fusion = self.fusion(posed=variant.posed, summed=True) if variant.summed else None
+        return Learner(name, variant.title, self.policy(made_as), variant.by, made_as, fusion)
+
+
+def lattice_data(dataset: DataConfig, out: Path, views: int) -> Path:
+    """The folder of the data set with so many candidate views, made if it is not there."""
+    own = dataset.capture.views == views
+    folder = out / "data" if own else out / "active" / f"lattice_{views}"
+    prepare(replace(dataset, capture=replace(dataset.capture, views=views)), folder)
+    return folder

@@ -1,0 +1,70 @@
+"""What a trained network outputs for every view of every object of a split."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import partial
+from itertools import islice
+from pathlib import Path
+from typing import Any
+
+import flax.nnx as nnx
+import jax
+import numpy as np
+
+from data_pipeline.dataset.batches import evaluation_batches
+from data_pipeline.dataset.builder import open_split
+from data_pipeline.progress import progress_bar
+from train.devices import device_mesh, parameter_sharding, place, place_batch
+from train.step import Batch, Task
+
+Ask = Callable[[Any, Task, Batch], jax.Array]
+"""A network, its task and a batch to what is wanted of each view, (views, numbers)."""
+
+
+def _answer(network: Any, task: Task, batch: Batch) -> jax.Array:
+    return network(task.inputs(batch))
+
+
+@partial(jax.jit, static_argnames=("task", "structure", "ask"))
+def _look(
+    task: Task,
+    structure: nnx.GraphDef,
+    state: nnx.State,
+    batch: Batch,
+    ask: Ask,
+) -> jax.Array:
+    return ask(nnx.merge(structure, state), task, batch)
+
+
+def network_outputs(
+    data: Path,
+    split: str,
+    task: Task,
+    network: nnx.Module,
+    ask: Ask = _answer,
+    chosen: np.ndarray | None = None,
+) -> np.ndarray:
+    """What a network says of every view of every object of a split, (objects, views, classes or views).
+
+    Args:
+        ask: what is wanted of it; its outputs unless given.
+        chosen: positions of some objects in the split, in order; all of them unless given.
+    """
+    structure, state = nnx.split(network)
+    mesh = device_mesh()
+    state = place(state, parameter_sharding(mesh, state))
+    chosen = np.arange(len(open_split(data, split))) if chosen is None else chosen
+    objects = len(chosen)
+    batches = evaluation_batches(data, split, points=task.batches.points, images=task.batches.images, chosen=chosen)
+    with progress_bar("objects") as bar:
+        line = bar.add_task(f"Looking at {split} objects: {task.name}", total=objects, note="")
+        out = []
+        while chunk := list(islice(batches, mesh.size)):
+            filled = [*chunk, *chunk[:1] * (mesh.size - len(chunk))]
+            batch = {name: np.concatenate([one[name] for one in filled]) for name in filled[0]}
+            # Fetched after the loop: the next objects are read while the devices look at these.
+            out.append(_look(task, structure, state, place_batch(mesh, batch), ask))
+            bar.advance(line, len(chunk))
+    found = np.concatenate([np.asarray(part) for part in out])
+    return found.reshape(len(out) * mesh.size, -1, found.shape[-1])[:objects]

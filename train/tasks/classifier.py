@@ -1,0 +1,140 @@
+"""The classifier: one view to the logits of its class (thesis §5.2)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Literal
+
+import jax
+import jax.numpy as jnp
+import optax
+from flax import nnx
+
+from data_pipeline.capture.casting import CaptureConfig
+from data_pipeline.dataset.augment import ImageAugmentation, augment_image
+from data_pipeline.dataset.batches import ViewBatches
+from data_pipeline.dataset.inputs import image_input
+from data_pipeline.errors import DataError
+from mevs_jax.models import ResNet
+from train.optimiser import OptimiserConfig
+from train.starting_weights import StartingWeights, weights_from_torch
+from train.step import Batch, Hyperparameters, Metrics
+
+
+@dataclass(frozen=True)
+class ResNetConfig:
+    """Shape of the network."""
+
+    depth: Literal[10, 18, 34] = 18
+    """18 or 34; 10 has half the blocks of 18"""
+    width: int = 64
+    """channels of the first stage"""
+    channels: int = 3
+    """channels of the input; depth and grey images are replicated"""
+    standardise: bool = True
+    """take off ImageNet's mean and divide by its standard deviation, for three channels"""
+    stem: Literal["convolution", "patches"] = "convolution"
+    """the first layer: ResNet's, or pieces of 4×4 pixels, a third faster on a CPU"""
+
+
+def starting_weights(files: tuple[Path, ...], network: ResNetConfig) -> StartingWeights | None:
+    """What a classifier of this shape begins with: the weights of the file that is of its depth; None without files.
+
+    Raises:
+        DataError: where the files cannot be read, or none fits.
+    """
+    if not files:
+        return None
+    if (network.width, network.channels) != (64, 3):
+        raise DataError(
+            f"--pretrained weights are of a ResNet 64 channels wide that sees three, this one has {network.width} and "
+            f"{network.channels}; use --preset thesis, or --classifier.network.width 64 --classifier.network.channels 3"
+        )
+    return weights_from_torch(files, network.depth)
+
+
+@dataclass(frozen=True)
+class ClassifierConfig:
+    """The classifier and its training."""
+
+    network: ResNetConfig = ResNetConfig()
+    images: Literal["depth", "image"] = "depth"
+    """what it looks at: depth, or the shaded image"""
+    augmentation: ImageAugmentation = ImageAugmentation()
+    optimiser: OptimiserConfig = OptimiserConfig(weight_decay=1e-4)
+
+
+@dataclass(frozen=True)
+class ClassifierTask:
+    """Cross entropy on single views."""
+
+    network_config: ResNetConfig
+    classes: int
+    images: Literal["depth", "image"]
+    camera: CaptureConfig
+    augmentation: ImageAugmentation
+    optimiser: OptimiserConfig
+    name: str = "classifier"
+
+    @classmethod
+    def of(cls, config: ClassifierConfig, classes: int, camera: CaptureConfig) -> ClassifierTask:
+        return cls(config.network, classes, config.images, camera, config.augmentation, config.optimiser)
+
+    @property
+    def batches(self) -> ViewBatches:
+        config = self.optimiser
+        return ViewBatches(
+            config.batch_size,
+            config.views_per_object,
+            images=self.images,
+            seed=config.data_seed,
+            validation_by=config.validation_by,
+        )
+
+    @property
+    def metrics(self) -> tuple[str, ...]:
+        return ("accuracy", "loss")
+
+    @property
+    def hyperparameters(self) -> Hyperparameters:
+        return Hyperparameters.of(self.optimiser, 0.0, self.augmentation.strength)
+
+    def network(self, rngs: nnx.Rngs) -> ResNet:
+        shape = self.network_config
+        return ResNet(
+            depth=shape.depth,
+            classes=self.classes,
+            channels=shape.channels,
+            width=shape.width,
+            standardise=shape.standardise and shape.channels == 3,
+            stem=shape.stem,
+            dtype=jnp.dtype(self.optimiser.compute),
+            rngs=rngs,
+        )
+
+    def inputs(self, batch: Batch) -> jax.Array:
+        """Images (views, height, width, channels) of a batch."""
+        convert = partial(image_input, images=self.images, channels=self.network_config.channels, camera=self.camera)
+        return jax.vmap(convert)(batch[self.images])
+
+    def loss(
+        self, network: ResNet, batch: Batch, key: jax.Array, samples: jax.Array, hyper: Hyperparameters
+    ) -> tuple[jax.Array, Metrics]:
+        del samples
+        images = self.inputs(batch)
+        keys = jax.random.split(key, len(images))
+        images = jax.vmap(augment_image, in_axes=(0, 0, None, None))(
+            keys, images, self.augmentation, hyper.augmentation
+        )
+        logits = network(images, train=True)
+        loss = jnp.mean(optax.softmax_cross_entropy_with_integer_labels(logits, batch["label"]))
+        return loss, {"loss": loss, "accuracy": jnp.mean(jnp.argmax(logits, -1) == batch["label"])}
+
+    def evaluate(self, network: ResNet, batch: Batch) -> Metrics:
+        logits = network(self.inputs(batch))
+        return {
+            "loss": optax.softmax_cross_entropy_with_integer_labels(logits, batch["label"]),
+            "accuracy": (jnp.argmax(logits, -1) == batch["label"]).astype(jnp.float32),
+        }

@@ -1,0 +1,124 @@
+"""The entropy predictor: one partial cloud to the depth entropy of every candidate view (thesis §4.3.2 and §5.1)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import partial
+from typing import Literal
+
+import jax
+import jax.numpy as jnp
+from flax import nnx
+
+from data_pipeline.capture.casting import CaptureConfig
+from data_pipeline.dataset.augment import CloudAugmentation, augment_cloud
+from data_pipeline.dataset.batches import ViewBatches
+from data_pipeline.dataset.inputs import cloud_input
+from mevs_jax.models import THESIS_ABSTRACTIONS, Abstraction, PointNet2
+from train.optimiser import OptimiserConfig
+from train.step import Batch, Hyperparameters, Metrics
+
+
+@dataclass(frozen=True)
+class PointNet2Config:
+    """Shape of the network and of the clouds it reads."""
+
+    points: int = 4096
+    """points of a cloud"""
+    frame: Literal["world", "camera"] = "world"
+    """the frame of the clouds: world (the camera's pose is known) or camera (the thesis, whose clouds lose it)"""
+    directions: bool = True
+    """beside each point of a cloud in the world frame, the direction to the camera, in the place of the normals"""
+    abstractions: tuple[Abstraction, ...] = THESIS_ABSTRACTIONS
+    """the set-abstraction levels"""
+    global_layers: tuple[int, ...] = (256, 512, 1024)
+    """layers over all centres"""
+    head_layers: tuple[int, ...] = (512, 256)
+    """layers before the output"""
+    dropout: float = 0.5
+    """before the output"""
+
+
+@dataclass(frozen=True)
+class EntropyConfig:
+    """The entropy predictor and its training."""
+
+    network: PointNet2Config = PointNet2Config()
+    augmentation: CloudAugmentation = CloudAugmentation()
+    optimiser: OptimiserConfig = OptimiserConfig(epochs=200, batch_size=32, schedule="steps")
+
+
+@dataclass(frozen=True)
+class EntropyTask:
+    """Mean squared error on normalised entropies."""
+
+    network_config: PointNet2Config
+    views: int
+    entropy_max: float
+    camera: CaptureConfig
+    augmentation: CloudAugmentation
+    optimiser: OptimiserConfig
+    name: str = "entropy predictor"
+
+    @classmethod
+    def of(cls, config: EntropyConfig, views: int, entropy_max: float, camera: CaptureConfig) -> EntropyTask:
+        return cls(config.network, views, entropy_max, camera, config.augmentation, config.optimiser)
+
+    @property
+    def batches(self) -> ViewBatches:
+        config = self.optimiser
+        return ViewBatches(
+            config.batch_size,
+            config.views_per_object,
+            points=self.network_config.points,
+            seed=config.data_seed,
+            validation_by=config.validation_by,
+        )
+
+    @property
+    def metrics(self) -> tuple[str, ...]:
+        return ("loss",)
+
+    @property
+    def hyperparameters(self) -> Hyperparameters:
+        return Hyperparameters.of(self.optimiser, self.network_config.dropout, self.augmentation.strength)
+
+    def network(self, rngs: nnx.Rngs) -> PointNet2:
+        shape = self.network_config
+        return PointNet2(
+            views=self.views,
+            abstractions=shape.abstractions,
+            global_layers=shape.global_layers,
+            head_layers=shape.head_layers,
+            dropout=shape.dropout,
+            dtype=jnp.dtype(self.optimiser.compute),
+            rngs=rngs,
+        )
+
+    def inputs(self, batch: Batch) -> jax.Array:
+        """Clouds (views, points, 3 or 6) of a batch."""
+        shape = self.network_config
+        directions = shape.directions and shape.frame == "world"
+        convert = partial(cloud_input, camera=self.camera, frame=shape.frame, directions=directions)
+        return jax.vmap(convert)(batch["pixels"], batch["pixel_depth"], batch["pose"])
+
+    def momentum(self, samples: jax.Array) -> jax.Array:
+        """Batch-norm momentum after so many samples: 0.5, halved every 20,000, not below 0.01 (thesis code)."""
+        return jnp.maximum(0.5 * 0.5 ** (samples // 20_000), 0.01)
+
+    def loss(
+        self, network: PointNet2, batch: Batch, key: jax.Array, samples: jax.Array, hyper: Hyperparameters
+    ) -> tuple[jax.Array, Metrics]:
+        augment, drop = jax.random.split(key)
+        clouds = self.inputs(batch)
+        keys = jax.random.split(augment, len(clouds))
+        clouds = jax.vmap(augment_cloud, in_axes=(0, 0, None, None))(
+            keys, clouds, self.augmentation, hyper.augmentation
+        )
+        predicted = network(clouds, train=True, key=drop, momentum=self.momentum(samples), dropout=hyper.dropout)
+        loss = jnp.mean(jnp.square(predicted - batch["entropy"] / self.entropy_max))
+        return loss, {"loss": loss}
+
+    def evaluate(self, network: PointNet2, batch: Batch) -> Metrics:
+        predicted = network(self.inputs(batch))
+        return {"loss": jnp.mean(jnp.square(predicted - batch["entropy"] / self.entropy_max), axis=-1)}

@@ -1,0 +1,175 @@
+"""The recogniser: single views and any set of them to the class, encoder and set fusion trained together.
+
+Views come from directions all around (a data set made with `dataset.capture.turned`), so that no lattice is special.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import optax
+from flax import nnx
+
+from data_pipeline.capture.casting import CaptureConfig
+from data_pipeline.dataset.augment import (
+    ImageAugmentation,
+    ViewAugmentation,
+    augment_image,
+    object_changes,
+    views_after,
+)
+from data_pipeline.dataset.batches import ViewBatches
+from data_pipeline.dataset.inputs import depth_and_normals
+from mevs_jax.models import Recogniser, ResNet
+from train.choosing.features import SetFusionConfig, new_fusion, random_sets
+from train.optimiser import OptimiserConfig
+from train.step import Batch, Hyperparameters, Metrics
+from train.tasks.classifier import ResNetConfig
+
+
+@dataclass(frozen=True)
+class RecogniserConfig:
+    """The recogniser and its training."""
+
+    network: ResNetConfig = ResNetConfig(channels=4, standardise=False)
+    """the encoder, which sees depth and normals: four channels"""
+    fusion: SetFusionConfig = SetFusionConfig()
+    """the set fusion"""
+    augmentation: ViewAugmentation = ViewAugmentation()
+    """of training objects"""
+    shift: int = 3
+    """pixels by which training images are shifted in each direction at most"""
+    balanced: bool = False
+    """train on as many objects of each class, those of rarer ones more often; else as many as there are"""
+    optimiser: OptimiserConfig = OptimiserConfig()
+
+
+@dataclass(frozen=True)
+class RecogniserTask:
+    """Cross entropy on every view alone, and on a random set of an object's views in the batch, of any size: half with the
+    object's pose known, half without."""
+
+    network_config: ResNetConfig
+    fusion_config: SetFusionConfig
+    classes: int
+    camera: CaptureConfig
+    augmentation: ViewAugmentation
+    shift: int
+    balanced: bool
+    optimiser: OptimiserConfig
+    fold: tuple[int, int] | None = None
+    """trained without part k of n of the training objects"""
+    name: str = "recogniser"
+
+    @classmethod
+    def of(
+        cls, config: RecogniserConfig, classes: int, camera: CaptureConfig, fold: tuple[int, int] | None = None
+    ) -> RecogniserTask:
+        name = "recogniser" if fold is None else f"recogniser without part {fold[0] + 1} of {fold[1]}"
+        return cls(
+            config.network,
+            config.fusion,
+            classes,
+            camera,
+            config.augmentation,
+            config.shift,
+            config.balanced,
+            config.optimiser,
+            fold,
+            name,
+        )
+
+    @property
+    def batches(self) -> ViewBatches:
+        config = self.optimiser
+        return ViewBatches(
+            config.batch_size,
+            config.views_per_object,
+            images="depth",
+            seed=config.data_seed,
+            fold=self.fold,
+            balanced=self.balanced,
+        )
+
+    @property
+    def metrics(self) -> tuple[str, ...]:
+        return ("accuracy", "fused_accuracy", "unposed_accuracy", "loss")
+
+    @property
+    def hyperparameters(self) -> Hyperparameters:
+        return Hyperparameters.of(self.optimiser, self.fusion_config.dropout, 1.0)
+
+    def network(self, rngs: nnx.Rngs) -> Recogniser:
+        shape = self.network_config
+        encoder = ResNet(
+            depth=shape.depth,
+            classes=self.classes,
+            channels=4,
+            width=shape.width,
+            stem=shape.stem,
+            dtype=jnp.dtype(self.optimiser.compute),
+            rngs=rngs,
+        )
+        return Recogniser(encoder, new_fusion(self.fusion_config, 8 * shape.width, self.classes, rngs))
+
+    def inputs(self, batch: Batch) -> jax.Array:
+        """Images (views, height, width, 4) of a batch."""
+        return jax.vmap(partial(depth_and_normals, camera=self.camera))(batch["depth"])
+
+    def directions(self, batch: Batch) -> jax.Array:
+        """Unit vectors (views, 3) from the object to the cameras."""
+        position = batch["pose"][:, :3, 3]
+        return position / jnp.linalg.norm(position, axis=-1, keepdims=True)
+
+    def loss(
+        self, network: Recogniser, batch: Batch, key: jax.Array, samples: jax.Array, hyper: Hyperparameters
+    ) -> tuple[jax.Array, Metrics]:
+        del samples, hyper
+        change, move, sets, drop = jax.random.split(key, 4)
+        by_object = partial(views_by_object, views=self.optimiser.views_per_object)
+        images, poses = by_object(self.inputs(batch)), by_object(batch["pose"])
+        labels = batch["label"].reshape(images.shape[:2])[:, 0]
+        changes = object_changes(change, len(images), self.augmentation)
+        images, directions = jax.vmap(partial(views_after, camera=self.camera))(changes, images, poses)
+        shift = ImageAugmentation(mirror=False, shift=self.shift)
+        moves = jax.random.split(move, images.shape[:2])
+        images = jax.vmap(jax.vmap(partial(augment_image, config=shift)))(moves, images)
+        present = random_sets(sets, len(images), images.shape[1], images.shape[1])
+        found = _judged(*network(images, directions, present, train=True, key=drop), labels)
+        means = {name: jnp.mean(values) for name, values in found.items()}
+        return means["loss"], means
+
+    def evaluate(self, network: Recogniser, batch: Batch) -> Metrics:
+        """`fused`: all views of an object in the batch together. Where objects are turned in training, they are so here, each the
+        same way every time."""
+        by_object = partial(views_by_object, views=self.optimiser.validation_views)
+        images, directions = by_object(self.inputs(batch)), by_object(self.directions(batch))
+        if self.augmentation.turn:
+            turns = object_changes(jax.random.key(1), len(images), ViewAugmentation(mirror=False, turn=True))
+            images, directions = jax.vmap(partial(views_after, camera=self.camera))(
+                turns, images, by_object(batch["pose"])
+            )
+        labels = batch["label"].reshape(images.shape[:2])[:, 0]
+        found = _judged(*network(images, directions, jnp.ones(images.shape[:2], bool)), labels)
+        return {name: values.reshape(-1) for name, values in found.items()}
+
+
+def _judged(each: jax.Array, posed: jax.Array, unposed: jax.Array, labels: jax.Array) -> Metrics:
+    """Metrics of every view, (objects, views), from logits of single views and of the objects."""
+    labels = jnp.broadcast_to(labels[:, None], each.shape[:2])
+    posed, unposed = (jnp.broadcast_to(logits[:, None], each.shape) for logits in (posed, unposed))
+    single, fused, blind = (
+        optax.softmax_cross_entropy_with_integer_labels(logits, labels) for logits in (each, posed, unposed)
+    )
+    right = {"accuracy": each, "fused_accuracy": posed, "unposed_accuracy": unposed}
+    return {"loss": single + (fused + blind) / 2} | {
+        name: (jnp.argmax(logits, -1) == labels).astype(jnp.float32) for name, logits in right.items()
+    }
+
+
+def views_by_object(array: jax.Array, views: int) -> jax.Array:
+    """Of views one behind the other, so many for each object: (objects, views, …)."""
+    return array.reshape(-1, views, *array.shape[1:])

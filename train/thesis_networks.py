@@ -1,0 +1,171 @@
+"""The thesis's networks: four classifiers, two of which go on from another, and PointNet++ for two lattices and two frames."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Literal
+
+from data_pipeline.dataset.builder import DatasetStatistics, load_statistics
+from data_pipeline.files import read_json
+from train.loop import fit, load_best
+from train.optimiser import OptimiserConfig
+from train.starting_weights import StartingWeights, weights_from_network
+from train.tasks.classifier import ClassifierConfig, ClassifierTask, ResNetConfig, starting_weights
+from train.tasks.entropy import EntropyConfig, EntropyTask
+
+VIEWS = (10, 40)
+"""The thesis's two data sets, by views of an object."""
+Frame = Literal["world", "camera"]
+FRAMES: tuple[Frame, ...] = ("world", "camera")
+
+
+@dataclass(frozen=True)
+class Backbone:
+    """One of the thesis's classifiers (§5.3.3, Table 5).
+
+    Attributes:
+        name: of its folder.
+        title: the thesis's.
+        depth: of the ResNet.
+        images: what it looks at.
+        views: the data set it is trained on.
+        start: the backbone it goes on from; None for ImageNet's weights, or random ones where there are none.
+    """
+
+    name: str
+    title: str
+    depth: Literal[18, 34]
+    images: Literal["depth", "image"]
+    views: int
+    start: str | None = None
+
+
+BACKBONES = (
+    Backbone("resnet18_image_10", "ResNet-18 (10 views/object, image)", 18, "image", 10),
+    Backbone("resnet18_image_40", "ResNet-18 (40 views/object, image)", 18, "image", 40, "resnet18_image_10"),
+    Backbone("resnet18_depth_40", "ResNet-18 (40 views/object, depth)", 18, "depth", 40, "resnet18_image_40"),
+    Backbone("resnet34_depth_40", "ResNet-34 (40 views/object, depth)", 34, "depth", 40),
+)
+PIPELINE = tuple(backbone for backbone in BACKBONES if backbone.views == 40)
+"""Those that are walked with (§5.3.3: "the last 3 models in Table 6")."""
+
+
+@dataclass(frozen=True)
+class ThesisConfig:
+    """What `mevs thesis` sets beyond the settings of a single run, from which all else is taken."""
+
+    resnet18: OptimiserConfig = OptimiserConfig(weight_decay=1e-4)
+    """how the first ResNet-18 is trained"""
+    resnet34: OptimiserConfig = OptimiserConfig(weight_decay=1e-4)
+    """how ResNet-34 is trained"""
+    fine_tuning: OptimiserConfig = OptimiserConfig(weight_decay=1e-4)
+    """how classifiers are trained that go on from another"""
+    resnet34_width: int = 64
+    """channels of ResNet-34's first stage"""
+    timing_runs: int = 50
+    """of PointNet++ on each class, for the thesis's Table 3"""
+    climbing_runs: int = 3
+    """objects of each class that are climbed on, for the thesis's Table 2"""
+    climbing_starts: int = 8
+    """viewpoints to climb from; the thesis's times are of one"""
+    climbing_resolution: int = 64
+    """pixels along each side of what is rendered on the way"""
+
+
+@dataclass(frozen=True)
+class ThesisFolder:
+    """Where everything of a thesis run lies."""
+
+    out: Path
+
+    def data(self, views: int) -> Path:
+        return self.out / f"views{views}" / "data"
+
+    def backbone(self, name: str) -> Path:
+        return self.out / "backbones" / name
+
+    def entropy(self, views: int, frame: Frame) -> Path:
+        return self.out / "entropy" / f"{views}_{frame}"
+
+    def networks(self) -> dict[str, Path]:
+        """The folders of all eight, by name."""
+        out = {backbone.name: self.backbone(backbone.name) for backbone in BACKBONES}
+        return out | {f"entropy_{views}_{frame}": self.entropy(views, frame) for views in VIEWS for frame in FRAMES}
+
+    def statistics(self, views: int) -> DatasetStatistics:
+        return load_statistics(self.data(views))
+
+
+def backbone_network(backbone: Backbone, classifier: ClassifierConfig, thesis: ThesisConfig) -> ResNetConfig:
+    """The shape of a backbone, under the settings of a run."""
+    width = classifier.network.width if backbone.depth == 18 else thesis.resnet34_width
+    return replace(classifier.network, depth=backbone.depth, width=width)
+
+
+def first_weights(
+    classifier: ClassifierConfig, thesis: ThesisConfig, pretrained: tuple[Path, ...]
+) -> dict[str, StartingWeights | None]:
+    """What the backbones begin with that go on from no other, by name.
+
+    Raises:
+        DataError: where the files cannot be read, or one that is needed is not among them.
+    """
+    return {
+        backbone.name: starting_weights(pretrained, backbone_network(backbone, classifier, thesis))
+        for backbone in BACKBONES
+        if backbone.start is None
+    }
+
+
+def backbone_task(
+    backbone: Backbone, classifier: ClassifierConfig, thesis: ThesisConfig, statistics: DatasetStatistics
+) -> ClassifierTask:
+    """How a backbone is trained, under the settings of a run."""
+    alone = thesis.resnet18 if backbone.depth == 18 else thesis.resnet34
+    config = replace(
+        classifier,
+        network=backbone_network(backbone, classifier, thesis),
+        images=backbone.images,
+        optimiser=thesis.fine_tuning if backbone.start else alone,
+    )
+    task = ClassifierTask.of(config, len(statistics.classes), statistics.camera)
+    return replace(task, name=backbone.title)
+
+
+def entropy_task(frame: Frame, entropy: EntropyConfig, statistics: DatasetStatistics) -> EntropyTask:
+    """How PointNet++ is trained for a lattice and a frame: the same but for the frame."""
+    config = replace(entropy, network=replace(entropy.network, frame=frame))
+    task = EntropyTask.of(config, statistics.views, statistics.entropy_max, statistics.camera)
+    return replace(task, name=f"PointNet++ ({statistics.views} views, {frame} frame)")
+
+
+def train_thesis(
+    folder: ThesisFolder,
+    classifier: ClassifierConfig,
+    entropy: EntropyConfig,
+    thesis: ThesisConfig,
+    first: dict[str, StartingWeights | None],
+) -> None:
+    """Trains all eight networks, skipping those that are done; `first` is what `first_weights` gives."""
+    for backbone in BACKBONES:
+        statistics = folder.statistics(backbone.views)
+        task = backbone_task(backbone, classifier, thesis, statistics)
+        start = _weights_before(backbone, folder, classifier, thesis) if backbone.start else first[backbone.name]
+        fit(task, folder.data(backbone.views), statistics, folder.backbone(backbone.name), start)
+    for views in VIEWS:
+        statistics = folder.statistics(views)
+        for frame in FRAMES:
+            predict = entropy_task(frame, entropy, statistics)
+            fit(predict, folder.data(views), statistics, folder.entropy(views, frame))
+
+
+def _weights_before(
+    backbone: Backbone, folder: ThesisFolder, classifier: ClassifierConfig, thesis: ThesisConfig
+) -> StartingWeights:
+    """The weights of the backbone that this one goes on from."""
+    before = next(other for other in BACKBONES if other.name == backbone.start)
+    task = backbone_task(before, classifier, thesis, folder.statistics(before.views))
+    trained = folder.backbone(before.name)
+    loss = read_json(trained / "summary.json")["best_loss"]
+    return weights_from_network(load_best(task, trained), f"{before.title}, validation loss {loss:.6f}")
