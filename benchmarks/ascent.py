@@ -26,7 +26,7 @@ import trimesh
 from data_pipeline.errors import EmptyMesh
 from data_pipeline.files import read_json, write_json
 from data_pipeline.objects.sources import load_object, open_source
-from eval.rendering.ascent import METHODS, climb, look_everywhere
+from eval.rendering.ascent import METHODS, ascend_on_sphere, look_everywhere
 
 RESULTS = Path(__file__).parent / "results"
 SIDE, STARTS = 64, 40
@@ -68,7 +68,7 @@ def main() -> None:
     entries = [entry for entry in source.entries if entry.split == "test"]
     chosen = [entries[index] for index in np.linspace(0, len(entries) - 1, count).astype(int)]
     dense = np.asarray(trimesh.creation.icosphere(4).vertices)
-    climb_on = jax.jit(lambda thing: climb(method, thing, STARTS, SIDE))
+    climb_on = jax.jit(lambda thing: ascend_on_sphere(method, thing, STARTS, SIDE))
     look = jax.jit(lambda thing: look_everywhere(method, thing, dense, SIDE))
 
     path = RESULTS / f"ascent_{sys.argv[1]}.json"

@@ -1,8 +1,8 @@
 """What holds accuracy down, however many views are taken: `python benchmarks/ceiling.py RUN ARCHIVE [--split val]`.
 
-RUN is a directory in which `mevs active` was run on ARCHIVE, an .npz of voxel grids. Grids of this resolution have lost thin
-surfaces: table tops, mattresses, whole chairs but for their feet. So for every object: the share of its filled cells that
-hang together (26 neighbours), and beside it how accurate 1, 2, 4 and all views are where it is whole and where it is not;
+RUN is a directory in which `mevs study learned` was run on ARCHIVE, an .npz of voxel grids. Grids of this resolution have
+lost thin surfaces: table tops, mattresses, whole chairs but for their feet. So for every object: the share of its filled cells
+that hang together (26 neighbours), and beside it how accurate 1, 2, 4 and all views are where it is whole and where it is not;
 which classes are taken for which once everything was seen; and how often the nearest training grid has another label.
 
 The table goes to `benchmarks/results/ceiling.md`, some objects that are wrong after all views to `ceiling.png`.
@@ -39,7 +39,7 @@ WHOLE = 0.9
 @dataclass(frozen=True)
 class Options:
     run: Annotated[Path, tyro.conf.Positional]
-    """where `mevs active` was run"""
+    """where `mevs study learned` was run"""
     archive: Annotated[Path, tyro.conf.Positional]
     """the .npz of voxel grids that it was run on"""
     preset: Literal["small", "tiny"] = "small"
@@ -87,7 +87,7 @@ def draw(path: Path, views: list[np.ndarray], titles: list[str], columns: int = 
 
 def main(options: Options) -> None:
     settings = PRESETS[options.preset]
-    stages = Stages(settings.active, settings.dataset, options.run)
+    stages = Stages(settings.learned, settings.dataset, options.run)
     classes, views = stages.statistics.classes, settings.dataset.capture.views
     data = stages.features(f"lattice_{views}_{options.split}", options.run / "data", options.split)
     source = open_split(options.run / "data", options.split)
@@ -129,10 +129,10 @@ def main(options: Options) -> None:
     wrong = np.flatnonzero(final != labels)
     pairs, counts = np.unique(np.stack([labels[wrong], final[wrong]]), axis=1, return_counts=True)
     often = np.argsort(-counts)[:8]
-    told = ", ".join(f"{classes[pairs[0, i]]} for {classes[pairs[1, i]]} {counts[i]}" for i in often)
+    confusions = ", ".join(f"{classes[pairs[0, i]]} for {classes[pairs[1, i]]} {counts[i]}" for i in often)
     lines += [
         "",
-        f"Wrong after all {views} views: {len(wrong)} of {len(labels)}. Taken the first for the second: {told}.",
+        f"Wrong after all {views} views: {len(wrong)} of {len(labels)}. Taken the first for the second: {confusions}.",
     ]
 
     others = np.setdiff1d(np.arange(len(train)), number) if options.split == "val" else np.arange(len(train))

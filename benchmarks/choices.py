@@ -1,8 +1,8 @@
 """What every way to choose views did for each test object: `python benchmarks/choices.py [RUN]`.
 
-RUN is a directory in which `mevs active` was run; its walks are kept in `benchmarks/results/choices/`, a file for each seed and
-kind of candidates, beside those that are there. From all that are kept come the tables of `benchmarks/results/choices.md`:
-means over seeds, taken of each object first, with 95 % intervals over objects.
+RUN is a directory in which `mevs study learned` was run; its walks are kept in `benchmarks/results/choices/`, a file for each
+seed and kind of candidates, beside those that are there. From all that are kept come the tables of
+`benchmarks/results/choices.md`: means over seeds, taken of each object first, with 95 % intervals over objects.
 
 Whoever has another policy can compare it object by object. Such a file has `names` of the objects in their order, and for
 each policy `right`, shares of its walks that are right after 1, 2, … views, in 240ths if in bytes and else in 720ths (so that
@@ -32,11 +32,11 @@ from eval.learned.study import BASELINES, ByObject, seeds_together
 
 RESULTS = Path(__file__).parent / "results"
 KEPT = RESULTS / "choices"
-METHODS = {"learnt": "view policy", "learnt_and_table": "view policy and table"}
+METHODS = {"learned": "view policy", "learned_and_table": "view policy and table"}
 _WHOLES: dict[type[np.unsignedinteger], int] = {np.uint8: 240, np.uint16: 720}
 """What a share of 1 is stored as."""
-_TOLD = ("objects", "views", "trying_starts", "single_view")
-_TOLD_OF_EACH = ("title", "knows", "calibration_error")
+_KEPT = ("objects", "views", "trying_starts", "single_view")
+_KEPT_OF_EACH = ("title", "knows", "calibration_error")
 _SHOWN = (0, 1, 2, 3, 5, 7)
 """Steps of walks in tables, from the first view."""
 
@@ -44,23 +44,23 @@ _SHOWN = (0, 1, 2, 3, 5, 7)
 @dataclass(frozen=True)
 class Options:
     run: Annotated[Path | None, tyro.conf.Positional] = None
-    """where `mevs active` was run"""
+    """where `mevs study learned` was run"""
 
 
 def keep(run: Path) -> None:
     """Keeps what the walks of a run say of each object."""
     names = np.array([one["name"].decode() for one in open_split(run / "data", "test")])
-    for path in sorted((run / "active").glob("seed_*/walks_*.npz")):
+    for path in sorted((run / "learned").glob("seed_*/walks_*.npz")):
         found = read_json(path.with_suffix(".json"))
-        told: dict[str, Any] = {key: found[key] for key in _TOLD}
-        told["policies"] = {
-            name: {key: policy[key] for key in _TOLD_OF_EACH} for name, policy in found["policies"].items()
+        summary: dict[str, Any] = {key: found[key] for key in _KEPT}
+        summary["policies"] = {
+            name: {key: policy[key] for key in _KEPT_OF_EACH} for name, policy in found["policies"].items()
         }
         with np.load(path) as walks:
             arrays: dict[str, Any] = {key: _packed(key, walks[key]) for key in walks.files}
         kind = path.stem.removeprefix("walks_")
         buffer = io.BytesIO()
-        np.savez_compressed(buffer, told=json.dumps(told), names=names, **arrays)
+        np.savez_compressed(buffer, summary=json.dumps(summary), names=names, **arrays)
         write_bytes(KEPT / f"{path.parent.name}_{kind}.npz", buffer.getvalue())
 
 
@@ -81,16 +81,16 @@ def _shares(counts: np.ndarray) -> np.ndarray:
 def kept(path: Path) -> tuple[dict[str, Any], dict[str, ByObject]]:
     """What `study` found of one seed, as far as it is kept, and what each policy does by object."""
     with np.load(path) as arrays:
-        told = json.loads(str(arrays["told"]))
+        summary = json.loads(str(arrays["summary"]))
         each = {
             name: ByObject(
                 right=_shares(arrays[f"{name} right"]),
                 likelihood=arrays[f"{name} likelihood"].astype(np.float32),
                 from_some=_shares(arrays[f"{name} from_some"]),
             )
-            for name in told["policies"]
+            for name in summary["policies"]
         }
-    return told, each
+    return summary, each
 
 
 def _row(cells: list[str]) -> str:
@@ -128,7 +128,7 @@ def tables(found: dict[str, Any]) -> str:
     text = _table(["next view chosen by", *steps, "% of the gap, 2–4", "ECE at most"], rows)
     for method in METHODS:
         rows = []
-        for base in (*BASELINES, "learnt"):
+        for base in (*BASELINES, "learned"):
             gains = found["against"].get(base, {}).get(method)
             if gains is not None:
                 for of, unit in ((gains, ""), (gains["likelihood"], ", nat/100")):
@@ -156,10 +156,10 @@ def main(options: Options) -> None:
         text += (
             f"## {kind}: {found[0]['views']} candidates, {found[0]['objects']} objects, seeds {', '.join(numbers)}\n\n"
         )
-        text += tables(seeds_together(found, each, "learnt"))
+        text += tables(seeds_together(found, each, "learned"))
         if len(seeds) > 1:
             for number, one, own in seeds:
-                text += f"### seed {number}\n\n" + tables(seeds_together([one], [own], "learnt"))
+                text += f"### seed {number}\n\n" + tables(seeds_together([one], [own], "learned"))
     write_text(RESULTS / "choices.md", text)
     print(text)
 

@@ -35,7 +35,7 @@ def made_up_tables() -> ViewTable:
     random = np.random.default_rng(0)
     return ViewTable(
         logits=jnp.asarray(random.normal(0, 2, (OBJECTS, BACKBONES, VIEWS, CLASSES)), jnp.float32),
-        utility=jnp.asarray(random.uniform(0, 1, (OBJECTS, VIEWS, VIEWS)), jnp.float32),
+        predicted_entropy=jnp.asarray(random.uniform(0, 1, (OBJECTS, VIEWS, VIEWS)), jnp.float32),
         entropy=jnp.asarray(random.uniform(0, 1, (OBJECTS, VIEWS)), jnp.float32),
         label=jnp.asarray(random.integers(0, CLASSES, OBJECTS), jnp.int32),
     )
@@ -47,8 +47,8 @@ def loop_over_objects(tables: ViewTable, neighbours: np.ndarray, objects: int) -
     As published: every cell walks from scratch; a walk chooses, looks, adds up and stops, in plain Python over NumPy arrays. To
     keep it short, each object starts from one view only, which is as many walks as the published code makes in one run.
     """
-    logits, utility, entropy, labels = (
-        np.asarray(leaf) for leaf in (tables.logits, tables.utility, tables.entropy, tables.label)
+    logits, predicted_entropy, entropy, labels = (
+        np.asarray(leaf) for leaf in (tables.logits, tables.predicted_entropy, tables.entropy, tables.label)
     )
     random = np.random.default_rng(0)
     shape = (objects, BACKBONES, len(RUNGS), LAST_MV - FIRST_MV + 1, len(THRESHOLDS))
@@ -56,7 +56,7 @@ def loop_over_objects(tables: ViewTable, neighbours: np.ndarray, objects: int) -
     for index, backbone, policy, limit, threshold in np.ndindex(*shape):
         weights, graph = {
             "random": (random.uniform(0, 1, (LAST_MV + 1, VIEWS)), None),
-            "predicted_entropy": (utility[index], neighbours),
+            "predicted_entropy": (predicted_entropy[index], neighbours),
             "oracle_entropy": (np.broadcast_to(entropy[index], (VIEWS, VIEWS)), neighbours),
         }[RUNGS[policy].policy]
         _, predictions, _ = numpy_rules.walk(

@@ -76,12 +76,12 @@ def main() -> None:
     variance = np.square(entropy - entropy.mean()).mean()
 
     @jax.jit
-    def first_choices(utility: jax.Array) -> jax.Array:
+    def first_choices(predicted_entropy: jax.Array) -> jax.Array:
         def choice(start: jax.Array, weights: jax.Array) -> jax.Array:
             allowed = jnp.arange(statistics.views) != start
             return jnp.argmax(jnp.where(allowed, maxima_first(weights, allowed, graph.neighbours), -jnp.inf))
 
-        return jax.vmap(jax.vmap(choice), in_axes=(None, 0))(jnp.arange(statistics.views), utility)
+        return jax.vmap(jax.vmap(choice), in_axes=(None, 0))(jnp.arange(statistics.views), predicted_entropy)
 
     found = {}
     for name, dtype, wrap in (
@@ -94,14 +94,14 @@ def main() -> None:
             saved = replace(task, optimiser=replace(task.optimiser, compute=dtype))
             network = load_best(saved, run / folder)
             outputs.append(network_outputs(run / "data", "test", saved, wrap(network)))
-        logits, utility = outputs
-        error = np.square(utility - entropy[:, None]).mean(axis=(1, 2))
+        logits, predicted_entropy = outputs
+        error = np.square(predicted_entropy - entropy[:, None]).mean(axis=(1, 2))
         found[name] = {
             "right": (logits.argmax(-1) == labels[:, None]).mean(axis=1),
             "error": error,
             "logits": logits,
-            "utility": utility,
-            "chosen": np.asarray(first_choices(jnp.asarray(utility))),
+            "entropy": predicted_entropy,
+            "chosen": np.asarray(first_choices(jnp.asarray(predicted_entropy))),
         }
         print(name, f"{100 * found[name]['right'].mean():.2f} %, R² {1 - error.mean() / variance:.4f}", flush=True)
     first = next(iter(found.values()))
@@ -125,7 +125,7 @@ def main() -> None:
         lines.append(
             f"| {name} | {100 * by['right'].mean():.2f} | {interval(100 * (by['right'] - first['right']))} "
             f"| {1 - by['error'].mean() / variance:.4f} | {interval(100 * (by['error'] - first['error']) / variance)} "
-            f"| {np.abs(by['logits'] - first['logits']).max():.1e} | {np.abs(by['utility'] - first['utility']).max():.1e} "
+            f"| {np.abs(by['logits'] - first['logits']).max():.1e} | {np.abs(by['entropy'] - first['entropy']).max():.1e} "
             f"| {100 * (by['chosen'] == first['chosen']).mean():.2f} % |"
         )
     write_text(RESULTS, "\n".join(lines) + "\n")

@@ -8,13 +8,13 @@ from data_pipeline.capture.casting import CaptureConfig
 from data_pipeline.dataset.augment import CloudAugmentation, ViewAugmentation
 from data_pipeline.dataset.builder import DataConfig
 from eval.rendering.ascent import AscentConfig
-from eval.rendering.policies import ClimbConfig
+from eval.rendering.policies import RenderingConfig
 from eval.walks.grid import GridConfig
 from eval.walks.live import LiveConfig
 from mevs_jax.models import Abstraction
 from train.choosing.features import SetFusionConfig
 from train.choosing.policy import PolicyConfig
-from train.choosing.stages import ABLATIONS, ActiveConfig
+from train.choosing.stages import ABLATIONS, LearnedConfig
 from train.optimiser import OptimiserConfig
 from train.sweep import SweepConfig
 from train.tasks.classifier import ClassifierConfig, ResNetConfig
@@ -35,8 +35,8 @@ class Settings:
     thesis: ThesisConfig = ThesisConfig()
     sweep: SweepConfig = SweepConfig()
     ascent: AscentConfig = AscentConfig()
-    climb: ClimbConfig = ClimbConfig()
-    active: ActiveConfig = ActiveConfig()
+    rendering: RenderingConfig = RenderingConfig()
+    learned: LearnedConfig = LearnedConfig()
 
 
 THESIS = Settings()
@@ -82,7 +82,7 @@ SMALL = Settings(
         fine_tuning=replace(_BRIEF, epochs=4, views_per_object=2),
         resnet34_width=32,
     ),
-    active=ActiveConfig(
+    learned=LearnedConfig(
         recogniser=RecogniserConfig(
             network=ResNetConfig(width=32, channels=4, standardise=False, stem="patches"),
             augmentation=ViewAugmentation(stretch=0.15),
@@ -108,18 +108,18 @@ SMALL = Settings(
     ),
 )
 """The same study at 64×64 with narrower networks.
-`mevs run --data modelnet10_voxels32.npz`: 12 minutes on two cores of an AMD EPYC (Zen 5), `mevs thesis` 40."""
+`mevs run --data modelnet10_voxels32.npz`: 12 minutes on two cores of an AMD EPYC (Zen 5), `mevs study thesis` 40."""
 
 
 BEST = replace(
     SMALL,
     dataset=replace(SMALL.dataset, capture=CaptureConfig(resolution=128)),
-    active=replace(
-        SMALL.active,
+    learned=replace(
+        SMALL.learned,
         recogniser=replace(
-            SMALL.active.recogniser,
+            SMALL.learned.recogniser,
             network=ResNetConfig(channels=4, standardise=False),
-            optimiser=replace(SMALL.active.recogniser.optimiser, epochs=12, batch_size=512),
+            optimiser=replace(SMALL.learned.recogniser.optimiser, epochs=12, batch_size=512),
         ),
         folds=4,
         fold_epochs=0,
@@ -127,8 +127,8 @@ BEST = replace(
         lattices=(10, 60),
     ),
 )
-"""What `mevs active` is meant to have where there is an accelerator: views of 128×128, a ResNet-18 as wide as the paper's, four
-parts, three seeds. It has been run for some steps, never to its end."""
+"""What `mevs study learned` is meant to have where there is an accelerator: views of 128×128, a ResNet-18 as wide as the paper's,
+four parts, three seeds. It has been run for some steps, never to its end."""
 
 
 _TRIFLING_SETS = SetFusionConfig(width=16, heads=2, blocks=1)
@@ -163,11 +163,11 @@ TINY = Settings(
         _TRIFLE,
         resnet34_width=8,
         timing_runs=3,
-        climbing_runs=1,
-        climbing_starts=2,
-        climbing_resolution=16,
+        ascent_runs=1,
+        ascent_starts=2,
+        ascent_resolution=16,
     ),
-    active=ActiveConfig(
+    learned=LearnedConfig(
         recogniser=RecogniserConfig(
             network=ResNetConfig(depth=10, width=8, channels=4, standardise=False, stem="patches"),
             fusion=_TRIFLING_SETS,
@@ -182,7 +182,7 @@ TINY = Settings(
         novel=1,
         rotation_epochs=1,
     ),
-    climb=ClimbConfig(objects=1, starts=2, resolution=16, faces=64),
+    rendering=RenderingConfig(objects=1, starts=2, resolution=16, faces=64),
 )
 """Seconds, and no use but to see that everything runs."""
 

@@ -20,9 +20,9 @@ from data_pipeline.errors import DataError
 from data_pipeline.files import as_read, read_json, write_json
 from data_pipeline.progress import console
 from eval.learned.measure import measure, together, train_all
-from eval.learned.page import write_active_page
+from eval.learned.page import write_learned_page
 from eval.numbers.study import reachable_views, run_study
-from eval.rendering.policies import climb_objects, climbing_study, load_climbed
+from eval.rendering.policies import ascend_objects, ascent_study, load_ascent_scores
 from eval.report.html import ReportInputs
 from eval.report.page import read_history, write_report
 from eval.report.sweep import write_sweep_report
@@ -30,11 +30,11 @@ from eval.settings import Settings
 from eval.tables import ViewTables, compute_view_tables, load_view_tables, save_view_tables
 from eval.walks.grid import FIRST_MV, GridConfig
 from eval.walks.knowledge import learn
-from eval.walks.ladder import CLIMBED
+from eval.walks.ladder import ASCENT_RUNGS
 from eval.walks.live import Agreement, Networks, compare_with_tables
 from mevs_jax.policies.registry import POLICIES
 from mevs_jax.viewpoints import ViewGraph
-from train.choosing.stages import Stages, check_active
+from train.choosing.stages import Stages, check_learned
 from train.kept import made_by
 from train.loop import fit, load_best
 from train.starting_weights import StartingWeights
@@ -145,9 +145,9 @@ def evaluate(settings: Settings, out: Path) -> dict[str, Any]:
         "by_view": by_view_made,
         "climbed": None,
     }
-    climbed = load_climbed(out, statistics, settings.climb)
+    climbed = load_ascent_scores(out, statistics, settings.rendering)
     if climbed is not None:
-        identity["climbed"] = asdict(settings.climb)
+        identity["climbed"] = asdict(settings.rendering)
     identity = as_read(identity)
     check_evaluation(settings.evaluation)
     path = out / "metrics.json"
@@ -170,31 +170,31 @@ def evaluate(settings: Settings, out: Path) -> dict[str, Any]:
     validation = _tables(settings, out, statistics, "val")
     metrics = run_study(tables, validation, statistics, settings.evaluation, by_view, leak)
     if climbed is not None:
-        metrics["climbing"] = climbing_study(tables, statistics, climbed, settings.evaluation)
+        metrics["climbing"] = ascent_study(tables, statistics, climbed, settings.evaluation)
     metrics["identity"] = identity
     write_json(path, metrics)
     return metrics
 
 
 def learn_to_choose(settings: Settings, out: Path) -> Path:
-    """Trains and measures learnt fusion and learnt choice; returns the page."""
-    config, found = settings.active, []
-    check_active(config, settings.dataset.capture.views)
+    """Trains and measures learned fusion and learned choice; returns the page."""
+    config, found = settings.learned, []
+    check_learned(config, settings.dataset.capture.views)
     seeds = [Stages(config, settings.dataset, out, seed, settings.entropy) for seed in range(config.seeds)]
     for stages in seeds:
         train_all(stages)
         found.append(measure(stages))
     metrics = {"seeds": found, "together": together(seeds, found), "settings": asdict(config)}
-    write_json(out / "active" / "metrics.json", metrics)
-    page = out / "active" / "index.html"
-    write_active_page(metrics, load_statistics(out / "data"), page)
+    write_json(out / "learned" / "metrics.json", metrics)
+    page = out / "learned" / "index.html"
+    write_learned_page(metrics, load_statistics(out / "data"), page)
     return page
 
 
-def climb_on_objects(settings: Settings, out: Path) -> None:
+def ascend_on_objects(settings: Settings, out: Path) -> None:
     """Finds where differentiable rendering would look next on many test objects; `evaluate` then compares it."""
     statistics = load_statistics(out / "data")
-    climb_objects(settings.dataset, statistics, out, settings.climb)
+    ascend_objects(settings.dataset, statistics, out, settings.rendering)
 
 
 def check_live(settings: Settings, out: Path) -> dict[str, Agreement]:
@@ -202,8 +202,8 @@ def check_live(settings: Settings, out: Path) -> dict[str, Agreement]:
     for policy in settings.live.policies:
         if policy not in POLICIES:
             raise DataError(f"unknown policy {policy!r}; it is one of {', '.join(POLICIES)}")
-        if policy in {rung.policy for rung in CLIMBED}:
-            raise DataError(f"{policy} looks into what mevs climb has found; live walks have no such tables")
+        if policy in {rung.policy for rung in ASCENT_RUNGS}:
+            raise DataError(f"{policy} looks into what mevs study rendering has found; live walks have no such tables")
     statistics = load_statistics(out / "data")
     classify, predict = tasks(settings, statistics)
     networks = Networks(classify, load_best(classify, out / "classifier"), predict, load_best(predict, out / "entropy"))
@@ -223,7 +223,7 @@ def check_live(settings: Settings, out: Path) -> dict[str, Agreement]:
 
 def report(settings: Settings, preset: str, out: Path) -> Path:
     """Writes the page and returns where it is; one that is newer than its metrics is left as it is."""
-    page, metrics, active = out / "report" / "index.html", out / "metrics.json", out / "active" / "metrics.json"
+    page, metrics, active = out / "report" / "index.html", out / "metrics.json", out / "learned" / "metrics.json"
     if not metrics.exists():
         raise DataError(f"no metrics in {out}; make them with: mevs eval --out {out}")
     made_of = [path for path in (metrics, active) if path.exists()]
@@ -240,7 +240,7 @@ def report(settings: Settings, preset: str, out: Path) -> Path:
                 summaries={name: read_json(folder / "summary.json") for name, folder in networks.items()},
                 preset=preset,
                 settings=asdict(settings),
-                active=read_json(active) if active.exists() else None,
+                learned=read_json(active) if active.exists() else None,
             ),
             page,
         )

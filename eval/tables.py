@@ -25,7 +25,7 @@ class ViewTables:
         names: of the objects, in the order of the shards.
         labels: (objects,) int.
         logits: (objects, views, classes).
-        utility: (objects, views, views) predicted normalised entropies; row i after seeing view i.
+        predicted_entropy: (objects, views, views) predicted normalised entropies; row i after seeing view i.
         entropy: (objects, views) true normalised entropies.
         made_by: names the data set and the networks; tables made by others are stale.
     """
@@ -33,14 +33,16 @@ class ViewTables:
     names: list[str]
     labels: np.ndarray
     logits: np.ndarray
-    utility: np.ndarray
+    predicted_entropy: np.ndarray
     entropy: np.ndarray
     made_by: str = ""
 
     def stacked(self) -> ViewTable:
         """As one `ViewTable` with a leading axis of objects, to be vmapped over."""
-        logits, utility, entropy, labels = map(jnp.asarray, (self.logits, self.utility, self.entropy, self.labels))
-        return ViewTable(logits, utility, entropy, labels)
+        logits, predicted_entropy, entropy, labels = map(
+            jnp.asarray, (self.logits, self.predicted_entropy, self.entropy, self.labels)
+        )
+        return ViewTable(logits, predicted_entropy, entropy, labels)
 
 
 def objects_of(data: Path, split: str, statistics: DatasetStatistics) -> tuple[list[str], np.ndarray, np.ndarray]:
@@ -73,7 +75,7 @@ def save_view_tables(path: Path, tables: ViewTables) -> None:
         names=np.array(tables.names),
         labels=tables.labels,
         logits=tables.logits,
-        utility=tables.utility,
+        predicted_entropy=tables.predicted_entropy,
         entropy=tables.entropy,
         made_by=np.array(tables.made_by),
     )
@@ -81,5 +83,5 @@ def save_view_tables(path: Path, tables: ViewTables) -> None:
 
 def load_view_tables(path: Path) -> ViewTables:
     with np.load(path) as stored:
-        arrays = {name: stored[name] for name in ("labels", "logits", "utility", "entropy")}
+        arrays = {name: stored[name] for name in ("labels", "logits", "predicted_entropy", "entropy")}
         return ViewTables(names=[str(name) for name in stored["names"]], **arrays, made_by=str(stored["made_by"]))

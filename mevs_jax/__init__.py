@@ -44,7 +44,7 @@ from mevs_jax.policies.base import (
     maxima_first,
     with_movement,
 )
-from mevs_jax.policies.learned import learnt
+from mevs_jax.policies.learned import learned
 from mevs_jax.policies.oracles import fused_oracle
 from mevs_jax.policies.registry import POLICIES
 from mevs_jax.selection import (
@@ -109,7 +109,7 @@ __all__ = [
     "fit_exponent",
     "fit_temperature",
     "fused_oracle",
-    "learnt",
+    "learned",
     "level_entropy",
     "local_maxima",
     "look_at_origin",

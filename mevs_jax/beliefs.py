@@ -8,7 +8,7 @@ independent. All of the family p ∝ Π pᵢ^α with an α that depends on the n
 thesis has α = 1, the mean of log-probabilities α = 1/n, and α = 1/T(n) is what `mevs_jax.calibration` fits. The mean of
 probabilities (a mixture) can disagree.
 
-`SetFusion` is learnt: a belief of features and directions of any views, which need not be independent.
+`SetFusion` is learned: a belief of features and directions of any views, which need not be independent.
 """
 
 from __future__ import annotations
@@ -22,17 +22,17 @@ from jaxtyping import Array, Bool, Float
 from mevs_jax.arrays import AnyArray
 
 
-def sum_of_logits(belief: Float[Array, "classes"], logits: Float[Array, "classes"]) -> Float[Array, "classes"]:
+def sum_of_logits(belief: Float[Array, " classes"], logits: Float[Array, " classes"]) -> Float[Array, " classes"]:
     """The belief after one more view; the belief before any view is zero."""
     return belief + logits
 
 
-def confidence(belief: Float[Array, "classes"]) -> Float[Array, ""]:
+def confidence(belief: Float[Array, " classes"]) -> Float[Array, ""]:
     """Probability of the most likely class, in (0, 1]."""
     return jnp.max(jax.nn.softmax(belief))
 
 
-def running_sum(values: Float[Array, "steps *rest"]) -> Float[Array, "steps *rest"]:
+def running_sum(values: Float[Array, " steps *rest"]) -> Float[Array, " steps *rest"]:
     """Cumulative sum over a few steps, one after the other like the selection loop, so that no rounding differs from it."""
     sums = [values[0]]
     for step in range(1, values.shape[0]):
@@ -46,7 +46,7 @@ def beliefs_along(logits: Float[Array, "steps classes"]) -> Float[Array, "steps 
 
 
 def discounted(
-    beliefs: Float[Array, "steps classes"], temperatures: Float[Array, "steps"]
+    beliefs: Float[Array, "steps classes"], temperatures: Float[Array, " steps"]
 ) -> Float[Array, "steps classes"]:
     """Log-probabilities softmax(belief / T(n)) after each number of views; T = 1 is the thesis, T = n the mean of logits."""
     return jax.nn.log_softmax(beliefs / temperatures[:, None], axis=-1)
@@ -73,8 +73,8 @@ class CalibratedFusion:
 
     structure: nnx.GraphDef = flax.struct.field(pytree_node=False)
     weights: nnx.State
-    prior: Float[Array, "classes"]
-    temperatures: Float[Array, "most"]
+    prior: Float[Array, " classes"]
+    temperatures: Float[Array, " most"]
     single: Float[Array, ""]
     posed: bool = flax.struct.field(pytree_node=False, default=True)
 

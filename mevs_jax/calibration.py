@@ -23,8 +23,8 @@ def _bin_of(confidences: Array, bins: int) -> Int[Array, "..."]:
 
 
 def reliability(
-    confidences: Float[AnyArray, "n"], right: Bool[AnyArray, "n"], bins: int = BINS
-) -> tuple[Float[Array, "{bins}"], Float[Array, "{bins}"], Float[Array, "{bins}"]]:
+    confidences: Float[AnyArray, " n"], right: Bool[AnyArray, " n"], bins: int = BINS
+) -> tuple[Float[Array, "  {bins}"], Float[Array, " {bins}"], Float[Array, " {bins}"]]:
     """By bin of confidence, (0, 1/bins], …: mean confidence, accuracy, and the share of answers; 0 where there are none."""
     confidences, right = jnp.asarray(confidences), jnp.asarray(right)
     member = _bin_of(confidences, bins) == jnp.arange(bins)[:, None]
@@ -34,7 +34,7 @@ def reliability(
 
 
 def expected_calibration_error(
-    confidences: Float[AnyArray, "n"], right: Bool[AnyArray, "n"], bins: int = BINS
+    confidences: Float[AnyArray, " n"], right: Bool[AnyArray, " n"], bins: int = BINS
 ) -> Float[Array, ""]:
     """Mean distance between confidence and accuracy over bins of equal width, weighted by answers; in [0, 1]."""
     confidence, accuracy, share = reliability(confidences, right, bins)
@@ -70,19 +70,19 @@ def log_likelihood(beliefs: Float[AnyArray, "*n classes"], labels: Int[AnyArray,
     return jnp.take_along_axis(log_probabilities, jnp.asarray(labels)[..., None], axis=-1)[..., 0]
 
 
-def negative_log_likelihood(beliefs: Float[AnyArray, "n classes"], labels: Int[AnyArray, "n"]) -> Float[Array, ""]:
+def negative_log_likelihood(beliefs: Float[AnyArray, "n classes"], labels: Int[AnyArray, " n"]) -> Float[Array, ""]:
     """Mean of −log softmax(belief)[label] in nats."""
     return -jnp.mean(log_likelihood(beliefs, labels))
 
 
-def class_weights(labels: Int[AnyArray, "n"], classes: int) -> Float[Array, "n"]:
+def class_weights(labels: Int[AnyArray, " n"], classes: int) -> Float[Array, " n"]:
     """Weights under which every class that occurs counts the same; their mean is 1."""
     counts = jnp.bincount(jnp.asarray(labels), length=classes)
     return len(labels) / jnp.sum(counts > 0) / counts[jnp.asarray(labels)]
 
 
 def fit_temperature(
-    beliefs: Float[AnyArray, "n classes"], labels: Int[AnyArray, "n"], weights: Float[AnyArray, "n"] | float = 1.0
+    beliefs: Float[AnyArray, "n classes"], labels: Int[AnyArray, " n"], weights: Float[AnyArray, " n"] | float = 1.0
 ) -> Float[Array, ""]:
     """The T that makes softmax(belief / T) most likely, in [0.01, 100]; `weights` say how much each counts.
 
@@ -105,7 +105,7 @@ def fit_temperature(
 
 
 def fit_exponent(
-    beliefs: Float[AnyArray, "n steps classes"], labels: Int[AnyArray, "n"]
+    beliefs: Float[AnyArray, "n steps classes"], labels: Int[AnyArray, " n"]
 ) -> tuple[Float[Array, ""], Float[Array, ""]]:
     """(scale, growth) of temperatures scale · steps^growth, fitted to all numbers of views at once.
 

@@ -81,7 +81,7 @@ def pixel_directions(camera: Camera) -> Float[Array, "resolution resolution 3"]:
 
 
 def unproject(
-    pixels: Int[AnyArray, "points"], depth: Float[AnyArray, "points"], camera: Camera, *, frame: str = "world"
+    pixels: Int[AnyArray, " points"], depth: Float[AnyArray, " points"], camera: Camera, *, frame: str = "world"
 ) -> Float[Array, "points 3"]:
     """Points seen at flat pixel indices (row · resolution + column).
 
@@ -101,7 +101,7 @@ def unproject(
 
 def partial_cloud(
     depth: Float[AnyArray, "resolution resolution"], camera: Camera
-) -> tuple[Float[Array, "pixels 3"], Bool[Array, "pixels"]]:
+) -> tuple[Float[Array, "pixels 3"], Bool[Array, " pixels"]]:
     """The world point behind every pixel, and which of them are real (something was hit)."""
     flat = jnp.asarray(depth).reshape(-1)
     pixels = jnp.arange(flat.shape[0])

@@ -32,7 +32,7 @@ class Decision:
     """
 
     view: int
-    entropies: Float[np.ndarray, "views"]
+    entropies: Float[np.ndarray, " views"]
 
 
 class NextView:
@@ -63,7 +63,7 @@ class NextView:
         self._decide = jax.jit(decide)
 
     def __call__(
-        self, cloud: Float[np.ndarray, "points columns"], available: Bool[np.ndarray, "views"] | None = None
+        self, cloud: Float[np.ndarray, "points columns"], available: Bool[np.ndarray, " views"] | None = None
     ) -> Decision:
         """The available view with the most promising entropy: the best local maximum, or the best of all where there is none.
 

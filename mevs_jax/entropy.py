@@ -30,7 +30,7 @@ def depth_levels(depth: Float[AnyArray, "*shape"]) -> Int[Array, "*shape"]:
     return quantise_depth(depth) // _LEVELS
 
 
-def shannon_entropy(counts: Float[AnyArray, "levels"] | Int[AnyArray, "levels"]) -> Float[Array, ""]:
+def shannon_entropy(counts: Float[AnyArray, " levels"] | Int[AnyArray, " levels"]) -> Float[Array, ""]:
     """Entropy in bits of a histogram; 0 for an empty one."""
     total = jnp.sum(counts)
     p = counts / jnp.maximum(total, 1)

@@ -14,10 +14,10 @@ from mevs_jax.arrays import AnyArray
 
 
 def confusion_matrix(
-    labels: Int[AnyArray, "n"],
-    predictions: Int[AnyArray, "n"],
+    labels: Int[AnyArray, " n"],
+    predictions: Int[AnyArray, " n"],
     classes: int,
-    weights: Float[AnyArray, "n"] | None = None,
+    weights: Float[AnyArray, " n"] | None = None,
 ) -> Float[Array, "{classes} {classes}"]:
     """Weight by (true class, predicted class); every weight 1 unless given."""
     weights = jnp.ones(labels.shape) if weights is None else weights
@@ -45,8 +45,8 @@ def is_right(beliefs: Float[Array, "..."], label: Int[Array, ""], *, axis: int) 
 
 
 def bootstrap_means(
-    key: Array, values: Float[AnyArray, "objects"], *, resamples: int = 2000
-) -> Float[Array, "{resamples}"]:
+    key: Array, values: Float[AnyArray, " objects"], *, resamples: int = 2000
+) -> Float[Array, " {resamples}"]:
     """Means over objects drawn with replacement.
 
     The same key draws the same objects, so a `vmap` over cells with one key keeps them paired, and costs one matrix product.
@@ -61,7 +61,7 @@ def bootstrap_means(
 
 
 def bootstrap_interval(
-    key: Array, values: Float[AnyArray, "objects"], *, level: float = 0.95, resamples: int = 2000
+    key: Array, values: Float[AnyArray, " objects"], *, level: float = 0.95, resamples: int = 2000
 ) -> Float[Array, 2]:
     """Percentile interval of the mean over objects, drawn with replacement.
 

@@ -28,35 +28,37 @@ class ViewTable:
 
     Attributes:
         logits: (views, classes) of the classifier at each view; an axis of its own where several classifiers are compared.
-        utility: (views, views); row i is what the entropy predictor says about every view after seeing view i.
+        predicted_entropy: (views, views); row i is what the entropy predictor says about every view after seeing view i.
         entropy: (views,) true depth entropies.
         label: the true class.
-        climbed: (views, views) by policy; row i is where differentiable rendering would look after seeing view i.
-        features: (views, features) of the encoder, for a learnt fusion.
+        ascent_scores: (views, views) by policy; row i is where differentiable rendering would look after seeing view i.
+        features: (views, features) of the encoder, for a learned fusion.
         clouds: (views, embedding) of the partial clouds, for a policy that uses them.
     """
 
     logits: Float[Array, "*batch_and_backbones views classes"]
-    utility: Float[Array, "*batch views views"] | None
+    predicted_entropy: Float[Array, "*batch views views"] | None
     entropy: Float[Array, "*batch views"] | None
     label: Int[Array, "*batch"]
-    climbed: dict[str, Float[Array, "*batch views views"]] | None = None
+    ascent_scores: dict[str, Float[Array, "*batch views views"]] | None = None
     features: Float[Array, "*batch views features"] | None = None
     clouds: Float[Array, "*batch views embedding"] | None = None
 
     def observe(self, view: Int[Array, ""]) -> Observation:
         return Observation(
             self.logits[view],
-            None if self.utility is None else self.utility[view],
+            None if self.predicted_entropy is None else self.predicted_entropy[view],
             None if self.features is None else self.features[view],
             None if self.clouds is None else self.clouds[view],
         )
 
     def scene(
-        self, graph: ViewGraph, knowledge: Knowledge | None = None, reachable: Bool[Array, "views"] | None = None
+        self, graph: ViewGraph, knowledge: Knowledge | None = None, reachable: Bool[Array, " views"] | None = None
     ) -> Scene:
         """The scene with everything that an oracle may ask for."""
-        return Scene(graph, self.entropy, self.logits, self.label, knowledge, reachable, self.climbed, self.features)
+        return Scene(
+            graph, self.entropy, self.logits, self.label, knowledge, reachable, self.ascent_scores, self.features
+        )
 
 
 @flax.struct.dataclass
@@ -76,7 +78,7 @@ class Episode:
     count: Int[Array, "*batch"]
 
 
-def best_view(scores: Float[Array, "views"], allowed: Bool[Array, "views"]) -> Int[Array, ""]:
+def best_view(scores: Float[Array, " views"], allowed: Bool[Array, " views"]) -> Int[Array, ""]:
     """The allowed view of highest score, the lowest index among equals; −inf and NaN come last.
 
     A score of +inf is an order: that view is taken even where it is not allowed, having been seen before.
@@ -87,22 +89,22 @@ def best_view(scores: Float[Array, "views"], allowed: Bool[Array, "views"]) -> I
     return jnp.argmax(allowed & (scores == best)).astype(jnp.int32)
 
 
-Fuse = Callable[[SelectionState, Scene], Float[Array, "classes"]]
+Fuse = Callable[[SelectionState, Scene], Float[Array, " classes"]]
 """The belief once the latest look is among those `seen`; `belief` is still that before it."""
 
 
-def adding(state: SelectionState, scene: Scene) -> Float[Array, "classes"]:
+def adding(state: SelectionState, scene: Scene) -> Float[Array, " classes"]:
     """The thesis's fusion (§4.4): the sum of logits."""
     del scene
     return sum_of_logits(state.belief, state.latest.logits)
 
 
 def by_attention(fusion: CalibratedFusion) -> Fuse:
-    """A learnt fusion of the features that were seen; the belief is its log-probabilities."""
+    """A learned fusion of the features that were seen; the belief is its log-probabilities."""
 
-    def fuse(state: SelectionState, scene: Scene) -> Float[Array, "classes"]:
+    def fuse(state: SelectionState, scene: Scene) -> Float[Array, " classes"]:
         if state.seen.features is None:
-            raise ValueError("a learnt fusion needs the features of every look, which are not given")
+            raise ValueError("a learned fusion needs the features of every look, which are not given")
         present = jnp.arange(len(state.views)) < state.count
         return fusion(state.seen.features, scene.graph.points[state.views], present)
 
@@ -217,7 +219,7 @@ def select_from_table(
 
 
 def stop_at(
-    confidences: Float[Array, "steps"], threshold: float | Float[Array, ""], max_views: int | Int[Array, ""]
+    confidences: Float[Array, " steps"], threshold: float | Float[Array, ""], max_views: int | Int[Array, ""]
 ) -> Int[Array, ""]:
     """How many views a full walk would have used: up to the first confidence ≥ `threshold`, at most `max_views`.
 

@@ -191,7 +191,9 @@ class ViewGraph:
         )
 
 
-def local_maxima(weights: Float[AnyArray, "views"], neighbours: Bool[AnyArray, "views views"]) -> Bool[Array, "views"]:
+def local_maxima(
+    weights: Float[AnyArray, " views"], neighbours: Bool[AnyArray, "views views"]
+) -> Bool[Array, " views"]:
     """Which views weigh strictly more than every neighbour (thesis Algorithm 1).
 
     Two equal neighbours exclude each other; a view without neighbours is a maximum. At least one view is a maximum

@@ -9,12 +9,12 @@ import pytest
 from benchmarks import choices
 from eval.learned.study import BASELINES, ByObject, compared, seeds_together
 
-POLICIES = (*BASELINES, "learnt", "belief_oracle")
+POLICIES = (*BASELINES, "learned", "belief_oracle")
 OBJECTS, STARTS = 30, 40
 
 
 def test_what_is_kept_says_what_the_walks_said(tmp_path, monkeypatch, random):
-    folder = tmp_path / "run" / "active" / "seed_0"
+    folder = tmp_path / "run" / "learned" / "seed_0"
     folder.mkdir(parents=True)
     each = {
         name: ByObject(
@@ -43,9 +43,9 @@ def test_what_is_kept_says_what_the_walks_said(tmp_path, monkeypatch, random):
         np.testing.assert_allclose(mine[name].right, one.right, atol=1e-12)
         np.testing.assert_allclose(mine[name].from_some, one.from_some, atol=1e-12)
         np.testing.assert_allclose(mine[name].likelihood, one.likelihood, atol=1e-3)
-    again = seeds_together([told], [mine], "learnt")
-    gain = compared(each, "learnt")["against"]["random"]["learnt"]
-    np.testing.assert_allclose(again["against"]["random"]["learnt"]["interval"], gain["interval"], atol=1e-6)
+    again = seeds_together([told], [mine], "learned")
+    gain = compared(each, "learned")["against"]["random"]["learned"]
+    np.testing.assert_allclose(again["against"]["random"]["learned"]["interval"], gain["interval"], atol=1e-6)
     page = (tmp_path / "choices.md").read_text()
     low, high = gain["interval"][1]
     assert f"{100 * gain['difference'][1]:+.1f} [{100 * low:+.1f}, {100 * high:+.1f}]".replace("-", "−") in page

@@ -19,9 +19,9 @@ import pytest
 import trimesh
 
 from data_pipeline.dataset.builder import load_statistics
-from eval.learned.page import write_active_page
+from eval.learned.page import write_learned_page
 from eval.settings import TINY
-from eval.stages import climb_on_objects, learn_to_choose
+from eval.stages import ascend_on_objects, learn_to_choose
 from mevs_jax.cli import main as cli
 from tests.conftest import open3d_or_skip
 
@@ -231,16 +231,16 @@ def test_networks_for_another_number_of_views_are_refused(whole, tmp_path, refus
 
 
 def test_compat_climbs_and_learning_fill_their_tables(whole, tmp_path):
-    """One evaluation of what `mevs compat`, `climb` and `active` add to a run."""
+    """One evaluation of what `mevs study published-code`, `climb` and `active` add to a run."""
     open3d_or_skip()
     out = tmp_path / "run"
     shutil.copytree(whole, out)
-    assert "mevs compat" in (out / "report" / "index.html").read_text()
-    upright = replace(TINY, active=replace(TINY.active, rotation_epochs=0))
+    assert "mevs study published-code" in (out / "report" / "index.html").read_text()
+    upright = replace(TINY, learned=replace(TINY.learned, rotation_epochs=0))
     page = learn_to_choose(upright, out).read_text()
-    made_once = (out / "active" / "seed_0" / "policies" / "learnt" / "summary.json").stat().st_mtime_ns
+    made_once = (out / "learned" / "seed_0" / "policies" / "learned" / "summary.json").stat().st_mtime_ns
     assert learn_to_choose(upright, out).read_text() == page
-    assert (out / "active" / "seed_0" / "policies" / "learnt" / "summary.json").stat().st_mtime_ns == made_once
+    assert (out / "learned" / "seed_0" / "policies" / "learned" / "summary.json").stat().st_mtime_ns == made_once
     sections = (
         "6 candidate views",
         "Facing any way",
@@ -249,13 +249,13 @@ def test_compat_climbs_and_learning_fill_their_tables(whole, tmp_path):
     )
     for said in (*sections, "PointNet++ entropy (thesis)", "view policy", "label-free oracle"):
         assert html.escape(said) in page
-    found = json.loads((out / "active" / "metrics.json").read_text())
+    found = json.loads((out / "learned" / "metrics.json").read_text())
     first = found["seeds"][0]
     more = found | {"seeds": [first | {"rotated": first["unposed"]}, {"lattices": first["lattices"]}]}
-    write_active_page(more, load_statistics(out / "data"), tmp_path / "more.html")
+    write_learned_page(more, load_statistics(out / "data"), tmp_path / "more.html")
     for said in ("Means of 2 trainings", "Joined with a table", "Other random weights", "Turned anyhow"):
         assert said in (tmp_path / "more.html").read_text()
-    climb_on_objects(TINY, out)
+    ascend_on_objects(TINY, out)
     assert mevs("compat", "--preset", "tiny", "--out", out).returncode == 0
     metrics = json.loads((out / "metrics.json").read_text())
     made = metrics["compatibility"]
@@ -266,7 +266,7 @@ def test_compat_climbs_and_learning_fill_their_tables(whole, tmp_path):
     page = (out / "report" / "index.html").read_text()
     assert "Choosing by differentiable rendering" in page
     assert "Learning to fuse and to choose" in page
-    assert "mevs compat" not in page
+    assert "mevs study published-code" not in page
     before = json.loads((whole / "metrics.json").read_text())
     assert before["compatibility"]["rows"]["text"] == made["rows"]["text"]
 
@@ -293,7 +293,7 @@ def test_many_devices_say_what_one_does(whole, tmp_path, monkeypatch):
     result = mevs("eval", "--preset", "tiny", "--out", out)
     assert result.returncode == 0, result.stderr
     with np.load(out / "tables" / "test.npz") as mine, np.load(whole / "tables" / "test.npz") as theirs:
-        for name in ("logits", "utility"):
+        for name in ("logits", "predicted_entropy"):
             np.testing.assert_allclose(mine[name], theirs[name], rtol=1e-4, atol=1e-5)
     result = mevs("live", "--preset", "tiny", "--live.objects", "6", "--out", out, "--live.policies", "random")
     assert result.returncode == 0, result.stderr
@@ -324,7 +324,7 @@ def test_an_interrupt_that_is_lost_is_given_again():
     """Python ignores an interrupt that falls into a finaliser; here one does."""
     script = """
 import os, signal, sys, time
-from mevs_jax import cli
+from mevs_jax.cli import main as cli
 
 class Loses:
     def __del__(self):

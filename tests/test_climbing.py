@@ -8,8 +8,8 @@ import numpy as np
 from data_pipeline.objects.mesh import Mesh, ObjectEntry
 from data_pipeline.objects.recipes import FurniturePiece
 from data_pipeline.objects.sources import load_object
-from eval.rendering.policies import ClimbConfig, chosen_objects, scores_of_object, view_scores
-from eval.walks.ladder import CLIMBED
+from eval.rendering.policies import RenderingConfig, chosen_objects, scores_of_object, view_scores
+from eval.walks.ladder import ASCENT_RUNGS
 from mevs_jax import cameras_at, fibonacci_sphere
 from mevs_jax.rendering import render_depth
 from tests.conftest import open3d_or_skip
@@ -36,8 +36,8 @@ def test_distinct_optima_come_first_in_their_order_each_as_its_nearest_candidate
 
 
 def test_objects_are_spread_evenly_and_never_twice():
-    assert chosen_objects(ClimbConfig(objects=3), 11).tolist() == [0, 5, 10]
-    assert chosen_objects(ClimbConfig(objects=30), 4).tolist() == [0, 1, 2, 3]
+    assert chosen_objects(RenderingConfig(objects=3), 11).tolist() == [0, 5, 10]
+    assert chosen_objects(RenderingConfig(objects=30), 4).tolist() == [0, 1, 2, 3]
 
 
 def views_of(mesh: Mesh, side: int) -> tuple[np.ndarray, np.ndarray]:
@@ -54,10 +54,10 @@ def test_an_object_gets_a_row_for_every_view_and_what_shows_nothing_is_counted()
     mesh = load_object(ObjectEntry("chair", 0, "test", FurniturePiece("chair", 3)))
     depth, poses = views_of(mesh, 32)
     depth[4] = 0  # as if the object were out of sight
-    config = ClimbConfig(starts=2, resolution=16, faces=64)
+    config = RenderingConfig(starts=2, resolution=16, faces=64)
     found = scores_of_object(mesh, depth, poses, np.pi / 3, jnp.asarray(fibonacci_sphere(VIEWS)), config)
     assert found.pop("without_surface") == 1
-    assert set(found) == {rung.policy for rung in CLIMBED}
+    assert set(found) == {rung.policy for rung in ASCENT_RUNGS}
     for name, rows in found.items():
         assert rows.shape == (VIEWS, VIEWS)
         assert np.isfinite(rows).all()

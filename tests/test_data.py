@@ -122,8 +122,8 @@ def test_too_few_views_and_missing_data_are_described(tmp_path):
 
 def test_no_tensorflow_is_imported(data):
     code = (
-        "import sys; from pathlib import Path; from data_pipeline.builder import open_split; "
-        "import mevs_jax.cli, eval.pipeline; "
+        "import sys; from pathlib import Path; from data_pipeline.dataset.builder import open_split; "
+        "import mevs_jax.cli.main, eval.stages; "
         "open_split(Path(sys.argv[1]), 'val')[0]; assert 'tensorflow' not in sys.modules; print('none')"
     )
     out = subprocess.run([sys.executable, "-c", code, str(data)], capture_output=True, text=True, check=True)

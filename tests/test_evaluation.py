@@ -22,7 +22,7 @@ from eval.tables import ViewTables, load_view_tables, save_view_tables
 from eval.walks.exact import expected_random
 from eval.walks.grid import FIRST_MV, THRESHOLDS, GridConfig, run_grid
 from eval.walks.knowledge import learn
-from eval.walks.ladder import CLIMBED, Rung
+from eval.walks.ladder import ASCENT_RUNGS, Rung
 from mevs_jax import POLICIES, ViewGraph, bootstrap_interval, fibonacci_sphere, select_from_table
 from tests.reference import numpy_rules
 
@@ -36,9 +36,9 @@ def tables() -> ViewTables:
     logits = random.normal(0, 1.2, (OBJECTS, VIEWS, CLASSES))
     logits[np.arange(OBJECTS), :, labels] += 0.7
     entropy = random.uniform(0.2, 0.9, (OBJECTS, VIEWS))
-    utility = entropy[:, None, :] + random.normal(0, 0.05, (OBJECTS, VIEWS, VIEWS))
+    predicted_entropy = entropy[:, None, :] + random.normal(0, 0.05, (OBJECTS, VIEWS, VIEWS))
     return ViewTables(
-        [f"o{i}" for i in range(OBJECTS)], labels, *(a.astype(np.float32) for a in (logits, utility, entropy))
+        [f"o{i}" for i in range(OBJECTS)], labels, *(a.astype(np.float32) for a in (logits, predicted_entropy, entropy))
     )
 
 
@@ -213,11 +213,11 @@ def test_devices_and_chunks_change_nothing(tables, tmp_path):
 import sys, numpy as np, jax, jax.numpy as jnp
 from dataclasses import replace
 from functools import partial
-from eval import grid
-from eval.grid import run_grid
-from eval.knowledge import learn
-from eval.ladder import Rung
-from eval.view_tables import load_view_tables
+from eval.walks import grid
+from eval.walks.grid import run_grid
+from eval.walks.knowledge import learn
+from eval.walks.ladder import Rung
+from eval.tables import load_view_tables
 from mevs_jax import ViewGraph, fibonacci_sphere
 tables = load_view_tables(sys.argv[1])
 graph = ViewGraph.from_points(fibonacci_sphere(10))
@@ -322,7 +322,7 @@ def test_the_study_is_complete_and_repeats(study, tables, statistics):
     again = run_study(tables, tables, statistics, GridConfig(draws=2), by_view=tables, leak=None)
     assert json.dumps(study) == json.dumps(again)
     names = [rung["policy"] for rung in study["ladder"]]
-    assert set(names) == set(POLICIES) - {"scrambled_entropy"} - {rung.policy for rung in CLIMBED}
+    assert set(names) == set(POLICIES) - {"scrambled_entropy"} - {rung.policy for rung in ASCENT_RUNGS}
     assert set(study["policies"]) == set(names)
     assert set(study["against_random"]) == set(names) - {"random"}
     assert study["left_out"] == {"train": {"x": "empty"}, "test": {}}
@@ -379,5 +379,5 @@ def test_tables_are_saved_whole(tables, tmp_path):
     save_view_tables(tmp_path / "t.npz", tables)
     again = load_view_tables(tmp_path / "t.npz")
     assert again.names == tables.names
-    for name in ("labels", "logits", "utility", "entropy"):
+    for name in ("labels", "logits", "predicted_entropy", "entropy"):
         np.testing.assert_array_equal(getattr(again, name), getattr(tables, name))

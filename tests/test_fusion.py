@@ -167,7 +167,7 @@ def made_up(objects: int, seed: int) -> Features:
     )
 
 
-def test_what_no_view_shows_alone_is_learnt_and_reported():
+def test_what_no_view_shows_alone_is_learned_and_reported():
     config = FusionConfig(
         network=SetFusionConfig(width=32, heads=2, blocks=1, dropout=0.0),
         largest_set=4,
@@ -183,10 +183,10 @@ def test_what_no_view_shows_alone_is_learnt_and_reported():
     assert fusion.temperatures.shape == (4,)
     rows = {row["views"]: row for row in random_sets_study(fusion, validation, test)}
     assert list(rows) == [1, 2, 3, 4]
-    assert rows[1]["learnt"]["accuracy"] < 0.6  # one sign says nothing
-    assert rows[4]["learnt"]["accuracy"] > 0.95
+    assert rows[1]["learned"]["accuracy"] < 0.6  # one sign says nothing
+    assert rows[4]["learned"]["accuracy"] > 0.95
     assert rows[4]["sum"]["accuracy"] < 0.65
     assert rows[4]["difference_interval"][0] > 0.25
     # Two of four views show both signs in four cases of six, in the others one guesses.
-    assert 0.75 < rows[2]["learnt"]["accuracy"] < 0.88
-    assert rows[2]["learnt"]["calibration_error"] < 0.1
+    assert 0.75 < rows[2]["learned"]["accuracy"] < 0.88
+    assert rows[2]["learned"]["calibration_error"] < 0.1

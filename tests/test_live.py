@@ -59,10 +59,10 @@ def tables(networks, captures) -> ViewTable:
         return logits, networks.predictor(networks.predict.inputs(captured.clouds))
 
     random = np.random.default_rng(1)
-    logits, utility = jax.jit(lambda captures: jax.lax.map(look, captures))(captures)
+    logits, predicted_entropy = jax.jit(lambda captures: jax.lax.map(look, captures))(captures)
     return ViewTable(
         logits,
-        utility,
+        predicted_entropy,
         jnp.asarray(random.uniform(0, 1, (OBJECTS, VIEWS)), jnp.float32),
         jnp.asarray(random.integers(0, CLASSES, OBJECTS), jnp.int32),
     )

@@ -1,4 +1,4 @@
-"""The view policy: what it may depend on, labels of exact value, the loop with a learnt fusion, and that learning pays."""
+"""The view policy: what it may depend on, labels of exact value, the loop with a learned fusion, and that learning pays."""
 
 from __future__ import annotations
 
@@ -19,9 +19,9 @@ from mevs_jax import ViewGraph, ViewTable, fibonacci_sphere
 from mevs_jax.beliefs import CalibratedFusion
 from mevs_jax.models import ViewPolicy
 from mevs_jax.models.set_fusion import SetFusion
-from mevs_jax.models.view_policy import direction_features, expected_gain, worth
+from mevs_jax.models.view_policy import direction_features, expected_gain, utility_of
 from mevs_jax.policies.base import Knowledge
-from mevs_jax.policies.learned import learnt, looking_ahead
+from mevs_jax.policies.learned import learned, looking_ahead
 from mevs_jax.policies.oracles import fused_oracle
 from mevs_jax.policies.registry import POLICIES
 from mevs_jax.policies.uninformed import random_view
@@ -38,7 +38,7 @@ from train.choosing.policy import (
     walk,
 )
 from train.choosing.q_learning import QLearningConfig, temporal_difference, train_by_q_learning, transitions_along
-from train.kept import _made_once
+from train.kept import trained_once
 
 VIEWS, CLASSES, SEEN = 6, 4, 3
 
@@ -148,7 +148,7 @@ def test_what_is_expected_for_a_class_leaves_its_probability_a_probability(rando
     sure = moved(make(), 3.0)
     for held in (belief, np.log(np.array([0.4, 0.3, 0.2, 0.1], np.float32))):
         _, gain_if = asked(sure, held, *known)
-        before = worth(np.clip(held, -12, -1e-5), utility)
+        before = utility_of(np.clip(held, -12, -1e-5), utility)
         low, high = (0.0, 1.0) if utility == "probability" else (np.log(0.01), np.log(1.01))
         after = np.asarray(before + gain_if)
         assert (after >= low - 1e-5).all()
@@ -192,7 +192,7 @@ def test_the_loss_compares_candidates_with_each_other(policy, random):
         assert float(found[name]) == pytest.approx(float(value), rel=1e-4)
 
 
-def test_a_policy_learnt_otherwise_takes_the_place_of_the_one_before(tmp_path):
+def test_a_policy_learned_otherwise_takes_the_place_of_the_one_before(tmp_path):
     def made(seed: int) -> ViewPolicy:
         return ViewPolicy(CLASSES, width=4, heads=1, blocks=1, rngs=nnx.Rngs(seed))
 
@@ -203,7 +203,7 @@ def test_a_policy_learnt_otherwise_takes_the_place_of_the_one_before(tmp_path):
                 raise KeyboardInterrupt
             return made(seed), {"rounds": []}
 
-        return _made_once(tmp_path, {"seed": seed}, nnx.eval_shape(lambda: made(0)), train)
+        return trained_once(tmp_path, {"seed": seed}, nnx.eval_shape(lambda: made(0)), train)
 
     trained: list[int] = []
     for seed in (1, 1, 2, 2, 1):
@@ -286,7 +286,7 @@ def plain_walk(fusion, data, index, scores, start, steps):
 
 
 @pytest.mark.parametrize("by", ["belief", "state", "table"])
-def test_the_loop_with_a_learnt_fusion_and_policy_is_a_plain_one(fusion, policy, by):
+def test_the_loop_with_a_learned_fusion_and_policy_is_a_plain_one(fusion, policy, by):
     data, index = some_features(3, seed=4), 1
     graph = graph_of(data.directions[index])
     table = ViewTable(data.logits[index], None, None, data.labels[index], features=data.features[index])
@@ -295,7 +295,7 @@ def test_the_loop_with_a_learnt_fusion_and_policy_is_a_plain_one(fusion, policy,
 
     @jax.jit
     def looped(start):
-        choose = learnt(policy, fusion.single, by=by)
+        choose = learned(policy, fusion.single, by=by)
         return select_from_table(jax.random.key(0), table, scene, choose, start, max_views=4, fuse=by_attention(fusion))
 
     def rise(belief, label, view):
@@ -384,7 +384,7 @@ def test_oracles_of_the_fused_belief_try_every_view(fusion, by):
     assert episode.views.tolist() == plain_walk(fusion, data, index, scores, 3, 3)[0]
 
 
-def test_a_learnt_fusion_says_what_it_lacks(fusion):
+def test_a_learned_fusion_says_what_it_lacks(fusion):
     data = some_features(1)
     table = ViewTable(data.logits[0], None, None, data.labels[0])
     scene = table.scene(graph_of(data.directions[0]))
@@ -392,7 +392,7 @@ def test_a_learnt_fusion_says_what_it_lacks(fusion):
         select_from_table(jax.random.key(0), table, scene, random_view, 0, max_views=2, fuse=by_attention(fusion))
     with pytest.raises(ValueError, match=r"needs Scene\.features"):
         select_from_table(jax.random.key(0), table, scene, fused_oracle(fusion), 0, max_views=2)
-    with pytest.raises(ValueError, match=r"needs Observation\.utility"):
+    with pytest.raises(ValueError, match=r"needs Observation\.predicted_entropy"):
         select_from_table(jax.random.key(0), table, scene, POLICIES["predicted_entropy"], 0, max_views=2)
 
 
@@ -412,7 +412,7 @@ def telling(objects: int, seed: int) -> Features:
 
 
 class _Sum(nnx.Module):
-    """The sum of what was seen, in the place of a fusion that is learnt."""
+    """The sum of what was seen, in the place of a fusion that is learned."""
 
     def __call__(self, features, directions, present, *, posed=True):
         del directions, posed
@@ -425,7 +425,7 @@ def adding() -> CalibratedFusion:
     return CalibratedFusion(structure, weights, jnp.zeros(4), jnp.ones(1), jnp.float32(1))
 
 
-def test_what_looking_was_worth_is_learnt_and_the_study_says_so(adding):
+def test_what_looking_was_worth_is_learned_and_the_study_says_so(adding):
     parts = [(adding, telling(160, seed)) for seed in (0, 1)]
     validation, test = telling(120, 2), telling(120, 3)
     config = PolicyConfig(
@@ -437,10 +437,10 @@ def test_what_looking_was_worth_is_learnt_and_the_study_says_so(adding):
     found, each = study(
         adding,
         [
-            Learner("learnt", "view policy", policy),
+            Learner("learned", "view policy", policy),
             Learner("as_it_is", "without belief", policy, "state"),
             Learner("look_ahead", "two ahead", policy, "ahead"),
-            Learner("learnt_and_table", "with a table", policy, "table"),
+            Learner("learned_and_table", "with a table", policy, "table"),
             Learner("unsure", "another fusion", policy, fusion=replace(adding, temperatures=jnp.full(1, 50.0))),
         ],
         OnLattice(validation),
@@ -451,35 +451,39 @@ def test_what_looking_was_worth_is_learnt_and_the_study_says_so(adding):
         costs=True,
     )
     after = {name: result["after_views"] for name, result in found["policies"].items()}
-    same = seeds_together([found, found], [each, each], "learnt")
+    same = seeds_together([found, found], [each, each], "learned")
     close = partial(np.testing.assert_allclose, atol=1e-6)
     jax.tree.map(close, same["against"], found["against"])  # the mean of two that are alike
     jax.tree.map(close, same["gap_closed"], found["gap_closed"])
     for key in ("interval", "calibration_error"):
-        close(same["policies"]["learnt"][key], found["policies"]["learnt"][key])
-    better = {name: replace(policy, likelihood=policy.likelihood + (name == "learnt")) for name, policy in each.items()}
-    both = seeds_together([found, found], [each, better], "learnt")
-    gain = both["against"]["random"]["learnt"]["likelihood"]["difference"]
+        close(same["policies"]["learned"][key], found["policies"]["learned"][key])
+    better = {
+        name: replace(policy, likelihood=policy.likelihood + (name == "learned")) for name, policy in each.items()
+    }
+    both = seeds_together([found, found], [each, better], "learned")
+    gain = both["against"]["random"]["learned"]["likelihood"]["difference"]
     np.testing.assert_allclose(
-        gain, 0.5 + np.array(found["against"]["random"]["learnt"]["likelihood"]["difference"]), atol=1e-5
+        gain, 0.5 + np.array(found["against"]["random"]["learned"]["likelihood"]["difference"]), atol=1e-5
     )
     # From view 0 the telling view can be known; random finds it in one case of five.
-    assert after["learnt"][1] > after["random"][1] + 0.05
-    assert after["learnt"][2] > after["random"][2] + 0.1
-    assert found["against"]["random"]["learnt"]["interval"][2][0] > 0
-    assert found["gap_closed"]["learnt"][1] > 0.4
+    assert after["learned"][1] > after["random"][1] + 0.05
+    assert after["learned"][2] > after["random"][2] + 0.1
+    assert found["against"]["random"]["learned"]["interval"][2][0] > 0
+    assert found["gap_closed"]["learned"][1] > 0.4
     assert found["trying_starts"] == 6  # all of them, where there are so few
-    assert after["label_oracle"][1] >= after["learnt"][1]
+    assert after["label_oracle"][1] >= after["learned"][1]
     assert after["look_ahead"][2] > after["random"][2] + 0.1
-    assert after["learnt_and_table"][2] > after["random"][2] + 0.1
-    first = found["policies"]["unsure"]["temperatures"][0] / found["policies"]["learnt"]["temperatures"][0]
+    assert after["learned_and_table"][2] > after["random"][2] + 0.1
+    first = found["policies"]["unsure"]["temperatures"][0] / found["policies"]["learned"]["temperatures"][0]
     assert first == pytest.approx(1 / 50, rel=1e-3)  # of a fusion of its own
     costs = found["costs"]
     assert costs["thesis_walks"] == "random"
     ways = [row["way"] for row in costs["moving"]]
     assert ways[0][0] == 0
     assert ways[-1][1] <= ways[0][1]
-    np.testing.assert_allclose(costs["moving"][0]["after_views"], after["learnt"], atol=1e-6)  # nothing paid: as it was
+    np.testing.assert_allclose(
+        costs["moving"][0]["after_views"], after["learned"], atol=1e-6
+    )  # nothing paid: as it was
     paying = [row["views"] for row in costs["not_paying"]]
     assert paying == sorted(paying)  # the cheaper a view, the more
     assert paying[0] < paying[-1]
@@ -487,11 +491,11 @@ def test_what_looking_was_worth_is_learnt_and_the_study_says_so(adding):
     assert [row["views"] for row in found["random_sets"]] == [1, 2, 3, 4, 5, 6]
     without = novel_classes(adding, [((0, 2), policy), ((1, 3), policy)], policy, test, max_views=3, draws=2)
     assert without["objects"] == 120
-    gain = np.array(after["learnt"]) - after["random"]
+    gain = np.array(after["learned"]) - after["random"]
     for found_without in without["gain"].values():  # the same policy: what is found on all objects
         np.testing.assert_allclose(found_without["difference"], gain, atol=0.02)
     chosen = walk(
-        jax.random.key(0), adding, test, partial(_learnt, structure=nnx.graphdef(policy)), nnx.state(policy), 3, 4
+        jax.random.key(0), adding, test, partial(_learned, structure=nnx.graphdef(policy)), nnx.state(policy), 3, 4
     )
     assert chosen.shape == (120, 4, 3)
     assert all(len(set(order)) == 3 for order in chosen.reshape(-1, 3).tolist())
@@ -516,8 +520,8 @@ def test_rules_are_compared_where_they_are_as_accurate():
     assert (half.accuracy(0.5), weighed.accuracy(0.5)) == (0.5, 1)
 
 
-def _learnt(weights, structure):
-    return learnt(nnx.merge(structure, weights), 1.0, by="state")
+def _learned(weights, structure):
+    return learned(nnx.merge(structure, weights), 1.0, by="state")
 
 
 def test_temporal_differences_are_those_of_a_plain_loop(fusion, policy, random):
@@ -553,7 +557,7 @@ def test_q_learning_finds_the_telling_view_too(adding):
     network, histories = train_by_q_learning(config, [(adding, telling(160, 0))], (adding, telling(80, 1)))
     assert len(histories) == 2
     data, key = telling(120, 2), jax.random.key(0)
-    chosen = walk(key, adding, data, partial(_learnt, structure=nnx.graphdef(network)), nnx.state(network), 2, 4)
+    chosen = walk(key, adding, data, partial(_learned, structure=nnx.graphdef(network)), nnx.state(network), 2, 4)
     told = 2 + np.asarray(data.labels)[:, None] // 2
     from_the_first = chosen[..., 0] == 0  # where the pair is known, and so which view settles it
     assert (chosen[..., 1] == told)[from_the_first].mean() > 0.8

@@ -27,8 +27,8 @@ from eval.settings import TINY
 from mevs_jax.cameras import Camera, look_at_origin, pixel_directions
 from mevs_jax.models import Recogniser, ResNet
 from mevs_jax.viewpoints import viewpoint_lattice
-from train.choosing.looks import _see_changed, _see_rotated
-from train.choosing.stages import Stages, check_active
+from train.choosing.looks import see_changed, see_rotated
+from train.choosing.stages import Stages, check_learned
 from train.loop import load_best, steps_of_an_epoch
 from train.tasks.recogniser import RecogniserTask
 
@@ -155,14 +155,14 @@ def test_views_of_a_changed_object_are_those_that_a_camera_takes_of_it(change):
 def test_objects_turned_anyhow_are_seen_from_the_lattice_itself(turned):
     """Undoing the turn of an object's cameras turns the object instead."""
     statistics = load_statistics(turned)
-    task = RecogniserTask.of(TINY.active.recogniser, 10, statistics.camera)
+    task = RecogniserTask.of(TINY.learned.recogniser, 10, statistics.camera)
     network = nnx.jit(lambda: task.network(nnx.Rngs(0)))()
     batches = list(islice(evaluation_batches(turned, "train", images="depth"), 2))
     features = network.encoder.head.in_features
     together = {name: np.concatenate([batch[name] for batch in batches]) for name in batches[0]}
     lattice = viewpoint_lattice(task.camera.views, task.camera.lattice)
     see, after = nnx.jit(Recogniser.see), jax.jit(partial(views_after, camera=task.camera))
-    turned_back = nnx.jit(partial(_see_rotated, task=task))(network, batch=together)
+    turned_back = nnx.jit(partial(see_rotated, task=task))(network, batch=together)
     for index, found in enumerate(np.split(np.asarray(turned_back), 2)):
         np.testing.assert_allclose(found[:, features + 10 : -1], lattice, atol=1e-4)
         np.testing.assert_array_equal(found[:, -1], batches[index]["label"])
@@ -176,11 +176,11 @@ def test_objects_turned_anyhow_are_seen_from_the_lattice_itself(turned):
 
 
 def test_changed_objects_are_each_changed_in_a_way_of_their_own_and_the_same_every_time(turned):
-    task = RecogniserTask.of(TINY.active.recogniser, 10, load_statistics(turned).camera)
+    task = RecogniserTask.of(TINY.learned.recogniser, 10, load_statistics(turned).camera)
     network = nnx.jit(lambda: task.network(nnx.Rngs(0)))()
     batches = list(islice(evaluation_batches(turned, "val", images="depth"), 5))
     features, changes = network.encoder.head.in_features, []
-    asked = [nnx.jit(partial(_see_changed(number), task=task)) for number in (0, 1)]
+    asked = [nnx.jit(partial(see_changed(number), task=task)) for number in (0, 1)]
     see, after = nnx.jit(Recogniser.see), jax.jit(partial(views_after, camera=task.camera))
     for position, batch in enumerate(batches):
         found, other = (np.asarray(ask(network, batch=batch)) for ask in asked)
@@ -200,7 +200,7 @@ def test_changed_objects_are_each_changed_in_a_way_of_their_own_and_the_same_eve
 
 
 def test_recognisers_of_objects_turned_anyhow_go_on_from_the_others(turned, tmp_path):
-    config = replace(TINY.active, rotation_epochs=1)
+    config = replace(TINY.learned, rotation_epochs=1)
     stages = Stages(config, TINY.dataset, tmp_path)
     stages.turned = turned
     stages.train_recogniser()
@@ -272,13 +272,13 @@ def test_rare_classes_come_as_often_as_others(turned):
 
 def test_an_epoch_without_a_part_is_shorter(turned):
     statistics = load_statistics(turned)
-    whole, part = (RecogniserTask.of(TINY.active.recogniser, 10, statistics.camera, fold) for fold in (None, (0, 2)))
+    whole, part = (RecogniserTask.of(TINY.learned.recogniser, 10, statistics.camera, fold) for fold in (None, (0, 2)))
     assert steps_of_an_epoch(part, statistics) < 0.6 * steps_of_an_epoch(whole, statistics)
 
 
 @pytest.fixture(scope="module")
 def recogniser() -> Recogniser:
-    task = RecogniserTask.of(TINY.active.recogniser, 10, TINY.dataset.capture)
+    task = RecogniserTask.of(TINY.learned.recogniser, 10, TINY.dataset.capture)
     return nnx.jit(lambda: task.network(nnx.Rngs(0)))()
 
 
@@ -329,14 +329,14 @@ def test_gradients_of_convolutions_are_those_of_jax(size, stride, random):
 @pytest.mark.parametrize(
     ("changes", "said"),
     [
-        ({"folds": 1}, "--active.folds must be at least 2"),
-        ({"seeds": 0}, "--active.seeds at least 1"),
-        ({"changed": -1}, "--active.changed must be at least 0, got -1"),
+        ({"folds": 1}, "--learned.folds must be at least 2"),
+        ({"seeds": 0}, "--learned.seeds at least 1"),
+        ({"changed": -1}, "--learned.changed must be at least 0, got -1"),
         ({"ablations": ("magic",)}, "unknown ablation 'magic'"),
         ({"max_views": 6}, "need more than 6 candidate views, and at least 2; there are 6"),
     ],
 )
 def test_a_study_that_cannot_be_made_is_refused(changes, said):
-    check_active(TINY.active, 6)
+    check_learned(TINY.learned, 6)
     with pytest.raises(DataError, match=re.escape(said)):
-        check_active(replace(TINY.active, **changes), 6)
+        check_learned(replace(TINY.learned, **changes), 6)

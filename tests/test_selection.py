@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from eval.walks.ladder import CLIMBED
+from eval.walks.ladder import ASCENT_RUNGS
 from mevs_jax import (
     POLICIES,
     Knowledge,
@@ -37,10 +37,10 @@ def random_tables(views: int, classes: int, count: int, seed: int) -> ViewTable:
     entropy[: count // 4] = np.round(entropy[: count // 4], 1)  # ties
     return ViewTable(
         logits=jnp.asarray(random.normal(0, 1.5, (count, views, classes)), jnp.float32),
-        utility=jnp.asarray(random.uniform(0, 1, (count, views, views)), jnp.float32),
+        predicted_entropy=jnp.asarray(random.uniform(0, 1, (count, views, views)), jnp.float32),
         entropy=jnp.asarray(entropy, jnp.float32),
         label=jnp.asarray(random.integers(0, classes, count), jnp.int32),
-        climbed={rung.policy: jnp.asarray(random.uniform(0, 1, (count, views, views))) for rung in CLIMBED},
+        ascent_scores={rung.policy: jnp.asarray(random.uniform(0, 1, (count, views, views))) for rung in ASCENT_RUNGS},
     )
 
 
@@ -71,11 +71,11 @@ def test_the_jitted_loop_walks_the_views_of_a_plain_loop(policy):
         )(keys)
     )
     neighbours = np.asarray(graph.neighbours)
-    logits, utility, entropy = map(np.asarray, (tables.logits, tables.utility, tables.entropy))
+    logits, predicted_entropy, entropy = map(np.asarray, (tables.logits, tables.predicted_entropy, tables.entropy))
     for index in range(TABLES):
         weights = {
             "random": draws[index],
-            "predicted_entropy": utility[index],
+            "predicted_entropy": predicted_entropy[index],
             "oracle_entropy": np.broadcast_to(entropy[index], (views, views)),
         }[policy]
         graph_used = None if policy == "random" else neighbours
@@ -215,7 +215,12 @@ def test_a_dear_way_is_not_taken():
 
 @pytest.mark.parametrize(
     ("policy", "field"),
-    [("fixed_order", "knowledge"), ("diff_mesh", "climbed"), ("oracle_entropy", "entropy"), ("label_oracle", "logits")],
+    [
+        ("fixed_order", "knowledge"),
+        ("diff_mesh", "ascent_scores"),
+        ("oracle_entropy", "entropy"),
+        ("label_oracle", "logits"),
+    ],
 )
 def test_a_scene_that_lacks_what_a_policy_needs_is_described(policy, field):
     graph = ViewGraph.from_points(fibonacci_sphere(10))
@@ -238,7 +243,7 @@ def test_a_policy_may_look_back_on_all_that_was_seen():
     last = max(states, key=lambda state: int(state.count))
     assert last.views.tolist() == [5, 0, 1]
     np.testing.assert_array_equal(last.seen.logits, table.logits[jnp.array([5, 0, 1])])
-    np.testing.assert_array_equal(last.seen.utility, table.utility[jnp.array([5, 0, 1])])
+    np.testing.assert_array_equal(last.seen.predicted_entropy, table.predicted_entropy[jnp.array([5, 0, 1])])
     np.testing.assert_array_equal(last.latest.logits, table.logits[1])
     np.testing.assert_allclose(last.belief, table.logits[jnp.array([5, 0, 1])].sum(axis=0), rtol=1e-5)
 
@@ -274,7 +279,7 @@ def test_observing_may_be_anything():
 
     def look(view):
         onehot = jax.nn.one_hot(view, 10)
-        return Observation(onehot @ table.logits, jnp.einsum("v,vw->w", onehot, table.utility))
+        return Observation(onehot @ table.logits, jnp.einsum("v,vw->w", onehot, table.predicted_entropy))
 
     live = select_views(jax.random.key(0), look, scene, POLICIES["predicted_entropy"], 4, threshold=0.9, max_views=8)
     stored = select_from_table(

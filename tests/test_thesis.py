@@ -65,11 +65,11 @@ def made_up_lattice(views: int, seed: int) -> LatticeTables:
         noise = random.normal(size=(OBJECTS, views, len(CLASSES)))
         logits[backbone.name] = (noise + 1.5 * np.eye(len(CLASSES))[labels][:, None]).astype(np.float32)
     entropy = random.uniform(0.1, 0.9, (OBJECTS, views)).astype(np.float32)
-    utility = {
+    predicted_entropy = {
         frame: (entropy[:, None] + spread * random.normal(size=(OBJECTS, views, views))).astype(np.float32)
         for frame, spread in (("world", 0.05), ("camera", 0.2))
     }
-    return LatticeTables([f"o{i}" for i in range(OBJECTS)], labels, entropy, logits, utility)
+    return LatticeTables([f"o{i}" for i in range(OBJECTS)], labels, entropy, logits, predicted_entropy)
 
 
 @pytest.fixture(scope="module")
@@ -132,12 +132,12 @@ def cell_by_hand(lattice: LatticeTables, views: int, policy: str, row: int, colu
         logits = lattice.logits[backbone.name].astype(np.float64)
         for thing in range(OBJECTS):
             for start in range(views):
-                utility = lattice.utility["world"][thing]
+                predicted_entropy = lattice.predicted_entropy["world"][thing]
                 if policy == "oracle_entropy":
-                    utility = np.repeat(lattice.entropy[thing][None], views, axis=0)
+                    predicted_entropy = np.repeat(lattice.entropy[thing][None], views, axis=0)
                 seen, belief = [start], logits[thing, start].copy()
                 while len(seen) < row + 2 and 1 / np.exp(belief - belief.max()).sum() < THRESHOLDS[column]:
-                    scores = maxima_first(utility[seen[-1]], seen, neighbours)
+                    scores = maxima_first(predicted_entropy[seen[-1]], seen, neighbours)
                     scores[seen] = -np.inf
                     seen.append(int(scores.argmax()))
                     belief += logits[thing, seen[-1]]

@@ -19,7 +19,7 @@ from train.checkpoints import Checkpoints
 Network = TypeVar("Network", bound=nnx.Module)
 
 
-def _made_once(
+def trained_once(
     folder: Path, identity: dict[str, Any], like: Network, train: Callable[[], tuple[Network, dict[str, Any]]]
 ) -> Network:
     """The network that is kept in the folder under this identity, shaped as `like`, whose weights need not be drawn; else the
@@ -31,14 +31,14 @@ def _made_once(
             if restored is not None:
                 nnx.update(like, restored[0])
                 return like
-        network, told = train()
+        network, summary = train()
         path.unlink(missing_ok=True)  # the weights are never under another's identity
         checkpoints.save("best", checkpoints.latest_step("best") + 1, nnx.state(network, nnx.Param), {})
-    write_json(path, {"identity": identity, **told})
+    write_json(path, {"identity": identity, **summary})
     return network
 
 
-def stored_array(path: Path, made: str, compute: Callable[[], np.ndarray]) -> np.ndarray:
+def kept_array(path: Path, made: str, compute: Callable[[], np.ndarray]) -> np.ndarray:
     """The array in `path`, computed anew where it is not there or was made by other networks."""
     if path.exists():
         with np.load(path) as stored:

@@ -93,7 +93,7 @@ class TrainState:
 
     Attributes:
         step: steps done.
-        parameters: what is learnt.
+        parameters: what is learned.
         statistics: of batch norm.
         moments: of the gradients, what the optimiser remembers.
         sums: of the metrics, over the steps of this epoch.

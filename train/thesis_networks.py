@@ -53,7 +53,7 @@ PIPELINE = tuple(backbone for backbone in BACKBONES if backbone.views == 40)
 
 @dataclass(frozen=True)
 class ThesisConfig:
-    """What `mevs thesis` sets beyond the settings of a single run, from which all else is taken."""
+    """What `mevs study thesis` sets beyond the settings of a single run, from which all else is taken."""
 
     resnet18: OptimiserConfig = OptimiserConfig(weight_decay=1e-4)
     """how the first ResNet-18 is trained"""
@@ -65,11 +65,11 @@ class ThesisConfig:
     """channels of ResNet-34's first stage"""
     timing_runs: int = 50
     """of PointNet++ on each class, for the thesis's Table 3"""
-    climbing_runs: int = 3
+    ascent_runs: int = 3
     """objects of each class that are climbed on, for the thesis's Table 2"""
-    climbing_starts: int = 8
+    ascent_starts: int = 8
     """viewpoints to climb from; the thesis's times are of one"""
-    climbing_resolution: int = 64
+    ascent_resolution: int = 64
     """pixels along each side of what is rendered on the way"""
 
 

@@ -56,8 +56,8 @@ def depth_and_normals(view: Int[Array, "height width"], camera: CaptureConfig) -
 
 
 def cloud_input(
-    pixels: Int[Array, "points"],
-    pixel_depth: Int[Array, "points"],
+    pixels: Int[Array, " points"],
+    pixel_depth: Int[Array, " points"],
     pose: Float[Array, "4 4"],
     camera: CaptureConfig,
     frame: str,

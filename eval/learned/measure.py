@@ -1,4 +1,4 @@
-"""What the networks of `mevs active` reach: on each lattice, without a pose, on classes never chosen for, and how fast.
+"""What the networks of `mevs study learned` reach: on each lattice, without a pose, on classes never chosen for, and how fast.
 
 What is found is kept in files of the seed's folder; what is there is not measured again.
 """
@@ -21,7 +21,7 @@ from data_pipeline.dataset.builder import load_statistics, open_split
 from data_pipeline.dataset.inputs import depth_and_normals
 from data_pipeline.files import as_read, read_json, write_json, write_npz
 from data_pipeline.progress import console
-from eval.learned.stopping import PRICES_OF_A_VIEW, PRICES_OF_THE_WAY
+from eval.learned.stopping import MOVEMENT_COSTS, VIEW_COSTS
 from eval.learned.study import ByObject, novel_classes, seeds_together, study
 from eval.learned.walks import OnLattice
 from eval.numbers.timing import milliseconds
@@ -42,7 +42,7 @@ def train_all(stages: Stages) -> None:
     """Every network of one seed, but those that only one part of what is measured asks for."""
     stages.prepare()
     stages.train_recogniser()
-    stages.policy("learnt")
+    stages.policy("learned")
 
 
 def measure(stages: Stages) -> dict[str, Any]:
@@ -83,7 +83,7 @@ def together(seeds: Sequence[Stages], found: Sequence[dict[str, Any]]) -> dict[s
                         for name in first["policies"]
                     }
                 )
-        lattices[views] = seeds_together([one["lattices"][views] for one in found], each, "learnt")
+        lattices[views] = seeds_together([one["lattices"][views] for one in found], each, "learned")
     return lattices
 
 
@@ -100,16 +100,16 @@ def _walks(
 ) -> dict[str, Any]:
     """Every policy's walks among the views of a data set, which the features kept are named after; or those of the method and its
     ablations."""
-    config, method = stages.config, "learnt" if posed else "learnt_unposed"
+    config, method = stages.config, "learned" if posed else "learned_unposed"
     shared = posed and data != stages.turned
-    names = [method, *ablations, *["learnt_and_table"] * (shared and not ablations)]
+    names = [method, *ablations, *["learned_and_table"] * (shared and not ablations)]
     if "cloud" in names and not stages.has_clouds:
         console.print(
             f"Left out: the view policy that sees clouds; PointNet++ is trained by: mevs train --out {stages.out}"
         )
         names.remove("cloud")
     learners = [stages.learner(name) for name in names]
-    learners[0] = replace(learners[0], name="learnt")
+    learners[0] = replace(learners[0], name="learned")
     costs = posed and not ablations and data == stages.out / "data"
     kind = ("" if posed else "_unposed") + ("_ablations" if ablations else "")
     path = stages.folder / f"walks_{views}{kind}.json"
@@ -157,7 +157,7 @@ def _walks(
             config.draws,
             config.fitting_starts,
             _entropy_tables(stages.out, data, "test") is not None,
-            costs and [PRICES_OF_A_VIEW, PRICES_OF_THE_WAY],
+            costs and [VIEW_COSTS, MOVEMENT_COSTS],
         ],
     }
     return _kept(path, identity, walk)
@@ -252,4 +252,4 @@ def _entropies(out: Path, data: Path, split: str) -> tuple[np.ndarray | None, np
     if path is None:
         return None, None
     tables = load_view_tables(path)
-    return tables.utility, tables.entropy
+    return tables.predicted_entropy, tables.entropy

@@ -1,4 +1,4 @@
-"""The page of `mevs active`: learnt fusion and learnt choice beside every other policy, with intervals."""
+"""The page of `mevs study learned`: learned fusion and learned choice beside every other policy, with intervals."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from eval.report import figures
 from eval.report.html import ReportInputs, difference, document, image, percent, signed, span, table
 from eval.walks.ladder import KNOWS
 
-METHOD = "learnt"
+METHOD = "learned"
 """The policy that the page is about."""
 _SHOWN = (0, 1, 2, 3, 5, 7)
 """Steps of walks in tables, from the first view."""
@@ -91,9 +91,9 @@ def _sets(found: dict[str, Any]) -> str:
     rows = [
         [
             str(row["views"]),
-            *(_accuracy(row[name]["accuracy"], row[name]["interval"]) for name in ("sum", "learnt")),
+            *(_accuracy(row[name]["accuracy"], row[name]["interval"]) for name in ("sum", "learned")),
             difference(row["difference"], row["difference_interval"]),
-            *(percent(row[name]["calibration_error"]) for name in ("sum", "learnt")),
+            *(percent(row[name]["calibration_error"]) for name in ("sum", "learned")),
         ]
         for row in found["random_sets"]
     ]
@@ -158,7 +158,7 @@ def _costs(found: dict[str, Any]) -> str:
         + table(["cost of a view", *header], paying)
         + "<h2>Going there</h2><p>Accuracy and way of the camera, where a radian costs so much of the log-probability (nats) "
         "that a view brings; from some of the starts, as the oracles.</p>"
-        + table(["price", *(title for step in steps for title in (f"{step + 1} views", "way"))], ways)
+        + table(["cost", *(title for step in steps for title in (f"{step + 1} views", "way"))], ways)
     )
 
 
@@ -184,14 +184,14 @@ def _lead(metrics: dict[str, Any], views: str) -> str:
     each, together = [seed["lattices"][views] for seed in metrics["seeds"]], metrics["together"][views]
     method, random = (together["policies"][name]["after_views"] for name in (METHOD, "random"))
     gains, first, tabled = together["against"]["random"], each[0], ""
-    if "learnt_and_table" in gains:
-        known = together["policies"]["learnt_and_table"]["after_views"]
+    if "learned_and_table" in gains:
+        known = together["policies"]["learned_and_table"]["after_views"]
         tabled = (
             f" Joined with a table of what views of each class show, the policy reaches {percent(known[1])} %: "
-            f"{_gain_of_two(gains, 'learnt_and_table')}."
+            f"{_gain_of_two(gains, 'learned_and_table')}."
         )
     single = fmean(found["single_view"] for found in each)
-    every, summed = (fmean(found["random_sets"][-1][name]["accuracy"] for found in each) for name in ("learnt", "sum"))
+    every, summed = (fmean(found["random_sets"][-1][name]["accuracy"] for found in each) for name in ("learned", "sum"))
     trainings = f" Means of {len(each)} trainings; what follows is of the first, unless said otherwise." * (
         len(each) > 1
     )
@@ -220,7 +220,7 @@ def _unposed(metrics: dict[str, Any]) -> str:
         "<h2>Facing any way</h2>"
         "<p>Objects are turned about the vertical by an angle that nobody knows: fusion and policy are told directions "
         "relative to the first view's alone. After two views the policy is "
-        f"{_gain_of_two(blind['against']['random'])} points above random. What is learnt of single views of a "
+        f"{_gain_of_two(blind['against']['random'])} points above random. What is learned of single views of a "
         "lattice, as in the best fixed order, is of no use here.</p>"
         + table(["next view chosen by", *(str(step + 1) for step in range(len(rows[0]) - 1))], rows)
     )
@@ -236,7 +236,7 @@ def _rotated(metrics: dict[str, Any]) -> str:
         "<h2>Turned anyhow</h2>"
         "<p>Objects are turned by any rotation, which nobody knows: they lie, stand on their heads, lean. The recognisers were "
         "trained some epochs further on objects turned so. "
-        f"All {every['views']} views fused: {percent(every['learnt']['accuracy'])} %.</p>"
+        f"All {every['views']} views fused: {percent(every['learned']['accuracy'])} %.</p>"
         + _ladder(found)
         + _against(found)
     )
@@ -322,14 +322,14 @@ def _seeds(metrics: dict[str, Any], views: str) -> str:
 
 
 def active_section(inputs: ReportInputs) -> str:
-    """For the report of the whole run; empty where `mevs active` was not run."""
-    if inputs.active is None:
+    """For the report of the whole run; empty where `mevs study learned` was not run."""
+    if inputs.learned is None:
         return ""
-    views, found = next(iter(inputs.active["seeds"][0]["lattices"].items()))
-    return "<h2>Learning to fuse and to choose</h2>" + _lead(inputs.active, views) + _ladder(found)
+    views, found = next(iter(inputs.learned["seeds"][0]["lattices"].items()))
+    return "<h2>Learning to fuse and to choose</h2>" + _lead(inputs.learned, views) + _ladder(found)
 
 
-def write_active_page(metrics: dict[str, Any], statistics: DatasetStatistics, path: Path) -> None:
+def write_learned_page(metrics: dict[str, Any], statistics: DatasetStatistics, path: Path) -> None:
     """Writes the page; it needs no other file. Numbers are of the first seed, unless said otherwise."""
     parts = []
     for number, (views, found) in enumerate(metrics["seeds"][0]["lattices"].items()):
@@ -340,7 +340,7 @@ def write_active_page(metrics: dict[str, Any], statistics: DatasetStatistics, pa
         )
         parts.append(
             image(
-                figures.accuracy_of_choices(curves, titles, found["random_sets"][-1]["learnt"]["accuracy"]),
+                figures.accuracy_of_choices(curves, titles, found["random_sets"][-1]["learned"]["accuracy"]),
                 "Accuracy by number of views, all starts; bands: 95 % intervals over objects.",
             )
         )

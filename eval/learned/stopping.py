@@ -29,11 +29,11 @@ from mevs_jax.models.view_policy import expected_gain
 from mevs_jax.policies.base import Knowledge, Policy, with_movement
 from train.choosing.chunks import in_chunks
 from train.choosing.features import Features
-from train.choosing.policy import graph_of, learnt_policy
+from train.choosing.policy import graph_of, learned_policy
 
-PRICES_OF_A_VIEW = (0.2, 0.1, 0.05, 0.02, 0.01, 0.005)
+VIEW_COSTS = (0.2, 0.1, 0.05, 0.02, 0.01, 0.005)
 """What a view costs, in the policy's utility: nats of the true class's log-probability, unless it was trained otherwise."""
-PRICES_OF_THE_WAY = (0.0, 0.002, 0.005, 0.01, 0.02, 0.05)
+MOVEMENT_COSTS = (0.0, 0.002, 0.005, 0.01, 0.02, 0.05)
 """What a radian costs, in the same unit."""
 
 
@@ -49,9 +49,9 @@ class Signal:
 
     value: Float[np.ndarray, "objects walks steps"]
     right: Bool[np.ndarray, "objects walks steps"]
-    weight: Float[np.ndarray, "objects"]
+    weight: Float[np.ndarray, " objects"]
 
-    def stopped(self, threshold: float) -> tuple[Float[np.ndarray, "objects"], Float[np.ndarray, "objects"]]:
+    def stopped(self, threshold: float) -> tuple[Float[np.ndarray, " objects"], Float[np.ndarray, " objects"]]:
         """Accuracy and views of each object, means over its walks."""
         at = stops_at(self.value >= threshold)
         answer = np.take_along_axis(self.right, at[..., None], axis=-1)[..., 0]
@@ -68,7 +68,7 @@ class Signal:
         return None
 
 
-def confidences(beliefs: Float[AnyArray, "objects walks steps classes"], labels: Int[AnyArray, "objects"]) -> Signal:
+def confidences(beliefs: Float[AnyArray, "objects walks steps classes"], labels: Int[AnyArray, " objects"]) -> Signal:
     """How sure a belief is of its most likely class, and whether that is the right one."""
     right = jnp.argmax(jnp.asarray(beliefs), axis=-1) == labels[:, None, None]
     confidence = jnp.max(jax.nn.softmax(jnp.asarray(beliefs), axis=-1), axis=-1)
@@ -108,7 +108,7 @@ def beside(
 
 
 @dataclass(frozen=True)
-class Told:
+class WalkRecord:
     """A policy's walks on validation and on test objects, the fused beliefs along them, and how sure they are, calibrated."""
 
     views: Sequence[Int[np.ndarray, "objects walks steps"]]
@@ -116,7 +116,7 @@ class Told:
     confidence: Sequence[Signal]
 
 
-def _difference(gain: Float[np.ndarray, "objects"]) -> dict[str, Any]:
+def _difference(gain: Float[np.ndarray, " objects"]) -> dict[str, Any]:
     return {"difference": float(gain.mean()), "interval": intervals(gain)}
 
 
@@ -157,7 +157,7 @@ def best_gains(
 
 
 def _priced(given: tuple[tuple[nnx.State, Array], Array], structure: nnx.GraphDef) -> Policy:
-    return with_movement(learnt_policy(given[0], structure), given[1])
+    return with_movement(learned_policy(given[0], structure), given[1])
 
 
 def moving(
@@ -171,10 +171,10 @@ def moving(
 ) -> list[dict[str, Any]]:
     """Accuracy and way (radians) after each number of views, by price of the way; from every so many-th start."""
     policy_of = partial(_priced, structure=nnx.graphdef(learner.network))
-    contender = Contender("priced", "", "learnt", policy_of, every=every)
+    contender = Contender("priced", "", "learned", policy_of, every=every)
     directions, rows = test.features.directions, []
     distances = np.asarray(graph_of(directions[0]).distances)
-    for price in PRICES_OF_THE_WAY:
+    for price in MOVEMENT_COSTS:
         given = given_to(learner, fusion), jnp.float32(price)
         views = walk_all(key, contender, given, fusion, test.table(True), directions, knowledge, max_views)
         steps = distances[views[:, :, :-1], views[:, :, 1:]]
@@ -185,7 +185,7 @@ def moving(
         after = right.mean(axis=1).T
         rows.append(
             {
-                "price": price,
+                "cost": price,
                 "after_views": after.mean(axis=1).tolist(),
                 "interval": intervals(after),
                 "way": way.mean(axis=(0, 1)).tolist(),
@@ -201,7 +201,7 @@ def what_it_costs(
     validation: OnLattice,
     test: OnLattice,
     knowledge: Knowledge | None,
-    told: dict[str, Told],
+    records: dict[str, WalkRecord],
     max_views: int,
     every: int,
 ) -> dict[str, Any]:
@@ -210,11 +210,11 @@ def what_it_costs(
     The thesis's rule: walks by predicted entropy (at random, where there is none), sums of logits, and a threshold on their
     confidence as it is. Where the way has a price, walks begin at every so many-th start.
     """
-    walked_by = next(name for name in ("predicted_entropy", "random") if name in told)
-    both, method = (validation.features, test.features), told[learner.name]
+    walked_by = next(name for name in ("predicted_entropy", "random") if name in records)
+    both, method = (validation.features, test.features), records[learner.name]
     thesis = [
         confidences(jax.vmap(jax.vmap(beliefs_along))(walked(jnp.asarray(views), data.logits)), data.labels)
-        for data, views in zip(both, told[walked_by].views, strict=True)
+        for data, views in zip(both, records[walked_by].views, strict=True)
     ]
     gains = [
         replace(signal, value=-best_gains(learner, fusion, data, views, beliefs))
@@ -223,6 +223,6 @@ def what_it_costs(
     return {
         "thesis_walks": walked_by,
         "beside_thesis": beside(thesis, method.confidence),
-        "not_paying": beside(gains, method.confidence, [-price for price in PRICES_OF_A_VIEW]),
+        "not_paying": beside(gains, method.confidence, [-price for price in VIEW_COSTS]),
         "moving": moving(key, learner, fusion, test, knowledge, max_views, every),
     }

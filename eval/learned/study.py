@@ -1,4 +1,4 @@
-"""How well views are chosen where a learnt fusion makes the belief: walks of every object from every start, and what they say.
+"""How well views are chosen where a learned fusion makes the belief: walks of every object from every start, and what they say.
 
 All policies share starts, fusion and objects, so every difference is paired. Temperatures are fitted once more for each
 policy, on its own walks over validation objects: one that picks telling views makes beliefs of another kind than one that draws.
@@ -16,7 +16,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from data_pipeline.progress import console
-from eval.learned.stopping import Signal, Told, confidences, what_it_costs
+from eval.learned.stopping import Signal, WalkRecord, confidences, what_it_costs
 from eval.learned.walks import (
     Contender,
     Learner,
@@ -62,14 +62,14 @@ class ByObject:
 
 
 @jax.jit
-def _refit(beliefs: Array, labels: Array) -> Float[Array, "steps"]:
+def _refit(beliefs: Array, labels: Array) -> Float[Array, " steps"]:
     flat = beliefs.reshape(-1, *beliefs.shape[2:])
     truth = jnp.repeat(labels, beliefs.shape[1])
     return jax.vmap(fit_temperature, (1, None, None))(flat, truth, class_weights(truth, flat.shape[-1]))
 
 
 def judged(
-    beliefs: Sequence[Float[AnyArray, "objects walks steps classes"]], labels: Sequence[Int[AnyArray, "objects"]]
+    beliefs: Sequence[Float[AnyArray, "objects walks steps classes"]], labels: Sequence[Int[AnyArray, " objects"]]
 ) -> tuple[dict[str, Any], list[Signal], Float[np.ndarray, "steps objects"]]:
     """One policy's numbers, and its confidence, on walks over validation objects, where temperatures are fitted, and over test
     objects; and the log-probability that it gives the class of each test object, a mean over its walks."""
@@ -160,7 +160,7 @@ _GAP = 3
 def random_sets_study(
     fusion: CalibratedFusion, validation: Features, test: Features, draws: int = 8
 ) -> list[dict[str, Any]]:
-    """How accurate and how well calibrated random sets of every size are, by the sum of logits and by the learnt fusion.
+    """How accurate and how well calibrated random sets of every size are, by the sum of logits and by the learned fusion.
 
     The same sets for both. The fusion's temperatures are its own; the sum's are fitted here, on validation objects.
     """
@@ -175,7 +175,7 @@ def random_sets_study(
             sets_of_size(len(data.labels), views, size, 1 if size == views else draws) for data in (validation, test)
         ]
         temperature = _refit(jnp.moveaxis(summed(validation, sets[0]), 0, 1)[:, :, None], validation.labels)[0]
-        beliefs = {"sum": summed(test, sets[1]) / temperature, "learnt": beliefs_of_sets(fusion, test, sets[1])}
+        beliefs = {"sum": summed(test, sets[1]) / temperature, "learned": beliefs_of_sets(fusion, test, sets[1])}
         row: dict[str, Any] = {"views": size}
         right = {}
         for name, belief in beliefs.items():
@@ -189,7 +189,7 @@ def random_sets_study(
                     expected_calibration_error(probability.max(-1).reshape(-1), correct.reshape(-1))
                 ),
             }
-        gain = right["learnt"] - right["sum"]
+        gain = right["learned"] - right["sum"]
         row |= {"difference": float(gain.mean()), "difference_interval": intervals(gain)}
         rows.append(row)
     return rows
@@ -241,8 +241,8 @@ def study(
     parameters: dict[str, Any] = {"belief_oracle": fusion, "label_oracle": fusion}
     parameters |= {learner.name: given_to(learner, fusion) for learner in learners}
     fusions = {learner.name: learner.fusion or fusion for learner in learners}
-    told: dict[str, Told] = {}
-    entropies = shared and test.utility is not None and test.entropy is not None
+    records: dict[str, WalkRecord] = {}
+    entropies = shared and test.predicted_entropy is not None and test.entropy is not None
     asked = contenders(learners, draws, oracle_views, apart, entropies, shared)
     for contender in asked if others else [random_walker(draws), *map(walker, learners)]:
         name, own, walks, beliefs = contender.name, fusions.get(contender.name, fusion), [], []
@@ -262,7 +262,7 @@ def study(
             beliefs.append(beliefs_of(own, data.features, views))
         judgement, signals, likelihood = judged(beliefs, [data.features.labels for data in (validation, test)])
         right = signals[1].right
-        told[name] = Told(walks, beliefs, signals)
+        records[name] = WalkRecord(walks, beliefs, signals)
         by_start = right.reshape(len(right), -1, contender.draws, right.shape[-1]).mean(axis=2)
         from_some = by_start if contender.every > 1 else by_start[:, some_starts]
         each[name] = ByObject(by_start.mean(axis=1).T, likelihood, from_some.mean(axis=1).T)
@@ -270,7 +270,7 @@ def study(
         console.print(f"{contender.title}: " + " ".join(f"{100 * share:.1f}" for share in judgement["after_views"]))
     if costs:
         key, method = jax.random.key(seed), learners[0]
-        found["costs"] = what_it_costs(key, method, fusion, validation, test, knowledge, told, max_views, apart)
+        found["costs"] = what_it_costs(key, method, fusion, validation, test, knowledge, records, max_views, apart)
     return found | compared(each, learners[0].name), each
 
 

@@ -1,4 +1,4 @@
-"""Who walks in the study of learnt choice, and the walks: every policy from every start, by the same fusion."""
+"""Who walks in the study of learned choice, and the walks: every policy from every start, by the same fusion."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from mevs_jax.selection import ViewTable, adding, by_attention, select_from_tabl
 from mevs_jax.viewpoints import ViewGraph
 from train.choosing.chunks import in_chunks
 from train.choosing.features import Features
-from train.choosing.policy import By, learnt_policy
+from train.choosing.policy import By, learned_policy
 
 _WALKS_AT_ONCE = 2**11
 
@@ -34,19 +34,21 @@ class OnLattice:
 
     Attributes:
         features: of every view.
-        utility: (objects, views, views) what the entropy predictor says of every view after each, if it was asked.
+        predicted_entropy: (objects, views, views) what the entropy predictor says of every view after each, if it was asked.
         entropy: (objects, views) true normalised entropies, if known.
     """
 
     features: Features
-    utility: np.ndarray | None = None
+    predicted_entropy: np.ndarray | None = None
     entropy: np.ndarray | None = None
 
     def table(self, with_features: bool) -> ViewTable:
-        utility, entropy = (None if known is None else jnp.asarray(known) for known in (self.utility, self.entropy))
+        predicted_entropy, entropy = (
+            None if known is None else jnp.asarray(known) for known in (self.predicted_entropy, self.entropy)
+        )
         data = self.features
         features = data.features if with_features else None
-        return ViewTable(data.logits, utility, entropy, data.labels, features=features, clouds=data.clouds)
+        return ViewTable(data.logits, predicted_entropy, entropy, data.labels, features=features, clouds=data.clouds)
 
 
 @dataclass(frozen=True)
@@ -102,8 +104,8 @@ def random_walker(draws: int) -> Contender:
 
 def walker(learner: Learner) -> Contender:
     """Whose parameters are `given_to` it."""
-    policy_of = partial(learnt_policy, structure=nnx.graphdef(learner.network), by=learner.by)
-    return Contender(learner.name, learner.title, "learnt", policy_of)
+    policy_of = partial(learned_policy, structure=nnx.graphdef(learner.network), by=learner.by)
+    return Contender(learner.name, learner.title, "learned", policy_of)
 
 
 def given_to(learner: Learner, fusion: CalibratedFusion) -> tuple[nnx.State, Array]:

@@ -59,7 +59,7 @@ def entropy_errors(tables: ViewTables, statistics: DatasetStatistics) -> dict[st
     class. All on normalised entropies.
     """
     true = tables.entropy[:, None, :]  # (objects, 1, views): every view predicts the whole map
-    network = np.square(tables.utility - true).mean(axis=(1, 2))
+    network = np.square(tables.predicted_entropy - true).mean(axis=(1, 2))
     mean_map = np.square(np.array(statistics.mean_map) - tables.entropy).mean(axis=1)
     class_map = np.square(np.array(statistics.class_mean_maps)[tables.labels] - tables.entropy).mean(axis=1)
     by_class = {

@@ -24,7 +24,7 @@ from flax import nnx
 from data_pipeline.dataset.batches import select_views
 from data_pipeline.dataset.builder import open_split
 from data_pipeline.objects.mesh import Mesh
-from eval.rendering.ascent import Method, climb
+from eval.rendering.ascent import Method, ascend_on_sphere
 from mevs_jax.policies.base import maxima_first
 from mevs_jax.viewpoints import ViewGraph, fibonacci_sphere, local_maxima
 from train.tasks.classifier import ClassifierTask
@@ -80,11 +80,11 @@ def time_local_maxima(views: int, runs: int = 200, objects: int = 1000) -> dict[
     }
 
 
-def time_climbing(method: Method, meshes: dict[str, list[Mesh]], starts: int, resolution: int) -> dict[str, Any]:
+def time_ascent(method: Method, meshes: dict[str, list[Mesh]], starts: int, resolution: int) -> dict[str, Any]:
     """Seconds of climbs on each class's objects, mean and standard deviation, and megabytes planned for one object."""
     things = {name: [jnp.asarray(method.prepare(mesh)) for mesh in some] for name, some in meshes.items()}
     first = next(iter(things.values()))[0]
-    compiled = jax.jit(lambda thing: climb(method, thing, starts, resolution).values).lower(first).compile()
+    compiled = jax.jit(lambda thing: ascend_on_sphere(method, thing, starts, resolution).values).lower(first).compile()
     jax.block_until_ready(compiled(first))
     seconds: dict[str, np.ndarray] = {}
     for name, some in things.items():

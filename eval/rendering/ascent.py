@@ -1,7 +1,7 @@
 """The best view of one object by climbing: the thesis's methods by differentiable rendering (§4.2.1), all starts together.
 
-A method says what an object becomes before it is rendered, and what is climbed. `mevs ascend` climbs on one object and draws it;
-`benchmarks/ascent.py` measures how good the views are that are found so.
+A method says what an object becomes before it is rendered, and the objective. `mevs draw ascent` runs it for one object
+and draws it; `benchmarks/ascent.py` measures how good the views are that are found so.
 """
 
 from __future__ import annotations
@@ -117,7 +117,7 @@ class AscentConfig:
     """pixels along each side of what is rendered"""
 
 
-def climb(method: Method, thing: Any, starts: int, resolution: int) -> Ascent:
+def ascend_on_sphere(method: Method, thing: Any, starts: int, resolution: int) -> Ascent:
     """From Fibonacci viewpoints on `thing`, as the method prepared it."""
     return ascend(
         lambda pose: method.objective(thing, Camera(pose, resolution=resolution)),
@@ -125,7 +125,7 @@ def climb(method: Method, thing: Any, starts: int, resolution: int) -> Ascent:
     )
 
 
-def look_everywhere(method: Method, thing: Any, directions: np.ndarray, resolution: int) -> Float[Array, "views"]:
+def look_everywhere(method: Method, thing: Any, directions: np.ndarray, resolution: int) -> Float[Array, " views"]:
     """The objective from every direction (views, 3)."""
     poses = cameras_at(directions.astype(np.float32)).pose
     return jax.lax.map(lambda pose: method.objective(thing, Camera(pose, resolution=resolution)), poses)
@@ -161,7 +161,7 @@ def ascend_on(data: DataConfig, config: AscentConfig, out: Path) -> tuple[str, P
         thing = jnp.asarray(method.prepare(load_object(entry)))
     except EmptyMesh as reason:
         raise DataError(f"{entry.name} shows nothing ({reason}); choose another --ascent.object") from reason
-    found = jax.jit(lambda thing: climb(method, thing, config.starts, config.resolution))(thing)
+    found = jax.jit(lambda thing: ascend_on_sphere(method, thing, config.starts, config.resolution))(thing)
     order, kept = distinct_optima(found.poses, found.values)
     best = int(order[0])
     x, y, z = np.asarray(found.poses[best, :3, 3]) / 2

@@ -2,7 +2,7 @@
 
 For each test object and each of its views, what that view alone shows becomes a surface (Poisson) or a grid of densities, and
 the camera climbs on it; once more on the whole object, which no robot has, as the upper bound. What is kept is a score for every
-candidate view. `mevs climb` makes these tables object by object, then evaluates and reports again.
+candidate view. `mevs study rendering` makes these tables object by object, then evaluates and reports again.
 """
 
 from __future__ import annotations
@@ -31,10 +31,10 @@ from data_pipeline.objects.sources import load_object
 from data_pipeline.progress import console, progress_bar
 from eval.numbers.comparison import difference, summarise
 from eval.numbers.study import exactly_random, reachable_views
-from eval.rendering.ascent import METHODS, climb, padded_triangles
+from eval.rendering.ascent import METHODS, ascend_on_sphere, padded_triangles
 from eval.tables import ViewTables, objects_of
 from eval.walks.grid import GridConfig, run_grid
-from eval.walks.ladder import CLIMBED, KNOWS, Rung, ladder
+from eval.walks.ladder import ASCENT_RUNGS, KNOWS, Rung, ladder
 from mevs_jax.cameras import Camera, partial_cloud
 from mevs_jax.rendering import corners_of_cells, distinct_optima
 from mevs_jax.viewpoints import ViewGraph
@@ -44,7 +44,7 @@ COMPARED = ("random", "farthest", "predicted_entropy", "oracle_entropy")
 
 
 @dataclass(frozen=True)
-class ClimbConfig:
+class RenderingConfig:
     """Where differentiable rendering would look next, for many test objects."""
 
     objects: int = 200
@@ -58,7 +58,7 @@ class ClimbConfig:
 
 
 @dataclass(frozen=True)
-class Climbed:
+class AscentScores:
     """Scores of candidate views for the chosen test objects.
 
     Attributes:
@@ -71,12 +71,12 @@ class Climbed:
     chosen: np.ndarray
     scores: dict[str, np.ndarray]
     without_surface: int
-    config: ClimbConfig
+    config: RenderingConfig
 
 
 def view_scores(
-    poses: Float[Array, "starts 4 4"], values: Float[Array, "starts"], points: Float[Array, "views 3"]
-) -> Float[Array, "views"]:
+    poses: Float[Array, "starts 4 4"], values: Float[Array, " starts"], points: Float[Array, "views 3"]
+) -> Float[Array, " views"]:
     """Scores of candidate views from where climbs ended.
 
     Distinct optima, from the best on, each take the candidate nearest to them that is not taken yet, and these come first in
@@ -96,9 +96,9 @@ def view_scores(
 
 
 @partial(jax.jit, static_argnames=("method", "config"))
-def _scores(method: str, things: Array, points: Array, config: ClimbConfig) -> Float[Array, "things views"]:
+def _scores(method: str, things: Array, points: Array, config: RenderingConfig) -> Float[Array, "things views"]:
     def one(thing: Array) -> Array:
-        found = climb(METHODS[method], thing, config.starts, config.resolution)
+        found = ascend_on_sphere(METHODS[method], thing, config.starts, config.resolution)
         return view_scores(found.poses, found.values, points)
 
     at_once = None if jax.default_backend() == "cpu" else len(things)
@@ -114,7 +114,7 @@ def _surface(points: np.ndarray, camera: np.ndarray, faces: int) -> np.ndarray |
 
 
 def scores_of_object(
-    mesh: Mesh, depth: np.ndarray, poses: np.ndarray, field_of_view: float, points: Array, config: ClimbConfig
+    mesh: Mesh, depth: np.ndarray, poses: np.ndarray, field_of_view: float, points: Array, config: RenderingConfig
 ) -> dict[str, np.ndarray]:
     """Scores after each view of one object, by method.
 
@@ -125,7 +125,7 @@ def scores_of_object(
         points: (views, 3) unit vectors to the candidates.
 
     Returns:
-        (views, views) by the names of `CLIMBED`, and `without_surface`, how many views show too little for one.
+        (views, views) by the names of `ASCENT_RUNGS`, and `without_surface`, how many views show too little for one.
     """
     volumes, surfaces, missing = [], [], 0
     nothing = np.zeros((config.faces, 3, 3), np.float32)
@@ -149,13 +149,13 @@ def scores_of_object(
 # ---------------------------------------------------------------------------------------------------------- many objects
 
 
-def _folder(out: Path, statistics: DatasetStatistics, config: ClimbConfig) -> Path:
+def _folder(out: Path, statistics: DatasetStatistics, config: RenderingConfig) -> Path:
     """Of one data set and one way to climb."""
     made = (str(value) for name, value in asdict(config).items() if name != "objects")
-    return out / "climbed" / "_".join((statistics.fingerprint, *made))
+    return out / "rendering" / "_".join((statistics.fingerprint, *made))
 
 
-def chosen_objects(config: ClimbConfig, objects: int) -> np.ndarray:
+def chosen_objects(config: RenderingConfig, objects: int) -> np.ndarray:
     """Positions of the chosen objects in a split of so many."""
     return np.unique(np.linspace(0, objects - 1, min(config.objects, objects)).round().astype(int))
 
@@ -164,7 +164,7 @@ _Job = tuple[int, ObjectEntry]
 _worker: Callable[[_Job], None] | None = None
 
 
-def _climb_one(job: _Job, data: Path, statistics: DatasetStatistics, folder: Path, config: ClimbConfig) -> None:
+def _ascend_one(job: _Job, data: Path, statistics: DatasetStatistics, folder: Path, config: RenderingConfig) -> None:
     position, entry = job
     example = open_split(data, "test")[position]
     field_of_view = np.radians(statistics.camera.field_of_view)
@@ -174,9 +174,9 @@ def _climb_one(job: _Job, data: Path, statistics: DatasetStatistics, folder: Pat
     write_npz(npz_of(folder, entry.name), **found)
 
 
-def _start_worker(data: Path, statistics: DatasetStatistics, folder: Path, config: ClimbConfig) -> None:
+def _start_worker(data: Path, statistics: DatasetStatistics, folder: Path, config: RenderingConfig) -> None:
     global _worker
-    _worker = partial(_climb_one, data=data, statistics=statistics, folder=folder, config=config)
+    _worker = partial(_ascend_one, data=data, statistics=statistics, folder=folder, config=config)
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent answers Ctrl-C and ends its workers
 
 
@@ -185,13 +185,15 @@ def _work(job: _Job) -> None:
     _worker(job)
 
 
-def climb_objects(dataset: DataConfig, statistics: DatasetStatistics, out: Path, config: ClimbConfig) -> None:
+def ascend_objects(dataset: DataConfig, statistics: DatasetStatistics, out: Path, config: RenderingConfig) -> None:
     """Climbs on the chosen test objects, each into a file of its own; those that are there are not climbed on again.
 
     On a CPU several processes at a time: a climb uses one core.
     """
     if min(config.objects, config.starts - 1, config.faces) < 1 or config.resolution < 8:
-        raise DataError("--climb.objects and faces must be at least 1, --climb.starts 2 and --climb.resolution 8")
+        raise DataError(
+            "--rendering.objects and faces must be at least 1, --rendering.starts 2 and --rendering.resolution 8"
+        )
     entries = {entry.name: entry for entry in open_objects(dataset).entries}
     names = objects_of(out / "data", "test", statistics)[0]
     folder, chosen = _folder(out, statistics, config), chosen_objects(config, len(names))
@@ -205,7 +207,7 @@ def climb_objects(dataset: DataConfig, statistics: DatasetStatistics, out: Path,
         workers = min(len(jobs), os.cpu_count() or 1)
         if jax.default_backend() != "cpu" or workers < 2:
             for job in jobs:
-                _climb_one(job, *given)
+                _ascend_one(job, *given)
                 bar.advance(line)
             return
         with multiprocessing.get_context("spawn").Pool(workers, _start_worker, given) as pool:
@@ -213,7 +215,7 @@ def climb_objects(dataset: DataConfig, statistics: DatasetStatistics, out: Path,
                 bar.advance(line)
 
 
-def load_climbed(out: Path, statistics: DatasetStatistics, config: ClimbConfig) -> Climbed | None:
+def load_ascent_scores(out: Path, statistics: DatasetStatistics, config: RenderingConfig) -> AscentScores | None:
     """What was climbed, or None where some chosen objects are missing."""
     folder = _folder(out, statistics, config)
     if not folder.exists():
@@ -223,18 +225,18 @@ def load_climbed(out: Path, statistics: DatasetStatistics, config: ClimbConfig) 
     paths = [npz_of(folder, names[at]) for at in chosen]
     if not all(path.exists() for path in paths):
         return None
-    scores: dict[str, list[np.ndarray]] = {rung.policy: [] for rung in CLIMBED}
+    scores: dict[str, list[np.ndarray]] = {rung.policy: [] for rung in ASCENT_RUNGS}
     missing = 0
     for path in paths:
         with np.load(path) as stored:
             missing += int(stored["without_surface"])
             for name, of_all in scores.items():
                 of_all.append(stored[name])
-    return Climbed(chosen, {name: np.stack(of_all) for name, of_all in scores.items()}, missing, config)
+    return AscentScores(chosen, {name: np.stack(of_all) for name, of_all in scores.items()}, missing, config)
 
 
-def climbing_study(
-    tables: ViewTables, statistics: DatasetStatistics, climbed: Climbed, config: GridConfig
+def ascent_study(
+    tables: ViewTables, statistics: DatasetStatistics, climbed: AscentScores, config: GridConfig
 ) -> dict[str, Any]:
     """The ladder of these policies beside others, on the chosen objects, from every start.
 
@@ -246,16 +248,16 @@ def climbing_study(
     some = replace(
         tables,
         names=[tables.names[at] for at in chosen],
-        **{name: getattr(tables, name)[chosen] for name in ("labels", "logits", "utility", "entropy")},
+        **{name: getattr(tables, name)[chosen] for name in ("labels", "logits", "predicted_entropy", "entropy")},
     )
     table = some.stacked()
     table = replace(
         table,
         logits=table.logits[:, None],
-        climbed={name: jnp.asarray(scores, jnp.float32) for name, scores in climbed.scores.items()},
+        ascent_scores={name: jnp.asarray(scores, jnp.float32) for name, scores in climbed.scores.items()},
     )
     compared = [rung for rung in ladder(config.draws) if rung.policy in COMPARED]
-    rungs: tuple[Rung, ...] = tuple(sorted((*compared, *CLIMBED), key=lambda rung: [*KNOWS].index(rung.knows)))
+    rungs: tuple[Rung, ...] = tuple(sorted((*compared, *ASCENT_RUNGS), key=lambda rung: [*KNOWS].index(rung.knows)))
     console.print(f"Walking {len(chosen)} test objects by differentiable rendering")
     found = run_grid(
         jax.random.key(config.seed),

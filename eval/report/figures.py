@@ -27,7 +27,7 @@ KNOWS_COLOURS = {
     "nothing": "#6b7280",
     "networks": "#2563eb",
     "others": "#dc2626",
-    "learnt": "#059669",
+    "learned": "#059669",
     "truth": "#d97706",
 }
 

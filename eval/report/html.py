@@ -43,8 +43,8 @@ class ReportInputs:
     summaries: dict[str, dict[str, Any]]
     preset: str
     settings: dict[str, Any]
-    active: dict[str, Any] | None = None
-    """of `mevs active`, where it was run"""
+    learned: dict[str, Any] | None = None
+    """of `mevs study learned`, where it was run"""
 
 
 def drawn(figure: Figure, kind: str) -> bytes:

@@ -17,7 +17,7 @@ from eval.learned.page import active_section
 from eval.report import figures
 from eval.report.html import ReportInputs, document, image, percent, table
 from eval.report.policies import (
-    climbing_section,
+    ascent_section,
     compatibility_section,
     confidence_section,
     draws,
@@ -76,9 +76,9 @@ def _data_section(inputs: ReportInputs) -> str:
 def _entropy_section(inputs: ReportInputs) -> str:
     entropy, statistics, tables = inputs.metrics["entropy"], inputs.statistics, inputs.tables
     graph = ViewGraph.from_points(np.array(statistics.viewpoints))
-    errors = np.square(tables.utility - tables.entropy[:, None, :]).mean(axis=(1, 2))
+    errors = np.square(tables.predicted_entropy - tables.entropy[:, None, :]).mean(axis=(1, 2))
     example = int(np.argsort(errors)[len(errors) // 2])
-    true, predicted = tables.entropy[example], tables.utility[example, 0]
+    true, predicted = tables.entropy[example], tables.predicted_entropy[example, 0]
     limits = (float(min(true.min(), predicted.min())), float(max(true.max(), predicted.max())))
     maps = [
         figures.view_map(
@@ -135,7 +135,7 @@ def _methods_section(inputs: ReportInputs) -> str:
     return (
         "<h2>How this was made</h2><p>Splits are by object; nothing was chosen on test objects. Every object is walked from "
         f"every start view that can be reached; policies that draw are averaged over {draws(inputs.metrics)}. "
-        f"What policies may know of other objects, and all temperatures, is learnt on "
+        f"What policies may know of other objects, and all temperatures, is learned on "
         f"{inputs.metrics['validation_objects']} validation objects. Preset "
         f"<code>{html.escape(inputs.preset)}</code>, JAX {jax.__version__} on {html.escape(device.device_kind)} "
         f"({html.escape(platform.machine())}, Python {platform.python_version()}).</p>"
@@ -150,7 +150,7 @@ def read_history(folder: Path) -> list[dict[str, float]]:
 _SECTIONS = (
     lead,
     ladder_section,
-    climbing_section,
+    ascent_section,
     active_section,
     movement_section,
     confidence_section,

@@ -129,7 +129,7 @@ def ladder_section(inputs: ReportInputs) -> str:
     )
 
 
-def climbing_section(inputs: ReportInputs) -> str:
+def ascent_section(inputs: ReportInputs) -> str:
     """Empty where nothing was climbed."""
     found = inputs.metrics.get("climbing")
     if found is None:
@@ -191,7 +191,7 @@ def movement_section(inputs: ReportInputs) -> str:
             "Dots: after 1, 2, 3, … views. Thin lines: the same policy with the price at their end.",
         )
         + f"<details><summary>After {last[0]} views, by price</summary>"
-        + table(["policy", "price", "accuracy (%)", "way"], rows)
+        + table(["policy", "cost", "accuracy (%)", "way"], rows)
         + "</details>"
     )
 
@@ -262,7 +262,9 @@ def compatibility_section(inputs: ReportInputs) -> str:
         )
     for row in made["rows"].values():
         if row["difference"] is None:
-            rows.append([html.escape(row["title"]), "<code>mevs compat</code>", "", *["" for _ in limits]])
+            rows.append(
+                [html.escape(row["title"]), "<code>mevs study published-code</code>", "", *["" for _ in limits]]
+            )
             continue
         cells = [
             difference(

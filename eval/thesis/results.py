@@ -33,23 +33,23 @@ class LatticeTables:
     Attributes:
         names, labels, entropy: as in `ViewTables`.
         logits: by backbone, (objects, views, classes).
-        utility: by frame, (objects, views, views).
+        predicted_entropy: by frame, (objects, views, views).
     """
 
     names: list[str]
     labels: np.ndarray
     entropy: np.ndarray
     logits: dict[str, np.ndarray]
-    utility: dict[Frame, np.ndarray]
+    predicted_entropy: dict[Frame, np.ndarray]
 
     def stacked(self, frame: Frame) -> ViewTable:
         """With the three backbones that are walked with as an axis of the logits."""
         logits = np.stack([self.logits[backbone.name] for backbone in PIPELINE], axis=1)
-        of_frame = jnp.asarray(self.utility[frame])
+        of_frame = jnp.asarray(self.predicted_entropy[frame])
         return ViewTable(jnp.asarray(logits), of_frame, jnp.asarray(self.entropy), jnp.asarray(self.labels))
 
     def of(self, backbone: str, frame: Frame) -> ViewTables:
-        return ViewTables(self.names, self.labels, self.logits[backbone], self.utility[frame], self.entropy)
+        return ViewTables(self.names, self.labels, self.logits[backbone], self.predicted_entropy[frame], self.entropy)
 
 
 # ------------------------------------------------------------------------------------------------------- single networks
@@ -78,10 +78,10 @@ def entropy_learning(lattice: LatticeTables, statistics: DatasetStatistics) -> d
     `every_side` is the error of the mean prediction over the clouds of all views: about as far as one gets by looking.
     """
     true, labels, classes = lattice.entropy, lattice.labels, statistics.classes
-    errors = {frame: np.square(lattice.utility[frame] - true[:, None]).mean(axis=-1) for frame in FRAMES}
+    errors = {frame: np.square(lattice.predicted_entropy[frame] - true[:, None]).mean(axis=-1) for frame in FRAMES}
     mean_map = np.square(np.array(statistics.mean_map) - true).mean(axis=1, keepdims=True)
     class_map = np.square(np.array(statistics.class_mean_maps)[labels] - true).mean(axis=1, keepdims=True)
-    every_side = np.square(lattice.utility["world"].mean(axis=1) - true).mean(axis=1, keepdims=True)
+    every_side = np.square(lattice.predicted_entropy["world"].mean(axis=1) - true).mean(axis=1, keepdims=True)
     variance = float(true.var())
     per_object = {frame: of.mean(axis=1) for frame, of in errors.items()}
     return {

@@ -1,4 +1,4 @@
-"""`mevs thesis`: every network, table and figure of the thesis, from one run directory; each stage skips what is done.
+"""`mevs study thesis`: every network, table and figure of the thesis, from one run directory; each stage skips what is done.
 
 The directory holds both data sets (`views10/`, `views40/`), the networks (`backbones/`, `entropy/`), what they say of every
 view (`outputs/`), `timing.json`, `thesis.json` and the report (`report/`).
@@ -18,7 +18,7 @@ from data_pipeline.errors import DataError
 from data_pipeline.files import as_read, read_json, write_json
 from data_pipeline.objects.sources import load_object
 from data_pipeline.progress import console
-from eval.numbers.timing import decision_memory_alone, time_climbing, time_local_maxima, time_predictor
+from eval.numbers.timing import decision_memory_alone, time_ascent, time_local_maxima, time_predictor
 from eval.rendering.ascent import METHODS
 from eval.report.page import read_history
 from eval.settings import Settings
@@ -27,7 +27,7 @@ from eval.tables import objects_of
 from eval.thesis.figures import FigureInputs
 from eval.thesis.page import write_thesis_report
 from eval.thesis.results import NO_ACCELERATOR, LatticeTables, all_results, machine
-from train.kept import made_by, stored_array
+from train.kept import kept_array, made_by
 from train.loop import load_best
 from train.outputs import network_outputs
 from train.tasks.classifier import ClassifierTask
@@ -69,7 +69,7 @@ def lattice_tables(
     statistics, data = folder.statistics(views), folder.data(views)
 
     def outputs(name: str, network: Path, task: ClassifierTask | EntropyTask) -> np.ndarray:
-        return stored_array(
+        return kept_array(
             folder.out / "outputs" / f"{name}_on_{views}_{split}.npz",
             made_by(statistics, network),
             lambda: network_outputs(data, split, task, load_best(task, network)),
@@ -79,12 +79,12 @@ def lattice_tables(
     for backbone in backbones:
         task = backbone_task(backbone, settings.classifier, settings.thesis, statistics)
         logits[backbone.name] = outputs(backbone.name, folder.backbone(backbone.name), task)
-    utility: dict[Frame, np.ndarray] = {}
+    predicted_entropy: dict[Frame, np.ndarray] = {}
     for frame in frames:
         predict = entropy_task(frame, settings.entropy, statistics)
-        utility[frame] = outputs(f"entropy_{frame}", folder.entropy(views, frame), predict)
+        predicted_entropy[frame] = outputs(f"entropy_{frame}", folder.entropy(views, frame), predict)
     names, labels, entropy = objects_of(data, split, statistics)
-    return LatticeTables(names, labels, entropy, logits, utility)
+    return LatticeTables(names, labels, entropy, logits, predicted_entropy)
 
 
 # --------------------------------------------------------------------------------------------------------- time and memory
@@ -117,9 +117,9 @@ def _timing(settings: Settings, folder: ThesisFolder, tables: dict[int, LatticeT
     return out
 
 
-def _climbing(settings: Settings, tables: LatticeTables, classes: list[str]) -> dict[str, Any]:
+def _ascents(settings: Settings, tables: LatticeTables, classes: list[str]) -> dict[str, Any]:
     thesis = settings.thesis
-    runs, starts, resolution = thesis.climbing_runs, thesis.climbing_starts, thesis.climbing_resolution
+    runs, starts, resolution = thesis.ascent_runs, thesis.ascent_starts, thesis.ascent_resolution
     meshes = {}
     entries = {entry.name: entry for entry in open_objects(settings.dataset).entries}
     for label, name in enumerate(classes):
@@ -127,7 +127,7 @@ def _climbing(settings: Settings, tables: LatticeTables, classes: list[str]) -> 
         evenly = np.unique(np.linspace(0, len(members) - 1, min(runs, len(members))).round().astype(int))
         if len(members):
             meshes[name] = [load_object(entries[tables.names[members[at]]]) for at in evenly]
-    methods = {name: time_climbing(method, meshes, starts, resolution) for name, method in METHODS.items()}
+    methods = {name: time_ascent(method, meshes, starts, resolution) for name, method in METHODS.items()}
     return {"runs": runs, "starts": starts, "resolution": resolution, **methods}
 
 
@@ -135,7 +135,7 @@ def measure(settings: Settings, folder: ThesisFolder, tables: dict[int, LatticeT
     """Machine, times and memory; measured once, and again on another machine or with networks of another size."""
     ran_on = machine()
     thesis = settings.thesis
-    counts = thesis.timing_runs, thesis.climbing_runs, thesis.climbing_starts, thesis.climbing_resolution
+    counts = thesis.timing_runs, thesis.ascent_runs, thesis.ascent_starts, thesis.ascent_resolution
     identity = as_read([ran_on, counts, asdict(settings.entropy.network)])
     path = folder.out / "timing.json"
     if path.exists() and (found := read_json(path))["identity"] == identity:
@@ -146,7 +146,7 @@ def measure(settings: Settings, folder: ThesisFolder, tables: dict[int, LatticeT
         "machine": ran_on,
         "timing": _timing(settings, folder, tables),
         "memory": _memory(settings, folder),
-        "climbing": _climbing(settings, tables[40], folder.statistics(40).classes),
+        "ascent": _ascents(settings, tables[40], folder.statistics(40).classes),
     }
     write_json(path, found)
     return found
@@ -194,7 +194,7 @@ def evaluate_thesis(settings: Settings, folder: ThesisFolder) -> FigureInputs:
         validation = {views: lattice_tables(settings, folder, views, "val", PIPELINE, ("world",)) for views in VIEWS}
         console.print(f"Walking {len(test[40].labels)} test objects with {len(PIPELINE)} classifiers on two lattices")
         results = all_results(test, validation, statistics, settings.evaluation) | _training(folder, histories)
-        results |= {name: measured[name] for name in ("machine", "timing", "memory", "climbing")}
+        results |= {name: measured[name] for name in ("machine", "timing", "memory", "ascent")}
         results |= {"identity": identity, "left_out": {str(v): s.left_out for v, s in statistics.items()}}
         write_json(path, results)
     return FigureInputs(folder, results, statistics, test, histories, _example(test[40], statistics[40].classes))
@@ -207,13 +207,13 @@ def reproduce(settings: Settings, preset: str, out: Path, pretrained: tuple[Path
         DataError: settings that the thesis's grid cannot be had with, or a directory that holds another run.
     """
     if settings.evaluation.lowest_elevation > -90:
-        raise DataError("mevs thesis walks from every view; leave --evaluation.lowest-elevation as it is")
+        raise DataError("mevs study thesis walks from every view; leave --evaluation.lowest-elevation as it is")
     check_evaluation(settings.evaluation)
     thesis = settings.thesis
-    if thesis.climbing_runs < 1 or thesis.climbing_starts < 2 or thesis.climbing_resolution < 8:
+    if thesis.ascent_runs < 1 or thesis.ascent_starts < 2 or thesis.ascent_resolution < 8:
         raise DataError(
-            "--thesis.climbing-runs must be at least 1, --thesis.climbing-starts at least 2 and "
-            "--thesis.climbing-resolution at least 8"
+            "--thesis.ascent-runs must be at least 1, --thesis.ascent-starts at least 2 and "
+            "--thesis.ascent-resolution at least 8"
         )
     first = first_weights(settings.classifier, thesis, pretrained)
     folder = ThesisFolder(out)

@@ -89,7 +89,7 @@ def machine_table(results: dict[str, Any]) -> ThesisTable:
 
 
 def rendering_times(results: dict[str, Any]) -> ThesisTable:
-    thesis, ours = thesis_numbers()["table_2"], results["climbing"]
+    thesis, ours = thesis_numbers()["table_2"], results["ascent"]
     names = [*results["classes"], "all"]
     seconds = {method: ours[method]["seconds"] for method in ("mesh", "volume")}
     rows = [
@@ -292,7 +292,7 @@ def best_table(results: dict[str, Any]) -> ThesisTable:
 def memory_table(results: dict[str, Any]) -> ThesisTable:
     thesis, ours = thesis_numbers()["table_9"]["rows"], dict(results["memory"])
     for name, method in (("Neural Renderer", "mesh"), ("DiffDVR", "volume")):
-        ours[name] = results["climbing"][method]["memory"]
+        ours[name] = results["ascent"][method]["memory"]
     rows = [
         Row(name, [ours[name]["planned"], ours[name]["device_peak"]] if name in ours else [None, None], [*values, None])
         for name, values in thesis.items()

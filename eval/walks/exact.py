@@ -58,7 +58,7 @@ def expected_of_object(
     sizes: list[Subsets],
     candidates: int,
     thresholds: tuple[float, ...],
-) -> tuple[Float[Array, "sizes CT"], Float[Array, "sizes CT"], Float[Array, "sizes"]]:
+) -> tuple[Float[Array, "sizes CT"], Float[Array, "sizes CT"], Float[Array, " sizes"]]:
     """One object: probability of ending right and views used, by limit on views and threshold; and right after so many."""
     levels = jnp.array(thresholds)
     belief = jnp.zeros((1, logits.shape[1]))
@@ -81,7 +81,7 @@ def expected_of_object(
 
 def expected_random(
     logits: Float[Array, "objects backbones views classes"],
-    labels: Int[Array, "objects"],
+    labels: Int[Array, " objects"],
     reachable: np.ndarray,
     thresholds: tuple[float, ...],
     max_views: int,

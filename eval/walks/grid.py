@@ -70,8 +70,8 @@ def read_object(
     label: Int[Array, ""],
     distances: Float[Array, "views views"],
     views: Int[Array, "steps walks"],
-    weights: Float[Array, "walks"],
-) -> tuple[Float[Array, "MV CT"], Float[Array, "MV CT"], Float[Array, "steps"], Float[Array, "steps"]]:
+    weights: Float[Array, " walks"],
+) -> tuple[Float[Array, "MV CT"], Float[Array, "MV CT"], Float[Array, " steps"], Float[Array, " steps"]]:
     """Everything that full walks of one object say: `right`, `used`, `after` and `travelled` of `Results`.
 
     Walks are the last axis of everything here, so that a CPU's vectors run along them, not along ten classes; and what XLA does
@@ -114,7 +114,7 @@ def run_grid(
     rungs: tuple[Rung, ...],
     *,
     max_views: int,
-    reachable: Bool[Array, "views"] | None = None,
+    reachable: Bool[Array, " views"] | None = None,
     movement_cost: Float[Array, ""] | float | None = None,
 ) -> dict[str, Results]:
     """Walks every object from every start by every policy and reads the whole grid.
@@ -123,7 +123,7 @@ def run_grid(
         key: for policies that draw.
         tables: (objects, …) of each field, logits (objects, backbones, views, classes).
         graph: the candidate views.
-        knowledge: what was learnt on other objects, with a leading axis of backbones; None where no policy asks for it.
+        knowledge: what was learned on other objects, with a leading axis of backbones; None where no policy asks for it.
         rungs: the policies.
         max_views: the largest MV.
         reachable: where the camera can go, and start; None for everywhere.

@@ -1,4 +1,4 @@
-"""What policies may know from other objects, learnt on the validation split: a class × view table and a fixed order of views."""
+"""What policies may know from other objects, learned on the validation split: a class × view table and a fixed order of views."""
 
 from __future__ import annotations
 
@@ -10,14 +10,14 @@ from mevs_jax.policies.base import Knowledge
 
 
 def class_view_table(
-    logits: Float[Array, "objects views classes"], labels: Int[Array, "objects"]
+    logits: Float[Array, "objects views classes"], labels: Int[Array, " objects"]
 ) -> Float[Array, "classes views classes"]:
     """Entry [y, j]: mean logits at view j of the objects of class y; zeros for a class without objects."""
     member = jax.nn.one_hot(labels, logits.shape[-1])
     return jnp.einsum("oy,ovc->yvc", member, logits) / jnp.maximum(jnp.sum(member, axis=0), 1)[:, None, None]
 
 
-def greedy_order(logits: Float[Array, "objects views classes"], labels: Int[Array, "objects"]) -> Int[Array, "views"]:
+def greedy_order(logits: Float[Array, "objects views classes"], labels: Int[Array, " objects"]) -> Int[Array, " views"]:
     """Views in the order in which a greedy search adds them: each time the one that is best on top of those before.
 
     Best means the most right answers over all objects and all start views, the start seen first; of equals the lowest index.
@@ -43,7 +43,7 @@ def greedy_order(logits: Float[Array, "objects views classes"], labels: Int[Arra
 
 
 @jax.jit
-def learn(logits: Float[Array, "objects views classes"], labels: Int[Array, "objects"]) -> Knowledge:
+def learn(logits: Float[Array, "objects views classes"], labels: Int[Array, " objects"]) -> Knowledge:
     """Both, from the logits of objects that are not tested on."""
     views = logits.shape[1]
     order = greedy_order(logits, labels)

@@ -5,13 +5,13 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal
 
-Knows = Literal["nothing", "networks", "others", "learnt", "rendering", "truth"]
+Knows = Literal["nothing", "networks", "others", "learned", "rendering", "truth"]
 
 KNOWS: dict[Knows, str] = {
     "nothing": "nothing of the object",
     "networks": "what the entropy predictor says of the views seen",
     "others": "what views show of other (validation) objects",
-    "learnt": "what looking was worth on validation objects",
+    "learned": "what looking was worth on validation objects",
     "rendering": "what a surface or volume through the latest view's points would look like from elsewhere",
     "truth": "the object itself, which no robot does",
 }
@@ -37,7 +37,7 @@ class Rung:
 SCRAMBLED = Rung("scrambled_entropy", "sorted in place", "networks")
 """The thesis's policy as its published code has it: no rung of the ladder, but part of what that code changes."""
 
-CLIMBED = (
+ASCENT_RUNGS = (
     Rung("diff_volume", "climbing on a volume", "rendering"),
     Rung("diff_mesh", "climbing on a surface", "rendering"),
     Rung("diff_volume_whole", "climbing on the whole volume", "truth"),

@@ -72,7 +72,7 @@ class LiveWalker:
         keys: Array,
         captures: Captures,
         scenes: Scene,
-        starts: Int[Array, "objects"],
+        starts: Int[Array, " objects"],
         *,
         policy: str,
         max_views: int,

@@ -25,7 +25,7 @@ COMMANDS = {
     "compat": "train the classifier the published code's way too, evaluate and report again",
     "thesis": "every network, table and figure of the thesis, beside its own numbers",
     "ascend": "climb to the best view of one object by a renderer's gradient; draw it",
-    "active": "learn to fuse views and to choose them; compare with every other policy",
+    "learned": "learn to fuse views and to choose them; compare with every other policy",
     "climb": "where differentiable rendering would look next; evaluate and report again",
     "live": "walk test objects with the networks in the loop; compare with the tables",
 }
@@ -41,7 +41,7 @@ commands:
 common options:
   --preset small|best|thesis
                           small (default): 64×64 views, narrow networks, for a CPU; best: 128×128
-                          and wide ones for mevs active, thesis: the thesis's sizes, both for an
+                          and wide ones for mevs study learned, thesis: the thesis's sizes, both for an
                           accelerator; tiny: to see it all run in a minute
   --data PATH             furniture10 (default, built in), modelnet10 or modelnet40 (downloaded), a
                           folder <class>/{{train,test}}/ of .off, .obj, .stl, .ply or .glb, a zip of
@@ -54,7 +54,7 @@ common options:
 `mevs COMMAND --help` lists every setting. Examples:
   mevs run
   mevs run --data modelnet10 --out runs/modelnet10
-  mevs thesis --data modelnet10 --archive ModelNet10.zip
+  mevs study thesis --data modelnet10 --archive ModelNet10.zip
   mevs train --out runs/modelnet10 --classifier.optimiser.epochs 20
 """
 
@@ -118,7 +118,7 @@ def _run(command: str, arguments: list[str]) -> None:
 
         if options.views is not None:
             raise DataError(
-                "mevs thesis makes both of the thesis's data sets, of 10 and of 40 views; leave --views out"
+                "mevs study thesis makes both of the thesis's data sets, of 10 and of 40 views; leave --views out"
             )
 
         console.print(f"Report: {reproduce(settings, preset, out, options.pretrained).absolute()}")
@@ -130,7 +130,7 @@ def _run(command: str, arguments: list[str]) -> None:
         console.print(sentence)
         console.print(f"Animation: {path.absolute()}")
         return
-    if command == "active":
+    if command == "learned":
         console.print(f"Report: {stages.learn_to_choose(settings, out).absolute()}")
         return
     start = starting_weights(options.pretrained, settings.classifier.network)
@@ -149,7 +149,7 @@ def _run(command: str, arguments: list[str]) -> None:
     if command == "compat":
         stages.train_by_view(settings, out, start)
     if command == "climb":
-        stages.climb_on_objects(settings, out)
+        stages.ascend_on_objects(settings, out)
     if command in ("run", "eval", "compat", "climb"):
         metrics = stages.evaluate(settings, out)
         console.print(

@@ -25,7 +25,7 @@ class BatchNorm(nnx.Module):
         self.batches = nnx.BatchStat(jnp.zeros((), jnp.int32))
         self.epsilon = epsilon
 
-    def folded(self) -> tuple[Float[Array, "features"], Float[Array, "features"]]:
+    def folded(self) -> tuple[Float[Array, " features"], Float[Array, " features"]]:
         """What normalising by the running statistics comes to: a factor for the linear layer before it, and a bias after."""
         factor = self.scale[...] * jax.lax.rsqrt(self.variance[...] + self.epsilon)
         return factor, self.bias[...] - self.mean[...] * factor
@@ -68,8 +68,8 @@ class BatchNorm(nnx.Module):
 
 @partial(jax.custom_vjp, nondiff_argnums=(3,))
 def _normalise(
-    x: Float[Array, "... features"], scale: Float[Array, "features"], bias: Float[Array, "features"], epsilon: float
-) -> tuple[Float[Array, "... features"], Float[Array, "features"], Float[Array, "features"]]:
+    x: Float[Array, "... features"], scale: Float[Array, " features"], bias: Float[Array, " features"], epsilon: float
+) -> tuple[Float[Array, "... features"], Float[Array, " features"], Float[Array, " features"]]:
     """`x` normalised by its own mean and (biased) variance, and these two, through which no gradient flows.
 
     The gradient is written out: of all that is as large as `x` it keeps `x` alone, and takes half the time of the derived one.
@@ -107,10 +107,10 @@ _normalise.defvjp(_normalise_forward, _normalise_backward)
 @partial(jax.custom_vjp, nondiff_argnums=(3,))
 def _largest_normalised(
     x: Float[Array, "groups rows features"],
-    scale: Float[Array, "features"],
-    bias: Float[Array, "features"],
+    scale: Float[Array, " features"],
+    bias: Float[Array, " features"],
     epsilon: float,
-) -> tuple[Float[Array, "groups features"], Float[Array, "features"], Float[Array, "features"]]:
+) -> tuple[Float[Array, "groups features"], Float[Array, " features"], Float[Array, " features"]]:
     """The maximum over rows of `relu(_normalise(x, …))`, and the mean and variance, through which no gradient flows."""
     return _largest_normalised_forward(x, scale, bias, epsilon)[0]
 

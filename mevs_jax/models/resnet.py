@@ -76,7 +76,7 @@ class Convolution(nnx.Module):
         self.size, self.stride = size, stride
 
     def __call__(
-        self, x: Float[Array, "batch height width inputs"], factor: Float[Array, "outputs"] | None = None
+        self, x: Float[Array, "batch height width inputs"], factor: Float[Array, " outputs"] | None = None
     ) -> Float[Array, "batch rows columns outputs"]:
         """Each output channel is multiplied by its `factor`, where that is given, by way of the weights."""
         kernel, stride = self.kernel[...], self.stride

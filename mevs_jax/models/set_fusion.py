@@ -129,7 +129,7 @@ class SumFusion(nnx.Module):
         prior: (classes,) log-probabilities of the classes in training, which count once, not with every view.
     """
 
-    def __init__(self, head: nnx.Linear, prior: Float[Array, "classes"]):
+    def __init__(self, head: nnx.Linear, prior: Float[Array, " classes"]):
         self.head, self.prior = head, nnx.Variable(prior)
 
     def __call__(

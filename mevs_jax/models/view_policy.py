@@ -1,9 +1,9 @@
-"""ViewPolicy: what looking at each candidate direction would be worth, given what was seen.
+"""ViewPolicy: how much each candidate direction is expected to raise the utility of the belief, given what was seen.
 
 A query for each candidate attends to the views seen and to the belief. Candidates are directions, not numbers of a lattice, so a
 lattice that was never trained on will do. It sees what single views say (log-probabilities), not the encoder's features: those
 mean other things in another encoder, which the policy would not do for. Should the object be of some class, a view moves that
-class's log-odds by so much: that is what is learnt, and probabilities stay probabilities.
+class's log-odds by so much: that is what is learned, and probabilities stay probabilities.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ Utility = Literal["probability", "log"]
 """What a belief is worth: the true class's probability, or its logarithm."""
 
 
-def worth(
+def utility_of(
     log_probability: Float[AnyArray, "*any"], utility: Utility = "log", floor: float = 0.01
 ) -> Float[Array, "*any"]:
     """The utility of a belief that gives the true class this log-probability; in a logarithm, `floor` is added first."""
@@ -146,7 +146,7 @@ class ViewPolicy(nnx.Module):
         queries = self.last_norm(queries)
         before = jnp.clip(belief, least, -1e-5)[..., None, :]
         after = jax.nn.log_sigmoid(before - jnp.log(-jnp.expm1(before)) + self.log_odds_if(queries))
-        gain_if = worth(after, self.utility, self.floor) - worth(before, self.utility, self.floor)
+        gain_if = utility_of(after, self.utility, self.floor) - utility_of(before, self.utility, self.floor)
         return self.gain(queries)[..., 0], gain_if
 
 

@@ -9,13 +9,13 @@ from jaxtyping import Array, Int, UInt32
 WORD = 32
 
 
-def bits_until(words: UInt32[Array, "words"]) -> Int[Array, "words"]:
+def bits_until(words: UInt32[Array, " words"]) -> Int[Array, " words"]:
     """How many bits are set up to the end of each word."""
     # On CPU twice as fast as cumsum.
     return jax.lax.associative_scan(jnp.add, jax.lax.population_count(words).astype(jnp.int32))
 
 
-def set_bits(words: UInt32[Array, "words"], until: Int[Array, "words"], ranks: Int[Array, "k"]) -> Int[Array, "k"]:
+def set_bits(words: UInt32[Array, " words"], until: Int[Array, " words"], ranks: Int[Array, " k"]) -> Int[Array, " k"]:
     """Positions of the set bits of some ranks, counted from 0; a rank that no bit has gives any position.
 
     Args:
@@ -26,7 +26,7 @@ def set_bits(words: UInt32[Array, "words"], until: Int[Array, "words"], ranks: I
     return word * WORD + _select_bit(words[word], ranks - before)
 
 
-def _first_above(rising: Int[Array, "n"], values: Int[Array, "k"]) -> Int[Array, "k"]:
+def _first_above(rising: Int[Array, " n"], values: Int[Array, " k"]) -> Int[Array, " k"]:
     """For each value the first index of `rising` that exceeds it, at most n − 1.
 
     Comparing with the ends of some sixteen blocks, one after the other, says which block, and bisection where in it: bisection
@@ -42,7 +42,7 @@ def _first_above(rising: Int[Array, "n"], values: Int[Array, "k"]) -> Int[Array,
     return jnp.minimum(found, count - 1)
 
 
-def _select_bit(word: UInt32[Array, "k"], rank: Int[Array, "k"]) -> Int[Array, "k"]:
+def _select_bit(word: UInt32[Array, " k"], rank: Int[Array, " k"]) -> Int[Array, " k"]:
     """Position of the set bit number `rank` (from 0) of each word, by halving."""
     position = jnp.zeros_like(rank)
     for width in (16, 8, 4, 2, 1):

@@ -30,7 +30,7 @@ def _columns(points: Float[Array, "points 3"], count: int, fill: float) -> Float
     return jnp.pad(points, ((0, count - points.shape[0]), (0, 0)), constant_values=fill).T
 
 
-def farthest_point_sample(points: Float[Array, "points 3"], k: int, *, interpret: bool = False) -> Int[Array, "{k}"]:
+def farthest_point_sample(points: Float[Array, "points 3"], k: int, *, interpret: bool = False) -> Int[Array, " {k}"]:
     """As `point_ops.farthest_point_sample`, of at most `LARGEST_CLOUD` points; `interpret` runs it anywhere, slowly."""
     count = points.shape[0]
     columns = _columns(points, _power_of_two(count), 0.0)

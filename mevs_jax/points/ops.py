@@ -30,7 +30,7 @@ def _on_one_gpu(points: Array) -> bool:
     return jax.default_backend() == "gpu" and jax.device_count() == 1 and points.dtype == jnp.float32
 
 
-def farthest_point_sample(points: Float[AnyArray, "points 3"], k: int) -> Int[Array, "{k}"]:
+def farthest_point_sample(points: Float[AnyArray, "points 3"], k: int) -> Int[Array, " {k}"]:
     """Indices of `k` points, each the farthest from those taken before it; the first is point 0.
 
     Args:
@@ -57,7 +57,7 @@ def farthest_point_sample(points: Float[AnyArray, "points 3"], k: int) -> Int[Ar
     return _farthest_of_array(points, k)
 
 
-def _farthest_of_array(points: Float[Array, "points 3"], k: int) -> Int[Array, "{k}"]:
+def _farthest_of_array(points: Float[Array, "points 3"], k: int) -> Int[Array, " {k}"]:
     # On CPU, XLA vectorises what runs along columns, and neither argmax nor a maximum over everything. So points stand in a grid,
     # consecutive ones below each other; the maxima of its columns say in which column the farthest is, and then in which row.
     count = points.shape[0]
@@ -83,7 +83,7 @@ def _farthest_of_array(points: Float[Array, "points 3"], k: int) -> Int[Array, "
     return jax.lax.fori_loop(1, k, step, (chosen, nearest, jnp.int32(0)))[0]
 
 
-def _first_equal(values: Float[Array, "n"], value: Float[Array, ""]) -> Int[Array, ""]:
+def _first_equal(values: Float[Array, " n"], value: Float[Array, ""]) -> Int[Array, ""]:
     """The smallest index where `values` are equal to `value`, the last where none is."""
     index = jnp.arange(values.shape[0], dtype=jnp.int32)
     return jnp.min(jnp.where(values == value, index, index[-1]))
@@ -134,7 +134,7 @@ def _query_of_array(
     return jax.vmap(_first_hits, in_axes=(0, None))(words, k)
 
 
-def _first_hits(words: UInt32[Array, "words"], k: int) -> Int[Array, "{k}"]:
+def _first_hits(words: UInt32[Array, " words"], k: int) -> Int[Array, " {k}"]:
     """Positions of the first `k` set bits, the first one repeated where there are fewer, 0 where there is none."""
     until = bits_until(words)
     slot = jnp.arange(k, dtype=jnp.int32)

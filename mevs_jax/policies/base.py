@@ -18,7 +18,7 @@ class Observation:
     encoder's features (features,), where they are fused; and PointNet++'s embedding of the partial cloud, where it is used."""
 
     logits: Float[Array, "*batch classes"]
-    utility: Float[Array, "*batch views"] | None = None
+    predicted_entropy: Float[Array, "*batch views"] | None = None
     features: Float[Array, "*batch features"] | None = None
     cloud: Float[Array, "*batch embedding"] | None = None
 
@@ -48,7 +48,7 @@ class SelectionState:
 
 @flax.struct.dataclass
 class Knowledge:
-    """What was learnt on other objects, none of them tested on.
+    """What was learned on other objects, none of them tested on.
 
     Attributes:
         order: (views,) scores of the best fixed order; the first to look at has the highest.
@@ -68,9 +68,9 @@ class Scene:
         entropy: (views,) true depth entropies; for oracles.
         logits: (views, classes) what every view would show; for oracles.
         label: the true class; for oracles.
-        knowledge: learnt on other objects.
+        knowledge: learned on other objects.
         reachable: (views,) where the camera can go; None for everywhere. The start may lie outside.
-        climbed: (views, views) by policy; row i scores the views after seeing view i, by climbing with a renderer's gradient.
+        ascent_scores: by policy, (views, views); row i scores the views after seeing view i, by ascent on a renderer's gradient.
         features: (views, features) of every view; for oracles.
     """
 
@@ -80,11 +80,11 @@ class Scene:
     label: Int[Array, "*batch"] | None = None
     knowledge: Knowledge | None = None
     reachable: Bool[Array, "*batch views"] | None = None
-    climbed: dict[str, Float[Array, "*batch views views"]] | None = None
+    ascent_scores: dict[str, Float[Array, "*batch views views"]] | None = None
     features: Float[Array, "*batch views features"] | None = None
 
 
-Policy = Callable[[Array, SelectionState, Scene], Float[Array, "views"]]
+Policy = Callable[[Array, SelectionState, Scene], Float[Array, " views"]]
 
 
 T = TypeVar("T")
@@ -96,14 +96,14 @@ def _given(value: T | None, name: str) -> T:
     return value
 
 
-def candidates(state: SelectionState, scene: Scene) -> Bool[Array, "views"]:
+def candidates(state: SelectionState, scene: Scene) -> Bool[Array, " views"]:
     """Which views may be looked at next: neither attempted nor out of reach."""
     return ~state.attempted if scene.reachable is None else ~state.attempted & scene.reachable
 
 
 def maxima_first(
-    weights: Float[Array, "views"], allowed: Bool[Array, "views"], neighbours: Bool[Array, "views views"]
-) -> Float[Array, "views"]:
+    weights: Float[Array, " views"], allowed: Bool[Array, " views"], neighbours: Bool[Array, "views views"]
+) -> Float[Array, " views"]:
     """Scores of the thesis's rule (§4.4): the heaviest allowed local maximum, or the heaviest view if none is left."""
     maximum = local_maxima(weights, neighbours)
     left = jnp.any(maximum & allowed)
@@ -113,7 +113,7 @@ def maxima_first(
 def with_movement(policy: Policy, cost: float | Float[Array, ""]) -> Policy:
     """`policy` with `cost` per radian of the great-circle way from the latest view taken off its scores."""
 
-    def scores(key: Array, state: SelectionState, scene: Scene) -> Float[Array, "views"]:
+    def scores(key: Array, state: SelectionState, scene: Scene) -> Float[Array, " views"]:
         return policy(key, state, scene) - cost * scene.graph.distances[state.view]
 
     return scores

@@ -11,13 +11,13 @@ from mevs_jax.policies.base import Scene, SelectionState, _given
 # Knowing what views of other objects show.
 
 
-def fixed_order(key: Array, state: SelectionState, scene: Scene) -> Float[Array, "views"]:
+def fixed_order(key: Array, state: SelectionState, scene: Scene) -> Float[Array, " views"]:
     """The same views for every object, in the order that did best on other objects."""
     del key, state
     return _given(scene.knowledge, "Scene.knowledge").order
 
 
-def information_gain(key: Array, state: SelectionState, scene: Scene) -> Float[Array, "views"]:
+def information_gain(key: Array, state: SelectionState, scene: Scene) -> Float[Array, " views"]:
     """Expected drop of the belief's entropy in nats, if view j shows class y its mean logits.
 
     With p the belief, M[y, j] the mean logits: H(p) − Σ_y p(y) H(softmax(belief + M[y, j])). As in Denzler and Brown (2002)

@@ -8,13 +8,13 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from mevs_jax.models.view_policy import ViewPolicy, expected_gain, worth
+from mevs_jax.models.view_policy import ViewPolicy, expected_gain, utility_of
 from mevs_jax.policies.base import Knowledge, Policy, Scene, SelectionState, _given, candidates
 
-# Having learnt what looking was worth.
+# Having learned what looking was worth.
 
 
-def learnt(
+def learned(
     network: ViewPolicy, temperature: float | Float[Array, ""], *, by: Literal["belief", "state", "table"] = "belief"
 ) -> Policy:
     """The view from which `network` expects most.
@@ -26,7 +26,7 @@ def learnt(
             as much what these views showed of other objects (`Knowledge.expected_logits`, log-probabilities of single views).
     """
 
-    def scores(key: Array, state: SelectionState, scene: Scene) -> Float[Array, "views"]:
+    def scores(key: Array, state: SelectionState, scene: Scene) -> Float[Array, " views"]:
         del key
         points, present = scene.graph.points, jnp.arange(len(state.views)) < state.count
         views = jax.nn.log_softmax(state.seen.logits / temperature, axis=-1)
@@ -40,42 +40,42 @@ def learnt(
     return scores
 
 
-_TOLD_BY_A_VIEW = 0.5
+_TABLE_WEIGHT = 0.5
 """How much of what a view shows of a class by itself counts beside views seen before, from which it is not independent."""
 
 
 def _gain_by_table(
-    network: ViewPolicy, belief: Float[Array, "classes"], knowledge: Knowledge
+    network: ViewPolicy, belief: Float[Array, " classes"], knowledge: Knowledge
 ) -> Float[Array, "views classes"]:
     """[j, y]: by how much the utility that `network` expects would rise, should view j show half of what it shows of others of
     class y."""
-    after = jax.nn.log_softmax(belief + _TOLD_BY_A_VIEW * knowledge.expected_logits, axis=-1)
+    after = jax.nn.log_softmax(belief + _TABLE_WEIGHT * knowledge.expected_logits, axis=-1)
     own = jnp.diagonal(after, axis1=0, axis2=2)
-    return worth(own, network.utility, network.floor) - worth(belief, network.utility, network.floor)
+    return utility_of(own, network.utility, network.floor) - utility_of(belief, network.utility, network.floor)
 
 
 def looking_ahead(
     network: ViewPolicy, temperature: float | Float[Array, ""], *, shortlist: int = 4, classes: int = 3
 ) -> Policy:
-    """`learnt` by the belief, two views ahead: what a view is expected to bring, and what the best one after it would.
+    """`learned` by the belief, two views ahead: what a view is expected to bring, and what the best one after it would.
 
     A view is imagined to show an object of class y what it shows of others (`Knowledge.expected_logits`, log-probabilities of
     single views), as if independent of what was seen: p′ ∝ p · softmax(M[y, j]).
 
     Args:
-        network, temperature: as for `learnt`.
+        network, temperature: as for `learned`.
         shortlist: how many views are looked behind, those that promise most by themselves; no other is taken.
         classes: how many of the likeliest classes are imagined.
     """
 
-    def scores(key: Array, state: SelectionState, scene: Scene) -> Float[Array, "views"]:
+    def scores(key: Array, state: SelectionState, scene: Scene) -> Float[Array, " views"]:
         del key
         expected = jax.nn.log_softmax(_given(scene.knowledge, "Scene.knowledge").expected_logits, axis=-1)
         points, slots = scene.graph.points, jnp.arange(len(state.views))
         views = jax.nn.log_softmax(state.seen.logits / temperature, axis=-1)
         allowed = candidates(state, scene)
 
-        def gains(belief: Array, views: Array, order: Array, count: Array) -> Float[Array, "views"]:
+        def gains(belief: Array, views: Array, order: Array, count: Array) -> Float[Array, " views"]:
             gain_if = network(belief, views, points[order], slots < count, points, state.seen.cloud)[1]
             return expected_gain(belief, gain_if)
 

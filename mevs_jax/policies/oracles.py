@@ -14,19 +14,19 @@ from mevs_jax.policies.base import Policy, Scene, SelectionState, _given, candid
 # Knowing what no robot can: oracles and a control.
 
 
-def oracle_entropy(key: Array, state: SelectionState, scene: Scene) -> Float[Array, "views"]:
+def oracle_entropy(key: Array, state: SelectionState, scene: Scene) -> Float[Array, " views"]:
     """The thesis's rule on the true entropies: what a perfect predictor would do."""
     del key
     return maxima_first(_given(scene.entropy, "Scene.entropy"), candidates(state, scene), scene.graph.neighbours)
 
 
-def lowest_entropy(key: Array, state: SelectionState, scene: Scene) -> Float[Array, "views"]:
+def lowest_entropy(key: Array, state: SelectionState, scene: Scene) -> Float[Array, " views"]:
     """The lowest true entropy first: the control. If this does no worse than the oracle, entropy is not what matters."""
     del key, state
     return -_given(scene.entropy, "Scene.entropy")
 
 
-def belief_oracle(key: Array, state: SelectionState, scene: Scene) -> Float[Array, "views"]:
+def belief_oracle(key: Array, state: SelectionState, scene: Scene) -> Float[Array, " views"]:
     """The view after which the belief is closest (in Kullback–Leibler divergence) to the belief after all views.
 
     Sees every view but not the label, so it cannot pick views that are right by luck: a fair ceiling for one step.
@@ -37,20 +37,20 @@ def belief_oracle(key: Array, state: SelectionState, scene: Scene) -> Float[Arra
     return jnp.sum(final * jax.nn.log_softmax(state.belief + logits), axis=-1)
 
 
-def label_oracle(key: Array, state: SelectionState, scene: Scene) -> Float[Array, "views"]:
+def label_oracle(key: Array, state: SelectionState, scene: Scene) -> Float[Array, " views"]:
     """The view after which the true class is most probable. Optimistic: it finds views that are right by luck."""
     del key
     logits, label = _given(scene.logits, "Scene.logits"), _given(scene.label, "Scene.label")
     return jax.nn.log_softmax(state.belief + logits)[:, label]
 
 
-def pair_oracle(key: Array, state: SelectionState, scene: Scene) -> Float[Array, "views"]:
+def pair_oracle(key: Array, state: SelectionState, scene: Scene) -> Float[Array, " views"]:
     """The first view of the pair after which the true class is most probable, over all pairs; every second view is the greedy
     one, which completes the pair. More optimistic still (exhaustive search over subsets, as in MVSelect, Hou et al. 2024).
     """
     logits, label = _given(scene.logits, "Scene.logits"), _given(scene.label, "Scene.label")
 
-    def best_partner() -> Float[Array, "views"]:
+    def best_partner() -> Float[Array, " views"]:
         both = state.belief + (
             logits[:, None] + logits[None, :]
         )  # in this order: a pair weighs the same both ways round
@@ -63,14 +63,14 @@ def pair_oracle(key: Array, state: SelectionState, scene: Scene) -> Float[Array,
 
 
 def fused_oracle(fusion: CalibratedFusion, *, by: Literal["belief", "label"] = "belief") -> Policy:
-    """`belief_oracle` or `label_oracle` where a learnt fusion makes the belief."""
+    """`belief_oracle` or `label_oracle` where a learned fusion makes the belief."""
 
-    def scores(key: Array, state: SelectionState, scene: Scene) -> Float[Array, "views"]:
+    def scores(key: Array, state: SelectionState, scene: Scene) -> Float[Array, " views"]:
         del key
         features, points = _given(scene.features, "Scene.features"), scene.graph.points
         seen = features[state.views], points[state.views], jnp.arange(len(state.views)) < state.count
 
-        def with_one_more(*view: Array) -> Float[Array, "classes"]:
+        def with_one_more(*view: Array) -> Float[Array, " classes"]:
             return fusion(*(jnp.concatenate([known, new[None]]) for known, new in zip(seen, view, strict=True)))
 
         after = jax.vmap(with_one_more)(features, points, jnp.ones(len(points), bool))

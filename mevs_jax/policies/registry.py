@@ -11,7 +11,7 @@ from mevs_jax.policies.entropy import (
 )
 from mevs_jax.policies.informed import fixed_order, information_gain
 from mevs_jax.policies.oracles import belief_oracle, label_oracle, lowest_entropy, oracle_entropy, pair_oracle
-from mevs_jax.policies.rendering import climbed
+from mevs_jax.policies.rendering import by_ascent
 from mevs_jax.policies.uninformed import farthest_view, random_view, random_with_repetition
 
 POLICIES: dict[str, Policy] = {
@@ -24,10 +24,10 @@ POLICIES: dict[str, Policy] = {
     "remembered_entropy": remembered_entropy,
     "scrambled_entropy": scrambled_entropy,
     "information_gain": information_gain,
-    "diff_volume": climbed("diff_volume"),
-    "diff_mesh": climbed("diff_mesh"),
-    "diff_volume_whole": climbed("diff_volume_whole"),
-    "diff_mesh_whole": climbed("diff_mesh_whole"),
+    "diff_volume": by_ascent("diff_volume"),
+    "diff_mesh": by_ascent("diff_mesh"),
+    "diff_volume_whole": by_ascent("diff_volume_whole"),
+    "diff_mesh_whole": by_ascent("diff_mesh_whole"),
     "oracle_entropy": oracle_entropy,
     "lowest_entropy": lowest_entropy,
     "belief_oracle": belief_oracle,

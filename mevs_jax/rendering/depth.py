@@ -89,11 +89,11 @@ def _planes(corners: Float[Array, "faces 3 3"]) -> Float[Array, "faces 4 3"]:
 
 def _tile(
     planes: Float[Array, "faces 4 3"],
-    x: Float[Array, "pixels"],
-    y: Float[Array, "pixels"],
+    x: Float[Array, " pixels"],
+    y: Float[Array, " pixels"],
     centre: tuple[Array, Array],
     half: float,
-) -> tuple[Float[Array, "pixels"], Int[Array, "pixels"]]:
+) -> tuple[Float[Array, " pixels"], Int[Array, " pixels"]]:
     """1/depth and face of each pixel of a tile, 0 and −1 where nothing is hit."""
     most = planes[..., 0] * centre[0] + planes[..., 1] * centre[1] + planes[..., 2]
     most = most + half * (jnp.abs(planes[..., 0]) + jnp.abs(planes[..., 1]))
@@ -119,6 +119,6 @@ def _tile(
     return nearness, face
 
 
-def _packed(flags: Array) -> UInt32[Array, "words"]:
+def _packed(flags: Array) -> UInt32[Array, " words"]:
     bit = jnp.uint32(1) << jnp.arange(WORD, dtype=jnp.uint32)
     return jnp.sum(jnp.where(flags.reshape(-1, WORD), bit, jnp.uint32(0)), axis=1, dtype=jnp.uint32)

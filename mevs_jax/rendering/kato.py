@@ -87,11 +87,11 @@ def _of_rows(
         # What each pixel of a row would gain: outside where nothing is seen, inside where this face is.
         outside = (pixel - crossing[:, None]) * inwards < 0
         gain = jnp.where(outside & ~covered, 1.0, 0.0) - jnp.where(~outside & (face == number), 1.0, 0.0)
-        worth = gain * towards
-        worth = jnp.where(worth > 0 if rises else worth < 0, worth, 0.0)
+        pull = gain * towards
+        pull = jnp.where(pull > 0 if rises else pull < 0, pull, 0.0)
         way = pixel - crossing[:, None]
         way = jnp.where(way < 0, jnp.minimum(way, -_NEAREST), jnp.maximum(way, _NEAREST))
-        of_row = jnp.where(there, jnp.sum(worth / way, axis=1), 0.0)
+        of_row = jnp.where(there, jnp.sum(pull / way, axis=1), 0.0)
         return jnp.sum((1 - part) * of_row), jnp.sum(part * of_row)
 
     def of_face(arguments: tuple[Array, Array]) -> Array:

@@ -72,7 +72,7 @@ def _pieces(side: int) -> tuple[int, int]:
 
 def _near_tiles(
     corners: Float[Array, "faces 3 3"], camera: Camera, margin: float, tile: int
-) -> tuple[Int[Array, "tiles faces"], Int[Array, "tiles"]]:
+) -> tuple[Int[Array, "tiles faces"], Int[Array, " tiles"]]:
     """For each tile the faces whose bounding boxes come within `margin` pixels of it, the others as `faces`; and how many."""
     depth = jnp.maximum(corners[..., 2:], _NEAREST)
     at = camera.focal_length * corners[..., :2] / depth + camera.resolution / 2  # (faces, 3, 2), column and row

@@ -133,8 +133,8 @@ def ascend(
 
 
 def distinct_optima(
-    poses: Float[Array, "starts 4 4"], values: Float[Array, "starts"], angle: float = 0.2
-) -> tuple[Int[Array, "starts"], Bool[Array, "starts"]]:
+    poses: Float[Array, "starts 4 4"], values: Float[Array, " starts"], angle: float = 0.2
+) -> tuple[Int[Array, " starts"], Bool[Array, " starts"]]:
     """Starts from the best value to the worst, and which of them are not within `angle` radians of a better one that is kept."""
     order = jnp.argsort(-values, stable=True)
     directions = poses[order, :3, 3]

@@ -96,7 +96,7 @@ def _march(cells: Array, rays: tuple[Array, Array], steps: int, absorption: floa
 
 def _absorbed(
     cells: Array, rays: tuple[Array, Array], number: Array, steps: int, absorption: float
-) -> tuple[Float[Array, "pixels"], Array]:
+) -> tuple[Float[Array, " pixels"], Array]:
     """What one step absorbs, as a logarithm, and its depth."""
     origin, directions = rays
     length = 2.0 / steps
@@ -106,7 +106,7 @@ def _absorbed(
     return absorption * way * _sample(cells, origin + at * directions), at
 
 
-def _sample(cells: Float[Array, "cells 8"], points: Float[Array, "points 3"]) -> Float[Array, "points"]:
+def _sample(cells: Float[Array, "cells 8"], points: Float[Array, "points 3"]) -> Float[Array, " points"]:
     """Trilinear density, 0 outside."""
     side = round(len(cells) ** (1 / 3))  # cells along an edge: one more than nodes
     position = (points + 1) / 2 * (side - 1) + 0.5

@@ -31,13 +31,13 @@ class Node:
         self.view, self.weight = view, 0.0
 
 
-def scrambled(utility: np.ndarray, seen: list[int], neighbours: np.ndarray) -> np.ndarray:
+def scrambled(predicted_entropy: np.ndarray, seen: list[int], neighbours: np.ndarray) -> np.ndarray:
     """Runs the published code's walk from its start and hands back the weights as it sees them at the end."""
     nodes = [Node(view) for view in range(len(neighbours))]
     for step, view in enumerate(seen):
         for position, node in enumerate(nodes):
-            node.weight = utility[view][position]
-        weights = np.zeros(len(nodes), utility.dtype)
+            node.weight = predicted_entropy[view][position]
+        weights = np.zeros(len(nodes), predicted_entropy.dtype)
         for node in nodes:
             weights[node.view] = node.weight
         attempted = seen[: step + 1]
@@ -51,27 +51,30 @@ def scores(policy: str, seen: list[int], table: dict, graph: dict, knowledge: di
     """Scores of a policy that does not draw.
 
     Args:
-        table: logits (views, classes), utility (views, views), entropy (views,), label; climbed by policy, each (views, views).
+        table: logits (views, classes), predicted_entropy (views, views), entropy (views,), label;
+            ascent_scores by policy, each (views, views).
         graph: neighbours and distances, each (views, views).
         knowledge: order (views,) and expected_logits (classes, views, classes).
     """
-    logits, utility, entropy, label = (table[name] for name in ("logits", "utility", "entropy", "label"))
+    logits, predicted_entropy, entropy, label = (
+        table[name] for name in ("logits", "predicted_entropy", "entropy", "label")
+    )
     neighbours, views = graph["neighbours"], len(logits)
     if policy.startswith("diff_"):
-        return table["climbed"][policy][seen[-1]]
+        return table["ascent_scores"][policy][seen[-1]]
     belief = logits[seen].sum(axis=0)
     if policy == "farthest":
         return np.array([min(graph["distances"][view, other] for other in seen) for view in range(views)])
     if policy == "fixed_order":
         return knowledge["order"]
     if policy == "predicted_entropy":
-        return maxima_first(utility[seen[-1]], seen, neighbours)
+        return maxima_first(predicted_entropy[seen[-1]], seen, neighbours)
     if policy == "predicted_entropy_without_maxima":
-        return utility[seen[-1]]
+        return predicted_entropy[seen[-1]]
     if policy == "remembered_entropy":
-        return maxima_first(utility[seen].mean(axis=0), seen, neighbours)
+        return maxima_first(predicted_entropy[seen].mean(axis=0), seen, neighbours)
     if policy == "scrambled_entropy":
-        return scrambled(utility, seen, neighbours)
+        return scrambled(predicted_entropy, seen, neighbours)
     if policy == "oracle_entropy":
         return maxima_first(entropy, seen, neighbours)
     if policy == "lowest_entropy":

@@ -79,7 +79,7 @@ def fit_averaged(
 
     @jax.jit
     def epoch(carry: Carry, data: Data, key: Array) -> tuple[Carry, Array]:
-        def step(carry: Carry, given: tuple[Int[Array, "batch"], Array]) -> tuple[Carry, Array]:
+        def step(carry: Carry, given: tuple[Int[Array, " batch"], Array]) -> tuple[Carry, Array]:
             parameters, moments, mean, taken = carry
             index, key = given
             some = jax.tree.map(lambda leaf: leaf[index], data)

@@ -25,7 +25,7 @@ _CALIBRATED = (1, 2, 3, 4, 5, 6, 8, 12, 16, 24, 32, 40)
 def calibrated(
     network: SetFusion | SumFusion,
     validation: Features,
-    prior: Float[Array, "classes"],
+    prior: Float[Array, " classes"],
     posed: bool = True,
     draws: int = 4,
 ) -> CalibratedFusion:

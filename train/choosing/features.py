@@ -62,11 +62,11 @@ class Features:
 
     features: Float[Array, "objects views features"]
     logits: Float[Array, "objects views classes"]
-    labels: Int[Array, "objects"]
+    labels: Int[Array, " objects"]
     directions: Float[Array, "objects views 3"]
     clouds: Float[Array, "objects views embedding"] | None = None
 
-    def some(self, chosen: Int[np.ndarray, "some"]) -> Features:
+    def some(self, chosen: Int[np.ndarray, " some"]) -> Features:
         """Those of some objects."""
         return jax.tree.map(lambda leaf: leaf[chosen], self)
 
@@ -105,7 +105,7 @@ def sets_of_size(objects: int, views: int, size: int, draws: int, seed: int = 0)
 
 def fusion_loss(
     network: SetFusion, chosen: Features, present: Array, key: Array | None = None
-) -> Float[Array, "objects"]:
+) -> Float[Array, " objects"]:
     """Cross-entropy of each set, in nats; with a key, dropping out."""
     logits = network(chosen.features, chosen.directions, present, key=key)
     return optax.softmax_cross_entropy_with_integer_labels(logits, chosen.labels)

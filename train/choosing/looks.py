@@ -17,7 +17,7 @@ from train.tasks.entropy import EntropyTask
 from train.tasks.recogniser import RecogniserTask, views_by_object
 
 
-def _see(network: Recogniser, task: Task, batch: Batch) -> jax.Array:
+def see(network: Recogniser, task: Task, batch: Batch) -> jax.Array:
     """Features, logits, direction and label of every view, side by side."""
     assert isinstance(task, RecogniserTask)
     return _seen(network, task.inputs(batch), task.directions(batch), batch)
@@ -29,14 +29,14 @@ def _seen(network: Recogniser, images: Array, directions: Array, batch: Batch) -
 
 
 def _seen_after(changes: Array, network: Recogniser, task: RecogniserTask, batch: Batch) -> jax.Array:
-    """`_see` of objects whose points were multiplied by these matrices, one for each."""
+    """`see` of objects whose points were multiplied by these matrices, one for each."""
     images, poses = (views_by_object(array, task.camera.views) for array in (task.inputs(batch), batch["pose"]))
     images, directions = jax.vmap(partial(views_after, camera=task.camera))(changes, images, poses)
     return _seen(network, images.reshape(-1, *images.shape[2:]), directions.reshape(-1, 3), batch)
 
 
-def _see_rotated(network: Recogniser, task: Task, batch: Batch) -> jax.Array:
-    """`_see` of turned views after the object was turned, by the rotation after which its cameras stand as in the lattice again.
+def see_rotated(network: Recogniser, task: Task, batch: Batch) -> jax.Array:
+    """`see` of turned views after the object was turned, by the rotation after which its cameras stand as in the lattice again.
 
     Turns are drawn evenly among all rotations, and so are these.
     """
@@ -51,8 +51,8 @@ def _see_rotated(network: Recogniser, task: Task, batch: Batch) -> jax.Array:
 
 
 @cache
-def _see_changed(number: int) -> Ask:
-    """`_see` of objects that are changed as in the recogniser's training, each in a way of its own, and otherwise by number."""
+def see_changed(number: int) -> Ask:
+    """`see` of objects that are changed as in the recogniser's training, each in a way of its own, and otherwise by number."""
 
     def see(network: Recogniser, task: Task, batch: Batch) -> jax.Array:
         assert isinstance(task, RecogniserTask)
@@ -64,6 +64,6 @@ def _see_changed(number: int) -> Ask:
     return see
 
 
-def _embed(network: PointNet2, task: Task, batch: Batch) -> jax.Array:
+def embed(network: PointNet2, task: Task, batch: Batch) -> jax.Array:
     assert isinstance(task, EntropyTask)
     return network.embed(task.inputs(batch))

@@ -23,9 +23,9 @@ from jaxtyping import Array, Bool, Float, Int
 from data_pipeline.progress import console
 from mevs_jax.beliefs import CalibratedFusion
 from mevs_jax.calibration import class_weights
-from mevs_jax.models.view_policy import Utility, ViewPolicy, expected_gain, worth
+from mevs_jax.models.view_policy import Utility, ViewPolicy, expected_gain, utility_of
 from mevs_jax.policies.base import Policy
-from mevs_jax.policies.learned import learnt, looking_ahead
+from mevs_jax.policies.learned import learned, looking_ahead
 from mevs_jax.policies.uninformed import random_view
 from mevs_jax.selection import ViewTable, by_attention, select_from_table
 from mevs_jax.viewpoints import ViewGraph
@@ -90,8 +90,8 @@ class Choices:
     present: Bool[Array, "states seen"]
     candidates: Float[Array, "states candidates 3"]
     gain: Float[Array, "states candidates"]
-    label: Int[Array, "states"]
-    weight: Float[Array, "states"]
+    label: Int[Array, " states"]
+    weight: Float[Array, " states"]
     clouds: Float[Array, "states seen embedding"] | None = None
 
 
@@ -163,7 +163,7 @@ def _choices_of_some(fusion: CalibratedFusion, some: tuple[Features, Array, Arra
                 )
 
             after = jax.vmap(with_one_more)(asked)
-            gain = worth(after[:, one.labels], *by) - worth(belief[one.labels], *by)
+            gain = utility_of(after[:, one.labels], *by) - utility_of(belief[one.labels], *by)
             known = belief, single[order], directions, present, one.directions[asked]
             clouds = None if one.clouds is None else one.clouds[order]
             return Choices(*known, gain, one.labels, jnp.float32(1), clouds)
@@ -225,14 +225,14 @@ def policy_loss(network: ViewPolicy, some: Choices, differences: float) -> dict[
 
 
 By = Literal["belief", "state", "table", "ahead"]
-"""How a view policy is asked: as `learnt` has it, or two views ahead."""
+"""How a view policy is asked: as `learned` has it, or two views ahead."""
 
 
-def learnt_policy(given: tuple[nnx.State, Array], structure: nnx.GraphDef, by: By = "belief") -> Policy:
-    """`learnt` or `looking_ahead` of a network's weights and the temperature of single views, which a compiled program takes as
+def learned_policy(given: tuple[nnx.State, Array], structure: nnx.GraphDef, by: By = "belief") -> Policy:
+    """`learned` or `looking_ahead` of a network's weights and the temperature of single views, which a compiled program takes as
     arguments."""
     network, temperature = nnx.merge(structure, given[0]), given[1]
-    return looking_ahead(network, temperature) if by == "ahead" else learnt(network, temperature, by=by)
+    return looking_ahead(network, temperature) if by == "ahead" else learned(network, temperature, by=by)
 
 
 def new_policy(config: PolicyConfig, classes: int, posed: bool = True, cloud: int = 0) -> ViewPolicy:
@@ -322,7 +322,7 @@ def _at_random(_: Any) -> Policy:
 @cache
 def _guided(structure: nnx.GraphDef) -> Callable[..., Policy]:
     """One function for all weights: walks are compiled for each."""
-    return partial(learnt_policy, structure=structure)
+    return partial(learned_policy, structure=structure)
 
 
 def _balanced(choices: Choices) -> Choices:

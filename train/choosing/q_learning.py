@@ -1,6 +1,6 @@
-"""The learnt baseline: Q-learning of the views to look at, as MVSelect does (Hou et al., CVPR 2024).
+"""The learned baseline: Q-learning of the views to look at, as MVSelect does (Hou et al., CVPR 2024).
 
-Where `train.policy` asks of every candidate what it was worth, here the walk alone is known: which view was taken, and by how
+Where `train.policy` asks of every candidate how much it gained, here the walk alone is known: which view was taken, and by how
 much the belief in the true class rose. Values follow by bootstrapping from the next state's (DQN; Mnih et al. 2015), with a
 network that is the view policy's, so that nothing but the way of learning differs. Walks are ε-greedy; a round walks with the
 network of the round before, which is also the target, and trains on the walks of all rounds (the replay).
@@ -25,12 +25,12 @@ from jaxtyping import Array, Float, Int
 
 from data_pipeline.progress import console
 from mevs_jax.beliefs import CalibratedFusion
-from mevs_jax.models.view_policy import ViewPolicy, worth
+from mevs_jax.models.view_policy import ViewPolicy, utility_of
 from mevs_jax.policies.base import Policy
 from train.choosing.averaged import fit_averaged, mean_losses
 from train.choosing.chunks import in_chunks
 from train.choosing.features import Features
-from train.choosing.policy import PolicyConfig, Seen, joined, learnt_policy, new_policy, walk
+from train.choosing.policy import PolicyConfig, Seen, joined, learned_policy, new_policy, walk
 
 
 @dataclass(frozen=True)
@@ -80,7 +80,7 @@ def _transitions_of_some(
         def of_walk(order: Array) -> Transitions:
             seen = one.features[order], one.directions[order]
             beliefs = jax.vmap(lambda count: fusion(*seen, jnp.arange(steps) < count))(jnp.arange(1, steps + 1))
-            reward = jnp.diff(worth(beliefs[:, one.labels], config.utility, config.floor))
+            reward = jnp.diff(utility_of(beliefs[:, one.labels], config.utility, config.floor))
             return Transitions(beliefs, single[order], order, one.directions, reward)
 
         return jax.vmap(of_walk)(walks)
@@ -127,7 +127,7 @@ def temporal_difference(
 
 def exploring(given: tuple[nnx.State, Array], structure: nnx.GraphDef, share: float) -> Policy:
     """Now and then any view, otherwise that of the highest value."""
-    greedy = learnt_policy(given, structure, by="state")
+    greedy = learned_policy(given, structure, by="state")
 
     def scores(key: Array, state: Any, scene: Any) -> Array:
         whether, drawn = jax.random.split(key)

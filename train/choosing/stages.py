@@ -3,8 +3,8 @@
 Each stage skips what is done. Everything that is selected, fitted or learned from the recogniser's outputs, temperatures and
 policies among it, uses validation objects.
 
-In a run's folder: `active/turned/` (data), `active/seed_0/` with `recogniser/`, `features/`, `policies/`, `fold_0/`, …; and
-`active/seed_0_rotated/`, the same for objects under any rotation.
+In a run's folder: `learned/turned/` (data), `learned/seed_0/` with `recogniser/`, `features/`, `policies/`, `fold_0/`, …; and
+`learned/seed_0_rotated/`, the same for objects under any rotation.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from typing import Any, Literal
 import jax.numpy as jnp
 import numpy as np
 from flax import nnx
-from jaxtyping import Array
+from jaxtyping import Array, Float
 
 from data_pipeline.dataset.batches import fold_of
 from data_pipeline.dataset.builder import DataConfig, DatasetStatistics, load_statistics, open_split, prepare
@@ -29,10 +29,10 @@ from mevs_jax.models import Recogniser, ViewPolicy
 from mevs_jax.models.set_fusion import SumFusion
 from train.choosing.calibrated import calibrated
 from train.choosing.features import Features
-from train.choosing.looks import _embed, _see, _see_changed, _see_rotated
+from train.choosing.looks import embed, see, see_changed, see_rotated
 from train.choosing.policy import By, PolicyConfig, Seen, new_policy, train_policy
 from train.choosing.q_learning import QLearningConfig, train_by_q_learning
-from train.kept import _made_once, made_by, stored_array
+from train.kept import kept_array, made_by, trained_once
 from train.loop import fit, load_best
 from train.outputs import Ask, network_outputs
 from train.starting_weights import StartingWeights
@@ -41,8 +41,8 @@ from train.tasks.recogniser import RecogniserConfig, RecogniserTask
 
 
 @dataclass(frozen=True)
-class ActiveConfig:
-    """Learnt fusion and learnt choice."""
+class LearnedConfig:
+    """Learned fusion and learned choice."""
 
     recogniser: RecogniserConfig = RecogniserConfig()
     folds: int = 2
@@ -88,7 +88,7 @@ class Variant:
             training objects seen by the one that was trained on them.
         cloud: it sees PointNet++'s embedding of every partial cloud too.
         summed: beliefs are sums of logits, in training and on its walks.
-        q_learning: learnt from walks alone.
+        q_learning: learned from walks alone.
         settings: what is set otherwise than for the method.
     """
 
@@ -105,18 +105,18 @@ class Variant:
 
 
 VARIANTS = {
-    "learnt": Variant("view policy"),
-    "learnt_unposed": Variant("view policy", posed=False),
-    "learnt_and_table": Variant("view policy and table", by="table", network="learnt"),
-    "as_it_is": Variant("… by what it expects of the state as it is", by="state", network="learnt"),
-    "look_ahead": Variant("… two views ahead", by="ahead", network="learnt"),
+    "learned": Variant("view policy"),
+    "learned_unposed": Variant("view policy", posed=False),
+    "learned_and_table": Variant("view policy and table", by="table", network="learned"),
+    "as_it_is": Variant("… by what it expects of the state as it is", by="state", network="learned"),
+    "look_ahead": Variant("… two views ahead", by="ahead", network="learned"),
     "probability": Variant(
         "… by the rise of the probability, not of its logarithm", settings={"utility": "probability"}
     ),
     "random_states": Variant("… trained on random walks alone", settings={"rounds": 1}),
-    "unchanged": Variant("… learnt from objects as they are", changed=False),
-    "crossed": Variant("… learnt from training objects, by recognisers without them", learns_from="parts"),
-    "known": Variant("… learnt from training objects, by the one that knows them", learns_from="training"),
+    "unchanged": Variant("… learned from objects as they are", changed=False),
+    "crossed": Variant("… learned from training objects, by recognisers without them", learns_from="parts"),
+    "known": Variant("… learned from training objects, by the one that knows them", learns_from="training"),
     "summed": Variant("… with the sum of logits for a fusion", summed=True),
     "cloud": Variant("… and with PointNet++'s embedding of their clouds", cloud=True, changed=False),
     "q_learning": Variant("… Q-learning (as MVSelect)", by="state", q_learning=True),
@@ -124,34 +124,35 @@ VARIANTS = {
 """The method, and what it is compared with to see what each part of it is good for."""
 
 
-ABLATIONS = tuple(name for name in VARIANTS if not name.startswith("learnt"))
+ABLATIONS = tuple(name for name in VARIANTS if not name.startswith("learned"))
 
 
 _FURTHER = 0.4
 """Learning rate of further training, beside that of the first."""
 
 
-def check_active(config: ActiveConfig, views: int) -> None:
+def check_learned(config: LearnedConfig, views: int) -> None:
     """Raises `DataError` for a study that cannot be made."""
     if config.folds < 2 or config.seeds < 1:
-        raise DataError("--active.folds must be at least 2, and --active.seeds at least 1")
+        raise DataError("--learned.folds must be at least 2, and --learned.seeds at least 1")
     if config.changed < 0:
-        raise DataError(f"--active.changed must be at least 0, got {config.changed}")
+        raise DataError(f"--learned.changed must be at least 0, got {config.changed}")
     for name in config.ablations:
         if name not in ABLATIONS:
-            raise DataError(f"unknown ablation {name!r} (--active.ablations); it is one of {', '.join(ABLATIONS)}")
+            raise DataError(f"unknown ablation {name!r} (--learned.ablations); it is one of {', '.join(ABLATIONS)}")
     walks = [config.policy.most_seen, config.max_views]
     if "q_learning" in config.ablations:
         walks.append(config.q_learning.most_seen)
     most, batch = max(walks), config.recogniser.optimiser
     if not 2 <= most < views:
         raise DataError(
-            f"walks of {most} views (--active.max-views, --active.policy.most-seen, --active.q-learning.most-seen) need more "
+            f"walks of {most} views (--learned.max-views, --learned.policy.most-seen, --learned.q-learning.most-seen) need more "
             f"than {most} candidate views, and at least 2; there are {views}"
         )
     if not batch.validation_views or 256 % batch.validation_views or batch.validation_views > views:
         raise DataError(
-            f"--active.recogniser.optimiser.validation-views must divide 256 and be at most {views}, got {batch.validation_views}"
+            f"--learned.recogniser.optimiser.validation-views must divide 256 and be at most {views}, "
+            f"got {batch.validation_views}"
         )
 
 
@@ -164,7 +165,7 @@ class Stages:
 
     def __init__(
         self,
-        config: ActiveConfig,
+        config: LearnedConfig,
         dataset: DataConfig,
         out: Path,
         seed: int = 0,
@@ -172,8 +173,8 @@ class Stages:
         upright: Stages | None = None,
     ):
         self.config, self.dataset, self.out, self.seed, self.entropy = config, dataset, out, seed, entropy
-        self.turned, self.upright = out / "active" / "turned", upright
-        self.folder = out / "active" / (f"seed_{seed}" if upright is None else f"seed_{seed}_rotated")
+        self.turned, self.upright = out / "learned" / "turned", upright
+        self.folder = out / "learned" / (f"seed_{seed}" if upright is None else f"seed_{seed}_rotated")
         self._fusions: dict[tuple, CalibratedFusion] = {}
 
     def rotated(self) -> Stages:
@@ -230,8 +231,8 @@ class Stages:
     ) -> Features:
         """What the recogniser sees of every view, kept in `features/` under this name."""
         task, folder, classes = self.task(fold), self.recogniser_folder(fold), len(self.statistics.classes)
-        ask = ask or (_see if self.upright is None else _see_rotated)
-        seen = stored_array(
+        ask = ask or (see if self.upright is None else see_rotated)
+        seen = kept_array(
             self.folder / "features" / f"{name}.npz",
             made_by(load_statistics(data), folder),
             lambda: network_outputs(data, split, task, load_best(task, folder), ask, chosen).astype(np.float32),
@@ -244,7 +245,7 @@ class Stages:
     def changed(self, count: int) -> list[Features]:
         """The validation objects so many times, changed as in training, with the views that a policy learns from."""
         return [
-            self.features(f"turned_val_changed_{number}", self.turned, "val", ask=_see_changed(number))
+            self.features(f"turned_val_changed_{number}", self.turned, "val", ask=see_changed(number))
             for number in range(count)
         ]
 
@@ -275,14 +276,14 @@ class Stages:
         return self.entropy is not None and (self.out / "entropy" / "summary.json").exists()
 
     def clouds(self, data: Path, split: str) -> Float[Array, "objects views embedding"]:
-        """PointNet++'s embedding of the partial cloud of every view, kept in `active/clouds/` for all seeds."""
+        """PointNet++'s embedding of the partial cloud of every view, kept in `learned/clouds/` for all seeds."""
         folder, statistics = self.out / "entropy", load_statistics(self.out / "data")
         assert self.entropy is not None
         task = EntropyTask.of(self.entropy, statistics.views, statistics.entropy_max, statistics.camera)
-        found = stored_array(
-            self.out / "active" / "clouds" / f"{data.name}_{split}.npz",
+        found = kept_array(
+            self.out / "learned" / "clouds" / f"{data.name}_{split}.npz",
             made_by(load_statistics(data), folder),
-            lambda: network_outputs(data, split, task, load_best(task, folder), _embed).astype(np.float32),
+            lambda: network_outputs(data, split, task, load_best(task, folder), embed).astype(np.float32),
         )
         return jnp.asarray(found)
 
@@ -294,10 +295,10 @@ class Stages:
             found.append((self.fusion(fold), self.features(f"fold_{fold}_train", self.turned, "train", fold, held_out)))
         return found
 
-    def policy_folder(self, name: str = "learnt") -> Path:
+    def policy_folder(self, name: str = "learned") -> Path:
         return self.folder / "policies" / name
 
-    def policy(self, name: str = "learnt", without: tuple[int, ...] = ()) -> ViewPolicy:
+    def policy(self, name: str = "learned", without: tuple[int, ...] = ()) -> ViewPolicy:
         """The view policy, as the variant of this name has it; `without` objects of some classes."""
         variant = VARIANTS[name]
         config = replace(self.config.policy, seed=self.seed, **variant.settings)
@@ -337,7 +338,7 @@ class Stages:
         identity = {"made_by": made_by(self.statistics, *made), "of": asdict(config), "changed": changed}
         folder = self.policy_folder("_".join(map(str, (name, *(f"without_{label}" for label in without)))))
         untrained = nnx.eval_shape(lambda: new_policy(config, len(self.statistics.classes), variant.posed, cloud))
-        return _made_once(folder, identity, untrained, train)
+        return trained_once(folder, identity, untrained, train)
 
     def learner(self, name: str) -> Learner:
         variant = VARIANTS[name]
@@ -349,6 +350,6 @@ class Stages:
 def lattice_data(dataset: DataConfig, out: Path, views: int) -> Path:
     """The folder of the data set with so many candidate views, made if it is not there."""
     own = dataset.capture.views == views
-    folder = out / "data" if own else out / "active" / f"lattice_{views}"
+    folder = out / "data" if own else out / "learned" / f"lattice_{views}"
     prepare(replace(dataset, capture=replace(dataset.capture, views=views)), folder)
     return folder
