@@ -1,19 +1,24 @@
-# Needs python3 (3.11 or 3.12) with venv, and make. Everything else is installed into .venv, pinned.
-PYTHON ?= python3
+# Needs Python 3.11 to 3.14 with venv, and make. Everything else is installed into .venv, pinned.
+PYTHON ?= $(shell for p in python3 python3.14 python3.13 python3.12 python3.11; do \
+    command -v $$p >/dev/null && $$p -c 'import sys; sys.exit(not (3, 11) <= sys.version_info < (3, 15))' && echo $$p && break; done)
 BIN := .venv/bin
 READY := .venv/.ready
 OUT ?= runs/demo
 # Packages are installed without bytecode, which each keeps once it was imported, unless told not to: then every start of `mevs`
 # would compile them again, for 12 seconds.
 unexport PYTHONDONTWRITEBYTECODE
+PYTEST := $(BIN)/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder
 
-.PHONY: demo test lint bench clean
+.PHONY: demo test test-all lint bench wheel clean
 
 demo: $(READY)  ## environment, data, networks, evaluation, report
 	$(BIN)/mevs run --preset small --out $(OUT)
 
 test: lint  ## format, lint, types and tests
-	$(BIN)/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder
+	$(PYTEST)
+
+test-all: lint  ## those, and the slow tests
+	$(PYTEST)
 
 lint: $(READY)
 	$(BIN)/ruff format --check .
@@ -26,12 +31,16 @@ bench: $(READY)  ## what is fast, beside its peers, in one run
 	$(BIN)/python benchmarks/evaluation.py
 	$(BIN)/python benchmarks/sweep.py
 
+wheel: $(READY)  ## the library alone, as a wheel in dist/
+	$(BIN)/python -m pip wheel --quiet --disable-pip-version-check --no-deps --wheel-dir dist .
+
 $(READY): requirements.lock pyproject.toml
-	$(PYTHON) -c 'import sys; sys.exit(not (3, 11) <= sys.version_info < (3, 13) and "mevs_jax needs Python 3.11 or 3.12, this is " + sys.version.split()[0] + "; set PYTHON=python3.12, say")'
+	@test -n "$(PYTHON)" || { echo "mevs_jax needs Python 3.11 to 3.14; install one, or name it: make PYTHON=python3.12" >&2; exit 2; }
+	@$(PYTHON) -c 'import sys; sys.exit(not (3, 11) <= sys.version_info < (3, 15) and "mevs_jax needs Python 3.11 to 3.14, this is " + sys.version.split()[0] + "; name another: make PYTHON=python3.12")'
 	$(PYTHON) -m venv .venv
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-compile -r requirements.lock
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-deps --editable .
 	touch $@
 
-clean:
-	rm -rf .venv runs dist
+clean:  ## environment and builds; runs/ stays
+	rm -rf .venv dist

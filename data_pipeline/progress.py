@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import sys
+import threading
+from datetime import timedelta
+from typing import Any, Self
 
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, ProgressColumn, Task, TextColumn, TimeRemainingColumn
@@ -21,8 +24,49 @@ class _Rate(ProgressColumn):
         return Text("" if speed is None else f"{speed:,.1f} {self.unit}/s", style="cyan")
 
 
+class _ProgressInLines(Progress):
+    """For logs: every so often a line for each task that is under way, in place of bars."""
+
+    def __init__(self, unit: str):
+        super().__init__(console=console, disable=True)
+        self.unit = unit
+        self._ended = threading.Event()
+        self._writer = threading.Thread(target=self._write, daemon=True)
+
+    def __enter__(self) -> Self:
+        self._writer.start()
+        return super().__enter__()
+
+    def __exit__(self, *error: Any) -> None:
+        self._ended.set()
+        self._writer.join()
+        super().__exit__(*error)
+
+    def _write(self) -> None:
+        while not self._ended.wait(SECONDS_BETWEEN_LINES):
+            for task in self.tasks:
+                if task.started and not task.finished:
+                    console.print(line_of(task, self.unit))
+
+
+SECONDS_BETWEEN_LINES = 30.0
+
+
+def line_of(task: Task, unit: str) -> str:
+    """How far a task is, how fast, and how much longer it takes, in one line."""
+    said = f"{task.description}: {task.completed:,.0f} of {task.total or 0:,.0f} {unit} ({task.percentage:.0f} %)"
+    if task.speed:
+        said += f", {task.speed:,.1f} {unit}/s"
+    if task.time_remaining is not None:
+        said += f", {timedelta(seconds=round(task.time_remaining))} left"
+    note = task.fields.get("note")
+    return f"{said}, {note}" if note else said
+
+
 def progress_bar(unit: str) -> Progress:
-    """A bar counted in `unit`; silent where standard error is no terminal, so that logs stay short."""
+    """A bar counted in `unit`; where standard error is no terminal, a line every 30 seconds."""
+    if not sys.stderr.isatty():
+        return _ProgressInLines(unit)
     return Progress(
         TextColumn("{task.description}"),
         BarColumn(),
@@ -31,5 +75,4 @@ def progress_bar(unit: str) -> Progress:
         TimeRemainingColumn(),
         TextColumn("{task.fields[note]}", style="dim"),
         console=console,
-        disable=not sys.stderr.isatty(),
     )

@@ -1,6 +1,6 @@
-"""The command line `mevs`. It is the one place that knows the library, the data pipeline, the training and the evaluation.
+"""The command line `mevs`: the one place that knows all packages. It imports them only when a command needs them.
 
-Heavy imports wait until a command needs them, so that `mevs --help` answers at once.
+Results go to standard output, progress and messages to standard error.
 """
 
 from __future__ import annotations
@@ -10,166 +10,59 @@ import os
 import signal
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING
 
-if TYPE_CHECKING:
-    from mevs_jax.cli.options import Options
+from mevs_jax.cli.commands import COMMANDS, find, help_text
 
-COMMANDS = {
-    "run": "data, train, eval and report, skipping what is done",
-    "data": "capture objects from every viewpoint, write them as a sharded TFDS data set",
-    "train": "train the classifier and the entropy predictor on it",
-    "sweep": "train many configurations of one of them as one program",
-    "eval": "walk every test object from every start view; write metrics.json",
-    "report": "write report/index.html",
-    "compat": "train the classifier the published code's way too, evaluate and report again",
-    "thesis": "every network, table and figure of the thesis, beside its own numbers",
-    "ascend": "climb to the best view of one object by a renderer's gradient; draw it",
-    "learned": "learn to fuse views and to choose them; compare with every other policy",
-    "climb": "where differentiable rendering would look next; evaluate and report again",
-    "live": "walk test objects with the networks in the loop; compare with the tables",
-}
-
-_HELP = """usage: mevs COMMAND [--preset small|best|thesis] [--data PATH] [--views N] [--out DIR] [SETTINGS]
-
-Where should a camera look next? Trains the networks of maximum entropy viewpoint selection and
-measures how much choosing the next view helps.
-
-commands:
-{commands}
-
-common options:
-  --preset small|best|thesis
-                          small (default): 64×64 views, narrow networks, for a CPU; best: 128×128
-                          and wide ones for mevs study learned, thesis: the thesis's sizes, both for an
-                          accelerator; tiny: to see it all run in a minute
-  --data PATH             furniture10 (default, built in), modelnet10 or modelnet40 (downloaded), a
-                          folder <class>/{{train,test}}/ of .off, .obj, .stl, .ply or .glb, a zip of
-                          that layout, or an .npz of voxel grids
-  --archive FILE          ModelNet10.zip or ModelNet40.zip, where it is here already
-  --pretrained FILE ...   ImageNet weights for the classifiers: torchvision's .pth or .safetensors
-  --views N               candidate viewpoints around an object (default 40)
-  --out DIR               where everything is written (default runs/<preset>); a run goes on there
-
-`mevs COMMAND --help` lists every setting. Examples:
-  mevs run
-  mevs run --data modelnet10 --out runs/modelnet10
-  mevs study thesis --data modelnet10 --archive ModelNet10.zip
-  mevs train --out runs/modelnet10 --classifier.optimiser.epochs 20
-"""
+_HELP = ("-h", "--help")
 
 
-def _preset_of(arguments: list[str]) -> str:
-    """The preset named on the command line; it decides the defaults of all other settings."""
-    for position, argument in enumerate(arguments):
-        if argument.startswith("--preset="):
-            return argument.split("=", 1)[1]
-        if argument == "--preset" and position + 1 < len(arguments):
-            return arguments[position + 1]
-    return "small"
+def _fail(message: str, code: int = 2) -> None:
+    print(f"mevs: {message}", file=sys.stderr)
+    sys.exit(code)
 
 
-def _parse(command: str, arguments: list[str]) -> Options:
-    import tyro
+def _require_checkout() -> None:
+    """Ends with a sentence where only the library is installed: the wheel has no studies."""
+    import mevs_jax
+
+    root = Path(mevs_jax.__file__).resolve().parents[1]
+    if not all((root / package / "__init__.py").is_file() for package in ("data_pipeline", "train", "eval")):
+        _fail(
+            "the installed package holds the library alone; studies run from a checkout of the project: clone it, run "
+            "`make demo` there, and then use .venv/bin/mevs"
+        )
+    if str(root) not in sys.path:
+        sys.path.insert(0, str(root))
+
+
+def _run(name: str, arguments: list[str]) -> None:
+    import json
 
     from data_pipeline.errors import DataError
-    from eval.settings import PRESETS
-    from mevs_jax.cli.options import Options, options_from
+    from eval.run_file import NAME, configuration, load_run, save_run
+    from eval.stages import check_output
+    from mevs_jax.cli.parsing import parse
 
-    preset = _preset_of(arguments)
-    if preset not in PRESETS:
-        raise DataError(f"unknown preset {preset!r}; it is one of {', '.join(PRESETS)}")
-
-    return tyro.cli(
-        Options,
-        prog=f"mevs {command}",
-        description=COMMANDS[command],
-        args=arguments,
-        default=options_from(preset),  # type: ignore[arg-type]
-    )
-
-
-def _run(command: str, arguments: list[str]) -> None:
-    from data_pipeline.errors import DataError
-
-    options = _parse(command, arguments)
-    if command != "train" and (options.distributed or options.model_devices != 1):
-        raise DataError(
-            "--distributed and --model-devices go with mevs train alone; make the data first, then train, then eval"
-        )
-    if command != "data" and options.beam is not None:
-        raise DataError("--beam goes with mevs data alone")
-    if options.distributed:
-        from train.devices import join_processes
-
-        join_processes()  # before anything is computed
-    preset, settings = options.preset, options.settings()
-    out = options.out or Path("runs") / (preset if command != "thesis" else f"thesis-{preset}")
-    from data_pipeline.progress import console
-    from eval import stages
-    from train.devices import device_mesh, is_first
-    from train.tasks.classifier import starting_weights
-
-    console.quiet = options.distributed and not is_first()
-
-    stages.check_output(out)
-    if command == "thesis":
-        from eval.thesis.run import reproduce
-
-        if options.views is not None:
-            raise DataError(
-                "mevs study thesis makes both of the thesis's data sets, of 10 and of 40 views; leave --views out"
-            )
-
-        console.print(f"Report: {reproduce(settings, preset, out, options.pretrained).absolute()}")
+    call = parse(name, arguments)
+    if call.options.print_config:
+        print(json.dumps(configuration(call.preset, call.settings), indent=1, default=str))
         return
-    if command == "ascend":
-        from eval.rendering.ascent import ascend_on
-
-        sentence, path = ascend_on(settings.dataset, settings.ascent, out)
-        console.print(sentence)
-        console.print(f"Animation: {path.absolute()}")
-        return
-    if command == "learned":
-        console.print(f"Report: {stages.learn_to_choose(settings, out).absolute()}")
-        return
-    start = starting_weights(options.pretrained, settings.classifier.network)
-    if command in ("run", "data"):
-        stages.make_data(settings, out, options.beam)
-    if command in ("run", "train"):
-        stages.train(settings, out, start, device_mesh(options.model_devices))
-    if command == "sweep":
-        folder, members = stages.train_sweep(settings, out)
-        best = min(members, key=lambda member: member.loss)
-        console.print(
-            f"Best of {len(members)}: validation loss {best.loss:.4f} with learning rate {best.learning_rate:.2e}, weight decay "
-            f"{best.weight_decay:.2e}, dropout {best.dropout:.2f}, augmentation {best.augmentation:.2f}"
-        )
-        console.print(f"All of them: {folder / 'members.md'}; the best network: {folder / 'network'}")
-    if command == "compat":
-        stages.train_by_view(settings, out, start)
-    if command == "climb":
-        stages.ascend_on_objects(settings, out)
-    if command in ("run", "eval", "compat", "climb"):
-        metrics = stages.evaluate(settings, out)
-        console.print(
-            f"Single views: {100 * metrics['single_view']['accuracy']:.1f} % of {metrics['objects']} test objects right"
-        )
-        titles = {rung["policy"]: rung["title"] for rung in metrics["ladder"]}
-        after_two = ", ".join(
-            f"{titles[name]} {100 * metrics['policies'][name]['after_views'][1]:.1f} %"
-            for name in ("random", "predicted_entropy", "oracle_entropy", "information_gain")
-        )
-        console.print(f"After two views: {after_two}")
-        console.print(f"Metrics: {out / 'metrics.json'}")
-    if command == "live":
-        for policy, found in stages.check_live(settings, out).items():
-            console.print(
-                f"{policy}: {found.same} of {found.walks} walks are the same live as by table "
-                f"(confidences within {found.largest_difference:.1e})"
-            )
-    if command in ("run", "report", "compat", "climb"):
-        console.print(f"Report: {stages.report(settings, preset, out).absolute()}")
+    command = COMMANDS[name]
+    writes = command.writes_run and not getattr(call.options, "distributed", False)
+    if not getattr(call.options, "distributed", False):
+        check_output(call.out)
+    begins = writes and load_run(call.out) is None
+    typed = [*name.split(), *call.arguments]
+    if begins:  # a run that is interrupted continues with the same settings
+        save_run(call.out, call.preset, call.settings, typed)
+    try:
+        command.load()(call)
+    except DataError:
+        if begins:
+            (call.out / NAME).unlink(missing_ok=True)
+        raise
+    if writes:
+        save_run(call.out, call.preset, call.settings, typed)
 
 
 def _interrupt(signum: int, frame: object) -> None:
@@ -179,8 +72,10 @@ def _interrupt(signum: int, frame: object) -> None:
 
 
 def _begin_with_large_pages() -> None:
-    """Begins the program again so that glibc asks Linux for large pages, which it does only if told before: training on two CPU
-    cores then takes 11 % (ResNet-34) to 25 % (PointNet++) less time, since every step allots hundreds of megabytes anew.
+    """Starts the program again with large pages, which glibc requests from Linux only if an environment variable says so.
+
+    Training on two CPU cores then takes 11 % (ResNet-34) to 25 % (PointNet++) less time, since every step allocates hundreds of
+    megabytes anew.
     """
     alone = Path(sys.argv[0]).name in ("mevs", "__main__.py")  # not called from another program
     if not alone or "CS_GNU_LIBC_VERSION" not in getattr(os, "confstr_names", ()) or "GLIBC_TUNABLES" in os.environ:
@@ -189,52 +84,19 @@ def _begin_with_large_pages() -> None:
     os.execv(sys.executable, [sys.executable, *sys.orig_argv[1:]])
 
 
-def main() -> None:
-    """The program `mevs`.
-
-    Exit codes: 0; 2 for input that cannot be used; 130 when interrupted; 143 when asked to end (SIGTERM), with everything
-    saved; 75 when another process of the run was lost. After the last three, the same command goes on where it stopped.
-    """
-    arguments = sys.argv[1:]
-    if not arguments or arguments[0] in ("-h", "--help"):
-        print(_HELP.format(commands="\n".join(f"  {name:<8}{what}" for name, what in COMMANDS.items())))
-        sys.exit(0 if arguments else 2)
-    if arguments[0] == "--version":
-        from importlib.metadata import version
-
-        print(version("mevs-jax"))
-        return
-    if arguments[0] not in COMMANDS:
-        print(f"mevs: unknown command {arguments[0]!r}; it is one of {', '.join(COMMANDS)}", file=sys.stderr)
-        sys.exit(2)
-    _begin_with_large_pages()
-    os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "2")
-    # Tracing leaves many small objects that live: looking through them as often as Python does takes a twentieth of a short job.
-    gc.set_threshold(100_000, 50, 100)
+def _say_and_end(error: Exception) -> None:
+    """Ends the program for an error that a person can act on; returns for any other."""
     from data_pipeline.errors import DataError
+    from train.devices import is_lost_process
+    from train.preemption import Preempted
 
-    if hasattr(signal, "setitimer"):
-        signal.signal(signal.SIGINT, _interrupt)
-        signal.signal(signal.SIGALRM, _interrupt)
-    try:
-        _run(arguments[0], arguments[1:])
-    except (DataError, FloatingPointError) as error:  # the latter: a loss that is no number any more
-        print(f"mevs: {error}", file=sys.stderr)
-        sys.exit(2)
-    except KeyboardInterrupt:
-        if hasattr(signal, "setitimer"):
-            signal.setitimer(signal.ITIMER_REAL, 0)
-        print("mevs: interrupted; the same command goes on where it stopped", file=sys.stderr)
-        sys.exit(130)
-    except Exception as error:
-        from train.devices import is_lost_process
-        from train.preemption import Preempted
-
-        if isinstance(error, Preempted):
-            print(f"mevs: {error} and saved it; the same command goes on from there", file=sys.stderr)
-            sys.exit(143)
-        if not is_lost_process(error):
-            raise
+    if isinstance(error, DataError | FloatingPointError):  # the latter: a loss that is not finite any more
+        _fail(str(error))
+    if isinstance(error, ModuleNotFoundError) and error.name and not _is_ours(error.name):
+        _fail(f"the package {error.name} is not installed; install the study's packages: pip install -e '.[study]'")
+    if isinstance(error, Preempted):
+        _fail(f"{error} and saved it; the same command goes on from there", 143)
+    if is_lost_process(error):
         reason = str(error).splitlines()[0]
         print(
             f"mevs: another process of this run is gone ({reason}); start all of them again with the same command, which goes "
@@ -243,6 +105,66 @@ def main() -> None:
         )
         sys.stderr.flush()
         os._exit(75)  # JAX's own way out waits for the process that is gone
+
+
+def _is_ours(module: str) -> bool:
+    return module.split(".")[0] in ("mevs_jax", "data_pipeline", "train", "eval")
+
+
+def main() -> None:
+    """The program `mevs`.
+
+    Exit codes: 0; 2 for input that cannot be used; 130 when interrupted; 143 when asked to end (SIGTERM), with everything
+    saved; 75 when another process of the run was lost. After the last three, the same command goes on where it stopped.
+    """
+    try:
+        _main(sys.argv[1:])
+        sys.stdout.flush()
+    except BrokenPipeError:  # whoever read the output has closed it, as `| head` does
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        sys.exit(0)
+
+
+def _main(arguments: list[str]) -> None:
+    if not arguments or arguments[0] in _HELP:
+        print(help_text(), end="")
+        sys.exit(0 if arguments else 2)
+    if arguments[0] == "--version":
+        from mevs_jax import __version__
+
+        print(__version__)
+        return
+    if len(arguments) == 2 and arguments[1] in _HELP and any(name.startswith(arguments[0] + " ") for name in COMMANDS):
+        print(help_text(), end="")
+        return
+    try:
+        name, rest, note = find(arguments)
+    except ValueError as error:
+        _fail(str(error))
+        return
+    if note:
+        print(f"mevs: {note}", file=sys.stderr)
+    if any(argument in _HELP for argument in rest):
+        from mevs_jax.cli.parsing import show_options
+
+        show_options(name)
+    _begin_with_large_pages()
+    _require_checkout()
+    os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "2")
+    # Tracing leaves many small objects that live: looking through them as often as Python does takes a twentieth of a short job.
+    gc.set_threshold(100_000, 50, 100)
+    if hasattr(signal, "setitimer"):
+        signal.signal(signal.SIGINT, _interrupt)
+        signal.signal(signal.SIGALRM, _interrupt)
+    try:
+        _run(name, rest)
+    except KeyboardInterrupt:
+        if hasattr(signal, "setitimer"):
+            signal.setitimer(signal.ITIMER_REAL, 0)
+        _fail("interrupted; the same command goes on where it stopped", 130)
+    except Exception as error:
+        _say_and_end(error)
+        raise
 
 
 if __name__ == "__main__":

@@ -1,54 +1,98 @@
-"""Options of the command line."""
+"""The options of each command, without the settings of its stages. Light: imports nothing but tyro."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import tyro
 
-from eval.settings import PRESETS, Settings
+Preset = Literal["small", "best", "thesis", "tiny"]
+
+
+def _arg(metavar: str, default: str = "") -> Any:
+    """How an option is shown: its placeholder, and its default where that is not plain from the help text."""
+    return tyro.conf.arg(metavar=metavar, help_behavior_hint=f"(default: {default})" if default else "")
 
 
 @dataclass(frozen=True)
-class Options(Settings):
-    """What the command line takes: all settings, and short names for the common ones."""
+class Options:
+    """What every command takes."""
 
-    preset: Literal["small", "best", "thesis", "tiny"] = "small"
-    """which defaults all other settings have"""
-    data: str | None = None
-    """furniture10, modelnet10 or modelnet40 (downloaded), a folder of meshes, a zip of the same layout, or an .npz of voxel
-    grids; overrides dataset.source"""
-    archive: Annotated[str | None, tyro.conf.arg(metavar="FILE")] = None
-    """ModelNet10.zip or ModelNet40.zip where it is here already; overrides dataset.archive"""
-    views: Annotated[int | None, tyro.conf.arg(metavar="N")] = None
-    """candidate viewpoints around an object; overrides dataset.capture.views"""
-    out: Path | None = None
-    """where everything is written; runs/<preset> unless given"""
-    pretrained: Annotated[tuple[Path, ...], tyro.conf.arg(metavar="FILE")] = ()
-    """ImageNet weights to start classifiers from: torchvision's resnet18 (and resnet34), .pth or .safetensors"""
-    beam: Annotated[str | None, tyro.conf.arg(metavar="OPTIONS")] = None
-    """for mevs data: capture and write by Apache Beam, with such options, say "--runner=DirectRunner" (docs/scaling.md)"""
-    distributed: bool = False
-    """for mevs train: this is one of several processes, on one machine or many, that train together (docs/scaling.md)"""
-    model_devices: Annotated[int, tyro.conf.arg(metavar="N")] = 1
-    """for mevs train: devices that share one copy of a network's weights; batches are split over the others"""
-
-    def settings(self) -> Settings:
-        """The settings with the short names applied."""
-        dataset = self.dataset
-        if self.data is not None:
-            dataset = replace(dataset, source=self.data)
-        if self.archive is not None:
-            dataset = replace(dataset, archive=self.archive)
-        if self.views is not None:
-            dataset = replace(dataset, capture=replace(dataset.capture, views=self.views))
-        chosen = {field.name: getattr(self, field.name) for field in fields(Settings)}
-        return Settings(**chosen | {"dataset": dataset})
+    out: Annotated[Path | None, _arg("DIR", "runs/PRESET")] = None
+    """folder of the run: everything is written there, and a run continues there"""
+    preset: Annotated[Preset | None, _arg("small|best|thesis|tiny", "that of the run, or small")] = None
+    """defaults of all settings; a run that was begun keeps its own (run.json)"""
+    print_config: Annotated[tyro.conf.FlagCreatePairsOff[bool], _arg("")] = False
+    """print the resolved configuration as JSON and stop"""
 
 
-def options_from(preset: Literal["small", "best", "thesis", "tiny"]) -> Options:
-    """The defaults of all options under a preset."""
-    chosen = PRESETS[preset]
-    return Options(**{field.name: getattr(chosen, field.name) for field in fields(Settings)}, preset=preset)
+@dataclass(frozen=True)
+class WithSeed(Options):
+    """Commands that draw random numbers."""
+
+    seed: Annotated[int | None, _arg("N", "0")] = None
+    """seed of weights, training order and random policies (the split is --dataset.seed)"""
+
+
+@dataclass(frozen=True)
+class WithData(WithSeed):
+    """Commands that make a data set."""
+
+    data: Annotated[str | None, _arg("SOURCE", "furniture10, built in")] = None
+    """modelnet10 or modelnet40 (downloaded), a folder or zip of meshes (CLASS/train/, CLASS/test/), or an .npz of voxels"""
+    archive: Annotated[str | None, _arg("FILE")] = None
+    """ModelNet10.zip or ModelNet40.zip, where it has been downloaded already"""
+
+
+@dataclass(frozen=True)
+class WithViews(WithData):
+    """Commands that make one data set with a number of views of its own."""
+
+    views: Annotated[int | None, _arg("N", "40")] = None
+    """number of candidate viewpoints around an object"""
+
+
+@dataclass(frozen=True)
+class DataOptions(WithViews):
+    """Options of `mevs data`."""
+
+    beam: Annotated[str | None, _arg("OPTIONS")] = None
+    """use Apache Beam with these pipeline options, as "--runner=DirectRunner" (docs/scaling.md)"""
+
+
+@dataclass(frozen=True)
+class RunOptions(WithViews):
+    """Options of `mevs run`."""
+
+    pretrained: Annotated[tuple[Path, ...], _arg("FILE ...")] = ()
+    """ImageNet weights to start the classifier from: torchvision's .pth or .safetensors"""
+
+
+@dataclass(frozen=True)
+class ThesisOptions(WithData):
+    """Options of `mevs study thesis`."""
+
+    pretrained: Annotated[tuple[Path, ...], _arg("FILE ...")] = ()
+    """ImageNet weights to start the classifiers from: torchvision's resnet18 and resnet34"""
+
+
+@dataclass(frozen=True)
+class TrainOptions(WithSeed):
+    """Options of `mevs train`."""
+
+    pretrained: Annotated[tuple[Path, ...], _arg("FILE ...")] = ()
+    """ImageNet weights to start the classifier from: torchvision's .pth or .safetensors"""
+    distributed: Annotated[tyro.conf.FlagCreatePairsOff[bool], _arg("")] = False
+    """this is one of several processes that train together (docs/scaling.md)"""
+    model_devices: Annotated[int, _arg("N", "1")] = 1
+    """devices that share one copy of a network's weights; batches are split over the others"""
+
+
+@dataclass(frozen=True)
+class PublishedCodeOptions(WithSeed):
+    """Options of `mevs study published-code`."""
+
+    pretrained: Annotated[tuple[Path, ...], _arg("FILE ...")] = ()
+    """ImageNet weights to start the classifier from: torchvision's .pth or .safetensors"""

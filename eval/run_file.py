@@ -1,0 +1,106 @@
+"""`run.json`: what a run directory was made with. Later stages of the run start from these settings."""
+
+from __future__ import annotations
+
+import platform
+import types
+from dataclasses import asdict, dataclass, fields, is_dataclass
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
+
+from data_pipeline.errors import DataError
+from data_pipeline.files import as_read, read_json, write_json
+from eval.settings import Settings
+
+NAME = "run.json"
+Value = TypeVar("Value")
+
+
+@dataclass(frozen=True)
+class RunFile:
+    """What `run.json` holds.
+
+    Attributes:
+        preset: whose defaults the settings started from.
+        settings: all settings, as the stages so far were run with.
+    """
+
+    preset: str
+    settings: Settings
+
+
+def load_run(out: Path) -> RunFile | None:
+    """What the run directory `out` was made with; None where it has no `run.json`.
+
+    Raises:
+        DataError: for a file that is no `run.json` of this version.
+    """
+    path = out / NAME
+    if not path.exists():
+        return None
+    try:
+        content = read_json(path)
+        return RunFile(str(content["preset"]), from_plain(Settings, content["settings"], "settings"))
+    except (ValueError, KeyError, TypeError) as error:
+        raise DataError(
+            f"{path} cannot be read ({error}); delete it, and give the options of the run again, or choose another --out"
+        ) from error
+
+
+def save_run(out: Path, preset: str, settings: Settings, arguments: list[str]) -> None:
+    """Writes `run.json`; a file that holds the same settings already is left as it is."""
+    content, path = as_read(configuration(preset, settings)), out / NAME
+    if path.exists() and {name: value for name, value in read_json(path).items() if name in content} == content:
+        return
+    write_json(path, content | {"arguments": arguments, "made_with": _made_with()})
+
+
+def configuration(preset: str, settings: Settings) -> dict[str, Any]:
+    """The resolved configuration, as `run.json` has it and `--print-config` prints it."""
+    return {"preset": preset, "settings": asdict(settings)}
+
+
+def _made_with() -> dict[str, str]:
+    packages = ("mevs-jax", "jax", "flax", "optax", "numpy")
+    return {"python": platform.python_version(), **{name: version(name) for name in packages}}
+
+
+def from_plain(kind: type[Value], content: Any, where: str) -> Value:
+    """A value of a type made of dataclasses, tuples and plain values, from what JSON keeps of it.
+
+    Raises:
+        TypeError, ValueError: for content of another form; the message names the place.
+    """
+    origin, arguments = get_origin(kind), get_args(kind)
+    if is_dataclass(kind):
+        if not isinstance(content, dict):
+            raise TypeError(f"{where} is no object")
+        hints = get_type_hints(kind)
+        known = {field.name for field in fields(kind)}
+        if unknown := set(content) - known:
+            raise ValueError(f"{where} has no setting {min(unknown)!r}")
+        found = {name: from_plain(hints[name], value, f"{where}.{name}") for name, value in content.items()}
+        return kind(**found)
+    if origin is tuple:
+        if not isinstance(content, list):
+            raise TypeError(f"{where} is no list")
+        kinds = [arguments[0]] * len(content) if arguments[1:] == (...,) else list(arguments)
+        values = zip(kinds, content, strict=True)
+        return tuple(from_plain(one, item, f"{where}[{i}]") for i, (one, item) in enumerate(values))  # type: ignore
+    if origin in (Union, types.UnionType):
+        if content is None and type(None) in arguments:
+            return None  # type: ignore[return-value]
+        (one,) = [argument for argument in arguments if argument is not type(None)]
+        return from_plain(one, content, where)
+    if origin is Literal:
+        if content not in arguments:
+            raise ValueError(f"{where} is {content!r}, not one of {', '.join(map(str, arguments))}")
+        return content
+    if kind is Path:
+        return Path(content)  # type: ignore[return-value]
+    if kind is float and type(content) is int:
+        return float(content)  # type: ignore[return-value]
+    if kind is not Any and type(content) is not kind:
+        raise TypeError(f"{where} is {content!r}, not of type {kind.__name__}")
+    return content

@@ -1,0 +1,194 @@
+"""The commands of `mevs`: names, what each does, its options and the settings it uses. Light: nothing heavy is imported here."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from importlib import import_module
+
+
+@dataclass(frozen=True)
+class Command:
+    """One command.
+
+    Attributes:
+        title: what it does, in a line.
+        options: the class of its options in `mevs_jax.cli.options`, which is imported when needed.
+        settings: groups of settings that it uses, fields of `eval.settings.Settings`.
+        function: `module:function` that runs it, given an `Invocation`.
+        out: default of `--out`, where `{preset}` is the preset.
+        writes_run: whether its settings become those of the run, in `run.json`.
+    """
+
+    title: str
+    options: str
+    settings: tuple[str, ...]
+    function: str
+    out: str = "runs/{preset}"
+    writes_run: bool = True
+
+    def load(self) -> Callable:
+        module, name = self.function.split(":")
+        return getattr(import_module(f"mevs_jax.cli.{module}"), name)
+
+
+COMMANDS = {
+    "run": Command(
+        "data, train, eval and report; skips what is done",
+        "RunOptions",
+        ("dataset", "classifier", "entropy", "evaluation"),
+        "stages:run",
+    ),
+    "data": Command(
+        "capture objects from every viewpoint; write a sharded TFDS data set",
+        "DataOptions",
+        ("dataset",),
+        "stages:data",
+    ),
+    "train": Command(
+        "train the classifier and the entropy predictor",
+        "TrainOptions",
+        ("classifier", "entropy"),
+        "stages:train",
+    ),
+    "sweep": Command(
+        "train many configurations of one network as one program",
+        "WithSeed",
+        ("sweep", "classifier", "entropy"),
+        "stages:sweep",
+    ),
+    "eval": Command(
+        "run every policy on every test object from every start view",
+        "WithSeed",
+        ("evaluation",),
+        "stages:evaluate",
+    ),
+    "report": Command("write report/index.html", "Options", (), "stages:report"),
+    "study thesis": Command(
+        "every network, table and figure of the thesis, beside its own numbers",
+        "ThesisOptions",
+        ("dataset", "classifier", "entropy", "evaluation", "thesis"),
+        "studies:thesis",
+        "runs/thesis-{preset}",
+    ),
+    "study learned": Command(
+        "learn to fuse views and to choose them; compare with all policies",
+        "WithViews",
+        ("dataset", "learned"),
+        "studies:learned",
+    ),
+    "study rendering": Command(
+        "policies by differentiable rendering; evaluate and report again",
+        "WithViews",
+        ("dataset", "rendering", "evaluation"),
+        "studies:rendering",
+    ),
+    "study published-code": Command(
+        "what the thesis's published code changes; evaluate and report again",
+        "PublishedCodeOptions",
+        ("classifier", "evaluation"),
+        "studies:published_code",
+    ),
+    "check live": Command(
+        "walk with the networks in the loop; compare with the view tables",
+        "Options",
+        ("live",),
+        "checks:live",
+        writes_run=False,
+    ),
+    "draw ascent": Command(
+        "ascend to the best view of one object by a renderer's gradient; draw it",
+        "WithViews",
+        ("dataset", "ascent"),
+        "drawings:ascent",
+        writes_run=False,
+    ),
+}
+
+ALIASES = {
+    "thesis": "study thesis",
+    "active": "study learned",
+    "climb": "study rendering",
+    "compat": "study published-code",
+    "live": "check live",
+    "ascend": "draw ascent",
+}
+"""Names of version 0.1, which this version still takes."""
+
+_OLD_OPTIONS = {
+    "--active.": "--learned.",
+    "--climb.": "--rendering.",
+    "--thesis.climbing-": "--thesis.ascent-",
+}
+
+HELP = """usage: mevs COMMAND [--out DIR] [--preset small|best|thesis|tiny] [OPTIONS] [SETTINGS]
+
+Where should a camera look next? Trains the networks of maximum entropy viewpoint selection and
+measures how much choosing the next view helps.
+
+stages of a run:
+{stages}
+
+studies, checks, drawings:
+{others}
+
+common options:
+  --out DIR               where everything is written (default runs/<preset>); a run continues there
+  --preset NAME           small (default): 64×64 views and narrow networks, for a CPU; best, thesis:
+                          for an accelerator; tiny: to see it all work in a minute
+  --data PATH             furniture10 (default, built in), modelnet10 or modelnet40 (downloaded), a
+                          folder <class>/{{train,test}}/ of .off, .obj, .stl, .ply or .glb, a zip of
+                          that layout, or an .npz of voxel grids
+  --archive FILE          ModelNet10.zip or ModelNet40.zip, where it has been downloaded already
+  --views N               candidate viewpoints around an object (default 40)
+  --pretrained FILE ...   ImageNet weights for the classifiers: torchvision's .pth or .safetensors
+  --seed N                seed of everything that is random (default 0)
+  --print-config          print the resolved configuration as JSON, and stop
+
+`mevs COMMAND --help` lists the options of a command, --help-all its settings too. Examples:
+  mevs run
+  mevs run --data modelnet10 --out runs/modelnet10
+  mevs study thesis --data modelnet10 --archive ModelNet10.zip
+  mevs train --out runs/modelnet10 --classifier.optimiser.epochs 20
+"""
+
+
+def help_text() -> str:
+    """What `mevs --help` prints."""
+
+    def lines(grouped: bool) -> str:
+        shown = {name: command for name, command in COMMANDS.items() if (" " in name) == grouped}
+        width = max(map(len, shown)) + 2
+        return "\n".join(f"  {name:<{width}}{command.title}" for name, command in shown.items())
+
+    return HELP.format(stages=lines(False), others=lines(True))
+
+
+def find(arguments: Sequence[str]) -> tuple[str, list[str], str | None]:
+    """The command that arguments begin with, the arguments after it, and a note where an old name was used.
+
+    Raises:
+        ValueError: for a command that does not exist.
+    """
+    first, rest = arguments[0], list(arguments[1:])
+    rest = [_renamed(argument) for argument in rest]
+    if first in COMMANDS:
+        return first, rest, None
+    if first in ALIASES:
+        name = ALIASES[first]
+        return name, rest, f"`mevs {first}` is now `mevs {name}`; the old name goes with the next version"
+    members = [name.split()[1] for name in COMMANDS if name.split()[0] == first and " " in name]
+    if members and rest and rest[0] in members:
+        return f"{first} {rest[0]}", rest[1:], None
+    if members:
+        found = f"{rest[0]!r} is none of them" if rest and not rest[0].startswith("-") else "none was given"
+        raise ValueError(f"mevs {first} is followed by one of {', '.join(members)}; {found}")
+    names = dict.fromkeys(name.split()[0] for name in COMMANDS)
+    raise ValueError(f"unknown command {first!r}; it is one of {', '.join(names)} (see mevs --help)")
+
+
+def _renamed(argument: str) -> str:
+    for old, new in _OLD_OPTIONS.items():
+        if argument.startswith(old):
+            return new + argument.removeprefix(old)
+    return argument

@@ -1,0 +1,126 @@
+"""From arguments to what a command is to do: options, settings, output directory."""
+
+from __future__ import annotations
+
+import dataclasses
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import tyro
+
+from mevs_jax.cli import options as option_classes
+from mevs_jax.cli.commands import COMMANDS, Command
+
+if TYPE_CHECKING:
+    from eval.settings import Settings
+
+
+@dataclass(frozen=True)
+class Invocation:
+    """One call of a command.
+
+    Attributes:
+        options: of the command, one of `mevs_jax.cli.options`.
+        settings: all settings, with the options applied.
+        preset: whose defaults they started from.
+        out: the run directory.
+        arguments: as typed, after the command.
+    """
+
+    options: Any
+    settings: Settings
+    preset: str
+    out: Path
+    arguments: list[str]
+
+
+def show_options(name: str) -> None:
+    """Prints the options of a command, without its settings, and exits."""
+    command = COMMANDS[name]
+    about = f"{command.title}."
+    if command.settings:
+        about += f" Settings (listed by --help-all): {', '.join(f'--{group}.*' for group in command.settings)}."
+    tyro.cli(_class_of(command), prog=f"mevs {name}", description=about, args=["--help"])
+
+
+def _class_of(command: Command) -> type[option_classes.Options]:
+    return getattr(option_classes, command.options)
+
+
+def _given(arguments: list[str], flag: str) -> str | None:
+    """The value of an option on the command line, which decides the defaults of others."""
+    found = None
+    for position, argument in enumerate(arguments):
+        if argument.startswith(f"{flag}="):
+            found = argument.split("=", 1)[1]
+        elif argument == flag and position + 1 < len(arguments):
+            found = arguments[position + 1]
+    return found
+
+
+def parse(name: str, arguments: list[str]) -> Invocation:
+    """What a command is called with. Settings start from the run's own `run.json`, or else from the preset.
+
+    Raises:
+        DataError: for an unknown preset, or a `run.json` that cannot be read.
+        SystemExit: for options that tyro refuses, after its message.
+    """
+    from data_pipeline.errors import DataError
+    from eval.run_file import load_run
+    from eval.settings import PRESETS
+
+    command = COMMANDS[name]
+    preset, out = _given(arguments, "--preset"), _given(arguments, "--out")
+    if preset is not None and preset not in PRESETS:
+        raise DataError(f"unknown preset {preset!r}; it is one of {', '.join(PRESETS)}")
+    folder = Path(out or command.out.format(preset=preset or "small"))
+    run = load_run(folder)
+    if run is not None and preset in (None, run.preset):
+        preset, base = run.preset, run.settings
+    else:
+        preset = preset or "small"
+        base = PRESETS[preset]
+    kind = _options_with_settings(command, base)
+    arguments = ["--help" if argument == "--help-all" else argument for argument in arguments]
+    options: Any = tyro.cli(kind, prog=f"mevs {name}", description=f"{command.title}.", args=arguments)
+    return Invocation(options, settings_of(options, command, base), preset, folder, arguments)
+
+
+def _options_with_settings(command: Command, base: Settings) -> type:
+    """The command's options with its groups of settings beside them."""
+    groups = [(group, type(value), dataclasses.field(default=value)) for group, value in _groups(command, base).items()]
+    return dataclasses.make_dataclass(command.options, groups, bases=(_class_of(command),), frozen=True)
+
+
+def _groups(command: Command, base: Settings) -> dict[str, Any]:
+    return {group: getattr(base, group) for group in command.settings}
+
+
+def settings_of(options: Any, command: Command, base: Settings) -> Settings:
+    """All settings: the command's own as given, the others as they were; short options override."""
+    settings = replace(base, **{group: getattr(options, group) for group in command.settings})
+    dataset = settings.dataset
+    if getattr(options, "data", None) is not None:
+        dataset = replace(dataset, source=options.data)
+    if getattr(options, "archive", None) is not None:
+        dataset = replace(dataset, archive=options.archive)
+    if getattr(options, "views", None) is not None:
+        dataset = replace(dataset, capture=replace(dataset.capture, views=options.views))
+    settings = replace(settings, dataset=dataset)
+    seed = getattr(options, "seed", None)
+    return settings if seed is None else with_seed(settings, seed)
+
+
+def with_seed(settings: Any, seed: int) -> Any:
+    """Settings in which every field called `seed` or `data_seed` is this seed, but for the data set's own."""
+    changed = {}
+    for field in dataclasses.fields(settings):
+        if field.name == "dataset":
+            continue
+        value = getattr(settings, field.name)
+        if field.name in ("seed", "data_seed"):
+            changed[field.name] = seed
+        elif dataclasses.is_dataclass(value):
+            changed[field.name] = with_seed(value, seed)
+    return replace(settings, **changed)

@@ -1,0 +1,76 @@
+"""The stages of a run: `mevs run`, `data`, `train`, `sweep`, `eval`, `report`."""
+
+from __future__ import annotations
+
+from mevs_jax.cli.parsing import Invocation
+
+
+def run(call: Invocation) -> None:
+    """All stages, one after the other."""
+    from eval import stages
+    from train.tasks.classifier import starting_weights
+
+    start = starting_weights(call.options.pretrained, call.settings.classifier.network)
+    stages.make_data(call.settings, call.out)
+    stages.train(call.settings, call.out, start)
+    evaluate(call)
+    report(call)
+
+
+def data(call: Invocation) -> None:
+    """The data set."""
+    from eval import stages
+
+    statistics = stages.make_data(call.settings, call.out, call.options.beam)
+    counts = ", ".join(f"{sum(of.values())} {split}" for split, of in statistics.counts.items())
+    print(f"Data set: {counts} objects of {len(statistics.classes)} classes, {statistics.views} views each")
+
+
+def train(call: Invocation) -> None:
+    """The networks, with other processes if there are any."""
+    from data_pipeline.progress import console
+    from eval import stages
+    from train.devices import device_mesh, is_first, join_processes
+    from train.tasks.classifier import starting_weights
+
+    if call.options.distributed:
+        join_processes()  # before anything is computed
+        console.quiet = not is_first()
+    start = starting_weights(call.options.pretrained, call.settings.classifier.network)
+    stages.train(call.settings, call.out, start, device_mesh(call.options.model_devices))
+
+
+def sweep(call: Invocation) -> None:
+    """A sweep over one network's hyperparameters."""
+    from eval import stages
+
+    folder, members = stages.train_sweep(call.settings, call.out)
+    best = min(members, key=lambda member: member.loss)
+    print(
+        f"Best of {len(members)}: validation loss {best.loss:.4f} with learning rate {best.learning_rate:.2e}, weight decay "
+        f"{best.weight_decay:.2e}, dropout {best.dropout:.2f}, augmentation {best.augmentation:.2f}"
+    )
+    print(f"All of them: {folder / 'members.md'}; the best network: {folder / 'network'}")
+
+
+def evaluate(call: Invocation) -> None:
+    """The metrics, and the main ones in a few lines."""
+    from eval import stages
+
+    metrics = stages.evaluate(call.settings, call.out)
+    accuracy = metrics["single_view"]["accuracy"]
+    print(f"Single views: {100 * accuracy:.1f} % of {metrics['objects']} test objects right")
+    titles = {rung["policy"]: rung["title"] for rung in metrics["ladder"]}
+    after_two = ", ".join(
+        f"{titles[name]} {100 * metrics['policies'][name]['after_views'][1]:.1f} %"
+        for name in ("random", "predicted_entropy", "oracle_entropy", "information_gain")
+    )
+    print(f"After two views: {after_two}")
+    print(f"Metrics: {call.out / 'metrics.json'}")
+
+
+def report(call: Invocation) -> None:
+    """The report."""
+    from eval import stages
+
+    print(f"Report: {stages.report(call.settings, call.preset, call.out).absolute()}")

@@ -1,0 +1,41 @@
+"""Studies: `mevs study thesis`, `learned`, `rendering`, `published-code`."""
+
+from __future__ import annotations
+
+from mevs_jax.cli.parsing import Invocation
+from mevs_jax.cli.stages import evaluate, report
+
+
+def thesis(call: Invocation) -> None:
+    """The thesis, whole."""
+    from eval.thesis.run import reproduce
+
+    page = reproduce(call.settings, call.preset, call.out, call.options.pretrained)
+    print(f"Report: {page.absolute()}")
+
+
+def learned(call: Invocation) -> None:
+    """Learned fusion and learned choice."""
+    from eval import stages
+
+    print(f"Report: {stages.learn_to_choose(call.settings, call.out).absolute()}")
+
+
+def rendering(call: Invocation) -> None:
+    """Policies by differentiable rendering."""
+    from eval import stages
+
+    stages.ascend_on_objects(call.settings, call.out)
+    evaluate(call)
+    report(call)
+
+
+def published_code(call: Invocation) -> None:
+    """What the published code does otherwise than the thesis's text."""
+    from eval import stages
+    from train.tasks.classifier import starting_weights
+
+    start = starting_weights(call.options.pretrained, call.settings.classifier.network)
+    stages.train_by_view(call.settings, call.out, start)
+    evaluate(call)
+    report(call)
