@@ -182,7 +182,7 @@ def find(arguments: Sequence[str]) -> tuple[str, list[str], str | None]:
         return f"{first} {rest[0]}", rest[1:], None
     if members:
         found = f"{rest[0]!r} is none of them" if rest and not rest[0].startswith("-") else "none was given"
-        raise ValueError(f"mevs {first} is followed by one of {', '.join(members)}; {found}")
+        raise ValueError(f"`mevs {first}` is followed by one of {', '.join(members)}; {found}")
     names = dict.fromkeys(name.split()[0] for name in COMMANDS)
     raise ValueError(f"unknown command {first!r}; it is one of {', '.join(names)} (see mevs --help)")
 

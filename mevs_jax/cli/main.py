@@ -142,13 +142,13 @@ def _main(arguments: list[str]) -> None:
     except ValueError as error:
         _fail(str(error))
         return
-    if note:
-        print(f"mevs: {note}", file=sys.stderr)
     if any(argument in _HELP for argument in rest):
         from mevs_jax.cli.parsing import show_options
 
         show_options(name)
     _begin_with_large_pages()
+    if note:
+        print(f"mevs: {note}", file=sys.stderr)
     _require_checkout()
     os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "2")
     # Tracing leaves many small objects that live: looking through them as often as Python does takes a twentieth of a short job.
