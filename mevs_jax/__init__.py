@@ -5,11 +5,9 @@ Everything takes *one* object, cloud or view; put `jax.vmap` on for many. No fil
 
 from mevs_jax.beliefs import (
     CalibratedFusion,
-    beliefs_along,
     confidence,
     discounted,
     mean_of_probabilities,
-    sum_of_logits,
 )
 from mevs_jax.calibration import (
     calibration_error_by_chance,
@@ -28,7 +26,6 @@ from mevs_jax.metrics import (
     bootstrap_means,
     class_accuracy,
     confusion_matrix,
-    mean_squared_error,
 )
 from mevs_jax.models import Abstraction, PointNet2, Recogniser, ResNet, ViewPolicy, count_parameters
 from mevs_jax.models.pretrained import pointnet2_from_torch, resnet_from_torch
@@ -53,7 +50,7 @@ from mevs_jax.selection import (
     by_attention,
     select_from_table,
     select_views,
-    stop_at,
+    sum_of_logits,
 )
 from mevs_jax.viewpoints import (
     ViewGraph,
@@ -89,7 +86,6 @@ __all__ = [
     "ViewTable",
     "accuracy",
     "ball_query",
-    "beliefs_along",
     "bootstrap_interval",
     "bootstrap_means",
     "by_attention",
@@ -115,7 +111,6 @@ __all__ = [
     "look_at_origin",
     "maxima_first",
     "mean_of_probabilities",
-    "mean_squared_error",
     "negative_log_likelihood",
     "nested_lattice",
     "orbit",
@@ -130,7 +125,6 @@ __all__ = [
     "select_from_table",
     "select_views",
     "shannon_entropy",
-    "stop_at",
     "sum_of_logits",
     "unproject",
     "viewpoint_lattice",
