@@ -110,7 +110,8 @@ class SetFusion(nnx.Module):
             directions: unit vectors from the object to the cameras.
             present: True for the views to use; the values of the others are ignored.
             key: PRNG key for dropout in training; no dropout without.
-            posed: whether directions are in the object's own frame, or in one rotated about the vertical axis by an unknown angle.
+            posed: whether directions are in the object's own frame; if not, in one rotated about the vertical axis by an unknown
+                angle.
         """
         features, directions, present = jnp.asarray(features), jnp.asarray(directions), jnp.asarray(present)
         if not posed:

@@ -76,7 +76,8 @@ class ViewPolicy(nnx.Module):
         heads: number of attention heads.
         blocks: number of cross-attention blocks.
         cloud: length of PointNet++'s embedding of the partial cloud of each view; 0 for none.
-        posed: whether directions are in the object's own frame, or in one rotated about the vertical axis by an unknown angle.
+        posed: whether directions are in the object's own frame; if not, in one rotated about the vertical axis by an unknown
+            angle.
         utility, floor: the utility whose gain is predicted; see `utility_of`.
         rngs: source of the initial weights.
     """

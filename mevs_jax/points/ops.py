@@ -62,8 +62,9 @@ def farthest_point_sample(points: Float[AnyArray, "points 3"], k: int) -> Int[Ar
 
 def _farthest_of_array(points: Float[Array, "points 3"], k: int) -> Int[Array, " {k}"]:
     """`farthest_point_sample` as an array program."""
-    # On CPU, XLA vectorises maxima over columns, but neither argmax nor a maximum over a whole array. So the points are arranged
-    # in a grid, consecutive points below each other. The maxima of its columns give the column of the farthest point, then its row.
+    # On CPU, XLA vectorises operations along columns, but neither argmax nor a maximum over a whole array. So the points are
+    # arranged in a grid, consecutive points below each other. The maxima of its columns give the column of the farthest point,
+    # then its row.
     count = points.shape[0]
     rows = 1 << max(0, (count.bit_length() - 1) // 2 - 1)
     padded = jnp.pad(points, ((0, -count % rows), (0, 0)))
