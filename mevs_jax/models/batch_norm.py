@@ -104,13 +104,13 @@ def _normalise_forward(x: Array, scale: Array, bias: Array, epsilon: float):
     return ((x - mean) * (scale * inverse) + bias, mean, variance), (x, mean, inverse, scale)
 
 
-def _normalise_backward(epsilon: float, kept: tuple[Array, ...], cotangents: tuple[Array, Array, Array]):
-    x, mean, inverse, scale = kept
-    towards = cotangents[0]
+def _normalise_backward(epsilon: float, residuals: tuple[Array, ...], cotangents: tuple[Array, Array, Array]):
+    x, mean, inverse, scale = residuals
+    cotangent = cotangents[0]
     axes, count = tuple(range(x.ndim - 1)), x.size // x.shape[-1]
-    of_bias = jnp.sum(towards, axes)
-    of_scale = jnp.sum(towards * (x - mean), axes) * inverse
-    of_x = scale * inverse * (towards - of_bias / count - (x - mean) * (inverse * of_scale / count))
+    of_bias = jnp.sum(cotangent, axes)
+    of_scale = jnp.sum(cotangent * (x - mean), axes) * inverse
+    of_x = scale * inverse * (cotangent - of_bias / count - (x - mean) * (inverse * of_scale / count))
     return of_x, of_scale, of_bias
 
 
@@ -136,19 +136,19 @@ def _largest_normalised_forward(x: Array, scale: Array, bias: Array, epsilon: fl
     return (out, mean, variance), (x, extreme, out > 0, mean, inverse, scale)
 
 
-def _largest_normalised_backward(epsilon: float, kept: tuple[Array, ...], cotangents: tuple[Array, Array, Array]):
-    x, extreme, positive, mean, inverse, scale = kept
-    towards = jnp.where(positive, cotangents[0], 0.0)
+def _largest_normalised_backward(epsilon: float, residuals: tuple[Array, ...], cotangents: tuple[Array, Array, Array]):
+    x, extreme, positive, mean, inverse, scale = residuals
+    cotangent = jnp.where(positive, cotangents[0], 0.0)
     count = x.size // x.shape[-1]
-    of_bias = jnp.sum(towards, axis=0)
-    of_scale = jnp.sum(towards * (extreme - mean), axis=0) * inverse
+    of_bias = jnp.sum(cotangent, axis=0)
+    of_scale = jnp.sum(cotangent * (extreme - mean), axis=0) * inverse
     factor = scale * inverse
     slope = factor * inverse * of_scale / count
     row = jnp.arange(x.shape[1], dtype=jnp.int32)[None, :, None]
     first = jnp.min(jnp.where(x == extreme[:, None], row, x.shape[1]), axis=1)
     # The barrier keeps the compiler from recomputing `first` for every row.
     chosen = row == jax.lax.optimization_barrier(first)[:, None]
-    of_x = jnp.where(chosen, (towards * factor)[:, None], 0.0) - (factor * of_bias / count - mean * slope) - x * slope
+    of_x = jnp.where(chosen, (cotangent * factor)[:, None], 0.0) - (factor * of_bias / count - mean * slope) - x * slope
     return of_x, of_scale, of_bias
 
 

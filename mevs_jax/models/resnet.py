@@ -52,10 +52,10 @@ def _forwards(x: Array, kernel: Array, stride: int) -> tuple[Array, tuple[Array,
     return _convolve(x, kernel, stride), (x, kernel)
 
 
-def _backwards(stride: int, kept: tuple[Array, Array], towards: Array) -> tuple[Array, Array]:
-    x, kernel = kept
-    (of_x,) = jax.vjp(lambda x: _convolve(x, kernel, stride), x)[1](towards)
-    rows = towards.reshape(-1, towards.shape[-1])
+def _backwards(stride: int, residuals: tuple[Array, Array], cotangent: Array) -> tuple[Array, Array]:
+    x, kernel = residuals
+    (of_x,) = jax.vjp(lambda x: _convolve(x, kernel, stride), x)[1](cotangent)
+    rows = cotangent.reshape(-1, cotangent.shape[-1])
     of_kernel = jnp.matmul(_patches(x, kernel.shape[0], stride).T, rows, preferred_element_type=jnp.float32)
     return of_x, of_kernel.reshape(kernel.shape).astype(kernel.dtype)
 

@@ -33,9 +33,8 @@ def learned(
         if by == "state":
             return gain
         if by == "table":
-            gain_if = (
-                gain_if + _gain_by_table(network, state.belief, required(scene.knowledge, "Scene.knowledge"))
-            ) / 2
+            knowledge = required(scene.knowledge, "Scene.knowledge")
+            gain_if = (gain_if + _gain_by_table(network, state.belief, knowledge)) / 2
         return expected_gain(state.belief, gain_if)
 
     return scores

@@ -52,10 +52,10 @@ def _forward(corners: Array, face: Array, rises: bool) -> tuple[Array, tuple[Arr
     return (face >= 0).astype(corners.dtype), (corners, face)
 
 
-def _backward(rises: bool, kept: tuple[Array, Array], towards: Array) -> tuple[Array, None]:
-    corners, face = kept
-    along_x = _of_rows(corners, face, towards, rises)
-    along_y = _of_rows(corners[..., ::-1], face.T, towards.T, rises)
+def _backward(rises: bool, residuals: tuple[Array, Array], cotangent: Array) -> tuple[Array, None]:
+    corners, face = residuals
+    along_x = _of_rows(corners, face, cotangent, rises)
+    along_y = _of_rows(corners[..., ::-1], face.T, cotangent.T, rises)
     return jnp.stack([along_x, along_y], axis=-1), None
 
 
@@ -63,7 +63,7 @@ _silhouette.defvjp(_forward, _backward)
 
 
 def _of_rows(
-    corners: Float[Array, "faces 3 2"], face: Int[Array, "side side"], towards: Float[Array, "side side"], rises: bool
+    corners: Float[Array, "faces 3 2"], face: Int[Array, "side side"], cotangent: Float[Array, "side side"], rises: bool
 ) -> Float[Array, "faces 3"]:
     """The gradient with respect to the x of the corners, from edges that move along the rows."""
     side = face.shape[0]
@@ -88,7 +88,7 @@ def _of_rows(
         # Change of each pixel of a row: +1 for background outside of the edge, −1 for this face inside of it.
         outside = (pixel - crossing[:, None]) * inwards < 0
         gain = jnp.where(outside & ~covered, 1.0, 0.0) - jnp.where(~outside & (face == number), 1.0, 0.0)
-        pull = gain * towards
+        pull = gain * cotangent
         pull = jnp.where(pull > 0 if rises else pull < 0, pull, 0.0)
         distance = pixel - crossing[:, None]
         distance = jnp.where(distance < 0, jnp.minimum(distance, -_NEAREST), jnp.maximum(distance, _NEAREST))

@@ -1,7 +1,7 @@
 """Objectives for good views, with gradients; larger is better.
 
-Each objective takes soft images. Evaluated on hard images (from ray casting or a threshold) it is its own hard counterpart, unless
-its docstring names another.
+Each objective takes soft images. Evaluated on hard images (from ray casting or a threshold), it is its own hard counterpart,
+unless its docstring names another.
 """
 
 from __future__ import annotations

@@ -131,8 +131,8 @@ def _march_back_forward(cells: Array, rays: tuple[Array, Array], steps: int, abs
     return (transmitted, depth), (cells, rays, transmitted)
 
 
-def _march_back_backward(steps: int, absorption: float, kept: tuple, cotangents: tuple[Array, Array]):
-    cells, rays, transmitted = kept
+def _march_back_backward(steps: int, absorption: float, residuals: tuple, cotangents: tuple[Array, Array]):
+    cells, rays, transmitted = residuals
     of_transmitted, of_depth = cotangents
 
     def step(carry: tuple, number: Array) -> tuple[tuple, None]:
