@@ -32,7 +32,7 @@ from eval.walks.grid import FIRST_MV, GridConfig
 from eval.walks.knowledge import learn
 from eval.walks.ladder import ASCENT_RUNGS
 from eval.walks.live import Agreement, Networks, compare_with_tables
-from mevs_jax.policies.registry import POLICIES
+from mevs_jax.policies.registry import policy_named
 from mevs_jax.viewpoints import ViewGraph
 from train.choosing.stages import Stages, check_learned
 from train.kept import made_by
@@ -200,8 +200,10 @@ def ascend_on_objects(settings: Settings, out: Path) -> None:
 def check_live(settings: Settings, out: Path) -> dict[str, Agreement]:
     """Walks test objects with the networks in the loop and compares with the tables; writes `live.json`."""
     for policy in settings.live.policies:
-        if policy not in POLICIES:
-            raise DataError(f"unknown policy {policy!r}; it is one of {', '.join(POLICIES)}")
+        try:
+            policy_named(policy)
+        except ValueError as error:
+            raise DataError(str(error)) from error
         if policy in {rung.policy for rung in ASCENT_RUNGS}:
             raise DataError(f"{policy} looks into what mevs study rendering has found; live walks have no such tables")
     statistics = load_statistics(out / "data")

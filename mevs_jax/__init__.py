@@ -13,11 +13,9 @@ __version__ = "0.2.0.dev0"
 _MODULES = {
     "beliefs": (
         "CalibratedFusion",
-        "beliefs_along",
         "confidence",
         "discounted",
         "mean_of_probabilities",
-        "sum_of_logits",
     ),
     "calibration": (
         "calibration_error_by_chance",
@@ -53,7 +51,6 @@ _MODULES = {
         "bootstrap_means",
         "class_accuracy",
         "confusion_matrix",
-        "mean_squared_error",
     ),
     "models": (
         "Abstraction",
@@ -84,14 +81,14 @@ _MODULES = {
     ),
     "policies.learned": ("learned",),
     "policies.oracles": ("fused_oracle",),
-    "policies.registry": ("POLICIES",),
+    "policies.registry": ("POLICIES", "policy_named", "register_policy"),
     "selection": (
+        "sum_of_logits",
         "Episode",
         "ViewTable",
         "by_attention",
         "select_from_table",
         "select_views",
-        "stop_at",
     ),
     "viewpoints": (
         "ViewGraph",

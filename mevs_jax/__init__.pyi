@@ -4,7 +4,6 @@ from mevs_jax.beliefs import (
     CalibratedFusion as CalibratedFusion,
 )
 from mevs_jax.beliefs import (
-    beliefs_along as beliefs_along,
 )
 from mevs_jax.beliefs import (
     confidence as confidence,
@@ -16,7 +15,6 @@ from mevs_jax.beliefs import (
     mean_of_probabilities as mean_of_probabilities,
 )
 from mevs_jax.beliefs import (
-    sum_of_logits as sum_of_logits,
 )
 from mevs_jax.calibration import (
     calibration_error_by_chance as calibration_error_by_chance,
@@ -94,7 +92,6 @@ from mevs_jax.metrics import (
     confusion_matrix as confusion_matrix,
 )
 from mevs_jax.metrics import (
-    mean_squared_error as mean_squared_error,
 )
 from mevs_jax.models import (
     Abstraction as Abstraction,
@@ -161,24 +158,31 @@ from mevs_jax.policies.oracles import (
 )
 from mevs_jax.policies.registry import (
     POLICIES as POLICIES,
+    policy_named as policy_named,
+    register_policy as register_policy,
 )
 from mevs_jax.selection import (
+    sum_of_logits as sum_of_logits,
     Episode as Episode,
 )
 from mevs_jax.selection import (
+    sum_of_logits as sum_of_logits,
     ViewTable as ViewTable,
 )
 from mevs_jax.selection import (
+    sum_of_logits as sum_of_logits,
     by_attention as by_attention,
 )
 from mevs_jax.selection import (
+    sum_of_logits as sum_of_logits,
     select_from_table as select_from_table,
 )
 from mevs_jax.selection import (
+    sum_of_logits as sum_of_logits,
     select_views as select_views,
 )
 from mevs_jax.selection import (
-    stop_at as stop_at,
+    sum_of_logits as sum_of_logits,
 )
 from mevs_jax.viewpoints import (
     ViewGraph as ViewGraph,

@@ -1,4 +1,4 @@
-"""The kind of array that public functions take: JAX's own or NumPy's."""
+"""The array types that public functions accept: JAX's and NumPy's."""
 
 from __future__ import annotations
 

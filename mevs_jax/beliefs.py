@@ -1,14 +1,13 @@
-"""How the logits of several views become one belief.
+"""Beliefs: the class probabilities of an object after several views, and how far they can be trusted.
 
-The thesis adds them (§4.4): a product of experts that takes the views to be independent. The belief is kept as unnormalised
-log-probabilities, so a fusion is one function from (belief, logits) to belief.
+A belief is a vector of unnormalised log-probabilities. The thesis adds the logits of the views (§4.4): a product of experts,
+which assumes that views are independent. Views of one object are not, so the sum finds the most likely class but is too
+confident.
 
-What the sum gets wrong is not which class is the most likely but how sure one may be: views of one object are anything but
-independent. All of the family p ∝ Π pᵢ^α with an α that depends on the number of views (`discounted`) agree on the class; the
-thesis has α = 1, the mean of log-probabilities α = 1/n, and α = 1/T(n) is what `mevs_jax.calibration` fits. The mean of
-probabilities (a mixture) can disagree.
-
-`SetFusion` is learned: a belief of features and directions of any views, which need not be independent.
+All beliefs of the family p ∝ Π pᵢ^α, where α depends on the number of views n alone, agree on the class (`discounted`): α = 1
+is the thesis's sum, α = 1/n the mean of log-probabilities, and α = 1/T(n) uses temperatures fitted by `mevs_jax.calibration`.
+The mean of probabilities (a mixture) can disagree. A `CalibratedFusion` computes the belief by a trained network from the
+features and directions of the views, which need not be independent.
 """
 
 from __future__ import annotations
@@ -22,33 +21,31 @@ from jaxtyping import Array, Bool, Float
 from mevs_jax.arrays import AnyArray
 
 
-def sum_of_logits(belief: Float[Array, " classes"], logits: Float[Array, " classes"]) -> Float[Array, " classes"]:
-    """The belief after one more view; the belief before any view is zero."""
-    return belief + logits
-
-
 def confidence(belief: Float[Array, " classes"]) -> Float[Array, ""]:
     """Probability of the most likely class, in (0, 1]."""
     return jnp.max(jax.nn.softmax(belief))
 
 
 def running_sum(values: Float[Array, " steps *rest"]) -> Float[Array, " steps *rest"]:
-    """Cumulative sum over a few steps, one after the other like the selection loop, so that no rounding differs from it."""
+    """Cumulative sum over the first axis: of the logits of a walk, the belief after each step.
+
+    The order of additions is that of the selection loop, so the rounding is the same.
+    """
     sums = [values[0]]
     for step in range(1, values.shape[0]):
         sums.append(sums[-1] + values[step])
     return jnp.stack(sums)
 
 
-def beliefs_along(logits: Float[Array, "steps classes"]) -> Float[Array, "steps classes"]:
-    """Sum of the logits seen so far after each step of a walk."""
-    return running_sum(logits)
-
-
 def discounted(
     beliefs: Float[Array, "steps classes"], temperatures: Float[Array, " steps"]
 ) -> Float[Array, "steps classes"]:
-    """Log-probabilities softmax(belief / T(n)) after each number of views; T = 1 is the thesis, T = n the mean of logits."""
+    """Log-probabilities log softmax(belief / T(n)) after n = 1, 2, … views.
+
+    Args:
+        beliefs: sums of the logits after each step of a walk.
+        temperatures: T(n); T = 1 is the thesis's sum of logits, T = n the mean of logits.
+    """
     return jax.nn.log_softmax(beliefs / temperatures[:, None], axis=-1)
 
 
@@ -60,15 +57,15 @@ def mean_of_probabilities(logits: Float[Array, "steps classes"]) -> Float[Array,
 
 @flax.struct.dataclass
 class CalibratedFusion:
-    """A trained set fusion, or the sum of logits, whose log-probabilities can be taken at their word.
+    """A trained fusion network (`SetFusion` or `SumFusion`) with calibrated log-probabilities.
 
     Attributes:
-        structure: of the network.
-        weights: of the network.
-        prior: (classes,) log-probabilities of the classes in training, which are taken off: here each is as likely as another.
-        temperatures: (most,) by number of views, from one view on; the last is also that of more.
-        single: temperature of the logits of a view alone.
-        posed: whether the objects' pose is known; see `SetFusion`.
+        structure: graph definition of the network.
+        weights: state of the network.
+        prior: (classes,) log-probabilities of the classes in training. They are subtracted, so all classes are equally likely.
+        temperatures: (most,) by number of views, from one view on; the last also applies to more views.
+        single: temperature of the logits of a single view.
+        posed: whether the pose of the objects is known; see `SetFusion`.
     """
 
     structure: nnx.GraphDef = flax.struct.field(pytree_node=False)
@@ -84,7 +81,7 @@ class CalibratedFusion:
         directions: Float[AnyArray, "*batch views 3"],
         present: Bool[AnyArray, "*batch views"],
     ) -> Float[Array, "*batch classes"]:
-        """Log-probabilities of what was seen, as in `SetFusion`."""
+        """Calibrated log-probabilities of the views that are `present`; arguments as of `SetFusion`."""
         network = nnx.merge(self.structure, self.weights)
         logits = network(features, directions, present, posed=self.posed) - self.prior
         count = jnp.clip(jnp.sum(present, axis=-1), 1, len(self.temperatures))

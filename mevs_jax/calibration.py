@@ -1,8 +1,8 @@
-"""When a system says 90 %, is it right nine times in ten? Measuring that, and mending it with a temperature.
+"""Measures whether confidences match accuracies, and corrects them by temperatures.
 
 The sum of logits counts correlated views as independent evidence, so confidence grows faster than accuracy. One temperature
-per number of views, fitted after fusion on objects that were not trained on, mends most of it and never changes the answer
-(Guo et al. 2017; that one must calibrate after combining and not before: Rahaman and Thiery 2021).
+per number of views, fitted after fusion on objects that were not trained on, corrects most of it and never changes the most
+likely class (Guo et al. 2017). Calibration has to follow the combination, not precede it (Rahaman and Thiery 2021).
 """
 
 from __future__ import annotations
@@ -14,18 +14,24 @@ from jaxtyping import Array, Bool, Float, Int
 from mevs_jax.arrays import AnyArray
 
 BINS = 15
-"""Of the expected calibration error (Guo et al. 2017)."""
+"""Number of bins of the expected calibration error (Guo et al. 2017)."""
 
 
 def _bin_of(confidences: Array, bins: int) -> Int[Array, "..."]:
-    """Of bins (0, 1/bins], …"""
+    """Index of the bin, of (0, 1/bins], (1/bins, 2/bins], …, that each confidence is in."""
     return jnp.clip(jnp.ceil(confidences * bins).astype(jnp.int32) - 1, 0, bins - 1)
 
 
 def reliability(
     confidences: Float[AnyArray, " n"], right: Bool[AnyArray, " n"], bins: int = BINS
 ) -> tuple[Float[Array, "  {bins}"], Float[Array, " {bins}"], Float[Array, " {bins}"]]:
-    """By bin of confidence, (0, 1/bins], …: mean confidence, accuracy, and the share of answers; 0 where there are none."""
+    """Mean confidence, accuracy and share of answers in each bin of confidence; 0 in empty bins.
+
+    Args:
+        confidences: in (0, 1].
+        right: whether each answer is correct.
+        bins: number of bins of equal width, (0, 1/bins], ….
+    """
     confidences, right = jnp.asarray(confidences), jnp.asarray(right)
     member = _bin_of(confidences, bins) == jnp.arange(bins)[:, None]
     count = jnp.sum(member, axis=1)
@@ -36,7 +42,7 @@ def reliability(
 def expected_calibration_error(
     confidences: Float[AnyArray, " n"], right: Bool[AnyArray, " n"], bins: int = BINS
 ) -> Float[Array, ""]:
-    """Mean distance between confidence and accuracy over bins of equal width, weighted by answers; in [0, 1]."""
+    """Mean difference of confidence and accuracy over bins of equal width, weighted by their answers; in [0, 1]."""
     confidence, accuracy, share = reliability(confidences, right, bins)
     return jnp.sum(share * jnp.abs(confidence - accuracy))
 
@@ -47,36 +53,44 @@ def calibration_error_by_chance(
     bins: int = BINS,
     draws: int = 1000,
 ) -> Float[Array, "2"]:
-    """What `expected_calibration_error` would find of someone as sure as this whose confidence is never off: its mean, and what
-    it is at most in 95 of 100 such measurements.
+    """The `expected_calibration_error` that a perfectly calibrated system would have by chance.
 
-    So few objects fall into a bin that its accuracy differs from its confidence by luck alone, and luck adds up over bins. How
-    much is drawn from what is there: each object's share of every bin's error, about its mean and with a random weight (wild
-    bootstrap; Wu 1986), so all walks of an object have their luck together. In the sense of the consistency resampling of
-    Vaicenavicius et al. (2019), which needs independent answers.
+    With few objects in a bin, accuracy differs from confidence by chance, and these differences add up over bins. Their size is
+    estimated by a wild bootstrap (Wu 1986): each object's contribution to the error of every bin, minus the mean contribution,
+    is multiplied by a random weight. All walks of an object share one weight, as they are not independent. The purpose is that of
+    the consistency resampling of Vaicenavicius et al. (2019), which needs independent answers.
+
+    Args:
+        confidences: in (0, 1], for several walks of each object.
+        right: whether each answer is correct.
+        bins: number of bins of equal width.
+        draws: number of bootstrap samples.
+
+    Returns:
+        The mean, and the 95 % quantile.
     """
     confidences, right = jnp.asarray(confidences), jnp.asarray(right)
     objects, walks = confidences.shape
     member = jax.nn.one_hot(_bin_of(confidences, bins), bins)
     share = jnp.einsum("owb,ow->ob", member, confidences - right) / (objects * walks)
-    luck = jax.random.normal(jax.random.key(0), (draws, objects)) @ (share - jnp.mean(share, axis=0))
-    errors = jnp.sum(jnp.abs(luck), axis=1)
+    differences = jax.random.normal(jax.random.key(0), (draws, objects)) @ (share - jnp.mean(share, axis=0))
+    errors = jnp.sum(jnp.abs(differences), axis=1)
     return jnp.stack([jnp.mean(errors), jnp.quantile(errors, 0.95)])
 
 
 def log_likelihood(beliefs: Float[AnyArray, "*n classes"], labels: Int[AnyArray, "*n"]) -> Float[Array, "*n"]:
-    """log softmax(belief)[label] in nats."""
+    """Log-probability of each label, log softmax(belief)[label], in nats."""
     log_probabilities = jax.nn.log_softmax(jnp.asarray(beliefs), axis=-1)
     return jnp.take_along_axis(log_probabilities, jnp.asarray(labels)[..., None], axis=-1)[..., 0]
 
 
 def negative_log_likelihood(beliefs: Float[AnyArray, "n classes"], labels: Int[AnyArray, " n"]) -> Float[Array, ""]:
-    """Mean of −log softmax(belief)[label] in nats."""
+    """Mean of −log softmax(belief)[label], in nats."""
     return -jnp.mean(log_likelihood(beliefs, labels))
 
 
 def class_weights(labels: Int[AnyArray, " n"], classes: int) -> Float[Array, " n"]:
-    """Weights under which every class that occurs counts the same; their mean is 1."""
+    """Weight of each answer so that all classes that occur have the same total weight; the mean weight is 1."""
     counts = jnp.bincount(jnp.asarray(labels), length=classes)
     return len(labels) / jnp.sum(counts > 0) / counts[jnp.asarray(labels)]
 
@@ -84,9 +98,14 @@ def class_weights(labels: Int[AnyArray, " n"], classes: int) -> Float[Array, " n
 def fit_temperature(
     beliefs: Float[AnyArray, "n classes"], labels: Int[AnyArray, " n"], weights: Float[AnyArray, " n"] | float = 1.0
 ) -> Float[Array, ""]:
-    """The T that makes softmax(belief / T) most likely, in [0.01, 100]; `weights` say how much each counts.
+    """The temperature T in [0.01, 100] that maximises the likelihood of the labels under softmax(belief / T).
 
-    The likelihood is convex in 1/T, so the root of its derivative is found by bisection.
+    The negative log-likelihood is convex in 1/T, so the root of its derivative is found by bisection.
+
+    Args:
+        beliefs: unnormalised log-probabilities.
+        labels: the true classes.
+        weights: weight of each example.
     """
     beliefs, labels = jnp.asarray(beliefs), jnp.asarray(labels)
     centred = beliefs - jnp.take_along_axis(beliefs, labels[:, None], axis=-1)
@@ -107,9 +126,14 @@ def fit_temperature(
 def fit_exponent(
     beliefs: Float[AnyArray, "n steps classes"], labels: Int[AnyArray, " n"]
 ) -> tuple[Float[Array, ""], Float[Array, ""]]:
-    """(scale, growth) of temperatures scale · steps^growth, fitted to all numbers of views at once.
+    """Fits temperatures T(n) = scale · n^growth to all numbers of views n at once; returns (scale, growth).
 
-    The exponent of the product of experts is 1/T: growth 0 takes the views to be independent, 1 takes their mean.
+    The exponent of the product of experts is 1/T(n). With scale 1, growth 0 is the sum of logits, which treats views as
+    independent, and growth 1 is their mean.
+
+    Args:
+        beliefs: sums of logits after each step of a walk.
+        labels: the true classes.
     """
     beliefs, labels = jnp.asarray(beliefs), jnp.asarray(labels)
     steps = jnp.arange(1, beliefs.shape[1] + 1, dtype=jnp.float32)
@@ -120,7 +144,7 @@ def fit_exponent(
         return jnp.mean(jax.vmap(negative_log_likelihood, (1, None))(scaled, labels))
 
     def newton(_: Array, parameters: Array) -> Array:
-        # The cost is not convex in these two; the absolute eigenvalues of its Hessian still lead downhill.
+        # The cost is not convex in the two parameters. With the absolute eigenvalues of the Hessian, every step goes downhill.
         values, vectors = jnp.linalg.eigh(jax.hessian(cost)(parameters))
         step = vectors @ (vectors.T @ jax.grad(cost)(parameters) / jnp.maximum(jnp.abs(values), 1e-4))
         return parameters - step * jnp.minimum(1.0, 0.5 / jnp.maximum(jnp.linalg.norm(step), 1e-9))

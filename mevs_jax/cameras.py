@@ -1,11 +1,11 @@
-"""One pinhole camera, one convention, written down here and nowhere else.
+"""The pinhole camera and its conventions, which hold for the whole project.
 
 World: right-handed, z up, object centred in the unit sphere. Camera: x right, y down, z forward (OpenCV). A pose is the
-(4, 4) matrix from camera to world. Pixel (row, column) has its centre at (row + ½, column + ½). Depth is metric distance
+(4, 4) matrix from camera to world. Pixel (row, column) has its centre at (row + ½, column + ½). Depth is the metric distance
 along the camera's z axis, and 0 where nothing is hit.
 
-At distance 2 with a field of view of 60° the unit sphere touches the border of the image from inside (sin 30° = ½), so an
-object is never cut off; 60° is the field of view of the viewer that the thesis captured with.
+At distance 2 with a field of view of 60°, the unit sphere touches the border of the image from inside (sin 30° = ½), so an
+object is never cut off. The thesis's captures were made with a viewer whose field of view is 60°.
 """
 
 from __future__ import annotations
@@ -22,7 +22,13 @@ from mevs_jax.arrays import AnyArray
 
 @flax.struct.dataclass
 class Camera:
-    """Square pinhole camera: `pose` (4, 4) camera to world, `field_of_view` in radians, `resolution` in pixels."""
+    """Pinhole camera with a square image.
+
+    Attributes:
+        pose: (4, 4) matrix from camera to world.
+        field_of_view: horizontal and vertical, in radians.
+        resolution: pixels per side of the image.
+    """
 
     pose: Float[Array, "*batch 4 4"]
     field_of_view: float = flax.struct.field(pytree_node=False, default=math.pi / 3)
@@ -30,14 +36,14 @@ class Camera:
 
     @property
     def focal_length(self) -> float:
-        """In pixels."""
+        """The focal length in pixels."""
         return self.resolution / 2 / math.tan(self.field_of_view / 2)
 
 
 def look_at_origin(position: Float[AnyArray, 3]) -> Float[Array, "4 4"]:
-    """Pose of a camera at `position` looking at the origin with world z upwards in the image.
+    """Pose of a camera at `position` that looks at the origin, with world z upwards in the image.
 
-    Straight above or below, where "up" is undefined, world y takes its place.
+    Straight above or below the origin, where world z is no upward direction, world y is used instead.
     """
     position = jnp.asarray(position)
     forward = -position / jnp.linalg.norm(position)
@@ -51,21 +57,21 @@ def look_at_origin(position: Float[AnyArray, 3]) -> Float[Array, "4 4"]:
 
 
 def orbit(pose: Float[AnyArray, "4 4"], step: Float[AnyArray, 2]) -> Float[Array, "4 4"]:
-    """The pose after a step over the sphere, still looking at the origin from the same distance.
+    """The pose after a step on the sphere around the origin; the camera still looks at the origin from the same distance.
+
+    The image rotates as little as possible (parallel transport). No direction is special, so there are no poles and gradients
+    are finite everywhere.
 
     Args:
-        step: to the camera's right and downwards, on the unit sphere; tangents for small ones. A step of length s goes through
-            an angle of arctan(s).
-
-    The image turns no more than it must, so no direction is special, neither pole: steps before and after
-    are in frames that belong together (parallel transport), and gradients are finite everywhere.
+        pose: a pose that looks at the origin.
+        step: tangent vector on the unit sphere, (to the camera's right, downwards). A step of length s moves the camera by an
+            angle of arctan(s).
     """
     pose, step = jnp.asarray(pose), jnp.asarray(step)
     right, down, forward = pose[:3, 0], pose[:3, 1], pose[:3, 2]
     distance = jnp.linalg.norm(pose[:3, 3])
-    moved = (
-        forward - step[0] * right - step[1] * down
-    )  # what is seen moves to the left where the camera moves to the right
+    # The minus signs: when the camera moves to the right, it turns to the left to keep the origin in view.
+    moved = forward - step[0] * right - step[1] * down
     forward = moved / jnp.linalg.norm(moved)
     right = right - jnp.dot(right, forward) * forward
     right = right / jnp.linalg.norm(right)
@@ -74,7 +80,7 @@ def orbit(pose: Float[AnyArray, "4 4"], step: Float[AnyArray, 2]) -> Float[Array
 
 
 def pixel_directions(camera: Camera) -> Float[Array, "resolution resolution 3"]:
-    """World direction through each pixel centre, with length one *along the optical axis*: a hit at `t` has depth `t`."""
+    """World direction through each pixel centre, of length one along the optical axis, so a hit at `t` has depth `t`."""
     offset = (jnp.arange(camera.resolution) + 0.5 - camera.resolution / 2) / camera.focal_length
     x, y = jnp.meshgrid(offset, offset)
     return jnp.stack([x, y, jnp.ones_like(x)], axis=-1) @ camera.pose[:3, :3].T
@@ -83,11 +89,17 @@ def pixel_directions(camera: Camera) -> Float[Array, "resolution resolution 3"]:
 def unproject(
     pixels: Int[AnyArray, " points"], depth: Float[AnyArray, " points"], camera: Camera, *, frame: str = "world"
 ) -> Float[Array, "points 3"]:
-    """Points seen at flat pixel indices (row · resolution + column).
+    """The points that are visible at some pixels.
 
     Args:
-        depth: metric, positive.
-        frame: `world`, or `camera` (the thesis's clouds, whose pose is lost), there centred two units before the lens.
+        pixels: flat pixel indices, row · resolution + column.
+        depth: metric depth at these pixels, positive.
+        camera: the camera.
+        frame: `world`; or `camera` (the thesis's clouds, which do not contain the pose), with its origin moved along the optical
+            axis by the camera's distance to the world's origin.
+
+    Raises:
+        ValueError: for an unknown frame.
     """
     row, column = pixels // camera.resolution, pixels % camera.resolution
     half, focal = camera.resolution / 2, camera.focal_length
@@ -102,7 +114,7 @@ def unproject(
 def partial_cloud(
     depth: Float[AnyArray, "resolution resolution"], camera: Camera
 ) -> tuple[Float[Array, "pixels 3"], Bool[Array, " pixels"]]:
-    """The world point behind every pixel, and which of them are real (something was hit)."""
+    """The world point at every pixel, and a mask of the pixels where something was hit (depth above 0)."""
     flat = jnp.asarray(depth).reshape(-1)
     pixels = jnp.arange(flat.shape[0])
     return unproject(pixels, flat, camera), flat > 0
@@ -115,5 +127,12 @@ def cameras_at(
     resolution: int = 224,
     field_of_view: float = math.pi / 3,
 ) -> Camera:
-    """Cameras on a sphere of radius `distance`, one per unit vector, as one `Camera` with a leading axis on `pose`."""
+    """Cameras at `distance` in the direction of each unit vector, as one `Camera` with a leading axis on `pose`.
+
+    Args:
+        points: unit vectors from the origin to the cameras.
+        distance: from the origin, in metric units.
+        resolution: pixels per side of the image.
+        field_of_view: in radians.
+    """
     return Camera(jax.vmap(look_at_origin)(jnp.asarray(points) * distance), float(field_of_view), resolution)

@@ -1,9 +1,9 @@
-"""Cloud in, next view out: the thesis's decision (§4.3.3) as a robot asks for it, one cloud of any size after another.
+"""The thesis's decision (§4.3.3) for a robot: chooses the next view from a partial cloud of any size.
 
-Compiled programs have fixed shapes, and a camera's clouds have not. A cloud is filled up to the next of a few sizes with copies
-of its first point, which change nothing: farthest-point sampling never takes a copy of a point it has, and where a ball query
-finds the copies it found the point itself before, so that no maximum over neighbours is another. There are as many programs
-as sizes, and whoever cannot wait for the compiler calls `warm_up` first.
+Compiled programs have fixed shapes, but the clouds of a camera differ in size. A cloud is therefore padded to the next of a few
+sizes with copies of its first point. The copies change nothing: farthest-point sampling never takes a copy of a point that it
+has taken, and a ball query that finds the copies has already found the point itself, so the maxima over neighbours are the same.
+There is one program per size; `warm_up` compiles them in advance.
 """
 
 from __future__ import annotations
@@ -24,11 +24,11 @@ from mevs_jax.viewpoints import ViewGraph
 
 @dataclass(frozen=True)
 class Decision:
-    """Where to look next.
+    """The next view, and the predictions it was chosen by.
 
     Attributes:
         view: index of the next view.
-        entropies: (views,) predicted, in units of the training split's largest.
+        entropies: (views,) predicted entropies, in units of the largest entropy of the training split.
     """
 
     view: int
@@ -41,17 +41,17 @@ class NextView:
     Args:
         network: predicts the entropy of every view of `graph`.
         graph: the candidate views.
-        sizes: that clouds are filled up to, rising; of larger ones as many points as the last are drawn at random.
+        sizes: that clouds are padded to, increasing. Larger clouds are reduced to the last size by random sampling.
 
     Raises:
-        ValueError: for a network of another number of views, or sizes that do not rise.
+        ValueError: for a network with another number of views than `graph`, or sizes that do not increase.
     """
 
     def __init__(self, network: PointNet2, graph: ViewGraph, *, sizes: Sequence[int] = (512, 1024, 2048, 4096)):
         if network.views != len(graph.points):
             raise ValueError(f"the network predicts {network.views} views, the graph has {len(graph.points)}")
         if not sizes or any(b <= a for a, b in zip((0, *sizes), sizes, strict=False)):
-            raise ValueError(f"sizes must rise from at least 1, got {tuple(sizes)}")
+            raise ValueError(f"sizes must increase from at least 1, got {tuple(sizes)}")
         self.sizes, self.views = tuple(sizes), network.views
         structure, self._state = nnx.split(network)
 
@@ -65,15 +65,15 @@ class NextView:
     def __call__(
         self, cloud: Float[np.ndarray, "points columns"], available: Bool[np.ndarray, " views"] | None = None
     ) -> Decision:
-        """The available view with the most promising entropy: the best local maximum, or the best of all where there is none.
+        """Chooses the best available local maximum of the predicted entropies, or the best available view if there is none.
 
         Args:
-            cloud: (points, 3) or (points, 6), as `PointNet2` takes them, in any order: they are shuffled, the same way each
-                time, as training clouds are, since a ball query takes neighbours as they come.
-            available: views that may be chosen, say those not attempted yet; all of them unless given.
+            cloud: (points, 3) or (points, 6) as for `PointNet2`, in any order. The points are shuffled, in the same way in every
+                call, as in training, since a ball query depends on their order.
+            available: True for the views that may be chosen, for example those not yet attempted; all views by default.
 
         Raises:
-            ValueError: for a cloud without points or with numbers that are not finite, or where no view is available.
+            ValueError: for a cloud without points or with numbers that are not finite, or if no view is available.
         """
         return self.of_many([cloud], None if available is None else np.asarray(available)[None])[0]
 
@@ -82,7 +82,17 @@ class NextView:
         clouds: Sequence[Float[np.ndarray, "_ columns"]],
         available: Bool[np.ndarray, "clouds views"] | None = None,
     ) -> list[Decision]:
-        """Decisions on several clouds in one call. They share the size that the largest needs; their number is filled up too."""
+        """Decisions for several clouds in one call.
+
+        All clouds are padded to the size that the largest needs, and their number to a power of two.
+
+        Args:
+            clouds: as for `__call__`.
+            available: for each cloud, True for the views that may be chosen; all views by default.
+
+        Raises:
+            ValueError: as `__call__`.
+        """
         if not clouds:
             return []
         if available is None:
@@ -90,23 +100,31 @@ class NextView:
         if available.shape != (len(clouds), self.views) or not available.any(axis=1).all():
             raise ValueError(
                 f"a decision among {self.views} views needs one that is available, got a mask of shape {available.shape[1:]}"
-                f" with {available.sum(axis=-1).min()} of them"
+                f" with {available.sum(axis=-1).min()} available views"
             )
         size = self._size(max(map(len, clouds)))
         batch = np.minimum(np.arange(1 << (len(clouds) - 1).bit_length()), len(clouds) - 1)
-        filled = np.stack([self.fill(cloud, size) for cloud in clouds])
-        views, entropies = map(np.asarray, self._decide(self._state, filled[batch], available[batch]))
+        padded = np.stack([self.fill(cloud, size) for cloud in clouds])
+        views, entropies = map(np.asarray, self._decide(self._state, padded[batch], available[batch]))
         return [Decision(int(views[i]), entropies[i]) for i in range(len(clouds))]
 
     def warm_up(self, columns: int = 3) -> None:
-        """Compiles the programs of all sizes for one cloud, of 3 or 6 columns, so that no decision waits for it."""
+        """Compiles the programs for one cloud of every size, with 3 or 6 columns, so that no decision waits for the compiler."""
         for size in self.sizes:
             self(np.ones((size, columns), np.float32))
 
     def fill(
         self, cloud: Float[np.ndarray, "points columns"], size: int | None = None
     ) -> Float[np.ndarray, "size columns"]:
-        """The cloud in random order, in one of the sizes: filled up with copies of one point, or thinned out at random."""
+        """The cloud in random order, padded with copies of one point or reduced at random to `size` points.
+
+        Args:
+            cloud: as for `__call__`.
+            size: number of points of the result; by default the smallest of `sizes` that holds the cloud, else the largest.
+
+        Raises:
+            ValueError: for a cloud without points or with numbers that are not finite.
+        """
         cloud = np.asarray(cloud, np.float32)
         if cloud.ndim != 2 or len(cloud) == 0 or not np.isfinite(cloud).all():
             raise ValueError(

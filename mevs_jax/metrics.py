@@ -1,7 +1,7 @@
-"""How good a system is, and how sure one may be of that.
+"""Accuracy, class accuracy, and bootstrap intervals over objects.
 
-The thesis's eqs. (10) and (11), as printed, are one-vs-rest; its code and tables are what is here: accuracy is the trace of
-the confusion matrix over its sum, class accuracy the mean recall.
+The thesis prints one-vs-rest formulas (eqs. (10) and (11)). Its code and tables use the definitions of this module: accuracy is
+the trace of the confusion matrix divided by its sum, class accuracy is the mean recall.
 """
 
 from __future__ import annotations
@@ -19,25 +19,26 @@ def confusion_matrix(
     classes: int,
     weights: Float[AnyArray, " n"] | None = None,
 ) -> Float[Array, "{classes} {classes}"]:
-    """Weight by (true class, predicted class); every weight 1 unless given."""
+    """Total weight of the answers by (true class, predicted class); every answer has weight 1 unless `weights` is given."""
     weights = jnp.ones(labels.shape) if weights is None else weights
     return jnp.zeros((classes, classes)).at[labels, predictions].add(weights)
 
 
 def accuracy(confusion: Float[AnyArray, "classes classes"]) -> Float[Array, ""]:
-    """Share of the right answers, in [0, 1]; 0 for an empty matrix."""
+    """Share of correct answers, in [0, 1]; 0 for an empty matrix."""
     return jnp.trace(confusion) / jnp.maximum(jnp.sum(confusion), 1e-12)
 
 
 def class_accuracy(confusion: Float[AnyArray, "classes classes"]) -> Float[Array, ""]:
-    """Mean recall over the classes that occur, in [0, 1]."""
+    """Mean recall over the classes that occur, in [0, 1]; 0 for an empty matrix."""
     total = jnp.sum(confusion, axis=1)
     recall = jnp.diag(confusion) / jnp.maximum(total, 1e-12)
     return jnp.sum(jnp.where(total > 0, recall, 0)) / jnp.maximum(jnp.sum(total > 0), 1)
 
 
 def is_right(beliefs: Float[Array, "..."], label: Int[Array, ""], *, axis: int) -> Bool[Array, "..."]:
-    """Whether the label is the argmax over the axis of classes, the lowest index among equals; XLA's own is slow on CPUs."""
+    """Whether `label` is the argmax of `beliefs` over `axis`, the axis of classes; among equals the lowest index wins."""
+    # XLA's argmax is slow on CPU.
     beliefs = jnp.moveaxis(beliefs, axis, 0)
     own = beliefs[label]
     before = jnp.expand_dims(jnp.arange(beliefs.shape[0]) < label, range(1, beliefs.ndim))
@@ -47,9 +48,10 @@ def is_right(beliefs: Float[Array, "..."], label: Int[Array, ""], *, axis: int) 
 def bootstrap_means(
     key: Array, values: Float[AnyArray, " objects"], *, resamples: int = 2000
 ) -> Float[Array, " {resamples}"]:
-    """Means over objects drawn with replacement.
+    """Means of `values` over `resamples` samples of objects, drawn with replacement.
 
-    The same key draws the same objects, so a `vmap` over cells with one key keeps them paired, and costs one matrix product.
+    The same key draws the same objects. A `vmap` over cells of a table with one key therefore keeps the cells paired, and costs
+    one matrix product.
     """
     count = values.shape[0]
 
@@ -63,14 +65,14 @@ def bootstrap_means(
 def bootstrap_interval(
     key: Array, values: Float[AnyArray, " objects"], *, level: float = 0.95, resamples: int = 2000
 ) -> Float[Array, 2]:
-    """Percentile interval of the mean over objects, drawn with replacement.
+    """Percentile bootstrap interval of the mean over objects: the lower and the upper end.
 
-    For a paired comparison pass the differences, one per object; several measurements of an object (start views, draws) are
-    to be averaged first, since only objects are independent.
+    Args:
+        key: PRNG key of the resamples.
+        values: one per object; for a paired comparison, the differences. Average several measurements of an object (start
+            views, draws) first, since only objects are independent.
+        level: probability that the interval covers, in (0, 1).
+        resamples: number of bootstrap samples.
     """
     means = bootstrap_means(key, values, resamples=resamples)
     return jnp.quantile(means, jnp.array([(1 - level) / 2, (1 + level) / 2]))
-
-
-def mean_squared_error(predicted: Float[AnyArray, "*shape"], true: Float[AnyArray, "*shape"]) -> Float[Array, ""]:
-    return jnp.mean(jnp.square(predicted - true))

@@ -1,10 +1,10 @@
-"""The selection loop: look, add up, stop if sure enough, else look where the policy says (thesis §4.4, Fig. 16).
+"""The selection loop: observe a view, update the belief, stop if confident, else go to the policy's view (thesis §4.4, Fig. 16).
 
-Written for one object as a `lax.while_loop`; objects, start views, seeds and thresholds are `vmap` axes at the call site. What
-looking means is an argument: `observe(view)` reads a table here, and may as well call the networks.
+The loop is a `lax.while_loop` for one object; objects, start views, seeds and thresholds are `vmap` axes at the call site. The
+function `observe(view)` is an argument: `select_from_table` reads a table, and live walks call the networks.
 
-The views that a policy visits do not depend on when the loop would stop. So a walk without a threshold, which never stops
-early, holds the answer for every threshold and every limit on views at once (`stop_at`).
+The views that a policy visits do not depend on when the loop stops. One walk without a threshold, which never stops early,
+therefore contains the result for every threshold and every limit on the number of views.
 """
 
 from __future__ import annotations
@@ -17,21 +17,21 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from mevs_jax.beliefs import CalibratedFusion, confidence, sum_of_logits
+from mevs_jax.beliefs import CalibratedFusion, confidence
 from mevs_jax.policies.base import Knowledge, Observation, Policy, Scene, SelectionState, candidates
 from mevs_jax.viewpoints import ViewGraph
 
 
 @flax.struct.dataclass
 class ViewTable:
-    """All that the loop needs to know of one object, computed beforehand.
+    """The outputs of all networks for all views of one object, computed beforehand.
 
     Attributes:
-        logits: (views, classes) of the classifier at each view; an axis of its own where several classifiers are compared.
-        predicted_entropy: (views, views); row i is what the entropy predictor says about every view after seeing view i.
+        logits: (views, classes) of the classifier at each view; with a leading axis if several classifiers are compared.
+        predicted_entropy: (views, views); row i holds the entropies of all views predicted from view i.
         entropy: (views,) true depth entropies.
         label: the true class.
-        ascent_scores: (views, views) by policy; row i is where differentiable rendering would look after seeing view i.
+        ascent_scores: by policy name, (views, views); row i scores the views after view i, by gradient ascent on a rendering.
         features: (views, features) of the encoder, for a learned fusion.
         clouds: (views, embedding) of the partial clouds, for a policy that uses them.
     """
@@ -45,6 +45,7 @@ class ViewTable:
     clouds: Float[Array, "*batch views embedding"] | None = None
 
     def observe(self, view: Int[Array, ""]) -> Observation:
+        """Returns the observation of one view."""
         return Observation(
             self.logits[view],
             None if self.predicted_entropy is None else self.predicted_entropy[view],
@@ -55,7 +56,7 @@ class ViewTable:
     def scene(
         self, graph: ViewGraph, knowledge: Knowledge | None = None, reachable: Bool[Array, " views"] | None = None
     ) -> Scene:
-        """The scene with everything that an oracle may ask for."""
+        """Returns the scene of this object, with everything that an oracle uses."""
         return Scene(
             graph, self.entropy, self.logits, self.label, knowledge, reachable, self.ascent_scores, self.features
         )
@@ -63,13 +64,13 @@ class ViewTable:
 
 @flax.struct.dataclass
 class Episode:
-    """One object looked at; entries beyond `count` are −1 or 0.
+    """The views of one object and the predictions after each; entries beyond `count` are −1 or 0.
 
     Attributes:
-        views: (max_views,) in the order they were looked at.
-        predictions: (max_views,) the most likely class after each.
-        confidences: (max_views,) its probability.
-        count: how many views were looked at.
+        views: (max_views,) indices of the views, in order.
+        predictions: (max_views,) the most likely class after each view.
+        confidences: (max_views,) the probability of that class.
+        count: number of views seen.
     """
 
     views: Int[Array, "*batch max_views"]
@@ -79,9 +80,9 @@ class Episode:
 
 
 def best_view(scores: Float[Array, " views"], allowed: Bool[Array, " views"]) -> Int[Array, ""]:
-    """The allowed view of highest score, the lowest index among equals; −inf and NaN come last.
+    """Index of the allowed view with the highest score, the lowest index among equals; −inf and NaN come last.
 
-    A score of +inf is an order: that view is taken even where it is not allowed, having been seen before.
+    A view with a score of +inf is chosen even if it is not allowed. `random_with_repetition` uses this to repeat views.
     """
     scores = jnp.where(jnp.isnan(scores), -jnp.inf, scores)
     allowed = allowed | (scores == jnp.inf)
@@ -90,21 +91,28 @@ def best_view(scores: Float[Array, " views"], allowed: Bool[Array, " views"]) ->
 
 
 Fuse = Callable[[SelectionState, Scene], Float[Array, " classes"]]
-"""The belief once the latest look is among those `seen`; `belief` is still that before it."""
+"""A function of (state, scene) that returns the new belief.
+
+The state already contains the latest observation in `latest` and `seen`; its `belief` is the one before that observation.
+"""
 
 
-def adding(state: SelectionState, scene: Scene) -> Float[Array, " classes"]:
-    """The thesis's fusion (§4.4): the sum of logits."""
+def sum_of_logits(state: SelectionState, scene: Scene) -> Float[Array, " classes"]:
+    """The thesis's fusion (§4.4): the belief plus the logits of the latest view. The belief before any view is zero."""
     del scene
-    return sum_of_logits(state.belief, state.latest.logits)
+    return state.belief + state.latest.logits
 
 
 def by_attention(fusion: CalibratedFusion) -> Fuse:
-    """A learned fusion of the features that were seen; the belief is its log-probabilities."""
+    """Returns a fusion whose belief is the log-probabilities that `fusion` computes from the features of all views seen.
+
+    Raises:
+        ValueError: when called, if the observations hold no features.
+    """
 
     def fuse(state: SelectionState, scene: Scene) -> Float[Array, " classes"]:
         if state.seen.features is None:
-            raise ValueError("a learned fusion needs the features of every look, which are not given")
+            raise ValueError("a learned fusion needs the features of every view, but the observations have none")
         present = jnp.arange(len(state.views)) < state.count
         return fusion(state.seen.features, scene.graph.points[state.views], present)
 
@@ -120,24 +128,24 @@ def select_views(
     *,
     threshold: float | Float[Array, ""] | None = None,
     max_views: int,
-    fuse: Fuse = adding,
+    fuse: Fuse = sum_of_logits,
 ) -> Episode:
-    """Looks at one object from `start` on until the confidence reaches `threshold` or `max_views` views are seen.
+    """Observes one object view by view until the confidence reaches `threshold` or `max_views` views are seen.
 
-    It ends earlier where no view that can be reached is left.
+    The loop also ends when no reachable view is left.
 
     Args:
-        key: for policies that draw.
-        observe: what a look at a view gives.
-        scene: the candidate views, and what else the policy may know.
+        key: PRNG key for policies that draw at random.
+        observe: returns the observation of a view.
+        scene: the candidate views, and what else the policy may use.
         policy: scores the views; see `mevs_jax.policies`.
-        start: the first view, 0..views−1.
+        start: index of the first view, 0..views−1.
         threshold: on the confidence, CT in the thesis; None never stops early.
         max_views: 1..views, MV in the thesis.
-        fuse: how looks become a belief.
+        fuse: computes the belief after each observation.
 
     Raises:
-        ValueError: for `max_views` outside its range, or a scene that lacks what the policy asks for.
+        ValueError: for `max_views` outside its range, or a scene without a field that the policy needs.
     """
     views = scene.graph.points.shape[0]
     if not 1 <= max_views <= views:
@@ -154,7 +162,7 @@ def select_views(
         latest = episode.confidences[jnp.maximum(state.count - 1, 0)]
         return (state.count == 0) | ((state.count < limit) & (latest < threshold))
 
-    def look(carry: tuple[SelectionState, Episode]) -> tuple[SelectionState, Episode]:
+    def step(carry: tuple[SelectionState, Episode]) -> tuple[SelectionState, Episode]:
         state, episode = carry
         latest = observe(state.view)
         state = replace(
@@ -176,31 +184,32 @@ def select_views(
         scores = policy(jax.random.fold_in(key, state.count), state, scene)
         return replace(state, view=best_view(scores, candidates(state, scene))), episode
 
-    kind = []  # of tree, once `observe` was traced
+    structures = []  # receives the tree structure of an observation when `observe` is traced
 
     def leaves_of(view: Int[Array, ""]) -> list[Array]:
-        leaves, tree = jax.tree.flatten(observe(view))
-        kind.append(tree)
+        leaves, structure = jax.tree.flatten(observe(view))
+        structures.append(structure)
         return leaves
 
     shapes = jax.eval_shape(leaves_of, start)
-    blank = jax.tree.unflatten(kind[0], [jnp.zeros(shape.shape, shape.dtype) for shape in shapes])
-    nothing = jnp.full(max_views, -1, jnp.int32)
+    blank = jax.tree.unflatten(structures[0], [jnp.zeros(shape.shape, shape.dtype) for shape in shapes])
+    unset = jnp.full(max_views, -1, jnp.int32)
     state = SelectionState(
         count=jnp.int32(0),
         view=start,
         attempted=jnp.zeros(views, bool),
         belief=jnp.zeros_like(blank.logits),
         latest=blank,
-        views=nothing,
+        views=unset,
         seen=jax.tree.map(lambda leaf: jnp.zeros((max_views, *leaf.shape), leaf.dtype), blank),
     )
-    episode = Episode(nothing, nothing, jnp.zeros(max_views), jnp.int32(0))
-    return jax.lax.while_loop(unsure, look, (state, episode))[1]
+    episode = Episode(unset, unset, jnp.zeros(max_views), jnp.int32(0))
+    return jax.lax.while_loop(unsure, step, (state, episode))[1]
 
 
-def _put(history: Array, index: Int[Array, ""], now: Array) -> Array:
-    return jax.lax.dynamic_update_index_in_dim(history, now, index, 0)
+def _put(history: Array, index: Int[Array, ""], value: Array) -> Array:
+    """Returns `history` with row `index` replaced by `value`."""
+    return jax.lax.dynamic_update_index_in_dim(history, value, index, 0)
 
 
 def select_from_table(
@@ -212,19 +221,7 @@ def select_from_table(
     *,
     threshold: float | Float[Array, ""] | None = None,
     max_views: int,
-    fuse: Fuse = adding,
+    fuse: Fuse = sum_of_logits,
 ) -> Episode:
-    """`select_views` where a look is a row of `table`."""
+    """`select_views` with observations from `table`."""
     return select_views(key, table.observe, scene, policy, start, threshold=threshold, max_views=max_views, fuse=fuse)
-
-
-def stop_at(
-    confidences: Float[Array, " steps"], threshold: float | Float[Array, ""], max_views: int | Int[Array, ""]
-) -> Int[Array, ""]:
-    """How many views a full walk would have used: up to the first confidence ≥ `threshold`, at most `max_views`.
-
-    Confidences beyond the walk's end are 0.
-    """
-    sure = confidences >= threshold
-    first = jnp.where(jnp.any(sure), jnp.argmax(sure), confidences.shape[0] - 1) + 1
-    return jnp.minimum(first, max_views)

@@ -1,8 +1,8 @@
-"""Where the camera can stand: points on the unit sphere and the graph of neighbours between them.
+"""Camera positions: lattices of points on the unit sphere, and the graph of neighbours between them.
 
-The order of the points is canonical: the thesis's networks predict view `i` at output `i`. Source: thesis §4.1, eq. (8) and
-its published code, which differ; the code's lattice is the default here because the thesis's results were made with it. Others
-use Platonic solids (RotationNet, view-GCN) or rings (MORE), and a nested lattice lets few views be compared with many.
+The order of the points is canonical: the thesis's networks predict view `i` at output `i`. Source: thesis §4.1. Its eq. (8) and
+its published code differ; the code's lattice is the default, because the thesis's results were made with it. Other work uses
+Platonic solids (RotationNet, view-GCN) or rings (MORE). A nested lattice allows few views to be compared with many.
 """
 
 from __future__ import annotations
@@ -30,18 +30,18 @@ Lattice = Literal[
     "dodecahedron",
 ]
 SOLIDS = {"tetrahedron": 4, "octahedron": 6, "cube": 8, "icosahedron": 12, "dodecahedron": 20}
-"""The Platonic solids, by number of corners."""
+"""The number of corners of each Platonic solid."""
 RINGS = 5
-"""Rings of the lattice `rings`, as in MORE (Parisotto, Mukhopadhyay and Kasaei, 2021): 12 views on each of 5."""
+"""Number of rings of the lattice `rings`, as in MORE (Parisotto, Mukhopadhyay and Kasaei, 2021), which has 12 views per ring."""
 
 
 def fibonacci_sphere(n: int, variant: str = "golden_angle") -> Float[np.ndarray, "{n} 3"]:
     """`n` evenly spread unit vectors.
 
     Args:
-        n: how many, at least 2.
-        variant: `golden_angle`, the thesis's published code: a spiral with its poles on ±x, both of them views; or
-            `equation8`, the formula in its text: poles on ±z, only the upper one a view.
+        n: number of points, at least 2.
+        variant: `golden_angle`, from the thesis's published code: a spiral with poles on ±x, both of which are views; or
+            `equation8`, the formula in its text: poles on ±z, of which only the upper one is a view.
 
     Raises:
         ValueError: for fewer than 2 points or an unknown variant.
@@ -63,14 +63,14 @@ def fibonacci_sphere(n: int, variant: str = "golden_angle") -> Float[np.ndarray,
 
 
 def platonic_solid(name: str) -> Float[np.ndarray, "corners 3"]:
-    """Corners of a Platonic solid as unit vectors, sorted by height and then by longitude.
+    """Corners of a Platonic solid as unit vectors, sorted by height from the top down and then by longitude.
 
     Raises:
-        ValueError: for another name than those in `SOLIDS`.
+        ValueError: for a name that is not in `SOLIDS`.
     """
     golden = (1 + np.sqrt(5)) / 2
     signs = np.array(list(product((1, -1), repeat=3)), float)
-    turns = [np.roll(np.arange(3), shift) for shift in range(3)]
+    cyclic = [np.roll(np.arange(3), shift) for shift in range(3)]
     if name == "tetrahedron":
         corners = signs[signs.prod(axis=1) > 0]
     elif name == "octahedron":
@@ -78,10 +78,10 @@ def platonic_solid(name: str) -> Float[np.ndarray, "corners 3"]:
     elif name == "cube":
         corners = signs
     elif name in ("icosahedron", "dodecahedron"):
-        # (0, ±1, ±φ) and its turns; of the dodecahedron (0, ±1/φ, ±φ) and the cube besides.
+        # Icosahedron: (0, ±1, ±φ) and its cyclic permutations. Dodecahedron: those of (0, ±1/φ, ±φ), and the cube.
         flat = np.array([[0, a, b] for a, b in product((1, -1), repeat=2)], float)
         lengths = [0, 1, golden] if name == "icosahedron" else [0, 1 / golden, golden]
-        corners = np.concatenate([(flat * lengths)[:, turn] for turn in turns])
+        corners = np.concatenate([(flat * lengths)[:, permutation] for permutation in cyclic])
         if name == "dodecahedron":
             corners = np.concatenate([corners, signs])
     else:
@@ -92,13 +92,13 @@ def platonic_solid(name: str) -> Float[np.ndarray, "corners 3"]:
 
 
 def ring_lattice(n: int) -> Float[np.ndarray, "{n} 3"]:
-    """`n` views on five rings of equal elevation steps, 60° to −60°, as in MORE; from the top ring down, eastwards.
+    """`n` views on five rings at equal steps of elevation, 60° to −60°, as in MORE; from the top ring down, each eastwards.
 
     Raises:
-        ValueError: where `n` is no multiple of five, or leaves fewer than two views to a ring.
+        ValueError: if `n` is not a multiple of five, or there are fewer than two views per ring.
     """
     if n % RINGS or n < 2 * RINGS:
-        raise ValueError(f"rings take a multiple of {RINGS} viewpoints, at least {2 * RINGS}, got {n}")
+        raise ValueError(f"rings need a multiple of {RINGS} viewpoints, at least {2 * RINGS}, got {n}")
     elevation = np.pi / 2 - np.pi * np.arange(1, RINGS + 1) / (RINGS + 1)
     longitude = 2 * np.pi * np.arange(n // RINGS) / (n // RINGS)
     elevation, longitude = (angle.reshape(-1) for angle in np.meshgrid(elevation, longitude, indexing="ij"))
@@ -107,17 +107,17 @@ def ring_lattice(n: int) -> Float[np.ndarray, "{n} 3"]:
 
 
 def nested_lattice(n: int) -> Float[np.ndarray, "{n} 3"]:
-    """The first `n` points of one endless sequence, so that the 10 views are among the 40 (the thesis's are not).
+    """The first `n` points of a fixed sequence, so that the lattice of 10 views is part of that of 40 (the thesis's is not).
 
-    Always the point of a dense Fibonacci sphere that is farthest from those before, starting at its top: the nearest two of the
-    first n are never closer than half of what n points could be apart (Gonzalez 1985).
+    Each point is the one of a dense Fibonacci sphere that is farthest from all points before it, starting at its top. The
+    smallest distance among the first n points is at least half of the largest possible for n points (Gonzalez 1985).
 
     Raises:
         ValueError: for fewer than 2 points, or too many for the dense sphere.
     """
     dense = fibonacci_sphere(2000, "equation8")
     if not 2 <= n <= len(dense) // 4:
-        raise ValueError(f"a nested lattice has between 2 and {len(dense) // 4} viewpoints, got {n}")
+        raise ValueError(f"a nested lattice needs between 2 and {len(dense) // 4} viewpoints, got {n}")
     chosen, nearest = [0], np.full(len(dense), np.inf)
     while len(chosen) < n:
         nearest = np.minimum(nearest, np.linalg.norm(dense - dense[chosen[-1]], axis=1))
@@ -126,10 +126,10 @@ def nested_lattice(n: int) -> Float[np.ndarray, "{n} 3"]:
 
 
 def viewpoint_lattice(n: int, lattice: Lattice = "golden_angle") -> Float[np.ndarray, "{n} 3"]:
-    """`n` viewpoints of the kind asked for, unit vectors.
+    """`n` viewpoints of a lattice as unit vectors.
 
     Raises:
-        ValueError: for a number that the lattice cannot have, or an unknown lattice.
+        ValueError: for a number of viewpoints that the lattice does not allow, or an unknown lattice.
     """
     if lattice in SOLIDS:
         if n != SOLIDS[lattice]:
@@ -144,11 +144,11 @@ def viewpoint_lattice(n: int, lattice: Lattice = "golden_angle") -> Float[np.nda
 
 @flax.struct.dataclass
 class ViewGraph:
-    """Candidate viewpoints, who is next to whom, and how far apart any two are.
+    """Candidate viewpoints, their neighbours, and the distances between them.
 
     Attributes:
         points: (views, 3) unit vectors.
-        neighbours: (views, views) bool, symmetric, False on the diagonal.
+        neighbours: (views, views) True for neighbours; symmetric, False on the diagonal.
         distances: (views, views) great-circle distances in radians.
     """
 
@@ -158,24 +158,27 @@ class ViewGraph:
 
     @classmethod
     def from_points(cls, points: AnyArray) -> ViewGraph:
-        """The spherical Delaunay graph, which is the convex hull's edges (3n − 6 of them; thesis §4.1).
+        """The spherical Delaunay graph, whose edges are the 3n − 6 edges of the convex hull (thesis §4.1).
 
-        Up to three points are all neighbours of each other. Points of a hull with larger flat faces (a cube's corners)
-        are joined by the hull's edges and by the diagonals that triangulate them.
+        Two or three points are all neighbours of each other. If the hull has flat faces with more than three corners (as a cube
+        does), the diagonals that triangulate them are edges too.
+
+        Args:
+            points: (views, 3) unit vectors.
 
         Raises:
-            ValueError: for fewer than 2 points, points off the unit sphere, duplicates, or four and more in one plane.
+            ValueError: for fewer than 2 points, points off the unit sphere, duplicates, or four or more points in one plane.
         """
         array = np.asarray(points, float)
         if array.ndim != 2 or array.shape[1] != 3 or len(array) < 2:
             raise ValueError(f"a view graph needs at least 2 points of 3 coordinates, got shape {array.shape}")
         if np.abs(np.linalg.norm(array, axis=1) - 1).max() > 1e-4:
-            raise ValueError("viewpoints must be unit vectors")
+            raise ValueError("viewpoints must be unit vectors: divide each by its length")
         distances = np.arccos(np.clip(array @ array.T, -1, 1))
         np.fill_diagonal(distances, 0)
         count = len(array)
         if np.min(distances + 10 * np.eye(count)) < 1e-4:
-            raise ValueError("two viewpoints coincide")
+            raise ValueError("two viewpoints coincide: remove one of them")
         neighbours = np.zeros((count, count), bool)
         if count <= 3:
             neighbours[:] = ~np.eye(count, dtype=bool)
@@ -194,10 +197,10 @@ class ViewGraph:
 def local_maxima(
     weights: Float[AnyArray, " views"], neighbours: Bool[AnyArray, "views views"]
 ) -> Bool[Array, " views"]:
-    """Which views weigh strictly more than every neighbour (thesis Algorithm 1).
+    """Mask of the views whose weight is greater than that of every neighbour (thesis Algorithm 1).
 
-    Two equal neighbours exclude each other; a view without neighbours is a maximum. At least one view is a maximum
-    unless the largest weight is shared by neighbours.
+    Of two neighbours with equal weights, neither is a maximum. A view without neighbours is a maximum. At least one view is a
+    maximum unless neighbours share the largest weight.
     """
     weights, neighbours = jnp.asarray(weights), jnp.asarray(neighbours)
     return jnp.all(~neighbours | (weights[None, :] < weights[:, None]), axis=1)

@@ -10,7 +10,6 @@ from scipy.optimize import minimize, minimize_scalar
 
 from eval.numbers.confidence import RISKS, confidence_of, stopping
 from mevs_jax import (
-    beliefs_along,
     calibration_error_by_chance,
     discounted,
     expected_calibration_error,
@@ -20,6 +19,7 @@ from mevs_jax import (
     negative_log_likelihood,
     reliability,
 )
+from mevs_jax.beliefs import running_sum
 from tests.reference import numpy_rules
 
 
@@ -118,7 +118,7 @@ def test_scale_and_growth_are_the_most_likely_ones():
 
 def test_temperatures_never_change_an_answer_and_lower_the_error_they_were_fitted_on():
     logits, labels = correlated_views(3000, 9, 10, 1)
-    beliefs = jax.vmap(beliefs_along)(jnp.asarray(logits))
+    beliefs = jax.vmap(running_sum)(jnp.asarray(logits))
     temperatures = jax.vmap(fit_temperature, (1, None))(beliefs, jnp.asarray(labels))
     mended = jax.vmap(discounted, (0, None))(beliefs, temperatures)
     np.testing.assert_array_equal(jnp.argmax(mended, -1), jnp.argmax(beliefs, -1))

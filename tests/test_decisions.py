@@ -79,7 +79,7 @@ def test_what_cannot_be_decided_is_refused(network, choose):
             choose(bad)
     with pytest.raises(ValueError, match="needs one that is available"):
         choose(cloud, np.zeros(10, bool))
-    with pytest.raises(ValueError, match="sizes must rise"):
+    with pytest.raises(ValueError, match="sizes must increase"):
         NextView(network, GRAPH, sizes=(64, 32))
     with pytest.raises(ValueError, match="10 views, the graph has 20"):
         NextView(network, ViewGraph.from_points(fibonacci_sphere(20)))

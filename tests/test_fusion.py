@@ -11,7 +11,7 @@ import pytest
 from flax import nnx
 
 from eval.learned.study import random_sets_study
-from mevs_jax.models.set_fusion import SetFusion, SumFusion, about_the_first
+from mevs_jax.models.set_fusion import SetFusion, SumFusion, relative_to_first
 from train.choosing.calibrated import calibrated
 from train.choosing.features import Features, FusionConfig, SetFusionConfig, random_sets, sets_of_size, train_fusion
 
@@ -103,14 +103,14 @@ def test_order_and_padding_do_not_matter_and_no_view_is_a_belief_too(network, se
 
 def test_directions_are_told_from_the_first_view_on():
     directions = np.array([[0, 0, 1], [0, 0.6, 0.8], [0.8, 0, -0.6], [-1, 0, 0]], np.float32)
-    found, turn = about_the_first(directions, np.array([False, True, False, True]))
+    found, turn = relative_to_first(directions, np.array([False, True, False, True]))
     np.testing.assert_allclose(found, [[0, 0, 1], [0.6, 0, 0.8], [0, -0.8, -0.6], [0, 1, 0]], atol=1e-6)
     np.testing.assert_allclose(directions @ np.asarray(turn).T, found, atol=1e-6)
     for present in (
         np.array([True, False, False, False]),
         np.zeros(4, bool),
     ):  # from straight above there is no azimuth
-        np.testing.assert_allclose(about_the_first(directions, present)[0], directions, atol=1e-6)
+        np.testing.assert_allclose(relative_to_first(directions, present)[0], directions, atol=1e-6)
 
 
 def test_without_a_pose_objects_may_face_any_way(network, seen):
@@ -123,7 +123,7 @@ def test_without_a_pose_objects_may_face_any_way(network, seen):
     assert np.abs(fused(network, features, directions @ turn.T, present) - fused(network, *seen)).max() > 1e-3
     order = np.array([0, 3, 4, 2, 1])  # the first stays the first
     np.testing.assert_allclose(blind(network, features[order], directions[order], present[order]), belief, atol=1e-5)
-    relative = np.asarray(about_the_first(directions, present)[0])
+    relative = np.asarray(relative_to_first(directions, present)[0])
     like = nnx.clone(network)
     like.object[...] = network.unposed[...]
     np.testing.assert_allclose(belief, plain(like, features, relative, present), atol=2e-5)

@@ -8,7 +8,7 @@ import pytest
 from sklearn.metrics import accuracy_score, balanced_accuracy_score
 from sklearn.metrics import confusion_matrix as sklearn_confusion
 
-from mevs_jax import accuracy, bootstrap_interval, class_accuracy, confusion_matrix, mean_squared_error
+from mevs_jax import accuracy, bootstrap_interval, class_accuracy, confusion_matrix
 
 
 def test_equal_to_scikit_learn(random):
@@ -33,7 +33,3 @@ def test_the_bootstrap_interval_covers_as_it_says(random):
         low, high = interval(jax.random.key(trial), random.normal(1.0, 2.0, 80).astype(np.float32))
         hits += low <= 1.0 <= high
     assert 176 <= hits <= 200
-
-
-def test_mean_squared_error():
-    assert float(mean_squared_error(np.array([1.0, 3]), np.array([0.0, 1]))) == pytest.approx(2.5)

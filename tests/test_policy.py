@@ -388,7 +388,7 @@ def test_a_learned_fusion_says_what_it_lacks(fusion):
     data = some_features(1)
     table = ViewTable(data.logits[0], None, None, data.labels[0])
     scene = table.scene(graph_of(data.directions[0]))
-    with pytest.raises(ValueError, match="needs the features of every look"):
+    with pytest.raises(ValueError, match="needs the features of every view"):
         select_from_table(jax.random.key(0), table, scene, random_view, 0, max_views=2, fuse=by_attention(fusion))
     with pytest.raises(ValueError, match=r"needs Scene\.features"):
         select_from_table(jax.random.key(0), table, scene, fused_oracle(fusion), 0, max_views=2)

@@ -154,7 +154,7 @@ def test_standardised_images_are_what_torchvision_expects(weights):
     images = jax.random.uniform(jax.random.key(0), (2, 64, 64, 3))
     expected = plain((images - jnp.array([0.485, 0.456, 0.406])) / jnp.array([0.229, 0.224, 0.225]))
     np.testing.assert_allclose(standard(images), expected, atol=1e-5)
-    with pytest.raises(ValueError, match="3 channels, got 1"):
+    with pytest.raises(ValueError, match="3 channels only, got 1"):
         ResNet(channels=1, standardise=True, rngs=nnx.Rngs(0))
 
 

@@ -22,9 +22,9 @@ from mevs_jax import (
     fibonacci_sphere,
     select_from_table,
     select_views,
-    stop_at,
     with_movement,
 )
+from mevs_jax.policies import policy_named, register_policy
 from tests.reference import numpy_rules, policies
 
 THRESHOLDS = (0.5, 0.6, 0.7, 0.8, 0.9, 0.95, 0.99)
@@ -266,7 +266,8 @@ def test_a_full_walk_holds_the_answer_for_every_threshold_and_limit():
         stopped = walk_jitted(keys, tables, graph, starts, thresholds, policy="predicted_entropy", max_views=limit)
         for index in range(50):
             for at, threshold in enumerate(thresholds):
-                used = int(stop_at(full.confidences[index], threshold, limit))
+                sure = np.append(np.asarray(full.confidences[index] >= threshold), True)
+                used = min(int(np.argmax(sure)) + 1, limit)
                 assert used == int(stopped.count[index, at])
                 assert int(full.predictions[index, used - 1]) == int(stopped.predictions[index, at, used - 1])
 
@@ -335,3 +336,22 @@ def test_nothing_is_compiled_twice():
         table = jax.tree.map(lambda leaf: leaf[0], random_tables(10, 4, 1, seed=seed))
         walk(jax.random.key(seed), table, jnp.int32(seed), jnp.float32(0.5 + 0.1 * seed))
     assert compiled == 1
+
+
+def test_policies_are_registered_by_call_or_decorator_and_no_name_twice():
+    try:
+
+        @register_policy("decorated")
+        def decorated(key, state, scene):
+            return jnp.zeros(10)
+
+        assert register_policy("called", decorated) is decorated
+        assert list(POLICIES)[-2:] == ["decorated", "called"]
+        assert policy_named("decorated") is policy_named("called") is decorated
+        for register in (lambda: register_policy("called", decorated), lambda: register_policy("random")):
+            with pytest.raises(ValueError, match="is taken"):
+                register()
+    finally:
+        POLICIES.pop("decorated", None), POLICIES.pop("called", None)
+    with pytest.raises(ValueError, match=r"unknown policy 'called'; it is one of random, .*pair_oracle"):
+        policy_named("called")

@@ -23,7 +23,7 @@ from eval.numbers.comparison import intervals
 from eval.numbers.confidence import stops_at, walked
 from eval.walks.grid import THRESHOLDS
 from mevs_jax.arrays import AnyArray
-from mevs_jax.beliefs import CalibratedFusion, beliefs_along
+from mevs_jax.beliefs import CalibratedFusion, running_sum
 from mevs_jax.calibration import class_weights
 from mevs_jax.models.view_policy import expected_gain
 from mevs_jax.policies.base import Knowledge, Policy, with_movement
@@ -213,7 +213,7 @@ def what_it_costs(
     walked_by = next(name for name in ("predicted_entropy", "random") if name in records)
     both, method = (validation.features, test.features), records[learner.name]
     thesis = [
-        confidences(jax.vmap(jax.vmap(beliefs_along))(walked(jnp.asarray(views), data.logits)), data.labels)
+        confidences(jax.vmap(jax.vmap(running_sum))(walked(jnp.asarray(views), data.logits)), data.labels)
         for data, views in zip(both, records[walked_by].views, strict=True)
     ]
     gains = [

@@ -19,7 +19,7 @@ from mevs_jax.models import ViewPolicy
 from mevs_jax.policies.base import Knowledge, Policy
 from mevs_jax.policies.oracles import fused_oracle
 from mevs_jax.policies.registry import POLICIES
-from mevs_jax.selection import ViewTable, adding, by_attention, select_from_table
+from mevs_jax.selection import ViewTable, by_attention, select_from_table, sum_of_logits
 from mevs_jax.viewpoints import ViewGraph
 from train.choosing.chunks import in_chunks
 from train.choosing.features import Features
@@ -128,7 +128,7 @@ def _walk_some(
     max_views: int,
 ) -> Int[Array, "objects walks steps"]:
     starts = jnp.arange(0, graph.points.shape[0], contender.every)
-    policy, fuse = contender.policy_of(parameters), by_attention(fusion) if contender.believes else adding
+    policy, fuse = contender.policy_of(parameters), by_attention(fusion) if contender.believes else sum_of_logits
 
     def of_object(key: Array, table: ViewTable, directions: Array) -> Array:
         scene = table.scene(replace(graph, points=directions), knowledge)

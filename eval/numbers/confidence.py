@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from eval.numbers.comparison import intervals
-from mevs_jax.beliefs import beliefs_along, discounted, mean_of_probabilities
+from mevs_jax.beliefs import discounted, mean_of_probabilities, running_sum
 from mevs_jax.calibration import (
     expected_calibration_error,
     fit_exponent,
@@ -47,7 +47,7 @@ def walked(views: Int[Array, "objects starts steps"], logits: Float[Array, "obje
 def _fit(logits: Array, labels: Array) -> dict[str, Array]:
     """Temperatures (steps,) of the fitted readings, from walks (objects, starts, steps, classes)."""
     _, starts, steps, classes = logits.shape
-    beliefs = jax.vmap(beliefs_along)(logits.reshape(-1, steps, classes))
+    beliefs = jax.vmap(running_sum)(logits.reshape(-1, steps, classes))
     truth = jnp.repeat(labels, starts)
     scale, growth = fit_exponent(beliefs, truth)
     counts = jnp.arange(1, steps + 1, dtype=jnp.float32)
@@ -68,7 +68,7 @@ def _mixed(logits: Array) -> Array:
 @jax.jit
 def _discounted(logits: Array, temperatures: Array) -> Array:
     """Log-probabilities of all other readings, which differ in their temperatures (steps,) alone."""
-    return jax.vmap(jax.vmap(lambda walk: discounted(beliefs_along(walk), temperatures)))(logits)
+    return jax.vmap(jax.vmap(lambda walk: discounted(running_sum(walk), temperatures)))(logits)
 
 
 @jax.jit

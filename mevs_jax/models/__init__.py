@@ -1,4 +1,4 @@
-"""The networks, as Flax NNX modules."""
+"""The networks as Flax NNX modules."""
 
 from mevs_jax.models.batch_norm import BatchNorm
 from mevs_jax.models.counting import count_parameters

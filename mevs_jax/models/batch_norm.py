@@ -1,7 +1,7 @@
-"""Batch normalisation with the running statistics of the reference: unbiased variance, a counter, a scheduled momentum.
+"""Batch normalisation with PyTorch's running statistics: unbiased variance, a counter, and a momentum that can change.
 
-Flax's own layer keeps the biased variance and a momentum fixed at construction. The thesis lowers the momentum during
-training (§5, `BNMomentumScheduler`), and a momentum that is an argument needs no recompilation.
+Flax's own layer stores the biased variance and fixes the momentum at construction. The thesis lowers the momentum during
+training (§5, `BNMomentumScheduler`). Here the momentum is an argument, so changing it needs no recompilation.
 """
 
 from __future__ import annotations
@@ -15,7 +15,12 @@ from jaxtyping import Array, Float
 
 
 class BatchNorm(nnx.Module):
-    """Normalises the last axis over all others (Ioffe and Szegedy, 2015)."""
+    """Normalises each feature (last axis) over all other axes (Ioffe and Szegedy, 2015).
+
+    Args:
+        features: size of the last axis.
+        epsilon: added to the variance.
+    """
 
     def __init__(self, features: int, *, epsilon: float = 1e-5):
         self.scale = nnx.Param(jnp.ones(features))
@@ -26,16 +31,23 @@ class BatchNorm(nnx.Module):
         self.epsilon = epsilon
 
     def folded(self) -> tuple[Float[Array, " features"], Float[Array, " features"]]:
-        """What normalising by the running statistics comes to: a factor for the linear layer before it, and a bias after."""
+        """The normalisation by the running statistics as a factor and a bias: x · factor + bias.
+
+        The factor can be multiplied into the weights of the preceding linear layer.
+        """
         factor = self.scale[...] * jax.lax.rsqrt(self.variance[...] + self.epsilon)
         return factor, self.bias[...] - self.mean[...] * factor
 
     def __call__(
         self, x: Float[Array, "... features"], *, train: bool = False, momentum: float | Float[Array, ""] = 0.1
     ) -> Float[Array, "... features"]:
-        """Normalises by the batch and updates the running statistics where `train`, else by the running statistics.
+        """Returns `x` normalised, in the type of `x`; the statistics are computed in float32 or wider.
 
-        `momentum` is the weight of the new batch, in [0, 1]. Statistics are at least float32; the result is as `x`.
+        Args:
+            x: the values to normalise.
+            train: whether to normalise by the statistics of the batch and update the running statistics; otherwise the
+                running statistics are used.
+            momentum: weight of the new batch in the running statistics, in [0, 1].
         """
         dtype, x = x.dtype, x.astype(jnp.promote_types(x.dtype, jnp.float32))
         if train:
@@ -48,10 +60,10 @@ class BatchNorm(nnx.Module):
     def largest(
         self, x: Float[Array, "... rows features"], *, momentum: float | Float[Array, ""] = 0.1
     ) -> Float[Array, "... features"]:
-        """In training, the maximum over rows of what is normalised and rectified, which is never written out.
+        """Maximum over rows of relu(normalised x) in training, without storing the normalised rows.
 
-        Normalising is monotone in every feature, so the maximum is that of the largest row, or of the smallest where the
-        scale is negative. Of equal rows the first has the gradient, as in PyTorch.
+        Normalisation is monotone in every feature, so the maximum comes from the largest value, or from the smallest if the
+        scale is negative. Among equal rows the first receives the gradient, as in PyTorch.
         """
         dtype, x = x.dtype, x.astype(jnp.promote_types(x.dtype, jnp.float32))
         groups = x.reshape(-1, *x.shape[-2:])
@@ -70,9 +82,10 @@ class BatchNorm(nnx.Module):
 def _normalise(
     x: Float[Array, "... features"], scale: Float[Array, " features"], bias: Float[Array, " features"], epsilon: float
 ) -> tuple[Float[Array, "... features"], Float[Array, " features"], Float[Array, " features"]]:
-    """`x` normalised by its own mean and (biased) variance, and these two, through which no gradient flows.
+    """Returns `x` normalised by its own mean and (biased) variance, and the two; no gradient flows through the two.
 
-    The gradient is written out: of all that is as large as `x` it keeps `x` alone, and takes half the time of the derived one.
+    The gradient is written by hand. It stores no array of the size of `x` but `x` itself, and takes half the time of the
+    gradient that JAX derives.
     """
     return _normalise_forward(x, scale, bias, epsilon)[0]
 
@@ -81,7 +94,7 @@ def _moments(x: Array) -> tuple[Array, Array]:
     """Mean and variance over all axes but the last."""
     axes = tuple(range(x.ndim - 1))
     mean = jnp.mean(x, axes)
-    # In one pass over x, as Flax does: exact enough in float32 unless the mean is some hundreds of deviations from zero.
+    # One pass over x, as in Flax. Float32 is accurate enough unless the mean is some hundred standard deviations from zero.
     return mean, jnp.maximum(jnp.mean(jnp.square(x), axes) - jnp.square(mean), 0)
 
 
@@ -91,13 +104,13 @@ def _normalise_forward(x: Array, scale: Array, bias: Array, epsilon: float):
     return ((x - mean) * (scale * inverse) + bias, mean, variance), (x, mean, inverse, scale)
 
 
-def _normalise_backward(epsilon: float, kept: tuple[Array, ...], cotangents: tuple[Array, Array, Array]):
-    x, mean, inverse, scale = kept
-    towards = cotangents[0]
+def _normalise_backward(epsilon: float, residuals: tuple[Array, ...], cotangents: tuple[Array, Array, Array]):
+    x, mean, inverse, scale = residuals
+    cotangent = cotangents[0]
     axes, count = tuple(range(x.ndim - 1)), x.size // x.shape[-1]
-    of_bias = jnp.sum(towards, axes)
-    of_scale = jnp.sum(towards * (x - mean), axes) * inverse
-    of_x = scale * inverse * (towards - of_bias / count - (x - mean) * (inverse * of_scale / count))
+    of_bias = jnp.sum(cotangent, axes)
+    of_scale = jnp.sum(cotangent * (x - mean), axes) * inverse
+    of_x = scale * inverse * (cotangent - of_bias / count - (x - mean) * (inverse * of_scale / count))
     return of_x, of_scale, of_bias
 
 
@@ -111,7 +124,7 @@ def _largest_normalised(
     bias: Float[Array, " features"],
     epsilon: float,
 ) -> tuple[Float[Array, "groups features"], Float[Array, " features"], Float[Array, " features"]]:
-    """The maximum over rows of `relu(_normalise(x, …))`, and the mean and variance, through which no gradient flows."""
+    """Returns the maximum over rows of `relu(_normalise(x, …))`, the mean and the variance; no gradient flows through the two."""
     return _largest_normalised_forward(x, scale, bias, epsilon)[0]
 
 
@@ -123,19 +136,19 @@ def _largest_normalised_forward(x: Array, scale: Array, bias: Array, epsilon: fl
     return (out, mean, variance), (x, extreme, out > 0, mean, inverse, scale)
 
 
-def _largest_normalised_backward(epsilon: float, kept: tuple[Array, ...], cotangents: tuple[Array, Array, Array]):
-    x, extreme, positive, mean, inverse, scale = kept
-    towards = jnp.where(positive, cotangents[0], 0.0)
+def _largest_normalised_backward(epsilon: float, residuals: tuple[Array, ...], cotangents: tuple[Array, Array, Array]):
+    x, extreme, positive, mean, inverse, scale = residuals
+    cotangent = jnp.where(positive, cotangents[0], 0.0)
     count = x.size // x.shape[-1]
-    of_bias = jnp.sum(towards, axis=0)
-    of_scale = jnp.sum(towards * (extreme - mean), axis=0) * inverse
+    of_bias = jnp.sum(cotangent, axis=0)
+    of_scale = jnp.sum(cotangent * (extreme - mean), axis=0) * inverse
     factor = scale * inverse
     slope = factor * inverse * of_scale / count
     row = jnp.arange(x.shape[1], dtype=jnp.int32)[None, :, None]
     first = jnp.min(jnp.where(x == extreme[:, None], row, x.shape[1]), axis=1)
-    # The barrier keeps the compiler from looking for it anew for every row.
+    # The barrier keeps the compiler from recomputing `first` for every row.
     chosen = row == jax.lax.optimization_barrier(first)[:, None]
-    of_x = jnp.where(chosen, (towards * factor)[:, None], 0.0) - (factor * of_bias / count - mean * slope) - x * slope
+    of_x = jnp.where(chosen, (cotangent * factor)[:, None], 0.0) - (factor * of_bias / count - mean * slope) - x * slope
     return of_x, of_scale, of_bias
 
 

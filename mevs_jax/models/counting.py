@@ -1,4 +1,4 @@
-"""How many numbers a network holds, counted as the thesis counts."""
+"""The number of parameters of a network, counted as in the thesis."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from flax import nnx
 
 
 def count_parameters(module: nnx.Module, *, trainable_only: bool = False) -> int:
-    """Number of scalars in `module`: weights, and unless `trainable_only` the batch-norm mean, variance and counter.
+    """Number of scalars in `module`: the weights, and unless `trainable_only` also batch norm's mean, variance and counter.
 
     The thesis reports the larger number (§4.3): 11,191,262 for ResNet-18, 1,471,509 for PointNet++ with 10 views.
     """

@@ -1,8 +1,9 @@
-"""PointNet++ with single-scale grouping: one partial cloud to the depth entropy of every candidate view.
+"""PointNet++ with single-scale grouping: predicts the depth entropy of every candidate view from one partial cloud.
 
-Source: Qi et al., *PointNet++*, 2017, and the thesis §4.3.2. The thesis's network reads six numbers a point, xyz and three
-zeros in the place of normals; the place is kept so that its weights and its parameter count (1,471,509 for 10 views,
-1,479,219 for 40) carry over. Where the camera's pose is known, the direction from each point to the camera can stand there.
+Source: Qi et al., *PointNet++*, 2017, and the thesis §4.3.2. The thesis's network reads six numbers per point: the coordinates
+and three zeros in place of a normal. This network has the same inputs, so the thesis's weights and parameter counts (1,471,509
+for 10 views, 1,479,219 for 40) carry over. If the camera's pose is known, the direction from each point to the camera can
+replace the zeros.
 """
 
 from __future__ import annotations
@@ -26,7 +27,14 @@ from mevs_jax.points.ops import ball_query, farthest_point_sample
 
 @dataclass(frozen=True)
 class Abstraction:
-    """One set-abstraction level: how many centres, how far they look, at how many points, through which layers."""
+    """One set-abstraction level of PointNet++.
+
+    Attributes:
+        centres: number of points kept by farthest-point sampling.
+        radius: of the neighbourhood of each centre, in units of the cloud.
+        samples: number of neighbours per centre.
+        layers: number of outputs of each layer applied to the neighbours.
+    """
 
     centres: int
     radius: float
@@ -54,7 +62,7 @@ class Perceptron(nnx.Module):
         self.norm = nnx.List(BatchNorm(size) for size in layers)
 
     def __call__(self, x: Array, *, momentum: float | Array) -> Array:
-        """In training."""
+        """The outputs of all layers in training, with batch norm by the statistics of the batch."""
         for linear, norm in zip(self.linear, self.norm, strict=True):
             x = jax.nn.relu(norm(linear(x), train=True, momentum=momentum))
         return x
@@ -62,8 +70,8 @@ class Perceptron(nnx.Module):
     def largest(
         self, x: Float[Array, "*batch rows columns"], *, momentum: float | Array, passed: int = 0
     ) -> Float[Array, "*batch outputs"]:
-        """In training, the maximum over rows of what becomes of them; the first `passed` linear layers were passed before."""
-        # One long matrix instead of many small ones: the gradient of the weights is then a single product.
+        """Maximum over rows of the outputs in training; the first `passed` linear layers have already been applied to `x`."""
+        # One long matrix instead of many small ones, so that the gradient of the weights is a single product.
         batch = x.shape[:-1]
         x = x.reshape(-1, x.shape[-1])
         last = len(self.linear) - 1
@@ -74,7 +82,7 @@ class Perceptron(nnx.Module):
         return self.norm[last].largest(x.reshape(*batch, -1), momentum=momentum)
 
     def folded(self) -> list[tuple[Array, Array]]:
-        """Weights and bias of each layer, with batch norm by its running statistics among them."""
+        """Weights and bias of each layer, including batch norm by its running statistics."""
         layers = []
         for linear, norm in zip(self.linear, self.norm, strict=True):
             factor, bias = norm.folded()
@@ -83,17 +91,17 @@ class Perceptron(nnx.Module):
 
 
 def _infer(layers: list[tuple[Array, Array]], x: Array) -> Array:
-    """Folded layers, each followed by ReLU."""
+    """Applies folded layers, each followed by ReLU."""
     for kernel, bias in layers:
         x = jax.nn.relu(product(x, kernel) + bias).astype(x.dtype)
     return x
 
 
 def _passes_first(kernel: Float[Array, "inputs outputs"]) -> bool:
-    """Whether points pass the first layer before they are gathered.
+    """Whether the first layer is applied to points before they are gathered into neighbourhoods.
 
-    The layer is linear, so they may: once for a point instead of once for every neighbourhood that the point is in. A few
-    columns are gathered as they are, since that costs less than gathering what becomes of them.
+    This is possible since the layer is linear, and it computes each point once instead of once for every neighbourhood. With
+    few inputs it is not worthwhile: gathering them costs less than gathering the outputs.
     """
     return kernel.shape[0] > 8
 
@@ -101,14 +109,15 @@ def _passes_first(kernel: Float[Array, "inputs outputs"]) -> bool:
 def _passed(
     points: Float[Array, "points 3"], features: Float[Array, "points channels"], kernel: Float[Array, "inputs outputs"]
 ) -> Float[Array, "points columns"]:
-    """What is gathered of every neighbour."""
+    """The columns to gather for every neighbour: first-layer outputs if `_passes_first`, else the inputs."""
     if _passes_first(kernel):
         return _placed(points, kernel) + product(features, kernel[3:])
     return jnp.concatenate([points, features.astype(points.dtype)], axis=-1)
 
 
 def _placed(points: Float[Array, "points 3"], kernel: Float[Array, "inputs outputs"]) -> Float[Array, "points outputs"]:
-    """The coordinates' part of the first layer; exactly, since a difference of two such is small."""
+    """The contribution of the coordinates to the first layer."""
+    # In full precision, since differences of two such contributions are small.
     return jnp.matmul(points, kernel[:3], precision=jax.lax.Precision.HIGHEST)
 
 
@@ -118,7 +127,7 @@ def _first_layer(
     neighbours: Int[Array, "centres samples"],
     kernel: Float[Array, "inputs outputs"],
 ) -> Float[Array, "centres samples outputs"]:
-    """The neighbours' offsets from their centres beside their features, times the first layer's weights."""
+    """The first layer of every neighbour: its offset from the centre and its features, times the weights `kernel`."""
     if _passes_first(kernel):
         return passed[neighbours] - _placed(centres, kernel)[:, None]
     columns = passed.shape[-1]
@@ -127,8 +136,11 @@ def _first_layer(
 
 
 def _map(function: Callable, clouds: Any, at_once: int = 1) -> Any:
-    """`function` of every cloud, in inference: on CPU so few at once that they stay in the cache, elsewhere so many that the
-    device is busy and memory bounded (64 of the thesis's size take 2 GB)."""
+    """Applies `function` to every cloud in inference, in batches.
+
+    On CPU the batches are small (`at_once`) so that they stay in the cache. On accelerators they hold 64 clouds, which keeps the
+    device busy and bounds the memory (64 clouds of the thesis's size take 2 GB).
+    """
     return jax.lax.map(function, clouds, batch_size=at_once if jax.default_backend() == "cpu" else 64)
 
 
@@ -140,14 +152,14 @@ def _abstract(
     level: Abstraction,
     layers: list[tuple[Array, Array]],
 ) -> Float[Array, "centres outputs"]:
-    """One level of one cloud in inference, on CPU some centres at a time."""
+    """One level of one cloud in inference; on CPU in pieces of a few centres."""
     neighbours = ball_query(points, centres, level.radius, level.samples)
     kernel, bias = layers[0]
     passed = _passed(points, features, kernel)
 
     def some(piece: tuple[Array, Array]) -> Array:
         x = _first_layer(passed, *piece, kernel) + bias
-        x = x.reshape(-1, x.shape[-1])  # one long matrix
+        x = x.reshape(-1, x.shape[-1])
         x = _infer(layers[1:], jax.nn.relu(x).astype(features.dtype))
         return jnp.max(x.reshape(*piece[1].shape, -1), axis=1)
 
@@ -157,7 +169,7 @@ def _abstract(
 
 
 def _pieces(level: Abstraction) -> int:
-    """How many pieces a level's centres come in: on CPU as many as divide them, of at most 4,096 neighbours."""
+    """Number of pieces that a level's centres are processed in; on CPU, equal pieces of at most 4,096 neighbours."""
     if jax.default_backend() != "cpu":
         return 1
     fewest = -(-level.centres * level.samples // 4096)
@@ -165,15 +177,18 @@ def _pieces(level: Abstraction) -> int:
 
 
 class PointNet2(nnx.Module):
-    """PointNet++ SSG regressor.
+    """PointNet++ SSG regressor with one output per candidate view.
 
     Args:
-        views: number of candidate views, each of which gets one number.
-        abstractions, global_layers, head_layers: sizes; the thesis's by default.
+        views: number of candidate views, at least 2.
+        abstractions, global_layers, head_layers: sizes of the layers; the thesis's by default.
         dropout: rate before the last layer, in [0, 1).
         rngs: source of the initial weights.
-        dtype: what the hidden layers calculate in, that of the clouds unless given; coordinates, weights, batch-norm statistics
-            and the last layer keep their own.
+        dtype: type in which the hidden layers compute; that of the clouds by default. Coordinates, weights, batch-norm
+            statistics and the last layer keep their own types.
+
+    Raises:
+        ValueError: for fewer than 2 views.
     """
 
     def __init__(
@@ -191,7 +206,7 @@ class PointNet2(nnx.Module):
             raise ValueError(f"PointNet2 needs at least 2 candidate views, got {views}")
         self.views = views
         self.levels = tuple(abstractions)
-        channels = 3  # the place of the normals
+        channels = 3  # in place of normals
         perceptrons = []
         for level in self.levels:
             perceptrons.append(Perceptron(3 + channels, level.layers, rngs=rngs, dtype=dtype))
@@ -211,25 +226,28 @@ class PointNet2(nnx.Module):
         momentum: float | Float[Array, ""] = 0.1,
         dropout: float | Float[Array, ""] | None = None,
     ) -> Float[Array, "*batch views"]:
-        """Predicted entropy, in units of the training split's largest, of every view.
+        """Predicted entropy of every view, in units of the largest entropy of the training split.
 
         Args:
-            points: one cloud (points, 3) or a batch of them, in the unit sphere; or (points, 6), a direction beside each point.
-            train: normalise over the batch, update running statistics, drop out.
-            key: for dropout; needed where `train`.
-            momentum: of the running statistics, in [0, 1].
-            dropout: rate in the place of the network's own, in [0, 1).
+            points: one cloud (points, 3) or a batch of clouds, in the unit sphere; or (points, 6) with a direction per point.
+            train: whether to normalise by the batch, update the running statistics, and apply dropout.
+            key: PRNG key for dropout; required if `train`.
+            momentum: weight of the new batch in the running statistics, in [0, 1].
+            dropout: rate that replaces the network's own, in [0, 1).
+
+        Raises:
+            ValueError: for clouds of other than 3 or 6 columns, or training without a key.
         """
         points = jnp.asarray(points)
         if points.shape[-1] not in (3, 6):
-            raise ValueError(f"PointNet2 reads clouds of 3 or 6 columns, got {points.shape[-1]}")
+            raise ValueError(f"PointNet2 needs clouds of 3 or 6 columns, got {points.shape[-1]}")
         batch, dtype = points.shape[:-2], self.dtype or points.dtype
         clouds = points.reshape(-1, *points.shape[-2:])
         if not train:
             embedded = self._embed(clouds)
             return self.out(_infer(self.head.folded(), embedded).astype(points.dtype)).reshape(*batch, self.views)
         if key is None:
-            raise ValueError("PointNet2 in training needs a key for its dropout")
+            raise ValueError("PointNet2 needs a key for its dropout in training")
         coordinates, features = clouds[..., :3], clouds[..., 3:].astype(dtype)
         for level, perceptron in zip(self.levels, self.perceptrons, strict=True):
             chosen = jax.vmap(farthest_point_sample, in_axes=(0, None))(coordinates, level.centres)
@@ -243,19 +261,19 @@ class PointNet2(nnx.Module):
         everything = jnp.concatenate([coordinates.astype(dtype), features], axis=-1)
         features = self.whole.largest(everything, momentum=momentum)
         hidden = self.head(features, momentum=momentum).astype(points.dtype)
-        # Flax's own layer takes no rate that is traced.
+        # Flax's dropout layer does not accept a traced rate.
         kept = 1 - (self.dropout if dropout is None else dropout)
         hidden = jnp.where(jax.random.bernoulli(key, kept, hidden.shape), hidden / kept, 0.0)
         return self.out(hidden).reshape(*batch, self.views)
 
     def embed(self, points: Float[AnyArray, "*batch points columns"]) -> Float[Array, "*batch embedding"]:
-        """The vector of each cloud from which the entropies are predicted, in inference; arguments as of a call."""
+        """The embedding of each cloud, the input of the head, in inference; `points` as in `__call__`."""
         points = jnp.asarray(points)
         embedded = self._embed(points.reshape(-1, *points.shape[-2:])).astype(points.dtype)
         return embedded.reshape(*points.shape[:-2], -1)
 
     def _embed(self, clouds: Float[Array, "clouds points columns"]) -> Float[Array, "clouds embedding"]:
-        """Clouds to the vectors before the head, by the running statistics."""
+        """The embeddings of a batch of clouds, with batch norm by the running statistics."""
         points, features = clouds[..., :3], clouds[..., 3:].astype(self.dtype or clouds.dtype)
         for level, perceptron in zip(self.levels, self.perceptrons, strict=True):
             sample = partial(farthest_point_sample, k=level.centres)

@@ -1,7 +1,7 @@
-"""Weights trained with PyTorch, put into our networks: same numbers, other names and layouts.
+"""Copies weights trained with PyTorch into the networks of this package, with their names and layouts translated.
 
-A state dict is a mapping from torch's names to NumPy arrays; reading one from a file is not this module's business. Names are
-torchvision's for ResNet, and those of the usual PyTorch PointNet++ (`pointnet2_ops`' `PointnetSAModule`) for PointNet2.
+A state dict is a mapping from PyTorch's names to NumPy arrays; this module does not read files. The names are torchvision's for
+ResNet, and those of the usual PyTorch PointNet++ (`PointnetSAModule` of `pointnet2_ops`) for PointNet2.
 """
 
 from __future__ import annotations
@@ -20,17 +20,18 @@ StateDict = Mapping[str, np.ndarray]
 
 
 class _Reader:
-    """Takes arrays out of a state dict by name, checks their shape, and knows which are left."""
+    """Copies arrays from a state dict by name, checks their shapes, and records which names have not been used."""
 
     def __init__(self, state: StateDict):
         self.state = state
         self.left = set(state)
 
     def put(self, variable: nnx.Variable | None, name: str, *axes: int) -> None:
-        assert variable is not None  # biases are there where the names say so
-        like = variable.get_value()  # an array, or the shape of one in a network whose weights were not drawn
+        """Copies the array `name`, transposed to `axes` if given, into `variable`."""
+        assert variable is not None  # a bias exists wherever the caller names one
+        like = variable.get_value()  # an array, or only its shape in a network without initial weights
         if name not in self.state:
-            raise ValueError(f"the state dict has no {name!r}; is it of this network?")
+            raise ValueError(f"the state dict has no {name!r}; check that it belongs to this network")
         array = np.asarray(self.state[name])
         array = array.transpose(axes) if axes else array
         if array.shape[:2] == (1, 1) and like.ndim == 2:  # a 1×1 convolution over points is a linear layer
@@ -41,6 +42,7 @@ class _Reader:
         variable.set_value(jnp.asarray(array, like.dtype))
 
     def norm(self, norm: BatchNorm, name: str) -> None:
+        """Copies the weights and running statistics of a batch norm."""
         self.put(norm.scale, f"{name}.weight")
         self.put(norm.bias, f"{name}.bias")
         self.put(norm.mean, f"{name}.running_mean")
@@ -49,23 +51,24 @@ class _Reader:
             self.put(norm.batches, f"{name}.num_batches_tracked")
 
     def finish(self) -> None:
+        """Raises ValueError if the state dict has unused entries."""
         if self.left:
-            raise ValueError(f"the state dict has entries this network lacks: {', '.join(sorted(self.left)[:4])}")
+            raise ValueError(f"the state dict has entries that this network lacks: {', '.join(sorted(self.left)[:4])}")
 
 
 def resnet_from_torch(network: ResNet, state: StateDict, *, head: bool = True) -> None:
     """Fills `network` with a torchvision `resnet18` or `resnet34` state dict.
 
     Args:
-        network: of the same depth, 64 channels wide, for images of three channels.
-        state: torchvision's names to arrays.
-        head: whether the last layer is filled too; without, the network keeps its own, for other classes.
+        network: of the same depth, with width 64 and images of three channels.
+        state: arrays by torchvision's names.
+        head: whether to fill the last layer too; if not, the network keeps its own, for other classes.
 
     Raises:
-        ValueError: for a missing or superfluous entry, or another shape.
+        ValueError: for a missing or unexpected entry, or a different shape.
     """
     reader = _Reader(state)
-    assert isinstance(network.convolution, Convolution), "torchvision has no such stem"
+    assert isinstance(network.convolution, Convolution), "torchvision's ResNets have no patch stem"
     reader.put(network.convolution.kernel, "conv1.weight", 2, 3, 1, 0)
     reader.norm(network.norm, "bn1")
     names = [f"layer{stage + 1}.{block}" for stage, blocks in enumerate(network.stages) for block in range(blocks)]
@@ -85,10 +88,10 @@ def resnet_from_torch(network: ResNet, state: StateDict, *, head: bool = True) -
 
 
 def pointnet2_from_torch(network: PointNet2, state: StateDict) -> None:
-    """Fills `network` with the state dict of a PointNet++ SSG: `SA_modules.i.mlps.0.*` and `fc_layer.*`.
+    """Fills `network` with the state dict of a PyTorch PointNet++ SSG: `SA_modules.i.mlps.0.*` and `fc_layer.*`.
 
     Raises:
-        ValueError: for a missing or superfluous entry, or another shape.
+        ValueError: for a missing or unexpected entry, or a different shape.
     """
     reader = _Reader(state)
     for level, perceptron in enumerate([*network.perceptrons, network.whole]):
@@ -103,6 +106,7 @@ def pointnet2_from_torch(network: PointNet2, state: StateDict) -> None:
 
 
 def _shared_layers(reader: _Reader, perceptron: Perceptron, name: str) -> None:
+    """Fills a `Perceptron` from the entries that begin with `name`."""
     for index in range(len(perceptron.linear)):  # 1×1 convolution, norm, ReLU
         reader.put(perceptron.linear[index].kernel, f"{name}.{3 * index}.weight", 2, 3, 1, 0)
         reader.norm(perceptron.norm[index], f"{name}.{3 * index + 1}")

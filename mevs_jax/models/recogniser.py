@@ -1,4 +1,4 @@
-"""Recogniser: an encoder that looks at single views, and a set fusion that puts together what it saw."""
+"""Recogniser: an encoder of single views and a fusion network for sets of views, trained together."""
 
 from __future__ import annotations
 
@@ -12,11 +12,13 @@ from mevs_jax.models.set_fusion import SetFusion
 
 
 class Recogniser(nnx.Module):
-    """Both, trained together: so views learn to say what other views do not.
+    """An encoder and a fusion network.
+
+    Trained together, the encoder learns features that complement those of other views.
 
     Args:
-        encoder: each view to its features, and by its own head to logits.
-        fusion: features and directions of any set of views to logits.
+        encoder: computes the features of a view and, by its own head, the logits.
+        fusion: computes logits from the features and directions of any set of views.
     """
 
     def __init__(self, encoder: ResNet, fusion: SetFusion):
@@ -31,18 +33,23 @@ class Recogniser(nnx.Module):
         train: bool = False,
         key: Array | None = None,
     ) -> tuple[Float[Array, "*batch views classes"], Float[Array, "*batch classes"], Float[Array, "*batch classes"]]:
-        """Logits of every view alone, and of those of each object that are `present` together: its pose known, and unknown.
+        """Logits of every single view, and of the present views of each object together.
 
         Args:
+            images: of every view.
             directions: unit vectors from the object to the cameras.
-            train: normalise over the batch.
-            key: for dropout in the fusion; nothing is dropped without.
+            present: True for the views to fuse.
+            train: whether batch norm uses the statistics of the batch.
+            key: PRNG key for dropout in the fusion; no dropout without.
+
+        Returns:
+            Logits of single views; fused logits for a known pose; fused logits for an unknown pose.
         """
         features = self.encoder.features(images, train=train)
         posed, unposed = (self.fusion(features, directions, present, key, posed=known) for known in (True, False))
         return self.encoder.head(features), posed, unposed
 
     def see(self, images: Float[AnyArray, "*batch height width channels"]) -> Float[Array, "*batch both"]:
-        """Features and logits of single views, side by side: what is kept of a view."""
+        """Features and logits of single views, concatenated: the data that is stored of a view."""
         features = self.encoder.features(images)
         return jnp.concatenate([features, self.encoder.head(features)], axis=-1)

@@ -1,7 +1,7 @@
-"""ResNet-18 and ResNet-34 (He et al., 2016), and one of half the blocks: one view, image or depth, to the logits of its class.
+"""ResNet-18 and ResNet-34 (He et al., 2016), and a ResNet-10 with half the blocks: logits from the image of one view.
 
-Arithmetic, padding and order of layers are torchvision's, so that its weights carry over (`mevs_jax.pretrained`); the
-layout is channels-last. `width` scales all stages, for data sets and machines smaller than the thesis's.
+Arithmetic, padding and order of layers are torchvision's, so its weights carry over (`mevs_jax.models.pretrained`). The layout is
+channels-last. `width` scales all stages, for data sets and machines smaller than the thesis's.
 """
 
 from __future__ import annotations
@@ -22,19 +22,20 @@ _IMAGENET_MEAN, _IMAGENET_STD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
 
 
 def _patches(x: Float[Array, "batch height width inputs"], size: int, stride: int) -> Float[Array, "places patch"]:
-    """What a square kernel sees at each of its places, a row each."""
+    """The inputs of a square kernel at each of its places, one place per row."""
     pad = size // 2
     rows, columns = (-(-extent // stride) for extent in x.shape[1:3])
     x = jnp.pad(x, ((0, 0), (pad, pad), (pad, pad), (0, 0)))
-    seen = [
+    shifted = [
         x[:, i : i + (rows - 1) * stride + 1 : stride, j : j + (columns - 1) * stride + 1 : stride]
         for i in range(size)
         for j in range(size)
     ]
-    return jnp.concatenate(seen, axis=-1).reshape(x.shape[0] * rows * columns, -1)
+    return jnp.concatenate(shifted, axis=-1).reshape(x.shape[0] * rows * columns, -1)
 
 
 def _convolve(x: Array, kernel: Array, stride: int) -> Array:
+    """Convolution with zero padding of half the kernel's size."""
     pad = kernel.shape[0] // 2
     return jax.lax.conv_general_dilated(
         x, kernel, (stride, stride), [(pad, pad)] * 2, dimension_numbers=("NHWC", "HWIO", "NHWC")
@@ -43,7 +44,7 @@ def _convolve(x: Array, kernel: Array, stride: int) -> Array:
 
 @partial(jax.custom_vjp, nondiff_argnums=(2,))
 def _convolve_on_cpu(x: Array, kernel: Array, stride: int) -> Array:
-    """`_convolve`, but the gradient of the weights is one matrix product."""
+    """`_convolve` with the gradient of the weights as one matrix product."""
     return _convolve(x, kernel, stride)
 
 
@@ -51,10 +52,10 @@ def _forwards(x: Array, kernel: Array, stride: int) -> tuple[Array, tuple[Array,
     return _convolve(x, kernel, stride), (x, kernel)
 
 
-def _backwards(stride: int, kept: tuple[Array, Array], towards: Array) -> tuple[Array, Array]:
-    x, kernel = kept
-    (of_x,) = jax.vjp(lambda x: _convolve(x, kernel, stride), x)[1](towards)
-    rows = towards.reshape(-1, towards.shape[-1])
+def _backwards(stride: int, residuals: tuple[Array, Array], cotangent: Array) -> tuple[Array, Array]:
+    x, kernel = residuals
+    (of_x,) = jax.vjp(lambda x: _convolve(x, kernel, stride), x)[1](cotangent)
+    rows = cotangent.reshape(-1, cotangent.shape[-1])
     of_kernel = jnp.matmul(_patches(x, kernel.shape[0], stride).T, rows, preferred_element_type=jnp.float32)
     return of_x, of_kernel.reshape(kernel.shape).astype(kernel.dtype)
 
@@ -63,11 +64,11 @@ _convolve_on_cpu.defvjp(_forwards, _backwards)
 
 
 class Convolution(nnx.Module):
-    """Square convolution without bias, padded by half its size; torchvision's initial weights.
+    """Square convolution without bias, padded by half its size, with torchvision's initial weights.
 
     On CPU, XLA's convolution of small maps is slow (2×2 by 192 channels: 14 ms, as one matrix product 1.5 ms; backward
-    likewise), so maps of at most 8×8 outputs become a matrix product over gathered patches there; of larger ones the gradient
-    of the weights does. Same sums, other order.
+    likewise). On CPU, maps of at most 8×8 outputs are therefore computed as a matrix product over gathered patches; for larger
+    maps, only the gradient of the weights is. The sums are the same, in a different order.
     """
 
     def __init__(self, inputs: int, outputs: int, size: int, stride: int, *, rngs: nnx.Rngs):
@@ -78,7 +79,7 @@ class Convolution(nnx.Module):
     def __call__(
         self, x: Float[Array, "batch height width inputs"], factor: Float[Array, " outputs"] | None = None
     ) -> Float[Array, "batch rows columns outputs"]:
-        """Each output channel is multiplied by its `factor`, where that is given, by way of the weights."""
+        """The convolution of `x`; each output channel is multiplied by its `factor`, if given, by scaling the weights."""
         kernel, stride = self.kernel[...], self.stride
         kernel = (kernel if factor is None else kernel * factor).astype(x.dtype)
         if jax.default_backend() != "cpu":
@@ -91,7 +92,7 @@ class Convolution(nnx.Module):
 
 
 def _normalised(convolution: Convolution, norm: BatchNorm, x: Array, *, train: bool, momentum: float | Array) -> Array:
-    """A convolution and its batch norm, which in inference is a factor of the weights and a bias."""
+    """A convolution and its batch norm; in inference, the norm is folded into the weights and a bias."""
     if train:
         return norm(convolution(x), train=True, momentum=momentum)
     factor, bias = norm.folded()
@@ -99,7 +100,7 @@ def _normalised(convolution: Convolution, norm: BatchNorm, x: Array, *, train: b
 
 
 class BasicBlock(nnx.Module):
-    """Two 3×3 convolutions beside a shortcut."""
+    """Two 3×3 convolutions with a residual connection."""
 
     def __init__(self, inputs: int, outputs: int, stride: int, *, rngs: nnx.Rngs):
         self.convolution1 = Convolution(inputs, outputs, 3, stride, rngs=rngs)
@@ -121,8 +122,10 @@ class BasicBlock(nnx.Module):
 
 
 class PatchStem(nnx.Module):
-    """Pieces of 4×4 pixels to channels by one layer, as in ConvNeXt (Liu et al. 2022), in the place of ResNet's first convolution
-    and pooling: the same size of map for a twentieth of the work."""
+    """One linear layer on patches of 4×4 pixels, as in ConvNeXt (Liu et al. 2022).
+
+    It replaces ResNet's first convolution and pooling: the output has the same size, for a twentieth of the work.
+    """
 
     def __init__(self, inputs: int, outputs: int, *, rngs: nnx.Rngs):
         initial = nnx.initializers.he_normal()
@@ -131,25 +134,27 @@ class PatchStem(nnx.Module):
     def __call__(self, x: Float[Array, "batch height width inputs"]) -> Float[Array, "batch rows columns outputs"]:
         batch, height, width, channels = x.shape
         if height % 4 or width % 4:
-            raise ValueError(f"patches of 4 pixels do not fill an image of {height}×{width}")
-        pieces = x.reshape(batch, height // 4, 4, width // 4, 4, channels).swapaxes(2, 3)
-        return pieces.reshape(batch, height // 4, width // 4, -1) @ self.layer.kernel[...].astype(x.dtype)
+            raise ValueError(
+                f"patches of 4×4 pixels do not fill an image of {height}×{width}: choose a height and width divisible by 4"
+            )
+        patches = x.reshape(batch, height // 4, 4, width // 4, 4, channels).swapaxes(2, 3)
+        return patches.reshape(batch, height // 4, width // 4, -1) @ self.layer.kernel[...].astype(x.dtype)
 
 
 class ResNet(nnx.Module):
     """ResNet of basic blocks.
 
     Args:
-        depth: 18 or 34 as in the paper, or 10, one block a stage.
+        depth: 18 or 34 as in the paper, or 10 with one block per stage.
         classes: number of logits.
-        channels: channels of the image; depth is replicated to 3 in the thesis.
-        width: channels of the first stage, doubled at each of the three that follow; 64 in the paper.
-        standardise: take ImageNet's mean off the three channels and divide by its standard deviation, as torchvision's
-            weights expect of images in [0, 1].
-        stem: `convolution` as in the paper, 7×7 and pooling; or `patches` (`PatchStem`), for small images on small machines.
+        channels: of the image; the thesis replicates depth to 3.
+        width: channels of the first stage, doubled in each of the three later stages; 64 in the paper.
+        standardise: whether to subtract ImageNet's mean and divide by its standard deviation, as torchvision's weights expect
+            of images in [0, 1].
+        stem: `convolution`, 7×7 and pooling as in the paper; or `patches` (`PatchStem`), for small images on small machines.
         rngs: source of the initial weights.
-        dtype: what the convolutions calculate in, that of the images unless given; weights, batch-norm statistics and the last
-            layer keep their own.
+        dtype: type in which the convolutions compute; that of the images by default. Weights, batch-norm statistics and the
+            last layer keep their own types.
 
     Raises:
         ValueError: for another depth, or `standardise` with other than three channels.
@@ -168,9 +173,9 @@ class ResNet(nnx.Module):
         dtype: jnp.dtype | None = None,
     ):
         if depth not in _BLOCKS:
-            raise ValueError(f"ResNet has depth 10, 18 or 34, got {depth}")
+            raise ValueError(f"ResNet needs depth 10, 18 or 34, got {depth}")
         if standardise and channels != 3:
-            raise ValueError(f"ResNet standardises images of 3 channels, got {channels}")
+            raise ValueError(f"ResNet can standardise images of 3 channels only, got {channels}")
         self.depth, self.classes, self.channels, self.width = depth, classes, channels, width
         self.standardise, self.dtype = standardise, dtype
         self.stages = _BLOCKS[depth]
@@ -197,7 +202,7 @@ class ResNet(nnx.Module):
         train: bool = False,
         momentum: float | Array = 0.1,
     ) -> Float[Array, "*batch features"]:
-        """The vector before the last layer, `8 * width` long."""
+        """The feature vector before the last layer, of length `8 * width`."""
         images = jnp.asarray(images)
         batch = images.shape[:-3]
         x = images.reshape(-1, *images.shape[-3:])
@@ -220,5 +225,11 @@ class ResNet(nnx.Module):
         train: bool = False,
         momentum: float | Array = 0.1,
     ) -> Float[Array, "*batch classes"]:
-        """Logits of one image (height, width, channels) or of a batch; `train` normalises over the batch."""
+        """Logits of one image (height, width, channels) or of a batch.
+
+        Args:
+            images: the images, of any number of batch axes.
+            train: whether to normalise by the batch and update the running statistics.
+            momentum: weight of the new batch in the running statistics, in [0, 1].
+        """
         return self.head(self.features(images, train=train, momentum=momentum))

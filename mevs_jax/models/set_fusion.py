@@ -1,4 +1,4 @@
-"""Fusion of the views of one object by a set transformer, or by the sum of their logits."""
+"""Networks that fuse the views of one object: a set transformer, and the sum of logits for comparison."""
 
 from __future__ import annotations
 
@@ -10,15 +10,15 @@ from jaxtyping import Array, Bool, Float
 from mevs_jax.arrays import AnyArray
 
 
-def _drop_out(key: Array | None, rate: float, x: Array) -> Array:
-    """Without a key, `x` as it is."""
+def _dropout(key: Array | None, rate: float, x: Array) -> Array:
+    """Dropout with a `rate` in [0, 1); without a key, returns `x` unchanged."""
     if key is None or not rate:
         return x
     return jnp.where(jax.random.bernoulli(key, 1 - rate, x.shape), x / (1 - rate), 0.0)
 
 
 class _Block(nnx.Module):
-    """Attention among tokens, then two layers on each, beside what they are added to (pre-norm)."""
+    """A pre-norm transformer block: self-attention, then a two-layer perceptron on each token, both with residuals."""
 
     def __init__(self, width: int, heads: int, dropout: float, *, rngs: nnx.Rngs):
         self.norm1, self.norm2 = nnx.LayerNorm(width, rngs=rngs), nnx.LayerNorm(width, rngs=rngs)
@@ -27,46 +27,51 @@ class _Block(nnx.Module):
         self.dropout = dropout
 
     def __call__(self, x: Array, present: Array, key: Array | None) -> Array:
-        seen = present[..., None, None, :]  # one query like another, over all heads
+        mask = present[..., None, None, :]  # the same for all heads and queries
         keys = (None, None) if key is None else jax.random.split(key)
-        x = x + _drop_out(keys[0], self.dropout, self.attention(self.norm1(x), mask=seen))
+        x = x + _dropout(keys[0], self.dropout, self.attention(self.norm1(x), mask=mask))
         hidden = self.layer2(jax.nn.gelu(self.layer1(self.norm2(x))))
-        return x + _drop_out(keys[1], self.dropout, hidden)
+        return x + _dropout(keys[1], self.dropout, hidden)
 
 
-def about_the_first(
+def relative_to_first(
     directions: Float[AnyArray, "*batch views 3"], present: Bool[AnyArray, "*batch views"]
 ) -> tuple[Float[Array, "*batch views 3"], Float[Array, "*batch 3 3"]]:
-    """Directions turned about the vertical so that the first present one points to azimuth 0, and the turn.
+    """Rotates directions about the vertical axis so that the first present one has azimuth 0.
 
-    What is known of directions where nobody knows which way the object faces: the same however it is turned about the vertical.
+    The result does not depend on the object's rotation about the vertical axis, so it can be used where that is unknown. If the
+    first present direction is vertical, or none is present, nothing is rotated.
+
+    Returns:
+        The rotated directions, and the rotation matrix.
     """
     directions, present = jnp.asarray(directions), jnp.asarray(present)
     first = jnp.take_along_axis(directions, jnp.argmax(present, axis=-1)[..., None, None], axis=-2)[..., 0, :2]
     length = jnp.linalg.norm(first, axis=-1, keepdims=True)
     x, y = jnp.moveaxis(jnp.where(length > 1e-6, first / jnp.maximum(length, 1e-6), jnp.array([1.0, 0.0])), -1, 0)
-    nothing, one = jnp.zeros_like(x), jnp.ones_like(x)
-    turn = jnp.stack([x, y, nothing, -y, x, nothing, nothing, nothing, one], axis=-1).reshape(*x.shape, 3, 3)
-    return directions @ jnp.swapaxes(turn, -1, -2), turn
+    zero, one = jnp.zeros_like(x), jnp.ones_like(x)
+    rotation = jnp.stack([x, y, zero, -y, x, zero, zero, zero, one], axis=-1).reshape(*x.shape, 3, 3)
+    return directions @ jnp.swapaxes(rotation, -1, -2), rotation
 
 
 class SetFusion(nnx.Module):
-    """What several views say together: a small set transformer over features and viewing directions.
+    """A small set transformer that fuses the features and directions of any set of views into logits.
 
-    Any subset of views in any order, also none: a token of its own attends to those that are there, and becomes the belief. As
-    in Set Transformer (Lee et al. 2019) and ViewFormer (Sun et al. 2023), with directions, which the latter leaves out.
+    It accepts any subset of views in any order, also the empty set. A learned token attends to the views that are present, and
+    the logits are computed from this token. As in Set Transformer (Lee et al. 2019) and ViewFormer (Sun et al. 2023), with
+    viewing directions, which the latter leaves out.
 
-    It can do without knowing which way the object faces: directions then are relative to the first view's (`about_the_first`), so
-    only which view comes first matters of their order.
+    The object's pose may be unknown. Directions are then relative to the first view (`relative_to_first`), so of the order of
+    views only the choice of the first matters.
 
     Args:
         features: length of a view's feature vector.
         classes: number of logits.
         width: of the tokens.
-        heads: of attention.
-        blocks: of attention and layers.
-        dropout: within blocks, and of whole feature channels before them.
-        rngs: source of initial weights.
+        heads: number of attention heads.
+        blocks: number of transformer blocks.
+        dropout: rate within the blocks and of the features before them, in [0, 1).
+        rngs: source of the initial weights.
     """
 
     def __init__(
@@ -98,35 +103,37 @@ class SetFusion(nnx.Module):
         *,
         posed: bool = True,
     ) -> Float[Array, "*batch classes"]:
-        """Logits of what was seen.
+        """Logits of the object, from the views that are present.
 
         Args:
+            features: feature vector of each view.
             directions: unit vectors from the object to the cameras.
-            present: which views were looked at; what the others hold does not matter.
-            key: for dropout, in training; nothing is dropped without.
-            posed: whether directions are in the object's own frame, else in one that is turned about the vertical.
+            present: True for the views to use; the values of the others are ignored.
+            key: PRNG key for dropout in training; no dropout without.
+            posed: whether directions are in the object's own frame; if not, in one rotated about the vertical axis by an unknown
+                angle.
         """
         features, directions, present = jnp.asarray(features), jnp.asarray(directions), jnp.asarray(present)
         if not posed:
-            directions = about_the_first(directions, present)[0]
+            directions = relative_to_first(directions, present)[0]
         keys = [None] * (len(self.blocks) + 1) if key is None else list(jax.random.split(key, len(self.blocks) + 1))
-        known = _drop_out(keys[-1], self.dropout, self.norm(jnp.where(present[..., None], features, 0.0)))
-        tokens = self.view(known) + self.direction(directions)
+        normed = _dropout(keys[-1], self.dropout, self.norm(jnp.where(present[..., None], features, 0.0)))
+        tokens = self.view(normed) + self.direction(directions)
         own = self.object[...] if posed else self.unposed[...]
         own = jnp.broadcast_to(own, (*tokens.shape[:-2], 1, tokens.shape[-1]))
         x = jnp.concatenate([own, tokens], axis=-2)
-        there = jnp.concatenate([jnp.ones((*present.shape[:-1], 1), bool), present], axis=-1)
-        for block, drops in zip(self.blocks, keys[:-1], strict=True):
-            x = block(x, there, drops)
+        attended = jnp.concatenate([jnp.ones((*present.shape[:-1], 1), bool), present], axis=-1)
+        for block, block_key in zip(self.blocks, keys[:-1], strict=True):
+            x = block(x, attended, block_key)
         return self.head(self.last_norm(x[..., 0, :]))
 
 
 class SumFusion(nnx.Module):
-    """The thesis's sum of logits in the place of a `SetFusion`, to compare with: it knows no directions.
+    """The thesis's sum of logits with the interface of `SetFusion`, for comparison; it ignores directions.
 
     Args:
-        head: from a view's features to its logits.
-        prior: (classes,) log-probabilities of the classes in training, which count once, not with every view.
+        head: layer from a view's features to its logits.
+        prior: (classes,) log-probabilities of the classes in training. The sum contains them once, not once per view.
     """
 
     def __init__(self, head: nnx.Linear, prior: Float[Array, " classes"]):
@@ -140,7 +147,7 @@ class SumFusion(nnx.Module):
         *,
         posed: bool = True,
     ) -> Float[Array, "*batch classes"]:
-        """Logits of what was seen."""
+        """Logits of the object, from the views that are present; arguments as of `SetFusion`."""
         del directions, posed
         present, prior = jnp.asarray(present), self.prior[...]
         logits = self.head(jnp.where(present[..., None], jnp.asarray(features), 0.0)) - prior

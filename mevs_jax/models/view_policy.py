@@ -1,9 +1,9 @@
-"""ViewPolicy: how much each candidate direction is expected to raise the utility of the belief, given what was seen.
+"""ViewPolicy: a network that predicts how much each candidate view raises the utility of the belief.
 
-A query for each candidate attends to the views seen and to the belief. Candidates are directions, not numbers of a lattice, so a
-lattice that was never trained on will do. It sees what single views say (log-probabilities), not the encoder's features: those
-mean other things in another encoder, which the policy would not do for. Should the object be of some class, a view moves that
-class's log-odds by so much: that is what is learned, and probabilities stay probabilities.
+A query for each candidate attends to the views seen and to the belief. Candidates are directions, not indices into a lattice,
+so the network also works on lattices that it was not trained on. Its inputs are the log-probabilities of single views, not the
+encoder's features: features differ from encoder to encoder, so the network would be tied to one. For each class, the network
+predicts the change of that class's log-odds if the object is of that class. The resulting probabilities stay in (0, 1).
 """
 
 from __future__ import annotations
@@ -16,23 +16,29 @@ from flax import nnx
 from jaxtyping import Array, Bool, Float
 
 from mevs_jax.arrays import AnyArray
-from mevs_jax.models.set_fusion import about_the_first
+from mevs_jax.models.set_fusion import relative_to_first
 
 Utility = Literal["probability", "log"]
-"""What a belief is worth: the true class's probability, or its logarithm."""
+"""The utility of a belief: the probability of the true class, or its logarithm."""
 
 
 def utility_of(
     log_probability: Float[AnyArray, "*any"], utility: Utility = "log", floor: float = 0.01
 ) -> Float[Array, "*any"]:
-    """The utility of a belief that gives the true class this log-probability; in a logarithm, `floor` is added first."""
+    """The utility of a belief that assigns `log_probability` to the true class.
+
+    Args:
+        log_probability: log p of the true class.
+        utility: `probability` for p, `log` for log(p + floor).
+        floor: a positive probability that keeps the logarithm finite.
+    """
     if utility == "probability":
         return jnp.exp(jnp.asarray(log_probability))
     return jnp.logaddexp(jnp.asarray(log_probability), jnp.log(floor))
 
 
 def direction_features(directions: Float[AnyArray, "*batch 3"]) -> Float[Array, "*batch 19"]:
-    """All monomials of degree 1 to 3 of a unit vector: what a layer needs to tell top from side and corner from face."""
+    """All monomials of degree 1 to 3 of a unit vector: a linear layer on them can tell top from side and corner from face."""
     directions = jnp.asarray(directions)
     found = [directions[..., i] for i in range(3)]
     for i in range(3):
@@ -46,7 +52,10 @@ def direction_features(directions: Float[AnyArray, "*batch 3"]) -> Float[Array, 
 
 
 class _CrossBlock(nnx.Module):
-    """Queries look at what is known, not at each other, so a candidate's worth does not depend on which others there are."""
+    """A pre-norm transformer block with cross-attention from queries to the known tokens.
+
+    Queries do not attend to each other, so the score of a candidate does not depend on the other candidates.
+    """
 
     def __init__(self, width: int, heads: int, *, rngs: nnx.Rngs):
         self.norm1, self.norm2 = nnx.LayerNorm(width, rngs=rngs), nnx.LayerNorm(width, rngs=rngs)
@@ -59,16 +68,17 @@ class _CrossBlock(nnx.Module):
 
 
 class ViewPolicy(nnx.Module):
-    """Scores candidate directions.
+    """Predicts the gain in utility of every candidate direction.
 
     Args:
-        classes: of the belief.
+        classes: number of classes of the belief.
         width: of queries and tokens.
-        heads: of attention.
-        blocks: of attention and layers.
-        cloud: length of the vector beside each view, PointNet++'s embedding of its partial cloud; 0 for none.
-        posed: whether directions are in the object's own frame, else in one that is turned about the vertical.
-        utility, floor: what it expects to rise; see `worth`.
+        heads: number of attention heads.
+        blocks: number of cross-attention blocks.
+        cloud: length of PointNet++'s embedding of the partial cloud of each view; 0 for none.
+        posed: whether directions are in the object's own frame; if not, in one rotated about the vertical axis by an unknown
+            angle.
+        utility, floor: the utility whose gain is predicted; see `utility_of`.
         rngs: source of the initial weights.
     """
 
@@ -91,9 +101,9 @@ class ViewPolicy(nnx.Module):
         self.token1, self.token2 = nnx.Linear(width, 2 * width, rngs=rngs), nnx.Linear(2 * width, width, rngs=rngs)
         self.blocks = nnx.List([_CrossBlock(width, heads, rngs=rngs) for _ in range(blocks)])
         self.known_norm, self.last_norm = nnx.LayerNorm(width, rngs=rngs), nnx.LayerNorm(width, rngs=rngs)
-        nothing = nnx.initializers.zeros_init()  # is expected, to begin with
-        self.gain = nnx.Linear(width, 1, kernel_init=nothing, rngs=rngs)
-        self.log_odds_if = nnx.Linear(width, classes, kernel_init=nothing, rngs=rngs)
+        zeros = nnx.initializers.zeros_init()  # an untrained network predicts no gain
+        self.gain = nnx.Linear(width, 1, kernel_init=zeros, rngs=rngs)
+        self.log_odds_if = nnx.Linear(width, classes, kernel_init=zeros, rngs=rngs)
         self.cloud = (
             nnx.Sequential(nnx.LayerNorm(cloud, rngs=rngs), nnx.Linear(cloud, width, rngs=rngs)) if cloud else None
         )
@@ -107,42 +117,42 @@ class ViewPolicy(nnx.Module):
         candidates: Float[AnyArray, "*batch candidates 3"],
         clouds: Float[AnyArray, "*batch seen embedding"] | None = None,
     ) -> tuple[Float[Array, "*batch candidates"], Float[Array, "*batch candidates classes"]]:
-        """The worth of each candidate, said twice.
+        """Expected gain in utility of every candidate, overall and for each class.
 
         Args:
-            belief: log-probabilities of all that was seen, fused.
-            views: log-probabilities of each view seen alone.
-            directions: unit vectors to the cameras of those.
-            present: which of them there are; the rest is padding.
-            candidates: unit vectors to where the camera may go.
-            clouds: an embedding of the partial cloud of each view seen, for a network that was made with `cloud`.
+            belief: log-probabilities of the fused belief.
+            views: log-probabilities of each view seen, from that view alone.
+            directions: unit vectors to the cameras of the views seen.
+            present: True for the views seen; the others are padding.
+            candidates: unit vectors to the positions that the camera may go to.
+            clouds: embedding of the partial cloud of each view seen, for a network that was made with `cloud`.
 
         Returns:
-            By how much the utility is expected to rise; and [j, y]: by how much with candidate j should the class be y.
+            The expected gain of each candidate; and the gain [j, y] of candidate j if the true class is y.
 
         Raises:
-            ValueError: where the network wants clouds and is given none.
+            ValueError: if the network uses clouds and none are given.
         """
         if self.cloud is not None and clouds is None:
             raise ValueError("this view policy needs the embeddings of partial clouds, which are not given")
         belief, views, present = jnp.asarray(belief), jnp.asarray(views), jnp.asarray(present)
         if not self.posed:
-            directions, turn = about_the_first(directions, present)
-            candidates = jnp.asarray(candidates) @ jnp.swapaxes(turn, -1, -2)
-        spare = present[..., None]
-        least = -12.0  # a belief of 6 in a million is as good as none
-        tokens = self.view(jnp.where(spare, jnp.maximum(views, least), 0.0))
-        tokens = tokens + self.direction(direction_features(jnp.where(spare, jnp.asarray(directions), 0.0)))
+            directions, rotation = relative_to_first(directions, present)
+            candidates = jnp.asarray(candidates) @ jnp.swapaxes(rotation, -1, -2)
+        seen = present[..., None]
+        least = -12.0  # log-probabilities below this (6 in a million) make no difference
+        tokens = self.view(jnp.where(seen, jnp.maximum(views, least), 0.0))
+        tokens = tokens + self.direction(direction_features(jnp.where(seen, jnp.asarray(directions), 0.0)))
         if self.cloud is not None:
-            tokens = tokens + self.cloud(jnp.where(spare, jnp.asarray(clouds), 0.0))
+            tokens = tokens + self.cloud(jnp.where(seen, jnp.asarray(clouds), 0.0))
         count = jnp.log(jnp.maximum(jnp.sum(present, axis=-1, keepdims=True), 1).astype(belief.dtype))
         own = self.belief(jnp.concatenate([jnp.maximum(belief, least), count], axis=-1))
         tokens = jnp.concatenate([own[..., None, :], tokens], axis=-2)
         tokens = self.known_norm(tokens + self.token2(jax.nn.gelu(self.token1(tokens))))
-        there = jnp.concatenate([jnp.ones((*present.shape[:-1], 1), bool), present], axis=-1)
+        attended = jnp.concatenate([jnp.ones((*present.shape[:-1], 1), bool), present], axis=-1)
         queries = self.direction(direction_features(candidates)) + own[..., None, :]
         for block in self.blocks:
-            queries = block(queries, tokens, there)
+            queries = block(queries, tokens, attended)
         queries = self.last_norm(queries)
         before = jnp.clip(belief, least, -1e-5)[..., None, :]
         after = jax.nn.log_sigmoid(before - jnp.log(-jnp.expm1(before)) + self.log_odds_if(queries))
@@ -153,12 +163,12 @@ class ViewPolicy(nnx.Module):
 def expected_gain(
     belief: Float[AnyArray, "*batch classes"], gain_if: Float[AnyArray, "*batch candidates classes"]
 ) -> Float[Array, "*batch candidates"]:
-    """What is expected for each class, weighed by the belief: Σ_y p(y) gain_if[j, y].
+    """Expected gain of each candidate: its gain for each class, weighted by the belief, Σ_y p(y) gain_if[j, y].
 
-    The belief's log-probabilities have to keep their word.
+    The belief's log-probabilities must be calibrated.
 
-    Of gains in log-probability this is the expected information gain: with p′ the belief after the view,
-    Σ_y p(y) E[log p′(y) | y] + H(p). The mean of logarithms is what is predicted, not the logarithm of a mean belief, whose
+    For gains in log-probability this is the expected information gain: with p′ the belief after the view,
+    Σ_y p(y) E[log p′(y) | y] + H(p). The network predicts the mean of logarithms, not the logarithm of a mean belief, whose
     entropy would be too high.
     """
     return jnp.einsum("...y,...jy->...j", jnp.exp(jnp.asarray(belief)), jnp.asarray(gain_if))

@@ -1,4 +1,4 @@
-"""Long bit strings in words of 32: where the s-th set bit is, for many s at once, without looking at every bit again."""
+"""Bit strings in 32-bit words: finds the s-th set bit for many s at once, without a pass over all bits."""
 
 from __future__ import annotations
 
@@ -7,19 +7,24 @@ import jax.numpy as jnp
 from jaxtyping import Array, Int, UInt32
 
 WORD = 32
+"""Bits per word."""
 
 
 def bits_until(words: UInt32[Array, " words"]) -> Int[Array, " words"]:
-    """How many bits are set up to the end of each word."""
-    # On CPU twice as fast as cumsum.
+    """Number of set bits up to the end of each word."""
+    # On CPU, the associative scan is twice as fast as cumsum.
     return jax.lax.associative_scan(jnp.add, jax.lax.population_count(words).astype(jnp.int32))
 
 
 def set_bits(words: UInt32[Array, " words"], until: Int[Array, " words"], ranks: Int[Array, " k"]) -> Int[Array, " k"]:
-    """Positions of the set bits of some ranks, counted from 0; a rank that no bit has gives any position.
+    """Positions of the set bits of the given ranks; the position is arbitrary for a rank without a bit.
+
+    A search in `until` finds the word of a bit, and five halvings find the bit inside the word.
 
     Args:
-        until: `bits_until(words)`: it says which word holds a bit, and five halvings find it inside the word.
+        words: the bit string, lowest bit first.
+        until: `bits_until(words)`.
+        ranks: of the bits among the set bits, from 0.
     """
     word = _first_above(until, ranks)
     before = until[word] - jax.lax.population_count(words[word]).astype(jnp.int32)
@@ -27,10 +32,10 @@ def set_bits(words: UInt32[Array, " words"], until: Int[Array, " words"], ranks:
 
 
 def _first_above(rising: Int[Array, " n"], values: Int[Array, " k"]) -> Int[Array, " k"]:
-    """For each value the first index of `rising` that exceeds it, at most n − 1.
+    """For each value, the first index at which `rising` exceeds it, at most n − 1.
 
-    Comparing with the ends of some sixteen blocks, one after the other, says which block, and bisection where in it: bisection
-    alone gathers at every halving, which CPUs do one by one.
+    Comparisons with the ends of about sixteen blocks find the block, and bisection finds the index inside it. Bisection alone
+    would gather at every halving, and a CPU gathers one element at a time.
     """
     count = rising.shape[0]
     block = max(8, 1 << (count // 16).bit_length() - 1) if count >= 16 else 1 << count.bit_length()
@@ -43,7 +48,7 @@ def _first_above(rising: Int[Array, " n"], values: Int[Array, " k"]) -> Int[Arra
 
 
 def _select_bit(word: UInt32[Array, " k"], rank: Int[Array, " k"]) -> Int[Array, " k"]:
-    """Position of the set bit number `rank` (from 0) of each word, by halving."""
+    """Position of the set bit of each word with the given rank (from 0), by halving."""
     position = jnp.zeros_like(rank)
     for width in (16, 8, 4, 2, 1):
         low = word & jnp.uint32((1 << width) - 1)

@@ -1,8 +1,8 @@
-"""Squared distances that are the same to the last bit wherever they are calculated.
+"""Squared distances that are equal to the last bit on every device.
 
-A compiler may fuse `x*x + y*y` into one rounding instead of two, which moves a squared distance by one unit in the last place
-and, now and then, an index that depends on it. Here the roundings stay apart, so a plain NumPy loop, a CPU and an accelerator
-agree.
+A compiler may fuse `x*x + y*y` into an operation with one rounding instead of two. This changes a squared distance by one unit
+in the last place and, occasionally, an index that depends on it. These functions keep the roundings separate, so a plain NumPy
+loop, a CPU and an accelerator agree.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from jaxtyping import Array
 
 
 def square(x: Array) -> Array:
-    """x², rounded on its own: the comparison stops the compiler from fusing the product into a following addition."""
+    """x², rounded separately: the comparison keeps the compiler from fusing the product into a following addition."""
     product = x * x
     return jnp.where(product > 0, product, 0.0)
 

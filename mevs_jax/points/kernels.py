@@ -1,7 +1,7 @@
-"""Point operations as kernels for one GPU, in Pallas: the rules of `mevs_jax.point_ops`, which chooses between the two.
+"""Point operations as Pallas kernels for one GPU, with the results of `mevs_jax.points.ops`, which selects them.
 
-What makes them quick is what a compiler of array programs does not do by itself: a cloud's distances stay in the registers of
-one block for all of farthest-point sampling, and a ball query stops at the first points that fill its slots.
+They are fast for two reasons that a compiler of array programs does not find: a cloud's distances stay in the registers of one
+block during all of farthest-point sampling, and a ball query stops as soon as its slots are full.
 """
 
 from __future__ import annotations
@@ -18,20 +18,22 @@ from jaxtyping import Array, Float, Int
 from mevs_jax.points.distances import squared_distance
 
 LARGEST_CLOUD = 16_384
-"""points whose coordinates and distances fit into the registers of one block"""
-_CENTRES, _CHUNK = 16, 128  # of a ball query: centres in a block, points looked at together
+"""The largest number of points whose coordinates and distances fit into the registers of one block."""
+_CENTRES, _CHUNK = 16, 128  # of a ball query: centres per block, points per step
 
 
 def _power_of_two(count: int) -> int:
+    """The smallest power of two that is at least `count`."""
     return 1 << (count - 1).bit_length()
 
 
 def _columns(points: Float[Array, "points 3"], count: int, fill: float) -> Float[Array, "3 count"]:
+    """Coordinates along the first axis, and points padded to `count` with the value `fill`."""
     return jnp.pad(points, ((0, count - points.shape[0]), (0, 0)), constant_values=fill).T
 
 
 def farthest_point_sample(points: Float[Array, "points 3"], k: int, *, interpret: bool = False) -> Int[Array, " {k}"]:
-    """As `point_ops.farthest_point_sample`, of at most `LARGEST_CLOUD` points; `interpret` runs it anywhere, slowly."""
+    """`points.ops.farthest_point_sample` for at most `LARGEST_CLOUD` points; `interpret` runs it slowly on any device."""
     count = points.shape[0]
     columns = _columns(points, _power_of_two(count), 0.0)
     return pl.pallas_call(
@@ -44,6 +46,7 @@ def farthest_point_sample(points: Float[Array, "points 3"], k: int, *, interpret
 
 
 def _sample(points: Any, chosen: Any, *, count: int, k: int) -> None:
+    """Kernel of `farthest_point_sample`: writes the k indices to `chosen`."""
     x, y, z = (points[axis, :] for axis in range(3))
     index = jnp.arange(x.shape[0], dtype=jnp.int32)
     nearest = jnp.where(index < count, jnp.inf, -1.0).astype(x.dtype)
@@ -52,7 +55,7 @@ def _sample(points: Any, chosen: Any, *, count: int, k: int) -> None:
         nearest, last = carry
         here = [points[axis, last] for axis in range(3)]
         nearest = jnp.minimum(nearest, squared_distance(x - here[0], y - here[1], z - here[2]))
-        last = jnp.argmax(nearest).astype(jnp.int32)  # of equal ones the first
+        last = jnp.argmax(nearest).astype(jnp.int32)  # the first among equals
         chosen[i] = last
         return nearest, last
 
@@ -68,11 +71,11 @@ def ball_query(
     *,
     interpret: bool = False,
 ) -> Int[Array, "centres {k}"]:
-    """As `point_ops.ball_query`; `interpret` runs it anywhere, slowly."""
+    """`points.ops.ball_query`, with the squared radius; `interpret` runs it slowly on any device."""
     blocks = -(-centres.shape[0] // _CENTRES)
     found = pl.pallas_call(
         partial(_query, k=k),
-        out_shape=jax.ShapeDtypeStruct((blocks * _CENTRES, k + 1), jnp.int32),  # the last is for what is not kept
+        out_shape=jax.ShapeDtypeStruct((blocks * _CENTRES, k + 1), jnp.int32),  # the last column takes surplus hits
         grid=(blocks,),
         compiler_params=triton.CompilerParams(num_warps=4, num_stages=1),
         interpret=interpret,
@@ -86,6 +89,7 @@ def ball_query(
 
 
 def _query(points: Any, centres: Any, squared_radius: Any, found: Any, *, k: int) -> None:
+    """Kernel of `ball_query`: writes the indices of one block of centres to `found`."""
     rows = pl.program_id(0) * _CENTRES + jnp.arange(_CENTRES, dtype=jnp.int32)
     centre = [triton.load(centres.at[axis, rows])[:, None] for axis in range(3)]
     limit = squared_radius[0]

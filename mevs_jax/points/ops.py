@@ -1,14 +1,14 @@
-"""Sampling and grouping of points: the two operations every PointNet++ is built on.
+"""Farthest-point sampling and ball query, the two point operations of PointNet++.
 
 Both follow the index rules of the reference CUDA operations (Qi et al., PointNet++, 2017; the `pointnet2_ops` package), so
-that weights trained there mean the same thing here:
+weights trained with those can be used:
 
-* farthest-point sampling starts at point 0, and a tie goes to the smallest index;
-* ball query takes the first `k` points, in index order, that lie strictly within the radius, and fills what is missing
-  with the first of them (with point 0 where there is none).
+* farthest-point sampling starts at point 0, and among equal distances takes the smallest index;
+* ball query takes the first `k` points, in index order, that lie strictly within the radius, and fills empty slots with the
+  first of them, or with point 0 if there is none.
 
-On one GPU both are kernels (`mevs_jax.point_kernels`); elsewhere, for larger clouds and in float64, array programs. All give the
-same indices, since all compare the same distances (`mevs_jax.distances`).
+On one GPU both run as kernels (`mevs_jax.points.kernels`); on other devices, for larger clouds and in float64, as array
+programs. All return the same indices, since all compare the same distances (`mevs_jax.points.distances`).
 """
 
 from __future__ import annotations
@@ -26,21 +26,24 @@ from mevs_jax.points.distances import square, squared_distance
 
 
 def _on_one_gpu(points: Array) -> bool:
-    """Whether a kernel may be chosen: where a program spans several devices, the compiler could not split it."""
+    """Whether a kernel may be used: the compiler cannot split a kernel over several devices."""
     return jax.default_backend() == "gpu" and jax.device_count() == 1 and points.dtype == jnp.float32
 
 
 def farthest_point_sample(points: Float[AnyArray, "points 3"], k: int) -> Int[Array, " {k}"]:
-    """Indices of `k` points, each the farthest from those taken before it; the first is point 0.
+    """Indices of `k` points, each the farthest from those before it; the first is point 0.
+
+    Source: PointNet++ §3.3; the rule of `pointnet2_ops` without its exception for points near the origin.
 
     Args:
-        points: coordinates, any unit. Duplicates are allowed.
-        k: how many to take, at least 1. Where `k` exceeds the number of distinct points, the rest are 0.
+        points: coordinates in any unit. Duplicates are allowed.
+        k: number of points to take, at least 1. If `k` exceeds the number of distinct points, the rest are 0.
 
     Returns:
         (k,) int32 indices.
 
-    Source: PointNet++ §3.3; reference rule of `pointnet2_ops` without its exception for points near the origin.
+    Raises:
+        ValueError: for `k` below 1, or a cloud without points.
     """
     if k < 1:
         raise ValueError(f"farthest_point_sample needs k >= 1, got {k}")
@@ -58,8 +61,10 @@ def farthest_point_sample(points: Float[AnyArray, "points 3"], k: int) -> Int[Ar
 
 
 def _farthest_of_array(points: Float[Array, "points 3"], k: int) -> Int[Array, " {k}"]:
-    # On CPU, XLA vectorises what runs along columns, and neither argmax nor a maximum over everything. So points stand in a grid,
-    # consecutive ones below each other; the maxima of its columns say in which column the farthest is, and then in which row.
+    """`farthest_point_sample` as an array program."""
+    # On CPU, XLA vectorises operations along columns, but neither argmax nor a maximum over a whole array. So the points are
+    # arranged in a grid, consecutive points below each other. The maxima of its columns give the column of the farthest point,
+    # then its row.
     count = points.shape[0]
     rows = 1 << max(0, (count.bit_length() - 1) // 2 - 1)
     padded = jnp.pad(points, ((0, -count % rows), (0, 0)))
@@ -84,7 +89,7 @@ def _farthest_of_array(points: Float[Array, "points 3"], k: int) -> Int[Array, "
 
 
 def _first_equal(values: Float[Array, " n"], value: Float[Array, ""]) -> Int[Array, ""]:
-    """The smallest index where `values` are equal to `value`, the last where none is."""
+    """The smallest index at which `values` equals `value`, or the last index if it never does."""
     index = jnp.arange(values.shape[0], dtype=jnp.int32)
     return jnp.min(jnp.where(values == value, index, index[-1]))
 
@@ -92,17 +97,20 @@ def _first_equal(values: Float[Array, " n"], value: Float[Array, ""]) -> Int[Arr
 def ball_query(
     points: Float[AnyArray, "points 3"], centres: Float[AnyArray, "centres 3"], radius: float | Float[Array, ""], k: int
 ) -> Int[Array, "centres {k}"]:
-    """For each centre, the first `k` points in index order strictly within `radius`.
+    """For each centre, the indices of the first `k` points, in index order, strictly within `radius`.
+
+    Source: PointNet++ §3.2; the rule of `pointnet2_ops`.
 
     Args:
-        points, centres: coordinates in one unit.
-        radius: in that unit; compared as `d² < radius·radius` in float32, as the reference does.
-        k: slots per centre, at least 1. Missing ones repeat the first hit; a centre without any hit gets point 0.
+        points, centres: coordinates in the same unit.
+        radius: in that unit; compared as `d² < radius·radius` in float32, as in the reference.
+        k: number of indices per centre, at least 1. Empty slots repeat the first hit; a centre without hits gets point 0.
 
     Returns:
         (centres, k) int32 indices.
 
-    Source: PointNet++ §3.2; reference rule of `pointnet2_ops`.
+    Raises:
+        ValueError: for `k` below 1.
     """
     if k < 1:
         raise ValueError(f"ball_query needs k >= 1, got {k}")
@@ -119,11 +127,13 @@ def ball_query(
 def _query_of_array(
     points: Float[Array, "points 3"], centres: Float[Array, "centres 3"], squared_radius: Float[Array, ""], k: int
 ) -> Int[Array, "centres {k}"]:
-    """The hits of 32 points become the bits of one word. Prefix sums of popcounts say which word holds the s-th hit, and five
-    halvings find the bit inside it; no pass over the points but the one that measures distances.
+    """`ball_query` as an array program.
+
+    The hits of 32 points become the bits of one word. Prefix sums of the numbers of bits find the word of the s-th hit, and five
+    halvings find the bit inside it. Only the distances need a pass over all points.
     """
     padded = jnp.pad(points, ((0, -points.shape[0] % WORD), (0, 0)), constant_values=jnp.inf)
-    # A word's points one below the other, so that words lie side by side and the sum over bits runs along all of them at once.
+    # The points of a word form a column, so that the sum over bits is vectorised over words.
     x, y, z = (padded[:, axis].reshape(-1, WORD).T for axis in range(3))
     hit = (
         squared_distance(centres[:, 0, None, None] - x, centres[:, 1, None, None] - y, centres[:, 2, None, None] - z)
@@ -135,7 +145,7 @@ def _query_of_array(
 
 
 def _first_hits(words: UInt32[Array, " words"], k: int) -> Int[Array, " {k}"]:
-    """Positions of the first `k` set bits, the first one repeated where there are fewer, 0 where there is none."""
+    """Positions of the first `k` set bits; if there are fewer, the first is repeated, and without any all are 0."""
     until = bits_until(words)
     slot = jnp.arange(k, dtype=jnp.int32)
     position = set_bits(words, until, jnp.where(slot < until[-1], slot, 0))

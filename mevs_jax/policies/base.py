@@ -1,4 +1,4 @@
-"""What every policy is given (observations, state, scene, knowledge), and the rules that several share."""
+"""The inputs of every policy (observations, state, scene, knowledge) and the rules that several policies share."""
 
 from __future__ import annotations
 
@@ -14,8 +14,14 @@ from mevs_jax.viewpoints import ViewGraph, local_maxima
 
 @flax.struct.dataclass
 class Observation:
-    """What one look gives: logits (classes,); the entropy predictor's word on every view (views,), where it is asked; the
-    encoder's features (features,), where they are fused; and PointNet++'s embedding of the partial cloud, where it is used."""
+    """The outputs of the networks for one view.
+
+    Attributes:
+        logits: (classes,) from the classifier.
+        predicted_entropy: (views,) from the entropy predictor, for every candidate view; None where it is not used.
+        features: (features,) from the encoder, for a learned fusion; None where it is not used.
+        cloud: (embedding,) of the partial cloud, from PointNet++; None where it is not used.
+    """
 
     logits: Float[Array, "*batch classes"]
     predicted_entropy: Float[Array, "*batch views"] | None = None
@@ -25,16 +31,16 @@ class Observation:
 
 @flax.struct.dataclass
 class SelectionState:
-    """What is known after looking at `count` views of one object.
+    """The state of the selection loop after `count` views of one object.
 
     Attributes:
-        count: views looked at so far.
-        view: the latest of them.
-        attempted: (views,) which have been looked at.
+        count: number of views seen so far.
+        view: index of the latest view.
+        attempted: (views,) True for the views that have been seen.
         belief: (classes,) unnormalised log-probabilities.
-        latest: what the latest look gave.
-        views: (max_views,) in the order they were looked at, −1 beyond `count`.
-        seen: (max_views, …) what each of them gave, zeros beyond `count`.
+        latest: observation of the latest view.
+        views: (max_views,) indices of the views seen, in order; −1 beyond `count`.
+        seen: (max_views, …) observations of these views; zeros beyond `count`.
     """
 
     count: Int[Array, "*batch"]
@@ -48,10 +54,10 @@ class SelectionState:
 
 @flax.struct.dataclass
 class Knowledge:
-    """What was learned on other objects, none of them tested on.
+    """Statistics over other objects, none of which is a test object.
 
     Attributes:
-        order: (views,) scores of the best fixed order; the first to look at has the highest.
+        order: (views,) scores of the best fixed order; the view with the highest score comes first.
         expected_logits: (classes, views, classes); entry [y, j] is the mean logits at view j of objects of class y.
     """
 
@@ -61,17 +67,17 @@ class Knowledge:
 
 @flax.struct.dataclass
 class Scene:
-    """What a policy may know besides what it has seen.
+    """What a policy may use besides the observations so far.
 
     Attributes:
         graph: the candidate views.
         entropy: (views,) true depth entropies; for oracles.
-        logits: (views, classes) what every view would show; for oracles.
+        logits: (views, classes) the classifier's logits at every view; for oracles.
         label: the true class; for oracles.
-        knowledge: learned on other objects.
-        reachable: (views,) where the camera can go; None for everywhere. The start may lie outside.
-        ascent_scores: by policy, (views, views); row i scores the views after seeing view i, by ascent on a renderer's gradient.
-        features: (views, features) of every view; for oracles.
+        knowledge: statistics over other objects.
+        reachable: (views,) True where the camera can go; None means everywhere. The start view may be unreachable.
+        ascent_scores: by policy name, (views, views); row i scores the views after view i, by gradient ascent on a rendering.
+        features: (views, features) the encoder's features of every view; for oracles.
     """
 
     graph: ViewGraph
@@ -85,19 +91,28 @@ class Scene:
 
 
 Policy = Callable[[Array, SelectionState, Scene], Float[Array, " views"]]
+"""A function of (PRNG key, state, scene) that returns a score for every view; the highest score is chosen."""
 
 
 T = TypeVar("T")
 
 
-def _given(value: T | None, name: str) -> T:
+def required(value: T | None, name: str) -> T:
+    """Returns `value`, an optional field that a policy needs.
+
+    Args:
+        name: of the field, for the message, for example `Scene.entropy`.
+
+    Raises:
+        ValueError: if `value` is None.
+    """
     if value is None:
         raise ValueError(f"this policy needs {name}, which is not given")
     return value
 
 
 def candidates(state: SelectionState, scene: Scene) -> Bool[Array, " views"]:
-    """Which views may be looked at next: neither attempted nor out of reach."""
+    """Returns a mask of the views that may be chosen next: reachable and not yet attempted."""
     return ~state.attempted if scene.reachable is None else ~state.attempted & scene.reachable
 
 
@@ -111,7 +126,12 @@ def maxima_first(
 
 
 def with_movement(policy: Policy, cost: float | Float[Array, ""]) -> Policy:
-    """`policy` with `cost` per radian of the great-circle way from the latest view taken off its scores."""
+    """Returns `policy` with a movement cost subtracted from its scores.
+
+    Args:
+        policy: the policy without movement cost.
+        cost: per radian of great-circle distance from the latest view.
+    """
 
     def scores(key: Array, state: SelectionState, scene: Scene) -> Float[Array, " views"]:
         return policy(key, state, scene) - cost * scene.graph.distances[state.view]

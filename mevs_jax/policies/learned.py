@@ -1,4 +1,4 @@
-"""Policies by a trained network over candidate directions."""
+"""Policies that use a trained `ViewPolicy` network."""
 
 from __future__ import annotations
 
@@ -9,21 +9,20 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from mevs_jax.models.view_policy import ViewPolicy, expected_gain, utility_of
-from mevs_jax.policies.base import Knowledge, Policy, Scene, SelectionState, _given, candidates
-
-# Having learned what looking was worth.
+from mevs_jax.policies.base import Knowledge, Policy, Scene, SelectionState, candidates, required
 
 
 def learned(
     network: ViewPolicy, temperature: float | Float[Array, ""], *, by: Literal["belief", "state", "table"] = "belief"
 ) -> Policy:
-    """The view from which `network` expects most.
+    """Returns the policy that scores a view by the gain in utility that `network` expects from it.
 
     Args:
-        network: trained by `train.policy`.
+        network: trained by `train.choosing.policy`.
         temperature: of the logits of single views.
-        by: what it expects for each class, weighed by the belief; or what it expects in this state as it is; or the first, and
-            as much what these views showed of other objects (`Knowledge.expected_logits`, log-probabilities of single views).
+        by: `belief` uses the network's gain for each class, weighted by the belief; `state` uses its gain for the state as a
+            whole; `table` averages the gain for each class with the gain computed from the views of other objects
+            (`Knowledge.expected_logits`, log-probabilities of single views), weighted by the belief.
     """
 
     def scores(key: Array, state: SelectionState, scene: Scene) -> Float[Array, " views"]:
@@ -34,21 +33,21 @@ def learned(
         if by == "state":
             return gain
         if by == "table":
-            gain_if = (gain_if + _gain_by_table(network, state.belief, _given(scene.knowledge, "Scene.knowledge"))) / 2
+            knowledge = required(scene.knowledge, "Scene.knowledge")
+            gain_if = (gain_if + _gain_by_table(network, state.belief, knowledge)) / 2
         return expected_gain(state.belief, gain_if)
 
     return scores
 
 
 _TABLE_WEIGHT = 0.5
-"""How much of what a view shows of a class by itself counts beside views seen before, from which it is not independent."""
+"""Weight of the table's log-probabilities when added to the belief; below 1 since views are not independent."""
 
 
 def _gain_by_table(
     network: ViewPolicy, belief: Float[Array, " classes"], knowledge: Knowledge
 ) -> Float[Array, "views classes"]:
-    """[j, y]: by how much the utility that `network` expects would rise, should view j show half of what it shows of others of
-    class y."""
+    """Gain in utility [j, y] if view j adds `_TABLE_WEIGHT` times its expected log-probabilities for class y to the belief."""
     after = jax.nn.log_softmax(belief + _TABLE_WEIGHT * knowledge.expected_logits, axis=-1)
     own = jnp.diagonal(after, axis1=0, axis2=2)
     return utility_of(own, network.utility, network.floor) - utility_of(belief, network.utility, network.floor)
@@ -57,20 +56,20 @@ def _gain_by_table(
 def looking_ahead(
     network: ViewPolicy, temperature: float | Float[Array, ""], *, shortlist: int = 4, classes: int = 3
 ) -> Policy:
-    """`learned` by the belief, two views ahead: what a view is expected to bring, and what the best one after it would.
+    """Returns `learned` by the belief with a lookahead of two views: the expected gain of a view plus that of the best next.
 
-    A view is imagined to show an object of class y what it shows of others (`Knowledge.expected_logits`, log-probabilities of
-    single views), as if independent of what was seen: p′ ∝ p · softmax(M[y, j]).
+    For an object of class y, view j is assumed to show its expected log-probabilities M[y, j] over other objects
+    (`Knowledge.expected_logits`), independent of the views seen: p′ ∝ p · softmax(M[y, j]).
 
     Args:
         network, temperature: as for `learned`.
-        shortlist: how many views are looked behind, those that promise most by themselves; no other is taken.
-        classes: how many of the likeliest classes are imagined.
+        shortlist: number of views to evaluate, those with the highest gain of one view; no other view is chosen.
+        classes: number of classes to consider, the most likely ones.
     """
 
     def scores(key: Array, state: SelectionState, scene: Scene) -> Float[Array, " views"]:
         del key
-        expected = jax.nn.log_softmax(_given(scene.knowledge, "Scene.knowledge").expected_logits, axis=-1)
+        expected = jax.nn.log_softmax(required(scene.knowledge, "Scene.knowledge").expected_logits, axis=-1)
         points, slots = scene.graph.points, jnp.arange(len(state.views))
         views = jax.nn.log_softmax(state.seen.logits / temperature, axis=-1)
         allowed = candidates(state, scene)

@@ -1,4 +1,4 @@
-"""Oracles and a control: they use the object itself, which no robot has."""
+"""Oracles and a control: policies that use the true entropies, the logits of all views or the label of the object."""
 
 from __future__ import annotations
 
@@ -9,51 +9,50 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from mevs_jax.beliefs import CalibratedFusion
-from mevs_jax.policies.base import Policy, Scene, SelectionState, _given, candidates, maxima_first
-
-# Knowing what no robot can: oracles and a control.
+from mevs_jax.policies.base import Policy, Scene, SelectionState, candidates, maxima_first, required
 
 
 def oracle_entropy(key: Array, state: SelectionState, scene: Scene) -> Float[Array, " views"]:
-    """The thesis's rule on the true entropies: what a perfect predictor would do."""
+    """The thesis's rule on the true entropies: the limit of a perfect entropy predictor."""
     del key
-    return maxima_first(_given(scene.entropy, "Scene.entropy"), candidates(state, scene), scene.graph.neighbours)
+    return maxima_first(required(scene.entropy, "Scene.entropy"), candidates(state, scene), scene.graph.neighbours)
 
 
 def lowest_entropy(key: Array, state: SelectionState, scene: Scene) -> Float[Array, " views"]:
-    """The lowest true entropy first: the control. If this does no worse than the oracle, entropy is not what matters."""
+    """The lowest true entropy first, as a control: if this does no worse than the oracle, entropy is not what matters."""
     del key, state
-    return -_given(scene.entropy, "Scene.entropy")
+    return -required(scene.entropy, "Scene.entropy")
 
 
 def belief_oracle(key: Array, state: SelectionState, scene: Scene) -> Float[Array, " views"]:
     """The view after which the belief is closest (in Kullback–Leibler divergence) to the belief after all views.
 
-    Sees every view but not the label, so it cannot pick views that are right by luck: a fair ceiling for one step.
+    It uses every view but not the label, so it cannot choose views that are right by chance: a fair upper bound for one step.
     """
     del key
-    logits = _given(scene.logits, "Scene.logits")
+    logits = required(scene.logits, "Scene.logits")
     final = jax.nn.softmax(jnp.sum(logits, axis=0))
     return jnp.sum(final * jax.nn.log_softmax(state.belief + logits), axis=-1)
 
 
 def label_oracle(key: Array, state: SelectionState, scene: Scene) -> Float[Array, " views"]:
-    """The view after which the true class is most probable. Optimistic: it finds views that are right by luck."""
+    """The view after which the true class is most probable. Optimistic: it finds views that are right by chance."""
     del key
-    logits, label = _given(scene.logits, "Scene.logits"), _given(scene.label, "Scene.label")
+    logits, label = required(scene.logits, "Scene.logits"), required(scene.label, "Scene.label")
     return jax.nn.log_softmax(state.belief + logits)[:, label]
 
 
 def pair_oracle(key: Array, state: SelectionState, scene: Scene) -> Float[Array, " views"]:
-    """The first view of the pair after which the true class is most probable, over all pairs; every second view is the greedy
-    one, which completes the pair. More optimistic still (exhaustive search over subsets, as in MVSelect, Hou et al. 2024).
+    """The first view of the pair of views after which the true class is most probable, over all pairs.
+
+    Every second view is the greedy choice, which completes the pair. Still more optimistic than `label_oracle` (exhaustive
+    search over subsets, as in MVSelect, Hou et al. 2024).
     """
-    logits, label = _given(scene.logits, "Scene.logits"), _given(scene.label, "Scene.label")
+    logits, label = required(scene.logits, "Scene.logits"), required(scene.label, "Scene.label")
 
     def best_partner() -> Float[Array, " views"]:
-        both = state.belief + (
-            logits[:, None] + logits[None, :]
-        )  # in this order: a pair weighs the same both ways round
+        # Added in this order, (i, j) and (j, i) have the same sum to the last bit.
+        both = state.belief + (logits[:, None] + logits[None, :])
         probability = jax.nn.log_softmax(both)[..., label]
         partner = candidates(state, scene) & ~jnp.eye(len(logits), dtype=bool)
         best = jnp.max(jnp.where(partner, probability, -jnp.inf), axis=1)
@@ -63,11 +62,16 @@ def pair_oracle(key: Array, state: SelectionState, scene: Scene) -> Float[Array,
 
 
 def fused_oracle(fusion: CalibratedFusion, *, by: Literal["belief", "label"] = "belief") -> Policy:
-    """`belief_oracle` or `label_oracle` where a learned fusion makes the belief."""
+    """Returns `belief_oracle` or `label_oracle` for beliefs computed by a learned fusion.
+
+    Args:
+        fusion: computes the belief from `Scene.features`.
+        by: `belief` to approach the belief after all views, `label` to maximise the probability of the true class.
+    """
 
     def scores(key: Array, state: SelectionState, scene: Scene) -> Float[Array, " views"]:
         del key
-        features, points = _given(scene.features, "Scene.features"), scene.graph.points
+        features, points = required(scene.features, "Scene.features"), scene.graph.points
         seen = features[state.views], points[state.views], jnp.arange(len(state.views)) < state.count
 
         def with_one_more(*view: Array) -> Float[Array, " classes"]:
@@ -75,7 +79,7 @@ def fused_oracle(fusion: CalibratedFusion, *, by: Literal["belief", "label"] = "
 
         after = jax.vmap(with_one_more)(features, points, jnp.ones(len(points), bool))
         if by == "label":
-            return after[:, _given(scene.label, "Scene.label")]
+            return after[:, required(scene.label, "Scene.label")]
         return after @ jnp.exp(fusion(features, points, jnp.ones(len(points), bool)))
 
     return scores

@@ -4,19 +4,21 @@ from __future__ import annotations
 
 from jaxtyping import Array, Float
 
-from mevs_jax.policies.base import Policy, Scene, SelectionState, _given
-
-# Knowing what a surface or a volume made from the latest view would look like from elsewhere.
+from mevs_jax.policies.base import Policy, Scene, SelectionState, required
 
 
 def by_ascent(name: str) -> Policy:
-    """The thesis's methods by differentiable rendering (§4.2.1): the best views of what was seen, by climbing on it.
+    """Returns the policy that goes where gradient ascent found the best views (thesis §4.2.1).
 
-    Climbs are far slower than a look into a table, so `Scene.ascent_scores` holds how they end after each view.
+    The ascent runs on a rendering of a surface or volume made from the latest view. It is far slower than reading a table,
+    so its results after each view are computed beforehand and stored in `Scene.ascent_scores`.
+
+    Args:
+        name: key into `Scene.ascent_scores`.
     """
 
     def scores(key: Array, state: SelectionState, scene: Scene) -> Float[Array, " views"]:
         del key
-        return _given(scene.ascent_scores, "Scene.ascent_scores")[name][state.view]
+        return required(scene.ascent_scores, "Scene.ascent_scores")[name][state.view]
 
     return scores

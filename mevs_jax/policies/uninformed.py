@@ -1,4 +1,4 @@
-"""Policies that use nothing but the view graph."""
+"""Policies that use the view graph alone."""
 
 from __future__ import annotations
 
@@ -8,19 +8,17 @@ from jaxtyping import Array, Float
 
 from mevs_jax.policies.base import Scene, SelectionState
 
-# Knowing nothing of the object.
-
 
 def random_view(key: Array, state: SelectionState, scene: Scene) -> Float[Array, " views"]:
-    """Uniform over the unattempted views, as the thesis's text says (its code: `random_with_repetition`)."""
+    """Uniform over the unattempted views, as in the thesis's text (for its code, see `random_with_repetition`)."""
     del scene
     return jax.random.uniform(key, state.attempted.shape)
 
 
 def random_with_repetition(key: Array, state: SelectionState, scene: Scene) -> Float[Array, " views"]:
-    """Uniform over all views in reach, seen or not: the random baseline of the thesis's published code.
+    """Uniform over all reachable views, attempted or not: the random baseline of the thesis's published code.
 
-    A view seen again adds its logits again: confidence grows, evidence does not.
+    The logits of a repeated view are added again, so confidence grows without new evidence.
     """
     drawn = jax.random.uniform(key, state.attempted.shape)
     if scene.reachable is not None:
@@ -29,6 +27,6 @@ def random_with_repetition(key: Array, state: SelectionState, scene: Scene) -> F
 
 
 def farthest_view(key: Array, state: SelectionState, scene: Scene) -> Float[Array, " views"]:
-    """Great-circle distance in radians to the nearest view seen: spread out (farthest-point rule; Gonzalez 1985)."""
+    """Great-circle distance in radians to the nearest attempted view (farthest-point rule; Gonzalez 1985)."""
     del key
     return jnp.min(jnp.where(state.attempted, scene.graph.distances, jnp.inf), axis=1)

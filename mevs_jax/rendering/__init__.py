@@ -1,4 +1,4 @@
-"""Images of a mesh or a volume as array programs: for making data on an accelerator, and with gradients, for finding views."""
+"""Renders meshes and volumes as array programs: to make data on an accelerator, and with gradients, to find good views."""
 
 from mevs_jax.rendering.depth import Rendering, pad_triangles, render_depth
 from mevs_jax.rendering.kato import render_silhouette

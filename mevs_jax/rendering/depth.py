@@ -1,12 +1,12 @@
-"""Depth of a mesh from a camera, as one array program: what casting a ray through each pixel sees, made for accelerators.
+"""Depth images of a mesh as one array program for accelerators; equal to casting a ray through each pixel.
 
-In the camera's frame the ray through a pixel is d = (x, y, 1). It meets the triangle abc where d is on the inner side of the
-three planes through the camera and an edge: d·(b×c), d·(c×a) and d·(a×b) have the sign of a·n, with n = (b−a)×(c−a); and
-there 1/depth = d·n / a·n. All four are linear in (x, y), so a face is twelve numbers, and nothing need be clipped, not even what
-is behind the camera (Olano and Greer, *Triangle Scan Conversion using 2D Homogeneous Coordinates*, 1997).
+In the camera's frame the ray through a pixel is d = (x, y, 1). It meets the triangle abc if d is on the inner side of the
+three planes through the camera and an edge: d·(b×c), d·(c×a) and d·(a×b) have the sign of a·n, with n = (b−a)×(c−a). There,
+1/depth = d·n / a·n. All four are linear in (x, y), so a face is twelve numbers. Nothing needs to be clipped, not even faces
+behind the camera (Olano and Greer, *Triangle Scan Conversion using 2D Homogeneous Coordinates*, 1997).
 
-The image is cut into tiles. Which faces may touch a tile is one bit a face; a tile then takes as many of them at a time as
-`_AT_ONCE`, until none is left, so memory stays bounded whatever the mesh, and nothing is ever dropped.
+The image is divided into tiles. For each tile, one bit per face records whether the face may touch the tile. The tile then
+processes these faces in groups of `_AT_ONCE` until none is left, so memory is bounded for every mesh and no face is dropped.
 """
 
 from __future__ import annotations
@@ -21,16 +21,16 @@ from mevs_jax.arrays import AnyArray
 from mevs_jax.cameras import Camera
 from mevs_jax.points.bits import WORD, bits_until, set_bits
 
-_TILE, _AT_ONCE = 16, 64  # pixels along a side; faces
+_TILE, _AT_ONCE = 16, 64  # pixels per side of a tile; faces per group
 
 
 @flax.struct.dataclass
 class Rendering:
-    """What a camera sees of a mesh.
+    """The image of a mesh.
 
     Attributes:
-        depth: (resolution, resolution) along the optical axis, +inf where nothing is hit.
-        face: (resolution, resolution) index of the face that is hit, −1 where none is.
+        depth: (resolution, resolution) metric depth along the optical axis, +inf where nothing is hit.
+        face: (resolution, resolution) index of the face that is hit, −1 where nothing is hit.
     """
 
     depth: Float[Array, "*batch resolution resolution"]
@@ -38,16 +38,20 @@ class Rendering:
 
 
 def pad_triangles(triangles: Float[np.ndarray, "faces 3 3"]) -> Float[np.ndarray, "padded 3 3"]:
-    """The triangles, filled up to a power of two (at least 64) with ones that no ray hits: few programs do for all meshes."""
+    """Pads triangles to a power of two (at least 64) with triangles that no ray hits.
+
+    Meshes of similar size then share one compiled program.
+    """
     size = max(64, 1 << (max(len(triangles), 1) - 1).bit_length())
     return np.concatenate([triangles, np.zeros((size - len(triangles), 3, 3), triangles.dtype)])
 
 
 def render_depth(triangles: Float[AnyArray, "faces 3 3"], camera: Camera) -> Rendering:
-    """Depth and face of the nearest hit of each pixel; triangles are seen from either side.
+    """Depth and face of the nearest hit of each pixel; triangles are visible from both sides.
 
     Args:
-        triangles: `vertices[faces]`, corners in the world's frame; one without area is never hit.
+        triangles: `vertices[faces]`, corners in the world frame; a triangle without area is never hit.
+        camera: the camera.
     """
     triangles = jnp.asarray(triangles)
     corners = jnp.pad(triangles, ((0, -len(triangles) % WORD), (0, 0), (0, 0)))
@@ -74,14 +78,14 @@ def render_depth(triangles: Float[AnyArray, "faces 3 3"], camera: Camera) -> Ren
 
 
 def _planes(corners: Float[Array, "faces 3 3"]) -> Float[Array, "faces 4 3"]:
-    """Of each face three vectors whose product with a ray is not negative inside, and one that gives 1/depth there."""
+    """Four vectors per face: the products of a ray with the first three are ≥ 0 inside the face, with the last it is 1/depth."""
     a, b, c = corners[:, 0], corners[:, 1], corners[:, 2]
     normal = jnp.cross(b - a, c - a)
     volume = jnp.sum(a * normal, axis=-1)
-    # b×c as b×(c−b), which loses less where the face is small.
+    # b×c is computed as b×(c−b), which is more accurate for small faces.
     edges = jnp.stack([jnp.cross(b, c - b), jnp.cross(c, a - c), jnp.cross(a, b - a)], axis=1)
     edges = edges * jnp.sign(volume)[:, None, None]
-    hidden = (volume == 0)[:, None]  # without area, or seen from its edge
+    hidden = (volume == 0)[:, None]  # without area, or seen edge-on
     nearness = normal / jnp.where(hidden, 1.0, volume[:, None])
     planes = jnp.concatenate([edges, nearness[:, None]], axis=1)
     return jnp.where(hidden[..., None], jnp.array([0.0, 0.0, -1.0]), planes)
@@ -94,7 +98,14 @@ def _tile(
     centre: tuple[Array, Array],
     half: float,
 ) -> tuple[Float[Array, " pixels"], Int[Array, " pixels"]]:
-    """1/depth and face of each pixel of a tile, 0 and −1 where nothing is hit."""
+    """1/depth and face of each pixel of a tile; 0 and −1 where nothing is hit.
+
+    Args:
+        planes: from `_planes`.
+        x, y: components of the pixels' rays.
+        centre: x and y of the tile's centre.
+        half: half of the tile's side, in the same unit.
+    """
     most = planes[..., 0] * centre[0] + planes[..., 1] * centre[1] + planes[..., 2]
     most = most + half * (jnp.abs(planes[..., 0]) + jnp.abs(planes[..., 1]))
     touches = jnp.all(most >= 0, axis=-1)
@@ -120,5 +131,6 @@ def _tile(
 
 
 def _packed(flags: Array) -> UInt32[Array, " words"]:
+    """Booleans as the bits of words, lowest bit first."""
     bit = jnp.uint32(1) << jnp.arange(WORD, dtype=jnp.uint32)
     return jnp.sum(jnp.where(flags.reshape(-1, WORD), bit, jnp.uint32(0)), axis=1, dtype=jnp.uint32)

@@ -1,10 +1,10 @@
-"""A hard silhouette with an approximate gradient, the thesis's mesh renderer (Kato et al., *Neural 3D Mesh Renderer*, 2018).
+"""A hard silhouette with an approximate gradient: the thesis's mesh renderer (Kato et al., *Neural 3D Mesh Renderer*, 2018).
 
-A pixel is covered or not, so its derivative is zero almost everywhere. In its place stands what the pixel would gain if an edge
-of a visible face moved along the pixel's row (for x) or column (for y) until it crossed the pixel, divided by how far that is.
-Only changes count that better what is wanted (eq. 6 of the paper), so this gradient is not linear in what comes from above, and
-must know whether that is to rise or to fall. Departing from the published code, only edges with nothing beside them count: when a
-camera moves, faces move together, and no edge between two of them uncovers anything.
+A pixel is covered or not, so its derivative is zero almost everywhere. It is replaced by a quotient: the change of the pixel if
+an edge of a visible face moved along the pixel's row (for x) or column (for y) until it crossed the pixel, divided by the
+distance that the edge moves. Only changes that improve the objective count (eq. 6 of the paper). This gradient is therefore not
+linear in the incoming gradient, and it depends on whether the objective is maximised or minimised. Unlike in the published code,
+only edges next to the background count: when a camera moves, faces move together, and an edge between two faces uncovers nothing.
 """
 
 from __future__ import annotations
@@ -20,18 +20,19 @@ from mevs_jax.cameras import Camera
 from mevs_jax.rendering.depth import render_depth
 from mevs_jax.rendering.piecewise import limited
 
-_AT_ONCE = 32  # faces
-_NEAREST = 0.5  # pixels: no crossing is taken for nearer, as a pixel's gradient would be without bound
+_AT_ONCE = 32  # faces per batch
+_NEAREST = 0.5  # least distance to a crossing, in pixels; without it, gradients would be unbounded
 
 
 def render_silhouette(
     triangles: Float[AnyArray, "faces 3 3"], camera: Camera, *, rises: bool = True
 ) -> Float[Array, "resolution resolution"]:
-    """1 where a ray hits, 0 elsewhere, with the approximate gradient, in reverse only.
+    """1 where a ray hits the mesh, 0 elsewhere, with the approximate gradient in reverse mode only.
 
     Args:
-        triangles: `vertices[faces]`, corners in the world's frame, all before the camera.
-        rises: whether what is calculated from this is to be raised, or lowered, like a loss.
+        triangles: `vertices[faces]`, corners in the world frame, all in front of the camera.
+        camera: the camera.
+        rises: whether the objective computed from the silhouette is maximised; False if it is minimised, like a loss.
     """
     triangles = jnp.asarray(triangles)
     corners = (triangles - camera.pose[:3, 3]) @ camera.pose[:3, :3]
@@ -51,10 +52,10 @@ def _forward(corners: Array, face: Array, rises: bool) -> tuple[Array, tuple[Arr
     return (face >= 0).astype(corners.dtype), (corners, face)
 
 
-def _backward(rises: bool, kept: tuple[Array, Array], towards: Array) -> tuple[Array, None]:
-    corners, face = kept
-    along_x = _of_rows(corners, face, towards, rises)
-    along_y = _of_rows(corners[..., ::-1], face.T, towards.T, rises)
+def _backward(rises: bool, residuals: tuple[Array, Array], cotangent: Array) -> tuple[Array, None]:
+    corners, face = residuals
+    along_x = _of_rows(corners, face, cotangent, rises)
+    along_y = _of_rows(corners[..., ::-1], face.T, cotangent.T, rises)
     return jnp.stack([along_x, along_y], axis=-1), None
 
 
@@ -62,16 +63,16 @@ _silhouette.defvjp(_forward, _backward)
 
 
 def _of_rows(
-    corners: Float[Array, "faces 3 2"], face: Int[Array, "side side"], towards: Float[Array, "side side"], rises: bool
+    corners: Float[Array, "faces 3 2"], face: Int[Array, "side side"], cotangent: Float[Array, "side side"], rises: bool
 ) -> Float[Array, "faces 3"]:
-    """The gradient to the corners' x, from edges that move along the rows."""
+    """The gradient with respect to the x of the corners, from edges that move along the rows."""
     side = face.shape[0]
     pixel = jnp.arange(side)
     y = pixel + 0.5 - side / 2
     covered = face >= 0
 
     def of_edge(number: Array, start: Array, end: Array, third: Array) -> tuple[Array, Array]:
-        """Of one edge of one face: the gradients to the x of its two ends."""
+        """The gradients with respect to the x of the two ends of one edge of face `number`."""
         height = end[1] - start[1]
         slope = (end[0] - start[0]) / jnp.where(height == 0, 1.0, height)
         part = (y - start[1]) / jnp.where(height == 0, 1.0, height)
@@ -82,16 +83,16 @@ def _of_rows(
         there = (height != 0) & (part >= 0) & (part < 1) & (inwards != 0)
         there &= (jnp.minimum(inner, outer) >= 0) & (jnp.maximum(inner, outer) < side)
         inner, outer = (jnp.clip(column, 0, side - 1) for column in (inner, outer))
-        there &= jnp.take_along_axis(face, inner[:, None], axis=1)[:, 0] == number  # the edge can be seen
+        there &= jnp.take_along_axis(face, inner[:, None], axis=1)[:, 0] == number  # visible
         there &= ~jnp.take_along_axis(covered, outer[:, None], axis=1)[:, 0]
-        # What each pixel of a row would gain: outside where nothing is seen, inside where this face is.
+        # Change of each pixel of a row: +1 for background outside of the edge, −1 for this face inside of it.
         outside = (pixel - crossing[:, None]) * inwards < 0
         gain = jnp.where(outside & ~covered, 1.0, 0.0) - jnp.where(~outside & (face == number), 1.0, 0.0)
-        pull = gain * towards
+        pull = gain * cotangent
         pull = jnp.where(pull > 0 if rises else pull < 0, pull, 0.0)
-        way = pixel - crossing[:, None]
-        way = jnp.where(way < 0, jnp.minimum(way, -_NEAREST), jnp.maximum(way, _NEAREST))
-        of_row = jnp.where(there, jnp.sum(pull / way, axis=1), 0.0)
+        distance = pixel - crossing[:, None]
+        distance = jnp.where(distance < 0, jnp.minimum(distance, -_NEAREST), jnp.maximum(distance, _NEAREST))
+        of_row = jnp.where(there, jnp.sum(pull / distance, axis=1), 0.0)
         return jnp.sum((1 - part) * of_row), jnp.sum(part * of_row)
 
     def of_face(arguments: tuple[Array, Array]) -> Array:

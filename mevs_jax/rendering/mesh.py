@@ -1,10 +1,11 @@
-"""A mesh rendered softly: silhouette, depth and normals with gradients to the camera and to the corners of its faces.
+"""Soft rendering of a mesh: silhouette, depth and normals with gradients to the camera and to the corners of the faces.
 
-The soft rasteriser (Liu et al., *Soft Rasterizer*, 2019). Every face covers every pixel a little, by how far δ (in pixels) the
-pixel lies inside or outside of it: D = sigmoid(δ / σ). Coverages combine as independent chances, 1 − Π(1 − D), and what is seen
-is a mean of all faces, weighted by exp((nearness + min(0, log 2D)) / γ): beyond its border a face counts as one further away.
-(The paper weights by D · exp(nearness / γ), by which near faces hide others many σ beyond their border.) As σ and γ go to 0 that
-becomes what a ray sees.
+After the soft rasteriser (Liu et al., *Soft Rasterizer*, 2019). Every face covers every pixel by D = sigmoid(δ / σ), where δ is
+the signed distance in pixels from the pixel to the border of the face, positive inside. The silhouette combines the coverages as
+independent probabilities, 1 − Π(1 − D). Depth and normals are means over all faces, weighted by
+exp((nearness + min(0, log 2D)) / γ), so beyond its border a face counts as if it were farther away. (The paper's weights are
+D · exp(nearness / γ), by which near faces hide others many σ beyond their border.) As σ and γ go to 0, the result becomes that of
+ray casting.
 """
 
 from __future__ import annotations
@@ -21,29 +22,30 @@ from mevs_jax.arrays import AnyArray
 from mevs_jax.cameras import Camera
 from mevs_jax.rendering.piecewise import limited, smaller
 
-_NEAREST = 1e-3  # depth of the nearest corner that is seen
-_NOWHERE = -1e6  # σ from its border: a face that is not seen
-_FAR = 12.0  # σ from a face's border, beyond which it covers less than 1e-5 and is left out
-_LEAST = math.log(2) - _FAR  # log 2D there
+_NEAREST = 1e-3  # least depth of a corner of a visible face
+_NOWHERE = -1e6  # δ / σ that marks a face as not visible
+_FAR = 12.0  # −δ / σ beyond which a face covers less than 1e-5 of a pixel and is ignored
+_LEAST = math.log(2) - _FAR  # log 2D at that distance
 
 
 @dataclass(frozen=True)
 class Softness:
-    """How far a soft rendering is from a hard one."""
+    """The parameters of a soft rendering; as both go to 0, it becomes a hard one."""
 
     edge: float = 0.5
-    """σ, in pixels: the width of a face's border"""
+    """σ in pixels: the width of the border of a face."""
     nearness: float = 0.005
-    """γ, in 1/units: how much nearer (in 1/depth) a face must be to hide another"""
+    """γ in 1/units: how much nearer (in 1/depth) a face must be to hide another."""
 
 
 @flax.struct.dataclass
 class SoftRendering:
-    """What a camera sees of a mesh, softly.
+    """The soft image of a mesh.
 
     Attributes:
-        silhouette: (resolution, resolution) in [0, 1], how much of a pixel is covered.
-        depth: (resolution, resolution) along the optical axis, of what covers it or lies next to it; 0 where nothing does.
+        silhouette: (resolution, resolution) coverage of each pixel, in [0, 1].
+        depth: (resolution, resolution) metric depth along the optical axis of the faces that cover a pixel or lie near it; 0
+            where there are none.
         normal: (resolution, resolution, 3) in the camera's frame, towards the camera; a mean of unit vectors.
     """
 
@@ -54,7 +56,7 @@ class SoftRendering:
 
 @jax.custom_jvp
 def _softplus(x: Float[Array, "..."]) -> Float[Array, "..."]:
-    """log(1 + exp(x)); JAX's own takes two more exponentials for its derivative."""
+    """log(1 + exp(x)); the derivative of JAX's own function needs two more exponentials."""
     return jnp.maximum(x, 0) + jnp.log1p(jnp.exp(-jnp.abs(x)))
 
 
@@ -66,36 +68,43 @@ def _softplus_jvp(primals: tuple[Array], tangents: tuple[Array]) -> tuple[Array,
 
 
 def _pieces(side: int) -> tuple[int, int]:
-    """Pixels along a tile's side, and faces at once; on a CPU few of both, which stay in the cache."""
+    """Pixels per side of a tile, and faces per step; on CPU both are small so that the arrays stay in the cache."""
     return (16, 16) if jax.default_backend() == "cpu" else (side, 256)
 
 
 def _near_tiles(
     corners: Float[Array, "faces 3 3"], camera: Camera, margin: float, tile: int
 ) -> tuple[Int[Array, "tiles faces"], Int[Array, " tiles"]]:
-    """For each tile the faces whose bounding boxes come within `margin` pixels of it, the others as `faces`; and how many."""
+    """For each tile, the indices of the faces whose bounding boxes come within `margin` pixels of it, and their number.
+
+    The indices come first in each row; the rest of the row is filled with the number of faces.
+    """
     depth = jnp.maximum(corners[..., 2:], _NEAREST)
     at = camera.focal_length * corners[..., :2] / depth + camera.resolution / 2  # (faces, 3, 2), column and row
     low, high = at.min(axis=1) - margin, at.max(axis=1) + margin
     seen = jnp.min(corners[..., 2], axis=-1) >= _NEAREST
     edge = jnp.arange(0, camera.resolution, tile)[:, None]
-    columns, rows = ((low[:, axis] < edge + tile) & (high[:, axis] > edge) for axis in range(2))  # (tiles along, faces)
+    columns, rows = (
+        (low[:, axis] < edge + tile) & (high[:, axis] > edge) for axis in range(2)
+    )  # (tiles per side, faces)
     near = (rows[:, None] & columns & seen).reshape(-1, len(corners))
     place = jnp.where(near, jnp.cumsum(near, axis=1) - 1, len(corners))
     every = jnp.broadcast_to(jnp.arange(len(corners)), near.shape)
-    nobody = jnp.full(near.shape, len(corners))
-    listed = jax.vmap(lambda into, at, which: into.at[at].set(which, mode="drop"))(nobody, place, every)
+    empty = jnp.full(near.shape, len(corners))
+    listed = jax.vmap(lambda into, at, which: into.at[at].set(which, mode="drop"))(empty, place, every)
     return listed, jnp.sum(near, axis=1)
 
 
 def render_mesh(
     triangles: Float[AnyArray, "faces 3 3"], camera: Camera, softness: Softness = Softness()
 ) -> SoftRendering:
-    """Silhouette, depth and normals of a mesh, with gradients to both arguments, forwards and in reverse.
+    """Silhouette, depth and normals of a mesh, with gradients to triangles and camera in forward and reverse mode.
 
     Args:
-        triangles: `vertices[faces]`, corners in the world's frame, all before the camera. One without area is not seen, and has
-            no gradient.
+        triangles: `vertices[faces]`, corners in the world frame, all in front of the camera. A triangle without area is
+            invisible and has no gradient.
+        camera: the camera.
+        softness: widths of the transitions between faces.
     """
     triangles = jnp.asarray(triangles)
     corners = (triangles - camera.pose[:3, 3]) @ camera.pose[:3, :3]
@@ -103,7 +112,7 @@ def render_mesh(
     tile, at_once = _pieces(side)
     listed, counts = _near_tiles(jax.lax.stop_gradient(corners), camera, _FAR * softness.edge, tile)
     listed = jnp.pad(listed, ((0, 0), (0, -len(corners) % at_once)), constant_values=len(corners))
-    corners = jnp.pad(corners, ((0, 1), (0, 0), (0, 0)))  # the last is nobody's
+    corners = jnp.pad(corners, ((0, 1), (0, 0), (0, 0)))  # the last face stands for none
     pixel = jnp.arange(tile, dtype=corners.dtype) + 0.5 - side / 2
     rows, columns = jnp.meshgrid(pixel, pixel, indexing="ij")
     within = jnp.stack([columns.reshape(-1), rows.reshape(-1)])
@@ -113,19 +122,19 @@ def render_mesh(
         faces, count, corner = arguments
         at = within + corner[:, None]
 
-        def look(carry: tuple[Array, ...], chunk: Float[Array, "faces 3 3"]) -> tuple[Array, ...]:
+        def add(carry: tuple[Array, ...], chunk: Float[Array, "faces 3 3"]) -> tuple[Array, ...]:
             empty, largest, total, *seen = carry
-            # The barriers keep XLA from calculating all of this again for each of the sums.
+            # The barriers keep XLA from recomputing all of this for each of the sums.
             cover, nearness, normal = jax.lax.optimization_barrier(_faces(chunk, at, focal, softness.edge))
             spread = _softplus(cover)
             empty = empty - jnp.sum(spread, axis=0)  # log(1 − sigmoid(x)) = −softplus(x)
-            # With less coverage a face is not seen whatever its nearness, and larger numbers would lose the difference of
-            # nearness. log(sigmoid(x)) = x − softplus(x).
+            # log(sigmoid(x)) = x − softplus(x). The lower limit: with less coverage a face is invisible at any nearness, and
+            # adding a larger number would round off differences of nearness.
             hidden = limited(cover - spread + math.log(2), _LEAST, 0.0)
             weight = jnp.where(cover > _NOWHERE, (hidden + nearness) / softness.nearness, -jnp.inf)
             now = jax.lax.stop_gradient(jnp.maximum(largest, jnp.max(weight, axis=0)))
             weight, before = jax.lax.optimization_barrier((jnp.exp(weight - now), jnp.exp(largest - now)))
-            # Nothing in these is a matrix product whose precision an accelerator might lower.
+            # No matrix products here, since an accelerator might lower their precision.
             here = [weight / nearness, *(weight * normal[:, axis, None] for axis in range(3))]
             seen = [before * sofar + jnp.sum(part, axis=0) for sofar, part in zip(seen, here, strict=True)]
             return empty, now, before * total + jnp.sum(weight, axis=0), *seen
@@ -133,7 +142,7 @@ def render_mesh(
         @jax.checkpoint
         def some(carry: tuple[Array, ...], chunk: tuple[Array, Array]) -> tuple[tuple[Array, ...], None]:
             first, chosen = chunk
-            return jax.lax.cond(first < count, lambda: look(carry, corners[chosen]), lambda: carry), None
+            return jax.lax.cond(first < count, lambda: add(carry, corners[chosen]), lambda: carry), None
 
         start = (none, jnp.full_like(none, -1e30), *[none] * 5)
         chunks = jnp.arange(0, len(faces), at_once), faces.reshape(-1, at_once)
@@ -155,7 +164,7 @@ def render_mesh(
 def _faces(
     corners: Float[Array, "faces 3 3"], at: Float[Array, "2 pixels"], focal: float, edge: float
 ) -> tuple[Float[Array, "faces pixels"], Float[Array, "faces pixels"], Float[Array, "faces 3"]]:
-    """How far pixels lie inside of some faces, in units of the border's width; 1/depth there; and the faces' normals."""
+    """For some faces and pixels: the signed distance to the border in units of its width, 1/depth, and the faces' normals."""
     depth = limited(corners[..., 2], _NEAREST)
     x, y = (focal * corners[..., axis] / depth for axis in range(2))  # (faces, 3), in pixels from the middle
     before, after = (0, 1, 2), (1, 2, 0)
@@ -169,7 +178,7 @@ def _faces(
         dx, dy = at[0] - x[:, i, None], at[1] - y[:, i, None]
         part = limited((dx * along[0][:, None] + dy * along[1][:, None]) * over_length[:, None], 0.0, 1.0)
         squares.append(jnp.square(dx - part * along[0][:, None]) + jnp.square(dy - part * along[1][:, None]))
-        # The share of the corner across from this edge.
+        # The barycentric coordinate of the corner opposite this edge.
         shares.append((along[0][:, None] * dy - along[1][:, None] * dx) * over_area[:, None])
     inside = (shares[0] >= 0) & (shares[1] >= 0) & (shares[2] >= 0)
     distance = jnp.sqrt(smaller(smaller(squares[0], squares[1]), squares[2]) + 1e-12)

@@ -1,6 +1,7 @@
-"""What makes a view worth taking, as numbers with gradients: each is larger for a better view.
+"""Objectives for good views, with gradients; larger is better.
 
-Each takes soft images. Of hard ones, what rays or a threshold give, it is its own hard counterpart, or one is named.
+Each objective takes soft images. Evaluated on hard images (from ray casting or a threshold), it is its own hard counterpart,
+unless its docstring names another.
 """
 
 from __future__ import annotations
@@ -17,13 +18,14 @@ from mevs_jax.entropy import DEPTH_SCALE, shannon_entropy
 from mevs_jax.rendering.piecewise import limited
 
 _LEVELS = 256
-_GRAZING = 0.05  # the least cosine that a visible area is divided by
+_GRAZING = 0.05  # lower bound on the cosine that a visible area is divided by
 
 
 def opacity_entropy(opacity: Float[AnyArray, "height width"]) -> Float[Array, ""]:
-    """How evenly opacity is spread over the image, in [0, 1]: −Σ p log p / log N with p = opacity / Σ opacity (DiffDVR, §4.1).
+    """Normalised entropy of the distribution of opacity over the image, in [0, 1]; 0 for an empty image.
 
-    Its hard counterpart is itself: of a silhouette it is log(pixels covered) / log N. 0 for an empty image.
+    It is −Σ p log p / log N with p = opacity / Σ opacity and N pixels (DiffDVR, §4.1). For a hard silhouette it is
+    log(covered pixels) / log N.
     """
     opacity = jnp.asarray(opacity)
     total = jnp.sum(opacity)
@@ -34,18 +36,19 @@ def opacity_entropy(opacity: Float[AnyArray, "height width"]) -> Float[Array, ""
 def soft_depth_entropy(
     depth: Float[AnyArray, "height width"], silhouette: Float[AnyArray, "height width"], softness: float = 0.2
 ) -> Float[Array, ""]:
-    """The thesis's depth entropy in bits (eq. 9), with levels that pass into each other.
+    """The thesis's depth entropy in bits (eq. 9), with a soft assignment of pixels to levels.
+
+    Its hard counterpart is `depth_entropy`, which it becomes as `softness` goes to 0 and the silhouette becomes hard.
 
     Args:
-        depth: metric, anything where nothing is seen.
-        silhouette: in [0, 1]; what is not covered counts as level 0, as the thesis's background does.
-        softness: how far a pixel reaches into the next level, in levels. As it goes to 0 and the silhouette becomes hard,
-            this becomes `depth_entropy`, its hard counterpart.
+        depth: metric depth; arbitrary where the silhouette is 0.
+        silhouette: in [0, 1]; the uncovered part counts as level 0, like the thesis's background.
+        softness: width of the transition between two levels, in levels.
     """
     scaled = jnp.asarray(depth).reshape(-1) * (DEPTH_SCALE / _LEVELS)
     covered = jnp.asarray(silhouette).reshape(-1)
     level = jnp.floor(jax.lax.stop_gradient(scaled))
-    reach = 1 + math.ceil(10 * softness)  # beyond it a pixel has less than e⁻¹⁰ of itself
+    reach = 1 + math.ceil(10 * softness)  # beyond it lies less than e⁻¹⁰ of a pixel's weight
     counts = jnp.zeros(_LEVELS, scaled.dtype).at[0].set(jnp.sum(1 - covered))
     below = jax.nn.sigmoid((level - reach - scaled) / softness)
     for offset in range(-reach, reach + 1):
@@ -57,13 +60,13 @@ def soft_depth_entropy(
 
 
 def silhouette_gaussian(silhouette: Float[AnyArray, "side side"], width: float = 70 / 256) -> Float[Array, ""]:
-    """Minus the squared difference between a silhouette and a Gaussian in the middle of the image, summed over 256² pixels.
+    """Negative squared difference of a silhouette and a Gaussian at the image centre, summed and scaled to 256² pixels.
 
     The thesis's published objective for the mesh renderer, without its term for the distance, which is constant here.
 
     Args:
-        silhouette: in [0, 1]; a hard one gives the hard counterpart.
-        width: of the Gaussian at half its height, as a share of the image's side.
+        silhouette: in [0, 1].
+        width: full width at half maximum of the Gaussian, as a share of the image's side.
     """
     silhouette = jnp.asarray(silhouette)
     side = silhouette.shape[0]
@@ -78,18 +81,20 @@ def visible_area(
     silhouette: Float[AnyArray, "side side"],
     camera: Camera,
 ) -> Float[Array, ""]:
-    """The area of surface that is seen, in square units.
+    """The visible area of the surface, in square units.
 
-    A pixel of side 1/f at depth z shows z² / (f² |n·d|) of a surface with normal n, d the ray with length one along the axis.
+    A pixel of side 1/f at depth z shows the area z² / (f² |n·d|) of a surface with normal n, where d is the ray with length one
+    along the optical axis.
 
     Args:
-        depth: metric; anything finite where the silhouette is 0.
+        depth: metric depth; any finite value where the silhouette is 0.
         normal: in the camera's frame.
-        silhouette: in [0, 1]; a hard one with the depths and normals of a ray caster gives the hard counterpart.
+        silhouette: in [0, 1].
+        camera: the camera of the images.
     """
     offset = (jnp.arange(camera.resolution) + 0.5 - camera.resolution / 2) / camera.focal_length
     facing = jnp.abs(normal[..., 0] * offset + normal[..., 1] * offset[:, None] + normal[..., 2])
-    # Smooth where it would be divided by nothing; a surface so nearly edge-on shows little.
+    # A smooth lower bound against division by zero; a surface that is almost edge-on shows little area.
     facing = jnp.sqrt(jnp.square(facing) + _GRAZING**2)
     return jnp.sum(silhouette * jnp.square(depth / camera.focal_length) / facing)
 
@@ -97,13 +102,14 @@ def visible_area(
 def edge_content(
     depth: Float[AnyArray, "side side"], silhouette: Float[AnyArray, "side side"], step: float = 0.05
 ) -> Float[Array, ""]:
-    """How much of the image is edges, in [0, 1): where depth jumps by more than some `step` units, or the object ends.
+    """The share of edges in the image, in [0, 1): depth jumps of more than about `step`, and the outline of the object.
 
     Args:
-        depth: metric; anything finite where the silhouette is 0.
-        silhouette: in [0, 1]; a hard one with hard depths gives the hard counterpart.
+        depth: metric depth; any finite value where the silhouette is 0.
+        silhouette: in [0, 1].
+        step: jump of depth that counts half as an edge, in metric units.
     """
-    # Background stands as far behind as the far end of the unit sphere from a camera two radii away.
+    # The background is placed at the far end of the unit sphere, seen from a camera at a distance of two radii.
     seen = silhouette * depth + (1 - silhouette) * 3.0
     across, down = jnp.diff(seen, axis=1)[:-1], jnp.diff(seen, axis=0)[:, :-1]
     jump = (jnp.square(across) + jnp.square(down)) / step**2

@@ -1,7 +1,7 @@
-"""Where a camera sees best: gradient ascent over the sphere from many starts at once.
+"""Finds the best views by gradient ascent over the sphere from many start poses.
 
-A start is a pose; a step goes to the camera's right and downwards (`orbit`), so there are no poles, and what the
-optimiser remembers of earlier steps turns with the camera. Gradients go forwards: two parameters, no memory.
+A step is a vector to the camera's right and downwards (`orbit`). There are no poles, and the moments of the optimiser rotate with
+the camera. Gradients are computed in forward mode by default, which suits two parameters and stores no intermediate results.
 """
 
 from __future__ import annotations
@@ -17,18 +17,19 @@ from jaxtyping import Array, Bool, Float, Int
 from mevs_jax.cameras import orbit
 
 Objective = Callable[[Float[Array, "4 4"]], Float[Array, ""]]
+"""A function of a camera's pose, to be maximised."""
 
 
 @flax.struct.dataclass
 class Ascent:
-    """Where the starts ended.
+    """The result of gradient ascent from several starts.
 
     Attributes:
-        poses: (starts, 4, 4) of the best point on each way.
-        values: (starts,) of the objective there.
-        path: (starts, steps + 1, 3) camera positions; the last again once a start has ended.
-        path_values: (starts, steps + 1) of the objective on the way.
-        steps: (starts,) how many each took.
+        poses: (starts, 4, 4) pose at the best point of each path.
+        values: (starts,) objective at that pose.
+        path: (starts, steps + 1, 3) camera positions; the last position is repeated after a path has ended.
+        path_values: (starts, steps + 1) objective along the path.
+        steps: (starts,) number of steps of each path.
     """
 
     poses: Float[Array, "*batch starts 4 4"]
@@ -61,17 +62,18 @@ def ascend(
     at_once: int | None = None,
     forwards: bool = True,
 ) -> Ascent:
-    """Climbs from every start until it has not risen for a while.
+    """Gradient ascent from every start until the objective no longer rises.
 
     Args:
-        objective: of a camera's pose.
+        objective: to be maximised, of a camera's pose.
         starts: poses that look at the origin.
-        rate: of Adam, in tangents on the unit sphere at first; it falls to a tenth over `steps` (cosine).
-        steps: at most so many for each start.
-        tolerance: a relative gain that counts as one.
-        patience: steps without one after which a start ends; ended ones wait for the others of their batch.
-        forwards: how the gradient is calculated; in reverse for objectives that know no other, as `render_silhouette`.
-        at_once: starts in one batch; all of them unless given, on a CPU one after the other.
+        rate: initial learning rate of Adam, in tangents on the unit sphere; it decays to a tenth over `steps` (cosine).
+        steps: largest number of steps per start.
+        tolerance: smallest relative gain that counts as progress.
+        patience: steps without progress after which a path ends. Paths that have ended wait for the others of their batch.
+        at_once: starts per batch; by default all of them, on CPU one.
+        forwards: whether to compute gradients in forward mode; False for objectives that have reverse-mode gradients only, such
+            as those on `render_silhouette`.
     """
     rates = optax.cosine_decay_schedule(rate, steps, 0.1)
     optimiser = optax.adam(rates, b1=0.8, b2=0.95)
@@ -84,12 +86,12 @@ def ascend(
         return jax.vmap(along, out_axes=(None, 0))(jnp.eye(2, dtype=here.dtype))
 
     def one(start: Array) -> _Walk:
-        def goes_on(walk: _Walk) -> Bool[Array, ""]:
+        def unfinished(walk: _Walk) -> Bool[Array, ""]:
             return (walk.step < steps) & (walk.calm < patience)
 
         def climb(walk: _Walk) -> _Walk:
             value, slope = value_and_slope(walk.pose)
-            # A slope's size says nothing across objectives; Adam takes its direction, and a slope of nothing stays one.
+            # The scale of slopes differs between objectives. Adam normalises it, and a slope of zero stays zero.
             update, moments = optimiser.update(-slope, walk.moments)
             gain = value - walk.best_value > tolerance * jnp.abs(value)
             better = value > walk.best_value
@@ -115,8 +117,8 @@ def ascend(
             path=jnp.broadcast_to(start[:3, 3], (steps + 1, 3)),
             path_values=jnp.zeros(steps + 1, start.dtype),
         )
-        walk = jax.lax.while_loop(goes_on, climb, walk)
-        # The last point was stepped to and not looked at yet.
+        walk = jax.lax.while_loop(unfinished, climb, walk)
+        # The objective at the last pose has not been evaluated yet.
         last = objective(walk.pose)
         better = last > walk.best_value
         return walk.replace(  # type: ignore[attr-defined]
@@ -127,7 +129,7 @@ def ascend(
 
     if at_once is None:
         at_once = 1 if jax.default_backend() == "cpu" else len(starts)
-    # Not in batches of one, in which a branch that is not taken is calculated all the same.
+    # A batch of one is a `vmap` too, in which both branches of a `cond` are computed; None avoids that.
     walks = jax.lax.map(one, starts, batch_size=at_once if at_once > 1 else None)
     return Ascent(walks.best, walks.best_value, walks.path, walks.path_values, walks.step)
 
@@ -135,7 +137,16 @@ def ascend(
 def distinct_optima(
     poses: Float[Array, "starts 4 4"], values: Float[Array, " starts"], angle: float = 0.2
 ) -> tuple[Int[Array, " starts"], Bool[Array, " starts"]]:
-    """Starts from the best value to the worst, and which of them are not within `angle` radians of a better one that is kept."""
+    """Sorts the results of an ascent and marks those that are distinct.
+
+    Args:
+        poses: at the end of each path.
+        values: of the objective at these poses.
+        angle: in radians; results nearer than that to a better result that is kept are not kept.
+
+    Returns:
+        The indices of the results from the best value to the worst; and, in this order, True for those that are kept.
+    """
     order = jnp.argsort(-values, stable=True)
     directions = poses[order, :3, 3]
     directions = directions / jnp.linalg.norm(directions, axis=-1, keepdims=True)

@@ -1,8 +1,9 @@
-"""Limits and minima that rounding takes no gradient from.
+"""Minimum and clipping whose gradients do not depend on rounding.
 
-The derivative of `jnp.minimum`, `jnp.maximum` and `jnp.clip` asks whether the result *equals* an argument. A compiler may
-calculate either again, rounded otherwise (a fused multiplication, or a recomputed forward pass), and then neither has the
-gradient. These ask which is *less*, and something always has it; at a tie, or at a limit, the first argument does.
+The derivatives of `jnp.minimum`, `jnp.maximum` and `jnp.clip` test whether the result *equals* an argument. A compiler may
+recompute either with different rounding (a fused multiplication, or a recomputed forward pass), and then no argument receives
+the gradient. The functions of this module test which argument is *less*, so one always receives it; at a tie, or at a limit, the
+first argument does.
 """
 
 from __future__ import annotations
@@ -12,9 +13,10 @@ from jaxtyping import Array, Float
 
 
 def smaller(first: Float[Array, "*shape"], second: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
+    """The elementwise minimum."""
     return jnp.where(second < first, second, first)
 
 
 def limited(x: Float[Array, "*shape"], low: float, high: float = jnp.inf) -> Float[Array, "*shape"]:
-    """x between two numbers."""
+    """`x` clipped to [low, high]."""
     return jnp.where(x < low, low, jnp.where(x > high, high, x))

@@ -1,8 +1,9 @@
-"""A grid of densities rendered by emission and absorption: opacity and depth with gradients to the camera and to the grid.
+"""Volume rendering of a density grid by absorption: opacity and depth with gradients to the camera and to the grid.
 
-As in DiffDVR (Weiss and Westermann, *Differentiable Direct Volume Rendering*, 2021): rays step through the grid, densities
-between its nodes are trilinear, and light is absorbed at `absorption · density` a unit of length. In reverse, the steps are
-walked back and each transmittance recovered from the one after it, so memory does not grow with the number of steps.
+As in DiffDVR (Weiss and Westermann, *Differentiable Direct Volume Rendering*, 2021), rays step through the grid, densities
+between its nodes are interpolated trilinearly, and light is absorbed at a rate of `absorption · density` per unit of length. The
+reverse pass goes through the steps backwards and computes each transmittance from the one after it, so memory does not grow with
+the number of steps.
 """
 
 from __future__ import annotations
@@ -21,11 +22,11 @@ from mevs_jax.rendering.piecewise import limited
 
 @flax.struct.dataclass
 class VolumeRendering:
-    """What a camera sees of a volume.
+    """The image of a volume.
 
     Attributes:
-        opacity: (resolution, resolution) in [0, 1], the share of light that is absorbed on the way.
-        depth: (resolution, resolution) the mean depth at which it is, 0 where nothing is.
+        opacity: (resolution, resolution) share of light that is absorbed along the ray, in [0, 1].
+        depth: (resolution, resolution) mean depth of the absorption, 0 where nothing is absorbed.
     """
 
     opacity: Float[Array, "*batch resolution resolution"]
@@ -33,9 +34,9 @@ class VolumeRendering:
 
 
 def corners_of_cells(density: Float[AnyArray, "nodes nodes nodes"]) -> Float[Array, "cells 8"]:
-    """The grid as rendering reads it: beside each other the densities at the eight corners of each cell, (nodes + 1)³ of them.
+    """The densities at the eight corners of each of the (nodes + 1)³ cells, the form of the grid that `march` reads.
 
-    Around the grid there is nothing: a border of zeros.
+    The grid is surrounded by a border of zeros.
     """
     padded = jnp.pad(jnp.asarray(density), 1)
     cells = padded.shape[0] - 1
@@ -46,13 +47,13 @@ def corners_of_cells(density: Float[AnyArray, "nodes nodes nodes"]) -> Float[Arr
 def march(
     cells: Float[Array, "cells 8"], camera: Camera, *, steps: int = 64, absorption: float = 20.0
 ) -> VolumeRendering:
-    """Opacity and depth, for gradients forwards (`jax.jvp`, `jax.jacfwd`), which few parameters, a camera's say, do best with.
+    """Opacity and depth, for forward-mode gradients (`jax.jvp`, `jax.jacfwd`), which suit few parameters such as a camera's.
 
     Args:
-        cells: `corners_of_cells` of a grid that fills the cube [−1, 1]³, indexed x, y, z; its nodes are voxels' centres.
-        camera: outside of the unit sphere, of which alone it sees anything.
-        steps: samples along each ray, over the two units through the sphere.
-        absorption: a unit of length where the density is 1; at 20 and with voxels of 1/16 one of them absorbs 71 %.
+        cells: `corners_of_cells` of a grid that fills the cube [−1, 1]³, indexed x, y, z; its nodes are the centres of voxels.
+        camera: outside of the unit sphere. Only the depths that the unit sphere covers are rendered.
+        steps: samples along each ray, over the two units of depth that the sphere covers.
+        absorption: rate per unit of length at density 1; at 20, a voxel of size 1/16 absorbs 71 %.
     """
     return _rendering(_march(cells, _rays(camera), steps, absorption), camera.resolution)
 
@@ -60,10 +61,10 @@ def march(
 def render_volume(
     density: Float[AnyArray, "nodes nodes nodes"], camera: Camera, *, steps: int = 64, absorption: float = 20.0
 ) -> VolumeRendering:
-    """Opacity and depth, for gradients in reverse (`jax.grad`), in memory that does not grow with `steps`.
+    """Opacity and depth, for reverse-mode gradients (`jax.grad`) in memory that does not grow with `steps`.
 
     Args:
-        density: at least 0; fills the cube [−1, 1]³, indexed x, y, z; its nodes are voxels' centres.
+        density: at least 0; fills the cube [−1, 1]³, indexed x, y, z; its nodes are the centres of voxels.
         camera, steps, absorption: as for `march`.
     """
     rays = _rays(camera)
@@ -82,7 +83,7 @@ def _rendering(marched: tuple[Array, Array], side: int) -> VolumeRendering:
 
 
 def _march(cells: Array, rays: tuple[Array, Array], steps: int, absorption: float) -> tuple[Array, Array]:
-    """The logarithm of the transmittance of each ray, and its depths summed by what is absorbed there, (pixels,) each."""
+    """The log-transmittance of each ray, and the sum of its depths weighted by the absorption there, (pixels,) each."""
 
     def step(carry: tuple[Array, Array], number: Array) -> tuple[tuple[Array, Array], None]:
         transmitted, depth = carry
@@ -97,17 +98,17 @@ def _march(cells: Array, rays: tuple[Array, Array], steps: int, absorption: floa
 def _absorbed(
     cells: Array, rays: tuple[Array, Array], number: Array, steps: int, absorption: float
 ) -> tuple[Float[Array, " pixels"], Array]:
-    """What one step absorbs, as a logarithm, and its depth."""
+    """The decrease of the log-transmittance in one step, and the depth of that step."""
     origin, directions = rays
     length = 2.0 / steps
     at = jax.lax.stop_gradient(jnp.linalg.norm(origin)) - 1 + (number + 0.5) * length
-    # A ray that leaves the axis goes further than along the axis between two depths.
-    way = jnp.linalg.norm(directions, axis=-1) * length
-    return absorption * way * _sample(cells, origin + at * directions), at
+    # Between two depths, an oblique ray is longer than the optical axis.
+    distance = jnp.linalg.norm(directions, axis=-1) * length
+    return absorption * distance * _sample(cells, origin + at * directions), at
 
 
 def _sample(cells: Float[Array, "cells 8"], points: Float[Array, "points 3"]) -> Float[Array, " points"]:
-    """Trilinear density, 0 outside."""
+    """Densities at some points by trilinear interpolation, 0 outside of the grid."""
     side = round(len(cells) ** (1 / 3))  # cells along an edge: one more than nodes
     position = (points + 1) / 2 * (side - 1) + 0.5
     cell = jnp.clip(jnp.floor(jax.lax.stop_gradient(position)), 0, side - 1)
@@ -130,8 +131,8 @@ def _march_back_forward(cells: Array, rays: tuple[Array, Array], steps: int, abs
     return (transmitted, depth), (cells, rays, transmitted)
 
 
-def _march_back_backward(steps: int, absorption: float, kept: tuple, cotangents: tuple[Array, Array]):
-    cells, rays, transmitted = kept
+def _march_back_backward(steps: int, absorption: float, residuals: tuple, cotangents: tuple[Array, Array]):
+    cells, rays, transmitted = residuals
     of_transmitted, of_depth = cotangents
 
     def step(carry: tuple, number: Array) -> tuple[tuple, None]:
