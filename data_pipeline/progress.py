@@ -1,4 +1,4 @@
-"""One look for every progress bar: what, how far, how fast, how much longer."""
+"""Progress bars with a common layout: task, progress, rate and remaining time."""
 
 from __future__ import annotations
 
@@ -12,6 +12,8 @@ console = Console(stderr=True, highlight=False)
 
 
 class _Rate(ProgressColumn):
+    """The rate of a task in `unit` per second."""
+
     def __init__(self, unit: str):
         super().__init__()
         self.unit = unit
@@ -22,7 +24,7 @@ class _Rate(ProgressColumn):
 
 
 def progress_bar(unit: str) -> Progress:
-    """A bar counted in `unit`; silent where standard error is no terminal, so that logs stay short."""
+    """Returns a progress bar that counts in `unit`. It is disabled if standard error is not a terminal, to keep logs short."""
     return Progress(
         TextColumn("{task.description}"),
         BarColumn(),
