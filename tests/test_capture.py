@@ -173,7 +173,7 @@ if __name__ == "__main__":
 
 
 def test_capture_workers_do_not_import_jax(tmp_path):
-    """JAX takes seconds to import. A spawned worker also imports the main module, which imports here what the script `mevs` does."""
+    """JAX takes seconds to import. A spawned worker also imports the main module, here the imports of the script `mevs`."""
     script, out = tmp_path / "script.py", tmp_path / "captures"
     script.write_text(CAPTURE_BY_WORKERS)
     environment = os.environ | {"PYTHONPATH": str(Path(__file__).resolve().parents[1])}
