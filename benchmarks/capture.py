@@ -25,7 +25,7 @@ import jax.numpy as jnp
 import numpy as np
 import trimesh
 
-from data_pipeline.capture import casting as casting
+from data_pipeline.capture import casting
 from data_pipeline.capture.casting import CaptureConfig, capture, rig_for, save_capture
 from data_pipeline.capture.workers import capture_all
 from data_pipeline.files import write_json, write_text

@@ -26,7 +26,8 @@ import jax
 import numpy as np
 
 from data_pipeline.dataset.batches import train_batches
-from data_pipeline.dataset.builder import DatasetStatistics, load_statistics, prepare
+from data_pipeline.dataset.builder import prepare
+from data_pipeline.dataset.statistics import DatasetStatistics, load_statistics
 from data_pipeline.files import write_json
 from eval.settings import SMALL, THESIS
 from eval.stages import tasks

@@ -20,7 +20,8 @@ import jax
 import numpy as np
 
 from data_pipeline.dataset.batches import train_batches
-from data_pipeline.dataset.builder import DatasetStatistics, prepare
+from data_pipeline.dataset.builder import prepare
+from data_pipeline.dataset.statistics import DatasetStatistics
 from data_pipeline.files import write_json
 from eval.settings import SMALL, TINY
 from eval.stages import tasks

@@ -1,1 +1,1 @@
-"""Meshes become captures, captures become shards, shards become batches."""
+"""Data: objects are captured from all viewpoints, captures are written as shards, and shards are read as batches."""

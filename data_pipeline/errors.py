@@ -1,15 +1,18 @@
-"""Errors that a person can act on: input that cannot be used, in one sentence."""
+"""Errors about input data, with messages that tell the user what to do."""
 
 from __future__ import annotations
 
 
 class DataError(ValueError):
-    """The data cannot be used: what was wrong, where, and what to do, in one sentence."""
+    """Data that cannot be used. The message is one sentence: what is wrong, where, and what to do."""
 
 
 class DamagedMesh(DataError):
-    """A file that should be a mesh and is not, or is cut short, or holds numbers that are not finite."""
+    """A file that is not a readable mesh: of another format, truncated, or with values that are not finite.
+
+    The summary of a data set stores the messages of objects left out, so they are part of its fingerprint.
+    """
 
 
 class EmptyMesh(Exception):
-    """A sound mesh with nothing to see: it is left out of the data set, named and counted."""
+    """A valid mesh without a surface. The object is left out of the data set and listed in its summary with this message."""

@@ -1,4 +1,4 @@
-"""Files appear whole or not at all: written under a temporary name, then moved into place."""
+"""Reading and writing of files. Every file is written atomically: under a temporary name, then renamed."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ import numpy as np
 
 
 def write_bytes(path: Path, content: bytes) -> None:
+    """Writes a file atomically and makes its folder if needed."""
     path.parent.mkdir(parents=True, exist_ok=True)
     temporary = path.with_name(f".{path.name}.{os.getpid()}.partial")
     try:
@@ -22,17 +23,19 @@ def write_bytes(path: Path, content: bytes) -> None:
 
 
 def write_text(path: Path, content: str) -> None:
+    """Writes text as UTF-8, atomically."""
     write_bytes(path, content.encode())
 
 
 def write_npz(path: Path, **arrays: Any) -> None:
+    """Writes arrays to an uncompressed `.npz` file, atomically."""
     buffer = io.BytesIO()
     np.savez(buffer, **arrays)
     write_bytes(path, buffer.getvalue())
 
 
 def npz_of(folder: Path, name: str) -> Path:
-    """The file in `folder` that belongs to an object of this name."""
+    """Returns the path of the `.npz` file in `folder` for the object called `name`."""
     return folder / (name.replace("/", "__") + ".npz")
 
 
@@ -41,17 +44,23 @@ def _plain(value: Any) -> Any:
         return value.tolist()
     if isinstance(value, Path):
         return str(value)
-    raise TypeError(f"{type(value).__name__} has no JSON form")
+    raise TypeError(f"{type(value).__name__} cannot be written as JSON")
 
 
 def write_json(path: Path, content: Any) -> None:
+    """Writes JSON atomically. Arrays become lists, paths become strings.
+
+    Raises:
+        ValueError: if a number is not finite.
+    """
     write_text(path, json.dumps(content, indent=1, default=_plain, allow_nan=False) + "\n")
 
 
 def as_read(content: Any) -> Any:
-    """Content as `read_json` would give it back: what a stored identity is compared with."""
+    """Returns `content` as `read_json` would return it after writing, for comparison with a stored identity."""
     return json.loads(json.dumps(content))
 
 
 def read_json(path: Path) -> Any:
+    """Returns the content of a JSON file."""
     return json.loads(path.read_text())

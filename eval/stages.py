@@ -15,7 +15,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from data_pipeline.dataset.builder import DatasetStatistics, load_statistics, prepare, report_left_out
+from data_pipeline.dataset.builder import prepare
+from data_pipeline.dataset.statistics import DatasetStatistics, load_statistics, report_left_out
 from data_pipeline.errors import DataError
 from data_pipeline.files import as_read, read_json, write_json
 from data_pipeline.progress import console

@@ -9,7 +9,8 @@ import flax.nnx as nnx
 import jax.numpy as jnp
 import numpy as np
 
-from data_pipeline.dataset.builder import DatasetStatistics, open_split
+from data_pipeline.dataset.builder import open_split
+from data_pipeline.dataset.statistics import DatasetStatistics
 from data_pipeline.files import write_npz
 from mevs_jax.selection import ViewTable
 from train.outputs import network_outputs

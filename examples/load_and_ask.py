@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from data_pipeline.dataset.builder import load_statistics
+from data_pipeline.dataset.statistics import load_statistics
 from eval.tables import load_view_tables
 from eval.walks.knowledge import learn
 from mevs_jax import POLICIES, ViewGraph, select_from_table

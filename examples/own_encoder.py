@@ -15,7 +15,7 @@ import jax
 import jax.numpy as jnp
 from flax import nnx
 
-from data_pipeline.dataset.builder import load_statistics
+from data_pipeline.dataset.statistics import load_statistics
 from eval.run_file import load_run
 from eval.settings import SMALL
 from train.loop import fit

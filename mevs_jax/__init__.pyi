@@ -4,8 +4,6 @@ from mevs_jax.beliefs import (
     CalibratedFusion as CalibratedFusion,
 )
 from mevs_jax.beliefs import (
-)
-from mevs_jax.beliefs import (
     confidence as confidence,
 )
 from mevs_jax.beliefs import (
@@ -13,8 +11,6 @@ from mevs_jax.beliefs import (
 )
 from mevs_jax.beliefs import (
     mean_of_probabilities as mean_of_probabilities,
-)
-from mevs_jax.beliefs import (
 )
 from mevs_jax.calibration import (
     calibration_error_by_chance as calibration_error_by_chance,
@@ -91,8 +87,6 @@ from mevs_jax.metrics import (
 from mevs_jax.metrics import (
     confusion_matrix as confusion_matrix,
 )
-from mevs_jax.metrics import (
-)
 from mevs_jax.models import (
     Abstraction as Abstraction,
 )
@@ -158,27 +152,26 @@ from mevs_jax.policies.oracles import (
 )
 from mevs_jax.policies.registry import (
     POLICIES as POLICIES,
+)
+from mevs_jax.policies.registry import (
     policy_named as policy_named,
+)
+from mevs_jax.policies.registry import (
     register_policy as register_policy,
 )
 from mevs_jax.selection import (
-    sum_of_logits as sum_of_logits,
     Episode as Episode,
 )
 from mevs_jax.selection import (
-    sum_of_logits as sum_of_logits,
     ViewTable as ViewTable,
 )
 from mevs_jax.selection import (
-    sum_of_logits as sum_of_logits,
     by_attention as by_attention,
 )
 from mevs_jax.selection import (
-    sum_of_logits as sum_of_logits,
     select_from_table as select_from_table,
 )
 from mevs_jax.selection import (
-    sum_of_logits as sum_of_logits,
     select_views as select_views,
 )
 from mevs_jax.selection import (

@@ -16,7 +16,7 @@ from jax.sharding import Mesh
 
 import train.loop
 from data_pipeline.dataset.batches import train_batches
-from data_pipeline.dataset.builder import load_statistics
+from data_pipeline.dataset.statistics import load_statistics
 from eval.settings import TINY
 from eval.stages import tasks
 from train.devices import DATA, MODEL, device_mesh, parameter_sharding, place, place_batch

@@ -16,7 +16,8 @@ import trimesh
 
 from data_pipeline.capture.casting import CaptureConfig
 from data_pipeline.dataset import builder
-from data_pipeline.dataset.builder import DataConfig, load_statistics, open_split, prepare
+from data_pipeline.dataset.builder import DataConfig, open_split, prepare
+from data_pipeline.dataset.statistics import load_statistics
 from data_pipeline.errors import DataError
 from data_pipeline.objects import archives
 from data_pipeline.objects.archives import ARCHIVES, Archive, download, local
@@ -86,13 +87,13 @@ def test_an_archive_is_downloaded_once_and_checked(served, made_archive, tmp_pat
 
 @pytest.mark.parametrize("wrong", [{"sha256": "0" * 64}, {"size": 5}])
 def test_another_file_in_its_place_is_refused(served, tmp_path, wrong):
-    with pytest.raises(DataError, match=r"not ModelNet10: its size or SHA-256 is another; fetch .* with --archive"):
+    with pytest.raises(DataError, match=r"not ModelNet10: its size or SHA-256 differs; download .* with --archive"):
         download(replace(served[0], **wrong), tmp_path)
 
 
 def test_without_a_network_the_way_out_is_named(tmp_path):
     gone = replace(ARCHIVES["modelnet40"], url="http://127.0.0.1:9/ModelNet40.zip")
-    with pytest.raises(DataError, match=r"ModelNet40 could not be downloaded .* name the file with --archive"):
+    with pytest.raises(DataError, match=r"ModelNet40 could not be downloaded .* pass the file with --archive"):
         download(gone, tmp_path)
 
 

@@ -6,6 +6,7 @@ import os
 import shutil
 import subprocess
 import sys
+from pathlib import Path
 
 import jax.numpy as jnp
 import numpy as np
@@ -140,6 +141,49 @@ def test_without_system_libraries_embree_takes_over(monkeypatch):
     default_caster.cache_clear()
 
 
+CAPTURE_BY_WORKERS = """
+import sys
+from dataclasses import dataclass
+from multiprocessing import parent_process
+from pathlib import Path
+from data_pipeline.capture.casting import CaptureConfig
+from data_pipeline.capture.workers import capture_all
+from data_pipeline.errors import DamagedMesh
+from data_pipeline.objects.mesh import ObjectEntry
+from data_pipeline.objects.recipes import FurniturePiece
+from mevs_jax.cli.main import main
+
+
+@dataclass(frozen=True)
+class Checked:
+    recipe: FurniturePiece
+
+    def load(self):
+        if parent_process() is None:
+            raise DamagedMesh("was not captured by a worker")
+        if "jax" in sys.modules:
+            raise DamagedMesh("was captured by a worker that imported JAX")
+        return self.recipe.load()
+
+
+if __name__ == "__main__":
+    entries = [ObjectEntry(f"c{i}", 0, "train", Checked(FurniturePiece("chair", i))) for i in range(8)]
+    capture_all(entries, CaptureConfig(views=2, resolution=16), Path(sys.argv[1]), workers=2)
+"""
+
+
+def test_capture_workers_do_not_import_jax(tmp_path):
+    """JAX takes seconds to import. A spawned worker also imports the main module, here the imports of the script `mevs`."""
+    script, out = tmp_path / "script.py", tmp_path / "captures"
+    script.write_text(CAPTURE_BY_WORKERS)
+    environment = os.environ | {"PYTHONPATH": str(Path(__file__).resolve().parents[1])}
+    result = subprocess.run(
+        [sys.executable, str(script), str(out)], capture_output=True, text=True, timeout=300, env=environment
+    )
+    assert result.returncode == 0, result.stderr
+    assert len(list(out.glob("*.npz"))) == 8
+
+
 def under_xvfb(code: str, *arguments: str) -> subprocess.CompletedProcess:
     """Runs Python where there is a display, since a window opens once in a process and OpenGL may end it."""
     command = [sys.executable, "-c", code, *arguments]
@@ -151,9 +195,11 @@ def under_xvfb(code: str, *arguments: str) -> subprocess.CompletedProcess:
 SEE_BOTH = """
 import sys
 import numpy as np
-from data_pipeline.capture import CaptureConfig, capture, rig_for, save_capture
-from data_pipeline.meshes import FurniturePiece, ObjectEntry, load_object
-from data_pipeline.visualizer import capture_with_visualizer
+from data_pipeline.capture.casting import CaptureConfig, capture, rig_for, save_capture
+from data_pipeline.capture.visualizer import capture_with_visualizer
+from data_pipeline.objects.mesh import ObjectEntry
+from data_pipeline.objects.recipes import FurniturePiece
+from data_pipeline.objects.sources import load_object
 from pathlib import Path
 rig = rig_for(CaptureConfig(views=8, resolution=224))
 for name in sys.argv[2:]:

@@ -18,7 +18,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from data_pipeline.dataset.builder import load_statistics
+from data_pipeline.dataset.statistics import load_statistics
 from eval.learned.page import write_learned_page
 from eval.settings import TINY
 from eval.stages import ascend_on_objects, learn_to_choose

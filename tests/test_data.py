@@ -23,16 +23,9 @@ from data_pipeline.dataset.batches import (
     train_batches,
     validation_batches,
 )
-from data_pipeline.dataset.builder import (
-    SPLITS,
-    DataConfig,
-    load_statistics,
-    open_split,
-    prepare,
-    split_objects,
-    view_entropies,
-)
+from data_pipeline.dataset.builder import DataConfig, open_split, prepare, split_objects, view_entropies
 from data_pipeline.dataset.inputs import cloud_input, image_input
+from data_pipeline.dataset.statistics import SPLITS, load_statistics
 from data_pipeline.errors import DataError
 from data_pipeline.objects.sources import load_object, open_source
 from mevs_jax import Camera, depth_entropy, partial_cloud

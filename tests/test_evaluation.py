@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from data_pipeline.dataset.builder import DatasetStatistics
+from data_pipeline.dataset.statistics import DatasetStatistics
 from eval.numbers.comparison import class_mean, first_reaching
 from eval.numbers.study import entropy_errors, exactly_random, reachable_views, run_study, single_view
 from eval.tables import ViewTables, load_view_tables, save_view_tables

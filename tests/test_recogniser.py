@@ -19,8 +19,9 @@ from scipy.spatial.transform import Rotation
 from data_pipeline.capture.casting import DEPTH_SCALE, CaptureConfig, capture, rig_for
 from data_pipeline.dataset.augment import ViewAugmentation, object_changes, views_after
 from data_pipeline.dataset.batches import ViewBatches, equally_often, evaluation_batches, fold_of, train_batches
-from data_pipeline.dataset.builder import load_statistics, open_split, prepare
+from data_pipeline.dataset.builder import open_split, prepare
 from data_pipeline.dataset.inputs import depth_and_normals
+from data_pipeline.dataset.statistics import load_statistics
 from data_pipeline.errors import DataError
 from data_pipeline.objects.mesh import Mesh
 from eval.settings import TINY

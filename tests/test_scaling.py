@@ -17,7 +17,7 @@ import pytest
 from flax import nnx
 
 from data_pipeline.dataset.batches import train_batches
-from data_pipeline.dataset.builder import load_statistics
+from data_pipeline.dataset.statistics import load_statistics
 from data_pipeline.errors import DataError
 from eval.stages import tasks
 from tests.scaling_worker import SETTINGS

@@ -14,7 +14,7 @@ import pytest
 from flax import nnx
 
 import train.sweep
-from data_pipeline.dataset.builder import load_statistics
+from data_pipeline.dataset.statistics import load_statistics
 from data_pipeline.errors import DataError
 from eval.report.sweep import sweep_table
 from eval.stages import tasks, train_sweep

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from matplotlib.figure import Figure
 
-from data_pipeline.dataset.builder import DatasetStatistics
+from data_pipeline.dataset.statistics import DatasetStatistics
 from data_pipeline.objects.furniture import CLASSES, furniture
 from eval.numbers.timing import decision_memory, milliseconds, time_local_maxima
 from eval.settings import PRESETS

@@ -16,7 +16,7 @@ import pytest
 from flax import nnx
 
 import train.loop
-from data_pipeline.dataset.builder import load_statistics
+from data_pipeline.dataset.statistics import load_statistics
 from data_pipeline.errors import DataError
 from eval.settings import TINY
 from eval.stages import tasks

@@ -11,7 +11,7 @@ from typing import Any, TypeVar
 import flax.nnx as nnx
 import numpy as np
 
-from data_pipeline.dataset.builder import DatasetStatistics
+from data_pipeline.dataset.statistics import DatasetStatistics
 from data_pipeline.errors import DataError
 from data_pipeline.files import as_read, read_json, write_json, write_npz
 from train.checkpoints import Checkpoints

@@ -28,7 +28,7 @@ from data_pipeline.dataset.batches import (
     validation_batches,
     validation_splits,
 )
-from data_pipeline.dataset.builder import DatasetStatistics
+from data_pipeline.dataset.statistics import DatasetStatistics
 from data_pipeline.errors import DataError
 from data_pipeline.files import as_read, read_json, write_json, write_text
 from data_pipeline.progress import console, progress_bar

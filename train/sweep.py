@@ -20,7 +20,7 @@ import numpy as np
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
 from data_pipeline.dataset.batches import train_batches
-from data_pipeline.dataset.builder import DatasetStatistics
+from data_pipeline.dataset.statistics import DatasetStatistics
 from data_pipeline.errors import DataError
 from data_pipeline.files import as_read, read_json, write_json, write_text
 from data_pipeline.progress import console, progress_bar

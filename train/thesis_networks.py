@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
 
-from data_pipeline.dataset.builder import DatasetStatistics, load_statistics
+from data_pipeline.dataset.statistics import DatasetStatistics, load_statistics
 from data_pipeline.files import read_json
 from train.loop import fit, load_best
 from train.optimiser import OptimiserConfig

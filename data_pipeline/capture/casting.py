@@ -1,12 +1,13 @@
-"""Capture: a mesh seen from every viewpoint, by casting one ray through the centre of each pixel.
+"""Capture of a mesh from every viewpoint, by casting one ray through the centre of each pixel.
 
-Two casters give the same picture. Open3D's `RaycastingScene` is the default; it needs system libraries (libGL, libX11,
-libgomp), and where they are missing trimesh's Embree binding does the same work. Both stand on Embree and see a surface
-from either side, so holes and flipped triangles of CAD models do no harm.
+There are two casters with equal results. The default is Open3D's `RaycastingScene`, which needs system libraries (libGL,
+libX11, libgomp). If they are missing, trimesh's Embree binding is used. Both use Embree and hit a surface from either side,
+so holes and flipped triangles of CAD models do no harm.
 
-What is kept of each view: depth as 16-bit integers of 1/10,000 unit (the thesis's own format), a shaded image, and the pose.
-The partial cloud of a view is its depth unprojected by its pose (`mevs_jax.cameras.unproject`), so it needs no room of its own.
-The thesis's own way, a window of Open3D's, is in `data_pipeline.visualizer`.
+A capture stores for each view the depth as 16-bit integers in units of 1/10,000 (the thesis's format) and a shaded image. The
+partial cloud of a view is not stored: it is the depth unprojected with the pose (`mevs_jax.cameras.unproject`). The thesis's
+method, an Open3D window, is in `data_pipeline.capture.visualizer`. Capture workers import this module, so it must not import
+JAX, which would slow their start; only `rig_for`, which workers do not call, needs it.
 """
 
 from __future__ import annotations
@@ -24,14 +25,18 @@ from scipy.spatial.transform import Rotation
 from data_pipeline.files import write_npz
 from data_pipeline.objects.mesh import Mesh
 
-DEPTH_SCALE = 10_000  # as in mevs_jax.entropy, which capture workers do without; a test holds the two together
+DEPTH_SCALE = 10_000
+"""Stored depth units per metric unit. Equal to `mevs_jax.entropy.DEPTH_SCALE`, which would import JAX; a test compares them."""
+
 AMBIENT = 0.25
-_RAYS_AT_ONCE = 100_000
+"""Grey level, in [0, 1], of a surface seen edge-on."""
+
+_RAYS_PER_BATCH = 100_000
 
 
 @dataclass(frozen=True)
 class CaptureConfig:
-    """How objects are looked at."""
+    """How objects are captured."""
 
     views: int = 40
     """number of candidate viewpoints, at least 2"""
@@ -46,30 +51,31 @@ class CaptureConfig:
         "icosahedron",
         "dodecahedron",
     ] = "golden_angle"
-    """how they stand: Fibonacci of the thesis's published code or of its eq. (8), nested (the 10 are among the 40), five
-    rings, or the corners of a Platonic solid"""
+    """their arrangement: the Fibonacci lattice of the thesis's published code (golden_angle) or of its eq. (8) (equation8),
+    nested (the 10 views are among the 40), five rings, or the corners of a Platonic solid"""
     turned: bool = False
-    """turn them at random around each object: directions all around for training, none of them twice"""
+    """rotate the lattice at random for each object, so that training sees a different set of directions with every object"""
     resolution: int = 224
     """pixels along each side of a view"""
     distance: float = 2.0
-    """of the camera from the object's centre, in radii of the object"""
+    """distance of the camera from the object's centre, in radii of the object"""
     field_of_view: float = 60.0
-    """in degrees"""
+    """field of view in degrees"""
     backend: Literal["raycast", "rasterise", "visualizer"] = "raycast"
-    """how: by casting rays on the processor, by an array program that an accelerator can run, or the thesis's way, by a
-    window of Open3D's, which needs a display"""
+    """renderer: ray casting on the CPU, rasterisation by a JAX program that can run on an accelerator, or the thesis's method,
+    an Open3D window, which needs a display"""
 
 
 @dataclass(frozen=True)
 class Rig:
-    """All cameras around an object, as plain arrays that travel to worker processes.
+    """All cameras around an object, as NumPy arrays that can be sent to worker processes.
 
     Attributes:
-        poses: (views, 4, 4) camera to world, float32.
-        directions: (views, resolution, resolution, 3) ray directions of unit length along the optical axis, float32.
-        field_of_view: in radians.
-        turned: whether each object has them turned in its own way.
+        poses: (views, 4, 4) float32, camera to world.
+        directions: (views, resolution, resolution, 3) float32, ray directions in the world frame, whose component along the
+            optical axis is 1.
+        field_of_view: field of view in radians.
+        turned: whether the cameras are rotated at random for each object.
     """
 
     poses: np.ndarray
@@ -78,16 +84,17 @@ class Rig:
     turned: bool = False
 
     def poses_around(self, name: str) -> np.ndarray:
-        """The poses around the object of this name: these, or where `turned` these after a random turn that its name decides.
+        """Returns the poses (views, 4, 4) for the object called `name`.
 
-        The turn moves the cameras; each then looks at the object with the world's z upwards in its image, as before.
+        If `turned`, the camera positions are rotated about the object by a random rotation that depends only on the name.
+        Each camera looks at the object with the world's z axis upwards in its image, as before.
         """
         if not self.turned:
             return self.poses
         turn = Rotation.from_quat(np.random.default_rng(zlib.crc32(name.encode())).normal(size=4)).as_matrix()
         position = self.poses[:, :3, 3] @ turn.T
         forward = -position / np.linalg.norm(position, axis=1, keepdims=True)
-        right = np.cross(forward, [0.0, 0.0, 1.0])  # a camera straight above the object has no chance to be drawn
+        right = np.cross(forward, [0.0, 0.0, 1.0])  # a random camera is exactly above the object with probability 0
         right /= np.linalg.norm(right, axis=1, keepdims=True)
         axes = np.stack([right, np.cross(forward, right), forward], axis=-1)
         poses = np.tile(np.eye(4), (len(axes), 1, 1))
@@ -95,7 +102,7 @@ class Rig:
         return poses.astype(np.float32)
 
     def around(self, name: str) -> Rig:
-        """The cameras around the object of this name, with their rays."""
+        """Returns the rig for the object called `name`, with its ray directions."""
         if not self.turned:
             return self
         poses, local = self.poses_around(name), self.directions[0] @ self.poses[0, :3, :3]
@@ -108,9 +115,9 @@ class Capture:
     """One object from every viewpoint.
 
     Attributes:
-        depth: (views, resolution, resolution) uint16, 1/10,000 unit, 0 where nothing is hit.
-        image: (views, resolution, resolution) uint8, lit from the camera, 0 where nothing is hit.
-        extent: (3,) float32, the object's size before normalisation.
+        depth: (views, resolution, resolution) uint16, in units of 1/10,000, 0 where nothing is hit.
+        image: (views, resolution, resolution) uint8, shaded with the light at the camera, 0 where nothing is hit.
+        extent: (3,) float32, size of the object before normalisation.
     """
 
     depth: np.ndarray
@@ -119,7 +126,11 @@ class Capture:
 
 
 def rig_for(config: CaptureConfig) -> Rig:
-    """The cameras that `config` describes."""
+    """Returns the cameras that `config` describes.
+
+    Raises:
+        ValueError: if the lattice cannot have this number of views.
+    """
     import jax
 
     from mevs_jax.cameras import cameras_at, pixel_directions
@@ -140,20 +151,18 @@ def rig_for(config: CaptureConfig) -> Rig:
     )
 
 
-# ---------------------------------------------------------------------------------------------------------------- casters
-
-
 Cast = Callable[[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]
-"""(rays, 3) origins and directions to depth (rays,), inf for a miss, and the triangle hit"""
+"""Maps origins and directions (rays, 3) to depths (rays,), inf for a miss, and the indices of the triangles hit (rays,)."""
 
 
 class Caster(Protocol):
-    """Makes a mesh ready to have rays cast at it."""
+    """Prepares a mesh for ray casting."""
 
     def __call__(self, mesh: Mesh) -> Cast: ...
 
 
 def cast_open3d(mesh: Mesh) -> Cast:
+    """Ray casting with Open3D's `RaycastingScene`, on one thread."""
     import open3d
 
     scene = open3d.t.geometry.RaycastingScene(nthreads=1)
@@ -167,6 +176,7 @@ def cast_open3d(mesh: Mesh) -> Cast:
 
 
 def cast_embree(mesh: Mesh) -> Cast:
+    """Ray casting with trimesh's Embree binding."""
     from embreex.mesh_construction import TriangleMesh
     from embreex.rtcore_scene import EmbreeScene
 
@@ -183,7 +193,7 @@ def cast_embree(mesh: Mesh) -> Cast:
 
 @cache
 def default_caster() -> Caster:
-    """Open3D where its system libraries are there, else Embree alone."""
+    """Returns the Open3D caster, or the Embree caster if Open3D cannot be loaded."""
     try:
         import open3d  # noqa: F401
     except (ImportError, OSError):
@@ -191,31 +201,28 @@ def default_caster() -> Caster:
     return cast_open3d
 
 
-# ---------------------------------------------------------------------------------------------------------------- capture
-
-
 def capture(mesh: Mesh, rig: Rig, caster: Caster | None = None) -> Capture:
-    """Depth and shaded image of `mesh` from every camera of `rig`.
+    """Returns depth and shaded image of `mesh` from every camera of `rig`, by ray casting.
 
-    Rays are cast some tens of thousands at a time, which then stay in the cache, and only through pixels among which the mesh's
-    corners are seen; all rays at once took twice as long.
+    Rays are cast in batches that fit the CPU cache, and only through pixels inside the projected bounding box of the mesh.
+    Casting all rays at once took twice as long.
     """
     cast = (caster or default_caster())(mesh)
     views, side = rig.directions.shape[:2]
     depth = np.zeros((views, side, side), np.uint16)
     image = np.zeros((views, side, side), np.uint8)
     normals, windows = face_normals(mesh), _windows(mesh.vertices, rig)
-    at_once = max(1, _RAYS_AT_ONCE // side**2)
-    for first in range(0, views, at_once):
-        some = range(first, min(first + at_once, views))
-        rays = [rig.directions[view][windows[view]].reshape(-1, 3) for view in some]
-        ends = np.cumsum([len(of_view) for of_view in rays])
+    batch = max(1, _RAYS_PER_BATCH // side**2)
+    for first in range(0, views, batch):
+        batch_views = range(first, min(first + batch, views))
+        rays = [rig.directions[view][windows[view]].reshape(-1, 3) for view in batch_views]
+        ends = np.cumsum([len(view_rays) for view_rays in rays])
         directions = np.concatenate(rays)
-        found, triangle = cast(np.repeat(rig.poses[some, :3, 3], np.diff(ends, prepend=0), axis=0), directions)
+        found, triangle = cast(np.repeat(rig.poses[batch_views, :3, 3], np.diff(ends, prepend=0), axis=0), directions)
         hit = np.flatnonzero(np.isfinite(found))
         shades = np.zeros(len(found), np.uint8)
         shades[hit] = shade(normals[triangle[hit]], directions[hit])
-        parts = zip(some, np.split(store_depth(found), ends[:-1]), np.split(shades, ends[:-1]), strict=True)
+        parts = zip(batch_views, np.split(store_depth(found), ends[:-1]), np.split(shades, ends[:-1]), strict=True)
         for view, stored, shaded in parts:
             window = windows[view]
             depth[view][window] = stored.reshape(depth[view][window].shape)
@@ -224,8 +231,11 @@ def capture(mesh: Mesh, rig: Rig, caster: Caster | None = None) -> Capture:
 
 
 def _windows(vertices: np.ndarray, rig: Rig) -> list[tuple[slice, slice]]:
-    """The rows and columns of each view among which a mesh's bounding box is seen, with a pixel around for rounding; all of a
-    view where the box is beside its camera."""
+    """Returns the rows and columns of each view that contain the projected bounding box of a mesh.
+
+    One more pixel on each side allows for rounding. If a corner of the box is not in front of the camera, the whole view is
+    returned.
+    """
     side = rig.directions.shape[1]
     box = np.stack([vertices.min(axis=0), vertices.max(axis=0)])
     corners = np.stack(np.meshgrid(*box.T, indexing="ij"), axis=-1).reshape(-1, 3)
@@ -239,20 +249,20 @@ def _windows(vertices: np.ndarray, rig: Rig) -> list[tuple[slice, slice]]:
 
 
 def face_normals(mesh: Mesh) -> np.ndarray:
-    """(faces, 3) of unit length, 0 for a face without area."""
+    """Returns unit normals (faces, 3), 0 for a face without area."""
     corners = mesh.vertices[mesh.faces]
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     return normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
 
 
 def shade(normals: np.ndarray, directions: np.ndarray) -> np.ndarray:
-    """Grey levels (hits,) of surfaces lit from the camera, by how they face it."""
+    """Returns grey levels (hits,) uint8 of surfaces with the light at the camera, from normals and ray directions (hits, 3)."""
     facing = np.abs(np.einsum("ij,ij->i", normals, directions)) / np.sqrt(np.einsum("ij,ij->i", directions, directions))
     return np.round(255 * (AMBIENT + (1 - AMBIENT) * np.clip(facing, 0, 1))).astype(np.uint8)
 
 
 def store_depth(depth: np.ndarray) -> np.ndarray:
-    """Metric depth, inf where nothing is hit, as it is kept: uint16, 1/10,000 unit, 0 where nothing is hit."""
+    """Converts metric depth, inf where nothing is hit, to stored depth: uint16 in units of 1/10,000, 0 where nothing is hit."""
     stored = np.zeros(depth.shape, np.uint16)
     hit = np.isfinite(depth)
     stored[hit] = np.clip(depth[hit] * np.float32(DEPTH_SCALE), 1, 65535).astype(np.uint16)
@@ -260,12 +270,13 @@ def store_depth(depth: np.ndarray) -> np.ndarray:
 
 
 def save_capture(path: Path, capture: Capture) -> None:
-    """Fast compression: most of a view is background."""
+    """Writes a capture, with fast compression, since most of a view is background."""
     depth, image = (np.frombuffer(zlib.compress(a.tobytes(), 1), np.uint8) for a in (capture.depth, capture.image))
     write_npz(path, shape=np.array(capture.depth.shape), extent=capture.extent, depth=depth, image=image)
 
 
 def load_capture(path: Path) -> Capture:
+    """Reads a capture that `save_capture` wrote."""
     with np.load(path) as stored:
         shape = tuple(stored["shape"])
         depth = np.frombuffer(zlib.decompress(stored["depth"].tobytes()), np.uint16).reshape(shape)

@@ -1,6 +1,6 @@
-"""Capture by the array program `mevs_jax.rendering.render_depth`: the same pictures as by ray casting, made for accelerators.
+"""Capture with the JAX program `mevs_jax.rendering.render_depth`, for accelerators; the result is that of ray casting.
 
-On a processor it is faster than one thread of ray casting for a few thousand faces and large images, slower for many faces.
+On a CPU it is faster than one thread of ray casting for a few thousand faces and large images, and slower for many faces.
 """
 
 from __future__ import annotations
@@ -16,11 +16,14 @@ from data_pipeline.objects.mesh import Mesh
 from mevs_jax.cameras import Camera, pixel_directions
 from mevs_jax.rendering import pad_triangles, render_depth
 
-_VIEWS_AT_ONCE = 8  # on an accelerator, which bounds memory: 150 MB for 100,000 faces at 224×224
+_VIEWS_PER_BATCH = 8  # on an accelerator; bounds memory to 150 MB for 100,000 faces at 224×224
 
 
 def capture_by_rasterising(mesh: Mesh, rig: Rig) -> Capture:
-    """Depth and shaded image of `mesh` from every camera of `rig`; one program does for all meshes of a power of two of faces."""
+    """Returns depth and shaded image of `mesh` from every camera of `rig`.
+
+    Triangles are padded to a power of two, so that few programs are compiled.
+    """
     triangles = pad_triangles(mesh.vertices[mesh.faces])
     normals = np.zeros((len(triangles), 3), np.float32)
     normals[: len(mesh.faces)] = face_normals(mesh)
@@ -41,4 +44,4 @@ def _render(
         shaded = jnp.where(hit, jnp.round(255 * (AMBIENT + (1 - AMBIENT) * jnp.clip(facing, 0, 1))), 0)
         return stored.astype(jnp.uint16), shaded.astype(jnp.uint8)
 
-    return jax.lax.map(view, poses, batch_size=1 if jax.default_backend() == "cpu" else _VIEWS_AT_ONCE)
+    return jax.lax.map(view, poses, batch_size=1 if jax.default_backend() == "cpu" else _VIEWS_PER_BATCH)

@@ -1,9 +1,9 @@
-"""The thesis's own way to capture (§4.1): Open3D's `Visualizer`, a window that an OpenGL driver draws into.
+"""Capture by the thesis's method (§4.1): Open3D's `Visualizer`, a window rendered with OpenGL.
 
-It needs a display (on a server, `xvfb-run -a mevs data --dataset.capture.backend visualizer`) and about a quarter of a second a
-view in software. Ray casting sees the same (`data_pipeline.capture`), so this is here to show that, and for those who want it.
-Unlike the thesis's script it moves the camera, not the mesh, and sets its distance itself instead of having it follow the
-bounding box, so no view depends on the one before.
+It needs a display (on a server, `xvfb-run -a mevs data --dataset.capture.backend visualizer`) and about a quarter of a second
+per view with software rendering. Ray casting (`data_pipeline.capture.casting`) gives the same views; this module exists for
+comparison. Unlike the thesis's script, it moves the camera instead of the mesh, and sets the camera's distance instead of
+deriving it from the bounding box, so no view depends on the previous one.
 """
 
 from __future__ import annotations
@@ -18,10 +18,10 @@ from data_pipeline.objects.mesh import Mesh
 
 
 def capture_with_visualizer(mesh: Mesh, rig: Rig) -> Capture:
-    """Depth and shaded image of `mesh` from every camera of `rig`, rasterised.
+    """Returns depth and shaded image of `mesh` from every camera of `rig`, rendered by Open3D.
 
     Raises:
-        DataError: without Open3D's system libraries, or without a display.
+        DataError: if Open3D cannot be loaded, there is no display, or Open3D rejects the resolution.
     """
     try:
         import open3d
@@ -45,20 +45,18 @@ def capture_with_visualizer(mesh: Mesh, rig: Rig) -> Capture:
         visualizer.add_geometry(surface)
         options = visualizer.get_render_option()
         options.background_color = np.zeros(3)
-        options.mesh_show_back_face = True  # the faces of CAD models point either way
+        options.mesh_show_back_face = True  # the faces of CAD models are not oriented consistently
         control = visualizer.get_view_control()
         depth, image = np.zeros((views, side, side), np.float32), np.zeros((views, side, side), np.uint8)
         for view in range(views):
             camera = open3d.camera.PinholeCameraParameters()
-            # Open3D wants the principal point here, half a pixel off; what it draws is centred all the same.
+            # Open3D accepts only this principal point, half a pixel off; its images are centred all the same.
             camera.intrinsic = open3d.camera.PinholeCameraIntrinsic(
                 side, side, focal, focal, side / 2 - 0.5, side / 2 - 0.5
             )
             camera.extrinsic = np.linalg.inv(rig.poses[view].astype(np.float64))
             if not control.convert_from_pinhole_camera_parameters(camera, allow_arbitrary=True):
-                raise DataError(
-                    f"Open3D's window did not take a camera of {side}×{side} pixels; use another resolution"
-                )
+                raise DataError(f"Open3D's window rejected a camera of {side}×{side} pixels; use another resolution")
             distance = float(np.linalg.norm(rig.poses[view, :3, 3]))
             control.set_constant_z_near(max(distance - 1.01, 0.01))
             control.set_constant_z_far(distance + 1.01)

@@ -1,4 +1,7 @@
-"""Captures of many objects: several processes at a time, each object into a file of its own, so that a stopped job goes on."""
+"""Capture of many objects by several processes. Each object has its own file, so an interrupted job can be resumed.
+
+Worker processes import this module, so neither it nor the modules it imports may import JAX, which would slow their start.
+"""
 
 from __future__ import annotations
 
@@ -21,15 +24,17 @@ from data_pipeline.progress import progress_bar
 
 
 def capture_path(folder: Path, entry: ObjectEntry) -> Path:
+    """Returns the path of an object's capture in `folder`."""
     return npz_of(folder, entry.name)
 
 
 def _left_out_path(folder: Path, entry: ObjectEntry) -> Path:
+    """Returns the path of the file that says why an object was left out."""
     return capture_path(folder, entry).with_suffix(".left_out")
 
 
 def _rasterise(mesh: Mesh, rig: Rig) -> Capture:
-    from data_pipeline.capture.rasterise import capture_by_rasterising
+    from data_pipeline.capture.rasterise import capture_by_rasterising  # imports JAX
 
     return capture_by_rasterising(mesh, rig)
 
@@ -42,7 +47,11 @@ _BACKENDS: dict[str, Callable[[Mesh, Rig], Capture]] = {
 
 
 def capture_entry(entry: ObjectEntry, rig: Rig, folder: Path, backend: str, skip_damaged: bool) -> str | None:
-    """Captures one object into the folder; returns what is wrong with a damaged one, unless such are left out like empty ones."""
+    """Captures one object into `folder`, or records there why it is left out.
+
+    Returns:
+        None, or the damage of a mesh if it is damaged and `skip_damaged` is off.
+    """
     try:
         save_capture(capture_path(folder, entry), _BACKENDS[backend](load_object(entry), rig.around(entry.name)))
     except (EmptyMesh, DamagedMesh) as reason:
@@ -53,54 +62,56 @@ def capture_entry(entry: ObjectEntry, rig: Rig, folder: Path, backend: str, skip
 
 
 def still_to_capture(entries: Sequence[ObjectEntry], folder: Path) -> list[ObjectEntry]:
-    """Those that are neither captured nor left out yet."""
+    """Returns the objects that are neither captured nor left out yet, and makes `folder` if needed."""
     folder.mkdir(parents=True, exist_ok=True)
-    there = {path.name for path in folder.iterdir()}
-    done = (capture_path, _left_out_path)
-    return [entry for entry in entries if not any(path(folder, entry).name in there for path in done)]
+    present = {path.name for path in folder.iterdir()}
+    paths = (capture_path, _left_out_path)
+    return [entry for entry in entries if not any(path(folder, entry).name in present for path in paths)]
 
 
 def left_out_of(entries: Sequence[ObjectEntry], folder: Path) -> dict[str, str]:
-    """The objects left out, with the reason."""
+    """Returns the names of the objects left out, with the reasons."""
     paths = {entry.name: _left_out_path(folder, entry) for entry in entries}
     return {name: path.read_text() for name, path in paths.items() if path.exists()}
 
 
-_FEW = 64
-"""Objects for which no processes are started: each begins after some five seconds, in which this one captures a hundred or two
-of small meshes."""
-_worker: tuple[Rig, Path, str, bool] | None = None
+_FEW_OBJECTS = 64
+"""Up to this many objects are captured without worker processes. A worker needs about five seconds to start, in which this
+process captures one or two hundred small meshes."""
+
+_settings: tuple[Rig, Path, str, bool] | None = None
+"""The arguments of `capture_entry` after the entry, in a worker."""
 
 
 def _start_worker(rig: Rig, folder: Path, backend: str, skip_damaged: bool) -> None:
-    global _worker
-    _worker = rig, folder, backend, skip_damaged
-    if threading.current_thread() is threading.main_thread():  # of a process of its own
-        signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent answers Ctrl-C and ends its workers
+    global _settings
+    _settings = rig, folder, backend, skip_damaged
+    if threading.current_thread() is threading.main_thread():  # a process, not a thread of a pool
+        signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent handles Ctrl-C and ends its workers
 
 
 def _work(entry: ObjectEntry) -> str | None:
-    assert _worker is not None
-    return capture_entry(entry, *_worker)
+    assert _settings is not None
+    return capture_entry(entry, *_settings)
 
 
 @contextmanager
 def _captured(
     todo: Sequence[ObjectEntry], workers: int, rig: Rig, folder: Path, backend: str, skip_damaged: bool
 ) -> Iterator[Iterator[str | None]]:
-    """What `capture_entry` returns for each object, in their order."""
-    given = rig, folder, backend, skip_damaged
+    """Yields an iterator over what `capture_entry` returns for each object, in order."""
+    settings = rig, folder, backend, skip_damaged
     if workers == 1 and backend == "raycast":
-        yield (capture_entry(entry, *given) for entry in todo)
+        yield (capture_entry(entry, *settings) for entry in todo)
         return
-    # What rasterises is one program on one device; threads read meshes for it and write captures.
+    # Rasterisation is one program on one device; its threads read meshes and write captures.
     make_pool = ThreadPool if backend == "rasterise" else multiprocessing.get_context("spawn").Pool
-    with make_pool(workers, _start_worker, given) as pool:
+    with make_pool(workers, _start_worker, settings) as pool:
         yield pool.imap(_work, todo, chunksize=4)
 
 
 def say_damaged(damage: str) -> DamagedMesh:
-    """The error about a damaged object, with the way around it."""
+    """Returns the error about a damaged object, with the option that leaves such objects out."""
     return DamagedMesh(f"{damage}, or leave such objects out with --dataset.skip-damaged")
 
 
@@ -112,19 +123,23 @@ def capture_all(
     skip_damaged: bool = False,
     workers: int | None = None,
 ) -> dict[str, str]:
-    """Captures every object into `folder`, several at a time, and returns the objects left out with the reason.
+    """Captures every object into `folder` and returns the names of the objects left out, with the reasons.
 
-    Casting rays at a few objects takes less time than starting processes for it, and happens in this one, as with one worker.
-    Objects whose capture is there already are not captured again, so an interrupted run goes on where it stopped.
+    Objects that already have a capture are skipped, so an interrupted run resumes where it stopped.
+
+    Args:
+        skip_damaged: leave damaged meshes out, like empty ones.
+        workers: number of processes (threads for the backend `rasterise`). By default one for each CPU, or one for a few
+            objects. One worker that casts rays is this process itself.
 
     Raises:
-        DamagedMesh: at the first damaged mesh, unless `skip_damaged`, which leaves them out like empty ones.
+        DamagedMesh: at the first damaged mesh, unless `skip_damaged`.
     """
     todo = still_to_capture(entries, folder)
     if todo:
-        workers = workers or (1 if len(todo) <= _FEW else os.cpu_count() or 1)
-        given = rig_for(config), folder, config.backend, skip_damaged
-        with progress_bar("objects") as bar, _captured(todo, min(workers, len(todo)), *given) as captured:
+        workers = workers or (1 if len(todo) <= _FEW_OBJECTS else os.cpu_count() or 1)
+        settings = rig_for(config), folder, config.backend, skip_damaged
+        with progress_bar("objects") as bar, _captured(todo, min(workers, len(todo)), *settings) as captured:
             task = bar.add_task("Capturing", total=len(entries), completed=len(entries) - len(todo), note="")
             for damage in captured:
                 if damage:

@@ -1,7 +1,7 @@
-"""Changes to training inputs that leave the answer the same, on the device, for one cloud or one image each.
+"""Augmentation of training inputs on the device. Each function takes one cloud, one image or the views of one object.
 
-The six of the thesis for clouds (§5.1). Five of them are on by default; the full turn about the vertical contradicts targets
-that stay in the object's own order of views, and is off.
+Clouds have the six augmentations of the thesis (§5.1). Five are on by default. The rotation about the vertical axis by any
+angle is off, since the targets are in the object's own order of views and do not rotate with the cloud.
 """
 
 from __future__ import annotations
@@ -20,37 +20,38 @@ from mevs_jax.cameras import Camera, look_at_origin, pixel_directions
 
 @dataclass(frozen=True)
 class CloudAugmentation:
-    """Which changes a training cloud goes through, in the thesis's order."""
+    """Augmentation of training clouds, in the order of the thesis."""
 
     scale: bool = True
-    """all coordinates by U[0.8, 1.25]"""
+    """multiply all coordinates by U[0.8, 1.25]"""
     turn: bool = False
-    """about z by U[0, 2π]: contradicts canonical targets"""
+    """rotate about z by U[0, 2π]; contradicts targets in the object's own order of views"""
     tilt: bool = True
-    """about each axis by N(0, 0.06), at most 0.18 radians"""
+    """rotate about each axis by N(0, 0.06), at most 0.18 radians"""
     translate: bool = True
-    """by U[−0.1, 0.1] along each axis"""
+    """translate by U[−0.1, 0.1] along each axis"""
     jitter: bool = True
-    """each coordinate by N(0, 0.01), at most 0.05"""
+    """move each coordinate by N(0, 0.01), at most 0.05"""
     drop: bool = True
-    """a share U[0, 0.875] of the points, each replaced by the first"""
+    """replace a share U[0, 0.875] of the points by the first point"""
     strength: float = 1.0
-    """how far all of them go, in [0, 1]"""
+    """magnitude of all of them, in [0, 1]"""
 
 
 @dataclass(frozen=True)
 class ImageAugmentation:
-    """Which changes a training image goes through."""
+    """Augmentation of training images."""
 
     mirror: bool = True
-    """left to right, half of the time: an object and its mirror image are of one class"""
+    """mirror left to right with probability ½: an object and its mirror image have the same class"""
     shift: int = 4
-    """by up to this many pixels in each direction"""
+    """shift by at most this many pixels in each direction"""
     strength: float = 1.0
-    """how often images are mirrored and how far they are shifted, in [0, 1]"""
+    """scales the probability of mirroring and the shift, in [0, 1]"""
 
 
 def _rotation(axis: int, angle: Array) -> Float[Array, "3 3"]:
+    """Returns the rotation about a coordinate axis by `angle` radians."""
     c, s = jnp.cos(angle), jnp.sin(angle)
     i, j = (axis + 1) % 3, (axis + 2) % 3
     return jnp.eye(3).at[i, i].set(c).at[j, j].set(c).at[i, j].set(-s).at[j, i].set(s)
@@ -59,11 +60,12 @@ def _rotation(axis: int, angle: Array) -> Float[Array, "3 3"]:
 def augment_cloud(
     key: Array, cloud: Float[Array, "points columns"], config: CloudAugmentation, strength: float | Array | None = None
 ) -> Float[Array, "points columns"]:
-    """One cloud in the unit sphere, changed by what `config` switches on.
+    """Returns one cloud in the unit sphere with the augmentations that `config` enables.
 
     Args:
-        cloud: a point a row, xyz; and where there are six columns a direction, which only turns and is dropped with its point.
-        strength: in the place of the configuration's.
+        cloud: a point per row, xyz. With six columns, the last three are a direction, which is only rotated, and is replaced
+            together with its point.
+        strength: overrides `config.strength`.
     """
     strength = config.strength if strength is None else strength
     scale, turn, tilt, translate, jitter, share, drop = jax.random.split(key, 7)
@@ -92,7 +94,11 @@ def augment_image(
     config: ImageAugmentation,
     strength: float | Array | None = None,
 ) -> Float[Array, "height width channels"]:
-    """One image with a background of 0, changed by what `config` switches on; `strength` takes the place of its own."""
+    """Returns one image, whose background is 0, with the augmentations that `config` enables.
+
+    Args:
+        strength: overrides `config.strength`.
+    """
     strength = config.strength if strength is None else strength
     mirror, shift = jax.random.split(key)
     if config.mirror:
@@ -108,18 +114,18 @@ def augment_image(
 
 @dataclass(frozen=True)
 class ViewAugmentation:
-    """Which changes an object goes through whose views make a training set."""
+    """Augmentation of objects whose views make a training set."""
 
     mirror: bool = True
-    """half of the time, in the plane x = 0: an object and its mirror image are of one class"""
+    """mirror in the plane x = 0 with probability ½: an object and its mirror image have the same class"""
     stretch: float = 0.0
-    """along each axis by a factor drawn log-uniformly from at most this much above or below 1: 0.2 for 1/1.2 to 1.2"""
+    """scale each axis by a factor drawn log-uniformly from [1 / (1 + stretch), 1 + stretch]: 0.2 for 1/1.2 to 1.2"""
     turn: bool = False
-    """by any rotation, for objects that do not stand"""
+    """apply any rotation, for objects without a fixed upright pose"""
 
 
 def object_changes(key: Array, objects: int, config: ViewAugmentation) -> Float[Array, "objects 3 3"]:
-    """Matrices that change the points of each object, as `config` has it."""
+    """Returns random matrices to multiply the points of each object by, as `config` says."""
     mirror, stretch, turn = jax.random.split(key, 3)
     factors = (1 + config.stretch) ** jax.random.uniform(stretch, (objects, 3), minval=-1.0)
     if config.mirror:
@@ -136,17 +142,18 @@ def views_after(
     poses: Float[Array, "views 4 4"],
     camera: CaptureConfig,
 ) -> tuple[Float[Array, "views height width 4"], Float[Array, "views 3"]]:
-    """Views of an object whose points were multiplied by a matrix, and the directions that they are from.
+    """Returns views of an object whose points are multiplied by a matrix A, and the directions of the new cameras.
 
-    Lines stay lines and keep their order, so what the camera at c sees of an object is, up to a homography, what a camera at
-    A c sees of the changed one: nothing needs to be rendered. The new camera stands at the old distance and looks at the
-    centre, so a stretched object is also a little larger or smaller, and otherwise in each view. Pixels are those nearest to
-    where the new ones were.
+    A linear map preserves lines and the order of points on them. The view of the object from c is therefore, up to a
+    homography, the view of the changed object from A c, and nothing needs to be rendered. The new camera looks at the centre
+    from the old distance, so a stretched object also appears slightly larger or smaller, differently in each view. Pixels are
+    sampled from the nearest old pixel.
 
     Args:
-        change: A, not far from a rotation or a reflection.
-        images: as of `data_pipeline.inputs.depth_and_normals`.
-        poses: of the cameras that took them.
+        change: A, close to a rotation or a reflection.
+        images: views as `data_pipeline.dataset.inputs.depth_and_normals` returns them.
+        poses: poses of the cameras that took the views.
+        camera: settings of the capture.
     """
     side, distance = images.shape[1], camera.distance
     pinhole = Camera(jnp.eye(4), math.radians(camera.field_of_view), side)
@@ -156,15 +163,15 @@ def views_after(
     def of_view(image: Array, pose: Array) -> tuple[Array, Array]:
         position = change @ pose[:3, 3]
         scale = distance / jnp.linalg.norm(position)
-        back = pose[:3, :3].T @ undo @ look_at_origin(position)[:3, :3]  # directions, to the old camera's frame
+        back = pose[:3, :3].T @ undo @ look_at_origin(position)[:3, :3]  # maps directions to the old camera's frame
         old = rays @ back.T
-        place = jnp.floor(old[..., :2] / old[..., 2:] * pinhole.focal_length + side / 2).astype(jnp.int32)
-        inside = jnp.all((place >= 0) & (place < side), axis=-1)
-        place = jnp.clip(place, 0, side - 1)
-        seen = jnp.where(inside[..., None], image[place[..., 1], place[..., 0]], 0.0)
-        depth = scale * (distance + 1 - 2 * seen[..., 0]) / old[..., 2]
-        nearness = jnp.where(seen[..., 0] > 0, (distance + 1 - depth) / 2, 0.0)
-        normals = seen[..., 1:] @ back  # covectors: by the inverse's transpose
+        pixel = jnp.floor(old[..., :2] / old[..., 2:] * pinhole.focal_length + side / 2).astype(jnp.int32)
+        inside = jnp.all((pixel >= 0) & (pixel < side), axis=-1)
+        pixel = jnp.clip(pixel, 0, side - 1)
+        sampled = jnp.where(inside[..., None], image[pixel[..., 1], pixel[..., 0]], 0.0)
+        depth = scale * (distance + 1 - 2 * sampled[..., 0]) / old[..., 2]
+        nearness = jnp.where(sampled[..., 0] > 0, (distance + 1 - depth) / 2, 0.0)
+        normals = sampled[..., 1:] @ back  # normals transform by the inverse transpose
         normals = normals / jnp.maximum(jnp.linalg.norm(normals, axis=-1, keepdims=True), 1e-12)
         return jnp.concatenate([nearness[..., None], normals], axis=-1), position / jnp.linalg.norm(position)
 

@@ -1,11 +1,11 @@
-"""Shards become batches: a Grain pipeline of random access, and what turns a stored view into a network's input.
+"""Batches of views from shards, read by a Grain pipeline with random access.
 
-An epoch shows every training object once, through `views_per_object` views drawn anew. Batch number `i` is a function of
-(seed, i) alone, so a run that stops and goes on sees the same batches, and nothing but the step needs to be remembered.
-With several processes each reads its own piece of every batch.
+An epoch contains every training object once, with `views_per_object` views drawn anew. Batch `i` is a function of (seed, i)
+alone, so a resumed run reads the same batches and needs to store only the step. With several processes, each reads its own
+part of every batch.
 
-Validation is by object. The thesis's published code puts views aside instead, so that an object is on both sides; that is here
-as a switch (`ViewBatches.validation_by`), to show what it does.
+Validation is by object. The thesis's published code holds out views instead, so that the same objects are used for training
+and validation. The option `ViewBatches.validation_by` reproduces this, to show its effect.
 """
 
 from __future__ import annotations
@@ -25,18 +25,18 @@ from data_pipeline.dataset.builder import open_split
 
 @dataclass(frozen=True)
 class ViewBatches:
-    """How views are drawn.
+    """How training views are drawn.
 
     Attributes:
-        batch_size: views in a batch, over all processes; a multiple of `views_per_object`.
-        views_per_object: distinct views of each object in an epoch.
-        points: size of the clouds; 0 for no clouds.
+        batch_size: number of views in a batch, over all processes; a multiple of `views_per_object`.
+        views_per_object: number of distinct views of each object in an epoch.
+        points: number of points in a cloud; 0 for no clouds.
         images: `depth` or `image`, or None for neither.
-        seed: of order, views and points.
-        fold: train without part k of n of the training objects, (k, n); all of them unless given.
-        validation_by: `object`, the sound way; `view`: train on views of the validation objects too, except for a share
+        seed: seed of the order, the views and the points.
+        fold: (k, n) to train without part k of n of the training objects; None to train on all of them.
+        validation_by: `object`, without leakage; or `view`, to train also on views of the validation objects, except for a share
             of every object's views (`views_aside`).
-        balanced: in a pass over the training objects those of rarer classes come more often, so that all classes weigh the same.
+        balanced: repeat the objects of rarer classes in an epoch, so that all classes have the same weight.
     """
 
     batch_size: int
@@ -50,19 +50,19 @@ class ViewBatches:
 
 
 VIEWS_ASIDE = 0.2
-"""The share of an object's views that are put aside where validation is by view (thesis §5.2)."""
+"""Share of each object's views that is held out if validation is by view (thesis §5.2)."""
 
 
 def views_aside(views: int, index: int, seed: int) -> np.ndarray:
-    """Which views of training object `index` are never trained on where validation is by view; at least one."""
+    """Returns the sorted views of training object `index` that are held out if validation is by view; at least one."""
     random = np.random.default_rng([seed, index, views])
     return np.sort(random.permutation(views)[: max(1, round(VIEWS_ASIDE * views))])
 
 
 def sample_pixels(depth: np.ndarray, points: int, random: np.random.Generator) -> np.ndarray:
-    """Flat indices (points,) int32 of pixels that hit the object: drawn without repetition, then repeated to fill.
+    """Returns flat indices (points,) int32 of random pixels that hit the object, repeated only if there are too few.
 
-    A view that sees nothing gives pixel 0 throughout, whose depth of 0 is the camera's own centre.
+    For a view in which nothing is hit, all indices are 0; with a depth of 0, they become the camera's centre.
     """
     hit = np.flatnonzero(depth)
     if len(hit) == 0:
@@ -75,10 +75,10 @@ def sample_pixels(depth: np.ndarray, points: int, random: np.random.Generator) -
 def select_views(
     example: dict[str, Any], views: np.ndarray, *, points: int, images: str | None, random: np.random.Generator
 ) -> dict[str, np.ndarray]:
-    """Some views of one object, as arrays with a leading axis of views.
+    """Returns the given views of one object as arrays with a leading axis of views.
 
-    Returns:
-        `label`, `view`, `pose`, `entropy` (of *all* views) and, as asked for, `depth` or `image`, and `pixels`, `pixel_depth`.
+    The keys are `label`, `view`, `pose`, `entropy` (of all views of the object), `depth` or `image` as `images` says, and, if
+    `points` is not 0, `pixels` and `pixel_depth`.
     """
     out = {
         "label": np.full(len(views), example["label"], np.int32),
@@ -96,6 +96,8 @@ def select_views(
 
 
 class _DrawViews(grain.transforms.RandomMap):
+    """Draws `views_per_object` of the views of an object that may be used for training."""
+
     def __init__(self, config: ViewBatches):
         self.config = config
 
@@ -106,12 +108,12 @@ class _DrawViews(grain.transforms.RandomMap):
 
 
 def fold_of(objects: int, folds: int) -> np.ndarray:
-    """The part, 0 to folds − 1, of each training object, in the order of the shards (which is none)."""
+    """Returns the fold (0 to folds − 1) of each training object, in the order of the shards, which is random."""
     return np.arange(objects) % folds
 
 
 def objects_kept(objects: int, config: ViewBatches) -> np.ndarray:
-    """Which of so many training objects are trained on."""
+    """Returns the indices of the training objects outside of the fold left out, of `objects` in all."""
     if config.fold is None:
         return np.arange(objects)
     part, folds = config.fold
@@ -119,14 +121,14 @@ def objects_kept(objects: int, config: ViewBatches) -> np.ndarray:
 
 
 def equally_often(objects: np.ndarray, labels: np.ndarray) -> np.ndarray:
-    """The objects, those of rarer classes repeated until there are as many of each class."""
+    """Returns the objects, with those of rarer classes repeated so that all classes have the same number."""
     _, members = np.unique(labels, return_inverse=True)
     largest = int(np.bincount(members).max())
     return np.concatenate([np.resize(objects[members == one], largest) for one in range(members.max() + 1)])
 
 
 class _TrainingObjects:
-    """The objects of some splits, one after the other, each with the views that may be trained on."""
+    """The objects of several splits, concatenated; the key `trainable` lists the views that may be used for training."""
 
     def __init__(self, sources: list[Any], config: ViewBatches):
         self._sources, self._config = sources, config
@@ -153,7 +155,7 @@ class _TrainingObjects:
 
 
 def training_splits(config: ViewBatches) -> tuple[str, ...]:
-    """The splits whose objects are trained on."""
+    """Returns the splits used for training."""
     return ("train",) if config.validation_by == "object" else ("train", "val")
 
 
@@ -162,17 +164,21 @@ def _training_objects(folder: Path, config: ViewBatches) -> _TrainingObjects:
 
 
 def validation_splits(config: ViewBatches) -> tuple[str, ...]:
-    """The splits whose objects training is validated on."""
+    """Returns the splits used for validation."""
     return ("val",) if config.validation_by == "object" else training_splits(config)
 
 
 def validation_batches(
     folder: Path, config: ViewBatches, views: int, part: slice = slice(None)
 ) -> Iterator[dict[str, np.ndarray]]:
-    """What training is validated on, one object a batch: `views` views of each object put aside, 0 for all of them.
+    """Yields the validation views, one object per batch.
 
-    By object, every view of the lattice gets its turn. By view, an object gives its share of the views put aside. `part` of
-    the objects, all unless given.
+    If validation is by object, different objects contribute different views, so that every view of the lattice is used. If it
+    is by view, an object contributes views that are held out.
+
+    Args:
+        views: number of views of each object (by view: their held-out share); 0 for all of them.
+        part: which of the objects; all by default.
     """
     by_object = config.validation_by == "object"
     objects = open_split(folder, "val") if by_object else _training_objects(folder, config)
@@ -194,30 +200,43 @@ def _join(elements: list[dict[str, np.ndarray]]) -> dict[str, np.ndarray]:
 
 
 def objects_per_batch(config: ViewBatches) -> int:
+    """Returns the number of objects in a batch, over all processes.
+
+    Raises:
+        ValueError: if the batch size is not a multiple of the views per object.
+    """
     if config.batch_size % config.views_per_object:
-        raise ValueError(f"batch size {config.batch_size} is no multiple of {config.views_per_object} views per object")
+        raise ValueError(
+            f"batch size {config.batch_size} is not a multiple of {config.views_per_object} views per object; change either"
+        )
     return config.batch_size // config.views_per_object
 
 
 def steps_per_epoch(objects: int, config: ViewBatches) -> int:
-    """Batches in an epoch of `objects` objects; the last is filled from the next epoch."""
+    """Returns the number of batches in an epoch of `objects` objects; the last batch is filled from the next epoch."""
     return -(-objects // objects_per_batch(config))
 
 
 def train_batches(folder: Path, config: ViewBatches, *, first_step: int = 0) -> Iterator[dict[str, np.ndarray]]:
-    """Endless batches from step `first_step` on, of each this process's piece, read ahead by threads."""
+    """Returns an endless iterator over this process's part of each batch from step `first_step` on, prefetched by threads.
+
+    Raises:
+        ValueError: if the objects of a batch cannot be divided equally among the processes.
+    """
     processes = jax.process_count()
     per_batch = objects_per_batch(config)
     if per_batch % processes:
-        raise ValueError(f"{per_batch} objects a batch cannot be shared by {processes} processes")
-    # Repeated first: then every pass has its own order, and batches may cross from one pass to the next.
+        raise ValueError(
+            f"{per_batch} objects per batch cannot be shared by {processes} processes; choose another batch size"
+        )
+    # The order is drawn anew for every epoch, and a batch may contain objects of two successive epochs.
     objects = _training_objects(folder, config)
     stream = grain.MapDataset.source(objects).seed(config.seed).shuffle().repeat().random_map(_DrawViews(config))
-    # Pieces one after the other make the batch that a single process would read.
-    pieces = stream.batch(per_batch // processes, batch_fn=_join)[jax.process_index() :: processes]
+    # The parts of all processes, concatenated, are the batch that a single process would read.
+    parts = stream.batch(per_batch // processes, batch_fn=_join)[jax.process_index() :: processes]
     threads = min(16, max(1, (os.cpu_count() or 1) // 2))
     options = grain.ReadOptions(num_threads=threads, prefetch_buffer_size=16)
-    return iter(pieces[first_step:].to_iter_dataset(options))
+    return iter(parts[first_step:].to_iter_dataset(options))
 
 
 def evaluation_batches(
@@ -229,8 +248,13 @@ def evaluation_batches(
     seed: int = 0,
     chosen: np.ndarray | None = None,
 ) -> Iterator[dict[str, np.ndarray]]:
-    """Every view of every object of a split, or of those at the `chosen` positions, one object a batch, in the order of the
-    shards; the same at every call. `position`, for each view, is that of its object in the split."""
+    """Yields all views of the objects of a split, one object per batch, in the order of the shards; equal at every call.
+
+    Batches are those of `select_views`, with the key `position`: the position of the object in the split, for each view.
+
+    Args:
+        chosen: positions of the objects; all by default.
+    """
     source = open_split(folder, split)
     for index in range(len(source)) if chosen is None else map(int, chosen):
         example = source[index]

@@ -1,7 +1,7 @@
-"""The same data set by Apache Beam, for more objects than one machine can capture: any runner, the same records.
+"""Creation of a data set with Apache Beam, for more objects than one machine can capture. The records are the same.
 
-Captures go to a folder that all workers see, as they do on one machine; then TFDS reads them from there and writes its shards.
-Both steps are Beam pipelines. Install it with `pip install mevs-jax[beam]`.
+Captures are written to a folder that all workers share; TFDS then reads them from there and writes shards. Both steps are Beam
+pipelines, for any runner. Install Beam with `pip install mevs-jax[beam]`.
 """
 
 from __future__ import annotations
@@ -21,10 +21,10 @@ _rig_for = functools.cache(rig_for)
 
 
 def beam_options(options: str) -> Any:
-    """Beam's pipeline options, from a string such as `--runner=FlinkRunner --flink_master=host:8081`.
+    """Returns Beam's pipeline options from a string such as `--runner=FlinkRunner --flink_master=host:8081`.
 
     Raises:
-        DataError: where Beam is not installed.
+        DataError: if Beam is not installed.
     """
     try:
         from apache_beam.options.pipeline_options import PipelineOptions
@@ -41,11 +41,17 @@ def _capture(entry: ObjectEntry, config: CaptureConfig, folder: Path, skip_damag
 def capture_by_beam(
     entries: Sequence[ObjectEntry], config: CaptureConfig, folder: Path, options: Any, *, skip_damaged: bool = False
 ) -> dict[str, str]:
-    """`captures.capture_all`, by Beam; damaged objects are told after all others are captured."""
+    """Captures every object with Beam and returns the names of the objects left out, with the reasons.
+
+    Like `capture.workers.capture_all`, but damage is reported only after all other objects are captured.
+
+    Raises:
+        DamagedMesh: if a mesh is damaged, unless `skip_damaged`.
+    """
     import apache_beam as beam
 
     todo = still_to_capture(entries, folder)
-    damages = folder.parent / "damaged"
+    damage_file = folder.parent / "damaged"
     capture = functools.partial(_capture, config=config, folder=folder.absolute(), skip_damaged=skip_damaged)
     with beam.Pipeline(options=options) as pipeline:
         (
@@ -53,17 +59,17 @@ def capture_by_beam(
             | beam.Create(todo)
             | beam.Reshuffle()
             | "Capture" >> beam.FlatMap(capture)
-            | beam.io.WriteToText(str(damages.absolute()), shard_name_template="")
+            | beam.io.WriteToText(str(damage_file.absolute()), shard_name_template="")
         )
-    damaged = damages.read_text().splitlines()
-    damages.unlink()
+    damaged = damage_file.read_text().splitlines()
+    damage_file.unlink()
     if damaged:
         raise say_damaged(min(damaged))
     return left_out_of(entries, folder)
 
 
 def examples_by_beam(entries: Sequence[ObjectEntry], example_of: Callable[[ObjectEntry], Any]) -> Any:
-    """The (key, example) pairs of a split as a Beam transform, as TFDS takes them."""
+    """Returns the (key, example) pairs of a split as a Beam transform, in the form that TFDS expects."""
     import apache_beam as beam
 
     return beam.Create(list(entries)) | beam.Reshuffle() | beam.Map(example_of)

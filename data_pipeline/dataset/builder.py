@@ -1,15 +1,13 @@
-"""Captures become a TFDS data set: one example is one object with all its views, in ArrayRecord shards.
+"""Creation of a TFDS data set from captures. One example is one object with all its views, in ArrayRecord shards.
 
-An object is never on both sides of a split, whatever a later reader draws. Writing and reading need no TensorFlow. Beside
-the shards lie the statistics of the data set (`DatasetStatistics`), which everything that follows reads from there.
+Splits are by object, so no object is in two splits. Neither writing nor reading needs TensorFlow. The statistics of the data
+set (`DatasetStatistics`) are stored next to the shards; all later stages read them from there.
 """
 
 from __future__ import annotations
 
 import functools
-import hashlib
 import io
-import json
 import os
 import shutil
 import struct
@@ -23,9 +21,18 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from data_pipeline.capture.casting import DEPTH_SCALE, Capture, CaptureConfig, Rig, load_capture, rig_for
+from data_pipeline.capture.casting import Capture, CaptureConfig, Rig, load_capture, rig_for
 from data_pipeline.capture.workers import capture_all, capture_path
 from data_pipeline.dataset.beam import beam_options, capture_by_beam, examples_by_beam
+from data_pipeline.dataset.inputs import metric_depth
+from data_pipeline.dataset.statistics import (
+    SPLITS,
+    SUMMARY,
+    DatasetStatistics,
+    StatisticsCollector,
+    load_statistics,
+    report_left_out,
+)
 from data_pipeline.errors import DataError
 from data_pipeline.files import read_json, write_json
 from data_pipeline.objects.archives import ARCHIVES, download, download_folder, local
@@ -35,94 +42,48 @@ from data_pipeline.progress import console, progress_bar
 from mevs_jax.entropy import level_entropy
 from mevs_jax.viewpoints import viewpoint_lattice
 
-SPLITS = ("train", "val", "test")
-_SUMMARY = "summary.json"
+__all__ = [
+    "SPLITS",
+    "DataConfig",
+    "DatasetStatistics",
+    "example_of",
+    "load_statistics",
+    "metric_depth",
+    "open_objects",
+    "open_split",
+    "prepare",
+    "report_left_out",
+    "split_objects",
+    "view_entropies",
+]
 
 
 @dataclass(frozen=True)
 class DataConfig:
-    """Which objects, and how they are looked at."""
+    """Which objects the data set contains, and how they are captured."""
 
     source: str = "furniture10"
     """furniture10, modelnet10 or modelnet40 (downloaded), a folder of <class>/{train,test}/ meshes, a zip of the same
     layout, or an .npz of voxel grids"""
     archive: str = ""
-    """ModelNet10.zip or ModelNet40.zip where it is here already, in place of the download"""
+    """local ModelNet10.zip or ModelNet40.zip to use instead of the download"""
     train_per_class: int = 60
-    """training objects a class, for furniture10 (validation is taken from them)"""
+    """training objects per class, for furniture10 (including those for validation)"""
     test_per_class: int = 20
-    """test objects a class, for furniture10"""
+    """test objects per class, for furniture10"""
     validation_share: float = 0.2
-    """of the training objects, taken by class"""
+    """share of the training objects of each class that is used for validation"""
     seed: int = 0
-    """of the split into training and validation"""
+    """seed of the split into training and validation"""
     skip_damaged: bool = False
-    """leave damaged files out instead of stopping at the first"""
+    """leave damaged files out instead of stopping at the first one"""
     capture: CaptureConfig = CaptureConfig()
 
 
-@dataclass(frozen=True)
-class DatasetStatistics:
-    """What is known of a data set once it is made; everything is over the training split unless said otherwise.
-
-    Attributes:
-        classes: names, by label.
-        counts: objects by split and class.
-        left_out: name and reason of every object that could not be captured, by the source's split.
-        entropy_max: the largest depth entropy in bits: the normaliser of the network's targets (5.46 in the thesis).
-        entropy_mean, entropy_std: of the normalised entropies (0.329 and 0.156 in the thesis).
-        entropy_histograms: by split, counts of normalised entropies in 50 bins over [0, 1]; beyond 1 in the last bin.
-        mean_map: (views,) mean normalised entropy of each view.
-        class_mean_maps: (classes, views) the same by class.
-        points_mean, points_std: points seen per view.
-        points_by_class: by class, the 5th, 25th, 50th, 75th and 95th percentiles of points seen per view.
-        viewpoints: (views, 3) unit vectors.
-        capture: the `CaptureConfig`, as a dictionary.
-        source: what the objects are.
-    """
-
-    classes: list[str]
-    counts: dict[str, dict[str, int]]
-    left_out: dict[str, dict[str, str]]
-    entropy_max: float
-    entropy_mean: float
-    entropy_std: float
-    entropy_histograms: dict[str, list[int]]
-    mean_map: list[float]
-    class_mean_maps: list[list[float]]
-    points_mean: float
-    points_std: float
-    points_by_class: list[list[float]]
-    viewpoints: list[list[float]]
-    capture: dict[str, Any]
-    source: str
-
-    @property
-    def views(self) -> int:
-        return len(self.viewpoints)
-
-    def objects_of(self, splits: Sequence[str]) -> int:
-        """How many objects some splits hold."""
-        return sum(sum(self.counts[split].values()) for split in splits)
-
-    @property
-    def fingerprint(self) -> str:
-        """Changes with the objects, the views or their order."""
-        return hashlib.sha256(json.dumps(asdict(self), sort_keys=True).encode()).hexdigest()[:16]
-
-    @property
-    def left_out_count(self) -> int:
-        return sum(map(len, self.left_out.values()))
-
-    @property
-    def camera(self) -> CaptureConfig:
-        return CaptureConfig(**self.capture)
-
-
 def split_objects(entries: Sequence[ObjectEntry], validation_share: float, seed: int) -> dict[str, list[ObjectEntry]]:
-    """Objects by split: the source's test objects, and its training objects with a share of each class put aside.
+    """Returns the objects by split: the test objects of the source, and its training objects divided into train and val.
 
-    Every class keeps at least one object for training and, where it has two, one for validation.
+    Every class has at least one object for training and, if it has two or more, at least one for validation.
     """
     random = np.random.default_rng(seed)
     split: dict[str, list[ObjectEntry]] = {"train": [], "val": [], "test": [e for e in entries if e.split == "test"]}
@@ -141,54 +102,12 @@ def _entropies(levels: jax.Array) -> jax.Array:
 
 
 def view_entropies(capture: Capture) -> np.ndarray:
-    """Thesis-exact depth entropy of each view in bits, (views,)."""
+    """Returns the depth entropy of each view in bits, (views,), exactly as in the thesis."""
     return np.asarray(_entropies(jnp.asarray(capture.depth // 256, jnp.int32)))
 
 
-class _Statistics:
-    """What is kept of each object while the shards are being written."""
-
-    def __init__(self, classes: int):
-        self.classes = classes
-        self.objects: dict[str, dict[str, tuple[int, np.ndarray, np.ndarray]]] = {split: {} for split in SPLITS}
-
-    def add(self, split: str, name: str, example: dict[str, Any]) -> None:
-        """`example` as in the shards, of the object `name`."""
-        points = np.count_nonzero(example["depth"], axis=(1, 2))
-        self.objects[split][name] = int(example["label"]), example["entropy"], points
-
-    def finish(self, **rest: Any) -> DatasetStatistics:
-        # In the order of names, so that sums are the same in whatever order objects came.
-        ordered = {split: [members[name] for name in sorted(members)] for split, members in self.objects.items()}
-        labels = np.array([label for label, _, _ in ordered["train"]])
-        points = np.stack([points for _, _, points in ordered["train"]])
-        entropies = {split: np.stack([entropy for _, entropy, _ in members]) for split, members in ordered.items()}
-        largest = float(np.max(entropies["train"])) or 1.0
-        normalised = {split: members / largest for split, members in entropies.items()}
-        train = normalised["train"]
-        members = [labels == label for label in range(self.classes)]
-        return DatasetStatistics(
-            entropy_max=largest,
-            entropy_mean=float(train.mean()),
-            entropy_std=float(train.std()),
-            entropy_histograms={
-                split: np.histogram(np.minimum(values, 1), 50, (0, 1))[0].tolist()
-                for split, values in normalised.items()
-            },
-            mean_map=train.mean(axis=0).tolist(),
-            class_mean_maps=[
-                train[own].mean(axis=0).tolist() if own.any() else [0.0] * train.shape[1] for own in members
-            ],
-            points_mean=float(points.mean()),
-            points_std=float(points.std()),
-            points_by_class=[
-                np.percentile(points[own], (5, 25, 50, 75, 95)).tolist() if own.any() else [0.0] * 5 for own in members
-            ],
-            **rest,
-        )
-
-
 def _features(classes: Sequence[str], config: CaptureConfig) -> dict[str, Any]:
+    """Returns the TFDS features of an example."""
     import tensorflow_datasets as tfds
 
     views, side = config.views, config.resolution
@@ -205,11 +124,11 @@ def _features(classes: Sequence[str], config: CaptureConfig) -> dict[str, Any]:
 
 
 def _spill_without_tensorflow() -> None:
-    """Lets TFDS sort more than its 1 GiB of records without TensorFlow, which it uses there only to open files."""
+    """Replaces the buckets in which TFDS sorts records beyond 1 GiB on disk, which use TensorFlow to open files."""
     from tensorflow_datasets.core import shuffle
 
     class Bucket(shuffle._Bucket):
-        """Opened for each record, so that TFDS's thousand buckets need no thousand open files."""
+        """A bucket whose file is opened for each record, so that a thousand buckets do not need a thousand open files."""
 
         def add(self, key: int, data: bytes) -> None:
             path = Path(self._path)
@@ -232,7 +151,7 @@ def _spill_without_tensorflow() -> None:
 
 
 def example_of(entry: ObjectEntry, captures: Path, rig: Rig) -> tuple[str, dict[str, Any]]:
-    """Key and content of an object's record."""
+    """Returns the key and content of an object's record, from its capture in the folder `captures`."""
     capture = load_capture(capture_path(captures, entry))
     return entry.name, {
         "name": entry.name,
@@ -247,7 +166,7 @@ def example_of(entry: ObjectEntry, captures: Path, rig: Rig) -> tuple[str, dict[
 
 @functools.cache
 def _builder_class() -> type:
-    """The TFDS builder; made on first use, so that importing this module stays quick."""
+    """Returns the TFDS builder. It is defined on first use, since importing TFDS is slow."""
     import tensorflow_datasets as tfds
 
     tfds.disable_progress_bar()
@@ -260,7 +179,7 @@ def _builder_class() -> type:
 
         def __init__(self, *, source: ObjectSource, split, config_data: DataConfig, captures: Path, on_object, **rest):
             self._source, self._split, self._data = source, split, config_data
-            self._on_object = on_object  # None where Beam makes the examples, elsewhere
+            self._on_object = on_object  # None if Beam makes the examples, in other processes
             rig = rig_for(config_data.capture)
             self._example_of = functools.partial(example_of, captures=captures.absolute(), rig=rig)
             super().__init__(file_format="array_record", **rest)
@@ -270,7 +189,7 @@ def _builder_class() -> type:
             return tfds.core.DatasetInfo(builder=self, description=self.__doc__, features=features)
 
         def _split_generators(self, dl_manager):
-            del dl_manager  # the captures are on disk already
+            del dl_manager  # nothing to download: the captures are on disk
             if self._on_object is None:
                 return {name: examples_by_beam(self._split[name], self._example_of) for name in SPLITS}
             return {name: self._generate_examples(name) for name in SPLITS}
@@ -293,9 +212,10 @@ def _write_shards(
     folder: Path,
     beam: Any,
 ) -> DatasetStatistics:
+    """Writes the shards to `folder` and returns the statistics; `beam` are pipeline options or None."""
     import tensorflow_datasets as tfds
 
-    statistics = _Statistics(len(source.classes))
+    statistics = StatisticsCollector(len(source.classes))
     with progress_bar("objects") as bar:
         task = bar.add_task("Writing shards", total=sum(map(len, split.values())), note="")
 
@@ -311,7 +231,7 @@ def _write_shards(
             on_object=on_object if beam is None else None,
             data_dir=str(folder),
         )
-        with redirect_stdout(io.StringIO()):  # TFDS prints where it writes, twice
+        with redirect_stdout(io.StringIO()):  # TFDS prints its output folder, twice
             builder.download_and_prepare(download_config=tfds.download.DownloadConfig(beam_options=beam))
         if beam is not None:
             for name in SPLITS:
@@ -332,7 +252,11 @@ def _write_shards(
 
 
 def open_objects(config: DataConfig) -> ObjectSource:
-    """The source of objects; official archives are downloaded, or taken from `config.archive`."""
+    """Returns the source of objects. Official archives are downloaded, unless `config.archive` names a local file.
+
+    Raises:
+        DataError: if the source is not usable, or `config.archive` is set for another kind of source.
+    """
     official = ARCHIVES.get(config.source)
     if official is None:
         if config.archive:
@@ -346,23 +270,25 @@ def open_objects(config: DataConfig) -> ObjectSource:
     counts = {split: sum(entry.split == split for entry in source.entries) for split in SOURCE_SPLITS}
     if (len(source.classes), counts["train"], counts["test"]) != (official.classes, official.train, official.test):
         console.print(
-            f"{path} holds {len(source.classes)} classes, {counts['train']} training and {counts['test']} test objects; "
+            f"{path} has {len(source.classes)} classes, {counts['train']} training and {counts['test']} test objects; "
             f"{official.name} has {official.classes}, {official.train} and {official.test}"
         )
     return replace(source, name=official.name)
 
 
 def prepare(config: DataConfig, folder: Path, beam: str | None = None) -> DatasetStatistics:
-    """Makes the data set in `folder`, or finds it there.
+    """Creates the data set in `folder`, unless it exists, and returns its statistics.
 
-    The steps leave their results behind (captures, then shards, then the summary), so an interrupted run goes on. With `beam`,
-    the options of a Beam pipeline, Beam does the work; the records are the same.
+    Each step stores its results (captures, then shards, then the summary), so an interrupted run resumes.
+
+    Args:
+        beam: options of a Beam pipeline that does the work; the records are the same. None for this machine alone.
 
     Raises:
-        DataError: unusable source, or a folder that holds a data set made otherwise.
+        DataError: if the source is not usable, or `folder` has a data set with other settings.
     """
     if config.capture.views < 2:
-        raise DataError(f"--views {config.capture.views} is too few: choosing a next view takes at least 2 viewpoints")
+        raise DataError(f"--views {config.capture.views} is too few: choosing a next view needs at least 2 viewpoints")
     try:
         viewpoint_lattice(config.capture.views, config.capture.lattice)
     except ValueError as error:
@@ -373,11 +299,11 @@ def prepare(config: DataConfig, folder: Path, beam: str | None = None) -> Datase
         was = read_json(made_with)
         differs = ", ".join(sorted(key for key in identity if was.get(key) != identity[key]))
         raise DataError(
-            f"{folder} holds a data set made with other settings ({differs}); choose another --out, or delete it"
+            f"{folder} has a data set made with other settings ({differs}); choose another --out, or delete it"
         )
     captures = folder / "captures"
-    if (folder / _SUMMARY).exists():
-        shutil.rmtree(captures, ignore_errors=True)  # of a run that was stopped between the two
+    if (folder / SUMMARY).exists():
+        shutil.rmtree(captures, ignore_errors=True)  # left by a run that was stopped before it removed them
         return load_statistics(folder)
     options = None if beam is None else beam_options(beam)
     source = open_objects(config)
@@ -391,7 +317,7 @@ def prepare(config: DataConfig, folder: Path, beam: str | None = None) -> Datase
     split = split_objects(kept, config.validation_share, config.seed)
     for name, members in split.items():
         if not members:
-            raise DataError(f"{config.source} leaves no objects for {name}; add some (left out: {len(left_out)})")
+            raise DataError(f"{config.source} has no objects left for {name}; add some (left out: {len(left_out)})")
     reasons = {
         name: {
             entry.name: left_out[entry.name]
@@ -401,48 +327,22 @@ def prepare(config: DataConfig, folder: Path, beam: str | None = None) -> Datase
         for name in SOURCE_SPLITS
     }
     shards = folder / "shards"
-    shutil.rmtree(shards, ignore_errors=True)  # half-written ones
+    shutil.rmtree(shards, ignore_errors=True)  # incomplete shards of an interrupted run
     statistics = _write_shards(source, split, reasons, config, captures, shards, options)
-    write_json(folder / _SUMMARY, asdict(statistics))
+    write_json(folder / SUMMARY, asdict(statistics))
     shutil.rmtree(captures, ignore_errors=True)
     return statistics
 
 
-def load_statistics(folder: Path) -> DatasetStatistics:
-    """The summary of a data set; raises `DataError` where there is none."""
-    path = folder / _SUMMARY
-    if not path.exists():
-        raise DataError(f"no data set in {folder}; make one with: mevs data --out {os.path.dirname(folder) or '.'}")
-    try:
-        return DatasetStatistics(**read_json(path))
-    except TypeError as error:
-        raise DataError(
-            f"{folder} was made by another version of mevs_jax; choose another --out, or delete it"
-        ) from error
-
-
 def open_split(folder: Path, split: str) -> Any:
-    """Random access to the objects of one split: `source[i]` is a dictionary of NumPy arrays."""
+    """Returns a random-access source of the objects of one split: `source[i]` is a dictionary of NumPy arrays.
+
+    Raises:
+        DataError: if there are no shards.
+    """
     import tensorflow_datasets as tfds
 
     found = sorted((folder / "shards").glob("*/*/features.json"))
     if not found:
-        raise DataError(f"no shards in {folder}; make them with: mevs data --out {os.path.dirname(folder) or '.'}")
+        raise DataError(f"no shards in {folder}; create them with: mevs data --out {os.path.dirname(folder) or '.'}")
     return tfds.builder_from_directory(str(found[-1].parent)).as_data_source(split=split)
-
-
-def report_left_out(statistics: DatasetStatistics) -> None:
-    """Says which objects are missing and why; silence would be a lie about the data."""
-    objects = sum(sum(by_class.values()) for by_class in statistics.counts.values())
-    sizes = ", ".join(f"{sum(by_class.values())} {split}" for split, by_class in statistics.counts.items())
-    console.print(
-        f"Data set: {objects} objects ({sizes}), {statistics.views} views each, {statistics.left_out_count} left out"
-    )
-    for by_name in statistics.left_out.values():
-        for name, reason in by_name.items():
-            console.print(f"  left out: {name}: {reason}", style="dim", soft_wrap=True)
-
-
-def metric_depth(stored: jax.Array | np.ndarray) -> jax.Array:
-    """Stored depth to metric depth; 0 stays 0."""
-    return jnp.asarray(stored, jnp.float32) / DEPTH_SCALE

@@ -1,24 +1,34 @@
-"""What the networks see of a stored view: the one place where units become network inputs."""
+"""Conversion of stored views into network inputs."""
 
 from __future__ import annotations
 
 import math
 
+import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from data_pipeline.capture.casting import CaptureConfig
-from data_pipeline.dataset.builder import metric_depth
+from data_pipeline.capture.casting import DEPTH_SCALE, CaptureConfig
 from mevs_jax.cameras import Camera, pixel_directions, unproject
+
+
+def metric_depth(stored: jax.Array | np.ndarray) -> jax.Array:
+    """Returns metric depth, float32, from stored depth; 0 (nothing hit) stays 0."""
+    return jnp.asarray(stored, jnp.float32) / DEPTH_SCALE
 
 
 def image_input(
     view: Int[Array, "height width"], images: str, channels: int, camera: CaptureConfig
 ) -> Float[Array, "height width channels"]:
-    """One stored view as a network's image: background 0, nearest surface brightest, replicated over the channels.
+    """Returns one stored view as an image in [0, 1], background 0, repeated over the channels.
 
-    Depth becomes (far − depth) / (far − near) with near and far the ends of the unit sphere, and 0 for background; a
-    shaded image becomes its values over 255.
+    Depth becomes (far − depth) / (far − near), where near and far bound the unit sphere, and 0 for background. A shaded image
+    is divided by 255.
+
+    Args:
+        view: stored depth or shaded image.
+        images: `depth` or `image`, the kind of `view`.
     """
     if images == "depth":
         depth = metric_depth(view)
@@ -29,17 +39,17 @@ def image_input(
 
 
 def depth_and_normals(view: Int[Array, "height width"], camera: CaptureConfig) -> Float[Array, "height width 4"]:
-    """One stored view as depth (`image_input`) and the surface normal behind each pixel in the camera's frame, 0 for background.
+    """Returns depth (as `image_input`) and the unit surface normal of each pixel in the camera's frame, 0 for background.
 
-    A normal is that of the plane through a pixel's point and its neighbours, in each direction the one that is nearer in
-    depth, so that an edge takes no part; 0 where a pixel has none beside it, or none above and below it.
+    A normal is that of the plane through the point of a pixel and one neighbour along each image axis, the one closer in
+    depth, so that depth discontinuities are avoided. It is 0 unless the pixel has a neighbour on the object along both axes.
     """
     metric = metric_depth(view)
     side, hit = len(view), metric > 0
     points = pixel_directions(Camera(jnp.eye(4), math.radians(camera.field_of_view), side)) * metric[..., None]
 
     def step(axis: int) -> tuple[Float[Array, "height width 3"], Bool[Array, "height width"]]:
-        """Towards the next pixel along an axis, by way of the nearer neighbour."""
+        """Returns the step to the next pixel along an axis, from the neighbour closer in depth, and whether one exists."""
         ahead = jnp.roll(points, -1, axis) - points
         edge = jnp.arange(side) == side - 1
         edge = edge[:, None] if axis == 0 else edge[None]
@@ -63,14 +73,20 @@ def cloud_input(
     frame: str,
     directions: bool = False,
 ) -> Float[Array, "points 3"] | Float[Array, "points 6"]:
-    """The partial cloud behind the sampled pixels of one view, in the `world` or the `camera` frame.
+    """Returns the points at the sampled pixels of one view.
 
-    With `directions`, the unit vector from each point to the camera stands beside it; from the camera's own centre, zeros.
+    Args:
+        pixels: flat pixel indices.
+        pixel_depth: stored depth at these pixels.
+        pose: camera to world.
+        frame: `world` or `camera`, as in `mevs_jax.cameras.unproject`.
+        directions: append to each point the unit vector towards the camera (in the `camera` frame, towards its origin, which is
+            the object's centre), or zeros for a point that is already there.
     """
     pinhole = Camera(pose, math.radians(camera.field_of_view), camera.resolution)
     cloud = unproject(pixels, metric_depth(pixel_depth), pinhole, frame=frame)
     if not directions:
         return cloud
-    way = (pose[:3, 3] if frame == "world" else 0.0) - cloud
-    length = jnp.linalg.norm(way, axis=-1, keepdims=True)
-    return jnp.concatenate([cloud, way / jnp.maximum(length, 1e-6)], axis=-1)
+    offset = (pose[:3, 3] if frame == "world" else 0.0) - cloud
+    length = jnp.linalg.norm(offset, axis=-1, keepdims=True)
+    return jnp.concatenate([cloud, offset / jnp.maximum(length, 1e-6)], axis=-1)

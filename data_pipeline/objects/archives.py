@@ -1,4 +1,4 @@
-"""The official ModelNet archives: downloaded by TFDS and checked, or a file that is here already."""
+"""The official ModelNet archives: downloaded with TFDS and verified, or read from a local file."""
 
 from __future__ import annotations
 
@@ -12,20 +12,20 @@ from pathlib import Path
 from data_pipeline.errors import DataError
 from data_pipeline.progress import console
 
-_ANSWER_WITHIN = 20.0
-"""Seconds in which a server has to say that it has the file; TFDS by itself would try for minutes."""
+_TIMEOUT = 20.0
+"""Timeout in seconds of a first request to the server; without it, TFDS would retry for minutes."""
 
 
 @dataclass(frozen=True)
 class Archive:
-    """A file that others publish.
+    """A published data set in one file.
 
     Attributes:
-        name: of the data set.
-        url: where it is.
-        sha256: of the file.
-        size: in bytes; None where only its server knows.
-        classes, train, test: how many of each it holds.
+        name: name of the data set.
+        url: address of the file.
+        sha256: checksum of the file.
+        size: size in bytes; None if only the server knows it.
+        classes, train, test: numbers of classes, training objects and test objects.
     """
 
     name: str
@@ -60,35 +60,34 @@ ARCHIVES = {
 
 
 def sha256(path: Path) -> str:
+    """Returns the SHA-256 checksum of a file, in hexadecimal."""
     with path.open("rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
 
 
 def download_folder() -> Path:
-    """Where TFDS keeps its downloads: `$TFDS_DATA_DIR/downloads`, or in the home directory."""
+    """Returns the download folder of TFDS: `$TFDS_DATA_DIR/downloads`, by default in `~/tensorflow_datasets`."""
     return Path(os.environ.get("TFDS_DATA_DIR", "~/tensorflow_datasets")).expanduser() / "downloads"
 
 
 def download(archive: Archive, folder: Path) -> Path:
-    """Downloads an archive into `folder` with TFDS, unless it is there, and checks its size and SHA-256.
+    """Returns the path of an archive in `folder`, downloaded with TFDS if it is not there, with size and SHA-256 verified.
 
     Raises:
-        DataError: where it cannot be had, or is not the file that it should be.
+        DataError: if the download fails, or the size or SHA-256 differs.
     """
     import requests
     import tensorflow_datasets as tfds
     from tensorflow_datasets.core.download.checksums import UrlInfo
     from tensorflow_datasets.core.download.download_manager import NonMatchingChecksumError
 
-    for there in (folder / archive.name.lower()).glob("*.zip"):
-        if sha256(there) == archive.sha256:
-            return there
-    advice = f"fetch {archive.url} by other means and name the file with --archive"
+    for present in (folder / archive.name.lower()).glob("*.zip"):
+        if sha256(present) == archive.sha256:
+            return present
+    advice = f"download {archive.url} by other means and pass the file with --archive"
     try:
-        with urllib.request.urlopen(
-            urllib.request.Request(archive.url, method="HEAD"), timeout=_ANSWER_WITHIN
-        ) as answer:
-            size = archive.size or int(answer.headers["Content-Length"])
+        with urllib.request.urlopen(urllib.request.Request(archive.url, method="HEAD"), timeout=_TIMEOUT) as response:
+            size = archive.size or int(response.headers["Content-Length"])
         tfds.disable_progress_bar()
         console.print(
             f"Downloading {archive.name}, {size / 1e6:,.0f} MB, to {folder}; it is for academic research only"
@@ -102,7 +101,7 @@ def download(archive: Archive, folder: Path) -> Path:
         return Path(manager.download(archive.url))
     except NonMatchingChecksumError as error:
         raise DataError(
-            f"what {archive.url} gave is not {archive.name}: its size or SHA-256 is another; {advice}"
+            f"the file at {archive.url} is not {archive.name}: its size or SHA-256 differs; {advice}"
         ) from error
     except (urllib.error.URLError, requests.RequestException, OSError, TypeError) as error:
         reason = str(getattr(error, "reason", error)).splitlines()[0]
@@ -110,10 +109,10 @@ def download(archive: Archive, folder: Path) -> Path:
 
 
 def local(archive: Archive, path: Path) -> Path:
-    """A file that is taken for the archive; said if it is another.
+    """Returns `path`, a local copy of the archive; prints a note if its checksum is not the official one.
 
     Raises:
-        DataError: where there is no such file.
+        DataError: if the file cannot be read.
     """
     try:
         digest = sha256(path)
@@ -121,6 +120,6 @@ def local(archive: Archive, path: Path) -> Path:
         raise DataError(f"--archive {path} cannot be read: {error.strerror}") from error
     if digest != archive.sha256:
         console.print(
-            f"{path} is not the official {archive.name} (SHA-256 {digest[:16]}…); taken as it is", style="dim"
+            f"{path} is not the official {archive.name} (SHA-256 {digest[:16]}…); it is used unchanged", style="dim"
         )
     return path

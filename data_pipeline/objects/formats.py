@@ -1,4 +1,4 @@
-"""Readers of mesh formats. Own code for OFF, whose published files break its rules; trimesh for all others."""
+"""Readers of mesh formats: our own for OFF, whose published files violate the format, and trimesh for all others."""
 
 from __future__ import annotations
 
@@ -12,26 +12,23 @@ from data_pipeline.errors import DamagedMesh
 MESH_SUFFIXES = (".off", ".obj", ".stl", ".ply", ".glb")
 
 
-# ---------------------------------------------------------------------------------------------------------------- parsing
-
-
 def parse_mesh(content: bytes, suffix: str, where: str) -> tuple[np.ndarray, np.ndarray]:
-    """Vertices and triangles of a mesh file.
+    """Returns the vertices (n, 3) and triangles (m, 3) of a mesh file.
 
     Args:
-        content: the file.
-        suffix: which format, one of `MESH_SUFFIXES`.
-        where: its name, for messages.
+        content: content of the file.
+        suffix: format, one of `MESH_SUFFIXES`.
+        where: name of the file for error messages.
 
     Raises:
-        DamagedMesh: not a mesh, cut short, or with coordinates that are not finite.
+        DamagedMesh: if the file is not a mesh or is truncated.
     """
     if suffix == ".off":
         return parse_off(content, where)
     try:
         mesh = trimesh.load_mesh(io.BytesIO(content), file_type=suffix[1:], process=False)
         vertices, faces = np.asarray(mesh.vertices, np.float64), np.asarray(mesh.faces, np.int64)
-    except Exception as error:  # trimesh raises whatever its parsers raise
+    except Exception as error:  # the parsers of trimesh raise exceptions of many kinds
         reason = f"{type(error).__name__}: {error}".splitlines()[0]
         raise DamagedMesh(f"{where} is not a readable {suffix} mesh ({reason}); repair it or take it away") from error
     if len(vertices) == 0:
@@ -42,7 +39,14 @@ def parse_mesh(content: bytes, suffix: str, where: str) -> tuple[np.ndarray, np.
 
 
 def parse_off(content: bytes, where: str) -> tuple[np.ndarray, np.ndarray]:
-    """An OFF file, with the quirks of ModelNet's: `OFF490 518 0` on one line, comments, polygons, trailing colours."""
+    """Returns the vertices (n, 3) and triangles (m, 3) of an OFF file.
+
+    Also reads what ModelNet's files contain: counts on the first line (`OFF490 518 0`), comments, polygons (split into fans of
+    triangles), and colours after the corners of a face.
+
+    Raises:
+        DamagedMesh: if the file is not an OFF mesh or is truncated.
+    """
     try:
         text = content.decode("ascii")
     except UnicodeDecodeError as error:
@@ -71,7 +75,7 @@ def parse_off(content: bytes, where: str) -> tuple[np.ndarray, np.ndarray]:
     try:
         vertices = np.array([line[:3] for line in vertex_lines], np.float64).reshape(-1, 3)
         triangles: list[tuple[int, int, int]] = []
-        for number, line in enumerate(face_lines):  # colours may follow a face's corners
+        for number, line in enumerate(face_lines):  # colours may follow the corners of a face
             corners = int(line[0])
             if len(line) < corners + 1:
                 face_lines = face_lines[:number]

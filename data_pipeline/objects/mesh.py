@@ -1,4 +1,4 @@
-"""What an object is: a normalised triangle mesh, the recipe that makes it, and a source that lists many."""
+"""Objects: a normalised triangle mesh, the recipe that makes it, and a source that lists many objects."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ SOURCE_SPLITS = ("train", "test")
 
 @dataclass(frozen=True)
 class Mesh:
-    """Triangles of one normalised object: centred, in the unit sphere, z up.
+    """One normalised object as triangles: centred, in the unit sphere, z up.
 
     Attributes:
         vertices: (n, 3) float32.
         faces: (m, 3) int32.
-        extent: (3,) size of the bounding box before normalisation, in the units of the file.
+        extent: (3,) float32, size of the bounding box before normalisation, in the units of the file.
     """
 
     vertices: np.ndarray
@@ -28,15 +28,15 @@ class Mesh:
 
 
 class Recipe(Protocol):
-    """How to make one mesh."""
+    """Makes one mesh. Recipes are small and picklable, so that worker processes receive them instead of meshes."""
 
     def load(self) -> tuple[np.ndarray, np.ndarray]:
-        """Vertices (n, 3) and triangles (m, 3), as they are."""
+        """Returns vertices (n, 3) and triangles (m, 3), not normalised."""
 
 
 @dataclass(frozen=True)
 class ObjectEntry:
-    """One object of a source: a unique name, its label, `train` or `test`, and how to load it."""
+    """One object of a source: a unique name, its label, its split (`train` or `test`), and its recipe."""
 
     name: str
     label: int
@@ -46,7 +46,7 @@ class ObjectEntry:
 
 @dataclass(frozen=True)
 class ObjectSource:
-    """A list of objects, their `name` together, and the names of their classes."""
+    """A list of objects with the name of the source and the names of the classes, in the order of the labels."""
 
     name: str
     classes: tuple[str, ...]
@@ -54,11 +54,13 @@ class ObjectSource:
 
 
 def normalise(vertices: np.ndarray, faces: np.ndarray, where: str) -> Mesh:
-    """Centred on its bounding box and scaled into the unit sphere; only vertices that a face uses count.
+    """Returns the mesh centred on its bounding box and scaled into the unit sphere.
+
+    Vertices that no face uses and faces without area are removed. `where` names the mesh in error messages.
 
     Raises:
-        DamagedMesh: coordinates that are not finite, or faces that name vertices that are not there.
-        EmptyMesh: no faces, or none with an area.
+        DamagedMesh: if a coordinate is not finite, or a face refers to a vertex that does not exist.
+        EmptyMesh: if there are no faces, or none has an area.
     """
     vertices, faces = np.asarray(vertices, np.float64), np.asarray(faces, np.int64)
     if not np.isfinite(vertices).all():

@@ -1,4 +1,4 @@
-"""How each kind of object becomes a mesh when it is needed: procedural furniture, a file, a member of a zip."""
+"""Recipes of meshes: procedural furniture, a file, a member of a zip archive."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ from data_pipeline.errors import DamagedMesh
 from data_pipeline.objects.formats import parse_mesh
 from data_pipeline.objects.furniture import furniture
 
-# ---------------------------------------------------------------------------------------------------------------- recipes
-
 
 @dataclass(frozen=True)
 class FurniturePiece:
+    """A piece of furniture10."""
+
     class_name: str
     seed: int
 
@@ -27,6 +27,8 @@ class FurniturePiece:
 
 @dataclass(frozen=True)
 class MeshFile:
+    """A mesh file on disk."""
+
     path: str
 
     def load(self) -> tuple[np.ndarray, np.ndarray]:
@@ -39,6 +41,8 @@ class MeshFile:
 
 @dataclass(frozen=True)
 class ZipMember:
+    """A mesh file in a zip archive."""
+
     archive: str
     member: str
 

@@ -1,6 +1,6 @@
-"""Meshes and clouds become what a camera can be optimised on: fewer faces, surfaces through points, grids of densities.
+"""Conversion of meshes and clouds into inputs of differentiable rendering.
 
-By Open3D, as the thesis proposes (§4.2.1): quadric decimation, Poisson reconstruction, voxelisation.
+Quadric decimation, Poisson reconstruction and voxelisation, with Open3D, as the thesis proposes (§4.2.1).
 """
 
 from __future__ import annotations
@@ -35,20 +35,20 @@ def _cloud(points: np.ndarray) -> Any:
 
 
 def decimate(mesh: Mesh, faces: int) -> Mesh:
-    """The mesh with at most about `faces` triangles, as it is where it has no more."""
+    """Returns the mesh simplified to about `faces` triangles, or unchanged if it has no more than that."""
     if len(mesh.faces) <= faces:
         return mesh
     surface = _surface(mesh)
-    surface.merge_close_vertices(1e-6)  # else every face of a CAD model is an island that cannot be simplified
+    surface.merge_close_vertices(1e-6)  # the faces of a CAD model often share no vertices and could not be simplified
     simpler = surface.simplify_quadric_decimation(faces)
     return Mesh(np.asarray(simpler.vertices, np.float32), np.asarray(simpler.triangles, np.int32), mesh.extent)
 
 
 def normals_towards(points: np.ndarray, camera: np.ndarray) -> np.ndarray:
-    """Normals (points, 3) of a surface seen from the position `camera`, from each point's neighbours.
+    """Returns normals (points, 3), float32, estimated from 12 neighbours of each point and oriented towards `camera`.
 
     Raises:
-        DataError: where there are too few points for a plane.
+        DataError: if there are fewer than 3 points.
     """
     if len(points) < 3:
         raise DataError(f"normals need at least 3 points, got {len(points)}")
@@ -59,16 +59,16 @@ def normals_towards(points: np.ndarray, camera: np.ndarray) -> np.ndarray:
 
 
 def reconstruct(points: np.ndarray, normals: np.ndarray, faces: int, *, depth: int = 6) -> Mesh:
-    """The surface through a cloud by Poisson reconstruction, without what lies far from every point, decimated.
+    """Returns the surface of a cloud by Poisson reconstruction, cropped to the vicinity of the points and decimated.
 
     Args:
         points: (points, 3) in the unit sphere.
-        normals: (points, 3) outwards; their lengths do not matter.
-        faces: at most about so many.
-        depth: of the octree: 2^depth cells along an edge.
+        normals: (points, 3), pointing outwards, of any length.
+        faces: approximate maximum of the number of triangles.
+        depth: depth of the octree, which has 2^depth cells along an edge.
 
     Raises:
-        DataError: where there are too few points for a surface.
+        DataError: if there are fewer than 16 points, or no surface remains.
     """
     if len(points) < 16:
         raise DataError(f"a surface needs at least 16 points, got {len(points)}")
@@ -76,17 +76,17 @@ def reconstruct(points: np.ndarray, normals: np.ndarray, faces: int, *, depth: i
     unit = normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
     cloud.normals = open3d.utility.Vector3dVector(unit.astype(np.float64))
     surface, support = open3d.geometry.TriangleMesh.create_from_point_cloud_poisson(cloud, depth=depth, n_threads=1)
-    # The surface closes itself far from where anything was seen; those parts have little support.
+    # Poisson reconstruction closes the surface where there are no points; those parts have little support.
     surface.remove_vertices_by_mask(np.asarray(support) < np.quantile(np.asarray(support), 0.05))
     surface = surface.crop(open3d.geometry.AxisAlignedBoundingBox(points.min(0) - 0.1, points.max(0) + 0.1))
     if len(surface.triangles) == 0:
-        raise DataError(f"{len(points)} points give no surface")
+        raise DataError(f"{len(points)} points give no surface; use a larger or denser cloud")
     vertices, triangles = np.asarray(surface.vertices, np.float32), np.asarray(surface.triangles, np.int32)
     return decimate(Mesh(vertices, triangles, np.ptp(points, axis=0)), faces)
 
 
 def voxelise(mesh: Mesh, nodes: int = 32) -> np.ndarray:
-    """Density (nodes, nodes, nodes) float32, 1 in every voxel of the cube [−1, 1]³ that the surface passes through."""
+    """Returns the density (nodes, nodes, nodes), float32: 1 in every voxel of [−1, 1]³ that the surface intersects, else 0."""
     surface = _surface(mesh)
     grid = _open3d().geometry.VoxelGrid.create_from_triangle_mesh_within_bounds(
         surface, 2 / nodes, -np.ones(3), np.ones(3)
@@ -95,7 +95,7 @@ def voxelise(mesh: Mesh, nodes: int = 32) -> np.ndarray:
 
 
 def voxelise_cloud(points: np.ndarray, nodes: int = 32) -> np.ndarray:
-    """The same of a cloud (points, 3): 1 in every voxel that holds a point."""
+    """Returns the density (nodes, nodes, nodes), float32: 1 in every voxel of [−1, 1]³ that contains a point, else 0."""
     return _density(np.floor((points + 1) / 2 * nodes).astype(int), nodes)
 
 

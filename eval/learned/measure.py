@@ -17,8 +17,9 @@ import numpy as np
 from flax import nnx
 from jaxtyping import Array
 
-from data_pipeline.dataset.builder import load_statistics, open_split
+from data_pipeline.dataset.builder import open_split
 from data_pipeline.dataset.inputs import depth_and_normals
+from data_pipeline.dataset.statistics import load_statistics
 from data_pipeline.files import as_read, read_json, write_json, write_npz
 from data_pipeline.progress import console
 from eval.learned.stopping import MOVEMENT_COSTS, VIEW_COSTS

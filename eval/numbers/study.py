@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from data_pipeline.dataset.builder import DatasetStatistics
+from data_pipeline.dataset.statistics import DatasetStatistics
 from data_pipeline.progress import console
 from eval.numbers.comparison import cells, difference, intervals, summarise, views_to_reach
 from eval.numbers.confidence import confidence_of

@@ -22,7 +22,8 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from data_pipeline.capture.casting import DEPTH_SCALE
-from data_pipeline.dataset.builder import DataConfig, DatasetStatistics, open_objects, open_split
+from data_pipeline.dataset.builder import DataConfig, open_objects, open_split
+from data_pipeline.dataset.statistics import DatasetStatistics
 from data_pipeline.errors import DataError
 from data_pipeline.files import npz_of, write_npz
 from data_pipeline.objects.mesh import Mesh, ObjectEntry

@@ -13,7 +13,7 @@ from typing import Any
 import matplotlib.pyplot as plt
 from matplotlib.figure import Figure
 
-from data_pipeline.dataset.builder import DatasetStatistics
+from data_pipeline.dataset.statistics import DatasetStatistics
 from eval.tables import ViewTables
 
 STYLE = """

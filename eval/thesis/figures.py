@@ -13,7 +13,9 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
-from data_pipeline.dataset.builder import DatasetStatistics, metric_depth, open_split
+from data_pipeline.dataset.builder import open_split
+from data_pipeline.dataset.inputs import metric_depth
+from data_pipeline.dataset.statistics import DatasetStatistics
 from eval.report import figures
 from eval.thesis.results import LatticeTables
 from mevs_jax.viewpoints import ViewGraph, local_maxima

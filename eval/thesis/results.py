@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from data_pipeline.dataset.builder import DatasetStatistics
+from data_pipeline.dataset.statistics import DatasetStatistics
 from eval.numbers.comparison import class_mean, intervals
 from eval.numbers.study import HEADLINE_CT, HEADLINE_MV, exactly_random, headline_confusion
 from eval.tables import ViewTables

@@ -13,7 +13,8 @@ from typing import Any
 import numpy as np
 from flax import nnx
 
-from data_pipeline.dataset.builder import open_objects, prepare, report_left_out
+from data_pipeline.dataset.builder import open_objects, prepare
+from data_pipeline.dataset.statistics import report_left_out
 from data_pipeline.errors import DataError
 from data_pipeline.files import as_read, read_json, write_json
 from data_pipeline.objects.sources import load_object

@@ -20,7 +20,8 @@ from flax import nnx
 from jaxtyping import Array, Float
 
 from data_pipeline.dataset.batches import fold_of
-from data_pipeline.dataset.builder import DataConfig, DatasetStatistics, load_statistics, open_split, prepare
+from data_pipeline.dataset.builder import DataConfig, open_split, prepare
+from data_pipeline.dataset.statistics import DatasetStatistics, load_statistics
 from data_pipeline.errors import DataError
 from data_pipeline.progress import console
 from eval.learned.walks import Learner

@@ -1,0 +1,156 @@
+"""Statistics of a data set: its summary file, and how it is computed while shards are written."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from data_pipeline.capture.casting import CaptureConfig
+from data_pipeline.errors import DataError
+from data_pipeline.files import read_json
+from data_pipeline.progress import console
+
+SPLITS = ("train", "val", "test")
+SUMMARY = "summary.json"
+"""File name of the statistics in the folder of a data set."""
+
+
+@dataclass(frozen=True)
+class DatasetStatistics:
+    """Statistics of a data set, over the training split unless noted otherwise.
+
+    Attributes:
+        classes: class names, by label.
+        counts: numbers of objects by split and class.
+        left_out: names of the objects that could not be captured, with the reasons, by split of the source.
+        entropy_max: the largest depth entropy in bits, which normalises the network's targets (5.46 in the thesis).
+        entropy_mean, entropy_std: mean and standard deviation of the normalised entropies (0.329 and 0.156 in the thesis).
+        entropy_histograms: by split, counts of normalised entropies in 50 bins over [0, 1]; values above 1 are in the last bin.
+        mean_map: (views,) mean normalised entropy of each view.
+        class_mean_maps: (classes, views) mean normalised entropy of each view by class, 0 for a class without objects.
+        points_mean, points_std: mean and standard deviation of the number of points visible in a view.
+        points_by_class: by class, the 5th, 25th, 50th, 75th and 95th percentiles of that number.
+        viewpoints: (views, 3) unit vectors.
+        capture: the `CaptureConfig`, as a dictionary.
+        source: name of the source of objects.
+    """
+
+    classes: list[str]
+    counts: dict[str, dict[str, int]]
+    left_out: dict[str, dict[str, str]]
+    entropy_max: float
+    entropy_mean: float
+    entropy_std: float
+    entropy_histograms: dict[str, list[int]]
+    mean_map: list[float]
+    class_mean_maps: list[list[float]]
+    points_mean: float
+    points_std: float
+    points_by_class: list[list[float]]
+    viewpoints: list[list[float]]
+    capture: dict[str, Any]
+    source: str
+
+    @property
+    def views(self) -> int:
+        """Number of candidate viewpoints."""
+        return len(self.viewpoints)
+
+    def objects_of(self, splits: Sequence[str]) -> int:
+        """Returns the number of objects in the given splits."""
+        return sum(sum(self.counts[split].values()) for split in splits)
+
+    @property
+    def fingerprint(self) -> str:
+        """Hash of all statistics, which changes with the objects, the views or their order."""
+        return hashlib.sha256(json.dumps(asdict(self), sort_keys=True).encode()).hexdigest()[:16]
+
+    @property
+    def left_out_count(self) -> int:
+        """Number of objects left out."""
+        return sum(map(len, self.left_out.values()))
+
+    @property
+    def camera(self) -> CaptureConfig:
+        """The settings of the capture."""
+        return CaptureConfig(**self.capture)
+
+
+class StatisticsCollector:
+    """Collects what the statistics need from each object while shards are written."""
+
+    def __init__(self, classes: int):
+        self.classes = classes
+        self.objects: dict[str, dict[str, tuple[int, np.ndarray, np.ndarray]]] = {split: {} for split in SPLITS}
+
+    def add(self, split: str, name: str, example: dict[str, Any]) -> None:
+        """Adds the object `name` with its record `example`."""
+        points = np.count_nonzero(example["depth"], axis=(1, 2))
+        self.objects[split][name] = int(example["label"]), example["entropy"], points
+
+    def finish(self, **rest: Any) -> DatasetStatistics:
+        """Returns the statistics of the objects added; `rest` are the fields that do not depend on their views."""
+        # Sorted by name, so that floating-point sums do not depend on the order in which objects were added.
+        ordered = {split: [members[name] for name in sorted(members)] for split, members in self.objects.items()}
+        labels = np.array([label for label, _, _ in ordered["train"]])
+        points = np.stack([points for _, _, points in ordered["train"]])
+        entropies = {split: np.stack([entropy for _, entropy, _ in members]) for split, members in ordered.items()}
+        largest = float(np.max(entropies["train"])) or 1.0
+        normalised = {split: members / largest for split, members in entropies.items()}
+        train = normalised["train"]
+        members = [labels == label for label in range(self.classes)]
+        return DatasetStatistics(
+            entropy_max=largest,
+            entropy_mean=float(train.mean()),
+            entropy_std=float(train.std()),
+            entropy_histograms={
+                split: np.histogram(np.minimum(values, 1), 50, (0, 1))[0].tolist()
+                for split, values in normalised.items()
+            },
+            mean_map=train.mean(axis=0).tolist(),
+            class_mean_maps=[
+                train[own].mean(axis=0).tolist() if own.any() else [0.0] * train.shape[1] for own in members
+            ],
+            points_mean=float(points.mean()),
+            points_std=float(points.std()),
+            points_by_class=[
+                np.percentile(points[own], (5, 25, 50, 75, 95)).tolist() if own.any() else [0.0] * 5 for own in members
+            ],
+            **rest,
+        )
+
+
+def load_statistics(folder: Path) -> DatasetStatistics:
+    """Returns the statistics of the data set in `folder`.
+
+    Raises:
+        DataError: if there is no data set, or another version of this package made it.
+    """
+    path = folder / SUMMARY
+    if not path.exists():
+        raise DataError(f"no data set in {folder}; create one with: mevs data --out {os.path.dirname(folder) or '.'}")
+    try:
+        return DatasetStatistics(**read_json(path))
+    except TypeError as error:
+        raise DataError(
+            f"{folder} was made by another version of mevs_jax; choose another --out, or delete it"
+        ) from error
+
+
+def report_left_out(statistics: DatasetStatistics) -> None:
+    """Prints the size of a data set, and which objects were left out and why."""
+    objects = sum(sum(by_class.values()) for by_class in statistics.counts.values())
+    sizes = ", ".join(f"{sum(by_class.values())} {split}" for split, by_class in statistics.counts.items())
+    console.print(
+        f"Data set: {objects} objects ({sizes}), {statistics.views} views each, {statistics.left_out_count} left out"
+    )
+    for by_name in statistics.left_out.values():
+        for name, reason in by_name.items():
+            console.print(f"  left out: {name}: {reason}", style="dim", soft_wrap=True)
