@@ -8,8 +8,15 @@ from typing import Protocol
 import numpy as np
 
 from data_pipeline.errors import DamagedMesh, EmptyMesh
+from data_pipeline.objects.checks import check_indices
 
 SOURCE_SPLITS = ("train", "test")
+
+LARGEST_COORDINATE = 1e30
+"""Coordinates beyond this would overflow float32 when they are squared."""
+
+SMALLEST_RADIUS = 1e-150
+"""Meshes smaller than this are a single point, whose size cannot be normalised."""
 
 
 @dataclass(frozen=True)
@@ -59,25 +66,29 @@ def normalise(vertices: np.ndarray, faces: np.ndarray, where: str) -> Mesh:
     Vertices that no face uses and faces without area are removed. `where` names the mesh in error messages.
 
     Raises:
-        DamagedMesh: if a coordinate is not finite, or a face refers to a vertex that does not exist.
+        DamagedMesh: if a coordinate that a face uses is not finite or too large, or a face refers to a vertex that does not
+            exist.
         EmptyMesh: if there are no faces, or none has an area.
     """
     vertices, faces = np.asarray(vertices, np.float64), np.asarray(faces, np.int64)
+    if len(vertices) == 0:
+        raise EmptyMesh("mesh has no faces")
+    if len(faces) == 0:
+        raise EmptyMesh(f"mesh has no faces: it is a point cloud of {len(vertices)} points")
+    check_indices(faces, len(vertices), where)
+    used, compact = np.unique(faces, return_inverse=True)
+    vertices, faces = vertices[used], compact.reshape(faces.shape)
     if not np.isfinite(vertices).all():
         bad = int((~np.isfinite(vertices).all(axis=1)).sum())
         raise DamagedMesh(
             f"{where} has {bad} vertices that are not finite (NaN or infinite); repair it or take it away"
         )
-    if len(faces) == 0 or len(vertices) == 0:
-        raise EmptyMesh("mesh has no faces")
-    if faces.min() < 0 or faces.max() >= len(vertices):
-        raise DamagedMesh(f"{where} has faces that name vertices beyond its {len(vertices)}; repair it or take it away")
-    used, compact = np.unique(faces, return_inverse=True)
-    vertices, faces = vertices[used], compact.reshape(faces.shape)
+    if np.abs(vertices).max() > LARGEST_COORDINATE:
+        raise DamagedMesh(f"{where} has coordinates beyond {LARGEST_COORDINATE:g}; repair it or take it away")
     low, high = vertices.min(axis=0), vertices.max(axis=0)
     centred = vertices - (low + high) / 2
     radius = np.linalg.norm(centred, axis=1).max()
-    if radius == 0:
+    if radius < SMALLEST_RADIUS:
         raise EmptyMesh("mesh is a single point")
     centred /= radius
     corners = centred[faces]

@@ -1,0 +1,92 @@
+"""Readers of mesh formats: the one place where foreign files become arrays.
+
+One module reads one format. docs/data.md has a table of what each format promises: what is read, ignored and refused.
+Libraries read what they read right: pycollada COLLADA, DracoPy Draco, mapbox-earcut concave polygons. OFF, OBJ, STL, PLY and
+glTF have readers of our own, since trimesh and assimp lose or misread parts of the files of `tests/data_pipeline/objects`, or
+read truncated files without a word. Tests compare them with trimesh and with the counts that the files declare.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Literal
+
+import numpy as np
+
+from data_pipeline.errors import DamagedMesh, DataError
+from data_pipeline.objects.formats.dae import parse_dae
+from data_pipeline.objects.formats.gltf import parse_gltf
+from data_pipeline.objects.formats.obj import parse_obj
+from data_pipeline.objects.formats.off import parse_off
+from data_pipeline.objects.formats.ply import parse_ply
+from data_pipeline.objects.formats.stl import parse_stl
+from data_pipeline.objects.formats.threemf import parse_3mf
+
+__all__ = ["AXIS_DECLARED", "MESH_SUFFIXES", "UNREAD_SUFFIXES", "Up", "parse_mesh", "parse_off"]
+
+MESH_SUFFIXES = (".off", ".obj", ".stl", ".ply", ".glb", ".gltf", ".dae", ".3mf")
+
+UNREAD_SUFFIXES = (
+    ".3ds", ".amf", ".blend", ".brep", ".c4d", ".ctm", ".drc", ".dxf", ".fbx", ".iges", ".igs", ".lwo", ".ma", ".max", ".mb",
+    ".mesh", ".msh", ".skp", ".step", ".stp", ".usd", ".usda", ".usdc", ".usdz", ".vrml", ".vtk", ".vtp", ".vtu", ".wrl", ".x3d",
+    ".pcd", ".las", ".laz", ".e57",
+)  # fmt: skip
+"""Suffixes of meshes and scans that are not read. Such files are left out by name."""
+
+AXIS_DECLARED = (".glb", ".gltf", ".dae")
+"""Formats that define or declare which axis is up. All others are taken as z up."""
+
+Up = Literal["auto", "z", "y"]
+"""Which axis of a file is up: the one its format declares, else z (`auto`), or always z or y."""
+
+_TO_Z_UP = {
+    "x": np.array([[0.0, -1, 0], [0, 0, -1], [1, 0, 0]]),
+    "y": np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]]),
+}
+"""Rotations that turn x or y up into z up, as COLLADA's and glTF's axes are defined."""
+
+_Z_UP_READERS: dict[str, Callable[[bytes, str], tuple[np.ndarray, np.ndarray]]] = {
+    ".off": parse_off,
+    ".obj": parse_obj,
+    ".stl": parse_stl,
+    ".ply": parse_ply,
+    ".3mf": parse_3mf,
+}
+
+
+def _no_sibling(name: str) -> bytes:
+    raise DamagedMesh(f"it needs the file {name!r}, which cannot be read here")
+
+
+def parse_mesh(
+    content: bytes, suffix: str, where: str, *, up: Up = "auto", sibling: Callable[[str], bytes] = _no_sibling
+) -> tuple[np.ndarray, np.ndarray]:
+    """Returns the vertices (n, 3), z up, and triangles (m, 3) of a mesh file.
+
+    Args:
+        content: content of the file.
+        suffix: format, one of `MESH_SUFFIXES`.
+        where: name of the file for error messages.
+        up: which axis of the file is up.
+        sibling: returns the content of a file by its path relative to this one, for the buffers of glTF.
+
+    Raises:
+        DamagedMesh: if the file is not a readable mesh or is truncated.
+    """
+    axis = "z"
+    try:
+        if suffix in (".glb", ".gltf"):
+            (vertices, triangles), axis = parse_gltf(content, where, sibling), "y"
+        elif suffix == ".dae":
+            vertices, triangles, axis = parse_dae(content, where)
+        else:
+            vertices, triangles = _Z_UP_READERS[suffix](content, where)
+    except DataError:
+        raise
+    except (MemoryError, RecursionError) as error:
+        raise DamagedMesh(f"{where} is too large or too deeply nested to be read; export a simpler mesh") from error
+    turn = _TO_Z_UP.get(axis if up == "auto" else up)
+    if turn is not None:
+        with np.errstate(all="ignore"):  # vertices that no face uses may be NaN
+            vertices = vertices @ turn.T
+    return vertices, triangles

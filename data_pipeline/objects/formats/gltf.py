@@ -1,0 +1,345 @@
+"""glTF 2.0 and GLB: the triangles of the default scene, with all transforms, y up.
+
+Read are triangles, strips and fans, indexed or not; matrices and translation, rotation, scale of nodes; sparse accessors;
+KHR_mesh_quantization; KHR_draco_mesh_compression (by DracoPy); EXT_mesh_gpu_instancing; skins in their rest pose. Materials,
+animations, morph targets, points and lines are ignored. A file that requires any other extension of its geometry is refused.
+
+Source: glTF 2.0 specification, Khronos Group (ISO/IEC 12113:2022), sections 3.5 to 3.7.
+"""
+
+from __future__ import annotations
+
+import base64
+import json
+import math
+import urllib.parse
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from data_pipeline.errors import DamagedMesh, DataError
+from data_pipeline.objects.checks import check_indices
+from data_pipeline.objects.formats.polygons import fan_triangles, strip_triangles
+
+_COMPONENTS = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
+_WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT2": 4, "MAT3": 9, "MAT4": 16}
+_DRACO, _INSTANCING = "KHR_draco_mesh_compression", "EXT_mesh_gpu_instancing"
+_READ = (_DRACO, _INSTANCING, "KHR_mesh_quantization")
+_HARMLESS = ("KHR_materials_", "KHR_texture_", "EXT_texture_", "MSFT_texture_", "KHR_lights_", "KHR_xmp", "EXT_lights_",
+             "KHR_animation", "KHR_node_", "MSFT_packing", "KHR_techniques_", "ADOBE_materials")  # fmt: skip
+"""Beginnings of the names of extensions that leave the geometry as it is."""
+
+MOST_ELEMENTS = 100_000_000
+"""Largest number of elements that an accessor without data, or all instances of meshes together, may have."""
+
+
+def parse_gltf(content: bytes, where: str, sibling: Callable[[str], bytes]) -> tuple[np.ndarray, np.ndarray]:
+    """Returns the vertices (n, 3), y up, and triangles (m, 3) of a glTF or GLB file.
+
+    Args:
+        content: content of the file.
+        where: name of the file for error messages.
+        sibling: returns the content of a file by its path relative to this one.
+
+    Raises:
+        DamagedMesh: if the file is not a readable glTF mesh, is truncated, or requires an extension that is not read.
+    """
+    try:
+        document, binary = _chunks(content, where)
+        return _Reader(document, binary, where, sibling).meshes()
+    except DataError:
+        raise
+    except (
+        KeyError,
+        IndexError,
+        TypeError,
+        ValueError,
+        AttributeError,
+        OverflowError,
+        RecursionError,
+        MemoryError,
+    ) as error:
+        # A document of another form than the specification's may fail anywhere.
+        reason = f"{type(error).__name__}: {error}".splitlines()[0][:120]
+        raise DamagedMesh(f"{where} is not a readable glTF mesh ({reason}); repair it or take it away") from error
+
+
+def _chunks(content: bytes, where: str) -> tuple[Any, bytes]:
+    """Returns the JSON document and the binary chunk."""
+    if content[:4] != b"glTF":
+        return json.loads(content.decode("utf-8-sig")), b""
+    if int.from_bytes(content[4:8], "little") != 2:
+        raise DamagedMesh(f"{where} is a GLB file of version {content[4]}, not 2; export it again as glTF 2.0")
+    declared = int.from_bytes(content[8:12], "little")
+    if declared > len(content):
+        raise DamagedMesh(
+            f"{where} is cut short: {len(content)} of {declared} bytes are there; fetch or export it again"
+        )
+    document, binary, at = None, b"", 12
+    while at + 8 <= declared:
+        length, kind = int.from_bytes(content[at : at + 4], "little"), content[at + 4 : at + 8]
+        if at + 8 + length > declared:
+            raise DamagedMesh(f"{where} is not a readable glTF mesh: a chunk goes beyond its end; export it again")
+        chunk = content[at + 8 : at + 8 + length]
+        if kind == b"JSON" and document is None:
+            document = json.loads(chunk.decode())
+        elif kind == b"BIN\0" and not binary:
+            binary = chunk
+        at += 8 + length
+    return document, binary
+
+
+class _Reader:
+    """Reads the meshes of one document."""
+
+    def __init__(self, document: Any, binary: bytes, where: str, sibling: Callable[[str], bytes]):
+        if not isinstance(document, dict) or "asset" not in document:
+            raise DamagedMesh(f"{where} is not a readable glTF mesh: it has no asset; repair it or take it away")
+        if not str(document["asset"].get("version", "")).startswith("2."):
+            raise DamagedMesh(
+                f"{where} is not glTF 2.0 but {document['asset'].get('version')!r}; export it as glTF 2.0"
+            )
+        self.document, self.binary, self.where, self.sibling = document, binary, where, sibling
+        self.buffers: dict[int, bytes] = {}
+        self.elements = 0
+        for name in document.get("extensionsRequired", []):
+            if name not in _READ and not str(name).startswith(_HARMLESS):
+                raise DamagedMesh(
+                    f"{where} requires the extension {name}, which is not read; export it without (gltf-transform, Blender)"
+                )
+
+    def item(self, kind: str, index: Any) -> Any:
+        """Returns one entry of a list of the document, such as accessor 3."""
+        if type(index) is not int or index < 0:
+            raise ValueError(f"{index!r} is no index of {kind}")
+        return self.document[kind][index]
+
+    def buffer(self, index: Any) -> bytes:
+        """Returns the content of a buffer: the binary chunk, a data URI, or another file."""
+        if index in self.buffers:
+            return self.buffers[index]
+        entry = self.item("buffers", index)
+        uri = entry.get("uri")
+        if uri is None:
+            content = self.binary
+        elif uri.startswith("data:"):
+            head, _, body = uri.partition(",")
+            content = base64.b64decode(body) if head.endswith(";base64") else urllib.parse.unquote_to_bytes(body)
+        else:
+            content = self.sibling(urllib.parse.unquote(uri))
+        if len(content) < entry["byteLength"]:
+            raise DamagedMesh(
+                f"{self.where} is cut short: buffer {index} has {len(content)} of {entry['byteLength']} bytes; "
+                f"fetch or export it again"
+            )
+        self.buffers[index] = content
+        return content
+
+    def view(self, index: Any) -> tuple[bytes, int]:
+        """Returns the bytes of a buffer view and the distance of its elements, 0 if they are packed."""
+        entry = self.item("bufferViews", index)
+        for name in entry.get("extensions", {}):
+            if "meshopt" in name:
+                raise DamagedMesh(
+                    f"{self.where} is compressed with {name}, which is not read; unpack it with: gltf-transform copy, or gltfpack"
+                )
+        start, length = entry.get("byteOffset", 0), entry["byteLength"]
+        content = self.buffer(entry["buffer"])
+        if min(start, length) < 0 or start + length > len(content):
+            raise DamagedMesh(f"{self.where} is cut short: buffer view {index} goes beyond its buffer; export it again")
+        return content[start : start + length], int(entry.get("byteStride", 0))
+
+    def _array(self, index: Any, offset: int, count: int, kind: str, width: int) -> np.ndarray:
+        """Returns `count` elements of `width` numbers from a buffer view."""
+        content, stride = self.view(index)
+        element = np.dtype((kind, (width,)))
+        stride = stride or element.itemsize
+        if offset < 0 or count < 0 or stride < element.itemsize or (
+            count and offset + stride * (count - 1) + element.itemsize > len(content)
+        ):  # fmt: skip
+            raise DamagedMesh(
+                f"{self.where} is cut short: an accessor goes beyond buffer view {index}; export it again"
+            )
+        return np.ndarray((count, width), kind, content, offset, (stride, np.dtype(kind).itemsize))
+
+    def accessor(self, index: Any) -> np.ndarray:
+        """Returns the elements of an accessor (count, width); normalised integers become float64 in [−1, 1]."""
+        entry = self.item("accessors", index)
+        kind, width, count = _COMPONENTS[entry["componentType"]], _WIDTHS[entry["type"]], entry["count"]
+        if type(count) is not int or not 0 <= count <= MOST_ELEMENTS:
+            raise ValueError(f"accessor {index} has {count!r} elements")
+        if "bufferView" in entry:
+            values = self._array(entry["bufferView"], entry.get("byteOffset", 0), count, kind, width)
+        else:
+            self._spend(count)
+            values = np.zeros((count, width), kind)
+        if sparse := entry.get("sparse"):
+            at, new = sparse["indices"], sparse["values"]
+            places = self._array(
+                at["bufferView"], at.get("byteOffset", 0), sparse["count"], _COMPONENTS[at["componentType"]], 1
+            )
+            values = values.copy()
+            values[places[:, 0]] = self._array(
+                new["bufferView"], new.get("byteOffset", 0), sparse["count"], kind, width
+            )
+        return _unquantised(values) if entry.get("normalized") else values
+
+    def _spend(self, elements: int) -> None:
+        self.elements += elements
+        if self.elements > MOST_ELEMENTS:
+            raise DamagedMesh(f"{self.where} unfolds to more than {MOST_ELEMENTS:,} elements; export a simpler mesh")
+
+    def primitive(self, entry: Any) -> tuple[np.ndarray, np.ndarray, dict[str, np.ndarray]] | None:
+        """Returns the vertices, triangles and skin of a primitive, or None for points and lines."""
+        mode, attributes = entry.get("mode", 4), entry["attributes"]
+        if mode not in (4, 5, 6) or "POSITION" not in attributes:
+            if mode not in range(7):
+                raise ValueError(f"a primitive has mode {mode!r}")
+            return None
+        draco = entry.get("extensions", {}).get(_DRACO)
+        if draco is not None:
+            vertices, indices = self._draco(draco, entry)
+        else:
+            vertices = self.accessor(attributes["POSITION"])
+            indices = self.accessor(entry["indices"])[:, 0] if "indices" in entry else np.arange(len(vertices))
+        if vertices.shape[1:] != (3,):
+            raise ValueError("positions are not VEC3")
+        indices = indices.astype(np.int64)
+        if mode == 4:
+            triangles = indices[: len(indices) // 3 * 3].reshape(-1, 3)
+        else:
+            triangles = (strip_triangles if mode == 5 else fan_triangles)(indices)
+        check_indices(triangles, len(vertices), self.where)
+        skin = {name: self.accessor(at) for name, at in attributes.items() if name.startswith(("JOINTS_", "WEIGHTS_"))}
+        return vertices.astype(np.float64), triangles, skin
+
+    def _draco(self, draco: Any, entry: Any) -> tuple[np.ndarray, np.ndarray]:
+        import DracoPy
+
+        content, _ = self.view(draco["bufferView"])
+        try:
+            mesh = DracoPy.decode(bytes(content))
+        except Exception as error:  # DracoPy raises exceptions of its own and of Cython's
+            raise DamagedMesh(
+                f"{self.where} has a Draco mesh that cannot be decoded ({error}); export it again"
+            ) from error
+        vertices = np.asarray(mesh.points)
+        position = self.item("accessors", entry["attributes"]["POSITION"])
+        if position.get("normalized") and vertices.dtype.kind in "iu":
+            vertices = _unquantised(vertices.astype(_COMPONENTS[position["componentType"]]))
+        faces = getattr(mesh, "faces", None)
+        if faces is None:
+            raise DamagedMesh(f"{self.where} has a Draco point cloud in place of a mesh; export it again")
+        if len(vertices) != position["count"]:
+            raise DamagedMesh(
+                f"{self.where} declares {position['count']} vertices and its Draco mesh has {len(vertices)}; export it again"
+            )
+        return vertices.reshape(-1, 3), np.asarray(faces).reshape(-1)
+
+    def matrix(self, node: Any) -> np.ndarray:
+        """Returns the transform of a node into its parent's frame, (4, 4)."""
+        if "matrix" in node:
+            return np.array(node["matrix"], np.float64).reshape(4, 4).T
+        return _transform(
+            np.array([node.get("translation", (0, 0, 0))], np.float64),
+            np.array([node.get("rotation", (0, 0, 0, 1))], np.float64),
+            np.array([node.get("scale", (1, 1, 1))], np.float64),
+        )[0]
+
+    def placed(self) -> dict[int, np.ndarray]:
+        """Returns the nodes of the default scene, by number, with their transforms into the world."""
+        nodes = self.document.get("nodes", [])
+        if "scenes" in self.document:
+            roots = self.item("scenes", self.document.get("scene", 0)).get("nodes", [])
+        else:
+            roots = sorted(set(range(len(nodes))) - {child for node in nodes for child in node.get("children", [])})
+        found: dict[int, np.ndarray] = {}
+        todo = [(root, np.eye(4)) for root in roots[::-1]]
+        while todo:
+            index, parent = todo.pop()
+            if index in found:
+                raise ValueError(f"node {index} is in the scene twice")
+            node = self.item("nodes", index)
+            found[index] = parent @ self.matrix(node)
+            todo += [(child, found[index]) for child in node.get("children", [])[::-1]]
+        return found
+
+    def instances(self, node: Any) -> np.ndarray:
+        """Returns the transforms of the copies of a node's mesh into the node's frame, (copies, 4, 4)."""
+        instancing = node.get("extensions", {}).get(_INSTANCING)
+        if instancing is None:
+            return np.eye(4)[None]
+        given = {name: self.accessor(at).astype(np.float64) for name, at in instancing["attributes"].items()}
+        counts = {len(values) for name, values in given.items() if name in ("TRANSLATION", "ROTATION", "SCALE")}
+        if len(counts) != 1:
+            raise ValueError("the attributes of instances differ in their number")
+        count = counts.pop()
+        self._spend(count)
+        return _transform(
+            given.get("TRANSLATION", np.zeros((count, 3))),
+            given.get("ROTATION", np.tile((0.0, 0, 0, 1), (count, 1))),
+            given.get("SCALE", np.ones((count, 3))),
+        )
+
+    def meshes(self) -> tuple[np.ndarray, np.ndarray]:
+        """Returns the vertices and triangles of all meshes in the scene."""
+        placed = self.placed()
+        parts: list[tuple[np.ndarray, np.ndarray]] = []
+        read: dict[int, list[Any]] = {}
+        for index, world in placed.items():
+            node = self.item("nodes", index)
+            if "mesh" not in node:
+                continue
+            mesh = node["mesh"]
+            if mesh not in read:
+                primitives = [self.primitive(entry) for entry in self.item("meshes", mesh)["primitives"]]
+                read[mesh] = [primitive for primitive in primitives if primitive is not None]
+            copies = self.instances(node)
+            for vertices, triangles, skin in read[mesh]:
+                self._spend(len(copies) * (len(vertices) + len(triangles)))
+                if "skin" in node and skin:
+                    parts.append((self._skinned(vertices, skin, self.item("skins", node["skin"]), placed), triangles))
+                    continue
+                for copy in world @ copies:
+                    parts.append((vertices @ copy[:3, :3].T + copy[:3, 3], triangles))
+        if not parts:
+            return np.zeros((0, 3)), np.zeros((0, 3), np.int64)
+        first = np.cumsum([0] + [len(vertices) for vertices, _ in parts])
+        vertices = np.concatenate([vertices for vertices, _ in parts])
+        return vertices, np.concatenate([triangles + at for (_, triangles), at in zip(parts, first, strict=False)])
+
+    def _skinned(
+        self, vertices: np.ndarray, skin: dict[str, np.ndarray], entry: Any, placed: dict[int, np.ndarray]
+    ) -> np.ndarray:
+        """Returns the vertices of a skinned mesh in the rest pose; the transform of its own node does not count."""
+        joints = np.stack([placed[joint] for joint in entry["joints"]])
+        if "inverseBindMatrices" in entry:
+            inverse = self.accessor(entry["inverseBindMatrices"])[: len(joints)].reshape(-1, 4, 4)
+            joints = joints @ inverse.transpose(0, 2, 1)
+        posed, total = np.zeros_like(vertices), np.zeros((len(vertices), 1))
+        for name in sorted(name for name in skin if name.startswith("JOINTS_")):
+            weights = skin[name.replace("JOINTS_", "WEIGHTS_")].astype(np.float64)
+            for at in range(4):
+                matrices = joints[skin[name][:, at].astype(np.int64)]
+                moved = np.einsum("nij,nj->ni", matrices[:, :3, :3], vertices) + matrices[:, :3, 3]
+                posed, total = posed + weights[:, at, None] * moved, total + weights[:, at, None]
+        return posed / np.where(total == 0, 1, total)
+
+
+def _unquantised(values: np.ndarray) -> np.ndarray:
+    """Returns normalised integers as numbers in [−1, 1] (section 3.11)."""
+    if values.dtype.kind not in "iu":
+        return values
+    return np.maximum(values.astype(np.float64) / np.iinfo(values.dtype).max, -1.0)
+
+
+def _transform(translation: np.ndarray, rotation: np.ndarray, scale: np.ndarray) -> np.ndarray:
+    """Returns matrices (n, 4, 4) that scale, then rotate by a quaternion (x, y, z, w), then move."""
+    if not all(math.isfinite(part.sum()) for part in (translation, rotation, scale)):
+        raise ValueError("a transform is not finite")
+    found = np.tile(np.eye(4), (len(translation), 1, 1))
+    found[:, :3, :3] = Rotation.from_quat(rotation).as_matrix() * scale[:, None, :]
+    found[:, :3, 3] = translation
+    return found
