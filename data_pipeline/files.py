@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
+import hashlib
 import io
 import json
 import os
+import re
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+
+_SAFE_NAME = re.compile(r"[a-z0-9_][a-z0-9_.-]*")
+_UNSAFE = re.compile(r"[^a-z0-9_.-]")
 
 
 def write_bytes(path: Path, content: bytes) -> None:
@@ -35,8 +40,15 @@ def write_npz(path: Path, **arrays: Any) -> None:
 
 
 def npz_of(folder: Path, name: str) -> Path:
-    """Returns the path of the `.npz` file in `folder` for the object called `name`."""
-    return folder / (name.replace("/", "__") + ".npz")
+    """Returns the path of the `.npz` file in `folder` for the object called `name`.
+
+    Names that a file system may not hold, or may not tell apart (long, with capitals, other than ASCII), get a checksum.
+    """
+    plain = name.replace("/", "__")
+    if not _SAFE_NAME.fullmatch(plain) or "__" in name or len(plain) > 180:
+        digest = hashlib.sha256(name.encode("utf-8", "surrogateescape")).hexdigest()[:20]
+        plain = f"{_UNSAFE.sub('_', plain)[:80]}.{digest}"
+    return folder / f"{plain}.npz"
 
 
 def _plain(value: Any) -> Any:

@@ -19,8 +19,8 @@ from data_pipeline.dataset import builder
 from data_pipeline.dataset.builder import DataConfig, open_split, prepare
 from data_pipeline.dataset.statistics import load_statistics
 from data_pipeline.errors import DataError
-from data_pipeline.objects import archives
-from data_pipeline.objects.archives import ARCHIVES, Archive, download, local
+from data_pipeline.objects import downloads
+from data_pipeline.objects.downloads import ARCHIVES, Archive, download, local
 
 
 def off(mesh: trimesh.Trimesh, header: str) -> str:
@@ -112,7 +112,9 @@ def test_a_data_set_is_made_from_the_archive(served, made_archive, tmp_path, mon
         "val": 2,
         "test": 4,
     }
-    assert by_file.left_out["train"] == {"bathtub/train/bathtub_0099.off": "mesh has no faces"}
+    assert by_file.left_out["train"] == {
+        "bathtub/train/bathtub_0099.off": "mesh has no faces: it is a point cloud of 3 points"
+    }
     depths = [open_split(tmp_path / folder, "test")[0]["depth"] for folder in "ab"]
     np.testing.assert_array_equal(*depths)
     assert "2 classes" in " ".join(capsys.readouterr().err.split())  # one training object more than was said
@@ -129,7 +131,7 @@ def test_another_archive_is_taken_and_said(made_archive, capsys):
 
 def test_downloads_lie_where_tfds_keeps_them(monkeypatch, tmp_path):
     monkeypatch.setenv("TFDS_DATA_DIR", str(tmp_path))
-    assert archives.download_folder() == tmp_path / "downloads"
+    assert downloads.download_folder() == tmp_path / "downloads"
 
 
 def test_original_modelnet_meshes_become_a_data_set(real_meshes, tmp_path):

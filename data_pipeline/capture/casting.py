@@ -22,6 +22,7 @@ from typing import Literal, Protocol
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from data_pipeline.errors import DataError
 from data_pipeline.files import write_npz
 from data_pipeline.objects.mesh import Mesh
 
@@ -30,6 +31,9 @@ DEPTH_SCALE = 10_000
 
 AMBIENT = 0.25
 """Grey level, in [0, 1], of a surface seen edge-on."""
+
+LARGEST_RESOLUTION = 4096
+"""Largest number of pixels along each side of a view."""
 
 _RAYS_PER_BATCH = 100_000
 
@@ -125,12 +129,36 @@ class Capture:
     extent: np.ndarray
 
 
+def check_camera(config: CaptureConfig) -> None:
+    """Checks the numbers of a capture, apart from the number of views, which depends on the lattice.
+
+    Raises:
+        DataError: if a number is out of its range, or the depth of some object would not fit 16 bits.
+    """
+    farthest = 65535 / DEPTH_SCALE - 1  # the unit sphere ends one radius behind its centre
+    if not 1 < config.distance <= farthest:
+        raise DataError(
+            f"--dataset.capture.distance {config.distance:g} is not above 1 (the radius of an object) and at most {farthest:.2f}, "
+            f"since depth is stored in 16 bits, up to {farthest + 1:.2f} radii; choose another"
+        )
+    if not 0 < config.field_of_view < 180:
+        raise DataError(
+            f"--dataset.capture.field-of-view {config.field_of_view:g} is not between 0 and 180 degrees; choose another"
+        )
+    if not 1 <= config.resolution <= LARGEST_RESOLUTION:
+        raise DataError(
+            f"--dataset.capture.resolution {config.resolution} is not from 1 to {LARGEST_RESOLUTION} pixels; choose another"
+        )
+
+
 def rig_for(config: CaptureConfig) -> Rig:
     """Returns the cameras that `config` describes.
 
     Raises:
+        DataError: if a number of `config` is out of its range.
         ValueError: if the lattice cannot have this number of views.
     """
+    check_camera(config)
     import jax
 
     from mevs_jax.cameras import cameras_at, pixel_directions

@@ -5,6 +5,7 @@ Worker processes import this module, so neither it nor the modules it imports ma
 
 from __future__ import annotations
 
+import hashlib
 import multiprocessing
 import os
 import signal
@@ -24,8 +25,13 @@ from data_pipeline.progress import progress_bar
 
 
 def capture_path(folder: Path, entry: ObjectEntry) -> Path:
-    """Returns the path of an object's capture in `folder`."""
-    return npz_of(folder, entry.name)
+    """Returns the path of an object's capture in `folder`. It depends on the state of the object's file when it was listed.
+
+    So a capture of a file that has changed since is not found, and the file is captured again.
+    """
+    stamp = getattr(entry.recipe, "stamp", "")
+    state = f".{hashlib.sha256(stamp.encode()).hexdigest()[:12]}" if stamp else ""
+    return npz_of(folder, entry.name + state)
 
 
 def _left_out_path(folder: Path, entry: ObjectEntry) -> Path:
@@ -53,7 +59,12 @@ def capture_entry(entry: ObjectEntry, rig: Rig, folder: Path, backend: str, skip
         None, or the damage of a mesh if it is damaged and `skip_damaged` is off.
     """
     try:
-        save_capture(capture_path(folder, entry), _BACKENDS[backend](load_object(entry), rig.around(entry.name)))
+        seen = _BACKENDS[backend](load_object(entry), rig.around(entry.name))
+        if not seen.depth.any():
+            raise EmptyMesh(
+                f"no view shows it: it is thinner than the pixels of {seen.depth.shape[1]}×{seen.depth.shape[2]} views"
+            )
+        save_capture(capture_path(folder, entry), seen)
     except (EmptyMesh, DamagedMesh) as reason:
         if isinstance(reason, DamagedMesh) and not skip_damaged:
             return str(reason)

@@ -21,7 +21,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from data_pipeline.capture.casting import Capture, CaptureConfig, Rig, load_capture, rig_for
+from data_pipeline.capture.casting import Capture, CaptureConfig, Rig, check_camera, load_capture, rig_for
 from data_pipeline.capture.workers import capture_all, capture_path
 from data_pipeline.dataset.beam import beam_options, capture_by_beam, examples_by_beam
 from data_pipeline.dataset.inputs import metric_depth
@@ -35,9 +35,11 @@ from data_pipeline.dataset.statistics import (
 )
 from data_pipeline.errors import DataError
 from data_pipeline.files import read_json, write_json
-from data_pipeline.objects.archives import ARCHIVES, download, download_folder, local
+from data_pipeline.objects.changes import changes_between, source_state
+from data_pipeline.objects.downloads import ARCHIVES, download, download_folder, local
+from data_pipeline.objects.formats import Up
 from data_pipeline.objects.mesh import SOURCE_SPLITS, ObjectEntry, ObjectSource
-from data_pipeline.objects.sources import mesh_zip, open_source
+from data_pipeline.objects.sources import Reading, mesh_zip, open_source
 from data_pipeline.progress import console, progress_bar
 from mevs_jax.entropy import level_entropy
 from mevs_jax.viewpoints import viewpoint_lattice
@@ -56,6 +58,10 @@ __all__ = [
     "split_objects",
     "view_entropies",
 ]
+
+
+SOURCE_STATE = "source.json"
+"""File name of the state of the source's files in the folder of a data set."""
 
 
 @dataclass(frozen=True)
@@ -77,19 +83,29 @@ class DataConfig:
     """seed of the split into training and validation"""
     skip_damaged: bool = False
     """leave damaged files out instead of stopping at the first one"""
+    up: Up = "auto"
+    """which axis of mesh files is up: the one that the format declares (glTF, COLLADA), else z (auto), or always z or y"""
+    split: str = ""
+    """for a folder or zip without train and test folders: the share of training objects of each class, such as 0.8, or a .json
+    or .csv list of splits"""
     capture: CaptureConfig = CaptureConfig()
 
 
 def split_objects(entries: Sequence[ObjectEntry], validation_share: float, seed: int) -> dict[str, list[ObjectEntry]]:
     """Returns the objects by split: the test objects of the source, and its training objects divided into train and val.
 
-    Every class has at least one object for training and, if it has two or more, at least one for validation.
+    Every class has at least one object for training and, if it has two or more, at least one for validation. If the source has
+    objects for validation of a class, these are used, and all its training objects are for training.
     """
     random = np.random.default_rng(seed)
-    split: dict[str, list[ObjectEntry]] = {"train": [], "val": [], "test": [e for e in entries if e.split == "test"]}
+    split: dict[str, list[ObjectEntry]] = {name: [e for e in entries if e.split == name] for name in ("val", "test")}
+    split = {"train": [], **split}
+    provided = {entry.label for entry in split["val"]}
     for label in sorted({entry.label for entry in entries}):
         members = [entry for entry in entries if entry.split == "train" and entry.label == label]
         aside = max(min(1, len(members) - 1), round(validation_share * len(members)))
+        if label in provided:
+            aside = 0
         chosen = set(random.permutation(len(members))[:aside].tolist())
         for index, entry in enumerate(members):
             split["val" if index in chosen else "train"].append(entry)
@@ -248,6 +264,7 @@ def _write_shards(
         viewpoints=viewpoint_lattice(config.capture.views, config.capture.lattice).tolist(),
         capture=asdict(config.capture),
         source=source.name,
+        notes=source.notes,
     )
 
 
@@ -261,12 +278,19 @@ def open_objects(config: DataConfig) -> ObjectSource:
     if official is None:
         if config.archive:
             raise DataError(f"--archive goes with --data {' or '.join(ARCHIVES)}, not with {config.source}")
-        return open_source(config.source, train_per_class=config.train_per_class, test_per_class=config.test_per_class)
+        return open_source(
+            config.source,
+            train_per_class=config.train_per_class,
+            test_per_class=config.test_per_class,
+            up=config.up,
+            split=config.split,
+            seed=config.seed,
+        )
     if config.archive:
         path = local(official, Path(config.archive).expanduser().resolve())
     else:
         path = download(official, download_folder())
-    source = mesh_zip(path)
+    source = mesh_zip(path, Reading(config.up, config.split, config.seed))
     counts = {split: sum(entry.split == split for entry in source.entries) for split in SOURCE_SPLITS}
     if (len(source.classes), counts["train"], counts["test"]) != (official.classes, official.train, official.test):
         console.print(
@@ -274,6 +298,60 @@ def open_objects(config: DataConfig) -> ObjectSource:
             f"{official.name} has {official.classes}, {official.train} and {official.test}"
         )
     return replace(source, name=official.name)
+
+
+def _identity(config: DataConfig) -> dict[str, Any]:
+    """Returns the settings that identify a data set. Later settings are left out at their defaults, as in older data sets."""
+    identity, default = asdict(config), asdict(DataConfig())
+    return {key: value for key, value in identity.items() if key not in ("up", "split") or value != default[key]}
+
+
+def _state(config: DataConfig) -> dict[str, str] | None:
+    """Returns the state of the source's files, or None if it has none or they are an official archive's."""
+    data = config.archive if config.source in ARCHIVES else config.source
+    return source_state(data, config.split) if data else None
+
+
+def _say_changes(config: DataConfig, folder: Path) -> None:
+    """Prints a sentence if the source has changed since the data set in `folder` was made."""
+    if not (folder / SOURCE_STATE).exists():
+        return
+    now = _state(config)
+    if now is not None and (changes := changes_between(read_json(folder / SOURCE_STATE), now)):
+        console.print(
+            f"{config.source} has changed since its data set was made ({changes}); {folder} keeps the objects as they were: "
+            f"delete it, or choose another --out, to capture them again",
+            style="yellow",
+            markup=False,
+        )
+
+
+def _check_classes(
+    config: DataConfig, source: ObjectSource, split: dict[str, list[ObjectEntry]], left_out: dict[str, str]
+) -> None:
+    """Raises DataError if no objects are left for a split, or for the training of a class."""
+    for name, members in split.items():
+        if not members:
+            raise DataError(f"{config.source} has no objects left for {name}; add some (left out: {len(left_out)})")
+    trained = {entry.label for entry in split["train"]}
+    for label, name in enumerate(source.classes):
+        if label not in trained:
+            gone = next(entry.name for entry in source.entries if entry.label == label and entry.name in left_out)
+            raise DataError(
+                f"{config.source} has no training objects of class {name} left ({gone}: {left_out[gone]}); add some, or remove "
+                f"the class"
+            )
+
+
+def _reasons(source: ObjectSource, left_out: dict[str, str]) -> dict[str, dict[str, str]]:
+    """Returns the names of all objects left out with the reasons, by split of the source; always for training and test."""
+    reasons = {}
+    for name in (*SOURCE_SPLITS, "val", "other"):
+        captured = {e.name: left_out[e.name] for e in source.entries if e.split == name and e.name in left_out}
+        found = captured | source.left_out.get(name, {})
+        if found or name in SOURCE_SPLITS:
+            reasons[name] = found
+    return reasons
 
 
 def prepare(config: DataConfig, folder: Path, beam: str | None = None) -> DatasetStatistics:
@@ -289,11 +367,16 @@ def prepare(config: DataConfig, folder: Path, beam: str | None = None) -> Datase
     """
     if config.capture.views < 2:
         raise DataError(f"--views {config.capture.views} is too few: choosing a next view needs at least 2 viewpoints")
+    check_camera(config.capture)
     try:
         viewpoint_lattice(config.capture.views, config.capture.lattice)
     except ValueError as error:
         raise DataError(f"{error}; choose another --views or --dataset.capture.lattice") from error
-    identity = asdict(config)
+    if not 0 <= config.validation_share < 1:
+        raise DataError(
+            f"--dataset.validation-share {config.validation_share:g} is not at least 0 and below 1; choose another"
+        )
+    identity = _identity(config)
     made_with = folder / "config.json"
     if made_with.exists() and read_json(made_with) != identity:
         was = read_json(made_with)
@@ -304,32 +387,29 @@ def prepare(config: DataConfig, folder: Path, beam: str | None = None) -> Datase
     captures = folder / "captures"
     if (folder / SUMMARY).exists():
         shutil.rmtree(captures, ignore_errors=True)  # left by a run that was stopped before it removed them
+        _say_changes(config, folder)
         return load_statistics(folder)
     options = None if beam is None else beam_options(beam)
-    source = open_objects(config)
+    source, state = open_objects(config), _state(config)
+    for sentence in source.said:
+        console.print(f"{config.source}: {sentence}", markup=False)
     folder.mkdir(parents=True, exist_ok=True)
     write_json(made_with, identity)
     if options is None:
         left_out = capture_all(source.entries, config.capture, captures, skip_damaged=config.skip_damaged)
     else:
         left_out = capture_by_beam(source.entries, config.capture, captures, options, skip_damaged=config.skip_damaged)
-    kept = [entry for entry in source.entries if entry.name not in left_out]
-    split = split_objects(kept, config.validation_share, config.seed)
-    for name, members in split.items():
-        if not members:
-            raise DataError(f"{config.source} has no objects left for {name}; add some (left out: {len(left_out)})")
-    reasons = {
-        name: {
-            entry.name: left_out[entry.name]
-            for entry in source.entries
-            if entry.split == name and entry.name in left_out
-        }
-        for name in SOURCE_SPLITS
-    }
+    split = split_objects(
+        [entry for entry in source.entries if entry.name not in left_out], config.validation_share, config.seed
+    )
+    _check_classes(config, source, split, left_out)
+    reasons = _reasons(source, left_out)
     shards = folder / "shards"
     shutil.rmtree(shards, ignore_errors=True)  # incomplete shards of an interrupted run
     statistics = _write_shards(source, split, reasons, config, captures, shards, options)
-    write_json(folder / SUMMARY, asdict(statistics))
+    if state is not None:
+        write_json(folder / SOURCE_STATE, state)
+    write_json(folder / SUMMARY, statistics.content())
     shutil.rmtree(captures, ignore_errors=True)
     return statistics
 

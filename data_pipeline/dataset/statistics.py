@@ -40,6 +40,7 @@ class DatasetStatistics:
         viewpoints: (views, 3) unit vectors.
         capture: the `CaptureConfig`, as a dictionary.
         source: name of the source of objects.
+        notes: sentences on how the files were read, such as which axis was up. Not stored where there are none.
     """
 
     classes: list[str]
@@ -57,6 +58,7 @@ class DatasetStatistics:
     viewpoints: list[list[float]]
     capture: dict[str, Any]
     source: str
+    notes: tuple[str, ...] = ()
 
     @property
     def views(self) -> int:
@@ -70,7 +72,14 @@ class DatasetStatistics:
     @property
     def fingerprint(self) -> str:
         """Hash of all statistics, which changes with the objects, the views or their order."""
-        return hashlib.sha256(json.dumps(asdict(self), sort_keys=True).encode()).hexdigest()[:16]
+        return hashlib.sha256(json.dumps(self.content(), sort_keys=True).encode()).hexdigest()[:16]
+
+    def content(self) -> dict[str, Any]:
+        """Returns what the summary file holds."""
+        content = asdict(self)
+        if not self.notes:
+            del content["notes"]
+        return content
 
     @property
     def left_out_count(self) -> int:
@@ -137,7 +146,8 @@ def load_statistics(folder: Path) -> DatasetStatistics:
     if not path.exists():
         raise DataError(f"no data set in {folder}; create one with: mevs data --out {os.path.dirname(folder) or '.'}")
     try:
-        return DatasetStatistics(**read_json(path))
+        content = read_json(path)
+        return DatasetStatistics(**content | {"notes": tuple(content.get("notes", ()))})
     except TypeError as error:
         raise DataError(
             f"{folder} was made by another version of mevs_jax; choose another --out, or delete it"
@@ -153,4 +163,6 @@ def report_left_out(statistics: DatasetStatistics) -> None:
     )
     for by_name in statistics.left_out.values():
         for name, reason in by_name.items():
-            console.print(f"  left out: {name}: {reason}", style="dim", soft_wrap=True)
+            console.print(f"  left out: {name}: {reason}", style="dim", soft_wrap=True, markup=False)
+    for note in statistics.notes:
+        console.print(f"  {note}", style="dim", soft_wrap=True, markup=False)

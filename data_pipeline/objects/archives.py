@@ -1,125 +1,162 @@
-"""The official ModelNet archives: downloaded with TFDS and verified, or read from a local file."""
+"""Zip archives of meshes, read in place and never unpacked.
+
+The central directory is read once in a process. Names may have backslashes, `./` and double slashes; of several members of one
+name the last counts, as for programs that unpack.
+"""
 
 from __future__ import annotations
 
-import hashlib
+import functools
 import os
-import urllib.error
-import urllib.request
+import posixpath
+import stat
+import zipfile
+from collections import Counter
 from dataclasses import dataclass
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 
-from data_pipeline.errors import DataError
-from data_pipeline.progress import console
+import numpy as np
 
-_TIMEOUT = 20.0
-"""Timeout in seconds of a first request to the server; without it, TFDS would retry for minutes."""
+from data_pipeline.errors import DamagedMesh, DataError
+from data_pipeline.objects.formats import MESH_SUFFIXES, Up, parse_mesh
+from data_pipeline.objects.layout import Found, Listing
+from data_pipeline.objects.names import is_ignored, kind_of_ignored, shown, unread_reason
+from data_pipeline.objects.recipes import within
+
+LARGEST_MEMBER = 256 << 20
+"""Largest unpacked size of a member in bytes. A small archive can declare, and unpack to, any size."""
+
+_METHODS = {9: "Deflate64", 93: "Zstandard", 95: "XZ", 96: "JPEG", 97: "WavPack", 98: "PPMd", 99: "AES encryption"}
+_READ_METHODS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED, zipfile.ZIP_BZIP2, zipfile.ZIP_LZMA)
+
+
+@functools.lru_cache(maxsize=4)
+def _opened(
+    archive: str, size: int, changed: int, process: int
+) -> tuple[zipfile.ZipFile, dict[str, zipfile.ZipInfo], int]:
+    """Returns an open archive, its files by path, and the number of members that others of the same path replace.
+
+    All arguments but the first only tell states of the file and processes apart, which must not share an open file.
+    """
+    del size, changed, process
+    opened = zipfile.ZipFile(archive)
+    members: dict[str, zipfile.ZipInfo] = {}
+    replaced = 0
+    for info in opened.infolist():
+        path = info.filename.replace("\\", "/")
+        if path.endswith("/"):  # a folder
+            continue
+        path = path if path.startswith("/") else posixpath.normpath(path) if ".." not in path.split("/") else path
+        replaced += path in members
+        members[path] = info
+    return opened, members, replaced
+
+
+def _open(archive: str) -> tuple[zipfile.ZipFile, dict[str, zipfile.ZipInfo], int]:
+    status = os.stat(archive)
+    return _opened(archive, status.st_size, status.st_mtime_ns, os.getpid())
 
 
 @dataclass(frozen=True)
-class Archive:
-    """A published data set in one file.
+class ZipMember:
+    """A mesh file in a zip archive.
 
     Attributes:
-        name: name of the data set.
-        url: address of the file.
-        sha256: checksum of the file.
-        size: size in bytes; None if only the server knows it.
-        classes, train, test: numbers of classes, training objects and test objects.
+        archive: path of the archive.
+        member: path of the file in it, as `_opened` gives it.
+        stamp: checksum and size of the file.
+        up: which axis of the file is up.
     """
 
-    name: str
-    url: str
-    sha256: str
-    size: int | None
-    classes: int
-    train: int
-    test: int
+    archive: str
+    member: str
+    stamp: str = ""
+    up: Up = "auto"
+
+    def load(self) -> tuple[np.ndarray, np.ndarray]:
+        where = f"{shown(self.member)} in {shown(self.archive)}"
+        content = self._content(self.member, where)
+        return parse_mesh(content, PurePosixPath(self.member).suffix.lower(), where, up=self.up, sibling=self._sibling)
+
+    def _sibling(self, name: str) -> bytes:
+        where = f"{shown(self.member)} in {shown(self.archive)} needs {shown(name)!r}, which"
+        return self._content(posixpath.normpath(str(PurePosixPath(self.member).parent / within(name, where))), where)
+
+    def _content(self, member: str, where: str) -> bytes:
+        try:
+            opened, members, _ = _open(self.archive)
+            info = members.get(member)
+            if info is None:
+                raise DamagedMesh(f"{where} is not in the archive; pack it again")
+            if reason := unreadable(info):
+                raise DamagedMesh(f"{where} {reason}")
+            with opened.open(info) as file:
+                content = file.read(LARGEST_MEMBER + 1)
+        except DataError:
+            raise
+        except Exception as error:  # damaged streams raise errors of zipfile, zlib, lzma, struct and others
+            reason = (f"{error}".splitlines() or [""])[0] or type(error).__name__
+            raise DamagedMesh(f"{where} cannot be unpacked ({reason}); download or pack the archive again") from error
+        if len(content) > LARGEST_MEMBER:
+            raise DamagedMesh(f"{where} {_too_large()}")
+        return content
 
 
-ARCHIVES = {
-    "modelnet10": Archive(
-        "ModelNet10",
-        "http://3dvision.princeton.edu/projects/2014/3DShapeNets/ModelNet10.zip",
-        "9d8679435fc07d1d26f13009878db164a7aa8ea5e7ea3c8880e42794b7307d51",
-        473_402_300,
-        classes=10,
-        train=3991,
-        test=908,
-    ),
-    "modelnet40": Archive(
-        "ModelNet40",
-        "http://modelnet.cs.princeton.edu/ModelNet40.zip",
-        "42dc3e656932e387f554e25a4eb2cc0e1a1bd3ab54606e2a9eae444c60e536ac",
-        None,
-        classes=40,
-        train=9843,
-        test=2468,
-    ),
-}
+def _too_large() -> str:
+    return f"unpacks to more than {LARGEST_MEMBER >> 20} MB; unpack the archive and pass the folder, if this is true"
 
 
-def sha256(path: Path) -> str:
-    """Returns the SHA-256 checksum of a file, in hexadecimal."""
-    with path.open("rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()
+def unreadable(info: zipfile.ZipInfo) -> str | None:
+    """Returns why a member cannot be read, with what to do, or None."""
+    if info.flag_bits & 1 or info.compress_type == 99:
+        return "is encrypted; unpack the archive with its password and pass the folder"
+    if info.compress_type not in _READ_METHODS:
+        method = _METHODS.get(info.compress_type, "unknown")
+        return (
+            f"is compressed with method {info.compress_type} ({method}), which Python cannot read; unpack the archive and pass "
+            f"the folder, or pack it again with: zip -r"
+        )
+    if info.file_size > LARGEST_MEMBER:
+        return _too_large()
+    if stat.S_ISLNK(info.external_attr >> 16):
+        return "is a link, which is not followed in an archive; pack the file itself (zip -r does)"
+    return None
 
 
-def download_folder() -> Path:
-    """Returns the download folder of TFDS: `$TFDS_DATA_DIR/downloads`, by default in `~/tensorflow_datasets`."""
-    return Path(os.environ.get("TFDS_DATA_DIR", "~/tensorflow_datasets")).expanduser() / "downloads"
-
-
-def download(archive: Archive, folder: Path) -> Path:
-    """Returns the path of an archive in `folder`, downloaded with TFDS if it is not there, with size and SHA-256 verified.
+def list_zip(archive: Path, up: Up = "auto") -> Listing:
+    """Returns the files of a zip archive.
 
     Raises:
-        DataError: if the download fails, or the size or SHA-256 differs.
+        DataError: if the archive is not readable, contains paths outside of it, or none of its meshes can be read.
     """
-    import requests
-    import tensorflow_datasets as tfds
-    from tensorflow_datasets.core.download.checksums import UrlInfo
-    from tensorflow_datasets.core.download.download_manager import NonMatchingChecksumError
-
-    for present in (folder / archive.name.lower()).glob("*.zip"):
-        if sha256(present) == archive.sha256:
-            return present
-    advice = f"download {archive.url} by other means and pass the file with --archive"
+    where = shown(str(archive))
     try:
-        with urllib.request.urlopen(urllib.request.Request(archive.url, method="HEAD"), timeout=_TIMEOUT) as response:
-            size = archive.size or int(response.headers["Content-Length"])
-        tfds.disable_progress_bar()
-        console.print(
-            f"Downloading {archive.name}, {size / 1e6:,.0f} MB, to {folder}; it is for academic research only"
-        )
-        manager = tfds.download.DownloadManager(
-            download_dir=folder,
-            dataset_name=archive.name.lower(),
-            url_infos={archive.url: UrlInfo(size, archive.sha256, archive.url.rsplit("/", 1)[-1])},
-            force_checksums_validation=True,
-        )
-        return Path(manager.download(archive.url))
-    except NonMatchingChecksumError as error:
-        raise DataError(
-            f"the file at {archive.url} is not {archive.name}: its size or SHA-256 differs; {advice}"
-        ) from error
-    except (urllib.error.URLError, requests.RequestException, OSError, TypeError) as error:
-        reason = str(getattr(error, "reason", error)).splitlines()[0]
-        raise DataError(f"{archive.name} could not be downloaded ({reason}); {advice}") from error
-
-
-def local(archive: Archive, path: Path) -> Path:
-    """Returns `path`, a local copy of the archive; prints a note if its checksum is not the official one.
-
-    Raises:
-        DataError: if the file cannot be read.
-    """
-    try:
-        digest = sha256(path)
-    except OSError as error:
-        raise DataError(f"--archive {path} cannot be read: {error.strerror}") from error
-    if digest != archive.sha256:
-        console.print(
-            f"{path} is not the official {archive.name} (SHA-256 {digest[:16]}…); it is used unchanged", style="dim"
-        )
-    return path
+        _, members, replaced = _open(str(archive))
+    except Exception as error:  # damaged directories raise errors of zipfile, struct and others
+        reason = (f"{error}".splitlines() or [""])[0] or type(error).__name__
+        raise DataError(f"{where} is not a readable zip file ({reason}); download it again") from error
+    found: list[Found] = []
+    ignored: Counter[str] = Counter()
+    hindered: list[str] = []
+    for name, info in members.items():
+        parts = PurePosixPath(name).parts
+        if name.startswith("/") or ".." in parts or (parts and ":" in parts[0]):
+            raise DataError(
+                f"{where} contains {shown(info.filename)!r}, a path that leaves its folder; do not trust this archive"
+            )
+        hidden = next((part for part in parts if is_ignored(part)), None)
+        if hidden is not None:
+            ignored[kind_of_ignored(hidden)] += 1
+            continue
+        place, identity = tuple(shown(part) for part in parts), (name,)
+        if PurePosixPath(name).suffix.lower() in MESH_SUFFIXES:
+            recipe = ZipMember(str(archive), name, f"{info.CRC:08x}-{info.file_size}", up)
+            found.append(Found(place, recipe, identity, False))
+            hindered += [reason] if (reason := unreadable(info)) else []
+        elif reason := unread_reason(name):
+            found.append(Found(place, None, identity, False, reason))
+    meshes = [one for one in found if one.recipe is not None]
+    if meshes and len(hindered) == len(meshes) and len(set(hindered)) == 1:
+        raise DataError(f"{where}: every mesh in it, such as {'/'.join(meshes[0].parts)}, {hindered[0]}")
+    notes = (f"{replaced} members of {archive.name} are there twice; the later ones count",) if replaced else ()
+    return Listing(tuple(sorted(found, key=lambda one: one.parts)), ignored, notes)

@@ -43,7 +43,7 @@ class Recipe(Protocol):
 
 @dataclass(frozen=True)
 class ObjectEntry:
-    """One object of a source: a unique name, its label, its split (`train` or `test`), and its recipe."""
+    """One object of a source: a unique name, its label, its split (`train`, `val` or `test`), and its recipe."""
 
     name: str
     label: int
@@ -53,11 +53,24 @@ class ObjectEntry:
 
 @dataclass(frozen=True)
 class ObjectSource:
-    """A list of objects with the name of the source and the names of the classes, in the order of the labels."""
+    """A list of objects.
+
+    Attributes:
+        name: name of the source.
+        classes: names of the classes, in the order of the labels.
+        entries: the objects.
+        left_out: files left out when the source was listed, by split and name, with the reasons. Files without a split are under
+            `other`.
+        notes: sentences on how files were read, for the summary of the data set.
+        said: sentences on files ignored by rule, only shown.
+    """
 
     name: str
     classes: tuple[str, ...]
     entries: tuple[ObjectEntry, ...]
+    left_out: dict[str, dict[str, str]] = field(default_factory=dict)
+    notes: tuple[str, ...] = ()
+    said: tuple[str, ...] = ()
 
 
 def normalise(vertices: np.ndarray, faces: np.ndarray, where: str) -> Mesh:

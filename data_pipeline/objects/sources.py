@@ -1,23 +1,53 @@
 """Sources of objects.
 
 A *source* lists objects. Each is an `ObjectEntry` whose `recipe` is small, picklable, and makes the mesh in the process that
-needs it. There are four sources: `furniture10` (procedural), a folder `<class>/{train,test}/*.off|obj|stl|ply|glb`, a zip
-archive of the same layout such as ModelNet's, and an archive of voxel grids. Capture workers import this module, so it must
-not import JAX, which would slow their start.
+needs it. There are four sources: `furniture10` (procedural), a folder of class folders, a zip archive of the same layout such as
+ModelNet's, and an archive of voxel grids. Capture workers import this module, so it must not import JAX, which would slow their
+start.
 """
 
 from __future__ import annotations
 
 import os
-import zipfile
+from collections import Counter
+from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 
-from data_pipeline.errors import DataError
-from data_pipeline.objects.formats import MESH_SUFFIXES
+from data_pipeline.errors import DataError, EmptyMesh
+from data_pipeline.objects.archives import list_zip
+from data_pipeline.objects.folders import list_folder
+from data_pipeline.objects.formats import AXIS_DECLARED, MESH_SUFFIXES, Up
 from data_pipeline.objects.furniture import CLASSES as FURNITURE_CLASSES
+from data_pipeline.objects.layout import (
+    SPLIT_FOLDERS,
+    Found,
+    Listing,
+    by_class_folders,
+    by_split_folders,
+    has_split_folders,
+    names_of,
+    without_copies,
+)
 from data_pipeline.objects.mesh import SOURCE_SPLITS, Mesh, ObjectEntry, ObjectSource, normalise
-from data_pipeline.objects.recipes import FurniturePiece, MeshFile, ZipMember
+from data_pipeline.objects.names import is_ignored, say_ignored, shown
+from data_pipeline.objects.recipes import FurniturePiece, MeshFile
+from data_pipeline.objects.splits import divide
 from data_pipeline.objects.voxels import voxel_archive
+
+
+@dataclass(frozen=True)
+class Reading:
+    """How the meshes of a folder or zip are read.
+
+    Attributes:
+        up: which axis of the files is up.
+        split: empty for folders of splits, a share of training objects, or the path of a list.
+        seed: seed of the choice by share.
+    """
+
+    up: Up = "auto"
+    split: str = ""
+    seed: int = 0
 
 
 def load_object(entry: ObjectEntry) -> Mesh:
@@ -51,103 +81,138 @@ def furniture10(train_per_class: int, test_per_class: int) -> ObjectSource:
     return ObjectSource("furniture10", FURNITURE_CLASSES, tuple(entries))
 
 
-def _layout(files: list[PurePosixPath], where: str) -> dict[tuple[str, str], list[PurePosixPath]]:
-    """Returns files by (class, split), from paths that end in `<class>/<train|test>/<file>`."""
-    found: dict[tuple[str, str], list[PurePosixPath]] = {}
-    for path in sorted(files):
-        if path.suffix.lower() in MESH_SUFFIXES and len(path.parts) >= 3 and path.parts[-2] in SOURCE_SPLITS:
-            found.setdefault((path.parts[-3], path.parts[-2]), []).append(path)
-    if not found:
-        raise DataError(
-            f"{where} has no meshes laid out as <class>/train/*.off and <class>/test/*.off "
-            f"(or {', '.join(MESH_SUFFIXES[1:])}); pass --data a folder that has"
-        )
-    return found
-
-
-def _entries(
-    found: dict[tuple[str, str], list[PurePosixPath]], recipe_of, where: str
-) -> tuple[tuple[str, ...], list[ObjectEntry]]:
-    """Returns the classes and entries of `found` (see `_layout`); `recipe_of` makes the recipe of a path."""
-    classes = tuple(sorted({name for name, _ in found}))
-    if len(classes) < 2:
-        raise DataError(f"{where} has one class only ({classes[0]}); add the folder of at least one other class")
-    entries = []
-    for (name, split), paths in sorted(found.items()):
-        for path in paths:
-            entries.append(ObjectEntry(f"{name}/{split}/{path.name}", classes.index(name), split, recipe_of(path)))
-    for name in classes:
-        for split in SOURCE_SPLITS:
-            if (name, split) not in found:
-                raise DataError(f"{where} has no meshes in {name}/{split}; add some, or remove the class folder")
-    return classes, entries
-
-
-def mesh_folder(folder: Path) -> ObjectSource:
-    """Returns the objects of a folder `<class>/{train,test}/*.{off,obj,stl,ply,glb}`, ModelNet's layout, at any depth.
+def _arranged(listing: Listing, name: str, where: str, reading: Reading) -> ObjectSource:
+    """Returns the source that the files of a folder or zip make.
 
     Raises:
-        DataError: if the layout differs, a class has no meshes for a split, or there are fewer than two classes.
+        DataError: if they have no known layout, a class has no meshes for a split, or there are fewer than two classes.
     """
-    files = [PurePosixPath(path.relative_to(folder).as_posix()) for path in sorted(folder.rglob("*")) if path.is_file()]
+    found = list(listing.found)
+    if not any(one.recipe is not None for one in found):
+        unread = f" ({len(found)} files cannot be read: {found[0].path} {found[0].reason})" if found else ""
+        raise DataError(
+            f"{where} has no meshes laid out as <class>/train/*.off and <class>/test/*.off "
+            f"(or {', '.join(MESH_SUFFIXES[1:])}){unread}; pass --data a folder that has"
+        )
+    with_splits = has_split_folders(found)
+    placed = by_split_folders(found) if with_splits else by_class_folders(found)
+    if reading.split:
+        placed = divide(placed, reading.split, reading.seed, where)
+    elif not with_splits:
+        classes = {one.class_name for one in placed if one.class_name}
+        raise DataError(
+            f"{where} has {len(found)} meshes in {len(classes)} class folders and no meshes laid out as <class>/train/*.off and "
+            f"<class>/test/*.off; add --dataset.split 0.8 to train on 80 % of each class, or a .json or .csv list of splits"
+        )
+    placed = sorted(without_copies(placed), key=lambda one: (one.class_name, one.split, one.parts))
+    members = [one for one in placed if one.recipe is not None and one.class_name and one.split]
+    _check_classes(placed, members, where)
+    classes = tuple(sorted({one.class_name for one in members}))
+    entries, left_out = [], {}
+    for one, unique in zip(placed, names_of(placed), strict=True):
+        if one.recipe is not None and one.class_name and one.split:
+            entries.append(ObjectEntry(unique, classes.index(one.class_name), one.split, one.recipe))
+        else:
+            reason = one.reason or "lies in no folder of a class with train, val or test"
+            left_out.setdefault(one.split or "other", {})[unique] = reason
+    said = (*say_ignored(listing.ignored), *listing.notes)
+    return ObjectSource(name, classes, tuple(entries), left_out, _axes(members, reading.up), said)
+
+
+def _check_classes(placed: list[Found], members: list[Found], where: str) -> None:
+    """Raises DataError if fewer than two classes have meshes, or a class lacks meshes of a split that it needs."""
+    classes = sorted({one.class_name for one in placed if one.class_name and one.split})
+    there = Counter((one.class_name, one.split) for one in members)
+    for name in classes:
+        if not any(there[name, split] for split in set(SPLIT_FOLDERS.values())):
+            first = next(one for one in placed if one.class_name == name)
+            raise DataError(
+                f"{where}: no file of class {name} can be read ({first.path} {first.reason}); mend or remove the class"
+            )
+    if len(classes) < 2:
+        only = classes[0] if classes else "none"
+        raise DataError(f"{where} has one class only ({only}); add the folder of at least one other class")
+    for name in classes:
+        for split in SOURCE_SPLITS:
+            if not there[name, split]:
+                raise DataError(f"{where} has no meshes in {name}/{split}; add some, or remove the class folder")
+
+
+def _axes(members: list[Found], up: Up) -> tuple[str, ...]:
+    """Returns a sentence on which axis of the files was taken as up, unless all were z up without being turned."""
+    counts = Counter(PurePosixPath(one.parts[-1]).suffix.lower() for one in members)
+    declared = sum(counts[suffix] for suffix in AXIS_DECLARED)
+    if up == "auto" and declared:
+        kinds = ", ".join(f"{counts[suffix]} {suffix}" for suffix in AXIS_DECLARED if counts[suffix])
+        others = f"; the other {len(members) - declared} were taken as z up" if declared < len(members) else ""
+        return (
+            f"{kinds} files were turned to z up from the axis that their format declares{others} (--dataset.up auto)",
+        )
+    return (f"all {len(members)} files were taken as {up} up (--dataset.up {up})",) if up != "auto" else ()
+
+
+def mesh_folder(folder: Path, reading: Reading = Reading()) -> ObjectSource:
+    """Returns the objects of a folder of class folders, at any depth.
+
+    Raises:
+        DataError: if the layout is not known, a class has no meshes for a split, or there are fewer than two classes.
+    """
+    listing = list_folder(folder, reading.up)
     for child in sorted(folder.iterdir()):
-        splits = [child / split for split in SOURCE_SPLITS if (child / split).is_dir()]
-        if child.is_dir() and not child.name.startswith(".") and not any(child.iterdir()):
+        if is_ignored(child.name) or not child.is_dir():
+            continue
+        if not any(child.iterdir()):
             raise DataError(f"class folder {child} is empty; put meshes into its train and test folders, or remove it")
-        for part in splits:
-            if not any(path.suffix.lower() in MESH_SUFFIXES for path in part.iterdir()):
+        for part in child.iterdir():
+            inside = (shown(child.name), shown(part.name))
+            if (
+                part.name.lower() in SPLIT_FOLDERS
+                and part.is_dir()
+                and not any(one.parts[:2] == inside for one in listing.found)
+            ):
                 raise DataError(f"class folder {part} is empty; add meshes, or remove the class folder")
-    found = _layout(files, str(folder))
-    classes, entries = _entries(found, lambda path: MeshFile(str(folder / path)), str(folder))
-    return ObjectSource(folder.name, classes, tuple(entries))
+    return _arranged(listing, shown(folder.name), shown(str(folder)), reading)
 
 
-def mesh_zip(archive: Path) -> ObjectSource:
+def mesh_zip(archive: Path, reading: Reading = Reading()) -> ObjectSource:
     """Returns the objects of a zip archive laid out as in `mesh_folder`, such as ModelNet10.zip; it is never unpacked.
 
     Raises:
         DataError: as `mesh_folder`, or if the archive is not readable or contains paths outside of it.
     """
-    try:
-        with zipfile.ZipFile(archive) as opened:
-            infos = [info for info in opened.infolist() if not info.is_dir()]
-    except (zipfile.BadZipFile, OSError) as error:
-        raise DataError(f"{archive} is not a readable zip file ({error}); download it again") from error
-    for info in infos:
-        path = PurePosixPath(info.filename.replace("\\", "/"))
-        if path.is_absolute() or ".." in path.parts or (path.parts and ":" in path.parts[0]):
-            raise DataError(
-                f"{archive} contains {info.filename!r}, a path that leaves its folder; do not trust this archive"
-            )
-    usable = [info for info in infos if "__MACOSX" not in info.filename]
-    found = _layout([PurePosixPath(info.filename) for info in usable], str(archive))
-    classes, entries = _entries(found, lambda path: ZipMember(str(archive), str(path)), str(archive))
-    return ObjectSource(archive.stem, classes, tuple(entries))
+    return _arranged(list_zip(archive, reading.up), shown(archive.stem), shown(str(archive)), reading)
 
 
-def open_source(data: str, *, train_per_class: int, test_per_class: int) -> ObjectSource:
+def open_source(
+    data: str, *, train_per_class: int, test_per_class: int, up: Up = "auto", split: str = "", seed: int = 0
+) -> ObjectSource:
     """Returns the source for `data`: `furniture10`, or the path of a folder, a .zip or an .npz.
 
     Raises:
         DataError: if the file does not exist or is not usable as a data set.
     """
+    path, reading = Path(os.path.expanduser(data)), Reading(up, split, seed)
+    if (split or up != "auto") and (data == "furniture10" or path.suffix.lower() == ".npz"):
+        raise DataError(f"--dataset.split and --dataset.up go with a folder or zip of meshes, not with {data}")
     if data == "furniture10":
         return furniture10(train_per_class, test_per_class)
-    path = Path(os.path.expanduser(data))
-    if not path.exists():
+    if not os.path.exists(path):
         raise DataError(
             f"no such file or folder: {data}; --data takes furniture10, modelnet10, modelnet40, a folder of class folders, "
             f"a .zip or a .npz"
         )
     if path.is_dir():
-        return mesh_folder(path.resolve())
+        return mesh_folder(path.resolve(), reading)
     if path.suffix.lower() == ".zip":
-        return mesh_zip(path.resolve())
+        return mesh_zip(path.resolve(), reading)
     if path.suffix.lower() == ".npz":
         return voxel_archive(path.resolve())
     if path.suffix.lower() in MESH_SUFFIXES:
-        vertices, faces = MeshFile(str(path)).load()  # raises if it is damaged
-        normalise(vertices, faces, str(path))
+        vertices, faces = MeshFile(str(path), up=up).load()  # raises if it is damaged
+        try:
+            normalise(vertices, faces, str(path))
+        except EmptyMesh as reason:
+            raise DataError(f"{data} cannot be used: {reason}; --data takes a folder of meshes with faces") from reason
         raise DataError(
             f"{data} is a single mesh; --data takes a folder laid out as <class>/train/*.off and <class>/test/*.off"
         )

@@ -3,17 +3,29 @@
 from __future__ import annotations
 
 import zipfile
+import zlib
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from typing import IO, Any
 
 import numpy as np
 
 from data_pipeline.errors import DataError, EmptyMesh
 from data_pipeline.objects.furniture import CLASSES as FURNITURE_CLASSES
 from data_pipeline.objects.mesh import SOURCE_SPLITS, ObjectEntry, ObjectSource
+from data_pipeline.objects.names import shown
 
 FEWEST_VOXELS = 5
 """Grids with fewer occupied cells are treated as empty."""
+
+LARGEST_GRIDS = 4 << 30
+"""Largest size in bytes of the unpacked grids of a split. They are read in parts and kept as one bit per cell."""
+
+LARGEST_LABELS = 64 << 20
+"""Largest size in bytes of unpacked labels or class names, and of grids in Fortran's order, which are not read in parts."""
+
+_BYTES_PER_PART = 16 << 20
 
 VOXEL_CLASSES = FURNITURE_CLASSES
 """Class names of an archive of ten classes, in alphabetical order, as its labels are."""
@@ -25,6 +37,11 @@ class VoxelGrid:
 
     bits: bytes
     side: int
+
+    @property
+    def stamp(self) -> str:
+        """Checksum of the grid. Captures of another grid of the same name are not used."""
+        return f"{zlib.crc32(self.bits):08x}"
 
     def load(self) -> tuple[np.ndarray, np.ndarray]:
         from skimage.measure import marching_cubes
@@ -40,37 +57,170 @@ class VoxelGrid:
 def voxel_archive(path: Path) -> ObjectSource:
     """Returns the objects of an .npz file of occupancy grids.
 
-    The file has cubic grids `X_train` and `X_test` (n, side, side, side) of 0 and 1, and labels `y_train` and `y_test`. With
-    labels 0 to 9 the classes are those of ModelNet10, in alphabetical order.
+    The file has cubic grids `X_train` and `X_test` (n, side, side, side), where a positive number is an occupied cell, and labels
+    `y_train` and `y_test` (n,). An optional array `classes` names the classes. Without it, ten classes are those of
+    ModelNet10, in alphabetical order. Nothing is unpickled.
 
     Raises:
-        DataError: if the file is not readable, an array is missing, or shapes do not match.
+        DataError: if the file is not readable, an array is missing or of another kind, shapes do not match, a split is empty, or
+            the labels are not 0 to n − 1.
     """
+    where = shown(str(path))
     try:
-        with np.load(path) as archive:
-            missing = [key for key in ("X_train", "y_train", "X_test", "y_test") if key not in archive.files]
+        with zipfile.ZipFile(path) as archive:
+            members = {info.filename.removesuffix(".npy"): info for info in archive.infolist()}
+            missing = [key for key in ("X_train", "y_train", "X_test", "y_test") if key not in members]
             if missing:
                 raise DataError(
-                    f"{path} has no {', '.join(missing)}; a voxel archive has X_train, y_train, X_test and y_test"
+                    f"{where} has no {', '.join(missing)}; a voxel archive has X_train, y_train, X_test and y_test"
                 )
-            grids = {split: archive[f"X_{split}"] for split in SOURCE_SPLITS}
-            labels = {split: archive[f"y_{split}"].astype(int).reshape(-1) for split in SOURCE_SPLITS}
-    except (zipfile.BadZipFile, OSError, EOFError, ValueError) as error:
-        if isinstance(error, DataError):
-            raise
-        raise DataError(f"{path} is not a readable .npz archive ({error}); download it again") from error
-    for split in SOURCE_SPLITS:
-        shape = grids[split].shape
-        if len(shape) != 4 or len(set(shape[1:])) != 1 or shape[0] != len(labels[split]):
-            raise DataError(
-                f"{path}: X_{split} has shape {shape}, expected (n, side, side, side) and n labels; correct the file"
-            )
+            named = _names(archive, members["classes"], where) if "classes" in members else None
+            labels = {split: _labels(archive, members[f"y_{split}"], where) for split in SOURCE_SPLITS}
+            classes = _classes(labels, named, where)
+            entries = []
+            for split in SOURCE_SPLITS:
+                grids = _grids(archive, members[f"X_{split}"], len(labels[split]), where)
+                for index, (recipe, label) in enumerate(zip(grids, labels[split].tolist(), strict=True)):
+                    entries.append(ObjectEntry(f"{classes[label]}_{split}_{index:04d}", label, split, recipe))
+    except DataError:
+        raise
+    except Exception as error:  # damaged archives raise errors of zipfile, zlib, struct, NumPy and others
+        reason = (str(error).splitlines() or [""])[0] or type(error).__name__
+        raise DataError(f"{where} is not a readable .npz archive ({reason}); download it again") from error
+    return ObjectSource(shown(path.stem), classes, tuple(entries))
+
+
+def _header(file: IO[bytes], what: str, where: str) -> tuple[tuple[int, ...], bool, np.dtype]:
+    """Returns the shape, Fortran order and type of an array from the head of its file."""
+    version = np.lib.format.read_magic(file)  # type: ignore[arg-type]
+    if version == (1, 0):
+        shape, fortran, kind = np.lib.format.read_array_header_1_0(file)  # type: ignore[arg-type]
+    elif version == (2, 0):
+        shape, fortran, kind = np.lib.format.read_array_header_2_0(file)  # type: ignore[arg-type]
+    else:
+        raise DataError(f"{where}: {what} has version {version} of the .npy format; save it with numpy.savez")
+    if kind.hasobject:
+        raise DataError(f"{where}: {what} holds Python objects, which are never unpickled; save numbers")
+    return shape, fortran, kind
+
+
+def _small_array(archive: zipfile.ZipFile, info: zipfile.ZipInfo, where: str) -> np.ndarray:
+    what = info.filename.removesuffix(".npy")
+    if info.file_size > LARGEST_LABELS:
+        raise DataError(f"{where}: {what} unpacks to more than {LARGEST_LABELS >> 20} MB; save it smaller")
+    with archive.open(info) as file:
+        shape, fortran, kind = _header(file, what, where)
+        content = file.read(LARGEST_LABELS + 1)
+    count = _product(shape)
+    if len(content) != count * kind.itemsize:
+        raise DataError(
+            f"{where}: {what} is cut short: {len(content)} of {count * kind.itemsize} bytes; download it again"
+        )
+    array = np.frombuffer(content, kind) if kind.itemsize else np.zeros(count, kind)
+    return array.reshape(shape, order="F" if fortran else "C")
+
+
+def _product(shape: tuple[int, ...]) -> int:
+    count = 1
+    for length in shape:
+        count *= length
+    return count
+
+
+def _names(archive: zipfile.ZipFile, info: zipfile.ZipInfo, where: str) -> tuple[str, ...]:
+    names = _small_array(archive, info, where)
+    if names.dtype.kind not in "US" or names.ndim != 1:
+        raise DataError(f"{where}: classes has type {names.dtype} and shape {names.shape}; give a list of strings")
+    found = tuple(name.decode("utf-8", "replace") if isinstance(name, bytes) else name for name in names.tolist())
+    if len(set(found)) < len(found) or not all(found) or not all(name.isprintable() for name in found):
+        raise DataError(f"{where}: classes has a name twice, an empty one, or one that cannot be printed; correct it")
+    return found
+
+
+def _labels(archive: zipfile.ZipFile, info: zipfile.ZipInfo, where: str) -> np.ndarray:
+    """Returns the labels of a split, (n,) int64."""
+    labels, what = _small_array(archive, info, where), info.filename.removesuffix(".npy")
+    if labels.dtype.kind in "US":
+        raise DataError(
+            f"{where}: {what} holds strings; give whole numbers from 0 on, and the names of the classes as an array `classes`"
+        )
+    if labels.ndim == 2 and labels.shape[1] > 1:
+        raise DataError(
+            f"{where}: {what} has shape {labels.shape}, as labels coded one-hot have; give one number for each object (argmax)"
+        )
+    if labels.dtype.kind not in "biuf" or labels.ndim not in (1, 2):
+        raise DataError(f"{where}: {what} has type {labels.dtype} and shape {labels.shape}; give whole numbers (n,)")
+    labels = labels.reshape(-1)
+    if not len(labels):
+        raise DataError(f"{where}: {what} is empty; a voxel archive needs training and test objects")
+    if not np.isfinite(labels).all() or (labels != np.floor(labels)).any():
+        raise DataError(f"{where}: {what} has labels that are not whole numbers; give whole numbers from 0 on")
+    if labels.min() < 0:
+        raise DataError(
+            f"{where}: {what} has the label {int(labels.min())}, and {int((labels < 0).sum())} labels below 0; take objects without "
+            f"a class out, and number the classes from 0 on"
+        )
+    if labels.max() > 2**31:
+        raise DataError(f"{where}: {what} has the label {int(labels.max())}; number the classes from 0 on")
+    return labels.astype(np.int64)
+
+
+def _classes(labels: dict[str, np.ndarray], named: tuple[str, ...] | None, where: str) -> tuple[str, ...]:
+    """Returns the names of the classes after a check that every class has training objects."""
+    present = np.unique(labels["train"])
     count = max(int(labels[split].max()) for split in SOURCE_SPLITS) + 1
-    classes = VOXEL_CLASSES if count == len(VOXEL_CLASSES) else tuple(f"class_{i}" for i in range(count))
-    entries = []
-    for split in SOURCE_SPLITS:
-        packed = np.packbits(grids[split].reshape(len(grids[split]), -1) > 0, axis=1)
-        for index, (bits, label) in enumerate(zip(packed, labels[split], strict=True)):
-            recipe = VoxelGrid(bits.tobytes(), grids[split].shape[1])
-            entries.append(ObjectEntry(f"{classes[label]}_{split}_{index:04d}", int(label), split, recipe))
-    return ObjectSource(path.stem, classes, tuple(entries))
+    if named is not None and count != len(named):
+        raise DataError(
+            f"{where}: classes has {len(named)} names, and the labels go up to {count - 1}; correct one of them"
+        )
+    if len(present) < count:
+        absent = next(label for label in range(count) if label >= len(present) or present[label] != label)
+        advice = (
+            "subtract 1 from all labels"
+            if absent == 0 and len(present) == count - 1
+            else "number the classes from 0 on"
+        )
+        raise DataError(
+            f"{where}: labels go up to {count - 1}, and no training object has the label {absent}; {advice}"
+        )
+    if count < 2:
+        raise DataError(f"{where} has one class only; add objects of at least one other class")
+    if named is not None:
+        return named
+    return VOXEL_CLASSES if count == len(VOXEL_CLASSES) else tuple(f"class_{i}" for i in range(count))
+
+
+def _grids(archive: zipfile.ZipFile, info: zipfile.ZipInfo, count: int, where: str) -> Iterator[VoxelGrid]:
+    """Returns the grids of a split, read in parts."""
+    what = info.filename.removesuffix(".npy")
+    with archive.open(info) as file:
+        shape, fortran, kind = _header(file, what, where)
+        if len(shape) != 4 or len(set(shape[1:])) != 1 or shape[0] != count:
+            raise DataError(
+                f"{where}: {what} has shape {shape}, expected ({count}, side, side, side) for {count} labels; correct the file"
+            )
+        if kind.kind not in "biuf":
+            raise DataError(f"{where}: {what} has type {kind}; give grids of 0 and 1")
+        side = shape[1]
+        size = side**3 * kind.itemsize
+        limit = LARGEST_LABELS if fortran or size > LARGEST_LABELS else LARGEST_GRIDS
+        if not side or size * count > limit:
+            raise DataError(
+                f"{where}: {what} has {count} grids of {side}³ cells as {kind}, which is nothing or more than {limit >> 20} MB; save "
+                f"smaller ones as uint8"
+            )
+        per_part = count if fortran else max(1, _BYTES_PER_PART // size)
+        for first in range(0, count, per_part):
+            part = min(per_part, count - first)
+            content = file.read(part * size)
+            if len(content) < part * size:
+                raise DataError(f"{where}: {what} is cut short: {first} of {count} grids are there; download it again")
+            grids: Any = np.frombuffer(content, kind)
+            grids = grids.reshape(shape, order="F") if fortran else grids
+            grids = grids.reshape(part, -1)
+            if kind.kind == "f" and not np.isfinite(grids).all():
+                raise DataError(f"{where}: {what} has cells that are not finite (NaN or infinite); correct the file")
+            for bits in np.packbits(grids > 0, axis=1):
+                yield VoxelGrid(bits.tobytes(), side)
+        if file.read(1):
+            raise DataError(f"{where}: {what} is longer than its shape {shape}; save it again with numpy.savez")

@@ -1,0 +1,57 @@
+"""Names of files: how they are shown, and which are ignored."""
+
+from __future__ import annotations
+
+import os
+from collections import Counter
+from pathlib import PurePosixPath
+
+from data_pipeline.objects.formats import MESH_SUFFIXES, UNREAD_SUFFIXES
+
+_PACKED = (".gz", ".bz2", ".xz", ".zst")
+
+
+def shown(name: str) -> str:
+    """Returns a path as printable text: bytes that are not UTF-8 and control characters become escapes such as `\\xfc`."""
+    text = os.fsencode(name).decode("utf-8", "backslashreplace") if not _is_unicode(name) else name
+    if text.isprintable():
+        return text
+    return "".join(c if c.isprintable() else c.encode("unicode_escape").decode("ascii") for c in text)
+
+
+def _is_unicode(name: str) -> bool:
+    try:
+        name.encode()
+    except UnicodeEncodeError:
+        return False
+    return True
+
+
+def is_ignored(name: str) -> bool:
+    """Returns whether a file or folder is ignored by rule: what macOS adds to folders and archives, and hidden files."""
+    return name.startswith(".") or name == "__MACOSX"
+
+
+def unread_reason(name: str) -> str | None:
+    """Returns why a file is left out whose name is that of a mesh in a format that is not read; None for other files."""
+    path = PurePosixPath(name.lower())
+    if path.suffix in UNREAD_SUFFIXES:
+        return f"is a {path.suffix} file, which is not read; convert it to .glb, .obj or .ply"
+    if path.suffix in _PACKED and PurePosixPath(path.stem).suffix in (*MESH_SUFFIXES, *UNREAD_SUFFIXES):
+        return f"is compressed ({path.suffix}); unpack it"
+    return None
+
+
+def say_ignored(ignored: Counter[str]) -> tuple[str, ...]:
+    """Returns a sentence on the files and folders ignored by rule, if there are any; `ignored` counts them by kind."""
+    if not ignored:
+        return ()
+    kinds = ", ".join(f"{count} × {kind}" for kind, count in sorted(ignored.items()))
+    return (f"ignored by rule: {kinds}",)
+
+
+def kind_of_ignored(name: str) -> str:
+    """Returns the kind under which an ignored file or folder is counted."""
+    if name in (".DS_Store", "__MACOSX") or name.startswith("._"):
+        return name if not name.startswith("._") else "._*"
+    return "hidden"

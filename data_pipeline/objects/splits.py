@@ -1,0 +1,170 @@
+"""The option `--dataset.split`: training and test objects of a source without such folders, by share or by list."""
+
+from __future__ import annotations
+
+import csv
+import json
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from data_pipeline.errors import DataError
+from data_pipeline.objects.layout import SPLIT_FOLDERS, Found
+
+_NAME_COLUMNS = ("path", "name", "file", "filename", "object", "model", "modelid", "model_id", "id", "object_id", "uid")
+_KEYS = 5
+"""Number of keys by which a list may name a file, see `_keys`."""
+
+
+def divide(found: Sequence[Found], option: str, seed: int, where: str) -> list[Found]:
+    """Returns the files that have a class with the split that the option gives them.
+
+    Args:
+        found: files, with their classes.
+        option: a share of training objects such as `0.8`, or the path of a JSON or CSV list.
+        seed: seed of the choice by share.
+        where: name of the source for error messages.
+
+    Raises:
+        DataError: if the option is neither, or a class has too few objects.
+    """
+    try:
+        share = float(option)
+    except ValueError:
+        return _by_list(found, Path(option).expanduser())
+    if not 0 < share < 1:
+        raise DataError(
+            f"--dataset.split {option} is no share of training objects; give a number between 0 and 1, such as 0.8"
+        )
+    return _by_share(found, share, seed, where)
+
+
+def _group(one: Found) -> tuple[str, ...]:
+    """Returns what files of one object share: their folder below the class, or their name without suffix in its folder."""
+    at = one.parts.index(one.class_name, one.head)
+    below = [part for part in one.parts[at + 1 :] if part.lower() not in SPLIT_FOLDERS or part == one.parts[-1]]
+    if len(below) == 1:
+        return (*one.parts[: at + 1], below[0].rsplit(".", 1)[0])
+    return (*one.parts[: at + 1], below[0])
+
+
+def _by_share(found: Sequence[Found], share: float, seed: int, where: str) -> list[Found]:
+    """Divides the objects of each class at random; all files of an object's folder go together."""
+    groups = {id(one): _group(one) for one in found if one.class_name}
+    training: set[tuple[str, ...]] = set()
+    random = np.random.default_rng(seed)
+    for name in sorted({one.class_name for one in found if one.class_name}):
+        own = sorted({groups[id(one)] for one in found if one.class_name == name and one.recipe is not None})
+        if not own:
+            continue
+        if len(own) < 2:
+            raise DataError(
+                f"{where}: class {name} has {len(own)} object, and --dataset.split needs 2 or more; add some, or remove the class"
+            )
+        count = min(max(round(share * len(own)), 1), len(own) - 1)
+        training |= {own[at] for at in random.permutation(len(own))[:count]}
+    return [
+        replace(one, split="train" if groups[id(one)] in training else "test")
+        if id(one) in groups
+        else replace(one, split="")
+        for one in found
+    ]
+
+
+def _keys(one: Found) -> list[list[str]]:
+    """Returns the names by which a list may name a file, in the order in which they are tried."""
+    stem = one.parts[-1].rsplit(".", 1)[0]
+    below = one.parts[one.head :]
+    return [
+        [one.path, "/".join(below)],
+        [one.path.rsplit(".", 1)[0], "/".join(below).rsplit(".", 1)[0], "/".join(one.parts[:-1]), "/".join(below[:-1])],
+        [one.parts[-1]],
+        [stem],
+        list(one.parts[one.parts.index(one.class_name, one.head) + 1 : -1]),
+    ]
+
+
+def _by_list(found: Sequence[Found], path: Path) -> list[Found]:
+    listed = _read_list(path)
+    inside = [one for one in found if one.class_name]
+    keys = {id(one): _keys(one) for one in inside}
+    split: dict[int, str] = {}
+    named: set[str] = set()
+    for rank in range(_KEYS):
+        for one in inside:
+            if id(one) in split:
+                continue
+            hits = {key for key in keys[id(one)][rank] if key in listed}
+            if len({listed[key] for key in hits}) == 1:
+                split[id(one)] = listed[next(iter(hits))]
+                named |= hits
+    used = Counter(split.values())
+    if not used["train"] or not used["test"]:
+        raise DataError(
+            f"{path} names {used['train']} training and {used['test']} test objects of this source; list paths such as "
+            f"{inside[0].path if inside else 'class/object.off'}"
+        )
+    return [
+        replace(one, split=split[id(one)])
+        if id(one) in split
+        else replace(one, split="", recipe=None, reason=one.reason or f"is not in {path.name}")
+        for one in found
+    ]
+
+
+def _read_list(path: Path) -> Mapping[str, str]:
+    """Returns the split of each name in a JSON or CSV list.
+
+    JSON is `{"train": [names], "test": [names]}` or `{name: split}`; CSV has a column `split` and one with names.
+
+    Raises:
+        DataError: if the file cannot be read, has another form, or has a name in two splits.
+    """
+    if path.suffix.lower() not in (".json", ".csv"):
+        raise DataError(
+            f"--dataset.split {path} is neither a share such as 0.8 nor a .json or .csv list; give one of them"
+        )
+    try:
+        text = path.read_text(encoding="utf-8-sig")
+        pairs = _json_pairs(json.loads(text)) if path.suffix.lower() == ".json" else _csv_pairs(text)
+    except (OSError, ValueError, KeyError, csv.Error, RecursionError) as error:
+        if isinstance(error, DataError):
+            raise
+        reason = getattr(error, "strerror", None) or str(error).splitlines()[0]
+        raise DataError(
+            f"--dataset.split {path} cannot be read ({reason}); give a JSON object of lists train and test, or a CSV table with "
+            f"columns name and split"
+        ) from error
+    listed: dict[str, str] = {}
+    for name, split in pairs:
+        given = SPLIT_FOLDERS.get(str(split).strip().lower())
+        if given is None:
+            raise DataError(f"{path} has the split {str(split)[:40]!r} for {name!r}; give train, val or test")
+        key = str(name).strip().replace("\\", "/").removeprefix("./")
+        if listed.setdefault(key, given) != given:
+            raise DataError(f"{path} has {key!r} in {listed[key]} and in {given}; keep it in one of them")
+    return listed
+
+
+def _json_pairs(content: Any) -> list[tuple[Any, Any]]:
+    if not isinstance(content, dict):
+        raise ValueError("it is no object")
+    if all(isinstance(names, list) for names in content.values()):
+        return [(name, split) for split, names in content.items() for name in names]
+    return list(content.items())
+
+
+def _csv_pairs(text: str) -> list[tuple[Any, Any]]:
+    rows = [row for row in csv.reader(text.splitlines()) if row]
+    if not rows:
+        raise ValueError("it is empty")
+    columns = [title.strip().lower() for title in rows[0]]
+    names = [title for title in _NAME_COLUMNS if title in columns]
+    if "split" not in columns or not names:
+        raise ValueError("its first line has no titles name and split")
+    title, at = columns.index(names[0]), columns.index("split")
+    return [(row[title], row[at]) for row in rows[1:] if len(row) > max(title, at)]
