@@ -138,8 +138,8 @@ def check_camera(config: CaptureConfig) -> None:
     farthest = 65535 / DEPTH_SCALE - 1  # the unit sphere ends one radius behind its centre
     if not 1 < config.distance <= farthest:
         raise DataError(
-            f"--dataset.capture.distance {config.distance:g} is not above 1 (the radius of an object) and at most {farthest:.2f}, "
-            f"since depth is stored in 16 bits, up to {farthest + 1:.2f} radii; choose another"
+            f"--dataset.capture.distance {config.distance:g} is not above 1 (the radius of an object) and at most "
+            f"{farthest:.2f}, since depth is stored in 16 bits, up to {farthest + 1:.2f} radii; choose another"
         )
     if not 0 < config.field_of_view < 180:
         raise DataError(

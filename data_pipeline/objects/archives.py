@@ -133,7 +133,7 @@ def list_zip(archive: Path, up: Up = "auto") -> Listing:
     try:
         _, members, replaced = _open(str(archive))
     except Exception as error:  # damaged directories raise errors of zipfile, struct and others
-        reason = (f"{error}".splitlines() or [""])[0] or type(error).__name__
+        reason: str = (f"{error}".splitlines() or [""])[0] or type(error).__name__
         raise DataError(f"{where} is not a readable zip file ({reason}); download it again") from error
     found: list[Found] = []
     ignored: Counter[str] = Counter()
@@ -152,9 +152,10 @@ def list_zip(archive: Path, up: Up = "auto") -> Listing:
         if PurePosixPath(name).suffix.lower() in MESH_SUFFIXES:
             recipe = ZipMember(str(archive), name, f"{info.CRC:08x}-{info.file_size}", up)
             found.append(Found(place, recipe, identity, False))
-            hindered += [reason] if (reason := unreadable(info)) else []
-        elif reason := unread_reason(name):
-            found.append(Found(place, None, identity, False, reason))
+            hindrance = unreadable(info)
+            hindered += [hindrance] if hindrance else []
+        elif unread := unread_reason(name):
+            found.append(Found(place, None, identity, False, unread))
     meshes = [one for one in found if one.recipe is not None]
     if meshes and len(hindered) == len(meshes) and len(set(hindered)) == 1:
         raise DataError(f"{where}: every mesh in it, such as {'/'.join(meshes[0].parts)}, {hindered[0]}")

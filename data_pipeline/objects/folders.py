@@ -31,6 +31,7 @@ def list_folder(root: Path, up: Up = "auto") -> Listing:
         os.listdir(root)
     except OSError as error:
         raise DataError(f"{shown(str(root))} cannot be read: {error.strerror}; choose another --data") from error
+    todo: list[tuple[str, tuple[str, ...], tuple[tuple[int, int], ...], bool]]
     todo = [(str(root), (), ((status.st_dev, status.st_ino),), False)]
     while todo:
         folder, parts, above, linked = todo.pop()

@@ -99,16 +99,17 @@ def _arranged(listing: Listing, name: str, where: str, reading: Reading) -> Obje
     if reading.split:
         placed = divide(placed, reading.split, reading.seed, where)
     elif not with_splits:
-        classes = {one.class_name for one in placed if one.class_name}
+        folders = {one.class_name for one in placed if one.class_name}
         raise DataError(
-            f"{where} has {len(found)} meshes in {len(classes)} class folders and no meshes laid out as <class>/train/*.off and "
+            f"{where} has {len(found)} meshes in {len(folders)} class folders and no meshes laid out as <class>/train/*.off and "
             f"<class>/test/*.off; add --dataset.split 0.8 to train on 80 % of each class, or a .json or .csv list of splits"
         )
     placed = sorted(without_copies(placed), key=lambda one: (one.class_name, one.split, one.parts))
     members = [one for one in placed if one.recipe is not None and one.class_name and one.split]
     _check_classes(placed, members, where)
     classes = tuple(sorted({one.class_name for one in members}))
-    entries, left_out = [], {}
+    entries: list[ObjectEntry] = []
+    left_out: dict[str, dict[str, str]] = {}
     for one, unique in zip(placed, names_of(placed), strict=True):
         if one.recipe is not None and one.class_name and one.split:
             entries.append(ObjectEntry(unique, classes.index(one.class_name), one.split, one.recipe))

@@ -92,11 +92,11 @@ def voxel_archive(path: Path) -> ObjectSource:
 
 def _header(file: IO[bytes], what: str, where: str) -> tuple[tuple[int, ...], bool, np.dtype]:
     """Returns the shape, Fortran order and type of an array from the head of its file."""
-    version = np.lib.format.read_magic(file)  # type: ignore[arg-type]
+    version = np.lib.format.read_magic(file)
     if version == (1, 0):
-        shape, fortran, kind = np.lib.format.read_array_header_1_0(file)  # type: ignore[arg-type]
+        shape, fortran, kind = np.lib.format.read_array_header_1_0(file)
     elif version == (2, 0):
-        shape, fortran, kind = np.lib.format.read_array_header_2_0(file)  # type: ignore[arg-type]
+        shape, fortran, kind = np.lib.format.read_array_header_2_0(file)
     else:
         raise DataError(f"{where}: {what} has version {version} of the .npy format; save it with numpy.savez")
     if kind.hasobject:
@@ -157,8 +157,8 @@ def _labels(archive: zipfile.ZipFile, info: zipfile.ZipInfo, where: str) -> np.n
         raise DataError(f"{where}: {what} has labels that are not whole numbers; give whole numbers from 0 on")
     if labels.min() < 0:
         raise DataError(
-            f"{where}: {what} has the label {int(labels.min())}, and {int((labels < 0).sum())} labels below 0; take objects without "
-            f"a class out, and number the classes from 0 on"
+            f"{where}: {what} has the label {int(labels.min())}, and {int((labels < 0).sum())} labels below 0; take objects "
+            f"without a class out, and number the classes from 0 on"
         )
     if labels.max() > 2**31:
         raise DataError(f"{where}: {what} has the label {int(labels.max())}; number the classes from 0 on")
@@ -206,8 +206,8 @@ def _grids(archive: zipfile.ZipFile, info: zipfile.ZipInfo, count: int, where: s
         limit = LARGEST_LABELS if fortran or size > LARGEST_LABELS else LARGEST_GRIDS
         if not side or size * count > limit:
             raise DataError(
-                f"{where}: {what} has {count} grids of {side}³ cells as {kind}, which is nothing or more than {limit >> 20} MB; save "
-                f"smaller ones as uint8"
+                f"{where}: {what} has {count} grids of {side}³ cells as {kind}, which is nothing or more than {limit >> 20} MB; "
+                f"save smaller ones as uint8"
             )
         per_part = count if fortran else max(1, _BYTES_PER_PART // size)
         for first in range(0, count, per_part):
