@@ -336,9 +336,9 @@ def _check_classes(
     trained = {entry.label for entry in split["train"]}
     for label, name in enumerate(source.classes):
         if label not in trained:
-            gone = next(entry.name for entry in source.entries if entry.label == label and entry.name in left_out)
+            gone = next(entry.name for entry in source.entries if entry.label == label and entry.split == "train")
             raise DataError(
-                f"{config.source} has no training objects of class {name} left ({gone}: {left_out[gone]}); add some, or remove "
+                f"{config.source} has no training objects of class {name} left ({gone}: {left_out.get(gone, 'is for validation')}); add some, or remove "
                 f"the class"
             )
 
