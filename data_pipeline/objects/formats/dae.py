@@ -45,7 +45,7 @@ def _parse(content: bytes, where: str) -> tuple[np.ndarray, np.ndarray, str]:
     parts: list[tuple[np.ndarray, np.ndarray]] = []
     corners = first = 0
     for primitive in found:
-        primitive = getattr(primitive, "primitive", primitive) if not hasattr(primitive, "vertex") else primitive
+        primitive = getattr(primitive, "primitive", primitive)  # of a skin
         if isinstance(primitive, collada.lineset.LineSet | collada.lineset.BoundLineSet):
             continue
         if primitive.vertex is None or primitive.vertex_index is None:
@@ -55,10 +55,10 @@ def _parse(content: bytes, where: str) -> tuple[np.ndarray, np.ndarray, str]:
         corners += indices.size
         if corners > MOST_CORNERS:
             raise DamagedMesh(f"{where} unfolds to more than {MOST_CORNERS:,} corners; export a simpler mesh")
-        if indices.ndim == 2:
+        if indices.ndim == 2:  # triangles
             counts = np.full(len(indices), indices.shape[1])
         else:
-            counts = np.asarray(primitive.polyends) - np.asarray(primitive.polystarts)
+            counts = np.diff(np.asarray(primitive.polyindex, np.int64).reshape(-1, 2), axis=1)[:, 0]
         triangles = triangulate(vertices, indices.reshape(-1), counts, where)
         parts.append((vertices, triangles + first))
         first += len(vertices)

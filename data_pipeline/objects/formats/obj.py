@@ -8,7 +8,7 @@ import numpy as np
 
 from data_pipeline.errors import DamagedMesh
 from data_pipeline.objects.formats.polygons import triangulate
-from data_pipeline.objects.formats.text import columns, integers, text_of
+from data_pipeline.objects.formats.text import COMMENT, columns, integers, text_of
 
 _VERTEX = re.compile(r"^[ \t]*v[ \t]+(.*)$", re.MULTILINE)
 _FACE = re.compile(r"^[ \t]*fo?[ \t]+(.*)$", re.MULTILINE)
@@ -24,7 +24,7 @@ def parse_obj(content: bytes, where: str) -> tuple[np.ndarray, np.ndarray]:
     """
     text = text_of(content, "an OBJ", where)
     if "#" in text:
-        text = re.sub(r"#.*", "", text)
+        text = COMMENT.sub("", text)
     if "\\" in text:
         text = re.sub(r"\\[ \t]*\n", " ", text)  # a statement may go on in the next line
     vertex_lines, face_lines = _VERTEX.findall(text), _FACE.findall(text)

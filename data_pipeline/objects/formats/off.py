@@ -8,10 +8,10 @@ import numpy as np
 
 from data_pipeline.errors import DamagedMesh
 from data_pipeline.objects.formats.polygons import triangulate
-from data_pipeline.objects.formats.text import columns, integers, text_of
+from data_pipeline.objects.formats.text import COMMENT, columns, integers, text_of
 
 _HEADER = re.compile(
-    r"(?i:ST)?[Cc]?(?P<normals>[Nn])?(?P<homogeneous>4)?(?P<dimensions>n)?(?i:OFF)(?P<rest>.*)", re.DOTALL
+    r"(?i:ST)?[Cc]?(?P<normals>N|n(?=off))?(?P<homogeneous>4)?(?P<dimensions>n)?(?i:OFF)(?P<rest>.*)", re.DOTALL
 )
 
 
@@ -30,7 +30,7 @@ def parse_off(content: bytes, where: str) -> tuple[np.ndarray, np.ndarray]:
     text = text_of(content, "an OFF", where)
     lines = text.split("\n")
     if "#" in text:
-        lines = [line.partition("#")[0] for line in lines]
+        lines = [COMMENT.sub("", line) if "#" in line else line for line in lines]
     lines = [line for line in lines if line and not line.isspace()]
     header = _HEADER.match(lines[0].strip()) if lines else None
     if header is None:

@@ -13,6 +13,9 @@ from data_pipeline.errors import DamagedMesh
 _NOT_A_NUMBER = re.compile(r"[+-]?(nan(\(.*\))?|\d+\.#(QNAN|SNAN|IND|R)\d*)", re.IGNORECASE)
 """Spellings of NaN that C libraries print, such as `-nan(ind)` and `1.#QNAN`; `float` reads only `nan`."""
 
+COMMENT = re.compile(r"(?<!\d\.)#.*")
+"""A comment to the end of its line, as against a spelling of NaN."""
+
 
 def text_of(content: bytes, kind: str, where: str) -> str:
     """Returns the text of a file with line ends as `\\n`.
