@@ -37,6 +37,8 @@ def parse_obj(content: bytes, where: str) -> tuple[np.ndarray, np.ndarray]:
     except ValueError as error:
         raise DamagedMesh(f"{where} is not a readable .obj mesh: {error}; repair it or take it away") from error
     counts = np.array([len(line.split()) for line in face_lines], np.int64)
+    if counts.sum() != len(corners):  # such as `- 6`, or a corner without a vertex
+        raise DamagedMesh(f"{where} has a face whose corners are not whole numbers; repair it or take it away")
     if len(counts) and counts[-1] < 3 and _FACE.findall(text[text.rstrip().rfind("\n") + 1 :]):
         raise DamagedMesh(f"{where} is cut short: its last face has {counts[-1]} corners; fetch or export it again")
     if (corners == 0).any():

@@ -41,7 +41,8 @@ def parse_stl(content: bytes, where: str) -> tuple[np.ndarray, np.ndarray]:
 
 def _parse_binary(content: bytes, count: int) -> tuple[np.ndarray, np.ndarray]:
     corners = np.frombuffer(content, _TRIANGLE, count, offset=84)["corners"]
-    return corners.reshape(-1, 3).astype(np.float64), np.arange(3 * count).reshape(-1, 3)
+    with np.errstate(invalid="ignore"):  # NaN, which the normalisation refuses
+        return corners.reshape(-1, 3).astype(np.float64), np.arange(3 * count).reshape(-1, 3)
 
 
 def _parse_text(content: bytes, where: str) -> tuple[np.ndarray, np.ndarray]:
