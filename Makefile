@@ -44,3 +44,7 @@ $(READY): requirements.lock pyproject.toml
 
 clean:  ## environment and builds; runs/ stays
 	rm -rf .venv dist
+
+.PHONY: fuzz
+fuzz: $(READY)  ## 20,000 mutated inputs for each reader of foreign files
+	$(BIN)/python -m tests.fuzz.run

@@ -337,8 +337,9 @@ def _check_classes(
     for label, name in enumerate(source.classes):
         if label not in trained:
             gone = next(entry.name for entry in source.entries if entry.label == label and entry.split == "train")
+            reason = left_out.get(gone, "is for validation")
             raise DataError(
-                f"{config.source} has no training objects of class {name} left ({gone}: {left_out.get(gone, 'is for validation')}); add some, or remove "
+                f"{config.source} has no training objects of class {name} left ({gone}: {reason}); add some, or remove "
                 f"the class"
             )
 

@@ -1,8 +1,8 @@
 """Long fuzzing: `python -m tests.fuzz.run [--inputs 20000] [--seed 0] [reader …]`, or `make fuzz`.
 
 Each reader runs in a process of its own, so that one that ends by a signal is noticed. For each the program prints the number of
-inputs, the longest time of one and the largest memory of the process, and ends with 1 if any went wrong. The input that went wrong
-is written to the current folder.
+inputs, the longest time of one and the largest memory of the process, and ends with 1 if any went wrong. An input that went
+wrong is left in the current folder.
 """
 
 from __future__ import annotations
@@ -28,7 +28,11 @@ def fuzz(name: str, inputs: int, start: int, last: Path, result: Any) -> None:
 
     @seed(start)
     @settings(
-        max_examples=inputs, deadline=None, database=None, phases=[Phase.generate], suppress_health_check=list(HealthCheck)
+        max_examples=inputs,
+        deadline=None,
+        database=None,
+        phases=[Phase.generate],
+        suppress_health_check=list(HealthCheck),
     )
     @given(mutated(name))
     def check(content: bytes) -> None:

@@ -87,7 +87,8 @@ class Glb:
 
     def __init__(self) -> None:
         self.document: dict[str, Any] = {
-            "asset": {"version": "2.0"}, "bufferViews": [], "accessors": [], "meshes": [], "nodes": [], "scene": 0, "scenes": [{}],
+            "asset": {"version": "2.0"}, "bufferViews": [], "accessors": [], "meshes": [], "nodes": [], "scene": 0,
+            "scenes": [{}],
         }  # fmt: skip
         self.binary = b""
 
@@ -131,7 +132,12 @@ class Glb:
         self.document["buffers"] = [{"byteLength": len(self.binary)}]
         text = json.dumps(self.document).encode()
         text += b" " * (-len(text) % 4)
-        body = struct.pack("<I4s", len(text), b"JSON") + text + struct.pack("<I4s", len(self.binary), b"BIN\0") + self.binary
+        body = (
+            struct.pack("<I4s", len(text), b"JSON")
+            + text
+            + struct.pack("<I4s", len(self.binary), b"BIN\0")
+            + self.binary
+        )
         return struct.pack("<4sII", b"glTF", 2, 12 + len(body)) + body
 
     def gltf(self, buffer: str) -> bytes:
@@ -150,7 +156,9 @@ def draco(vertices: np.ndarray, faces: Polygons) -> bytes:
     import DracoPy
 
     made = Glb()
-    packed = DracoPy.encode(np.asarray(vertices, np.float32), triangles_of(faces).astype(np.uint32), quantization_bits=16)
+    packed = DracoPy.encode(
+        np.asarray(vertices, np.float32), triangles_of(faces).astype(np.uint32), quantization_bits=16
+    )
     view = made.view(packed)
     bounds = {"min": vertices.min(0).tolist(), "max": vertices.max(0).tolist()}
     made.document["accessors"] = [
@@ -163,7 +171,9 @@ def draco(vertices: np.ndarray, faces: Polygons) -> bytes:
     return made.bytes()
 
 
-def dae(vertices: np.ndarray, faces: Polygons, up: str = "Z_UP", matrix: str = "1 0 0 0 0 1 0 0 0 0 1 0 0 0 0 1") -> bytes:
+def dae(
+    vertices: np.ndarray, faces: Polygons, up: str = "Z_UP", matrix: str = "1 0 0 0 0 1 0 0 0 0 1 0 0 0 0 1"
+) -> bytes:
     numbers = " ".join(map(repr, map(float, vertices.reshape(-1))))
     return f"""<?xml version="1.0" encoding="utf-8"?>
 <COLLADA xmlns="http://www.collada.org/2005/11/COLLADASchema" version="1.4.1">
@@ -174,7 +184,8 @@ def dae(vertices: np.ndarray, faces: Polygons, up: str = "Z_UP", matrix: str = "
     <param name="Y" type="float"/><param name="Z" type="float"/></accessor></technique_common></source>
   <vertices id="v"><input semantic="POSITION" source="#p"/></vertices>
   <polylist count="{len(faces)}"><input semantic="VERTEX" source="#v" offset="0"/>
-   <vcount>{" ".join(str(len(face)) for face in faces)}</vcount><p>{" ".join(str(c) for face in faces for c in face)}</p></polylist>
+   <vcount>{" ".join(str(len(face)) for face in faces)}</vcount>
+   <p>{" ".join(str(c) for face in faces for c in face)}</p></polylist>
  </mesh></geometry></library_geometries>
  <library_visual_scenes><visual_scene id="s"><node id="n"><matrix>{matrix}</matrix><instance_geometry url="#g"/></node>
  </visual_scene></library_visual_scenes><scene><instance_visual_scene url="#s"/></scene>
@@ -186,9 +197,10 @@ def threemf(vertices: np.ndarray, faces: Polygons, transform: str = "") -> bytes
     points = "".join(f'<vertex x="{x}" y="{y}" z="{z}"/>' for x, y, z in vertices)
     corners = "".join(f'<triangle v1="{a}" v2="{b}" v3="{c}"/>' for a, b, c in triangles_of(faces))
     given = f' transform="{transform}"' if transform else ""
+    mesh = f"<mesh><vertices>{points}</vertices><triangles>{corners}</triangles></mesh>"
     model = (
-        f'<?xml version="1.0"?><model unit="millimeter" xmlns="{core}"><resources><object id="1" type="model"><mesh><vertices>{points}'
-        f'</vertices><triangles>{corners}</triangles></mesh></object></resources><build><item objectid="1"{given}/></build></model>'
+        f'<?xml version="1.0"?><model unit="millimeter" xmlns="{core}"><resources><object id="1" type="model">{mesh}</object>'
+        f'</resources><build><item objectid="1"{given}/></build></model>'
     )
     return zipped({"3D/3dmodel.model": model.encode()})
 

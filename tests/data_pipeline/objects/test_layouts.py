@@ -29,7 +29,9 @@ def test_links_to_folders_and_files_are_followed(tmp_path):
     write(tmp_path / "elsewhere", members(("lamp",)))
     write(tmp_path / "set", members(("mug", "rack")))
     (tmp_path / "set" / "lamp").symlink_to("../elsewhere/lamp")
-    (tmp_path / "set" / "mug" / "train" / "more.off").symlink_to(tmp_path / "elsewhere" / "lamp" / "test" / "lamp_2.off")
+    (tmp_path / "set" / "mug" / "train" / "more.off").symlink_to(
+        tmp_path / "elsewhere" / "lamp" / "test" / "lamp_2.off"
+    )
     source = opened(tmp_path / "set")
     assert source.classes == ("lamp", "mug", "rack")
     # The linked file is a lamp too: by its own name, and once.
@@ -153,24 +155,37 @@ def test_without_folders_of_splits_one_sentence_offers_the_option(tmp_path):
     assert opened(root, split="0.8").entries == source.entries
     assert opened(root, split="0.8", seed=1).entries != source.entries
     wrapped = opened(shapenet(tmp_path / "wrapped", prefix="ShapeNetCore.v2/"), split="0.8")
-    assert [(entry.name, entry.split) for entry in wrapped.entries] == [(entry.name, entry.split) for entry in source.entries]
+    assert [(entry.name, entry.split) for entry in wrapped.entries] == [
+        (entry.name, entry.split) for entry in source.entries
+    ]
 
 
 def test_files_of_one_object_go_to_one_split(tmp_path):
-    files = {f"{name}/{at}/{part}.stl": stl(*box((1, at + 1, 2))) for name in ("mug", "rack") for at in range(6) for part in "ab"}
+    files = {
+        f"{name}/{at}/{part}.stl": stl(*box((1, at + 1, 2)))
+        for name in ("mug", "rack")
+        for at in range(6)
+        for part in "ab"
+    }
     files |= {f"mug/flat_{at}.{suffix}": b"" for at in range(6) for suffix in ("obj", "ply")}
     source = opened(write(tmp_path / "set", files), split="0.5")
     for entry in source.entries:
         group = entry.name.rsplit("/", 1)[0] if "flat" not in entry.name else entry.name.rsplit(".", 1)[0]
-        assert {other.split for other in source.entries if other.name.startswith(f"{group}/") or other.name.startswith(f"{group}.")} == {
-            entry.split
-        }
+        assert {
+            other.split
+            for other in source.entries
+            if other.name.startswith(f"{group}/") or other.name.startswith(f"{group}.")
+        } == {entry.split}
 
 
 def test_lists_of_splits(tmp_path):
     root = shapenet(tmp_path / "set")
     by_id = tmp_path / "all.csv"
-    rows = [f"{at},0{name},{name}a{at},{'test' if at == 4 else 'val' if at == 3 else 'train'}" for name in (1, 2) for at in range(5)]
+    rows = [
+        f"{at},0{name},{name}a{at},{'test' if at == 4 else 'val' if at == 3 else 'train'}"
+        for name in (1, 2)
+        for at in range(5)
+    ]
     by_id.write_text("\n".join(["id,synsetId,modelId,split", *rows]))
     source = opened(root, split=str(by_id))
     assert of_split(source, "test") == ["01/1a4/models/model.obj", "02/2a4/models/model.obj"]
@@ -218,7 +233,9 @@ def test_the_options_go_with_meshes(tmp_path):
 
 def test_names_are_whole_paths_where_collections_lie_side_by_side(tmp_path):
     files = members(("mug", "rack"))
-    both = {f"batch1/{name}": content for name, content in files.items()} | {f"batch2/{name}": content for name, content in files.items()}
+    both = {f"batch1/{name}": content for name, content in files.items()} | {
+        f"batch2/{name}": content for name, content in files.items()
+    }
     source = opened(write(tmp_path / "set", both))
     names = [entry.name for entry in source.entries]
     assert len(set(names)) == len(names) == 12
@@ -255,7 +272,9 @@ def test_captures_have_files_of_their_own():
     paths = {npz_of(Path("out"), name).name.lower() for name in names}
     assert len(paths) == len(names)
     assert all(len(path) < 200 and path.isascii() and "/" not in path for path in paths)
-    assert npz_of(Path("out"), "bed/train/bed_0001.off").name == "bed__train__bed_0001.off.npz"  # as finished runs have it
+    assert (
+        npz_of(Path("out"), "bed/train/bed_0001.off").name == "bed__train__bed_0001.off.npz"
+    )  # as finished runs have it
 
 
 # ---------------------------------------------------------------------------------------------- what is not read, or not there
@@ -272,7 +291,12 @@ def test_what_macos_adds_is_ignored_and_said(tmp_path):
 
 
 def test_formats_that_are_not_read_are_named(tmp_path):
-    files = members(("mug", "rack")) | {"mug/train/a.fbx": b"", "mug/test/b.OFF.gz": b"", "readme.txt": b"", "extra/c.obj": obj(*BOX)}
+    files = members(("mug", "rack")) | {
+        "mug/train/a.fbx": b"",
+        "mug/test/b.OFF.gz": b"",
+        "readme.txt": b"",
+        "extra/c.obj": obj(*BOX),
+    }
     source = opened(write(tmp_path / "set", files))
     assert source.left_out == {
         "train": {"mug/train/a.fbx": "is a .fbx file, which is not read; convert it to .glb, .obj or .ply"},

@@ -55,7 +55,10 @@ def test_class_names_may_come_along(tmp_path, names):
     [
         ({"X_test": grids(0), "y_test": np.zeros(0, int)}, "y_test is empty"),
         ({"y_train": np.array(["mug", "rack", "mug", "rack"])}, "y_train holds strings; .* an array `classes`"),
-        ({"y_train": np.array([1, 2, 1, 2]), "y_test": np.array([2, 1])}, "no training object has the label 0; subtract 1"),
+        (
+            {"y_train": np.array([1, 2, 1, 2]), "y_test": np.array([2, 1])},
+            "no training object has the label 0; subtract 1",
+        ),
         ({"y_train": np.eye(2, dtype=int)[[0, 1, 0, 1]]}, r"shape \(4, 2\), as labels coded one-hot"),
         ({"y_train": np.array([0, 1, -1, 1])}, "y_train has the label -1, and 1 labels below 0"),
         ({"y_test": np.array([0, 2**40])}, "the label 1099511627776"),

@@ -77,7 +77,10 @@ def changed(content: bytes, *, flags: int | None = None, method: int | None = No
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"flags": 1}, "every mesh in it, such as mug/train/mug_0.off, is encrypted; unpack the archive with its password"),
+        (
+            {"flags": 1},
+            "every mesh in it, such as mug/train/mug_0.off, is encrypted; unpack the archive with its password",
+        ),
         ({"method": 9}, r"method 9 \(Deflate64\), which Python cannot read; .* pack it again"),
         ({"method": 93}, r"method 93 \(Zstandard\)"),
         ({"method": 77}, r"method 77 \(unknown\)"),
@@ -93,15 +96,12 @@ def test_one_damaged_member_is_named(tmp_path):
     content = bytearray(zipped(FILES))
     at = content.find(b"rack/train/rack_1.off") + len("rack/train/rack_1.off") + 20
     content[at : at + 20] = bytes(byte ^ 0xFF for byte in content[at : at + 20])
-    damaged = 0
     for entry in opened(archive_of(tmp_path, bytes(content))).entries:
-        try:
+        if entry.name == "rack/train/rack_1.off":
+            with pytest.raises(DamagedMesh, match=r"^rack/train/rack_1.off in .* cannot be unpacked"):
+                load_object(entry)
+        else:
             load_object(entry)
-        except DamagedMesh as error:
-            damaged += 1
-            assert str(error).startswith("rack/train/rack_1.off in ")
-            assert "cannot be unpacked" in str(error)
-    assert damaged == 1
 
 
 @pytest.mark.parametrize("end", [0, 100, -1, -30, -200])
@@ -116,12 +116,17 @@ def test_sizes_are_capped(tmp_path, monkeypatch):
     bomb = zipped(FILES | {"mug/train/bomb.off": b"OFF\n" + b"0 " * 100_000})
     for content in (bomb, bomb.replace((200_004).to_bytes(4, "little"), (9_000).to_bytes(4, "little"))):
         (entry,) = [entry for entry in opened(archive_of(tmp_path, content)).entries if "bomb" in entry.name]
-        with pytest.raises(DamagedMesh, match="unpacks to more than|cannot be unpacked"):
+        with pytest.raises(DamagedMesh, match=r"unpacks to more than|cannot be unpacked"):
             load_object(entry)
 
 
 def test_the_directory_is_read_once(tmp_path, monkeypatch):
-    many = {f"{name}/{split}/{at}.off": off(*box()) for name in ("a", "b") for split in ("train", "test") for at in range(50)}
+    many = {
+        f"{name}/{split}/{at}.off": off(*box())
+        for name in ("a", "b")
+        for split in ("train", "test")
+        for at in range(50)
+    }
     path = archive_of(tmp_path, zipped(many))
     opens = []
     real = zipfile.ZipFile.__init__
@@ -141,7 +146,7 @@ def test_files_of_gltf_are_found_in_the_archive(tmp_path):
     source = opened(archive_of(tmp_path, zipped(FILES | more)))
     by_name = {entry.name: entry for entry in source.entries}
     assert load_object(by_name["mug/train/a/scene.gltf"]).extent.tolist() == [1, 3, 2]
-    with pytest.raises(DamagedMesh, match="needs 'numbers.bin', which is not in the archive"):
+    with pytest.raises(DamagedMesh, match=r"needs 'numbers.bin', which is not in the archive"):
         load_object(by_name["rack/train/b.gltf"])
 
 
