@@ -34,6 +34,7 @@ from data_pipeline.files import as_read, read_json, write_json, write_text
 from data_pipeline.progress import console, progress_bar
 from train.checkpoints import Checkpoints
 from train.devices import DATA, check_batch, device_mesh, is_first, parameter_sharding, place, place_batch, summed_over
+from train.kept import check_config
 from train.optimiser import learning_rate
 from train.preemption import Preempted, Preemption
 from train.starting_weights import StartingWeights
@@ -163,10 +164,7 @@ def fit(
     """
     config = task.optimiser
     identity = identity_of(task, statistics, start)
-    if (folder / "config.json").exists() and read_json(folder / "config.json") != identity:
-        raise DataError(
-            f"{folder} holds a network trained with other settings; choose another --out, or delete that folder"
-        )
+    check_config(folder, identity, "a network trained")
     if (folder / "summary.json").exists():
         return read_json(folder / "summary.json")
     mesh = mesh or device_mesh()

@@ -26,6 +26,7 @@ from data_pipeline.files import as_read, read_json, write_json, write_text
 from data_pipeline.progress import console, progress_bar
 from train.checkpoints import Checkpoints
 from train.devices import DATA, device_mesh
+from train.kept import check_config
 from train.loop import Lead, identity_of, steps_of_an_epoch, validation_set, weighted_means
 from train.preemption import Preempted, Preemption
 from train.step import Hyperparameters, TrainState, abstract_state, evaluate_step_of, initial_state, train_step_of
@@ -151,8 +152,7 @@ def sweep(
         Preempted: after SIGTERM, at the end of an epoch.
     """
     identity = as_read({"task": asdict(task), "sweep": asdict(config), "data": statistics.fingerprint})
-    if (folder / "config.json").exists() and read_json(folder / "config.json") != identity:
-        raise DataError(f"{folder} holds a sweep made with other settings; choose another --out, or delete that folder")
+    check_config(folder, identity, "a sweep made")
     members = draw_members(config, task)
     if (folder / "members.json").exists():
         return [Member(**member) for member in read_json(folder / "members.json")]

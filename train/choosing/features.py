@@ -7,18 +7,15 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Any
 
 import flax.struct
 import jax
 import jax.numpy as jnp
 import numpy as np
-import optax
 from flax import nnx
 from jaxtyping import Array, Bool, Float, Int
 
 from mevs_jax.models.set_fusion import SetFusion
-from train.choosing.averaged import AveragedConfig, fit_averaged
 
 
 @dataclass(frozen=True)
@@ -33,19 +30,6 @@ class SetFusionConfig:
     """of attention and layers"""
     dropout: float = 0.2
     """within blocks, and of features"""
-
-
-@dataclass(frozen=True)
-class FusionConfig(AveragedConfig):
-    """The set fusion's training on features that are there."""
-
-    epochs: int = 60
-    """looks at each object's views"""
-    weight_decay: float = 0.05
-    """decoupled"""
-    network: SetFusionConfig = SetFusionConfig()
-    largest_set: int = 12
-    """views in a training set at most"""
 
 
 @flax.struct.dataclass
@@ -101,40 +85,3 @@ def sets_of_size(objects: int, views: int, size: int, draws: int, seed: int = 0)
     """Random sets of so many views, the same at every call."""
     drawn = jax.random.uniform(jax.random.key(seed), (draws, objects, views))
     return jnp.argsort(jnp.argsort(drawn, axis=-1), axis=-1) < size
-
-
-def fusion_loss(
-    network: SetFusion, chosen: Features, present: Array, key: Array | None = None
-) -> Float[Array, " objects"]:
-    """Cross-entropy of each set, in nats; with a key, dropping out."""
-    logits = network(chosen.features, chosen.directions, present, key=key)
-    return optax.softmax_cross_entropy_with_integer_labels(logits, chosen.labels)
-
-
-def train_fusion(
-    config: FusionConfig, train: Features, validation: Features, start: SetFusion | None = None
-) -> tuple[SetFusion, dict[str, Any]]:
-    """The network of the best epoch, and what happened: losses by epoch. It begins as `start`, or with random weights."""
-    if start is None:
-        start = new_fusion(config.network, train.features.shape[-1], train.logits.shape[-1], nnx.Rngs(config.seed))
-    structure, parameters = nnx.split(start)
-    views, largest = train.features.shape[1], config.largest_set
-
-    def loss_of(parameters: nnx.State, some: Features, key: Array) -> Array:
-        sets, drop = jax.random.split(key)
-        present = random_sets(sets, len(some.labels), views, largest)
-        return jnp.mean(fusion_loss(nnx.merge(structure, parameters), some, present, drop))
-
-    @jax.jit
-    def check(mean: nnx.State, validation: Features) -> Array:
-        network = nnx.merge(structure, mean)
-        keys = jax.random.split(jax.random.key(1), 4)  # the same sets after every epoch
-        sets = [random_sets(key, len(validation.labels), views, largest) for key in keys]
-        return jnp.mean(jnp.stack([fusion_loss(network, validation, present) for present in sets]))
-
-    def validate(mean: nnx.State) -> dict[str, float]:
-        return {"validation": float(check(mean, validation))}
-
-    best, history = fit_averaged(config, loss_of, parameters, train, validate)
-    best_loss = min((epoch["validation"] for epoch in history), default=None)
-    return nnx.merge(structure, best), {"best_loss": best_loss, "epochs": history}

@@ -23,7 +23,6 @@ from data_pipeline.dataset.batches import fold_of
 from data_pipeline.dataset.builder import DataConfig, DatasetStatistics, load_statistics, open_split, prepare
 from data_pipeline.errors import DataError
 from data_pipeline.progress import console
-from eval.learned.walks import Learner
 from mevs_jax.beliefs import CalibratedFusion
 from mevs_jax.models import Recogniser, ViewPolicy
 from mevs_jax.models.set_fusion import SumFusion
@@ -339,12 +338,6 @@ class Stages:
         folder = self.policy_folder("_".join(map(str, (name, *(f"without_{label}" for label in without)))))
         untrained = nnx.eval_shape(lambda: new_policy(config, len(self.statistics.classes), variant.posed, cloud))
         return trained_once(folder, identity, untrained, train)
-
-    def learner(self, name: str) -> Learner:
-        variant = VARIANTS[name]
-        made_as = variant.network or name
-        fusion = self.fusion(posed=variant.posed, summed=True) if variant.summed else None
-        return Learner(name, variant.title, self.policy(made_as), variant.by, made_as, fusion)
 
 
 def lattice_data(dataset: DataConfig, out: Path, views: int) -> Path:
