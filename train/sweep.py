@@ -99,9 +99,8 @@ def draw_members(config: SweepConfig, task: SweepTask) -> list[Member]:
     shares = {"dropout": config.dropout, "augmentation": config.augmentation}
     for name, (low, high) in shares.items():
         if not 0 <= low <= high <= 1 or (name == "dropout" and high == 1):
-            raise DataError(
-                f"--sweep.{name} {low} {high} must be a range within [0, 1{')' if name == 'dropout' else ']'}, smaller end first"
-            )
+            limits = "[0, 1)" if name == "dropout" else "[0, 1]"
+            raise DataError(f"--sweep.{name} {low} {high} must be a range within {limits}, smaller end first")
     from scipy.stats import qmc  # imported late: it takes a third of a second
 
     low, high = np.array([*(np.log(pair) for pair in ranges.values()), *shares.values()]).T
@@ -244,8 +243,8 @@ def sweep(
             )
             leader = min(members, key=lambda member: member.loss)
             console.print(
-                f"Sweep of {len(members)}, epoch {progress['epoch']}/{optimiser.epochs}: {sum(map(is_training, members))} still train, "
-                f"best val loss {leader.loss:.4f}"
+                f"Sweep of {len(members)}, epoch {progress['epoch']}/{optimiser.epochs}: "
+                f"{sum(map(is_training, members))} still train, best val loss {leader.loss:.4f}"
             )
             if preemption.after(progress["epoch"]):
                 raise Preempted(f"the sweep was asked to end after epoch {progress['epoch']}")

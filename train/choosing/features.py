@@ -1,7 +1,4 @@
-"""Training of the set fusion on cached features: random subsets of an object's views, of every size, to its class.
-
-Features of all objects fit into memory (`train.averaged`).
-"""
+"""Features of the recogniser for every view of some objects, the shape of the set fusion, and random sets of views."""
 
 from __future__ import annotations
 
@@ -20,28 +17,28 @@ from mevs_jax.models.set_fusion import SetFusion
 
 @dataclass(frozen=True)
 class SetFusionConfig:
-    """Shape of the set fusion."""
+    """Architecture of the set fusion."""
 
     width: int = 128
-    """of the tokens"""
+    """width of the tokens"""
     heads: int = 4
-    """of attention"""
+    """heads of attention"""
     blocks: int = 2
-    """of attention and layers"""
+    """blocks of attention and feed-forward layers"""
     dropout: float = 0.2
-    """within blocks, and of features"""
+    """dropout rate within the blocks and of the features"""
 
 
 @flax.struct.dataclass
 class Features:
-    """What the encoder says of every view of some objects.
+    """Outputs of the encoder for every view of some objects.
 
     Attributes:
-        features: (objects, views, features).
-        logits: (objects, views, classes) of the single views.
-        labels: (objects,).
-        directions: (objects, views, 3) unit vectors to the cameras.
-        clouds: (objects, views, embedding) of the partial clouds, where they are used.
+        features: features of each view.
+        logits: logits of each single view.
+        labels: true class of each object.
+        directions: unit vectors from the object to the cameras.
+        clouds: PointNet++'s embedding of the partial cloud of each view, if used.
     """
 
     features: Float[Array, "objects views features"]
@@ -51,11 +48,11 @@ class Features:
     clouds: Float[Array, "objects views embedding"] | None = None
 
     def some(self, chosen: Int[np.ndarray, " some"]) -> Features:
-        """Those of some objects."""
+        """Returns those of the chosen objects."""
         return jax.tree.map(lambda leaf: leaf[chosen], self)
 
     def without(self, classes: tuple[int, ...]) -> Features:
-        """Those of objects of other classes; all of them where none is given."""
+        """Returns those of objects that belong to none of `classes`."""
         return self.some(np.flatnonzero(~np.isin(self.labels, classes))) if classes else self
 
 
@@ -72,8 +69,11 @@ def new_fusion(shape: SetFusionConfig, features: int, classes: int, rngs: nnx.Rn
 
 
 def random_sets(key: Array, objects: int, views: int, largest: int) -> Bool[Array, "objects views"]:
-    """For each object a random set of 1 to `largest` views; small ones more often: one view as often as 2 and 3 together, about,
-    and as 4 to 7, since much changes with each of the first views and little with each of the last."""
+    """Returns for each object a random set of 1 to `largest` views.
+
+    Small sets are drawn more often, since the first views change a belief much and later ones little: about as many sets have 1
+    view as have 2 or 3 views, and as have 4 to 7.
+    """
     sizes, order = jax.random.split(key)
     logarithm = jax.random.uniform(sizes, (objects, 1), maxval=math.log(min(largest, views) + 1))
     count = jnp.clip(jnp.floor(jnp.exp(logarithm)), 1, min(largest, views))
@@ -82,6 +82,6 @@ def random_sets(key: Array, objects: int, views: int, largest: int) -> Bool[Arra
 
 
 def sets_of_size(objects: int, views: int, size: int, draws: int, seed: int = 0) -> Bool[Array, "draws objects views"]:
-    """Random sets of so many views, the same at every call."""
+    """Returns random sets of `size` views; the same `seed` gives the same sets."""
     drawn = jax.random.uniform(jax.random.key(seed), (draws, objects, views))
     return jnp.argsort(jnp.argsort(drawn, axis=-1), axis=-1) < size
