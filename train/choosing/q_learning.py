@@ -1,9 +1,9 @@
 """The learned baseline: Q-learning of the next view, as in MVSelect (Hou et al., CVPR 2024).
 
 `train.choosing.policy` learns from the gain of many candidates in each state. Here only walks are known: the view taken, and by
-how much the belief in the true class rose. Values are bootstrapped from those of the next state (DQN; Mnih et al. 2015). The
-network is that of the view policy, so that only the method of learning differs. Walks are ε-greedy. A round walks with the network
-of the round before, which is also the target network, and trains on the walks of all rounds (the replay).
+how much the belief in the true class rose. Values are bootstrapped from the next state's values (DQN; Mnih et al. 2015). The
+network is that of the view policy, so that only the method of learning differs. Walks are ε-greedy. A round walks with the last
+round's network, which is also the target network, and trains on the walks of all rounds (the replay).
 
 Differences to MVSelect: fusion is by attention instead of the maximum, beliefs are of recognisers that were not trained on the
 object, and there is a reward at every step instead of only the last.
