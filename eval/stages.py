@@ -18,7 +18,7 @@ import numpy as np
 from data_pipeline.dataset.builder import prepare
 from data_pipeline.dataset.statistics import DatasetStatistics, load_statistics, report_left_out
 from data_pipeline.errors import DataError
-from data_pipeline.files import as_read, read_json, write_json
+from data_pipeline.files import read_json, write_json
 from data_pipeline.progress import console
 from eval.learned.measure import measure, together, train_all
 from eval.learned.page import write_learned_page
@@ -36,7 +36,7 @@ from eval.walks.live import Agreement, Networks, compare_with_tables
 from mevs_jax.policies.registry import policy_named
 from mevs_jax.viewpoints import ViewGraph
 from train.choosing.stages import Stages, check_learned
-from train.kept import made_by
+from train.kept import kept, kept_json, made_by
 from train.loop import fit, load_best
 from train.starting_weights import StartingWeights
 from train.step import Task
@@ -118,14 +118,14 @@ def _tables(
     """The view tables of a split, made anew where the stored ones are of other networks."""
     made = made_by(statistics, out / classifier, out / "entropy")
     path = out / "tables" / (f"{split}.npz" if classifier == "classifier" else f"{split}_by_view.npz")
-    if path.exists() and (tables := load_view_tables(path)).made_by == made:
-        return tables
-    classify, predict = tasks(settings, statistics)
-    networks = load_best(classify, out / classifier), load_best(predict, out / "entropy")
-    tables = compute_view_tables(out / "data", split, statistics, classify, networks[0], predict, networks[1])
-    tables = replace(tables, made_by=made)
-    save_view_tables(path, tables)
-    return tables
+
+    def compute() -> ViewTables:
+        classify, predict = tasks(settings, statistics)
+        networks = load_best(classify, out / classifier), load_best(predict, out / "entropy")
+        tables = compute_view_tables(out / "data", split, statistics, classify, networks[0], predict, networks[1])
+        return replace(tables, made_by=made)
+
+    return kept(path, load_view_tables, save_view_tables, lambda tables: tables.made_by == made, compute)
 
 
 def check_evaluation(config: GridConfig) -> None:
@@ -149,32 +149,30 @@ def evaluate(settings: Settings, out: Path) -> dict[str, Any]:
     climbed = load_ascent_scores(out, statistics, settings.rendering)
     if climbed is not None:
         identity["climbed"] = asdict(settings.rendering)
-    identity = as_read(identity)
     check_evaluation(settings.evaluation)
-    path = out / "metrics.json"
-    if path.exists() and (metrics := read_json(path))["identity"] == identity:
-        return metrics
-    try:
-        reachable_views(np.array(statistics.viewpoints), settings.evaluation.lowest_elevation)
-    except ValueError as error:
-        raise DataError(str(error)) from error
-    tables, by_view, leak = _tables(settings, out, statistics, "test"), None, None
-    if by_view_made is not None:
-        by_view = _tables(settings, out, statistics, "test", BY_VIEW)
-        leak = {
-            name: {
-                "validation": float(read_json(out / name / "summary.json")["best"]["accuracy"]),
-                "test": float((made.logits.argmax(-1) == made.labels[:, None]).mean()),
+
+    def compute() -> dict[str, Any]:
+        try:
+            reachable_views(np.array(statistics.viewpoints), settings.evaluation.lowest_elevation)
+        except ValueError as error:
+            raise DataError(str(error)) from error
+        tables, by_view, leak = _tables(settings, out, statistics, "test"), None, None
+        if by_view_made is not None:
+            by_view = _tables(settings, out, statistics, "test", BY_VIEW)
+            leak = {
+                name: {
+                    "validation": float(read_json(out / name / "summary.json")["best"]["accuracy"]),
+                    "test": float((made.logits.argmax(-1) == made.labels[:, None]).mean()),
+                }
+                for name, made in (("classifier", tables), (BY_VIEW, by_view))
             }
-            for name, made in (("classifier", tables), (BY_VIEW, by_view))
-        }
-    validation = _tables(settings, out, statistics, "val")
-    metrics = run_study(tables, validation, statistics, settings.evaluation, by_view, leak)
-    if climbed is not None:
-        metrics["climbing"] = ascent_study(tables, statistics, climbed, settings.evaluation)
-    metrics["identity"] = identity
-    write_json(path, metrics)
-    return metrics
+        validation = _tables(settings, out, statistics, "val")
+        metrics = run_study(tables, validation, statistics, settings.evaluation, by_view, leak)
+        if climbed is not None:
+            metrics["climbing"] = ascent_study(tables, statistics, climbed, settings.evaluation)
+        return metrics
+
+    return kept_json(out / "metrics.json", identity, compute)
 
 
 def learn_to_choose(settings: Settings, out: Path) -> Path:

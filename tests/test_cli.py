@@ -153,7 +153,10 @@ def weights_that_are_none(root: Path) -> list:
         (one_view, "--views 1 is too few"),
         (unwritable, "cannot write to"),
         (no_archive, r"--archive .*ModelNet10.zip cannot be read: No such file"),
-        (weights_for_another, r"64 channels wide that sees three, this one has 8 and 1; use --preset thesis"),
+        (
+            weights_for_another,
+            r"of width 64 with 3 input channels, this one has width 8 and 1 channels; use --preset thesis",
+        ),
         (weights_that_are_none, r"resnet18.pth is not a file of weights that can be read safely"),
     ],
     ids=lambda value: getattr(value, "__name__", ""),

@@ -96,6 +96,6 @@ def test_a_lost_process_ends_the_others_and_the_run_goes_on(run):
     wait_for_epoch(done + 1)
     both[0].send_signal(signal.SIGTERM)
     said = [ended(process, 143) for process in both]
-    assert "going on after epoch" in said[0]
+    assert "resuming after epoch" in said[0]
     assert all("was asked to end after step" in text for text in said)
     assert len({text.split("after step ")[1].split()[0] for text in said}) == 1

@@ -334,7 +334,7 @@ def test_gradients_of_convolutions_are_those_of_jax(size, stride, random):
         ({"seeds": 0}, "--learned.seeds at least 1"),
         ({"changed": -1}, "--learned.changed must be at least 0, got -1"),
         ({"ablations": ("magic",)}, "unknown ablation 'magic'"),
-        ({"max_views": 6}, "need more than 6 candidate views, and at least 2; there are 6"),
+        ({"max_views": 6}, "walks of 6 views are not possible with 6 candidate views"),
     ],
 )
 def test_a_study_that_cannot_be_made_is_refused(changes, said):

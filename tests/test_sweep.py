@@ -118,8 +118,8 @@ def test_configurations_fill_their_ranges(out):
     assert {member.dropout for member in draw_members(SWEEP, task_named("classifier", out))} == {0.0}
     for config, told in (
         (SweepConfig(members=0), "--sweep.members 0 is too few"),
-        (SweepConfig(learning_rate=(0.0, 1.0)), "--sweep.learning-rate 0.0 1.0 must go up from more than 0"),
-        (SweepConfig(dropout=(0.5, 1.0)), "--sweep.dropout 0.5 1.0 must go up within 0 and 1"),
+        (SweepConfig(learning_rate=(0.0, 1.0)), "--sweep.learning-rate 0.0 1.0 must be a range above 0"),
+        (SweepConfig(dropout=(0.5, 1.0)), r"--sweep.dropout 0.5 1.0 must be a range within \[0, 1\)"),
     ):
         with pytest.raises(DataError, match=told):
             draw_members(config, task)

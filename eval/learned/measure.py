@@ -5,7 +5,7 @@ What is found is kept in files of the seed's folder; what is there is not measur
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import fields, replace
 from functools import partial
 from pathlib import Path
@@ -20,19 +20,19 @@ from jaxtyping import Array
 from data_pipeline.dataset.builder import open_split
 from data_pipeline.dataset.inputs import depth_and_normals
 from data_pipeline.dataset.statistics import load_statistics
-from data_pipeline.files import as_read, read_json, write_json, write_npz
+from data_pipeline.files import read_json, write_npz
 from data_pipeline.progress import console
 from eval.learned.stopping import MOVEMENT_COSTS, VIEW_COSTS
 from eval.learned.study import ByObject, novel_classes, seeds_together, study
-from eval.learned.walks import OnLattice
+from eval.learned.walks import Learner, OnLattice
 from eval.numbers.timing import milliseconds
 from eval.tables import load_view_tables
 from eval.thesis.results import machine
 from mevs_jax.models import Recogniser
 from mevs_jax.models.view_policy import expected_gain
 from mevs_jax.viewpoints import viewpoint_lattice
-from train.choosing.stages import Stages, lattice_data
-from train.kept import made_by
+from train.choosing.stages import VARIANTS, Stages, lattice_data
+from train.kept import kept_json, made_by
 from train.loop import load_best
 
 _FORM = 5
@@ -88,12 +88,12 @@ def together(seeds: Sequence[Stages], found: Sequence[dict[str, Any]]) -> dict[s
     return lattices
 
 
-def _kept(path: Path, identity: dict[str, Any], find: Callable[[], dict[str, Any]]) -> dict[str, Any]:
-    """What the file holds under this identity, else what is found now."""
-    identity = as_read(identity)
-    if not path.exists() or read_json(path)["identity"] != identity:
-        write_json(path, find() | {"identity": identity})
-    return read_json(path)
+def learner_of(stages: Stages, name: str) -> Learner:
+    """Returns a variant of the view policy by its name in `VARIANTS`, trained first if it is not yet."""
+    variant = VARIANTS[name]
+    made_as = variant.network or name
+    fusion = stages.fusion(posed=variant.posed, summed=True) if variant.summed else None
+    return Learner(name, variant.title, stages.policy(made_as), variant.by, made_as, fusion)
 
 
 def _walks(
@@ -109,7 +109,7 @@ def _walks(
             f"Left out: the view policy that sees clouds; PointNet++ is trained by: mevs train --out {stages.out}"
         )
         names.remove("cloud")
-    learners = [stages.learner(name) for name in names]
+    learners = [learner_of(stages, name) for name in names]
     learners[0] = replace(learners[0], name="learned")
     costs = posed and not ablations and data == stages.out / "data"
     kind = ("" if posed else "_unposed") + ("_ablations" if ablations else "")
@@ -161,7 +161,7 @@ def _walks(
             costs and [VIEW_COSTS, MOVEMENT_COSTS],
         ],
     }
-    return _kept(path, identity, walk)
+    return kept_json(path, identity, walk)
 
 
 def _rotated(stages: Stages) -> dict[str, Any]:
@@ -191,13 +191,13 @@ def _novel(stages: Stages) -> dict[str, Any]:
             stages.fusion(), policies, stages.policy(), test, stages.config.max_views, stages.config.draws, stages.seed
         )
 
-    return _kept(stages.folder / "walks_novel.json", identity, walk)
+    return kept_json(stages.folder / "walks_novel.json", identity, walk)
 
 
 def _decision(stages: Stages) -> dict[str, Any]:
     policy = read_json(stages.policy_folder() / "summary.json")["identity"]
     identity = {"policy": policy, "machine": machine(), "candidates": stages.dataset.capture.views}
-    return _kept(stages.folder / "decision.json", identity, partial(_decision_times, stages))
+    return kept_json(stages.folder / "decision.json", identity, partial(_decision_times, stages))
 
 
 def _decision_times(stages: Stages, calls: int = 200) -> dict[str, Any]:

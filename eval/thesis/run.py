@@ -16,7 +16,7 @@ from flax import nnx
 from data_pipeline.dataset.builder import open_objects, prepare
 from data_pipeline.dataset.statistics import report_left_out
 from data_pipeline.errors import DataError
-from data_pipeline.files import as_read, read_json, write_json
+from data_pipeline.files import read_json
 from data_pipeline.objects.sources import load_object
 from data_pipeline.progress import console
 from eval.numbers.timing import decision_memory_alone, time_ascent, time_local_maxima, time_predictor
@@ -28,7 +28,7 @@ from eval.tables import objects_of
 from eval.thesis.figures import FigureInputs
 from eval.thesis.page import write_thesis_report
 from eval.thesis.results import NO_ACCELERATOR, LatticeTables, all_results, machine
-from train.kept import kept_array, made_by
+from train.kept import kept_array, kept_json, made_by
 from train.loop import load_best
 from train.outputs import network_outputs
 from train.tasks.classifier import ClassifierTask
@@ -137,20 +137,19 @@ def measure(settings: Settings, folder: ThesisFolder, tables: dict[int, LatticeT
     ran_on = machine()
     thesis = settings.thesis
     counts = thesis.timing_runs, thesis.ascent_runs, thesis.ascent_starts, thesis.ascent_resolution
-    identity = as_read([ran_on, counts, asdict(settings.entropy.network)])
-    path = folder.out / "timing.json"
-    if path.exists() and (found := read_json(path))["identity"] == identity:
-        return found
-    console.print(f"Timing {counts[0]} decisions and {counts[1]} climbs a class, and measuring their memory")
-    found = {
-        "identity": identity,
-        "machine": ran_on,
-        "timing": _timing(settings, folder, tables),
-        "memory": _memory(settings, folder),
-        "ascent": _ascents(settings, tables[40], folder.statistics(40).classes),
-    }
-    write_json(path, found)
-    return found
+    identity = [ran_on, counts, asdict(settings.entropy.network)]
+
+    def compute() -> dict[str, Any]:
+        console.print(f"Timing {counts[0]} decisions and {counts[1]} climbs a class, and measuring their memory")
+        return {
+            "identity": identity,
+            "machine": ran_on,
+            "timing": _timing(settings, folder, tables),
+            "memory": _memory(settings, folder),
+            "ascent": _ascents(settings, tables[40], folder.statistics(40).classes),
+        }
+
+    return kept_json(folder.out / "timing.json", identity, compute)
 
 
 # ------------------------------------------------------------------------------------------------------------- everything
@@ -188,16 +187,16 @@ def evaluate_thesis(settings: Settings, folder: ThesisFolder) -> FigureInputs:
     test = {views: lattice_tables(settings, folder, views, "test") for views in VIEWS}
     measured = measure(settings, folder, test)
     made = made_by(statistics[40], *folder.networks().values())
-    identity = as_read([made, asdict(settings.evaluation), measured])
-    path = folder.out / "thesis.json"
-    results = read_json(path) if path.exists() else {"identity": None}
-    if results["identity"] != identity:
+    identity = [made, asdict(settings.evaluation), measured]
+
+    def compute() -> dict[str, Any]:
         validation = {views: lattice_tables(settings, folder, views, "val", PIPELINE, ("world",)) for views in VIEWS}
         console.print(f"Walking {len(test[40].labels)} test objects with {len(PIPELINE)} classifiers on two lattices")
         results = all_results(test, validation, statistics, settings.evaluation) | _training(folder, histories)
         results |= {name: measured[name] for name in ("machine", "timing", "memory", "ascent")}
-        results |= {"identity": identity, "left_out": {str(v): s.left_out for v, s in statistics.items()}}
-        write_json(path, results)
+        return results | {"identity": identity, "left_out": {str(v): s.left_out for v, s in statistics.items()}}
+
+    results = kept_json(folder.out / "thesis.json", identity, compute)
     return FigureInputs(folder, results, statistics, test, histories, _example(test[40], statistics[40].classes))
 
 
