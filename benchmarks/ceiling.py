@@ -25,6 +25,7 @@ from scipy.ndimage import label as connected
 from data_pipeline.dataset.builder import open_split
 from data_pipeline.files import write_text
 from eval.numbers.comparison import intervals
+from eval.report.markdown import markdown_table
 from eval.settings import PRESETS
 from mevs_jax.beliefs import CalibratedFusion
 from train.choosing.calibrated import beliefs_of_sets
@@ -109,28 +110,27 @@ def main(options: Options) -> None:
     sizes, given = (1, 2, 4, views), {}
     for size in sizes:
         given[size] = answers(stages.fusion(), data, size)
-    lines = [
-        f"# What holds accuracy down ({options.split} objects)",
-        "",
-        "Accuracy (%) of random views fused, 95 % intervals over objects.",
-        "",
-        "| objects | number | " + " | ".join(f"{size} views" if size > 1 else "1 view" for size in sizes) + " |",
-        "|---" * (2 + len(sizes)) + "|",
-    ]
+    rows = []
     for title, chosen in groups.items():
         cells = []
         for size in sizes:
             right = (given[size] == labels[:, None]).mean(axis=1)[chosen]
             low, high = intervals(right[None])[0]
             cells.append(f"{100 * right.mean():.1f} [{100 * low:.1f}, {100 * high:.1f}]")
-        lines.append(f"| {title} | {chosen.sum()} | " + " | ".join(cells) + " |")
+        rows.append([title, str(chosen.sum()), *cells])
 
     final = given[views][:, 0]
     wrong = np.flatnonzero(final != labels)
     pairs, counts = np.unique(np.stack([labels[wrong], final[wrong]]), axis=1, return_counts=True)
     often = np.argsort(-counts)[:8]
     confusions = ", ".join(f"{classes[pairs[0, i]]} for {classes[pairs[1, i]]} {counts[i]}" for i in often)
-    lines += [
+    header = ["objects", "number", *(f"{size} views" if size > 1 else "1 view" for size in sizes)]
+    lines = [
+        f"# What holds accuracy down ({options.split} objects)",
+        "",
+        "Accuracy (%) of random views fused, 95 % intervals over objects.",
+        "",
+        markdown_table(header, rows),
         "",
         f"Wrong after all {views} views: {len(wrong)} of {len(labels)}. Taken the first for the second: {confusions}.",
     ]

@@ -29,6 +29,7 @@ import tyro
 from data_pipeline.dataset.builder import open_split
 from data_pipeline.files import read_json, write_bytes, write_text
 from eval.learned.study import BASELINES, ByObject, seeds_together
+from eval.report.markdown import markdown_table
 
 RESULTS = Path(__file__).parent / "results"
 KEPT = RESULTS / "choices"
@@ -93,10 +94,6 @@ def kept(path: Path) -> tuple[dict[str, Any], dict[str, ByObject]]:
     return summary, each
 
 
-def _row(cells: list[str]) -> str:
-    return f"| {' | '.join(cells)} |\n"
-
-
 def _difference(difference: float, interval: list[float]) -> str:
     low, high = interval
     cell = f"{100 * difference:+.1f} [{100 * low:+.1f}, {100 * high:+.1f}]".replace("-", "−")
@@ -104,7 +101,7 @@ def _difference(difference: float, interval: list[float]) -> str:
 
 
 def _table(header: list[str], rows: list[list[str]]) -> str:
-    return _row(header) + _row(["---"] * len(header)) + "".join(map(_row, rows)) + "\n"
+    return markdown_table(header, rows, " --- ") + "\n\n"
 
 
 def tables(found: dict[str, Any]) -> str:

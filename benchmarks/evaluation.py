@@ -21,6 +21,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from data_pipeline.files import write_json
+from eval.report.markdown import markdown_table
 from eval.walks.grid import FIRST_MV, LAST_MV, THRESHOLDS, run_grid
 from eval.walks.ladder import Rung
 from mevs_jax import Knowledge, ViewGraph, ViewTable, fibonacci_sphere
@@ -83,8 +84,8 @@ def main() -> None:
         times.append(time.perf_counter() - start)
     # Before the loop and the check below, so that it is the program's own. Linux counts kilobytes.
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20
-    cells = BACKBONES * len(RUNGS) * (LAST_MV - FIRST_MV + 1) * len(THRESHOLDS)
-    walks = OBJECTS * VIEWS * cells
+    grid_cells = BACKBONES * len(RUNGS) * (LAST_MV - FIRST_MV + 1) * len(THRESHOLDS)
+    walks = OBJECTS * VIEWS * grid_cells
 
     start = time.perf_counter()
     right, looped = loop_over_objects(tables, np.asarray(graph.neighbours), SUBSET)
@@ -119,12 +120,17 @@ def main() -> None:
         "times_faster": per_walk * walks / float(np.median(times)),
     }
     print(f"Measured on: {machine}\n")
-    print("| walks | program, s | slowest of 15 | compiling, s | peak memory, GiB | loop, s (scaled) | ratio |")
-    print("|---|---|---|---|---|---|---|")
-    print(
-        f"| {walks:,} | {row['seconds']:.3f} | {row['slowest_seconds']:.3f} | {compiling:.1f} | {peak:.2f} "
-        f"| {row['loop_seconds_scaled']:,.0f} | {row['times_faster']:,.0f}× |"
-    )
+    header = ("walks", "program, s", "slowest of 15", "compiling, s", "peak memory, GiB", "loop, s (scaled)", "ratio")
+    cells = [
+        f"{walks:,}",
+        f"{row['seconds']:.3f}",
+        f"{row['slowest_seconds']:.3f}",
+        f"{compiling:.1f}",
+        f"{peak:.2f}",
+        f"{row['loop_seconds_scaled']:,.0f}",
+        f"{row['times_faster']:,.0f}×",
+    ]
+    print(markdown_table(header, [cells]))
     path = Path(__file__).parent / "results" / "evaluation.json"
     write_json(path, {"machine": machine, "rows": [row]})
     print(f"\nWritten to {path.relative_to(Path.cwd()) if path.is_relative_to(Path.cwd()) else path}")

@@ -33,6 +33,7 @@ from scipy.spatial import cKDTree
 
 from data_pipeline.files import read_json, write_json, write_text
 from eval.numbers.timing import time_local_maxima
+from eval.report.markdown import markdown_row, markdown_table
 from mevs_jax import (
     NextView,
     PointNet2,
@@ -48,11 +49,8 @@ from tests.reference.weights import made_up_weights
 RESULTS = Path(__file__).parent / "results" / "points.json"
 CLOUDS, POINTS, CENTRES, RADIUS, SAMPLES = 16, 4096, 512, 0.2, 64
 GUARD = 3.0
-DECISIONS = """One decision, cloud to next of 40 views:
-
-| points | clouds | p50, ms | p99, ms | ms a cloud | memory, MB |
-|---|---|---|---|---|---|"""
-HEADER = "| what | ours | peer | theirs | ratio | |\n|---|---|---|---|---|---|"
+HEADER = ("what", "ours", "peer", "theirs", "ratio", "")
+DECISION_HEADER = ("points", "clouds", "p50, ms", "p99, ms", "ms a cloud", "memory, MB")
 
 
 @dataclass
@@ -103,7 +101,7 @@ def compare(
         for peer, theirs in zip(peers, quartiles[1:], strict=True)
     ]
     for row in rows:
-        print(line_of(row), flush=True)
+        print(markdown_row(row_cells(row)), flush=True)
     return rows
 
 
@@ -337,7 +335,7 @@ def decisions(clouds: np.ndarray, calls: int = 200) -> list[dict[str, float]]:
                 "memory_mb": (memory.argument_size_in_bytes + memory.temp_size_in_bytes) / 1e6,
             }
         )
-        print(decision_line(found[-1]), flush=True)
+        print(markdown_row(decision_cells(found[-1])), flush=True)
     return found
 
 
@@ -348,16 +346,20 @@ def maxima(maps: int = 1000) -> dict[str, float]:
     return {name: 1000 * value for name, value in found.items()}
 
 
-def decision_line(row: dict[str, float]) -> str:
-    return (
-        f"| {row['points']:,.0f} | {row['batch']:.0f} | {row['p50_ms']:.3g} | {row['p99_ms']:.3g} "
-        f"| {row['p50_ms'] / row['batch']:.3g} | {row['memory_mb']:.0f} |"
-    )
+def decision_cells(row: dict[str, float]) -> list[str]:
+    return [
+        f"{row['points']:,.0f}",
+        f"{row['batch']:.0f}",
+        f"{row['p50_ms']:.3g}",
+        f"{row['p99_ms']:.3g}",
+        f"{row['p50_ms'] / row['batch']:.3g}",
+        f"{row['memory_mb']:.0f}",
+    ]
 
 
-def line_of(row: Row) -> str:
+def row_cells(row: Row) -> list[str]:
     ours, theirs = (f"{m:.3g} ({low:.3g}–{high:.3g})" for low, m, high in (row.ours, row.theirs))
-    return f"| {row.what} | {ours} | {row.peer} | {theirs} | {row.ratio:.3g} | {row.note} |"
+    return [row.what, ours, row.peer, theirs, f"{row.ratio:.3g}", row.note]
 
 
 def slower_than_before(rows: list[Row], before: dict[str, Any]) -> list[str]:
@@ -376,7 +378,7 @@ def main() -> None:
     rounds = 3 if guard else 15
     machine = f"{platform.processor() or platform.machine()}, {jax.devices()[0].device_kind}, JAX {jax.__version__}"
     print(f"Measured on: {machine}. Milliseconds: median (quartiles).\n")
-    print(HEADER)
+    print(markdown_table(HEADER, []))
     torch_peer = None
     if installed("torch"):
         from benchmarks import torch_peer
@@ -392,9 +394,14 @@ def main() -> None:
         RESULTS,
         {"machine": machine, "rows": [asdict(row) for row in rows], "decisions": found, "local_maxima_us": of_maps},
     )
-    table = "\n".join([HEADER, *map(line_of, rows), "", DECISIONS, *map(decision_line, found)])
+    timed = markdown_table(HEADER, [row_cells(row) for row in rows])
+    decided = markdown_table(DECISION_HEADER, [decision_cells(row) for row in found])
     last = f"Local maxima of a map of 40 views: {of_maps['alone']:.0f} µs alone, {of_maps['batched']:.2f} µs as one of 1,000."
-    write_text(RESULTS.with_suffix(".md"), f"{machine}. Milliseconds: median (quartiles).\n\n{table}\n\n{last}\n")
+    write_text(
+        RESULTS.with_suffix(".md"),
+        f"{machine}. Milliseconds: median (quartiles).\n\n{timed}\n\n"
+        f"One decision, cloud to next of 40 views:\n\n{decided}\n\n{last}\n",
+    )
 
 
 if __name__ == "__main__":

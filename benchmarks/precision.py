@@ -24,6 +24,7 @@ from flax import nnx
 
 from data_pipeline.dataset.builder import load_statistics
 from data_pipeline.files import write_text
+from eval.report.markdown import markdown_table
 from eval.settings import PRESETS
 from eval.stages import tasks
 from eval.tables import objects_of
@@ -115,21 +116,23 @@ def main() -> None:
         "entropies",
         "first choice the same",
     )
-    lines = [
-        f"{len(labels)} test objects × {statistics.views} views; {platform.machine()}, {jax.default_backend()}.",
-        "",
-        "| " + " | ".join(columns) + " |",
-        "|---" * len(columns) + "|",
+    rows = [
+        [
+            name,
+            f"{100 * by['right'].mean():.2f}",
+            interval(100 * (by["right"] - first["right"])),
+            f"{1 - by['error'].mean() / variance:.4f}",
+            interval(100 * (by["error"] - first["error"]) / variance),
+            f"{np.abs(by['logits'] - first['logits']).max():.1e}",
+            f"{np.abs(by['entropy'] - first['entropy']).max():.1e}",
+            f"{100 * (by['chosen'] == first['chosen']).mean():.2f} %",
+        ]
+        for name, by in found.items()
     ]
-    for name, by in found.items():
-        lines.append(
-            f"| {name} | {100 * by['right'].mean():.2f} | {interval(100 * (by['right'] - first['right']))} "
-            f"| {1 - by['error'].mean() / variance:.4f} | {interval(100 * (by['error'] - first['error']) / variance)} "
-            f"| {np.abs(by['logits'] - first['logits']).max():.1e} | {np.abs(by['entropy'] - first['entropy']).max():.1e} "
-            f"| {100 * (by['chosen'] == first['chosen']).mean():.2f} % |"
-        )
-    write_text(RESULTS, "\n".join(lines) + "\n")
-    print("\n".join(lines))
+    measured = f"{len(labels)} test objects × {statistics.views} views; {platform.machine()}, {jax.default_backend()}."
+    text = f"{measured}\n\n{markdown_table(columns, rows)}\n"
+    write_text(RESULTS, text)
+    print(text, end="")
 
 
 if __name__ == "__main__":

@@ -12,8 +12,7 @@ from data_pipeline.dataset.builder import DatasetStatistics
 from data_pipeline.files import write_text
 from eval.learned.study import BASELINES
 from eval.report import figures
-from eval.report.html import ReportInputs, difference, document, image, percent, signed, span, table
-from eval.walks.ladder import KNOWS
+from eval.report.html import ReportInputs, difference, document, image, percent, rows_by_knowledge, signed, span, table
 
 METHOD = "learned"
 """The policy that the page is about."""
@@ -26,21 +25,17 @@ def _accuracy(share: float, interval: list[float]) -> str:
 
 
 def _ladder(found: dict[str, Any]) -> str:
-    rows, known, with_gap = [], None, bool(found["gap_closed"])
+    rows, with_gap = [], bool(found["gap_closed"])
     steps = [step for step in _SHOWN if step < len(found["policies"]["random"]["after_views"])]
     for name, policy in found["policies"].items():
-        if policy["knows"] != known:
-            known = policy["knows"]
-            rows.append([f'<b class="note">Knows {html.escape(KNOWS[known])}</b>'])
         cells = [_accuracy(*cell) for cell in zip(policy["after_views"], policy["interval"], strict=True)]
         closed = ["–" if share is None else signed(share, 0).lstrip("+") for share in found["gap_closed"].get(name, ())]
-        rows.append(
-            [
-                html.escape(policy["title"]),
-                *(cells[step] if step < len(cells) else "" for step in steps),
-                *[" / ".join(closed)] * with_gap,
-            ]
-        )
+        row = [
+            html.escape(policy["title"]),
+            *(cells[step] if step < len(cells) else "" for step in steps),
+            *[" / ".join(closed)] * with_gap,
+        ]
+        rows.append((policy["knows"], row))
     header = ["next view chosen by", *(str(step + 1) for step in steps), *["% of the gap"] * with_gap]
     note = "Accuracy (%) after exactly so many views, with 95 % intervals over objects."
     if with_gap:
@@ -49,7 +44,7 @@ def _ladder(found: dict[str, Any]) -> str:
             f"from {found['trying_starts']} of the {found['views']} starts, on which the gap is read; the label oracle finds "
             "views that are right by luck."
         )
-    return table(header, rows) + f"<p class='note'>{note}</p>"
+    return table(header, rows_by_knowledge(rows)) + f"<p class='note'>{note}</p>"
 
 
 def _against(found: dict[str, Any], bases: tuple[str, ...] = BASELINES) -> str:

@@ -28,6 +28,7 @@ from data_pipeline.files import write_bytes
 from data_pipeline.objects.mesh import Mesh, ObjectEntry
 from data_pipeline.objects.reconstruction import decimate, voxelise
 from data_pipeline.objects.sources import load_object
+from eval.projections import longitude_latitude
 from mevs_jax.cameras import Camera, cameras_at
 from mevs_jax.rendering import (
     Ascent,
@@ -183,7 +184,7 @@ def animation(method: Method, thing: Any, found: Ascent, resolution: int, frames
     draw = jax.jit(lambda thing, pose: method.picture(thing, Camera(pose, resolution=resolution)))
     best, steps = int(np.argmax(found.values)), int(np.max(found.steps)) + 1
     paths = np.asarray(found.path)[:, :steps] / 2
-    degrees = np.degrees(np.arctan2(paths[..., 1], paths[..., 0])), np.degrees(np.arcsin(np.clip(paths[..., 2], -1, 1)))
+    degrees = longitude_latitude(paths)
     poses = cameras_at(paths[best]).pose
 
     figure, (view, sphere) = plt.subplots(1, 2, figsize=(8.4, 3.6), width_ratios=(1, 1.7), layout="constrained")

@@ -13,6 +13,8 @@ import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.figure import Figure
 
+from eval.projections import longitude_latitude
+
 COLOURS = {
     "random": "#6b7280",
     "farthest": "#0d9488",
@@ -260,10 +262,7 @@ def view_map(
     limits: tuple[float, float],
 ) -> Figure:
     """Views in a Mercator-like chart (thesis Figs. 7 and 11), coloured by entropy; local maxima are ringed."""
-    longitude, latitude = (
-        np.degrees(np.arctan2(points[:, 1], points[:, 0])),
-        np.degrees(np.arcsin(np.clip(points[:, 2], -1, 1))),
-    )
+    longitude, latitude = longitude_latitude(points)
     figure, axis = plt.subplots(figsize=(4.8, 2.8), layout="constrained")
     for i, j in np.argwhere(np.triu(neighbours)):
         if abs(longitude[i] - longitude[j]) < 180:

@@ -7,6 +7,7 @@ import html
 import io
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import groupby
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +16,7 @@ from matplotlib.figure import Figure
 
 from data_pipeline.dataset.builder import DatasetStatistics
 from eval.tables import ViewTables
+from eval.walks.ladder import KNOWS, Knows
 
 STYLE = """
 body{font:15px/1.55 system-ui,sans-serif;color:#111827;max-width:60rem;margin:2rem auto;padding:0 1rem}
@@ -89,6 +91,15 @@ def table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
         for row in rows
     )
     return f"<table><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table>"
+
+
+def rows_by_knowledge(rows: Sequence[tuple[Knows, Sequence[str]]]) -> list[Sequence[str]]:
+    """Rows of a table, with a heading across it wherever what the policies know changes."""
+    out: list[Sequence[str]] = []
+    for knows, group in groupby(rows, key=lambda row: row[0]):
+        out.append([f'<b class="note">Knows {html.escape(KNOWS[knows])}</b>'])
+        out.extend(row for _, row in group)
+    return out
 
 
 def percent(value: float) -> str:

@@ -12,8 +12,7 @@ import numpy as np
 from data_pipeline.dataset.builder import open_split
 from eval.numbers.confidence import READINGS
 from eval.report import figures
-from eval.report.html import ReportInputs, difference, image, percent, signed, span, table
-from eval.walks.ladder import KNOWS
+from eval.report.html import ReportInputs, difference, image, percent, rows_by_knowledge, signed, span, table
 from mevs_jax.policies.base import Scene
 from mevs_jax.policies.registry import POLICIES
 from mevs_jax.selection import Episode, ViewTable, select_from_table
@@ -65,12 +64,9 @@ def ladder_section(inputs: ReportInputs) -> str:
     policies, against = metrics["policies"], metrics["against_random"]
     steps = _steps(metrics, (2, 3, 4, 6, 9))
     reach = metrics["views_to_reach"].get("5") or metrics["views_to_reach"].get("3")
-    rows, details, known = [], [], None
+    rows, details = [], []
     for rung in metrics["ladder"]:
         name, result = rung["policy"], policies[rung["policy"]]
-        if rung["knows"] != known:
-            known = rung["knows"]
-            rows.append([f'<b class="note">Knows {html.escape(KNOWS[known])}</b>'])
         row = [html.escape(rung["title"])]
         for step in steps:
             cell = f"<b>{percent(result['after_views'][step - 1])}</b>"
@@ -86,7 +82,7 @@ def ladder_section(inputs: ReportInputs) -> str:
             views = reach["views"][name]
             low, high = ("∞" if end is None else f"{end:.1f}" for end in reach["interval"][name])
             row.append(("never" if views is None else f"<b>{views:.1f}</b>") + f"<br><small>[{low}, {high}]</small>")
-        rows.append(row)
+        rows.append((rung["knows"], row))
         every = _steps(metrics, range(1, 10))
         details.append(
             [html.escape(rung["title"])]
@@ -108,7 +104,7 @@ def ladder_section(inputs: ReportInputs) -> str:
         "<h2>The ladder: who chooses the next view</h2><p>Accuracy (%) after exactly so many views, and below it the difference "
         "from random in points with its 95 % interval; <span class='faint'>grey</span> where it cannot be told from zero. "
         f"Area: mean accuracy over 1 to {len(policies['random']['after_views'])} views.{reach_note}</p>"
-        + table(header, rows)
+        + table(header, rows_by_knowledge(rows))
         + f"<p class='note'>Random without repetition is an exact expectation up to {exact} views"
         + ("" if exact >= len(policies["random"]["after_views"]) else f", beyond that a mean over {draws(metrics)}")
         + ". The label oracles are optimistic: they find views that are right by luck. If two views could be had anywhere and "
@@ -135,12 +131,9 @@ def ascent_section(inputs: ReportInputs) -> str:
     if found is None:
         return ""
     steps = _steps(inputs.metrics, (2, 3, 4, 6))
-    against, rows, known = found["against"], [], None
+    against, rows = found["against"], []
     for rung in found["ladder"]:
         name = rung["policy"]
-        if rung["knows"] != known:
-            known = rung["knows"]
-            rows.append([f'<b class="note">Knows {html.escape(KNOWS[known])}</b>'])
         row = [html.escape(rung["title"])]
         for step in steps:
             cell = f"<b>{percent(found['policies'][name]['after_views'][step - 1])}</b>"
@@ -151,7 +144,7 @@ def ascent_section(inputs: ReportInputs) -> str:
                 else:
                     cell += "<br>–"
             row.append(cell)
-        rows.append(row)
+        rows.append((rung["knows"], row))
     settings = found["settings"]
     return (
         "<h2>Choosing by differentiable rendering</h2><p>The thesis's other two methods: make a volume, or a surface of at most "
@@ -159,7 +152,7 @@ def ascent_section(inputs: ReportInputs) -> str:
         f"to where it looks best, at {settings['resolution']}×{settings['resolution']} pixels. Distinct optima are looked at in "
         "the order of their values. Accuracy (%) after so many views; below it the difference from random, and below that from "
         "the thesis's predicted entropy, both with 95 % intervals.</p>"
-        + table(["next view chosen by", *(f"{step} views" for step in steps)], rows)
+        + table(["next view chosen by", *(f"{step} views" for step in steps)], rows_by_knowledge(rows))
         + f"<p class='note'>{found['objects']} test objects, every start view. {found['views_without_surface']} of "
         f"{found['views']:,} views show too little for a surface; after those the choice is arbitrary.</p>"
     )

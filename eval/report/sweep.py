@@ -11,6 +11,7 @@ from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
 
 from data_pipeline.files import write_bytes, write_text
+from eval.report.markdown import markdown_table
 from train.sweep import Member
 
 _AXES = {
@@ -26,13 +27,13 @@ _LOGARITHMIC = ("learning_rate", "weight_decay", "loss")
 
 def sweep_table(members: Sequence[Member]) -> str:
     """Markdown; members best first, those that diverged last."""
-    rows = ["| " + " | ".join(["member", *_AXES.values(), "epochs"]) + " |", "|" + "---|" * (len(_AXES) + 2)]
+    rows = []
     for member in sorted(members, key=lambda member: member.loss):
         loss = "diverged" if member.best is None else f"{member.loss:.5f}"
         numbers = [f"{member.learning_rate:.2e}", f"{member.weight_decay:.2e}", f"{member.dropout:.2f}"]
         numbers += [f"{member.augmentation:.2f}", str(member.best_epoch), loss, str(member.epochs)]
-        rows.append("| " + " | ".join([str(members.index(member)), *numbers]) + " |")
-    return "\n".join(rows) + "\n"
+        rows.append([str(members.index(member)), *numbers])
+    return markdown_table(["member", *_AXES.values(), "epochs"], rows) + "\n"
 
 
 def parallel_coordinates(members: Sequence[Member]) -> Figure:

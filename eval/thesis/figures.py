@@ -14,14 +14,13 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
 from data_pipeline.dataset.builder import DatasetStatistics, metric_depth, open_split
+from eval.projections import mercator, mercator_ordinate
 from eval.report import figures
 from eval.thesis.results import LatticeTables
 from mevs_jax.viewpoints import ViewGraph, local_maxima
 from train.thesis_networks import BACKBONES, FRAMES, Frame, ThesisFolder
 
 _RING: dict[str, Any] = {"facecolors": "none", "edgecolors": "#dc2626", "linewidths": 1.6}
-_NEAREST_POLE = 85.0
-"""Degrees of latitude beyond which the Mercator projection is cut off."""
 
 
 @dataclass(frozen=True)
@@ -165,18 +164,10 @@ def view_graphs(inputs: FigureInputs) -> Figure:
     return figure
 
 
-def _mercator(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Longitude in degrees, and the Mercator ordinate in the same unit."""
-    longitude = np.degrees(np.arctan2(points[:, 1], points[:, 0]))
-    latitude = np.clip(np.degrees(np.arcsin(np.clip(points[:, 2], -1, 1))), -_NEAREST_POLE, _NEAREST_POLE)
-    return longitude, np.degrees(np.log(np.tan(np.radians(45 + latitude / 2))))
-
-
 def _map(axis: Axes, points: np.ndarray, **colour: Any) -> Any:
-    longitude, height = _mercator(points)
+    longitude, height = mercator(points)
     parallels = np.array([-80, -60, -30, 0, 30, 60, 80])
-    ticks = np.degrees(np.log(np.tan(np.radians(45 + parallels / 2))))
-    axis.set_yticks(ticks, [f"{p}°".replace("-", "−") for p in parallels])
+    axis.set_yticks(mercator_ordinate(parallels), [f"{p}°".replace("-", "−") for p in parallels])
     axis.set(xlim=(-185, 185), xticks=[-180, -90, 0, 90, 180], xlabel="longitude (°)", ylabel="latitude")
     axis.grid(color="#f3f4f6", linewidth=0.7)
     axis.set_axisbelow(True)
@@ -185,7 +176,7 @@ def _map(axis: Axes, points: np.ndarray, **colour: Any) -> Any:
 
 def _map_edges(axis: Axes, points: np.ndarray, neighbours: np.ndarray) -> None:
     """Edges of the graph; those across ±180° leave the map on one side and come back on the other."""
-    longitude, height = _mercator(points)
+    longitude, height = mercator(points)
     for i, j in np.argwhere(np.triu(neighbours)):
         x, y = longitude[[i, j]], height[[i, j]]
         if abs(x[0] - x[1]) <= 180:
@@ -200,7 +191,7 @@ def mercator_order_and_entropies(inputs: FigureInputs) -> Figure:
     points, weights = np.array(inputs.statistics[40].viewpoints), inputs.tables[40].entropy[inputs.example]
     figure, (order, entropies) = plt.subplots(1, 2, figsize=(10, 3.9), layout="constrained")
     _map(order, points, color="#bfdbfe")
-    for number, (x, y) in enumerate(zip(*_mercator(points), strict=True)):
+    for number, (x, y) in enumerate(zip(*mercator(points), strict=True)):
         order.annotate(str(number), (x, y), ha="center", va="center", fontsize=6.5, zorder=4)
     order.set_title("(a) canonical order")
     dots = _map(entropies, points, c=weights, cmap="viridis", vmin=0, vmax=1)
@@ -219,7 +210,7 @@ def graph_with_maxima(inputs: FigureInputs) -> Figure:
     _map(axes[0], points, color="#bfdbfe")
     axes[0].set_title("(a) neighbours")
     dots = _map(axes[1], points, c=weights, cmap="viridis", vmin=0, vmax=1)
-    longitude, height = _mercator(points)
+    longitude, height = mercator(points)
     axes[1].scatter(longitude[maxima], height[maxima], s=190, zorder=4, **_RING)
     axes[1].set_title(f"(b) {maxima.sum()} local maxima")
     figure.colorbar(dots, ax=axes[1], label="normalised depth entropy")

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from eval.rendering.ascent import FACES
+from eval.report.markdown import markdown_table
 from eval.thesis.results import ORACLE_MV
 from train.thesis_networks import BACKBONES, FRAMES, PIPELINE
 
@@ -435,12 +436,12 @@ def shown_cells(row: Row, table: ThesisTable) -> list[tuple[str, bool, str]]:
 
 def markdown(table: ThesisTable) -> str:
     """The table with the thesis's numbers in brackets behind ours."""
-    lines = [f"**Table {table.number}. {table.title}**", "", f"| | {' | '.join(table.columns)} |"]
-    lines.append("|---" * (len(table.columns) + 1) + "|")
+    rows = []
     for row in table.rows:
         cells = [
             (f"**{ours}**" if bold else ours) + (f" ({theirs})" if theirs else "")
             for ours, bold, theirs in shown_cells(row, table)
         ]
-        lines.append(f"| {row.name} | {' | '.join(cells)} |")
-    return "\n".join([*lines, "", f"{table.note} In brackets: the thesis.", ""])
+        rows.append([row.name, *cells])
+    shown = markdown_table(["", *table.columns], rows)
+    return f"**Table {table.number}. {table.title}**\n\n{shown}\n\n{table.note} In brackets: the thesis.\n"
