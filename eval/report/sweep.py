@@ -1,4 +1,4 @@
-"""What a sweep found: a table of its members, best first, and a parallel-coordinates plot."""
+"""The report of a sweep: a table of its members and a parallel-coordinates plot."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ _LOGARITHMIC = ("learning_rate", "weight_decay", "loss")
 
 
 def sweep_table(members: Sequence[Member]) -> str:
-    """Markdown; members best first, those that diverged last."""
+    """A Markdown table of the members, best first and diverged ones last."""
     rows = []
     for member in sorted(members, key=lambda member: member.loss):
         loss = "diverged" if member.best is None else f"{member.loss:.5f}"
@@ -37,7 +37,10 @@ def sweep_table(members: Sequence[Member]) -> str:
 
 
 def parallel_coordinates(members: Sequence[Member]) -> Figure:
-    """A line a member over the axes of a sweep, darker the better; members without a finite loss are left out and counted."""
+    """A line for each member over the swept parameters, darker for a lower loss.
+
+    Members without a finite loss are left out; the title counts them.
+    """
     finite = [member for member in members if member.best is not None]
     names = [name for name in _AXES if len({getattr(member, name) for member in finite}) > 1]
     columns, ticks = [], []
