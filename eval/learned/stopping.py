@@ -18,9 +18,9 @@ import numpy as np
 from flax import nnx
 from jaxtyping import Array, Bool, Float, Int
 
-from eval.learned.walks import Contender, Learner, OnLattice, beliefs_of, given_to, walk_all
+from eval.learned.walks import Contender, Learner, OnLattice, beliefs_of, policy_parameters, walk_all
 from eval.numbers.comparison import intervals
-from eval.numbers.confidence import stops_at, walked
+from eval.numbers.confidence import logits_along, stops_at
 from eval.walks.grid import THRESHOLDS
 from mevs_jax.arrays import AnyArray
 from mevs_jax.beliefs import CalibratedFusion, beliefs_along
@@ -76,7 +76,7 @@ def confidences(beliefs: Float[AnyArray, "objects walks steps classes"], labels:
     return Signal(np.asarray(confidence), np.asarray(right), np.asarray(weight))
 
 
-def beside(
+def compare_rules(
     others: Sequence[Signal], ours: Sequence[Signal], thresholds: Sequence[float] = THRESHOLDS
 ) -> list[dict[str, Any]]:
     """Accuracy and views of another rule at each of its thresholds, and of ours at equal accuracy on validation objects.
@@ -151,7 +151,7 @@ def best_gains(
     beliefs: Float[AnyArray, "objects walks steps classes"],
 ) -> Float[np.ndarray, "objects walks steps"]:
     """Expected gain of the best remaining view after each step of each walk."""
-    structure, given = nnx.graphdef(learner.network), given_to(learner, fusion)
+    structure, given = nnx.graphdef(learner.network), policy_parameters(learner, fusion)
     at_once = max(1, 256 // views.shape[1])
     return in_chunks(partial(_best_gains_of_some, given, structure=structure), (data, views, beliefs), at_once)
 
@@ -175,7 +175,7 @@ def moving(
     directions, rows = test.features.directions, []
     distances = np.asarray(graph_of(directions[0]).distances)
     for cost in MOVEMENT_COSTS:
-        given = given_to(learner, fusion), jnp.float32(cost)
+        given = policy_parameters(learner, fusion), jnp.float32(cost)
         views = walk_all(key, contender, given, fusion, test.table(True), directions, knowledge, max_views)
         steps = distances[views[:, :, :-1], views[:, :, 1:]]
         travelled = np.concatenate([np.zeros_like(steps[..., :1]), np.cumsum(steps, axis=-1)], axis=-1)
@@ -194,7 +194,7 @@ def moving(
     return rows
 
 
-def what_it_costs(
+def cost_metrics(
     key: Array,
     learner: Learner,
     fusion: CalibratedFusion,
@@ -214,7 +214,7 @@ def what_it_costs(
     walked_by = next(name for name in ("predicted_entropy", "random") if name in records)
     both, method = (validation.features, test.features), records[learner.name]
     thesis = [
-        confidences(jax.vmap(jax.vmap(beliefs_along))(walked(jnp.asarray(views), data.logits)), data.labels)
+        confidences(jax.vmap(jax.vmap(beliefs_along))(logits_along(jnp.asarray(views), data.logits)), data.labels)
         for data, views in zip(both, records[walked_by].views, strict=True)
     ]
     gains = [
@@ -223,7 +223,7 @@ def what_it_costs(
     ]
     return {
         "thesis_walks": walked_by,
-        "beside_thesis": beside(thesis, method.confidence),
-        "not_paying": beside(gains, method.confidence, [-cost for cost in VIEW_COSTS]),
+        "beside_thesis": compare_rules(thesis, method.confidence),
+        "not_paying": compare_rules(gains, method.confidence, [-cost for cost in VIEW_COSTS]),
         "moving": moving(key, learner, fusion, test, knowledge, max_views, every),
     }

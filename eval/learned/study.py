@@ -16,14 +16,14 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from data_pipeline.progress import console
-from eval.learned.stopping import Signal, WalkRecord, confidences, what_it_costs
+from eval.learned.stopping import Signal, WalkRecord, confidences, cost_metrics
 from eval.learned.walks import (
     Contender,
     Learner,
     OnLattice,
     beliefs_of,
     contenders,
-    given_to,
+    policy_parameters,
     random_walker,
     walk_all,
     walker,
@@ -68,7 +68,7 @@ def _refit(beliefs: Array, labels: Array) -> Float[Array, " steps"]:
     return jax.vmap(fit_temperature, (1, None, None))(flat, truth, class_weights(truth, flat.shape[-1]))
 
 
-def judged(
+def walk_metrics(
     beliefs: Sequence[Float[AnyArray, "objects walks steps classes"]], labels: Sequence[Int[AnyArray, " objects"]]
 ) -> tuple[dict[str, Any], list[Signal], Float[np.ndarray, "steps objects"]]:
     """Metrics of one policy.
@@ -249,7 +249,7 @@ def study(
         found["random_sets"] = random_sets_study(fusion, validation.features, test.features, draws)
     each: dict[str, ByObject] = {}
     parameters: dict[str, Any] = {"belief_oracle": fusion, "label_oracle": fusion}
-    parameters |= {learner.name: given_to(learner, fusion) for learner in learners}
+    parameters |= {learner.name: policy_parameters(learner, fusion) for learner in learners}
     fusions = {learner.name: learner.fusion or fusion for learner in learners}
     records: dict[str, WalkRecord] = {}
     entropies = shared and test.predicted_entropy is not None and test.entropy is not None
@@ -270,7 +270,7 @@ def study(
             )
             walks.append(views)
             beliefs.append(beliefs_of(own, data.features, views))
-        metrics, signals, likelihood = judged(beliefs, [data.features.labels for data in (validation, test)])
+        metrics, signals, likelihood = walk_metrics(beliefs, [data.features.labels for data in (validation, test)])
         right = signals[1].right
         records[name] = WalkRecord(walks, beliefs, signals)
         by_start = right.reshape(len(right), -1, contender.draws, right.shape[-1]).mean(axis=2)
@@ -280,7 +280,7 @@ def study(
         console.print(f"{contender.title}: " + " ".join(f"{100 * share:.1f}" for share in metrics["after_views"]))
     if costs:
         key, method = jax.random.key(seed), learners[0]
-        found["costs"] = what_it_costs(key, method, fusion, validation, test, knowledge, records, max_views, apart)
+        found["costs"] = cost_metrics(key, method, fusion, validation, test, knowledge, records, max_views, apart)
     return found | compared(each, learners[0].name), each
 
 
@@ -359,7 +359,7 @@ def novel_classes(
         some = test.some(np.flatnonzero(np.isin(test.labels, classes)))
         learners = Learner("trained_without", "", policy), Learner("trained_with", "", whole)
         walkers: list[tuple[Contender, Any]] = [(random_walker(draws), None)]
-        walkers += [(walker(one), given_to(one, fusion)) for one in learners]
+        walkers += [(walker(one), policy_parameters(one, fusion)) for one in learners]
         for contender, given in walkers:
             table, key = OnLattice(some).table(contender.believes), jax.random.key(seed)
             views = walk_all(key, contender, given, fusion, table, some.directions, None, max_views)

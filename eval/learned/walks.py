@@ -103,12 +103,12 @@ def random_walker(draws: int) -> Contender:
 
 
 def walker(learner: Learner) -> Contender:
-    """The contender of a learner; its parameters are those of `given_to`."""
+    """The contender of a learner; its parameters are those of `policy_parameters`."""
     policy_of = partial(learned_policy, structure=nnx.graphdef(learner.network), by=learner.by)
     return Contender(learner.name, learner.title, "learned", policy_of)
 
 
-def given_to(learner: Learner, fusion: CalibratedFusion) -> tuple[nnx.State, Array]:
+def policy_parameters(learner: Learner, fusion: CalibratedFusion) -> tuple[nnx.State, Array]:
     """The parameters of the learner's policy: the network's weights and the temperature of single views."""
     return nnx.state(learner.network, nnx.Param), fusion.single
 

@@ -34,7 +34,7 @@ READINGS = {
 }
 
 
-def walked(views: Int[Array, "objects starts steps"], logits: Float[Array, "objects views classes"]) -> Array:
+def logits_along(views: Int[Array, "objects starts steps"], logits: Float[Array, "objects views classes"]) -> Array:
     """Logits along every walk, (objects, starts, steps, classes); zeros beyond the end of a walk."""
 
     def one(views: Array, logits: Array) -> Array:
@@ -127,8 +127,8 @@ def confidence_of(
     labels: np.ndarray,
 ) -> dict[str, Any]:
     """All confidence metrics of one policy's walks; views are (objects, starts, steps)."""
-    fitting = walked(jnp.asarray(validation_views), jnp.asarray(validation_logits))
-    testing = walked(jnp.asarray(views), jnp.asarray(logits))
+    fitting = logits_along(jnp.asarray(validation_views), jnp.asarray(validation_logits))
+    testing = logits_along(jnp.asarray(views), jnp.asarray(logits))
     temperatures = _fit(fitting, jnp.asarray(validation_labels))
     out: dict[str, Any] = {"readings": {}}
     for reading in READINGS:
