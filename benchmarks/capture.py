@@ -1,10 +1,11 @@
-"""How many views a second: ray casting, the array program, and the whole way to a file: `python benchmarks/capture.py`.
+"""Views per second of ray casting, of the array program, and of a whole capture to files: `python benchmarks/capture.py`.
 
-Objects are wobbly balls of 320 to 81,920 faces, seen from 40 viewpoints at three resolutions. Both renderers see the same before
-they are timed, and take turns; ray casting has one thread here, the array program all that its device has. Below, where the
-time of a captured object goes, and how long a data set of 100 objects of furniture takes by the number of processes.
+The objects are deformed spheres of 320 to 81,920 faces, seen from 40 viewpoints at three resolutions. The images of
+both renderers are compared before they are timed in turns. Ray casting has one thread here, the array program the
+whole device. Further tables show the time of each stage of a capture, and the time for 100 pieces of furniture by
+number of processes.
 
-The tables go to `benchmarks/results/capture.json` and `capture.md`.
+The tables are written to `benchmarks/results/capture.json` and `capture.md`.
 """
 
 from __future__ import annotations
@@ -57,7 +58,7 @@ def depths(triangles: jax.Array, poses: jax.Array, side: int) -> jax.Array:
 
 
 def median_seconds(calls: list[Callable[[], Any]], rounds: int) -> list[float]:
-    """Of each call, taking turns, after one to warm up."""
+    """Median time of each call in seconds; the calls take turns, after one warm-up round."""
     taken = np.empty((len(calls), rounds))
     for turn in range(-1, rounds):
         for number, call in enumerate(calls):
@@ -98,7 +99,7 @@ def renderer_cells(row: dict[str, float]) -> list[str]:
 
 
 def stages(side: int, objects: int = 10) -> dict[str, float]:
-    """Milliseconds of an object of furniture, by what is done with it."""
+    """Milliseconds of each stage for one piece of furniture."""
     rig = rig_for(CaptureConfig(views=VIEWS, resolution=side))
     spent = dict.fromkeys(("load", "cast", "shade, store", "save"), 0.0)
 

@@ -1,11 +1,11 @@
-"""What folding batch norm and calculating in bfloat16 cost in accuracy: `python benchmarks/precision.py RUN`.
+"""Effect of folded batch norm and of bfloat16 on accuracy: `python benchmarks/precision.py RUN`.
 
-RUN is a directory that `mevs run` made. Every view of every test object, by the same weights in three ways: float32 with batch
-norm as layers of its own, float32 with batch norm folded into weights (what inference does), and bfloat16, folded too. With
-differences from the first, their 95 % intervals paired by object, and how often the first decision stays the same: which view
-the thesis's rule chooses after one cloud.
+RUN is a directory made by `mevs run`. Every view of every test object is evaluated with the same weights in three
+ways: float32 with separate batch norm layers, float32 with batch norm folded into the weights (as in inference), and
+bfloat16 with folded batch norm. The table has the differences from the first with 95 % intervals paired by object,
+and how often the first decision is the same, which is the view that the thesis's rule chooses after one cloud.
 
-The table goes to `benchmarks/results/precision.md`.
+The table is written to `benchmarks/results/precision.md`.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ RESULTS = Path(__file__).parent / "results" / "precision.md"
 
 
 class Unfolded(nnx.Module):
-    """A network whose batch norms are layers of their own: as in training, but by the running statistics."""
+    """A network with separate batch norm layers, as in training, but with the running statistics."""
 
     def __init__(self, network: nnx.Module):
         self.network = network

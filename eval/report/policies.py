@@ -53,8 +53,8 @@ def lead(inputs: ReportInputs) -> str:
         sentences.append(f"At two views, {called} is {verdict}.")
     return (
         f'<p class="lead">{" ".join(sentences)}</p><p class="note">Over {metrics["objects"]} test objects and '
-        f"{metrics['starts']} start views of each. All policies have the same objects, start views and logits. Policies are "
-        f"called distinguishable if the 95 % interval of their difference, paired by object, excludes zero.</p>"
+        f"{metrics['starts']} start views of each. All policies have the same objects, start views and logits. Two "
+        f"policies are called distinguishable if the 95 % interval of their difference, paired by object, excludes zero.</p>"
     )
 
 
