@@ -1,4 +1,4 @@
-"""The usual pure-PyTorch PointNet++, written anew, as the peer of the benchmarks.
+"""The usual pure-PyTorch PointNet++, reimplemented as the peer of the benchmarks.
 
 Its algorithm is the well-known one: farthest-point sampling as a loop over whole batches; ball query as a matrix of all
 distances, where indices outside the ball are replaced by the number of points and sorted; gathering; shared layers as 1×1

@@ -128,7 +128,7 @@ def _walks(
         validation, test = map(objects_of, ("val", "test"))
         pose = "" if posed else ", unknown yaw"
         objects, count, _ = test.features.logits.shape
-        around = " of its own for each" if data == stages.turned else ""
+        around = ", separate for each object" if data == stages.turned else ""
         around = ", objects in any rotation" if stages.upright is not None else around
         console.print(
             f"Walking {objects} test objects, {count} candidate views{around}{pose}{', ablations' * bool(ablations)}"

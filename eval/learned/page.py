@@ -286,7 +286,7 @@ def _decision(metrics: dict[str, Any]) -> str:
     found = metrics["seeds"][0]["decision"]
     ran_on = found["identity"]["machine"]
     features, image = (
-        "{:.1f} ms (99 %: {:.1f})".format(*(found[name][share] for share in ("p50", "p99")))
+        "{:.1f} ms (99th percentile: {:.1f})".format(*(found[name][share] for share in ("p50", "p99")))
         for name in ("from_features", "from_image")
     )
     return (

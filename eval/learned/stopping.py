@@ -171,7 +171,7 @@ def moving(
 ) -> list[dict[str, Any]]:
     """Accuracy and distance travelled (radians) after each number of views, by movement cost, from every n-th start view."""
     policy_of = partial(_with_cost, structure=nnx.graphdef(learner.network))
-    contender = Contender("priced", "", "learned", policy_of, every=every)
+    contender = Contender("with_cost", "", "learned", policy_of, every=every)
     directions, rows = test.features.directions, []
     distances = np.asarray(graph_of(directions[0]).distances)
     for cost in MOVEMENT_COSTS:

@@ -116,7 +116,8 @@ def ladder_section(inputs: ReportInputs) -> str:
         + image(
             figures.ladder_gains(against, metrics["ladder"], _steps(metrics, (2, 4)), ("label_oracle", "pair_oracle")),
             "Hollow markers: not distinguishable from random. Colours by what a policy uses: grey nothing, blue predicted "
-            "entropies, red views of other objects, orange the truth. The label oracles are left out; they lie far to the right.",
+            "entropies, red views of other objects, orange the truth. The label oracles are left out; they would lie far to "
+            "the right.",
         )
         + image(
             figures.accuracy_after_views(policies, _titles(metrics), metrics["single_view"]["all_views"]),
@@ -163,7 +164,7 @@ def ascent_section(inputs: ReportInputs) -> str:
 
 
 def draws(metrics: dict[str, Any]) -> str:
-    return f"{metrics['random_draws_per_start']} draws for each object and start"
+    return f"{metrics['random_draws_per_start']} draws for each object and start view"
 
 
 def movement_section(inputs: ReportInputs) -> str:
@@ -294,8 +295,8 @@ def compatibility_section(inputs: ReportInputs) -> str:
         )
     return (
         "<h2>Differences between the thesis and its published code</h2><p>Gain of the PointNet++ policy over random in the grid "
-        "above, in percentage points: first as the thesis's text describes it, then with one thing changed. The change is the "
-        "one in the published code, except for the row about all clouds.</p>"
+        "above, in percentage points: first as the thesis's text describes it, then with one change at a time, and last with all "
+        "changes of the published code. The use of all clouds is not part of the published code.</p>"
         + table(["switch", "mean of the grid", "cells above zero", *(f"CT 0.99, MV {mv}" for mv in limits)], rows)
         + note
     )

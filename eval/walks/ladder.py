@@ -11,11 +11,11 @@ KNOWS: dict[Knows, str] = {
     "nothing": "no information about the object",
     "networks": "entropies predicted from the views seen",
     "others": "statistics of other (validation) objects",
-    "learned": "a network trained on the gains of views of validation objects",
+    "learned": "a network trained on gains of views that were measured on validation objects",
     "rendering": "renderings of a surface or volume reconstructed from the latest view",
     "truth": "the object itself, which is not available to a robot",
 }
-"""What the policies of each kind use, as the report says it."""
+"""What the policies of each kind use, as shown in the report."""
 
 
 @dataclass(frozen=True)
