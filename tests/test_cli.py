@@ -203,15 +203,15 @@ def test_the_job_leaves_a_report_and_metrics(whole):
     assert "http" not in page.replace("http://www.w3.org", "").replace("https://www.w3.org", "")  # needs no other file
     headings = [line.split("</h2>")[0] for line in page.split("<h2>")[1:]]
     assert headings == [
-        "The ladder: who chooses the next view",
-        "What the way costs",
-        "How sure it may be",
+        "Accuracy by policy",
+        "Accuracy by distance travelled",
+        "Confidence and calibration",
         "The thesis's grid",
-        "What the published code changes",
+        "Differences between the thesis and its published code",
         "Predicting depth entropy",
         "Training",
         "Data",
-        "How this was made",
+        "Methods",
     ]
     for rung in metrics["ladder"]:
         assert html.escape(rung["title"]) in page
@@ -246,9 +246,9 @@ def test_compat_climbs_and_learning_fill_their_tables(whole, tmp_path):
     assert (out / "learned" / "seed_0" / "policies" / "learned" / "summary.json").stat().st_mtime_ns == made_once
     sections = (
         "6 candidate views",
-        "Facing any way",
-        "Classes never chosen for",
-        "Until it does not pay",
+        "Unknown yaw",
+        "Classes left out of policy training",
+        "Stopping when a further view does not pay",
     )
     for said in (*sections, "PointNet++ entropy (thesis)", "view policy", "label-free oracle"):
         assert html.escape(said) in page
@@ -256,7 +256,7 @@ def test_compat_climbs_and_learning_fill_their_tables(whole, tmp_path):
     first = found["seeds"][0]
     more = found | {"seeds": [first | {"rotated": first["unposed"]}, {"lattices": first["lattices"]}]}
     write_learned_page(more, load_statistics(out / "data"), tmp_path / "more.html")
-    for said in ("Means of 2 trainings", "Joined with a table", "Other random weights", "Turned anyhow"):
+    for said in ("Means of 2 seeds", "Combined with a table", "Other random seeds", "Any rotation"):
         assert said in (tmp_path / "more.html").read_text()
     ascend_on_objects(TINY, out)
     assert mevs("compat", "--preset", "tiny", "--out", out).returncode == 0
@@ -268,7 +268,7 @@ def test_compat_climbs_and_learning_fill_their_tables(whole, tmp_path):
     assert {"random", "predicted_entropy", "diff_volume", "diff_mesh"} <= set(metrics["climbing"]["policies"])
     page = (out / "report" / "index.html").read_text()
     assert "Choosing by differentiable rendering" in page
-    assert "Learning to fuse and to choose" in page
+    assert "Learned fusion and view selection" in page
     assert "mevs study published-code" not in page
     before = json.loads((whole / "metrics.json").read_text())
     assert before["compatibility"]["rows"]["text"] == made["rows"]["text"]
@@ -319,7 +319,7 @@ def test_a_sweep_is_made_by_command(whole, tmp_path, refuses):
 
 def test_a_reach_that_leaves_nothing_is_refused(whole, refuses):
     arguments = ("eval", "--preset", "tiny", "--out", whole, "--evaluation.lowest-elevation", "89")
-    assert "viewpoints are 89° above the horizon or higher" in refuses(*arguments)
+    assert "viewpoints have an elevation of at least 89°" in refuses(*arguments)
     assert "must be at least 2" in refuses(*arguments[:5], "--evaluation.max-views", "1")
 
 

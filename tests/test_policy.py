@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from flax import nnx
 
-from eval.learned.stopping import Signal, beside
+from eval.learned.stopping import Signal, compare_rules
 from eval.learned.study import fixed_order_scores, novel_classes, seeds_together, study
 from eval.learned.walks import Learner, OnLattice
 from eval.numbers.confidence import stops_at
@@ -509,12 +509,12 @@ def test_rules_are_compared_where_they_are_as_accurate():
     assert stops_at(knows.value >= 0.9).tolist() == [[1, 1]] * objects
     assert stops_at(knows.value >= 0.99).tolist() == [[2, 2]] * objects  # never: to the end
     assert [share.mean() for share in knows.stopped(0.1)] == [0, 1]
-    (row,) = beside([sure_late] * 2, [knows] * 2, [0.8])
+    (row,) = compare_rules([sure_late] * 2, [knows] * 2, [0.8])
     assert (row["accuracy"], row["views"]) == (1, 3)
     assert (row["ours"]["accuracy"], row["ours"]["views"]) == (1, 2)
     assert row["ours"]["views_difference"] == {"difference": -1, "interval": [-1, -1]}
     never = replace(knows, right=np.zeros_like(knows.right))
-    assert beside([sure_late] * 2, [never] * 2, [0.8])[0]["ours"] is None
+    assert compare_rules([sure_late] * 2, [never] * 2, [0.8])[0]["ours"] is None
     half = replace(knows, right=knows.right & (np.arange(objects) % 2 == 0)[:, None, None])
     weighed = replace(half, weight=np.where(np.arange(objects) % 2 == 0, 2.0, 0.0))
     assert (half.accuracy(0.5), weighed.accuracy(0.5)) == (0.5, 1)

@@ -1,7 +1,7 @@
-"""`mevs study thesis`: every network, table and figure of the thesis, from one run directory; each stage skips what is done.
+"""`mevs study thesis`: every network, table and figure of the thesis in one run directory; each stage skips completed work.
 
-The directory holds both data sets (`views10/`, `views40/`), the networks (`backbones/`, `entropy/`), what they say of every
-view (`outputs/`), `timing.json`, `thesis.json` and the report (`report/`).
+The directory holds both data sets (`views10/`, `views40/`), the networks (`backbones/`, `entropy/`), their outputs for every view
+(`outputs/`), `timing.json`, `thesis.json` and the report (`report/`).
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ from train.thesis_networks import (
 
 
 def make_thesis_data(settings: Settings, folder: ThesisFolder) -> None:
-    """Both data sets, of the same objects and splits."""
+    """Makes both data sets, which have the same objects and splits."""
     for views in VIEWS:
         dataset = replace(settings.dataset, capture=replace(settings.dataset.capture, views=views))
         report_left_out(prepare(dataset, folder.data(views)))
@@ -66,7 +66,7 @@ def lattice_tables(
     backbones: tuple[Backbone, ...] = BACKBONES,
     frames: tuple[Frame, ...] = FRAMES,
 ) -> LatticeTables:
-    """What the networks say of one split of one data set."""
+    """The outputs of the networks for one split of one data set."""
     statistics, data = folder.statistics(views), folder.data(views)
 
     def outputs(name: str, network: Path, task: ClassifierTask | EntropyTask) -> np.ndarray:
@@ -133,14 +133,16 @@ def _ascents(settings: Settings, tables: LatticeTables, classes: list[str]) -> d
 
 
 def measure(settings: Settings, folder: ThesisFolder, tables: dict[int, LatticeTables]) -> dict[str, Any]:
-    """Machine, times and memory; measured once, and again on another machine or with networks of another size."""
+    """Machine, times and memory; measured again only on another machine or with other settings."""
     ran_on = machine()
     thesis = settings.thesis
     counts = thesis.timing_runs, thesis.ascent_runs, thesis.ascent_starts, thesis.ascent_resolution
     identity = [ran_on, counts, asdict(settings.entropy.network)]
 
     def compute() -> dict[str, Any]:
-        console.print(f"Timing {counts[0]} decisions and {counts[1]} climbs a class, and measuring their memory")
+        console.print(
+            f"Timing {counts[0]} decisions and {counts[1]} gradient ascents per class, and measuring their memory"
+        )
         return {
             "identity": identity,
             "machine": ran_on,
@@ -156,13 +158,13 @@ def measure(settings: Settings, folder: ThesisFolder, tables: dict[int, LatticeT
 
 
 def _example(tables: LatticeTables, classes: list[str]) -> int:
-    """The first test object of the thesis's example class, bathtubs, or of the first class there is."""
+    """Index of the first bathtub, the thesis's example class, among the test objects; without bathtubs, 0."""
     label = classes.index("bathtub") if "bathtub" in classes else int(tables.labels[0])
     return int(np.flatnonzero(tables.labels == label)[0])
 
 
 def _training(folder: ThesisFolder, histories: dict[str, list[dict[str, float]]]) -> dict[str, Any]:
-    """Losses and beginnings of the classifiers (Table 5), and how long every network took."""
+    """Losses and initial weights of the classifiers (Table 5), and training times of all networks."""
     summaries = {name: read_json(network / "summary.json") for name, network in folder.networks().items()}
     backbones = {
         backbone.name: {
@@ -181,7 +183,7 @@ def _training(folder: ThesisFolder, histories: dict[str, list[dict[str, float]]]
 
 
 def evaluate_thesis(settings: Settings, folder: ThesisFolder) -> FigureInputs:
-    """All numbers, as written to `thesis.json`, and what else the report is drawn from."""
+    """Returns all numbers, as written to `thesis.json`, and the other inputs of the report."""
     statistics = {views: folder.statistics(views) for views in VIEWS}
     histories = {name: read_history(network) for name, network in folder.networks().items()}
     test = {views: lattice_tables(settings, folder, views, "test") for views in VIEWS}
@@ -201,13 +203,13 @@ def evaluate_thesis(settings: Settings, folder: ThesisFolder) -> FigureInputs:
 
 
 def reproduce(settings: Settings, preset: str, out: Path, pretrained: tuple[Path, ...] = ()) -> Path:
-    """Makes data, networks, tables and figures in `out`; returns the page.
+    """Makes data, networks, tables and figures in `out`; returns the path of the page.
 
     Raises:
-        DataError: settings that the thesis's grid cannot be had with, or a directory that holds another run.
+        DataError: the settings do not allow the thesis's grid, or the directory holds another run.
     """
     if settings.evaluation.lowest_elevation > -90:
-        raise DataError("mevs study thesis walks from every view; leave --evaluation.lowest-elevation as it is")
+        raise DataError("mevs study thesis walks from every view; leave out --evaluation.lowest-elevation")
     check_evaluation(settings.evaluation)
     thesis = settings.thesis
     if thesis.ascent_runs < 1 or thesis.ascent_starts < 2 or thesis.ascent_resolution < 8:
@@ -227,7 +229,7 @@ def reproduce(settings: Settings, preset: str, out: Path, pretrained: tuple[Path
     camera = statistics.camera
     lead = (
         f"{statistics.source}, preset {preset}: views of {camera.resolution}×{camera.resolution} pixels, "
-        f"{results['objects']['40']} test objects, {statistics.left_out_count} of all objects left out, "
-        f"{minutes:.0f} minutes of training on {where}. Ours first, the thesis's in brackets."
+        f"{results['objects']['40']} test objects, {statistics.left_out_count} objects left out, "
+        f"{minutes:.0f} minutes of training on {where}. Numbers of this run, with those of the thesis in parentheses."
     )
     return write_thesis_report(inputs, lead, out / "report")
