@@ -21,6 +21,7 @@ import time
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from functools import partial
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -268,7 +269,8 @@ def networks(clouds: np.ndarray, torch_peer: Any, rounds: int, training: bool) -
                 return theirs.eval()(tensor)
 
         peers["PyTorch"] = finished(forward_peer)
-    structure, parameters, statistics = nnx.split(network, nnx.Param, ...)
+    structure, parameters, *others = nnx.split(network, nnx.Param, ...)
+    statistics = others[0]
     rows: list[Row] = []
     if torch_peer and training:
         targets = np.random.default_rng(1).uniform(0, 1, (CLOUDS, 40)).astype(np.float32)
@@ -330,7 +332,7 @@ def decisions(clouds: np.ndarray, calls: int = 200) -> list[dict[str, float]]:
         some = [
             cloud[: size - 7] for cloud in np.resize(clouds, (batch, *clouds.shape[1:]))
         ]  # `choose` pads them to `size`
-        taken = take_turns([lambda some=some: choose.of_many(some)], calls if batch == 1 else 5)[0]
+        taken = take_turns([partial(choose.of_many, some)], calls if batch == 1 else 5)[0]
         arguments = (state, jnp.zeros((batch, size, 3)))
         plan = jax.jit(lambda state, clouds: nnx.merge(structure, state)(clouds)).lower(*arguments).compile()
         memory = plan.memory_analysis()
@@ -340,7 +342,9 @@ def decisions(clouds: np.ndarray, calls: int = 200) -> list[dict[str, float]]:
                 "batch": batch,
                 "p50_ms": float(np.median(taken)),
                 "p99_ms": float(np.quantile(taken, 0.99)),
-                "memory_mb": (memory.argument_size_in_bytes + memory.temp_size_in_bytes) / 1e6,
+                "memory_mb": (memory.argument_size_in_bytes + memory.temp_size_in_bytes) / 1e6
+                if memory
+                else float("nan"),
             }
         )
         print(markdown_row(decision_cells(found[-1])), flush=True)
@@ -387,9 +391,7 @@ def main() -> None:
     machine = f"{platform.processor() or platform.machine()}, {jax.devices()[0].device_kind}, JAX {jax.__version__}"
     print(f"Measured on: {machine}. Milliseconds: median (quartiles).\n")
     print(markdown_table(HEADER, []))
-    torch_peer = None
-    if installed("torch"):
-        from benchmarks import torch_peer
+    torch_peer: Any = import_module("benchmarks.torch_peer") if installed("torch") else None
     clouds = partial_clouds()
     rows = networks(clouds, torch_peer, rounds, not guard) + point_operations(clouds, torch_peer, rounds)
     if guard:

@@ -12,8 +12,10 @@ from __future__ import annotations
 
 import platform
 import sys
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from typing import Any, Literal
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
@@ -85,11 +87,12 @@ def main() -> None:
         return jax.vmap(jax.vmap(choice), in_axes=(None, 0))(jnp.arange(statistics.views), predicted_entropy)
 
     found = {}
-    for name, dtype, wrap in (
+    dtypes: list[tuple[str, Literal["float32", "bfloat16"], Callable[[Any], Any]]] = [
         ("float32, batch norm by itself", "float32", Unfolded),
         ("float32, folded", "float32", lambda network: network),
         ("bfloat16, folded", "bfloat16", lambda network: network),
-    ):
+    ]
+    for name, dtype, wrap in dtypes:
         outputs = []
         for task, folder in ((classify, "classifier"), (predict, "entropy")):
             saved = replace(task, optimiser=replace(task.optimiser, compute=dtype))
