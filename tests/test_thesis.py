@@ -18,9 +18,10 @@ from data_pipeline.objects.furniture import CLASSES, furniture
 from eval.numbers.timing import decision_memory, milliseconds, time_local_maxima
 from eval.settings import PRESETS
 from eval.thesis.figures import FIGURES, FigureInputs
+from eval.thesis.layout import thesis_numbers
 from eval.thesis.page import CHAPTERS
 from eval.thesis.results import LatticeTables, all_results, best_cells, machine
-from eval.thesis.tables import all_tables, markdown, thesis_numbers
+from eval.thesis.tables import all_tables, markdown
 from eval.walks.grid import THRESHOLDS, GridConfig
 from mevs_jax.viewpoints import ViewGraph, fibonacci_sphere
 from tests.reference.policies import maxima_first

@@ -26,7 +26,7 @@ from data_pipeline.dataset.builder import DataConfig, open_objects
 from data_pipeline.errors import DataError, EmptyMesh
 from data_pipeline.files import write_bytes
 from data_pipeline.objects.mesh import Mesh, ObjectEntry
-from data_pipeline.objects.reconstruction import decimate, voxelise
+from data_pipeline.objects.reconstruction import decimate, require_open3d, voxelise
 from data_pipeline.objects.sources import load_object
 from eval.projections import longitude_latitude
 from mevs_jax.cameras import Camera, cameras_at
@@ -157,6 +157,7 @@ def ascend_on(data: DataConfig, config: AscentConfig, out: Path) -> tuple[str, P
     """
     if config.starts < 2 or config.resolution < 8:
         raise DataError("--ascent.starts must be at least 2 and --ascent.resolution at least 8")
+    require_open3d()
     entry, method = find(data, config.object), METHODS[config.method]
     try:
         thing = jnp.asarray(method.prepare(load_object(entry)))

@@ -28,7 +28,14 @@ from data_pipeline.dataset.statistics import DatasetStatistics
 from data_pipeline.errors import DataError
 from data_pipeline.files import npz_of, write_npz
 from data_pipeline.objects.mesh import Mesh, ObjectEntry
-from data_pipeline.objects.reconstruction import decimate, normals_towards, reconstruct, voxelise, voxelise_cloud
+from data_pipeline.objects.reconstruction import (
+    decimate,
+    normals_towards,
+    reconstruct,
+    require_open3d,
+    voxelise,
+    voxelise_cloud,
+)
 from data_pipeline.objects.sources import load_object
 from data_pipeline.progress import console, progress_bar
 from eval.numbers.comparison import difference, summarise
@@ -198,6 +205,7 @@ def ascend_objects(dataset: DataConfig, statistics: DatasetStatistics, out: Path
             "--rendering.objects and --rendering.faces must be at least 1, --rendering.starts at least 2 and "
             "--rendering.resolution at least 8"
         )
+    require_open3d()
     entries = {entry.name: entry for entry in open_objects(dataset).entries}
     names = objects_of(out / "data", "test", statistics)[0]
     folder, chosen = _folder(out, statistics, config), chosen_objects(config, len(names))

@@ -10,7 +10,8 @@ import matplotlib.pyplot as plt
 from data_pipeline.files import write_bytes, write_text
 from eval.report.html import document, drawn, embedded, table
 from eval.thesis.figures import FIGURES, FigureInputs, ThesisFigure
-from eval.thesis.tables import ThesisTable, all_tables, markdown, shown_cells
+from eval.thesis.layout import ThesisTable
+from eval.thesis.tables import all_tables, markdown, shown_cells
 
 CHAPTERS = (
     ("The data (§4.1)", ("F5", "F6", "F7", "F8", "F9", "F10", "F11")),

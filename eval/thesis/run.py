@@ -17,6 +17,7 @@ from data_pipeline.dataset.builder import open_objects, prepare
 from data_pipeline.dataset.statistics import report_left_out
 from data_pipeline.errors import DataError
 from data_pipeline.files import read_json
+from data_pipeline.objects.reconstruction import why_no_open3d
 from data_pipeline.objects.sources import load_object
 from data_pipeline.progress import console
 from eval.numbers.timing import decision_memory_alone, time_ascent, time_local_maxima, time_predictor
@@ -119,8 +120,11 @@ def _timing(settings: Settings, folder: ThesisFolder, tables: dict[int, LatticeT
 
 
 def _ascents(settings: Settings, tables: LatticeTables, classes: list[str]) -> dict[str, Any]:
+    """Times and memory of the methods by differentiable rendering, or `missing`: why they cannot be measured here."""
     thesis = settings.thesis
     runs, starts, resolution = thesis.ascent_runs, thesis.ascent_starts, thesis.ascent_resolution
+    if (missing := why_no_open3d()) is not None:
+        return {"runs": runs, "starts": starts, "resolution": resolution, "missing": missing}
     meshes = {}
     entries = {entry.name: entry for entry in open_objects(settings.dataset).entries}
     for label, name in enumerate(classes):
@@ -137,7 +141,7 @@ def measure(settings: Settings, folder: ThesisFolder, tables: dict[int, LatticeT
     ran_on = machine()
     thesis = settings.thesis
     counts = thesis.timing_runs, thesis.ascent_runs, thesis.ascent_starts, thesis.ascent_resolution
-    identity = [ran_on, counts, asdict(settings.entropy.network)]
+    identity = [ran_on, counts, asdict(settings.entropy.network), *([] if why_no_open3d() is None else ["no Open3D"])]
 
     def compute() -> dict[str, Any]:
         console.print(
@@ -217,6 +221,8 @@ def reproduce(settings: Settings, preset: str, out: Path, pretrained: tuple[Path
             "--thesis.ascent-runs must be at least 1, --thesis.ascent-starts at least 2 and "
             "--thesis.ascent-resolution at least 8"
         )
+    if (missing := why_no_open3d()) is not None:
+        console.print(f"Tables 2 and 9 will lack differentiable rendering: {missing}. All else is made.")
     first = first_weights(settings.classifier, thesis, pretrained)
     folder = ThesisFolder(out)
     make_thesis_data(settings, folder)

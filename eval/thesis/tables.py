@@ -2,51 +2,17 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Sequence
-from dataclasses import dataclass
-from functools import cache
 from itertools import product
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from eval.rendering.ascent import FACES
 from eval.report.markdown import markdown_table
+from eval.thesis.layout import Cell, Row, ThesisTable, thesis_numbers
 from eval.thesis.results import ORACLE_MV
 from train.thesis_networks import BACKBONES, FRAMES, PIPELINE
-
-Cell = str | float | None
-
-
-@dataclass(frozen=True)
-class Row:
-    """One row: our cells and those of the thesis, None if missing. `bold` marks our cells whose interval excludes zero."""
-
-    name: str
-    ours: Sequence[Cell]
-    thesis: Sequence[Cell] = ()
-    bold: Sequence[bool] = ()
-
-
-@dataclass(frozen=True)
-class ThesisTable:
-    """A table of the report; numbers have `digits` decimals, and a sign if `signed`."""
-
-    number: int
-    title: str
-    columns: Sequence[str]
-    rows: Sequence[Row]
-    note: str
-    digits: int = 2
-    signed: bool = False
-
-
-@cache
-def thesis_numbers() -> dict[str, Any]:
-    """The tables as printed in the thesis; see `numbers.json`."""
-    return json.loads(Path(__file__).with_name("numbers.json").read_text())
 
 
 def _percent(values: Any) -> list[float]:
@@ -92,15 +58,15 @@ def machine_table(results: dict[str, Any]) -> ThesisTable:
 def rendering_times(results: dict[str, Any]) -> ThesisTable:
     thesis, ours = thesis_numbers()["table_2"], results["ascent"]
     names = [*results["classes"], "all"]
-    seconds = {method: ours[method]["seconds"] for method in ("mesh", "volume")}
+    seconds = {method: ours[method]["seconds"] for method in ("mesh", "volume") if method in ours}
     rows = [
         Row(
             name,
-            [number for of_method in seconds.values() for number in of_method[name]],
+            [n for of_method in seconds.values() for n in of_method[name]] or [None] * 4,
             thesis["rows"].get(name, [None] * 4),
         )
         for name in names
-        if name in seconds["mesh"]
+        if not seconds or name in seconds["mesh"]
     ]
     return ThesisTable(
         2,
@@ -109,8 +75,12 @@ def rendering_times(results: dict[str, Any]) -> ThesisTable:
         rows,
         f"Ours: depth entropy of a soft mesh of at most {FACES} faces, and opacity entropy of a 32³ volume, both at "
         f"{ours['resolution']}×{ours['resolution']} pixels; all {ours['starts']} start views of an object together, "
-        f"{ours['runs']} objects per class, on the machine of Table 1. The thesis: one start view, on its GPU.",
+        f"{ours['runs']} objects per class, on the machine of Table 1. The thesis: one start view, on its GPU.{_missing(ours)}",
     )
+
+
+def _missing(ascent: dict[str, Any]) -> str:
+    return f" Not measured: {ascent['missing']}." if "missing" in ascent else ""
 
 
 def predictor_times(results: dict[str, Any]) -> ThesisTable:
@@ -292,7 +262,8 @@ def best_table(results: dict[str, Any]) -> ThesisTable:
 def memory_table(results: dict[str, Any]) -> ThesisTable:
     thesis, ours = thesis_numbers()["table_9"]["rows"], dict(results["memory"])
     for name, method in (("Neural Renderer", "mesh"), ("DiffDVR", "volume")):
-        ours[name] = results["ascent"][method]["memory"]
+        if method in results["ascent"]:
+            ours[name] = results["ascent"][method]["memory"]
     rows = [
         Row(name, [ours[name]["planned"], ours[name]["device_peak"]] if name in ours else [None, None], [*values, None])
         for name, values in thesis.items()
@@ -303,7 +274,8 @@ def memory_table(results: dict[str, Any]) -> ThesisTable:
         ["planned by XLA", "peak of the device"],
         rows,
         "Weights, inputs and temporaries of one compiled decision, for the network sizes of this run. CPUs report no peak. The "
-        "thesis reports PyTorch's peak on a GPU. Neural Renderer and DiffDVR: all start views of Table 2 on one object.",
+        "thesis reports PyTorch's peak on a GPU. Neural Renderer and DiffDVR: all start views of Table 2 on one object."
+        f"{_missing(results['ascent'])}",
         digits=2,
     )
 
