@@ -35,7 +35,7 @@ from train.choosing.stages import VARIANTS, Stages, lattice_data
 from train.kept import kept_json, made_by
 from train.loop import load_best
 
-_FORM = 5
+_FORM = 6
 """Version of the stored walks; another version makes them stale."""
 
 

@@ -39,10 +39,10 @@ SCRAMBLED = Rung("scrambled_entropy", "sorted in place", "networks")
 """The thesis's policy as its published code implements it. It is not part of `ladder`; the compatibility table shows it."""
 
 ASCENT_RUNGS = (
-    Rung("diff_volume", "climbing on a volume", "rendering"),
-    Rung("diff_mesh", "climbing on a surface", "rendering"),
-    Rung("diff_volume_whole", "climbing on the whole volume", "truth"),
-    Rung("diff_mesh_whole", "climbing on the whole mesh", "truth"),
+    Rung("diff_volume", "ascent on a volume", "rendering"),
+    Rung("diff_mesh", "ascent on a surface", "rendering"),
+    Rung("diff_volume_whole", "ascent on the whole volume", "truth"),
+    Rung("diff_mesh_whole", "ascent on the whole mesh", "truth"),
 )
 """The policies by differentiable rendering. They have a table of their own, on fewer objects."""
 

@@ -108,17 +108,17 @@ VARIANTS = {
     "learned": Variant("view policy"),
     "learned_unposed": Variant("view policy", posed=False),
     "learned_and_table": Variant("view policy and table", by="table", network="learned"),
-    "as_it_is": Variant("… by what it expects of the state as it is", by="state", network="learned"),
+    "as_it_is": Variant("… by the gain expected in the state, not per class", by="state", network="learned"),
     "look_ahead": Variant("… two views ahead", by="ahead", network="learned"),
     "probability": Variant(
         "… by the rise of the probability, not of its logarithm", settings={"utility": "probability"}
     ),
     "random_states": Variant("… trained on random walks alone", settings={"rounds": 1}),
-    "unchanged": Variant("… learned from objects as they are", changed=False),
-    "crossed": Variant("… learned from training objects, by recognisers without them", learns_from="parts"),
-    "known": Variant("… learned from training objects, by the one that knows them", learns_from="training"),
-    "summed": Variant("… with the sum of logits for a fusion", summed=True),
-    "cloud": Variant("… and with PointNet++'s embedding of their clouds", cloud=True, changed=False),
+    "unchanged": Variant("… trained on unchanged objects", changed=False),
+    "crossed": Variant("… trained on training objects, by recognisers without them", learns_from="parts"),
+    "known": Variant("… trained on training objects, by their own recogniser", learns_from="training"),
+    "summed": Variant("… with the sum of logits as fusion", summed=True),
+    "cloud": Variant("… with PointNet++'s embedding of clouds as further input", cloud=True, changed=False),
     "q_learning": Variant("… Q-learning (as MVSelect)", by="state", q_learning=True),
 }
 """The method (`learned…`), and the ablations that measure the effect of its parts."""
