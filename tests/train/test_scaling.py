@@ -20,13 +20,13 @@ from data_pipeline.dataset.batches import train_batches
 from data_pipeline.dataset.builder import load_statistics
 from data_pipeline.errors import DataError
 from eval.stages import tasks
-from tests.scaling_worker import SETTINGS
-from tests.test_training import lines
+from tests.train.scaling_worker import SETTINGS
+from tests.train.test_training import lines
 from train.devices import check_batch, device_mesh, is_lost_process, parameter_sharding
 from train.loop import fit, load_best
 from train.step import Task, initial_state, train_step_of
 
-ROOT = Path(__file__).resolve().parents[1]
+ROOT = Path(__file__).resolve().parents[2]
 CPU = {"JAX_PLATFORMS": "cpu", "PYTHONPATH": str(ROOT)}
 """Environment of processes of their own."""
 
@@ -34,7 +34,7 @@ CPU = {"JAX_PLATFORMS": "cpu", "PYTHONPATH": str(ROOT)}
 def work(**asked) -> subprocess.CompletedProcess:
     asked = {key: str(value) if isinstance(value, Path) else value for key, value in asked.items()}
     return subprocess.run(
-        [sys.executable, str(ROOT / "tests" / "scaling_worker.py"), json.dumps(asked)],
+        [sys.executable, "-m", "tests.train.scaling_worker", json.dumps(asked)],
         capture_output=True,
         text=True,
         env=os.environ | CPU,

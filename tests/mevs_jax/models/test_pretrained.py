@@ -18,7 +18,7 @@ from safetensors.numpy import save_file
 from data_pipeline.errors import DataError
 from mevs_jax import ResNet
 from tests.reference.weights import made_up_inputs, made_up_weights, small_state
-from tests.test_models import GOLDEN, golden_shapes
+from tests.mevs_jax.models.test_networks import GOLDEN, golden_shapes
 from train.starting_weights import (
     _Storage,
     _Tensor,
@@ -28,7 +28,7 @@ from train.starting_weights import (
     weights_from_torch,
 )
 
-REFERENCE = Path(__file__).parent / "reference"
+REFERENCE = Path(__file__).parents[2] / "reference"
 
 
 def check_small(read: dict[str, np.ndarray]) -> None:

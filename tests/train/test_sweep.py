@@ -18,7 +18,7 @@ from data_pipeline.dataset.builder import load_statistics
 from data_pipeline.errors import DataError
 from eval.report.sweep import sweep_table
 from eval.stages import tasks, train_sweep
-from tests.scaling_worker import SETTINGS
+from tests.train.scaling_worker import SETTINGS
 from train.devices import device_mesh
 from train.loop import fit, load_best, validate, validation_set
 from train.preemption import Preempted

@@ -12,8 +12,8 @@ from pathlib import Path
 
 import pytest
 
-from tests.test_scaling import CPU
-from tests.test_training import lines
+from tests.train.test_scaling import CPU
+from tests.train.test_training import lines
 
 
 def start(out: Path, *options: str, processes: int = 1) -> list[subprocess.Popen]:

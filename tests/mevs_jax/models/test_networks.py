@@ -16,7 +16,7 @@ from mevs_jax import PointNet2, ResNet, count_parameters, pointnet2_from_torch, 
 from mevs_jax.models import BatchNorm
 from tests.reference.weights import made_up_inputs, made_up_weights
 
-GOLDEN = Path(__file__).parent / "reference" / "golden.npz"
+GOLDEN = Path(__file__).parents[2] / "reference" / "golden.npz"
 KINDS = ("resnet18", "resnet34", "pointnet2")
 
 
