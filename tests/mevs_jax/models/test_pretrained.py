@@ -17,8 +17,8 @@ from safetensors.numpy import save_file
 
 from data_pipeline.errors import DataError
 from mevs_jax import ResNet
-from tests.reference.weights import made_up_inputs, made_up_weights, small_state
 from tests.mevs_jax.models.test_networks import GOLDEN, golden_shapes
+from tests.reference.weights import made_up_inputs, made_up_weights, small_state
 from train.starting_weights import (
     _Storage,
     _Tensor,
