@@ -10,6 +10,13 @@ import pytest
 from mevs_jax import Camera, cameras_at, fibonacci_sphere, look_at_origin, partial_cloud, pixel_directions, unproject
 
 
+@pytest.mark.parametrize(("position", "right"), [((0, 0, 2), 1), ((0, 0, -2), -1), ((0, 0, 0.7), 1)])
+def test_at_the_poles_world_y_is_upwards_in_the_image(position, right):
+    rotation = np.asarray(look_at_origin(jnp.array(position, jnp.float32)))[:3, :3]
+    np.testing.assert_allclose(rotation[:, 0], (right, 0, 0), atol=1e-6)
+    np.testing.assert_allclose(rotation[:, 1], (0, -1, 0), atol=1e-6)  # image y points downwards
+
+
 @pytest.mark.parametrize("position", [(2, 0, 0), (0, -2, 0), (0, 0, 2), (0, 0, -2), (1, 1, 1)])
 def test_poses_are_rotations_that_look_at_the_origin(position):
     position = jnp.array(position, jnp.float32)
@@ -39,14 +46,15 @@ def test_the_unit_sphere_fits_the_image_exactly():
     assert closest[50, 0] < 1.02
 
 
-def test_clouds_of_both_frames_are_the_same_up_to_the_pose():
-    camera = Camera(look_at_origin(jnp.array([0.0, -2.0, 0.0])), resolution=4)
+@pytest.mark.parametrize("distance", [2.0, 3.5])
+def test_clouds_of_both_frames_are_the_same_up_to_the_pose(distance):
+    camera = Camera(look_at_origin(jnp.array([0.0, -distance, 0.0])), resolution=4)
     depth = jnp.full((4, 4), 2.0).at[0, 0].set(0)
     world, real = partial_cloud(depth, camera)
     assert not real[0]
     assert real[1:].all()
     local = unproject(jnp.arange(16), depth.reshape(-1), camera, frame="camera")
-    moved = (local + jnp.array([0, 0, 2.0])) @ camera.pose[:3, :3].T + camera.pose[:3, 3]
+    moved = (local + jnp.array([0, 0, distance])) @ camera.pose[:3, :3].T + camera.pose[:3, 3]
     np.testing.assert_allclose(moved, world, atol=1e-5)
     with pytest.raises(ValueError, match="frame"):
         unproject(jnp.arange(1), jnp.ones(1), camera, frame="robot")

@@ -12,6 +12,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from data_pipeline.capture.casting import CaptureConfig, capture, rig_for
 from data_pipeline.dataset.augment import CloudAugmentation, ImageAugmentation, augment_cloud, augment_image
@@ -215,6 +216,16 @@ def test_validation_by_view_keeps_a_share_of_every_objects_views_apart(data):
         assert not views & aside[key]
 
 
+def test_validation_views_take_turns_over_the_objects(data):
+    """Evenly spaced views, one place further on for each object, so that every view of the lattice is validated on."""
+    batches = list(validation_batches(data, BATCHES, 2))
+    assert [batch["view"].tolist() for batch in batches] == [[index % 8, (index + 4) % 8] for index in range(10)]
+    seen = [batch["view"].tolist() for batch in validation_batches(data, BATCHES, 3)]
+    assert seen[:3] == [[0, 2, 5], [1, 3, 6], [2, 4, 7]]
+    assert {view for views in seen for view in views} == set(range(8))
+    assert [batch["view"].tolist() for batch in validation_batches(data, BATCHES, 0)] == [list(range(8))] * 10
+
+
 def test_pixels_are_drawn_without_repetition_and_repeated_to_fill(random):
     depth = np.zeros((10, 10), np.uint16)
     depth[2:5, 3:7] = 9
@@ -297,10 +308,6 @@ def test_each_cloud_augmentation_does_what_the_thesis_says(random):
     )
     assert np.abs(turned[..., 0] - cloud[:, 0]).max() > 1
 
-    tilted = many("tilt", cloud)
-    angle = np.abs(tilted - cloud).max() / np.linalg.norm(cloud, axis=1).max()
-    assert 0.05 < angle < 0.32  # three small angles
-
     moved = many("translate", cloud) - cloud
     assert np.abs(moved).max() <= 0.1001
     np.testing.assert_allclose(moved.std(axis=1), 0, atol=1e-5)
@@ -316,6 +323,19 @@ def test_each_cloud_augmentation_does_what_the_thesis_says(random):
     np.testing.assert_array_equal(
         augment_cloud(jax.random.key(0), jnp.asarray(cloud), CloudAugmentation(*[False] * 6)), cloud
     )
+
+
+def test_tilts_are_three_clipped_normal_angles():
+    """About x, then y, then z, by N(0, 0.06) each, at most 0.18 radians (thesis section 5.1)."""
+    axes = 0.5 * jnp.eye(3)
+    keys = jax.random.split(jax.random.key(0), 4000)
+    tilted = np.asarray(jax.vmap(augment_cloud, (0, None, None))(keys, axes, only("tilt")))
+    angles = Rotation.from_matrix(2 * tilted.transpose(0, 2, 1)).as_euler("xyz")
+    np.testing.assert_allclose(angles.mean(axis=0), 0, atol=0.005)
+    np.testing.assert_allclose(angles.std(axis=0), 0.0595, rtol=0.05)  # of 0.06, clipped at three standard deviations
+    np.testing.assert_allclose(np.abs(angles).max(axis=0), 0.18, atol=1e-4)
+    np.testing.assert_allclose(np.corrcoef(angles.T), np.eye(3), atol=0.06)
+    np.testing.assert_allclose((np.abs(angles) > 0.06).mean(axis=0), 0.317, atol=0.03)  # a normal distribution's share
 
 
 def test_directions_beside_points_turn_with_them_and_are_else_as_they_were(random):

@@ -122,7 +122,7 @@ def test_hardly_soft_meshes_look_as_rays_see_them(name):
         agree.append((inside == hit) & (~hit | (np.abs(np.where(hit, rays.depth, 0) - seen.depth) < 5e-3)))
         mean_normal = np.linalg.norm(np.asarray(seen.normal)[hit & inside], axis=-1)
         assert (mean_normal < 1 + 1e-5).all()
-        assert np.median(mean_normal) > 0.999
+        assert np.quantile(mean_normal, 0.1) > 0.999
     assert np.mean(agree) > 0.99
 
 
@@ -163,7 +163,13 @@ def test_objectives_of_hard_images_are_their_hard_counterparts():
     )
     flat = edge_content(jnp.full((9, 9), 2.0), jnp.ones((9, 9)))
     assert flat == 0
-    assert edge_content(jnp.full((9, 9), 2.0).at[:, :4].set(1.0), jnp.ones((9, 9))) > 0.1
+    # One of eight columns of differences is an edge. A jump counts by how it compares with the step, and never more than once.
+    for jump, counted in ((0.05, 1 / 2), (0.1, 4 / 5), (1.0, 400 / 401), (100.0, 1.0)):
+        depth = jnp.full((9, 9), 2.0).at[:, :4].set(2.0 - jump)
+        np.testing.assert_allclose(edge_content(depth, jnp.ones((9, 9))), counted / 8, rtol=1e-4)
+    # Background is three units away: the contour of what covers the left half at a distance of 2.9 is a jump of two steps.
+    contour = edge_content(jnp.full((9, 9), 2.9), jnp.zeros((9, 9)).at[:, :4].set(1.0))
+    np.testing.assert_allclose(contour, 4 / 5 / 8, rtol=1e-4)
 
 
 # ---------------------------------------------------------------------------------------------------------------- gradients
@@ -204,7 +210,12 @@ def volume_of(name: str) -> np.ndarray:
 )
 @pytest.mark.usefixtures("fully_compiled")
 def test_camera_gradients_are_finite_and_those_of_differences(values, thing):
-    """In float64: 100 pairs of object and camera, both poles among them; a median, since faces and levels have corners."""
+    """In float64, for pairs of object and camera, both poles among them. The 90 % quantile, since faces and levels have corners.
+
+    Differences are taken a little beside each pose: from the poses themselves pixel centres lie exactly on edges of faces, where
+    a soft silhouette has a step of 1e-6.
+    """
+    beside = np.array([0.013, -0.0071])
     with jax.enable_x64(True):
         along = lambda what, pose, step: values(what, orbit(pose, step))  # noqa: E731
         gradient = jax.jit(jax.jacrev(along, argnums=2))
@@ -214,13 +225,14 @@ def test_camera_gradients_are_finite_and_those_of_differences(values, thing):
             what = np.asarray(thing(name), np.float64)
             for direction in np.concatenate([POLES, fibonacci_sphere(18)]):
                 pose = look_at_origin(2 * jnp.asarray(direction, jnp.float64))
-                ours = np.asarray(gradient(what, pose, np.zeros(2)))
-                steps = 1e-5 * np.eye(2)
-                theirs = np.stack([(at(what, pose, h) - at(what, pose, -h)) / 2e-5 for h in steps], axis=1)
-                assert np.isfinite(ours).all()
+                assert np.isfinite(gradient(what, pose, np.zeros(2))).all()
+                ours = np.asarray(gradient(what, pose, beside))
+                steps = 1e-6 * np.eye(2)
+                theirs = [(at(what, pose, beside + h) - at(what, pose, beside - h)) / 2e-6 for h in steps]
+                theirs = np.stack(theirs, axis=1)
                 errors.append(np.linalg.norm(ours - theirs, axis=1) / (np.linalg.norm(theirs, axis=1) + 1e-9))
         assert len(errors) == 100
-        assert (np.median(errors, axis=0) < 1e-2).all()
+        assert (np.quantile(errors, 0.9, axis=0) < 1e-3).all()
 
 
 def test_the_approximate_gradient_points_where_the_silhouette_betters():
@@ -257,10 +269,13 @@ def test_the_approximate_gradient_is_finite_everywhere_and_agrees_with_the_soft_
     for name in NAMES:
         for direction in np.concatenate([POLES, fibonacci_sphere(6)]):
             pose = look_at_origin(2 * jnp.asarray(direction, jnp.float32))
-            a, b = (np.asarray(slope(jnp.zeros(2), triangles_of(name)[:512], pose)) for slope in slopes)
-            assert np.isfinite(a).all()
+            assert np.isfinite(slopes[0](jnp.zeros(2), triangles_of(name)[:512], pose)).all()
+            # Beside the pose: at a pole the gradients of a symmetric object are zero, and have no direction.
+            beside = jnp.array([0.013, -0.0071])
+            a, b = (np.asarray(slope(beside, triangles_of(name)[:512], pose)) for slope in slopes)
             agree.append(a @ b / (np.linalg.norm(a) * np.linalg.norm(b) + 1e-9))
-    assert np.median(agree) > 0.5
+    assert np.quantile(agree, 0.1) > 0.3
+    assert np.median(agree) > 0.95
 
 
 @pytest.mark.usefixtures("fully_compiled")
