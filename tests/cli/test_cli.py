@@ -182,16 +182,6 @@ def test_unknown_words_are_refused_and_help_reads_well(tmp_path, refuses, at_onc
     assert "--classifier.optimiser.epochs" in at_once("run", "--help").stdout
 
 
-@pytest.fixture(scope="module")
-def whole(tmp_path_factory) -> Path:
-    """One run of the whole job, undisturbed."""
-    out = tmp_path_factory.mktemp("whole")
-    result = mevs("run", "--preset", "tiny", "--out", out)
-    assert result.returncode == 0, result.stderr
-    assert "Report:" in result.stderr
-    return out
-
-
 def test_the_job_leaves_a_report_and_metrics(whole):
     metrics = json.loads((whole / "metrics.json").read_text())
     assert metrics["objects"] == 10
@@ -215,11 +205,13 @@ def test_the_job_leaves_a_report_and_metrics(whole):
     assert "0 objects were left out" in page
 
 
-def test_a_second_run_redoes_nothing(whole):
-    before = {path: path.stat().st_mtime_ns for path in whole.rglob("*") if path.is_file()}
-    result = mevs("run", "--preset", "tiny", "--out", whole)
+def test_a_second_run_redoes_nothing(whole, tmp_path):
+    out = tmp_path / "run"
+    shutil.copytree(whole, out)
+    before = {path: path.stat().st_mtime_ns for path in out.rglob("*") if path.is_file()}
+    result = mevs("run", "--preset", "tiny", "--out", out)
     assert result.returncode == 0
-    assert before == {path: path.stat().st_mtime_ns for path in whole.rglob("*") if path.is_file()}
+    assert before == {path: path.stat().st_mtime_ns for path in out.rglob("*") if path.is_file()}
 
 
 def test_networks_for_another_number_of_views_are_refused(whole, tmp_path, refuses):
@@ -283,6 +275,7 @@ def test_live_walks_what_the_tables_say(whole, tmp_path, refuses):
     assert "unknown policy 'fly'" in refuses(*arguments, "fly")
 
 
+@pytest.mark.slow
 def test_many_devices_say_what_one_does(whole, tmp_path, monkeypatch):
     """View tables and live walks on four simulated devices, whose number divides neither the objects nor the chunks."""
     out = tmp_path / "run"
@@ -361,33 +354,39 @@ def kill_when(out: Path, ready, sign: int) -> int:
     return process.returncode
 
 
-def test_a_job_that_is_killed_again_and_again_ends_with_the_same_metrics(whole, tmp_path):
-    assert (
-        kill_when(tmp_path, lambda out: len(list((out / "data" / "captures").glob("*.npz"))) > 5, signal.SIGKILL)
-        == -signal.SIGKILL
-    )
-    assert kill_when(tmp_path, lambda out: (out / "data" / "shards").exists(), signal.SIGKILL) == -signal.SIGKILL
-    assert (
-        kill_when(
-            tmp_path,
-            lambda out: (
-                (out / "classifier" / "metrics.jsonl").exists()
-                and (out / "classifier" / "metrics.jsonl").stat().st_size
-            ),
-            signal.SIGINT,
-        )
-        == 130
-    )
-    assert (
-        kill_when(tmp_path, lambda out: (out / "entropy" / "config.json").exists(), signal.SIGKILL) == -signal.SIGKILL
-    )
-    result = mevs("run", "--preset", "tiny", "--out", tmp_path)
+def ends_like(out: Path, whole: Path) -> None:
+    """The job in `out`, begun again, ends with the results of the job that was never interrupted."""
+    result = mevs("run", "--preset", "tiny", "--out", out)
     assert result.returncode == 0, result.stderr
-    assert json.loads((tmp_path / "metrics.json").read_text()) == json.loads((whole / "metrics.json").read_text())
-    with np.load(tmp_path / "tables" / "test.npz") as a, np.load(whole / "tables" / "test.npz") as b:
+    assert json.loads((out / "metrics.json").read_text()) == json.loads((whole / "metrics.json").read_text())
+    with np.load(out / "tables" / "test.npz") as a, np.load(whole / "tables" / "test.npz") as b:
         np.testing.assert_array_equal(a["logits"], b["logits"])
-    leftovers = [path for path in tmp_path.rglob("*.partial*")]
-    assert leftovers == []
+    assert list(out.rglob("*.partial*")) == []
+
+
+def has_trained_an_epoch(out: Path) -> bool:
+    log = out / "classifier" / "metrics.jsonl"
+    return log.exists() and log.stat().st_size > 0
+
+
+def test_an_interrupted_job_ends_with_the_same_metrics(whole, tmp_path):
+    """Interrupted after an epoch of the first network."""
+    shutil.copytree(whole / "data", tmp_path / "data")
+    assert kill_when(tmp_path, has_trained_an_epoch, signal.SIGINT) == 130
+    assert not (tmp_path / "metrics.json").exists()
+    ends_like(tmp_path, whole)
+
+
+@pytest.mark.slow
+def test_a_job_that_is_killed_again_and_again_ends_with_the_same_metrics(whole, tmp_path):
+    for ready, sign, code in (
+        (lambda out: len(list((out / "data" / "captures").glob("*.npz"))) > 5, signal.SIGKILL, -signal.SIGKILL),
+        (lambda out: (out / "data" / "shards").exists(), signal.SIGKILL, -signal.SIGKILL),
+        (has_trained_an_epoch, signal.SIGINT, 130),
+        (lambda out: (out / "entropy" / "config.json").exists(), signal.SIGKILL, -signal.SIGKILL),
+    ):
+        assert kill_when(tmp_path, ready, sign) == code
+    ends_like(tmp_path, whole)
 
 
 @pytest.mark.skipif("CS_GNU_LIBC_VERSION" not in os.confstr_names, reason="large pages are asked of glibc")

@@ -92,7 +92,7 @@ def fit_until(data: Path, out: Path, stop_at: int) -> None:
 
 def meshes() -> dict[str, Mesh]:
     """One device, all of them, and all of them with weights split in two."""
-    return {"1": Mesh([[jax.devices()[0]]], (DATA, MODEL)), "8": device_mesh(), "4 × 2": device_mesh(2)}
+    return {"1": Mesh([[jax.devices()[0]]], (DATA, MODEL)), "all": device_mesh(), "split": device_mesh(2)}
 
 
 if __name__ == "__main__":

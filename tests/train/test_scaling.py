@@ -42,29 +42,35 @@ def work(**asked) -> subprocess.CompletedProcess:
     )
 
 
-def test_fifty_steps_on_eight_devices_equal_those_on_one(data):
+@pytest.mark.parametrize(
+    ("devices", "steps"), [(4, 10), pytest.param(8, 50, marks=pytest.mark.slow)], ids=["4 devices", "8 devices"]
+)
+def test_steps_on_many_devices_equal_those_on_one(data, devices, steps):
     """Dropout and augmentation on; and PointNet++ with its weights split in two as well. Ten steps in a row, then again from
     where one device was: after some dozens rounding decides whether a rectified unit is on, and how far the curves then part
     depends on the processor. Batches and activations stay where they are: devices add up sums, and that is all they say to each
     other, unless weights are split."""
-    done = work(data=data, devices=8, steps=50)
+    done = work(data=data, devices=devices, steps=steps)
     assert done.returncode == 0, done.stderr
     found = json.loads(done.stdout)
     alone, silent = found.pop("1")
     assert len(alone) == 2
     assert all(not said for said in silent.values())
-    assert found["8"][1] == {name: ["all-reduce"] for name in alone}
+    assert found["all"][1] == {name: ["all-reduce"] for name in alone}
     for mesh, (curve, _) in found.items():
         for name, losses in curve.items():
-            assert len(losses) == 50
+            assert len(losses) == steps
             assert np.std(losses) > 1e-3
             np.testing.assert_allclose(losses, alone[name], rtol=1e-5, err_msg=f"{name} on {mesh}")
 
 
-def test_a_run_goes_on_with_fewer_devices(data, tmp_path):
-    """Eight devices, told to end; then four, told to end; then one: as if one had done it all."""
+@pytest.mark.parametrize(
+    "before", [((2, 7),), pytest.param(((8, 7), (4, 19)), marks=pytest.mark.slow)], ids=["2 to 1", "8 to 4 to 1"]
+)
+def test_a_run_goes_on_with_fewer_devices(before, data, tmp_path):
+    """Some devices, told to end at a batch; then perhaps fewer, told to end; then one: as if one had done it all."""
     whole, moved = tmp_path / "whole", tmp_path / "moved"
-    for devices, stop_at in ((8, 7), (4, 19)):
+    for devices, stop_at in before:
         done = work(data=data, devices=devices, out=moved, stop_at=stop_at)
         assert done.returncode == 143, done.stderr
     statistics = load_statistics(data)

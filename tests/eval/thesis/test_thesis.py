@@ -280,6 +280,7 @@ def meshes_of(folder: Path, classes: tuple[str, ...]) -> Path:
     return folder
 
 
+@pytest.mark.slow
 def test_the_whole_command_makes_everything_and_goes_on(tmp_path, tmp_path_factory):
     meshes = meshes_of(tmp_path_factory.mktemp("meshes"), ("bathtub", "chair"))
     command = [sys.executable, "-m", "mevs_jax", "thesis", "--preset", "tiny", "--out", str(tmp_path)]
