@@ -3,17 +3,22 @@ PYTHON ?= python3
 BIN := .venv/bin
 READY := .venv/.ready
 OUT ?= runs/demo
+# A file at a time, since its tests share what is costly to make; the longest files first (tests/conftest.py).
+PYTEST := $(BIN)/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder
 # Packages are installed without bytecode, which each keeps once it was imported, unless told not to: then every start of `mevs`
 # would compile them again, for 12 seconds.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: demo test lint bench clean
+.PHONY: demo test test-all lint bench clean
 
 demo: $(READY)  ## environment, data, networks, evaluation, report
 	$(BIN)/mevs run --preset small --out $(OUT)
 
-test: lint  ## format, lint, types and tests
-	$(BIN)/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder
+test: lint  ## format, lint, types, and the tests that are not marked slow
+	$(PYTEST) -m "not slow"
+
+test-all: lint  ## the same with all tests
+	$(PYTEST)
 
 lint: $(READY)
 	$(BIN)/ruff format --check .

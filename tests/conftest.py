@@ -106,6 +106,18 @@ def data(tmp_path_factory) -> Path:
 
 
 @pytest.fixture(scope="session")
+def turned(tmp_path_factory) -> Path:
+    """As `data`, but the cameras of each object are turned; for reading only."""
+    from dataclasses import replace
+
+    from data_pipeline.dataset.builder import prepare
+    from eval.settings import TINY
+
+    config = replace(TINY.dataset, capture=replace(TINY.dataset.capture, turned=True))
+    return made_once(tmp_path_factory, "turned", lambda folder: prepare(config, folder))
+
+
+@pytest.fixture(scope="session")
 def whole(tmp_path_factory) -> Path:
     """One run of the preset `tiny` by the command line, never interrupted, for reading only."""
 
