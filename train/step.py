@@ -7,7 +7,7 @@ sample's random numbers depend on its place in it. So the number of devices chan
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any, Protocol
+from typing import Any, Protocol, runtime_checkable
 
 import flax.struct
 import jax
@@ -53,6 +53,7 @@ class Hyperparameters:
         )
 
 
+@runtime_checkable
 class Task(Protocol):
     """What one network adds to training."""
 

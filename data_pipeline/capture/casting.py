@@ -16,7 +16,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
-from typing import Literal, Protocol
+from typing import Literal, Protocol, runtime_checkable
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -147,6 +147,7 @@ Cast = Callable[[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]
 """(rays, 3) origins and directions to depth (rays,), inf for a miss, and the triangle hit"""
 
 
+@runtime_checkable
 class Caster(Protocol):
     """Makes a mesh ready to have rays cast at it."""
 

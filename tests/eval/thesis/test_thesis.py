@@ -6,14 +6,18 @@ import json
 import re
 import subprocess
 import sys
-from dataclasses import asdict
+from dataclasses import asdict, fields
 from pathlib import Path
 
 import numpy as np
 import pytest
+from flax import nnx
 from matplotlib.figure import Figure
 
-from data_pipeline.dataset.builder import DatasetStatistics
+import eval.thesis.run as thesis_run
+import train.thesis_networks as thesis_networks
+from data_pipeline.dataset.builder import DatasetStatistics, load_statistics, open_split
+from data_pipeline.files import write_json
 from data_pipeline.objects.furniture import CLASSES, furniture
 from eval.numbers.timing import decision_memory, milliseconds, time_local_maxima
 from eval.settings import PRESETS
@@ -21,9 +25,10 @@ from eval.thesis.figures import FIGURES, FigureInputs
 from eval.thesis.page import CHAPTERS
 from eval.thesis.results import LatticeTables, all_results, best_cells, machine
 from eval.thesis.tables import all_tables, markdown, thesis_numbers
-from eval.walks.grid import THRESHOLDS, GridConfig
+from eval.walks.grid import THRESHOLDS, GridConfig, Results
 from mevs_jax.viewpoints import ViewGraph, fibonacci_sphere
 from tests.reference.policies import maxima_first
+from train.tasks.entropy import EntropyTask
 from train.thesis_networks import BACKBONES, FRAMES, PIPELINE, VIEWS, ThesisFolder, backbone_task, entropy_task
 
 OBJECTS = 20
@@ -118,7 +123,7 @@ def results(lattices, statistics) -> dict:
         "machine": machine(),
         "timing": {"runs": 50, "10": timing, "40": timing},
         "memory": {"ResNet-18 + Random view selection": memory},
-        "climbing": {"runs": 3, "starts": 8, "resolution": 64, "mesh": climbing, "volume": climbing},
+        "ascent": {"runs": 3, "starts": 8, "resolution": 64, "mesh": climbing, "volume": climbing},
         "left_out": {"10": {}, "40": {}},
     }
     return json.loads(json.dumps(found))
@@ -183,14 +188,13 @@ def test_all_fifteen_tables_are_there_and_consistent(results):
 
 
 def test_the_best_cell_is_chosen_where_it_says(lattices):
-    class Grid:
-        def __init__(self, right):
-            self.right = right
+    def grid(right):
+        return Results(right, *(np.zeros_like(right) for _ in range(len(fields(Results)) - 1)))
 
     random = np.random.default_rng(0)
     test, validation = (random.uniform(size=(3, OBJECTS, 8, 7)) for _ in range(2))
     validation[:, :, 5, 2] = 2.0
-    found = best_cells(Grid(test), Grid(validation), lattices[10].labels)
+    found = best_cells(grid(test), grid(validation), lattices[10].labels)
     for backbone, best in enumerate(found):
         assert (best["validation"]["max_views"], best["validation"]["threshold"]) == (7, 0.7)
         assert best["validation"]["accuracy"] == pytest.approx(test[backbone, :, 5, 2].mean())
@@ -270,6 +274,66 @@ def test_memory_grows_with_the_networks(statistics):
 # --------------------------------------------------------------------------------------------------------- the whole command
 
 
+def has_all_tables_and_figures(report: Path) -> None:
+    page, text = (report / "index.html").read_text(), (report / "thesis.md").read_text()
+    for number in range(1, 16):
+        assert f'id="table-{number}"' in page
+        assert f"**Table {number}. " in text
+    for number in (*range(5, 12), *range(17, 26)):
+        assert f'id="figure-{number}"' in page
+        for kind in ("png", "svg"):
+            assert (report / "figures" / f"figure_{number:02d}.{kind}").stat().st_size > 1000
+
+
+def test_the_stages_make_everything_and_go_on(results, tmp_path, monkeypatch, capfd):
+    """With data sets as the command makes them, but networks that are not trained, and outputs that are made up."""
+    settings = PRESETS["tiny"]
+    begun, asked = {}, []
+
+    def fit(task, data, statistics, folder, start=None):
+        assert data == tmp_path / f"views{statistics.views}" / "data"
+        begun[folder.name] = start.name if start else "random weights"
+        summary = {
+            "best_epoch": 2,
+            "epoch": 3,
+            "best": {},
+            "best_loss": 0.5,
+            "start": begun[folder.name],
+            "seconds": 1.0,
+        }
+        write_json(folder / "config.json", {"name": task.name})
+        write_json(folder / "summary.json", summary)
+        lines = [json.dumps({"epoch": epoch, "train/loss": 1 / epoch, "val/loss": 1.2 / epoch}) for epoch in (1, 2, 3)]
+        (folder / "metrics.jsonl").write_text("\n".join(lines) + "\n")
+        return summary
+
+    def outputs(data, split, task, network):
+        asked.append((data, split, task.name))
+        last = task.views if isinstance(task, EntropyTask) else len(CLASSES)
+        random = np.random.default_rng(len(asked))
+        return random.normal(size=(len(open_split(data, split)), load_statistics(data).views, last)).astype(np.float32)
+
+    monkeypatch.setattr(thesis_networks, "fit", fit)
+    for module in (thesis_networks, thesis_run):
+        monkeypatch.setattr(module, "load_best", lambda task, folder: task.network(nnx.Rngs(0)))
+    monkeypatch.setattr(thesis_run, "network_outputs", outputs)
+    monkeypatch.setattr(thesis_run, "_memory", lambda *_: results["memory"])
+    monkeypatch.setattr(thesis_run, "_ascents", lambda *_: results["ascent"])
+    page = thesis_run.reproduce(settings, "tiny", tmp_path)
+    assert "Walking 10 test objects with 3 classifiers" in " ".join(capfd.readouterr().err.split())
+    has_all_tables_and_figures(tmp_path / "report")
+    assert begun["resnet18_image_10"] == begun["resnet34_depth_40"] == "random weights"
+    for name, before in (("image_40", "10 views/object, image"), ("depth_40", "40 views/object, image")):
+        assert begun[f"resnet18_{name}"].startswith(f"ResNet-18 ({before}), validation loss 0.5")
+    assert len(begun) == 8
+    assert (
+        len(set(asked)) == len(asked) == 2 * 6 + 2 * 4
+    )  # every network on both test splits, those walked with on both others
+    assert thesis_run.reproduce(settings, "tiny", tmp_path) == page
+    assert "Walking" not in capfd.readouterr().err
+    assert len(asked) == 20
+
+
 def meshes_of(folder: Path, classes: tuple[str, ...]) -> Path:
     """Five pieces of furniture of each class to train on and one to test on."""
     for name in classes:
@@ -290,15 +354,7 @@ def test_the_whole_command_makes_everything_and_goes_on(tmp_path, tmp_path_facto
         assert result.returncode == 0, result.stderr[-2000:]
     assert "Training" not in result.stderr
     assert "Walking" not in result.stderr
-    page = (tmp_path / "report" / "index.html").read_text()
-    text = (tmp_path / "report" / "thesis.md").read_text()
-    for number in range(1, 16):
-        assert f'id="table-{number}"' in page
-        assert f"**Table {number}. " in text
-    for number in (*range(5, 12), *range(17, 26)):
-        assert f'id="figure-{number}"' in page
-        for kind in ("png", "svg"):
-            assert (tmp_path / "report" / "figures" / f"figure_{number:02d}.{kind}").stat().st_size > 1000
+    has_all_tables_and_figures(tmp_path / "report")
     results = json.loads((tmp_path / "thesis.json").read_text())
     assert results["backbones"]["resnet18_image_40"]["start"].startswith("ResNet-18 (10 views/object, image), ")
     assert results["backbones"]["resnet34_depth_40"]["start"] == "random weights"
