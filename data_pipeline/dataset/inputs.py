@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Float, Int, Integer
 
 from data_pipeline.capture.casting import CaptureConfig
 from data_pipeline.dataset.builder import metric_depth
@@ -13,7 +13,7 @@ from mevs_jax.cameras import Camera, pixel_directions, unproject
 
 
 def image_input(
-    view: Int[Array, "height width"], images: str, channels: int, camera: CaptureConfig
+    view: Integer[Array, "height width"], images: str, channels: int, camera: CaptureConfig
 ) -> Float[Array, "height width channels"]:
     """One stored view as a network's image: background 0, nearest surface brightest, replicated over the channels.
 
@@ -28,7 +28,7 @@ def image_input(
     return jnp.repeat(pixels[..., None], channels, axis=-1)
 
 
-def depth_and_normals(view: Int[Array, "height width"], camera: CaptureConfig) -> Float[Array, "height width 4"]:
+def depth_and_normals(view: Integer[Array, "height width"], camera: CaptureConfig) -> Float[Array, "height width 4"]:
     """One stored view as depth (`image_input`) and the surface normal behind each pixel in the camera's frame, 0 for background.
 
     A normal is that of the plane through a pixel's point and its neighbours, in each direction the one that is nearer in
@@ -57,7 +57,7 @@ def depth_and_normals(view: Int[Array, "height width"], camera: CaptureConfig) -
 
 def cloud_input(
     pixels: Int[Array, " points"],
-    pixel_depth: Int[Array, " points"],
+    pixel_depth: Integer[Array, " points"],
     pose: Float[Array, "4 4"],
     camera: CaptureConfig,
     frame: str,

@@ -85,7 +85,11 @@ def expected_random(
     reachable: np.ndarray,
     thresholds: tuple[float, ...],
     max_views: int,
-) -> tuple[Float[Array, "backbones objects sizes CT"], ...]:
+) -> tuple[
+    Float[Array, "backbones objects sizes CT"],
+    Float[Array, "backbones objects sizes CT"],
+    Float[Array, "backbones objects sizes"],
+]:
     """`right` and `used` (backbones, objects, sizes, CT) and `after` (backbones, objects, sizes), as far as sizes go."""
     views = np.flatnonzero(reachable)
     sizes = all_subsets(views, max_views)
@@ -96,4 +100,5 @@ def expected_random(
         over_backbones = jax.vmap(one, (0, None))
         return jax.lax.map(lambda item: over_backbones(*item), (logits, labels), batch_size=4)
 
-    return tuple(jnp.moveaxis(values, 0, 1) for values in every(logits, labels))
+    right, used, after = (jnp.moveaxis(values, 0, 1) for values in every(logits, labels))
+    return right, used, after
