@@ -17,6 +17,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+import tests.typecheck  # noqa: F401  # jaxtyping's hook looks for it, and imports no more than `tests`
+
 # `MEVS_TEST_DEFAULT_FLAGS=1` runs the tests with XLA as users run it: all optimisations, by the emitters that are its default.
 DEFAULT_FLAGS = os.environ.get("MEVS_TEST_DEFAULT_FLAGS", "0") not in ("", "0")
 

@@ -222,31 +222,50 @@ def test_networks_for_another_number_of_views_are_refused(whole, tmp_path, refus
     assert "was trained for 8 views, the data set has 6" in refuses("eval", "--preset", "tiny", "--out", tmp_path)
 
 
-def test_compat_climbs_and_learning_fill_their_tables(whole, tmp_path):
-    """One evaluation of what `mevs study published-code`, `climb` and `active` add to a run."""
-    open3d_or_skip()
-    out = tmp_path / "run"
+UPRIGHT = replace(TINY.learned, rotation_epochs=0)
+
+
+@pytest.mark.parametrize(
+    "learned",
+    [replace(UPRIGHT, ablations=(), novel=0), pytest.param(UPRIGHT, marks=pytest.mark.slow)],
+    ids=["plain", "all"],
+)
+def test_learning_writes_a_page_and_is_not_repeated(learned, whole, tmp_path):
+    """What `mevs study learned` adds to a run; in the slow test with ablations and classes that are left out."""
+    out, settings = tmp_path / "run", replace(TINY, learned=learned)
     shutil.copytree(whole, out)
-    assert "mevs study published-code" in (out / "report" / "index.html").read_text()
-    upright = replace(TINY, learned=replace(TINY.learned, rotation_epochs=0))
-    page = learn_to_choose(upright, out).read_text()
-    made_once = (out / "learned" / "seed_0" / "policies" / "learned" / "summary.json").stat().st_mtime_ns
-    assert learn_to_choose(upright, out).read_text() == page
-    assert (out / "learned" / "seed_0" / "policies" / "learned" / "summary.json").stat().st_mtime_ns == made_once
-    sections = (
+    page = learn_to_choose(settings, out).read_text()
+    summary = out / "learned" / "seed_0" / "policies" / "learned" / "summary.json"
+    made_once = summary.stat().st_mtime_ns
+    assert learn_to_choose(settings, out).read_text() == page
+    assert summary.stat().st_mtime_ns == made_once
+    said = [
         "6 candidate views",
         "Facing any way",
-        "Classes never chosen for",
         "Until it does not pay",
-    )
-    for said in (*sections, "PointNet++ entropy (thesis)", "view policy", "label-free oracle"):
-        assert html.escape(said) in page
+        "PointNet++ entropy (thesis)",
+        "view policy",
+    ]
+    for words in (*said, "label-free oracle", *["Classes never chosen for"] * (learned.novel > 0)):
+        assert html.escape(words) in page
     found = json.loads((out / "learned" / "metrics.json").read_text())
     first = found["seeds"][0]
     more = found | {"seeds": [first | {"rotated": first["unposed"]}, {"lattices": first["lattices"]}]}
     write_learned_page(more, load_statistics(out / "data"), tmp_path / "more.html")
-    for said in ("Means of 2 trainings", "Joined with a table", "Other random weights", "Turned anyhow"):
-        assert said in (tmp_path / "more.html").read_text()
+    for words in (
+        "Means of 2 trainings",
+        "Turned anyhow",
+        *["Joined with a table", "Other random weights"] * (learned.novel > 0),
+    ):
+        assert words in (tmp_path / "more.html").read_text()
+
+
+def test_published_code_and_climbs_fill_their_tables(whole, tmp_path):
+    """One evaluation of what `mevs study published-code`, `study rendering` and `study learned` add to a run."""
+    open3d_or_skip()
+    out = tmp_path / "run"
+    shutil.copytree(whole, out)
+    assert "mevs study published-code" in (out / "report" / "index.html").read_text()
     ascend_on_objects(TINY, out)
     assert mevs("compat", "--preset", "tiny", "--out", out).returncode == 0
     metrics = json.loads((out / "metrics.json").read_text())
@@ -257,7 +276,6 @@ def test_compat_climbs_and_learning_fill_their_tables(whole, tmp_path):
     assert {"random", "predicted_entropy", "diff_volume", "diff_mesh"} <= set(metrics["climbing"]["policies"])
     page = (out / "report" / "index.html").read_text()
     assert "Choosing by differentiable rendering" in page
-    assert "Learning to fuse and to choose" in page
     assert "mevs study published-code" not in page
     before = json.loads((whole / "metrics.json").read_text())
     assert before["compatibility"]["rows"]["text"] == made["rows"]["text"]
