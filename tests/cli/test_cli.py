@@ -14,12 +14,14 @@ import time
 from dataclasses import replace
 from pathlib import Path
 
+import jax.numpy as jnp
 import numpy as np
 import pytest
 import trimesh
 
 from data_pipeline.dataset.builder import load_statistics
 from eval.learned.page import write_learned_page
+from eval.rendering import policies as rendering_policies
 from eval.settings import TINY
 from eval.stages import ascend_on_objects, learn_to_choose
 from mevs_jax.cli import main as cli
@@ -260,9 +262,14 @@ def test_learning_writes_a_page_and_is_not_repeated(learned, whole, tmp_path):
         assert words in (tmp_path / "more.html").read_text()
 
 
-def test_published_code_and_climbs_fill_their_tables(whole, tmp_path):
-    """One evaluation of what `mevs study published-code`, `study rendering` and `study learned` add to a run."""
+@pytest.mark.parametrize("climbs", [False, pytest.param(True, marks=pytest.mark.slow)], ids=["made up", "real"])
+def test_published_code_and_climbs_fill_their_tables(climbs, whole, tmp_path, monkeypatch):
+    """One evaluation of what `mevs study published-code` and `mevs study rendering` add to a run."""
     open3d_or_skip()
+    if not climbs:  # they are compared with what they should be in tests/eval/rendering
+        random = np.random.default_rng(0)
+        made_up = lambda method, things, points, config: jnp.asarray(random.uniform(size=(len(things), len(points))))  # noqa: E731
+        monkeypatch.setattr(rendering_policies, "_scores", made_up)
     out = tmp_path / "run"
     shutil.copytree(whole, out)
     assert "mevs study published-code" in (out / "report" / "index.html").read_text()

@@ -331,6 +331,7 @@ def test_the_stages_make_everything_and_go_on(results, tmp_path, monkeypatch, ca
     assert (
         len(set(asked)) == len(asked) == 2 * 6 + 2 * 4
     )  # every network on both test splits, those walked with on both others
+    monkeypatch.setattr(thesis_run, "write_thesis_report", lambda inputs, lead, folder: folder / "index.html")
     assert thesis_run.reproduce(settings, "tiny", tmp_path) == page
     assert "Walking" not in capfd.readouterr().err
     assert len(asked) == 20
