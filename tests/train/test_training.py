@@ -24,6 +24,7 @@ from train.checkpoints import Checkpoints
 from train.loop import fit, load_best
 from train.optimiser import OptimiserConfig, descent, learning_rate
 from train.starting_weights import weights_from_network
+from train.tasks.entropy import EntropyTask
 
 SETTINGS = replace(
     TINY,
@@ -181,19 +182,10 @@ def test_schedules():
     assert float(cosine(jnp.int32(100), 1e-3)) == pytest.approx(1e-3)
     assert float(cosine(jnp.int32(100), 1e-2)) == pytest.approx(1e-2)
     assert float(learning_rate(OptimiserConfig(), 10)(jnp.int32(7), 1e-2)) == pytest.approx(1e-2)
-    statistics_like = tasks(SETTINGS, _Like())[1]
-    assert float(statistics_like.momentum(jnp.int32(0))) == 0.5
-    assert float(statistics_like.momentum(jnp.int32(45_000))) == 0.125
-    assert float(statistics_like.momentum(jnp.int32(10**6))) == pytest.approx(0.01)
-
-
-class _Like:
-    """As much of a data set's statistics as tasks need."""
-
-    camera = TINY.dataset.capture
-    classes = tuple("abcdefghij")
-    views = 6
-    entropy_max = 4.0
+    task = EntropyTask.of(SETTINGS.entropy, 6, 4.0, TINY.dataset.capture)
+    assert float(task.momentum(jnp.int32(0))) == 0.5
+    assert float(task.momentum(jnp.int32(45_000))) == 0.125
+    assert float(task.momentum(jnp.int32(10**6))) == pytest.approx(0.01)
 
 
 def test_a_loss_that_is_no_number_stops_the_run(data, tmp_path):
