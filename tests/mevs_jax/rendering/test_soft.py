@@ -397,7 +397,7 @@ def test_a_surface_is_reconstructed_through_what_was_seen():
         reconstruct(cloud[:5], cloud[:5], 500)
 
 
-@pytest.mark.parametrize("method", ["volume", "mesh"])
+@pytest.mark.parametrize("method", ["volume", pytest.param("mesh", marks=pytest.mark.slow)])
 @pytest.mark.usefixtures("fully_compiled")
 def test_the_command_climbs_and_draws(method, tmp_path):
     from PIL import Image
