@@ -60,11 +60,11 @@ class Features:
         clouds: (objects, views, embedding) of the partial clouds, where they are used.
     """
 
-    features: Float[Array, "*objects views features"]
-    logits: Float[Array, "*objects views classes"]
-    labels: Int[Array, "*objects"]
-    directions: Float[Array, "*objects views 3"]
-    clouds: Float[Array, "*objects views embedding"] | None = None
+    features: Float[Array, "objects views features"]
+    logits: Float[Array, "objects views classes"]
+    labels: Int[Array, " objects"]
+    directions: Float[Array, "objects views 3"]
+    clouds: Float[Array, "objects views embedding"] | None = None
 
     def some(self, chosen: Int[np.ndarray, " some"]) -> Features:
         """Those of some objects."""

@@ -84,15 +84,15 @@ class Choices:
         clouds: embeddings of the partial clouds of the views seen, where they are used.
     """
 
-    belief: Float[Array, "*states classes"]
-    views: Float[Array, "*states seen classes"]
-    directions: Float[Array, "*states seen 3"]
-    present: Bool[Array, "*states seen"]
-    candidates: Float[Array, "*states candidates 3"]
-    gain: Float[Array, "*states candidates"]
-    label: Int[Array, "*states"]
-    weight: Float[Array, "*states"]
-    clouds: Float[Array, "*states seen embedding"] | None = None
+    belief: Float[Array, "states classes"]
+    views: Float[Array, "states seen classes"]
+    directions: Float[Array, "states seen 3"]
+    present: Bool[Array, "states seen"]
+    candidates: Float[Array, "states candidates 3"]
+    gain: Float[Array, "states candidates"]
+    label: Int[Array, " states"]
+    weight: Float[Array, " states"]
+    clouds: Float[Array, "states seen embedding"] | None = None
 
 
 def graph_of(directions: Float[Array, "views 3"]) -> ViewGraph:

@@ -61,11 +61,11 @@ class Transitions:
         reward: [t]: rise in utility by view t + 1.
     """
 
-    beliefs: Float[Array, "*walks steps classes"]
-    views: Float[Array, "*walks steps classes"]
-    order: Int[Array, "*walks steps"]
-    candidates: Float[Array, "*walks candidates 3"]
-    reward: Float[Array, "*walks transitions"]
+    beliefs: Float[Array, "walks steps classes"]
+    views: Float[Array, "walks steps classes"]
+    order: Int[Array, "walks steps"]
+    candidates: Float[Array, "walks candidates 3"]
+    reward: Float[Array, "walks transitions"]
 
 
 @partial(jax.jit, static_argnames="config")
