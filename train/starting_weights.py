@@ -15,7 +15,7 @@ from collections import OrderedDict
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, BinaryIO, ClassVar
+from typing import Any, ClassVar
 
 import ml_dtypes
 import numpy as np
@@ -128,7 +128,7 @@ def _zip_state(content: bytes) -> tuple[Any, Callable[[_Storage], np.ndarray]]:
     return state, lambda storage: np.frombuffer(archive.read(f"{root}data/{storage.key}"), storage.dtype)
 
 
-def _legacy_state(file: BinaryIO) -> tuple[Any, Callable[[_Storage], np.ndarray]]:
+def _legacy_state(file: io.BytesIO) -> tuple[Any, Callable[[_Storage], np.ndarray]]:
     if _WeightsUnpickler(file).load() != _LEGACY_MAGIC:
         raise ValueError("it does not begin as a file of weights does")
     for _ in range(2):  # version, and the writer's machine

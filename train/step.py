@@ -7,7 +7,7 @@ numbers of a sample depend on its position in the batch. So the number of device
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any, Protocol
+from typing import Any, Protocol, runtime_checkable
 
 import flax.struct
 import jax
@@ -53,6 +53,7 @@ class Hyperparameters:
         )
 
 
+@runtime_checkable
 class Task(Protocol):
     """What training needs to know of one kind of network."""
 

@@ -32,7 +32,7 @@ def intervals(values: np.ndarray) -> list:
     return np.asarray(_intervals(jnp.asarray(values, jnp.float32)), float).tolist()
 
 
-def class_mean(right: np.ndarray, labels: np.ndarray) -> np.ndarray:
+def class_mean(right: np.ndarray, labels: np.ndarray) -> np.ndarray | np.floating:
     """Mean recall (…) over the classes that occur, from `right` (…, objects)."""
     return np.stack([right[..., labels == label].mean(axis=-1) for label in np.unique(labels)]).mean(axis=0)
 

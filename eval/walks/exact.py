@@ -91,7 +91,11 @@ def expected_random(
     reachable: np.ndarray,
     thresholds: tuple[float, ...],
     max_views: int,
-) -> tuple[Float[Array, "backbones objects sizes CT"], ...]:
+) -> tuple[
+    Float[Array, "backbones objects sizes CT"],
+    Float[Array, "backbones objects sizes CT"],
+    Float[Array, "backbones objects sizes"],
+]:
     """Expected results of random selection on every object, for the sizes of `all_subsets`.
 
     Returns:
@@ -106,4 +110,5 @@ def expected_random(
         over_backbones = jax.vmap(one, (0, None))
         return jax.lax.map(lambda item: over_backbones(*item), (logits, labels), batch_size=4)
 
-    return tuple(jnp.moveaxis(values, 0, 1) for values in every(logits, labels))
+    right, used, after = (jnp.moveaxis(values, 0, 1) for values in every(logits, labels))
+    return right, used, after
