@@ -127,7 +127,7 @@ def whole(tmp_path_factory) -> Path:
         command = [sys.executable, "-m", "mevs_jax", "run", "--preset", "tiny", "--out", str(folder)]
         result = subprocess.run(command, capture_output=True, text=True, timeout=900)
         assert result.returncode == 0, result.stderr
-        assert "Report:" in result.stderr
+        assert "Report:" in result.stdout
 
     return made_once(tmp_path_factory, "whole", make)
 

@@ -1,15 +1,13 @@
-"""The command line as a user meets it: one sentence for bad input, and a job that survives being killed."""
+"""A job that survives being killed, and what each command adds to it."""
 
 from __future__ import annotations
 
 import html
 import json
 import os
-import re
 import shutil
 import signal
 import subprocess
-import sys
 import time
 from dataclasses import replace
 from pathlib import Path
@@ -17,174 +15,14 @@ from pathlib import Path
 import jax.numpy as jnp
 import numpy as np
 import pytest
-import trimesh
 
 from data_pipeline.dataset.statistics import load_statistics
 from eval.learned.page import write_learned_page
 from eval.rendering import policies as rendering_policies
 from eval.settings import TINY
 from eval.stages import ascend_on_objects, learn_to_choose
-from mevs_jax.cli import main as cli
+from tests.cli.conftest import MEVS, mevs
 from tests.conftest import open3d_or_skip
-
-MEVS = [sys.executable, "-m", "mevs_jax"]
-
-
-def mevs(*arguments: str | Path, cwd: Path | None = None) -> subprocess.CompletedProcess:
-    return subprocess.run([*MEVS, *map(str, arguments)], capture_output=True, text=True, cwd=cwd, timeout=600)
-
-
-@pytest.fixture
-def at_once(monkeypatch, capfd):
-    """`mevs` in this process, which imports nothing anew, where it ends before it works."""
-
-    def run(*arguments: str | Path) -> subprocess.CompletedProcess:
-        handlers = {sign: signal.getsignal(sign) for sign in (signal.SIGINT, signal.SIGALRM)}
-        monkeypatch.setattr(sys, "argv", ["test", *map(str, arguments)])  # not `mevs`, which would begin again
-        capfd.readouterr()
-        try:
-            with pytest.raises(SystemExit) as ended:
-                cli.main()
-        finally:
-            for sign, handler in handlers.items():
-                signal.signal(sign, handler)
-        return subprocess.CompletedProcess([], ended.value.code, *capfd.readouterr())
-
-    return run
-
-
-@pytest.fixture
-def refuses(at_once):
-    """The sentence with which it refuses something."""
-    return lambda *arguments: refused(at_once(*arguments))
-
-
-def cube_off() -> str:
-    cube = trimesh.creation.box((1, 2, 3))
-    rows = [f"OFF\n{len(cube.vertices)} {len(cube.faces)} 0"]
-    rows += [" ".join(map(str, vertex)) for vertex in cube.vertices] + [
-        "3 " + " ".join(map(str, face)) for face in cube.faces
-    ]
-    return "\n".join(rows) + "\n"
-
-
-def folder_with(root: Path, bad: str) -> Path:
-    """Two classes of cubes, one of them with a file of the content `bad`."""
-    for name in ("cup", "jug"):
-        for split in ("train", "test"):
-            (root / name / split).mkdir(parents=True)
-            for index in range(3):
-                (root / name / split / f"{index}.off").write_text(cube_off())
-    (root / "jug" / "train" / "1.off").write_text(bad)
-    return root
-
-
-def refused(result: subprocess.CompletedProcess) -> str:
-    assert result.returncode == 2, result.stderr
-    assert "Traceback" not in result.stderr
-    message = [line for line in result.stderr.splitlines() if line.startswith("mevs: ")]
-    assert len(message) == 1
-    assert result.stderr.strip().splitlines()[-1] == message[0]
-    return message[0]
-
-
-BY_THREADS = ["--dataset.capture.backend", "rasterise"]  # other backends capture in processes, which import for seconds
-
-
-def no_such_file(root: Path) -> list:
-    return ["--data", root / "nowhere"]
-
-
-def not_a_mesh(root: Path) -> list:
-    return ["--data", folder_with(root / "set", "hello")]
-
-
-def truncated(root: Path) -> list:
-    return [*BY_THREADS, "--data", folder_with(root / "set", cube_off()[:80])]
-
-
-def not_finite(root: Path) -> list:
-    return [*BY_THREADS, "--data", folder_with(root / "set", cube_off().replace("0.5", "nan", 1))]
-
-
-def empty_class(root: Path) -> list:
-    folder = folder_with(root / "set", cube_off())
-    (folder / "vase" / "train").mkdir(parents=True)
-    return ["--data", folder]
-
-
-def zip_that_leaves(root: Path) -> list:
-    import zipfile
-
-    with zipfile.ZipFile(root / "a.zip", "w") as archive:
-        archive.writestr("../cup/train/a.off", cube_off())
-    return ["--data", root / "a.zip"]
-
-
-def one_view(root: Path) -> list:
-    return ["--views", "1"]
-
-
-def unwritable(root: Path) -> list:
-    (root / "file").write_text("in the way")
-    return ["--out", root / "file" / "run"]
-
-
-def no_archive(root: Path) -> list:
-    return ["--data", "modelnet10", "--archive", root / "ModelNet10.zip"]
-
-
-def weights_for_another(root: Path) -> list:
-    (root / "resnet18.pth").write_bytes(b"")
-    return ["--pretrained", root / "resnet18.pth"]
-
-
-def weights_that_are_none(root: Path) -> list:
-    return [*weights_for_another(root), "--classifier.network.width", "64", "--classifier.network.channels", "3"]
-
-
-@pytest.mark.parametrize(
-    ("make", "message"),
-    [
-        (no_such_file, "no such file or folder: .*nowhere"),
-        (not_a_mesh, r"jug/train/1.off is not an OFF mesh"),
-        (truncated, r"jug/train/1.off is cut short"),
-        (not_finite, r"jug/train/1.off has \d vertices that are not finite"),
-        (empty_class, "class folder .*vase.train is empty"),
-        (zip_that_leaves, "a path that leaves its folder"),
-        (one_view, "--views 1 is too few"),
-        (unwritable, "cannot write to"),
-        (no_archive, r"--archive .*ModelNet10.zip cannot be read: No such file"),
-        (
-            weights_for_another,
-            r"of width 64 with 3 input channels, this one has width 8 and 1 channels; use --preset thesis",
-        ),
-        (weights_that_are_none, r"resnet18.pth is not a file of weights that can be read safely"),
-    ],
-    ids=lambda value: getattr(value, "__name__", ""),
-)
-def test_bad_input_gets_one_sentence_and_exit_code_2(tmp_path, make, message, refuses):
-    arguments = make(tmp_path)
-    if "--out" not in arguments:
-        arguments += ["--out", tmp_path / "run"]
-    assert re.search(message, refuses("run", "--preset", "tiny", *arguments))
-
-
-def test_unknown_words_are_refused_and_help_reads_well(tmp_path, refuses, at_once):
-    assert "unknown command 'fly'" in refused(mevs("fly"))
-    assert "unknown preset 'huge'" in refuses("run", "--preset", "huge")
-    assert at_once("run", "--no-such-option").returncode == 2
-    assert "of 10 and of 40 views" in refuses("thesis", "--views", "5", "--out", tmp_path / "thesis")
-    assert "no data set in" in refuses("train", "--out", tmp_path)
-    assert "go with mevs train alone" in refuses("run", "--distributed", "--out", tmp_path)
-    assert "--beam goes with mevs data alone" in refuses("run", "--beam", "", "--out", tmp_path)
-    assert "cannot join the other processes" in refused(mevs("train", "--distributed", "--out", tmp_path))
-    shown = at_once("--help")
-    assert shown.returncode == 0
-    for word in ("run", "data", "train", "eval", "report", "--preset", "--data", "--views", "--out"):
-        assert word in shown.stdout
-    assert max(map(len, shown.stdout.splitlines())) <= 100
-    assert "--classifier.optimiser.epochs" in at_once("run", "--help").stdout
 
 
 def test_the_job_leaves_a_report_and_metrics(whole):
@@ -342,7 +180,7 @@ def test_a_sweep_is_made_by_command(whole, tmp_path):
     (tmp_path / "data").symlink_to(whole / "data")
     result = mevs("sweep", "--preset", "tiny", "--out", tmp_path, "--sweep.members", "3")
     assert result.returncode == 0, result.stderr
-    assert "Best of 3: validation loss" in result.stderr
+    assert "Best of 3: validation loss" in result.stdout
     assert len(json.loads((tmp_path / "sweep" / "entropy" / "members.json").read_text())) == 3
 
 
@@ -350,30 +188,6 @@ def test_a_reach_that_leaves_nothing_is_refused(whole, refuses):
     arguments = ("eval", "--preset", "tiny", "--out", whole, "--evaluation.lowest-elevation", "89")
     assert "viewpoints have an elevation of at least 89°" in refuses(*arguments)
     assert "must be at least 2" in refuses(*arguments[:5], "--evaluation.max-views", "1")
-
-
-def test_an_interrupt_that_is_lost_is_given_again():
-    """Python ignores an interrupt that falls into a finaliser; here one does."""
-    script = """
-import os, signal, sys, time
-from mevs_jax.cli import main as cli
-
-class Loses:
-    def __del__(self):
-        os.kill(os.getpid(), signal.SIGINT)
-        time.sleep(0.1)
-
-def job(*arguments):
-    Loses()
-    time.sleep(300)
-
-cli._run, sys.argv = job, ["mevs", "run"]
-cli.main()
-"""
-    result = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, timeout=120)
-    assert result.returncode == 130
-    assert "Exception ignored" in result.stderr
-    assert "mevs: interrupted" in result.stderr
 
 
 def kill_when(out: Path, ready, sign: int) -> int:
@@ -426,22 +240,3 @@ def test_a_job_that_is_killed_again_and_again_ends_with_the_same_metrics(whole, 
     ):
         assert kill_when(tmp_path, ready, sign) == code
     ends_like(tmp_path, whole)
-
-
-@pytest.mark.skipif("CS_GNU_LIBC_VERSION" not in os.confstr_names, reason="large pages are asked of glibc")
-def test_jobs_begin_again_with_large_pages(monkeypatch):
-    """Once, with the arguments they had; and never where `main` is called from another program."""
-    begun = []
-    monkeypatch.setattr(os, "execv", lambda *command: begun.append(command))
-    monkeypatch.setattr(sys, "orig_argv", ["python", "-m", "mevs_jax", "run", "--views", "10"])
-    monkeypatch.delenv("GLIBC_TUNABLES", raising=False)
-    monkeypatch.setattr(sys, "argv", ["/usr/bin/notebook"])
-    cli._begin_with_large_pages()
-    assert not begun
-    for program in ("/somewhere/bin/mevs", "/somewhere/mevs_jax/__main__.py"):
-        monkeypatch.setattr(sys, "argv", [program])
-        monkeypatch.delenv("GLIBC_TUNABLES", raising=False)
-        cli._begin_with_large_pages()
-        assert os.environ["GLIBC_TUNABLES"] == "glibc.malloc.hugetlb=1"
-        cli._begin_with_large_pages()
-    assert begun == [(sys.executable, [sys.executable, "-m", "mevs_jax", "run", "--views", "10"])] * 2
