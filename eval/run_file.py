@@ -72,7 +72,7 @@ def from_plain(kind: Any, content: Any, where: str) -> Any:
         TypeError, ValueError: for content of another form; the message names the place.
     """
     origin, arguments = get_origin(kind), get_args(kind)
-    if is_dataclass(kind):
+    if isinstance(kind, type) and is_dataclass(kind):
         if not isinstance(content, dict):
             raise TypeError(f"{where} is no object")
         hints = get_type_hints(kind)
