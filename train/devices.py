@@ -12,7 +12,7 @@ from typing import Any
 
 import jax
 import numpy as np
-from jax.sharding import Mesh, NamedSharding, PartitionSpec
+from jax.sharding import AbstractMesh, Mesh, NamedSharding, PartitionSpec
 
 from data_pipeline.errors import DataError
 from train.step import Task
@@ -82,7 +82,7 @@ def check_batch(task: Task, mesh: Mesh) -> None:
         )
 
 
-def parameter_sharding(mesh: Mesh, tree: Any) -> Any:
+def parameter_sharding(mesh: Mesh | AbstractMesh, tree: Any) -> Any:
     """Where every array of a tree belongs: large ones split along `model` by their last axis, all others everywhere."""
     model = mesh.shape[MODEL]
 

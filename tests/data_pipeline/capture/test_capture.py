@@ -151,9 +151,11 @@ def under_xvfb(code: str, *arguments: str) -> subprocess.CompletedProcess:
 SEE_BOTH = """
 import sys
 import numpy as np
-from data_pipeline.capture import CaptureConfig, capture, rig_for, save_capture
-from data_pipeline.meshes import FurniturePiece, ObjectEntry, load_object
-from data_pipeline.visualizer import capture_with_visualizer
+from data_pipeline.capture.casting import CaptureConfig, capture, rig_for, save_capture
+from data_pipeline.capture.visualizer import capture_with_visualizer
+from data_pipeline.objects.mesh import ObjectEntry
+from data_pipeline.objects.recipes import FurniturePiece
+from data_pipeline.objects.sources import load_object
 from pathlib import Path
 rig = rig_for(CaptureConfig(views=8, resolution=224))
 for name in sys.argv[2:]:
