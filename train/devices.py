@@ -86,7 +86,7 @@ def parameter_sharding(mesh: Mesh | AbstractMesh, tree: Any) -> Any:
     """Where every array of a tree belongs: large ones split along `model` by their last axis, all others everywhere."""
     model = mesh.shape[MODEL]
 
-    def of(leaf: jax.Array) -> NamedSharding:
+    def of(leaf: jax.Array | jax.ShapeDtypeStruct) -> NamedSharding:
         splits = model > 1 and leaf.ndim > 1 and leaf.size >= _SMALLEST_SPLIT and leaf.shape[-1] % model == 0
         return NamedSharding(mesh, PartitionSpec(*[None] * (leaf.ndim - 1), MODEL) if splits else PartitionSpec())
 
