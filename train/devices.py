@@ -12,7 +12,7 @@ from typing import Any
 
 import jax
 import numpy as np
-from jax.sharding import Mesh, NamedSharding, PartitionSpec
+from jax.sharding import AbstractMesh, Mesh, NamedSharding, PartitionSpec
 
 from data_pipeline.errors import DataError
 from train.step import Task
@@ -85,11 +85,11 @@ def check_batch(task: Task, mesh: Mesh) -> None:
         )
 
 
-def parameter_sharding(mesh: Mesh, tree: Any) -> Any:
+def parameter_sharding(mesh: Mesh | AbstractMesh, tree: Any) -> Any:
     """Returns the sharding of every array of a tree: large ones split along `model` by the last axis, others copied."""
     model = mesh.shape[MODEL]
 
-    def of(leaf: jax.Array) -> NamedSharding:
+    def of(leaf: jax.Array | jax.ShapeDtypeStruct) -> NamedSharding:
         splits = model > 1 and leaf.ndim > 1 and leaf.size >= _SMALLEST_SPLIT and leaf.shape[-1] % model == 0
         return NamedSharding(mesh, PartitionSpec(*[None] * (leaf.ndim - 1), MODEL) if splits else PartitionSpec())
 

@@ -17,7 +17,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from flax import nnx
-from jaxtyping import Array, Int
+from jaxtyping import Array, Int, Integer
 
 from data_pipeline.dataset.batches import evaluation_batches
 from data_pipeline.progress import progress_bar
@@ -43,7 +43,7 @@ class Captures:
         clouds: the sampled points of each view, in the form that `EntropyTask.inputs` takes.
     """
 
-    images: Int[Array, "*batch views height width"]
+    images: Integer[Array, "*batch views height width"]
     clouds: dict[str, Array]
 
 

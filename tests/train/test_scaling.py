@@ -119,7 +119,7 @@ def test_the_step_is_adam_with_decoupled_weight_decay(data):
     task = linear(tasks(SETTINGS, load_statistics(data))[0])
     optimiser = replace(task.optimiser, weight_decay=1.0, learning_rate=1e-3, schedule="constant")
     task = replace(task, optimiser=optimiser)
-    batch = next(train_batches(data, task.batches))
+    batch = jax.tree.map(jnp.asarray, next(train_batches(data, task.batches)))
     structure, state = initial_state(task, 0)
     reference = optax.adamw(1e-3, weight_decay=1.0)
     parameters, moments = state.parameters, reference.init(state.parameters)

@@ -16,7 +16,7 @@ from tests.data_pipeline.dataset.conftest import CONFIG
 def test_inputs_are_what_the_stored_view_shows(data):
     example = open_split(data, "test")[0]
     camera = CONFIG.capture
-    image = np.asarray(image_input(example["depth"][0], "depth", 3, camera))
+    image = np.asarray(image_input(jnp.asarray(example["depth"][0]), "depth", 3, camera))
     assert image.shape == (32, 32, 3)
     assert image.min() == 0
     assert image.max() <= 1
