@@ -17,10 +17,8 @@ from data_pipeline.dataset.batches import (
     train_batches,
     validation_batches,
 )
-from data_pipeline.dataset.builder import (
-    load_statistics,
-    open_split,
-)
+from data_pipeline.dataset.builder import open_split
+from data_pipeline.dataset.statistics import load_statistics
 
 BATCHES = ViewBatches(batch_size=12, views_per_object=3, points=50, images="depth", seed=4)
 

@@ -10,14 +10,8 @@ import numpy as np
 import pytest
 
 from data_pipeline.capture.casting import Capture, CaptureConfig, capture, rig_for
-from data_pipeline.dataset.builder import (
-    SPLITS,
-    load_statistics,
-    open_split,
-    prepare,
-    split_objects,
-    view_entropies,
-)
+from data_pipeline.dataset.builder import open_split, prepare, split_objects, view_entropies
+from data_pipeline.dataset.statistics import SPLITS, load_statistics
 from data_pipeline.errors import DataError
 from data_pipeline.objects.sources import load_object, open_source
 from mevs_jax import depth_entropy

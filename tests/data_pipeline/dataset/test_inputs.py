@@ -5,9 +5,7 @@ from __future__ import annotations
 import jax.numpy as jnp
 import numpy as np
 
-from data_pipeline.dataset.builder import (
-    open_split,
-)
+from data_pipeline.dataset.builder import open_split
 from data_pipeline.dataset.inputs import cloud_input, image_input
 from mevs_jax import Camera, partial_cloud
 from tests.data_pipeline.dataset.conftest import CONFIG

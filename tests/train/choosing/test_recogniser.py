@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 
 from data_pipeline.dataset.augment import views_after
 from data_pipeline.dataset.batches import evaluation_batches
-from data_pipeline.dataset.builder import load_statistics
+from data_pipeline.dataset.statistics import load_statistics
 from data_pipeline.errors import DataError
 from eval.settings import TINY
 from mevs_jax.models import Recogniser
