@@ -74,8 +74,9 @@ def difference(results: Results, base: Results) -> dict[str, Any]:
     }
 
 
-def first_reaching(curve: np.ndarray, target: np.ndarray) -> np.ndarray:
+def first_reaching(curve: np.ndarray, target: np.ndarray | np.floating) -> np.ndarray:
     """Interpolated number of views at which each curve (…, steps) first reaches its target (…); inf if it never does."""
+    target = np.asarray(target)
     reached = curve >= target[..., None]
     at = reached.argmax(axis=-1)
     high = np.take_along_axis(curve, at[..., None], axis=-1)[..., 0]

@@ -120,7 +120,9 @@ def fingerprint(array: np.ndarray) -> np.ndarray:
 
 
 @pytest.mark.usefixtures("fully_compiled")
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize(
+    "kind", [pytest.param(kind, marks=[pytest.mark.slow] * (kind == "resnet34")) for kind in KINDS]
+)
 def test_forward_and_gradients_equal_stored_pytorch(kind):
     gradients, _ = train_ours(kind)
     with np.load(GOLDEN) as golden:

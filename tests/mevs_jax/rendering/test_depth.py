@@ -38,8 +38,9 @@ def test_rasterising_sees_what_rays_see(name, resolution):
     assert agreement(furniture(name), CaptureConfig(views=12, resolution=resolution)) > 0.999
 
 
-def test_rasterising_sees_real_meshes_and_voxels_as_rays_do(real_meshes, real_voxels):
-    for path, count in ((real_voxels, 3), (real_meshes, 2)):
+@pytest.mark.parametrize("counts", [(1, 1), pytest.param((3, 2), marks=pytest.mark.slow)], ids=["some", "more"])
+def test_rasterising_sees_real_meshes_and_voxels_as_rays_do(counts, real_meshes, real_voxels):
+    for path, count in zip((real_voxels, real_meshes), counts, strict=True):
         if path.suffix:
             entries = open_source(str(path), train_per_class=0, test_per_class=0).entries
         else:

@@ -27,12 +27,16 @@ from train.loop import load_best, steps_of_an_epoch
 from train.tasks.recogniser import RecogniserTask
 
 
+def on_device(batches) -> list[dict[str, jax.Array]]:
+    return [jax.tree.map(jnp.asarray, batch) for batch in batches]
+
+
 def test_objects_turned_anyhow_are_seen_from_the_lattice_itself(turned):
     """Undoing the turn of an object's cameras turns the object instead."""
     statistics = load_statistics(turned)
     task = RecogniserTask.of(TINY.learned.recogniser, 10, statistics.camera)
     network = nnx.jit(lambda: task.network(nnx.Rngs(0)))()
-    batches = list(islice(evaluation_batches(turned, "train", images="depth"), 2))
+    batches = on_device(islice(evaluation_batches(turned, "train", images="depth"), 2))
     features = network.encoder.head.in_features
     together = {name: np.concatenate([batch[name] for batch in batches]) for name in batches[0]}
     lattice = viewpoint_lattice(task.camera.views, task.camera.lattice)
@@ -53,7 +57,7 @@ def test_objects_turned_anyhow_are_seen_from_the_lattice_itself(turned):
 def test_changed_objects_are_each_changed_in_a_way_of_their_own_and_the_same_every_time(turned):
     task = RecogniserTask.of(TINY.learned.recogniser, 10, load_statistics(turned).camera)
     network = nnx.jit(lambda: task.network(nnx.Rngs(0)))()
-    batches = list(islice(evaluation_batches(turned, "val", images="depth"), 5))
+    batches = on_device(islice(evaluation_batches(turned, "val", images="depth"), 5))
     features, changes = network.encoder.head.in_features, []
     asked = [nnx.jit(partial(see_changed(number), task=task)) for number in (0, 1)]
     see, after = nnx.jit(Recogniser.see), jax.jit(partial(views_after, camera=task.camera))
