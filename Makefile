@@ -4,6 +4,8 @@ PYTHON ?= $(shell for p in python3 python3.14 python3.13 python3.12 python3.11; 
 BIN := .venv/bin
 READY := .venv/.ready
 OUT ?= runs/demo
+# A file at a time, since its tests share what is costly to make; the longest files first (tests/conftest.py).
+PYTEST := $(BIN)/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder
 # Packages are installed without bytecode, which each keeps once it was imported, unless told not to: then every start of `mevs`
 # would compile them again, for 12 seconds.
 unexport PYTHONDONTWRITEBYTECODE
@@ -14,10 +16,10 @@ PYTEST := $(BIN)/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder
 demo: $(READY)  ## environment, data, networks, evaluation, report
 	$(BIN)/mevs run --preset small --out $(OUT)
 
-test: lint  ## format, lint, types and tests
-	$(PYTEST)
+test: lint  ## format, lint, types, and the tests that are not marked slow
+	$(PYTEST) -m "not slow"
 
-test-all: lint  ## those, and the slow tests
+test-all: lint  ## the same with all tests
 	$(PYTEST)
 
 lint: $(READY)

@@ -1,12 +1,13 @@
-"""Whether climbing over the sphere finds the best view: `python benchmarks/ascent.py METHOD DATA [OBJECTS]`.
+"""Whether gradient ascent over the sphere finds the best view: `python benchmarks/ascent.py METHOD DATA [OBJECTS]`.
 
-METHOD is `volume` (opacity entropy of a grid of densities, 32³) or `mesh` (depth entropy of at most 500 faces, rendered softly);
-DATA is any source of objects, from whose test split OBJECTS (100) are taken evenly. Images are 64×64. From each object's 40
-Fibonacci viewpoints the camera climbs; the same objective on a dense grid of 2,562 directions says how high it could have come.
-Shown are the shares of objects whose best start, and of all single starts that, came within 5 % of the grid's maximum, and within
-5 % of its range, which is harder where every view is nearly as good; and seconds per object for all starts.
+METHOD is `volume` (opacity entropy of a grid of densities, 32³) or `mesh` (depth entropy of at most 500 faces,
+rendered softly). DATA is any source of objects; OBJECTS (100) are taken evenly from its test split. Images are 64×64.
+The ascent starts from the 40 Fibonacci viewpoints of each object. The maximum of the objective over a dense grid of
+2,562 directions is the reference. The summary gives the share of objects whose best start, and the share of single
+starts that, end within 5 % of that maximum, and within 5 % of the grid's range, which is harder if all views are
+nearly equal; and the seconds per object for all starts.
 
-Results go to `benchmarks/results/ascent_METHOD.json` object by object, and the command goes on where it stopped.
+Results are written to `benchmarks/results/ascent_METHOD.json` after each object; a stopped command continues where it stopped.
 """
 
 from __future__ import annotations
@@ -33,7 +34,7 @@ SIDE, STARTS = 64, 40
 
 
 def row_of(name: str, values: np.ndarray, grid: np.ndarray, seconds: float) -> dict[str, Any]:
-    """What is kept of an object: the grid's ends, the highest climb, and the shares of starts that came near."""
+    """Result of an object: range of the grid, best value of the ascent, and shares of starts that ended near the maximum."""
     best, worst = float(grid.max()), float(grid.min())
     return {
         "object": name,
@@ -68,8 +69,8 @@ def main() -> None:
     entries = [entry for entry in source.entries if entry.split == "test"]
     chosen = [entries[index] for index in np.linspace(0, len(entries) - 1, count).astype(int)]
     dense = np.asarray(trimesh.creation.icosphere(4).vertices)
-    climb_on = jax.jit(lambda thing: ascend_on_sphere(method, thing, STARTS, SIDE))
-    look = jax.jit(lambda thing: look_everywhere(method, thing, dense, SIDE))
+    run_ascent = jax.jit(lambda thing: ascend_on_sphere(method, thing, STARTS, SIDE))
+    evaluate_grid = jax.jit(lambda thing: look_everywhere(method, thing, dense, SIDE))
 
     path = RESULTS / f"ascent_{sys.argv[1]}.json"
     rows: list[dict[str, Any]] = read_json(path)["rows"] if path.exists() else []
@@ -84,11 +85,11 @@ def main() -> None:
             left_out += 1
             continue
         if not rows:
-            jax.block_until_ready(climb_on(thing))  # compiles
+            jax.block_until_ready(run_ascent(thing))  # compiles
         begun = time.perf_counter()
-        found = jax.block_until_ready(climb_on(thing))
+        found = jax.block_until_ready(run_ascent(thing))
         seconds = time.perf_counter() - begun
-        rows.append(row_of(entry.name, np.asarray(found.values), np.asarray(look(thing)), seconds))
+        rows.append(row_of(entry.name, np.asarray(found.values), np.asarray(evaluate_grid(thing)), seconds))
         write_json(path, {"summary": summary(rows), "rows": rows})
         print(
             f"{len(rows)} {entry.name}: {rows[-1]['highest']:.4f} of {rows[-1]['best']:.4f}, {seconds:.1f} s",

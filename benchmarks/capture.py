@@ -1,10 +1,11 @@
-"""How many views a second: ray casting, the array program, and the whole way to a file: `python benchmarks/capture.py`.
+"""Views per second of ray casting, of the array program, and of a whole capture to files: `python benchmarks/capture.py`.
 
-Objects are wobbly balls of 320 to 81,920 faces, seen from 40 viewpoints at three resolutions. Both renderers see the same before
-they are timed, and take turns; ray casting has one thread here, the array program all that its device has. Below, where the
-time of a captured object goes, and how long a data set of 100 objects of furniture takes by the number of processes.
+The objects are deformed spheres of 320 to 81,920 faces, seen from 40 viewpoints at three resolutions. The images of
+both renderers are compared before they are timed in turns. Ray casting has one thread here, the array program the
+whole device. Further tables show the time of each stage of a capture, and the time for 100 pieces of furniture by
+number of processes.
 
-The tables go to `benchmarks/results/capture.json` and `capture.md`.
+The tables are written to `benchmarks/results/capture.json` and `capture.md`.
 """
 
 from __future__ import annotations
@@ -32,6 +33,7 @@ from data_pipeline.files import write_json, write_text
 from data_pipeline.objects.mesh import Mesh, ObjectEntry
 from data_pipeline.objects.recipes import FurniturePiece
 from data_pipeline.objects.sources import load_object
+from eval.report.markdown import markdown_row, markdown_table
 from mevs_jax import Camera
 from mevs_jax.rendering import pad_triangles, render_depth
 
@@ -56,7 +58,7 @@ def depths(triangles: jax.Array, poses: jax.Array, side: int) -> jax.Array:
 
 
 def median_seconds(calls: list[Callable[[], Any]], rounds: int) -> list[float]:
-    """Of each call, taking turns, after one to warm up."""
+    """Median time of each call in seconds; the calls take turns, after one warm-up round."""
     taken = np.empty((len(calls), rounds))
     for turn in range(-1, rounds):
         for number, call in enumerate(calls):
@@ -81,19 +83,23 @@ def renderers(mesh: Mesh, side: int, rounds: int) -> dict[str, float]:
         "ray_casting": VIEWS / taken[1],
         "agreement": float(agree.mean()),
     }
-    print(renderer_line(row), flush=True)
+    print(markdown_row(renderer_cells(row)), flush=True)
     return row
 
 
-def renderer_line(row: dict[str, float]) -> str:
-    return (
-        f"| {row['faces']:,} | {row['resolution']} | {row['ray_casting']:,.0f} | {row['array_program']:,.0f} "
-        f"| {row['array_program'] / row['ray_casting']:.2g} | {100 * row['agreement']:.3f} % |"
-    )
+def renderer_cells(row: dict[str, float]) -> list[str]:
+    return [
+        f"{row['faces']:,}",
+        str(row["resolution"]),
+        f"{row['ray_casting']:,.0f}",
+        f"{row['array_program']:,.0f}",
+        f"{row['array_program'] / row['ray_casting']:.2g}",
+        f"{100 * row['agreement']:.3f} %",
+    ]
 
 
 def stages(side: int, objects: int = 10) -> dict[str, float]:
-    """Milliseconds of an object of furniture, by what is done with it."""
+    """Milliseconds of each stage for one piece of furniture."""
     rig = rig_for(CaptureConfig(views=VIEWS, resolution=side))
     spent = dict.fromkeys(("load", "cast", "shade, store", "save"), 0.0)
 
@@ -122,14 +128,14 @@ def stages(side: int, objects: int = 10) -> dict[str, float]:
             spent["shade, store"] += captured - loaded - (spent["cast"] - before)
             spent["save"] += time.perf_counter() - captured
     row = {"resolution": side} | {name: 1000 * seconds / objects for name, seconds in spent.items()}
-    print(stage_line(row), flush=True)
+    print(markdown_row(stage_cells(row)), flush=True)
     return row
 
 
-def stage_line(row: dict[str, float]) -> str:
+def stage_cells(row: dict[str, float]) -> list[str]:
     total = sum(value for name, value in row.items() if name != "resolution")
-    parts = " | ".join(f"{row[name]:.1f}" for name in ("load", "cast", "shade, store", "save"))
-    return f"| {row['resolution']} | {parts} | {1000 * VIEWS / total:,.0f} |"
+    parts = [f"{row[name]:.1f}" for name in ("load", "cast", "shade, store", "save")]
+    return [str(row["resolution"]), *parts, f"{1000 * VIEWS / total:,.0f}"]
 
 
 def furniture(index: int) -> ObjectEntry:
@@ -144,30 +150,29 @@ def whole(side: int, processes: int, objects: int = 100) -> dict[str, float]:
         capture_all(entries, CaptureConfig(views=VIEWS, resolution=side), Path(folder), workers=processes)
         seconds = time.perf_counter() - start
     row = {"resolution": side, "processes": processes, "views_per_second": objects * VIEWS / seconds}
-    print(whole_line(row), flush=True)
+    print(markdown_row(whole_cells(row)), flush=True)
     return row
 
 
-def whole_line(row: dict[str, float]) -> str:
-    return f"| {row['resolution']} | {row['processes']} | {row['views_per_second']:,.0f} |"
+def whole_cells(row: dict[str, float]) -> list[str]:
+    return [str(row["resolution"]), str(row["processes"]), f"{row['views_per_second']:,.0f}"]
 
 
 TABLES = (
     (
         "Views a second: faces, resolution, ray casting (one thread), array program, ratio, equal pixels.",
-        "| faces | pixels a side | ray casting | array program | ratio | equal |\n|---|---|---|---|---|---|",
-        renderer_line,
+        ("faces", "pixels a side", "ray casting", "array program", "ratio", "equal"),
+        renderer_cells,
     ),
     (
         "Milliseconds for 40 views of a piece of furniture, one process.",
-        "| pixels a side | make the mesh | cast rays | shade and store | compress and save | views a second |"
-        "\n|---|---|---|---|---|---|",
-        stage_line,
+        ("pixels a side", "make the mesh", "cast rays", "shade and store", "compress and save", "views a second"),
+        stage_cells,
     ),
     (
         "100 objects to files, their processes' start included.",
-        "| pixels a side | processes | views a second |\n|---|---|---|",
-        whole_line,
+        ("pixels a side", "processes", "views a second"),
+        whole_cells,
     ),
 )
 
@@ -183,8 +188,8 @@ def main() -> None:
     found = [rows, [stages(side) for side in (64, 128, 224)], [whole(side, n) for side in (64, 224) for n in (1, 2)]]
     write_json(RESULTS, {"machine": machine, **dict(zip(("renderers", "stages", "whole"), found, strict=True))})
     parts = [f"{machine}."]
-    for (title, header, line), lines in zip(TABLES, found, strict=True):
-        parts.append("\n".join([title, "", header, *map(line, lines)]))
+    for (title, header, cells), measured in zip(TABLES, found, strict=True):
+        parts.append(f"{title}\n\n{markdown_table(header, [cells(row) for row in measured])}")
     write_text(RESULTS.with_suffix(".md"), "\n\n".join(parts) + "\n")
 
 

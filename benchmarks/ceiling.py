@@ -1,11 +1,12 @@
-"""What holds accuracy down, however many views are taken: `python benchmarks/ceiling.py RUN ARCHIVE [--split val]`.
+"""What limits accuracy, regardless of the number of views: `python benchmarks/ceiling.py RUN ARCHIVE [--split val]`.
 
-RUN is a directory in which `mevs study learned` was run on ARCHIVE, an .npz of voxel grids. Grids of this resolution have
-lost thin surfaces: table tops, mattresses, whole chairs but for their feet. So for every object: the share of its filled cells
-that hang together (26 neighbours), and beside it how accurate 1, 2, 4 and all views are where it is whole and where it is not;
-which classes are taken for which once everything was seen; and how often the nearest training grid has another label.
+RUN is a directory in which `mevs study learned` was run on ARCHIVE, an .npz of voxel grids. Grids of this resolution
+have lost thin surfaces: table tops, mattresses, whole chairs except for their feet. An object counts as whole by the
+share of its filled cells that are connected (26 neighbours). The results are the accuracy from 1, 2, 4 and all views
+for whole and other objects, the classes that are confused after all views, and how often the nearest training grid
+has the same label.
 
-The table goes to `benchmarks/results/ceiling.md`, some objects that are wrong after all views to `ceiling.png`.
+The table is written to `benchmarks/results/ceiling.md`, images of some objects that are wrong after all views to `ceiling.png`.
 """
 
 from __future__ import annotations
@@ -25,6 +26,7 @@ from scipy.ndimage import label as connected
 from data_pipeline.dataset.builder import open_split
 from data_pipeline.files import write_text
 from eval.numbers.comparison import intervals
+from eval.report.markdown import markdown_table
 from eval.settings import PRESETS
 from mevs_jax.beliefs import CalibratedFusion
 from train.choosing.calibrated import beliefs_of_sets
@@ -33,19 +35,19 @@ from train.choosing.stages import Stages
 
 RESULTS = Path(__file__).parent / "results"
 WHOLE = 0.9
-"""An object is whole where at least this share of it hangs together."""
+"""An object is whole if at least this share of its cells is connected."""
 
 
 @dataclass(frozen=True)
 class Options:
     run: Annotated[Path, tyro.conf.Positional]
-    """where `mevs study learned` was run"""
+    """directory in which `mevs study learned` was run"""
     archive: Annotated[Path, tyro.conf.Positional]
-    """the .npz of voxel grids that it was run on"""
+    """the .npz of voxel grids that the study used"""
     preset: Literal["small", "tiny"] = "small"
-    """that it was run with"""
+    """preset of the study"""
     split: Literal["test", "val"] = "test"
-    """whose objects to look at"""
+    """split whose objects are evaluated"""
 
 
 def wholeness(grids: np.ndarray) -> np.ndarray:
@@ -58,15 +60,15 @@ def wholeness(grids: np.ndarray) -> np.ndarray:
 
 
 def nearest(some: np.ndarray, others: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Index of the grid with the largest intersection over union, and that."""
+    """Index of the other grid with the largest intersection over union, and that value, for each grid."""
     flat, against = (grids.reshape(len(grids), -1).astype(np.float32) for grids in (some, others))
     common = flat @ against.T
     overlap = common / (flat.sum(axis=1)[:, None] + against.sum(axis=1) - common)
     return overlap.argmax(axis=1), overlap.max(axis=1)
 
 
-def answers(fusion: CalibratedFusion, data: Features, size: int, draws: int = 8) -> np.ndarray:
-    """The class that random sets of so many views are taken for, (objects, draws)."""
+def predictions(fusion: CalibratedFusion, data: Features, size: int, draws: int = 8) -> np.ndarray:
+    """Predicted classes of random sets of `size` views, (objects, draws)."""
     views = data.features.shape[1]
     sets = sets_of_size(len(data.labels), views, size, 1 if size == views else draws)
     return beliefs_of_sets(fusion, data, sets).argmax(axis=-1).T
@@ -106,31 +108,30 @@ def main(options: Options) -> None:
         f"in one piece (≥ {WHOLE:.0%} of the cells)": whole,
         "in pieces": ~whole,
     }
-    sizes, given = (1, 2, 4, views), {}
+    sizes, predicted = (1, 2, 4, views), {}
     for size in sizes:
-        given[size] = answers(stages.fusion(), data, size)
+        predicted[size] = predictions(stages.fusion(), data, size)
+    rows = []
+    for title, chosen in groups.items():
+        cells = []
+        for size in sizes:
+            right = (predicted[size] == labels[:, None]).mean(axis=1)[chosen]
+            low, high = intervals(right[None])[0]
+            cells.append(f"{100 * right.mean():.1f} [{100 * low:.1f}, {100 * high:.1f}]")
+        rows.append([title, str(chosen.sum()), *cells])
+
+    final = predicted[views][:, 0]
+    wrong = np.flatnonzero(final != labels)
+    pairs, counts = np.unique(np.stack([labels[wrong], final[wrong]]), axis=1, return_counts=True)
+    often = np.argsort(-counts)[:8]
+    confusions = ", ".join(f"{classes[pairs[0, i]]} for {classes[pairs[1, i]]} {counts[i]}" for i in often)
+    header = ["objects", "number", *(f"{size} views" if size > 1 else "1 view" for size in sizes)]
     lines = [
         f"# What holds accuracy down ({options.split} objects)",
         "",
         "Accuracy (%) of random views fused, 95 % intervals over objects.",
         "",
-        "| objects | number | " + " | ".join(f"{size} views" if size > 1 else "1 view" for size in sizes) + " |",
-        "|---" * (2 + len(sizes)) + "|",
-    ]
-    for title, chosen in groups.items():
-        cells = []
-        for size in sizes:
-            right = (given[size] == labels[:, None]).mean(axis=1)[chosen]
-            low, high = intervals(right[None])[0]
-            cells.append(f"{100 * right.mean():.1f} [{100 * low:.1f}, {100 * high:.1f}]")
-        lines.append(f"| {title} | {chosen.sum()} | " + " | ".join(cells) + " |")
-
-    final = given[views][:, 0]
-    wrong = np.flatnonzero(final != labels)
-    pairs, counts = np.unique(np.stack([labels[wrong], final[wrong]]), axis=1, return_counts=True)
-    often = np.argsort(-counts)[:8]
-    confusions = ", ".join(f"{classes[pairs[0, i]]} for {classes[pairs[1, i]]} {counts[i]}" for i in often)
-    lines += [
+        markdown_table(header, rows),
         "",
         f"Wrong after all {views} views: {len(wrong)} of {len(labels)}. Taken the first for the second: {confusions}.",
     ]

@@ -1,13 +1,13 @@
-"""What every way to choose views did for each test object: `python benchmarks/choices.py [RUN]`.
+"""Results of every policy on each test object: `python benchmarks/choices.py [RUN]`.
 
-RUN is a directory in which `mevs study learned` was run; its walks are kept in `benchmarks/results/choices/`, a file for each
-seed and kind of candidates, beside those that are there. From all that are kept come the tables of
-`benchmarks/results/choices.md`: means over seeds, taken of each object first, with 95 % intervals over objects.
+RUN is a directory in which `mevs study learned` was run. Its walks are added to those in
+`benchmarks/results/choices/`, in a file for each seed and kind of candidates. `benchmarks/results/choices.md` has the
+tables of all files there: means over seeds, first for each object, with 95 % intervals over objects.
 
-Whoever has another policy can compare it object by object. Such a file has `names` of the objects in their order, and for
-each policy `right`, shares of its walks that are right after 1, 2, … views, in 240ths if in bytes and else in 720ths (so that
-they are exact for 8, 9, 10, 40 or 60 starts, once or twice each); `from_some`, the same of the starts that oracles walk from; and
-`likelihood`, the mean log-probability of the true class, in half precision.
+With these files another policy can be compared object by object. A file has the `names` of the objects in order, and
+for each policy `right`, the shares of its walks that are right after 1, 2, … views, in 240ths if in bytes and
+otherwise in 720ths (exact for 8, 9, 10, 40 or 60 start views, with one or two walks from each); `from_some`, the same
+for the start views of the oracles; and `likelihood`, the mean log-probability of the true class, in half precision.
 """
 
 from __future__ import annotations
@@ -29,26 +29,27 @@ import tyro
 from data_pipeline.dataset.builder import open_split
 from data_pipeline.files import read_json, write_bytes, write_text
 from eval.learned.study import BASELINES, ByObject, seeds_together
+from eval.report.markdown import markdown_table
 
 RESULTS = Path(__file__).parent / "results"
 KEPT = RESULTS / "choices"
 METHODS = {"learned": "view policy", "learned_and_table": "view policy and table"}
 _WHOLES: dict[type[np.unsignedinteger], int] = {np.uint8: 240, np.uint16: 720}
-"""What a share of 1 is stored as."""
+"""The stored value of a share of 1."""
 _KEPT = ("objects", "views", "trying_starts", "single_view")
 _KEPT_OF_EACH = ("title", "knows", "calibration_error")
 _SHOWN = (0, 1, 2, 3, 5, 7)
-"""Steps of walks in tables, from the first view."""
+"""Steps of a walk that the tables show; 0 is the first view."""
 
 
 @dataclass(frozen=True)
 class Options:
     run: Annotated[Path | None, tyro.conf.Positional] = None
-    """where `mevs study learned` was run"""
+    """directory in which `mevs study learned` was run"""
 
 
 def keep(run: Path) -> None:
-    """Keeps what the walks of a run say of each object."""
+    """Stores the results of a run's walks for each object."""
     names = np.array([one["name"].decode() for one in open_split(run / "data", "test")])
     for path in sorted((run / "learned").glob("seed_*/walks_*.npz")):
         found = read_json(path.with_suffix(".json"))
@@ -71,7 +72,7 @@ def _packed(key: str, values: np.ndarray) -> np.ndarray:
         counts = np.round(values * whole)
         if np.abs(counts - values * whole).max() <= 1e-2:
             return counts.astype(kind)
-    raise ValueError(f"{key}: shares of a number of walks that divides none of {list(_WHOLES.values())}")
+    raise ValueError(f"{key}: the shares are no multiples of 1/240 or 1/720; change the number of walks")
 
 
 def _shares(counts: np.ndarray) -> np.ndarray:
@@ -79,7 +80,7 @@ def _shares(counts: np.ndarray) -> np.ndarray:
 
 
 def kept(path: Path) -> tuple[dict[str, Any], dict[str, ByObject]]:
-    """What `study` found of one seed, as far as it is kept, and what each policy does by object."""
+    """The stored metrics of one seed, and the results of each policy by object."""
     with np.load(path) as arrays:
         summary = json.loads(str(arrays["summary"]))
         each = {
@@ -93,10 +94,6 @@ def kept(path: Path) -> tuple[dict[str, Any], dict[str, ByObject]]:
     return summary, each
 
 
-def _row(cells: list[str]) -> str:
-    return f"| {' | '.join(cells)} |\n"
-
-
 def _difference(difference: float, interval: list[float]) -> str:
     low, high = interval
     cell = f"{100 * difference:+.1f} [{100 * low:+.1f}, {100 * high:+.1f}]".replace("-", "−")
@@ -104,11 +101,11 @@ def _difference(difference: float, interval: list[float]) -> str:
 
 
 def _table(header: list[str], rows: list[list[str]]) -> str:
-    return _row(header) + _row(["---"] * len(header)) + "".join(map(_row, rows)) + "\n"
+    return markdown_table(header, rows, " --- ") + "\n\n"
 
 
 def tables(found: dict[str, Any]) -> str:
-    """The tables of what `seeds_together` says."""
+    """The tables of the result of `seeds_together`."""
     policies, steps = found["policies"], [str(step + 1) for step in _SHOWN]
 
     def shown(values: list[str]) -> list[str]:
@@ -146,7 +143,9 @@ def main(options: Options) -> None:
     for path in sorted(KEPT.glob("*.npz")):
         parts = re.fullmatch(r"seed_(\d+(?:_rotated)?)_(.*)", path.stem)
         if parts is None:
-            print(f"{path} is not named after a seed and candidates, as seed_0_lattice_40.npz is", file=sys.stderr)
+            print(
+                f"the name of {path} has no seed and candidates; rename it like seed_0_lattice_40.npz", file=sys.stderr
+            )
             sys.exit(2)
         seed, kind = parts.groups()
         kinds[kind + "_rotated" * seed.endswith("rotated")].append((seed, *kept(path)))

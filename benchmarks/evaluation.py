@@ -1,9 +1,10 @@
-"""The thesis's whole evaluation as one program, beside a loop over objects that does what the published code does.
+"""The thesis's whole evaluation as one program, compared with a loop over objects as in the published code.
 
-The grid is about 900 objects × 40 start views × 3 policies × 3 backbones × limits of 2–9 views × 7 confidence thresholds, from
-tables of random logits and entropies (time does not depend on what they say). The published evaluation walks every object
-anew for each cell, in Python; here it reads the same tables, without networks, on a subset, and its time is scaled up. Its
-answers are compared with the program's. `make bench` runs this; the peak memory is of the whole process before the loop.
+The grid has about 900 objects × 40 start views × 3 policies × 3 backbones × limits of 2–9 views × 7 confidence
+thresholds, from tables of random logits and entropies (the time does not depend on their values). The published
+evaluation walks every object again for each cell, in Python. Here the loop reads the same tables, without networks,
+on a subset, and its time is scaled up. Its predictions are compared with those of the program. `make bench` runs
+this. The peak memory is that of the process before the loop.
 """
 
 from __future__ import annotations
@@ -21,6 +22,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from data_pipeline.files import write_json
+from eval.report.markdown import markdown_table
 from eval.walks.grid import FIRST_MV, LAST_MV, THRESHOLDS, run_grid
 from eval.walks.ladder import Rung
 from mevs_jax import Knowledge, ViewGraph, ViewTable, fibonacci_sphere
@@ -42,10 +44,10 @@ def made_up_tables() -> ViewTable:
 
 
 def loop_over_objects(tables: ViewTable, neighbours: np.ndarray, objects: int) -> tuple[np.ndarray, int]:
-    """Right answers (objects, backbones, policies, MV, CT), a walk at a time, and how many walks that took.
+    """Whether each prediction is right (objects, backbones, policies, MV, CT), and the number of walks.
 
-    As published: every cell walks from scratch; a walk chooses, looks, adds up and stops, in plain Python over NumPy arrays. To
-    keep it short, each object starts from one view only, which is as many walks as the published code makes in one run.
+    As in the published code, every cell has its own walks, in plain Python on NumPy arrays. To save time, each object starts from
+    only one view, as in one run of the published code.
     """
     logits, predicted_entropy, entropy, labels = (
         np.asarray(leaf) for leaf in (tables.logits, tables.predicted_entropy, tables.entropy, tables.label)
@@ -81,16 +83,16 @@ def main() -> None:
         start = time.perf_counter()
         program()
         times.append(time.perf_counter() - start)
-    # Before the loop and the check below, so that it is the program's own. Linux counts kilobytes.
+    # Measured before the loop and the check below, so that they do not count. The unit on Linux is kilobytes.
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20
-    cells = BACKBONES * len(RUNGS) * (LAST_MV - FIRST_MV + 1) * len(THRESHOLDS)
-    walks = OBJECTS * VIEWS * cells
+    grid_cells = BACKBONES * len(RUNGS) * (LAST_MV - FIRST_MV + 1) * len(THRESHOLDS)
+    walks = OBJECTS * VIEWS * grid_cells
 
     start = time.perf_counter()
     right, looped = loop_over_objects(tables, np.asarray(graph.neighbours), SUBSET)
     per_walk = (time.perf_counter() - start) / looped
 
-    # The same answers: the program on the subset alone, from the loop's start views.
+    # Compares the predictions of the program with those of the loop, on the subset and its start views.
     views = {name: np.asarray(result.views)[0, :SUBSET, :, 0] for name, result in results.items()}
     logits = np.asarray(tables.logits)
     for policy, rung in enumerate(RUNGS):
@@ -119,12 +121,17 @@ def main() -> None:
         "times_faster": per_walk * walks / float(np.median(times)),
     }
     print(f"Measured on: {machine}\n")
-    print("| walks | program, s | slowest of 15 | compiling, s | peak memory, GiB | loop, s (scaled) | ratio |")
-    print("|---|---|---|---|---|---|---|")
-    print(
-        f"| {walks:,} | {row['seconds']:.3f} | {row['slowest_seconds']:.3f} | {compiling:.1f} | {peak:.2f} "
-        f"| {row['loop_seconds_scaled']:,.0f} | {row['times_faster']:,.0f}× |"
-    )
+    header = ("walks", "program, s", "slowest of 15", "compiling, s", "peak memory, GiB", "loop, s (scaled)", "ratio")
+    cells = [
+        f"{walks:,}",
+        f"{row['seconds']:.3f}",
+        f"{row['slowest_seconds']:.3f}",
+        f"{compiling:.1f}",
+        f"{peak:.2f}",
+        f"{row['loop_seconds_scaled']:,.0f}",
+        f"{row['times_faster']:,.0f}×",
+    ]
+    print(markdown_table(header, [cells]))
     path = Path(__file__).parent / "results" / "evaluation.json"
     write_json(path, {"machine": machine, "rows": [row]})
     print(f"\nWritten to {path.relative_to(Path.cwd()) if path.is_relative_to(Path.cwd()) else path}")

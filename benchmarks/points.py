@@ -1,13 +1,15 @@
-"""Point operations and PointNet++, each beside its peers in one run: `make bench`, or `python benchmarks/points.py`.
+"""Point operations and PointNet++, compared with other implementations: `make bench`, or `python benchmarks/points.py`.
 
-Rows: farthest-point sampling and ball query of one cloud and of sixteen; PointNet++'s forward pass and training step on sixteen
-clouds of 4,096 points with the same weights, and beside the forward pass its matrix products alone; decisions. All
-answers are compared before anything is timed. Calls take turns, so that a busy moment of the machine strikes all of them
-(training steps come one kind after the other, since each would have to take its gigabytes from the other anew); times are
-medians and quartiles, and what counts is their ratio. Peers that are not installed are left out, and it is said.
+The rows are farthest-point sampling and ball query of one cloud and of sixteen; the forward pass and training step of
+PointNet++ on sixteen clouds of 4,096 points with the same weights, and the matrix products of the forward pass alone;
+decisions. All results are compared before they are timed. Calls take turns, so that other load on the machine affects
+all of them. Only training steps do not, because each kind needs gigabytes that it would have to allocate again. Times
+are medians and quartiles; the relevant number is their ratio. Peers that are not installed are left out with a
+message.
 
-The table goes to `benchmarks/results/points.json` and `points.md`. With `--guard` nothing is written and nothing trained:
-ratios to peers are compared with those stored, and one below a third of its like ends the program with exit code 1.
+The table is written to `benchmarks/results/points.json` and `points.md`. With `--guard` nothing is written or
+trained: the ratios are compared with the stored ones, and the exit code is 1 if one is below a third of the stored
+ratio.
 """
 
 from __future__ import annotations
@@ -19,6 +21,7 @@ import time
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from functools import partial
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -33,6 +36,7 @@ from scipy.spatial import cKDTree
 
 from data_pipeline.files import read_json, write_json, write_text
 from eval.numbers.timing import time_local_maxima
+from eval.report.markdown import markdown_row, markdown_table
 from mevs_jax import (
     NextView,
     PointNet2,
@@ -48,22 +52,19 @@ from tests.reference.weights import made_up_weights
 RESULTS = Path(__file__).parent / "results" / "points.json"
 CLOUDS, POINTS, CENTRES, RADIUS, SAMPLES = 16, 4096, 512, 0.2, 64
 GUARD = 3.0
-DECISIONS = """One decision, cloud to next of 40 views:
-
-| points | clouds | p50, ms | p99, ms | ms a cloud | memory, MB |
-|---|---|---|---|---|---|"""
-HEADER = "| what | ours | peer | theirs | ratio | |\n|---|---|---|---|---|---|"
+HEADER = ("what", "ours", "peer", "theirs", "ratio", "")
+DECISION_HEADER = ("points", "clouds", "p50, ms", "p99, ms", "ms a cloud", "memory, MB")
 
 
 @dataclass
 class Row:
-    """One thing timed beside one peer.
+    """An operation timed together with one peer.
 
     Attributes:
-        what, peer: in words.
+        what, peer: names of the operation and of the peer.
         ours, theirs: lower quartile, median and upper quartile, in milliseconds.
-        ratio: how many of ours fit into one of theirs.
-        note: where the two do not quite do the same.
+        ratio: their time divided by ours.
+        note: differences between the two results.
     """
 
     what: str
@@ -75,7 +76,7 @@ class Row:
 
 
 def take_turns(calls: list[Callable[[], Any]], rounds: int) -> np.ndarray:
-    """Milliseconds (calls, rounds), each call once a round, after one to warm up."""
+    """Times in milliseconds (calls, rounds); each round runs every call once, after a warm-up."""
     for call in calls:
         jax.block_until_ready(call())
     taken = np.empty((len(calls), rounds))
@@ -103,7 +104,7 @@ def compare(
         for peer, theirs in zip(peers, quartiles[1:], strict=True)
     ]
     for row in rows:
-        print(line_of(row), flush=True)
+        print(markdown_row(row_cells(row)), flush=True)
     return rows
 
 
@@ -115,14 +116,14 @@ def installed(name: str) -> bool:
 
 
 def peer_device() -> str:
-    """Where PyTorch calculates: on the GPU where JAX does and PyTorch can."""
+    """Device of PyTorch: the GPU if JAX uses one and PyTorch can, otherwise the CPU."""
     import torch
 
     return "cuda" if jax.default_backend() == "gpu" and torch.cuda.is_available() else "cpu"
 
 
 def finished(call: Callable[[], Any]) -> Callable[[], Any]:
-    """A call of PyTorch's that returns when its device is done."""
+    """Wraps a PyTorch call so that it returns after its device has finished."""
     import torch
 
     def until_done() -> Any:
@@ -135,16 +136,16 @@ def finished(call: Callable[[], Any]) -> Callable[[], Any]:
 
 
 def partial_clouds() -> np.ndarray:
-    """(clouds, points, 3) float32: what a camera above sees of wobbly balls, in the unit sphere."""
+    """Partial clouds (clouds, points, 3) float32 of uneven spheres seen from above, in the unit sphere."""
     random = np.random.default_rng(0)
-    ways = random.normal(size=(CLOUDS, POINTS, 3))
-    ways /= np.linalg.norm(ways, axis=-1, keepdims=True)
-    ways[..., 2] = np.abs(ways[..., 2])
-    return (ways * random.uniform(0.8, 0.97, (CLOUDS, POINTS, 1))).astype(np.float32)
+    directions = random.normal(size=(CLOUDS, POINTS, 3))
+    directions /= np.linalg.norm(directions, axis=-1, keepdims=True)
+    directions[..., 2] = np.abs(directions[..., 2])
+    return (directions * random.uniform(0.8, 0.97, (CLOUDS, POINTS, 1))).astype(np.float32)
 
 
 def first_within(tree: cKDTree, centres: np.ndarray) -> np.ndarray:
-    """Ball query from a tree's answer: the first in index order, the first of them repeated."""
+    """Ball query by a k-d tree: the first hits in index order, padded with the first hit."""
     out = np.zeros((len(centres), SAMPLES), np.int32)
     for row, hits in enumerate(tree.query_ball_point(centres, np.nextafter(RADIUS, 0), return_sorted=True)):
         if hits:
@@ -203,16 +204,20 @@ def point_operations(clouds: np.ndarray, torch_peer: Any, rounds: int) -> list[R
             {"PyTorch": finished(lambda: torch_peer.farthest_point_sample(them, CENTRES))},
             rounds,
         )
-        ask = finished(lambda: torch_peer.ball_query(them, theirs_at, RADIUS, SAMPLES))
-        notes = {"PyTorch": f"{share_equal(ask().cpu().numpy(), neighbours):.3%} of indices equal"}
+        query_peer = finished(lambda: torch_peer.ball_query(them, theirs_at, RADIUS, SAMPLES))
+        notes = {"PyTorch": f"{share_equal(query_peer().cpu().numpy(), neighbours):.3%} of indices equal"}
         rows += compare(
-            "ball query, 16 clouds", lambda: query_all(clouds, centres), {"PyTorch": ask}, max(3, rounds // 3), notes
+            "ball query, 16 clouds",
+            lambda: query_all(clouds, centres),
+            {"PyTorch": query_peer},
+            max(3, rounds // 3),
+            notes,
         )
     return rows
 
 
 def matrix_products(network: PointNet2) -> Callable[[], jax.Array]:
-    """The forward pass's matrix products and maxima alone, on numbers that lie ready, in pieces that suit the cache."""
+    """Only the matrix products and maxima of the forward pass, on prepared arrays in cache-sized pieces."""
     random = np.random.default_rng(0)
     work = []
     for rows, pieces, group, layers in (
@@ -264,7 +269,8 @@ def networks(clouds: np.ndarray, torch_peer: Any, rounds: int, training: bool) -
                 return theirs.eval()(tensor)
 
         peers["PyTorch"] = finished(forward_peer)
-    structure, parameters, statistics = nnx.split(network, nnx.Param, ...)
+    structure, parameters, *others = nnx.split(network, nnx.Param, ...)
+    statistics = others[0]
     rows: list[Row] = []
     if torch_peer and training:
         targets = np.random.default_rng(1).uniform(0, 1, (CLOUDS, 40)).astype(np.float32)
@@ -316,15 +322,17 @@ def networks(clouds: np.ndarray, torch_peer: Any, rounds: int, training: bool) -
 
 
 def decisions(clouds: np.ndarray, calls: int = 200) -> list[dict[str, float]]:
-    """From clouds to the next of 40 views: by size of cloud one at a time, as a robot asks, and 256 clouds of 4,096 points."""
+    """Time from clouds to the next of 40 views: single clouds by size, as on a robot, and 256 clouds of 4,096 points."""
     graph = ViewGraph.from_points(fibonacci_sphere(40))
     network = PointNet2(views=40, rngs=nnx.Rngs(0))
     choose = NextView(network, graph)
     structure, state = nnx.split(network)
     found = []
     for size, batch in [(size, 1) for size in choose.sizes] + [(POINTS, 256)]:
-        some = [cloud[: size - 7] for cloud in np.resize(clouds, (batch, *clouds.shape[1:]))]  # filled up by as many
-        taken = take_turns([lambda some=some: choose.of_many(some)], calls if batch == 1 else 5)[0]
+        some = [
+            cloud[: size - 7] for cloud in np.resize(clouds, (batch, *clouds.shape[1:]))
+        ]  # `choose` pads them to `size`
+        taken = take_turns([partial(choose.of_many, some)], calls if batch == 1 else 5)[0]
         arguments = (state, jnp.zeros((batch, size, 3)))
         plan = jax.jit(lambda state, clouds: nnx.merge(structure, state)(clouds)).lower(*arguments).compile()
         memory = plan.memory_analysis()
@@ -334,34 +342,40 @@ def decisions(clouds: np.ndarray, calls: int = 200) -> list[dict[str, float]]:
                 "batch": batch,
                 "p50_ms": float(np.median(taken)),
                 "p99_ms": float(np.quantile(taken, 0.99)),
-                "memory_mb": (memory.argument_size_in_bytes + memory.temp_size_in_bytes) / 1e6,
+                "memory_mb": (memory.argument_size_in_bytes + memory.temp_size_in_bytes) / 1e6
+                if memory
+                else float("nan"),
             }
         )
-        print(decision_line(found[-1]), flush=True)
+        print(markdown_row(decision_cells(found[-1])), flush=True)
     return found
 
 
 def maxima(maps: int = 1000) -> dict[str, float]:
-    """Microseconds for the local maxima of one object's map of 40 views, alone and as one of a thousand."""
+    """Time in microseconds to find the local maxima of a map of 40 views, alone and per map in a batch."""
     found = time_local_maxima(40, objects=maps)
     print(f"local maxima of 40 views: {1000 * found['alone']:.1f} µs alone, {1000 * found['batched']:.2f} µs of {maps}")
     return {name: 1000 * value for name, value in found.items()}
 
 
-def decision_line(row: dict[str, float]) -> str:
-    return (
-        f"| {row['points']:,.0f} | {row['batch']:.0f} | {row['p50_ms']:.3g} | {row['p99_ms']:.3g} "
-        f"| {row['p50_ms'] / row['batch']:.3g} | {row['memory_mb']:.0f} |"
-    )
+def decision_cells(row: dict[str, float]) -> list[str]:
+    return [
+        f"{row['points']:,.0f}",
+        f"{row['batch']:.0f}",
+        f"{row['p50_ms']:.3g}",
+        f"{row['p99_ms']:.3g}",
+        f"{row['p50_ms'] / row['batch']:.3g}",
+        f"{row['memory_mb']:.0f}",
+    ]
 
 
-def line_of(row: Row) -> str:
+def row_cells(row: Row) -> list[str]:
     ours, theirs = (f"{m:.3g} ({low:.3g}–{high:.3g})" for low, m, high in (row.ours, row.theirs))
-    return f"| {row.what} | {ours} | {row.peer} | {theirs} | {row.ratio:.3g} | {row.note} |"
+    return [row.what, ours, row.peer, theirs, f"{row.ratio:.3g}", row.note]
 
 
 def slower_than_before(rows: list[Row], before: dict[str, Any]) -> list[str]:
-    """Sentences about ratios that fell below a third of the stored ones; rows that one of the two lacks are passed over."""
+    """Messages about ratios below a third of the stored ones; only rows that exist in both are compared."""
     stored = {(row["what"], row["peer"]): row["ratio"] for row in before["rows"]}
     known = [(row, stored[row.what, row.peer]) for row in rows if (row.what, row.peer) in stored]
     return [
@@ -376,10 +390,8 @@ def main() -> None:
     rounds = 3 if guard else 15
     machine = f"{platform.processor() or platform.machine()}, {jax.devices()[0].device_kind}, JAX {jax.__version__}"
     print(f"Measured on: {machine}. Milliseconds: median (quartiles).\n")
-    print(HEADER)
-    torch_peer = None
-    if installed("torch"):
-        from benchmarks import torch_peer
+    print(markdown_table(HEADER, []))
+    torch_peer: Any = import_module("benchmarks.torch_peer") if installed("torch") else None
     clouds = partial_clouds()
     rows = networks(clouds, torch_peer, rounds, not guard) + point_operations(clouds, torch_peer, rounds)
     if guard:
@@ -392,9 +404,14 @@ def main() -> None:
         RESULTS,
         {"machine": machine, "rows": [asdict(row) for row in rows], "decisions": found, "local_maxima_us": of_maps},
     )
-    table = "\n".join([HEADER, *map(line_of, rows), "", DECISIONS, *map(decision_line, found)])
+    timed = markdown_table(HEADER, [row_cells(row) for row in rows])
+    decided = markdown_table(DECISION_HEADER, [decision_cells(row) for row in found])
     last = f"Local maxima of a map of 40 views: {of_maps['alone']:.0f} µs alone, {of_maps['batched']:.2f} µs as one of 1,000."
-    write_text(RESULTS.with_suffix(".md"), f"{machine}. Milliseconds: median (quartiles).\n\n{table}\n\n{last}\n")
+    write_text(
+        RESULTS.with_suffix(".md"),
+        f"{machine}. Milliseconds: median (quartiles).\n\n{timed}\n\n"
+        f"One decision, cloud to next of 40 views:\n\n{decided}\n\n{last}\n",
+    )
 
 
 if __name__ == "__main__":

@@ -1,19 +1,21 @@
-"""What folding batch norm and calculating in bfloat16 cost in accuracy: `python benchmarks/precision.py RUN`.
+"""Effect of folded batch norm and of bfloat16 on accuracy: `python benchmarks/precision.py RUN`.
 
-RUN is a directory that `mevs run` made. Every view of every test object, by the same weights in three ways: float32 with batch
-norm as layers of its own, float32 with batch norm folded into weights (what inference does), and bfloat16, folded too. With
-differences from the first, their 95 % intervals paired by object, and how often the first decision stays the same: which view
-the thesis's rule chooses after one cloud.
+RUN is a directory made by `mevs run`. Every view of every test object is evaluated with the same weights in three
+ways: float32 with separate batch norm layers, float32 with batch norm folded into the weights (as in inference), and
+bfloat16 with folded batch norm. The table has the differences from the first with 95 % intervals paired by object,
+and how often the first decision is the same, which is the view that the thesis's rule chooses after one cloud.
 
-The table goes to `benchmarks/results/precision.md`.
+The table is written to `benchmarks/results/precision.md`.
 """
 
 from __future__ import annotations
 
 import platform
 import sys
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from typing import Any, Literal
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
@@ -24,6 +26,7 @@ from flax import nnx
 
 from data_pipeline.dataset.statistics import load_statistics
 from data_pipeline.files import write_text
+from eval.report.markdown import markdown_table
 from eval.settings import PRESETS
 from eval.stages import tasks
 from eval.tables import objects_of
@@ -36,7 +39,7 @@ RESULTS = Path(__file__).parent / "results" / "precision.md"
 
 
 class Unfolded(nnx.Module):
-    """A network whose batch norms are layers of their own: as in training, but by the running statistics."""
+    """A network with separate batch norm layers, as in training, but with the running statistics."""
 
     def __init__(self, network: nnx.Module):
         self.network = network
@@ -84,11 +87,12 @@ def main() -> None:
         return jax.vmap(jax.vmap(choice), in_axes=(None, 0))(jnp.arange(statistics.views), predicted_entropy)
 
     found = {}
-    for name, dtype, wrap in (
+    dtypes: list[tuple[str, Literal["float32", "bfloat16"], Callable[[Any], Any]]] = [
         ("float32, batch norm by itself", "float32", Unfolded),
         ("float32, folded", "float32", lambda network: network),
         ("bfloat16, folded", "bfloat16", lambda network: network),
-    ):
+    ]
+    for name, dtype, wrap in dtypes:
         outputs = []
         for task, folder in ((classify, "classifier"), (predict, "entropy")):
             saved = replace(task, optimiser=replace(task.optimiser, compute=dtype))
@@ -115,21 +119,23 @@ def main() -> None:
         "entropies",
         "first choice the same",
     )
-    lines = [
-        f"{len(labels)} test objects × {statistics.views} views; {platform.machine()}, {jax.default_backend()}.",
-        "",
-        "| " + " | ".join(columns) + " |",
-        "|---" * len(columns) + "|",
+    rows = [
+        [
+            name,
+            f"{100 * by['right'].mean():.2f}",
+            interval(100 * (by["right"] - first["right"])),
+            f"{1 - by['error'].mean() / variance:.4f}",
+            interval(100 * (by["error"] - first["error"]) / variance),
+            f"{np.abs(by['logits'] - first['logits']).max():.1e}",
+            f"{np.abs(by['entropy'] - first['entropy']).max():.1e}",
+            f"{100 * (by['chosen'] == first['chosen']).mean():.2f} %",
+        ]
+        for name, by in found.items()
     ]
-    for name, by in found.items():
-        lines.append(
-            f"| {name} | {100 * by['right'].mean():.2f} | {interval(100 * (by['right'] - first['right']))} "
-            f"| {1 - by['error'].mean() / variance:.4f} | {interval(100 * (by['error'] - first['error']) / variance)} "
-            f"| {np.abs(by['logits'] - first['logits']).max():.1e} | {np.abs(by['entropy'] - first['entropy']).max():.1e} "
-            f"| {100 * (by['chosen'] == first['chosen']).mean():.2f} % |"
-        )
-    write_text(RESULTS, "\n".join(lines) + "\n")
-    print("\n".join(lines))
+    measured = f"{len(labels)} test objects × {statistics.views} views; {platform.machine()}, {jax.default_backend()}."
+    text = f"{measured}\n\n{markdown_table(columns, rows)}\n"
+    write_text(RESULTS, text)
+    print(text, end="")
 
 
 if __name__ == "__main__":

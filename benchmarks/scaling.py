@@ -1,11 +1,11 @@
-"""What a training step costs, whether reading keeps up with it, and what a second core gains: the numbers of docs/scaling.md.
+"""Cost of a training step, speed of reading, and gain from a second core: the numbers of docs/scaling.md.
 
-`python benchmarks/scaling.py [RESULTS.json]` takes both networks of the `small` and `thesis` presets, on built-in objects:
+`python benchmarks/scaling.py [RESULTS.json]` measures both networks of the `small` and `thesis` presets on built-in objects:
 
-* arithmetic of a step (as XLA counts it in the compiled program) and its memory, in bytes of the program on one device;
-* views a second, read alone: reading is not the limit where it is the faster;
-* views a second, trained: on one core, on two, on two simulated devices and in two processes (gloo) that share the two cores. The
-  batch is the same throughout.
+* operations of a step (as XLA counts them in the compiled program), and its memory on one device;
+* views per second of reading alone; reading is not the limit if it is faster than training;
+* views per second of training: on one core, on two cores, on two simulated devices, and in two processes (gloo) that
+  share two cores. The batch is always the same.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ def task_named(preset: str, name: str, statistics: DatasetStatistics) -> Task:
 
 
 def compiled_step(task: Task):
-    """The compiled training step on all devices, the state it begins with, and the mesh."""
+    """The compiled training step on all devices, its initial state, and the mesh."""
     mesh = device_mesh()
     structure, state = initial_state(task, 0)
     where = parameter_sharding(mesh, state)
@@ -55,7 +55,7 @@ def compiled_step(task: Task):
 
 
 def train_rate(task: Task, data: Path) -> float:
-    """Views a second, over all processes; the median of some steps, the first apart."""
+    """Views per second over all processes, from the median time of some steps after the first."""
     step, state, mesh = compiled_step(task)
     batch = place_batch(mesh, next(train_batches(data, task.batches)))
     taken = []
@@ -68,7 +68,7 @@ def train_rate(task: Task, data: Path) -> float:
 
 
 def read_rate(task: Task, data: Path) -> float:
-    """Views a second from disk to batches, with nothing else to do."""
+    """Views per second from disk to batches, without training."""
     batches = train_batches(data, task.batches)
     next(batches)
     start, read = time.perf_counter(), 0
@@ -79,7 +79,7 @@ def read_rate(task: Task, data: Path) -> float:
 
 
 def costs(task: Task, data: Path) -> dict[str, float]:
-    """Of the step's program: arithmetic of a view, bytes of weights, of the state, and of what it holds besides."""
+    """Operations per view, and memory of the weights, of the state and of temporaries, of the training step."""
     step, state, mesh = compiled_step(task)
     batch = place_batch(mesh, next(train_batches(data, task.batches)))
     compiled = step.lower(state, batch, task.hyperparameters).compile()
@@ -95,12 +95,12 @@ def costs(task: Task, data: Path) -> dict[str, float]:
 
 
 def rate_apart(preset: str, name: str, data: Path, *, cores: int, processes: int = 1, devices: int = 1) -> float:
-    """Views a second of fresh processes, on so many cores together, each with so many simulated devices."""
+    """Views per second of new processes that share `cores` cores, each with `devices` simulated devices."""
     with socket.socket() as found:
         found.bind(("127.0.0.1", 0))
         address = f"127.0.0.1:{found.getsockname()[1]}"
     everywhere = os.sched_getaffinity(0)
-    os.sched_setaffinity(0, sorted(everywhere)[:cores])  # which the processes inherit
+    os.sched_setaffinity(0, sorted(everywhere)[:cores])  # inherited by the processes
     workers = []
     for index in range(processes):
         environment = os.environ | {"JAX_PLATFORMS": "cpu", "JAX_NUM_CPU_DEVICES": str(devices)}
@@ -110,17 +110,17 @@ def rate_apart(preset: str, name: str, data: Path, *, cores: int, processes: int
                 "JAX_NUM_PROCESSES": str(processes),
                 "JAX_PROCESS_ID": str(index),
             }
-        asked = [sys.executable, __file__, "--worker", preset, name, str(data)]
-        workers.append(subprocess.Popen(asked, env=environment, stdout=subprocess.PIPE, text=True))
+        command = [sys.executable, __file__, "--worker", preset, name, str(data)]
+        workers.append(subprocess.Popen(command, env=environment, stdout=subprocess.PIPE, text=True))
     os.sched_setaffinity(0, everywhere)
-    said = [worker.communicate()[0] for worker in workers]
+    outputs = [worker.communicate()[0] for worker in workers]
     if any(worker.returncode for worker in workers):
         raise RuntimeError("a worker failed; its message is above")
-    return float(said[0].splitlines()[-1])
+    return float(outputs[0].splitlines()[-1])
 
 
 def work(preset: str, name: str, data: str) -> None:
-    """What such a process does."""
+    """Runs one process of `rate_apart`."""
     if "JAX_NUM_PROCESSES" in os.environ:
         join_processes()
     task = task_named(preset, name, load_statistics(Path(data)))

@@ -1,8 +1,8 @@
-"""A sweep of sixteen PointNet++ beside sixteen separate runs: the same numbers, and how much sooner.
+"""A sweep of sixteen PointNet++ networks compared with sixteen separate runs: difference of the losses, and ratio of the times.
 
-`python benchmarks/sweep.py` trains both ways on the built-in objects, first a network the size of PointNet++'s head, then the one
-of the `small` preset. Both ways begin with nothing compiled and end with the last epoch; steps are timed besides, once all is
-compiled. A ratio above 1 is in favour of the sweep.
+`python benchmarks/sweep.py` trains both on the built-in objects, first a network of the size of PointNet++'s head,
+then that of the `small` preset. The times include compilation and end with the last epoch. Single steps are timed
+separately after compilation. A ratio above 1 means that the sweep is faster.
 """
 
 from __future__ import annotations
@@ -31,13 +31,13 @@ from train.sweep import SweepConfig, draw_members, sweep, task_of
 from train.tasks.entropy import EntropyTask
 
 MEMBERS = 16
-SWEEP = SweepConfig(members=MEMBERS, learning_rate=(1e-5, 1e-4))  # low: rounding grows with it, and is no news here
+SWEEP = SweepConfig(members=MEMBERS, learning_rate=(1e-5, 1e-4))  # low, because rounding differences grow with it
 SIZES = {"the size of PointNet++'s head": TINY, "the small preset's": SMALL}
 EPOCHS = 2
 
 
 def step_seconds(task: EntropyTask, data: Path, repeats: int = 5) -> tuple[float, float]:
-    """Median time of a step of one member, and of all of them at once."""
+    """Median time in seconds of a step of one member, and of a step of all members at once."""
     batch = next(train_batches(data, task.batches))
     members = [task_of(task, member).hyperparameters for member in draw_members(SWEEP, task)]
     structure, state = initial_state(task, 0)

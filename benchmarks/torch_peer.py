@@ -1,8 +1,8 @@
-"""The pure-PyTorch PointNet++ that most people use, in our own plain words: the peer that ours is timed beside.
+"""The usual pure-PyTorch PointNet++, reimplemented as the peer of the benchmarks.
 
 Its algorithm is the well-known one: farthest-point sampling as a loop over whole batches; ball query as a matrix of all
-distances whose indices outside the ball are replaced by the number of points and sorted; gathering; shared layers as 1×1
-convolutions. Layers and names are those of the reference network (`tests/reference/torch_networks.py`): the same weights fit.
+distances, where indices outside the ball are replaced by the number of points and sorted; gathering; shared layers as 1×1
+convolutions. It has the layers, names and weights of the reference network (`tests/reference/torch_networks.py`).
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from tests.reference import torch_networks
 
 
 def farthest_point_sample(points: torch.Tensor, k: int) -> torch.Tensor:
-    """(batch, points, 3) to (batch, k) indices; the first is 0."""
+    """Indices (batch, k) of the sampled points of (batch, points, 3); the first is 0."""
     batch, count, _ = points.shape
     rows = torch.arange(batch, device=points.device)
     chosen = torch.zeros(batch, k, dtype=torch.long, device=points.device)
@@ -28,7 +28,7 @@ def farthest_point_sample(points: torch.Tensor, k: int) -> torch.Tensor:
 
 
 def ball_query(points: torch.Tensor, centres: torch.Tensor, radius: float, k: int) -> torch.Tensor:
-    """(batch, points, 3) and (batch, centres, 3) to (batch, centres, k) indices; the first repeated where there are fewer."""
+    """Indices (batch, centres, k) of points in each ball, padded with the first; from (batch, points, 3), (batch, centres, 3)."""
     batch, count, _ = points.shape
     squared = -2 * centres @ points.transpose(1, 2)
     squared += torch.sum(centres**2, -1)[:, :, None] + torch.sum(points**2, -1)[:, None]
@@ -40,7 +40,7 @@ def ball_query(points: torch.Tensor, centres: torch.Tensor, radius: float, k: in
 
 
 def gather(values: torch.Tensor, index: torch.Tensor) -> torch.Tensor:
-    """(batch, points, channels) at (batch, …) indices."""
+    """The values (batch, points, channels) at indices (batch, …)."""
     rows = torch.arange(len(values), device=values.device).view(-1, *[1] * (index.ndim - 1))
     return values[rows, index]
 

@@ -1,10 +1,11 @@
-"""What a network makes of whole voxel grids: `python benchmarks/whole_grids.py ARCHIVE`.
+"""Accuracy of a network on whole voxel grids: `python benchmarks/whole_grids.py ARCHIVE`.
 
-A control for `ceiling.py`: VoxNet (Maturana and Scherer 2015) is told every cell of an object, inside and behind, in its known
-pose, where a camera sees surfaces. What it gets wrong, views can hardly get right. Nothing is chosen: so many epochs, the last
-weights, the mean over eight turns and mirror images of each test object. Classes count the same in training.
+A control for `ceiling.py`: VoxNet (Maturana and Scherer 2015) receives every cell of an object, including the inside
+and the back, in a known pose, while a camera sees only surfaces. Objects that it misclassifies can hardly be
+recognised from views. Nothing is selected: the number of epochs is fixed, the last weights are used, and predictions
+are means over eight rotations and mirror images of each test object. All classes have the same weight in training.
 
-The result goes to `benchmarks/results/whole_grids.json`.
+The result is written to `benchmarks/results/whole_grids.json`.
 """
 
 from __future__ import annotations
@@ -35,19 +36,19 @@ RESULT = Path(__file__).parent / "results" / "whole_grids.json"
 @dataclass(frozen=True)
 class Options:
     archive: Annotated[Path, tyro.conf.Positional]
-    """an .npz of voxel grids 32×32×32"""
+    """an .npz of 32×32×32 voxel grids"""
     epochs: int = 40
-    """passes over as many objects as there are in training, rare classes as often as others"""
+    """epochs; each draws as many objects as the training split has, with all classes equally often"""
     batch_size: int = 64
-    """grids in a batch"""
+    """number of grids in a batch"""
     learning_rate: float = 1e-3
-    """of Adam, falling along a cosine"""
+    """initial learning rate of AdamW, with a cosine schedule"""
     seed: int = 0
-    """of weights and batches"""
+    """seed of weights and batches"""
 
 
 class _Convolution(nnx.Module):
-    """In three dimensions, as one matrix product: XLA's own is slow on CPUs."""
+    """A three-dimensional convolution as one matrix product, because XLA's own is slow on CPUs."""
 
     def __init__(self, channels: int, filters: int, size: int, stride: int, *, rngs: nnx.Rngs):
         self.size, self.stride = size, stride
@@ -67,7 +68,7 @@ class _Convolution(nnx.Module):
 
 
 class VoxNet(nnx.Module):
-    """Two convolutions, one pooling, two layers."""
+    """VoxNet: two convolutions, one pooling, two linear layers."""
 
     def __init__(self, classes: int, *, rngs: nnx.Rngs):
         self.first, self.second = (
@@ -77,7 +78,7 @@ class VoxNet(nnx.Module):
         self.hidden, self.head = nnx.Linear(32 * 6**3, 128, rngs=rngs), nnx.Linear(128, classes, rngs=rngs)
 
     def __call__(self, grids: Array, key: Array | None = None) -> Array:
-        """Logits of grids (batch, 32, 32, 32); with a key, dropping out."""
+        """Logits of grids (batch, 32, 32, 32); dropout is applied if a key is given."""
         keys = (None,) * 3 if key is None else jax.random.split(key, 3)
         x = _dropped(keys[0], 0.2, nnx.leaky_relu(self.first(grids[..., None]), 0.1))
         x = nnx.max_pool(nnx.leaky_relu(self.second(x), 0.1), (2, 2, 2), (2, 2, 2))
@@ -90,13 +91,13 @@ def _dropped(key: Array | None, rate: float, x: Array) -> Array:
 
 
 def changed(grids: np.ndarray, turns: int, mirror: bool) -> np.ndarray:
-    """Turned about the vertical, the last axis, by so many right angles, and mirrored."""
+    """Grids rotated about the vertical (the last axis) by `turns` right angles, and mirrored if `mirror`."""
     grids = np.rot90(grids, turns, (1, 2))
     return grids[:, ::-1] if mirror else grids
 
 
 def drawn(random: np.random.Generator, grids: np.ndarray) -> np.ndarray:
-    """Some training grids, each turned, mirrored and moved by up to two cells."""
+    """Training grids with augmentation: each is rotated, mirrored and shifted by up to two cells at random."""
     found = np.empty(grids.shape, np.float32)
     for index, grid in enumerate(grids):
         one = changed(grid[None], int(random.integers(4)), bool(random.integers(2)))[0]
@@ -135,7 +136,7 @@ def main(options: Options) -> None:
         return jax.nn.softmax(nnx.merge(structure, weights)(grids))
 
     def accuracy() -> np.ndarray:
-        """Which test objects are right."""
+        """Whether each test object is classified correctly."""
         some = grids["test"].astype(np.float32)
         every = [changed(some, turns, mirror) for turns in range(4) for mirror in (False, True)]
         parts = [sum(judge(weights, one[i : i + 100]) for one in every) for i in range(0, len(some), 100)]

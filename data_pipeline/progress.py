@@ -5,7 +5,6 @@ from __future__ import annotations
 import sys
 import threading
 from datetime import timedelta
-from typing import Any, Self
 
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, ProgressColumn, Task, TextColumn, TimeRemainingColumn
@@ -33,14 +32,15 @@ class _ProgressInLines(Progress):
         self._ended = threading.Event()
         self._writer = threading.Thread(target=self._write, daemon=True)
 
-    def __enter__(self) -> Self:
+    def start(self) -> None:
         self._writer.start()
-        return super().__enter__()
+        super().start()
 
-    def __exit__(self, *error: Any) -> None:
+    def stop(self) -> None:
         self._ended.set()
-        self._writer.join()
-        super().__exit__(*error)
+        if self._writer.is_alive():
+            self._writer.join()
+        super().stop()
 
     def _write(self) -> None:
         while not self._ended.wait(SECONDS_BETWEEN_LINES):

@@ -1,1 +1,1 @@
-"""Networks fill view tables, view tables are walked, walks become metrics, metrics become a report."""
+"""Evaluation: view tables from networks, walks over view tables, metrics of walks, and the report."""

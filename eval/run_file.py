@@ -7,14 +7,13 @@ import types
 from dataclasses import asdict, dataclass, fields, is_dataclass
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
+from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
 
 from data_pipeline.errors import DataError
 from data_pipeline.files import as_read, read_json, write_json
 from eval.settings import Settings
 
 NAME = "run.json"
-Value = TypeVar("Value")
 
 
 @dataclass(frozen=True)
@@ -66,14 +65,14 @@ def _made_with() -> dict[str, str]:
     return {"python": platform.python_version(), **{name: version(name) for name in packages}}
 
 
-def from_plain(kind: type[Value], content: Any, where: str) -> Value:
+def from_plain(kind: Any, content: Any, where: str) -> Any:
     """A value of a type made of dataclasses, tuples and plain values, from what JSON keeps of it.
 
     Raises:
         TypeError, ValueError: for content of another form; the message names the place.
     """
     origin, arguments = get_origin(kind), get_args(kind)
-    if is_dataclass(kind):
+    if isinstance(kind, type) and is_dataclass(kind):
         if not isinstance(content, dict):
             raise TypeError(f"{where} is no object")
         hints = get_type_hints(kind)
@@ -87,10 +86,10 @@ def from_plain(kind: type[Value], content: Any, where: str) -> Value:
             raise TypeError(f"{where} is no list")
         kinds = [arguments[0]] * len(content) if arguments[1:] == (...,) else list(arguments)
         values = zip(kinds, content, strict=True)
-        return tuple(from_plain(one, item, f"{where}[{i}]") for i, (one, item) in enumerate(values))  # type: ignore
+        return tuple(from_plain(one, item, f"{where}[{i}]") for i, (one, item) in enumerate(values))
     if origin in (Union, types.UnionType):
         if content is None and type(None) in arguments:
-            return None  # type: ignore[return-value]
+            return None
         (one,) = [argument for argument in arguments if argument is not type(None)]
         return from_plain(one, content, where)
     if origin is Literal:
@@ -98,9 +97,9 @@ def from_plain(kind: type[Value], content: Any, where: str) -> Value:
             raise ValueError(f"{where} is {content!r}, not one of {', '.join(map(str, arguments))}")
         return content
     if kind is Path:
-        return Path(content)  # type: ignore[return-value]
+        return Path(content)
     if kind is float and type(content) is int:
-        return float(content)  # type: ignore[return-value]
+        return float(content)
     if kind is not Any and type(content) is not kind:
         raise TypeError(f"{where} is {content!r}, not of type {kind.__name__}")
     return content

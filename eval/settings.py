@@ -1,4 +1,4 @@
-"""Everything that can be set, and the presets."""
+"""All settings, and the presets."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from train.thesis_networks import ThesisConfig
 
 @dataclass(frozen=True)
 class Settings:
-    """Everything that can be set; the defaults are the thesis's."""
+    """All settings; the defaults are those of the thesis."""
 
     dataset: DataConfig = DataConfig()
     classifier: ClassifierConfig = ClassifierConfig()
@@ -40,8 +40,8 @@ class Settings:
 
 
 THESIS = Settings()
-"""The thesis's sizes: 224×224, 40 views, ResNet-18 on depth, PointNet++ on 4,096 points. For an accelerator: two CPU cores
-train PointNet++ of this size on 7 clouds a second, five hours for one epoch of ModelNet10.
+"""The sizes of the thesis: 224×224, 40 views, ResNet-18 on depth, PointNet++ on 4,096 points. It needs an accelerator: two CPU
+cores train PointNet++ of this size on 7 clouds per second, which is five hours for one epoch of ModelNet10.
 `mevs run --preset thesis --data ModelNet10.zip`"""
 
 
@@ -107,7 +107,7 @@ SMALL = Settings(
         rotation_epochs=3,
     ),
 )
-"""The same study at 64×64 with narrower networks.
+"""The thesis's study at 64×64 with narrower networks.
 `mevs run --data modelnet10_voxels32.npz`: 12 minutes on two cores of an AMD EPYC (Zen 5), `mevs study thesis` 40."""
 
 
@@ -127,21 +127,21 @@ BEST = replace(
         lattices=(10, 60),
     ),
 )
-"""What `mevs study learned` is meant to have where there is an accelerator: views of 128×128, a ResNet-18 as wide as the paper's,
-four parts, three seeds. It has been run for some steps, never to its end."""
+"""Settings of `mevs study learned` for an accelerator: views of 128×128, a ResNet-18 as wide as in its paper, four folds, three
+seeds. This preset has been run for some steps, never to the end."""
 
 
-_TRIFLING_SETS = SetFusionConfig(width=16, heads=2, blocks=1)
+_TINY_FUSION = SetFusionConfig(width=16, heads=2, blocks=1)
 
 
-_TRIFLE = OptimiserConfig(epochs=2, batch_size=16, views_per_object=2, epoch_views=4, schedule="cosine")
+_TINY_OPTIMISER = OptimiserConfig(epochs=2, batch_size=16, views_per_object=2, epoch_views=4, schedule="cosine")
 
 
 TINY = Settings(
     dataset=DataConfig(train_per_class=4, test_per_class=1, capture=CaptureConfig(views=6, resolution=32)),
     classifier=ClassifierConfig(
         network=ResNetConfig(depth=10, width=8, channels=1, standardise=False),
-        optimiser=_TRIFLE,
+        optimiser=_TINY_OPTIMISER,
     ),
     entropy=EntropyConfig(
         network=PointNet2Config(
@@ -153,14 +153,14 @@ TINY = Settings(
             global_layers=(32, 64),
             head_layers=(32,),
         ),
-        optimiser=_TRIFLE,
+        optimiser=_TINY_OPTIMISER,
     ),
     evaluation=GridConfig(draws=2),
     live=LiveConfig(objects=10, at_once=8, max_views=4),
     thesis=ThesisConfig(
-        _TRIFLE,
-        _TRIFLE,
-        _TRIFLE,
+        _TINY_OPTIMISER,
+        _TINY_OPTIMISER,
+        _TINY_OPTIMISER,
         resnet34_width=8,
         timing_runs=3,
         ascent_runs=1,
@@ -170,8 +170,8 @@ TINY = Settings(
     learned=LearnedConfig(
         recogniser=RecogniserConfig(
             network=ResNetConfig(depth=10, width=8, channels=4, standardise=False, stem="patches"),
-            fusion=_TRIFLING_SETS,
-            optimiser=replace(_TRIFLE, validation_views=2),
+            fusion=_TINY_FUSION,
+            optimiser=replace(_TINY_OPTIMISER, validation_views=2),
         ),
         policy=PolicyConfig(width=16, heads=2, blocks=1, most_seen=3, walks=1, rounds=1, epochs=2, batch_size=32),
         changed=1,
@@ -184,7 +184,7 @@ TINY = Settings(
     ),
     rendering=RenderingConfig(objects=1, starts=2, resolution=16, faces=64),
 )
-"""Seconds, and no use but to see that everything runs."""
+"""Runs in seconds. It only checks that everything works."""
 
 
 PRESETS = {"small": SMALL, "best": BEST, "thesis": THESIS, "tiny": TINY}

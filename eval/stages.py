@@ -1,7 +1,7 @@
-"""The stages of a run: data → networks → tables and metrics → report. Each stage skips what is done.
+"""The stages of a run: data → networks → tables and metrics → report. Each stage skips completed work.
 
-A run directory holds `data/`, `classifier/`, `entropy/`, `tables/`, `metrics.json` and `report/index.html`; and
-`classifier_by_view/` where the published code's validation is compared too.
+A run directory holds `data/`, `classifier/`, `entropy/`, `tables/`, `metrics.json` and `report/index.html`. It also holds
+`classifier_by_view/` if the validation of the published code is compared.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ import numpy as np
 from data_pipeline.dataset.builder import prepare
 from data_pipeline.dataset.statistics import DatasetStatistics, load_statistics, report_left_out
 from data_pipeline.errors import DataError
-from data_pipeline.files import as_read, read_json, write_json
+from data_pipeline.files import read_json, write_json
 from data_pipeline.progress import console
 from eval.learned.measure import measure, together, train_all
 from eval.learned.page import write_learned_page
@@ -36,7 +36,7 @@ from eval.walks.live import Agreement, Networks, compare_with_tables
 from mevs_jax.policies.registry import policy_named
 from mevs_jax.viewpoints import ViewGraph
 from train.choosing.stages import Stages, check_learned
-from train.kept import made_by
+from train.kept import kept, kept_json, made_by
 from train.loop import fit, load_best
 from train.starting_weights import StartingWeights
 from train.step import Task
@@ -46,7 +46,7 @@ from train.tasks.entropy import EntropyTask
 
 
 def check_output(out: Path) -> None:
-    """Raises `DataError` where nothing can be written to `out`."""
+    """Raises `DataError` if the directory `out` is not writable."""
     probe = out / f".probe.{os.getpid()}"
     try:
         out.mkdir(parents=True, exist_ok=True)
@@ -63,7 +63,7 @@ def make_data(settings: Settings, out: Path, beam: str | None = None) -> Dataset
 
 
 def tasks(settings: Settings, statistics: DatasetStatistics) -> tuple[ClassifierTask, EntropyTask]:
-    """What is trained on a data set."""
+    """The tasks of both networks on a data set."""
     camera = statistics.camera
     return (
         ClassifierTask.of(settings.classifier, len(statistics.classes), camera),
@@ -74,7 +74,7 @@ def tasks(settings: Settings, statistics: DatasetStatistics) -> tuple[Classifier
 def train(
     settings: Settings, out: Path, start: StartingWeights | None = None, mesh: jax.sharding.Mesh | None = None
 ) -> None:
-    """Trains both networks, the classifier from `start` or random weights, on `mesh` or all devices."""
+    """Trains both networks, the classifier from `start` or from random weights, on `mesh` or on all devices."""
     statistics = load_statistics(out / "data")
     classify, predict = tasks(settings, statistics)
     planned: list[tuple[Task, str, StartingWeights | None]] = [
@@ -91,7 +91,7 @@ def train(
 
 
 def train_sweep(settings: Settings, out: Path, mesh: jax.sharding.Mesh | None = None) -> tuple[Path, list[Member]]:
-    """Trains many configurations of one network together; returns the sweep's folder and its members."""
+    """Trains many configurations of one network together; returns the folder of the sweep and its members."""
     statistics = load_statistics(out / "data")
     name = settings.sweep.network
     task = tasks(settings, statistics)[("classifier", "entropy").index(name)]
@@ -105,7 +105,7 @@ BY_VIEW = "classifier_by_view"
 
 
 def train_by_view(settings: Settings, out: Path, start: StartingWeights | None = None) -> None:
-    """Trains the classifier once more, validated by view as in the thesis's published code, for the compatibility table."""
+    """Trains the classifier again for the compatibility table, validated by view as in the thesis's published code."""
     statistics = load_statistics(out / "data")
     classify, _ = tasks(settings, statistics)
     by_view = replace(classify, optimiser=replace(classify.optimiser, validation_by="view"))
@@ -115,27 +115,27 @@ def train_by_view(settings: Settings, out: Path, start: StartingWeights | None =
 def _tables(
     settings: Settings, out: Path, statistics: DatasetStatistics, split: str, classifier: str = "classifier"
 ) -> ViewTables:
-    """The view tables of a split, made anew where the stored ones are of other networks."""
+    """The view tables of a split, computed again if the stored ones are from other networks."""
     made = made_by(statistics, out / classifier, out / "entropy")
     path = out / "tables" / (f"{split}.npz" if classifier == "classifier" else f"{split}_by_view.npz")
-    if path.exists() and (tables := load_view_tables(path)).made_by == made:
-        return tables
-    classify, predict = tasks(settings, statistics)
-    networks = load_best(classify, out / classifier), load_best(predict, out / "entropy")
-    tables = compute_view_tables(out / "data", split, statistics, classify, networks[0], predict, networks[1])
-    tables = replace(tables, made_by=made)
-    save_view_tables(path, tables)
-    return tables
+
+    def compute() -> ViewTables:
+        classify, predict = tasks(settings, statistics)
+        networks = load_best(classify, out / classifier), load_best(predict, out / "entropy")
+        tables = compute_view_tables(out / "data", split, statistics, classify, networks[0], predict, networks[1])
+        return replace(tables, made_by=made)
+
+    return kept(path, load_view_tables, save_view_tables, lambda tables: tables.made_by == made, compute)
 
 
 def check_evaluation(config: GridConfig) -> None:
-    """Raises `DataError` for a grid without cells."""
+    """Raises `DataError` if the grid has no cells."""
     if config.max_views < FIRST_MV or config.draws < 1:
         raise DataError("--evaluation.max-views must be at least 2 and --evaluation.draws at least 1")
 
 
 def evaluate(settings: Settings, out: Path) -> dict[str, Any]:
-    """Metrics of the test split, as written to `metrics.json`."""
+    """Returns the metrics of the test split, as written to `metrics.json`."""
     statistics = load_statistics(out / "data")
     by_view_made = None
     if (out / BY_VIEW / "summary.json").exists():
@@ -149,36 +149,34 @@ def evaluate(settings: Settings, out: Path) -> dict[str, Any]:
     climbed = load_ascent_scores(out, statistics, settings.rendering)
     if climbed is not None:
         identity["climbed"] = asdict(settings.rendering)
-    identity = as_read(identity)
     check_evaluation(settings.evaluation)
-    path = out / "metrics.json"
-    if path.exists() and (metrics := read_json(path))["identity"] == identity:
-        return metrics
-    try:
-        reachable_views(np.array(statistics.viewpoints), settings.evaluation.lowest_elevation)
-    except ValueError as error:
-        raise DataError(str(error)) from error
-    tables, by_view, leak = _tables(settings, out, statistics, "test"), None, None
-    if by_view_made is not None:
-        by_view = _tables(settings, out, statistics, "test", BY_VIEW)
-        leak = {
-            name: {
-                "validation": float(read_json(out / name / "summary.json")["best"]["accuracy"]),
-                "test": float((made.logits.argmax(-1) == made.labels[:, None]).mean()),
+
+    def compute() -> dict[str, Any]:
+        try:
+            reachable_views(np.array(statistics.viewpoints), settings.evaluation.lowest_elevation)
+        except ValueError as error:
+            raise DataError(str(error)) from error
+        tables, by_view, leak = _tables(settings, out, statistics, "test"), None, None
+        if by_view_made is not None:
+            by_view = _tables(settings, out, statistics, "test", BY_VIEW)
+            leak = {
+                name: {
+                    "validation": float(read_json(out / name / "summary.json")["best"]["accuracy"]),
+                    "test": float((made.logits.argmax(-1) == made.labels[:, None]).mean()),
+                }
+                for name, made in (("classifier", tables), (BY_VIEW, by_view))
             }
-            for name, made in (("classifier", tables), (BY_VIEW, by_view))
-        }
-    validation = _tables(settings, out, statistics, "val")
-    metrics = run_study(tables, validation, statistics, settings.evaluation, by_view, leak)
-    if climbed is not None:
-        metrics["climbing"] = ascent_study(tables, statistics, climbed, settings.evaluation)
-    metrics["identity"] = identity
-    write_json(path, metrics)
-    return metrics
+        validation = _tables(settings, out, statistics, "val")
+        metrics = run_study(tables, validation, statistics, settings.evaluation, by_view, leak)
+        if climbed is not None:
+            metrics["climbing"] = ascent_study(tables, statistics, climbed, settings.evaluation)
+        return metrics
+
+    return kept_json(out / "metrics.json", identity, compute)
 
 
 def learn_to_choose(settings: Settings, out: Path) -> Path:
-    """Trains and measures learned fusion and learned choice; returns the page."""
+    """Trains and evaluates learned fusion and learned view selection; returns the path of the page."""
     config, found = settings.learned, []
     check_learned(config, settings.dataset.capture.views)
     seeds = [Stages(config, settings.dataset, out, seed, settings.entropy) for seed in range(config.seeds)]
@@ -193,20 +191,22 @@ def learn_to_choose(settings: Settings, out: Path) -> Path:
 
 
 def ascend_on_objects(settings: Settings, out: Path) -> None:
-    """Finds where differentiable rendering would look next on many test objects; `evaluate` then compares it."""
+    """Computes the choices of differentiable rendering for many test objects; `evaluate` then compares them."""
     statistics = load_statistics(out / "data")
     ascend_objects(settings.dataset, statistics, out, settings.rendering)
 
 
 def check_live(settings: Settings, out: Path) -> dict[str, Agreement]:
-    """Walks test objects with the networks in the loop and compares with the tables; writes `live.json`."""
+    """Compares walks with the networks in the loop with walks on view tables; writes `live.json`."""
     for policy in settings.live.policies:
         try:
             policy_named(policy)
         except ValueError as error:
             raise DataError(str(error)) from error
         if policy in {rung.policy for rung in ASCENT_RUNGS}:
-            raise DataError(f"{policy} looks into what mevs study rendering has found; live walks have no such tables")
+            raise DataError(
+                f"{policy} needs the tables of mevs study rendering, which live walks do not have; leave it out"
+            )
     statistics = load_statistics(out / "data")
     classify, predict = tasks(settings, statistics)
     networks = Networks(classify, load_best(classify, out / "classifier"), predict, load_best(predict, out / "entropy"))
@@ -225,7 +225,7 @@ def check_live(settings: Settings, out: Path) -> dict[str, Agreement]:
 
 
 def report(settings: Settings, preset: str, out: Path) -> Path:
-    """Writes the page and returns where it is; one that is newer than its metrics is left as it is."""
+    """Writes the report and returns its path; a report newer than its metrics is kept."""
     page, metrics, active = out / "report" / "index.html", out / "metrics.json", out / "learned" / "metrics.json"
     if not metrics.exists():
         raise DataError(f"no metrics in {out}; make them with: mevs eval --out {out}")

@@ -1,4 +1,4 @@
-"""View tables: everything the selection loop needs to know of every object, computed once by the networks."""
+"""View tables: all inputs of the selection loop for every object, computed once by the networks."""
 
 from __future__ import annotations
 
@@ -20,15 +20,15 @@ from train.tasks.entropy import EntropyTask
 
 @dataclass(frozen=True)
 class ViewTables:
-    """The tables of all objects of a split, stacked.
+    """The view tables of all objects of a split.
 
     Attributes:
-        names: of the objects, in the order of the shards.
+        names: names of the objects, in the order of the shards.
         labels: (objects,) int.
         logits: (objects, views, classes).
-        predicted_entropy: (objects, views, views) predicted normalised entropies; row i after seeing view i.
+        predicted_entropy: (objects, views, views) predicted normalised entropies; row i is predicted from view i.
         entropy: (objects, views) true normalised entropies.
-        made_by: names the data set and the networks; tables made by others are stale.
+        made_by: identifies the data set and the networks; tables with another value are stale.
     """
 
     names: list[str]
@@ -39,7 +39,7 @@ class ViewTables:
     made_by: str = ""
 
     def stacked(self) -> ViewTable:
-        """As one `ViewTable` with a leading axis of objects, to be vmapped over."""
+        """Returns one `ViewTable` with a leading axis of objects for `vmap`."""
         logits, predicted_entropy, entropy, labels = map(
             jnp.asarray, (self.logits, self.predicted_entropy, self.entropy, self.labels)
         )

@@ -3,30 +3,39 @@
 from __future__ import annotations
 
 import atexit
+import fcntl
 import gc
 import os
 import shutil
+import subprocess
+import sys
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from importlib.metadata import version
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+import tests.typecheck  # noqa: F401  # jaxtyping's hook looks for it, and imports no more than `tests`
+
+# `MEVS_TEST_DEFAULT_FLAGS=1` runs the tests with XLA as users run it: all optimisations, by the emitters that are its default.
+DEFAULT_FLAGS = os.environ.get("MEVS_TEST_DEFAULT_FLAGS", "0") not in ("", "0")
+
 if "PYTEST_XDIST_WORKER" not in os.environ:
-    # What one test has compiled the others need not, nor the workers and programs that they start, which inherit this. JAX is not
-    # imported yet.
+    # One cache of compiled programs for all workers and for the programs that tests start, which inherit these variables. JAX
+    # is not imported yet.
     compiled = tempfile.mkdtemp(prefix="mevs_jax-compiled-")
     atexit.register(shutil.rmtree, compiled, ignore_errors=True)
     os.environ |= {"JAX_COMPILATION_CACHE_DIR": compiled, "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0.2"}
     # Tests compile much and run little: without most optimisations, and by XLA's older emitters, that takes a third of the time.
     # What is compared with PyTorch and plain loops, and what runs long, has all optimisations (`fully_compiled`).
     jaxlib = tuple(map(int, version("jaxlib").split(".")[:2]))
-    if jaxlib < (0, 11):  # later ones have the newer emitters alone, and end at the name of the choice
-        flags = os.environ.get("XLA_FLAGS", "")
-        os.environ["XLA_FLAGS"] = f"{flags} --xla_cpu_use_fusion_emitters=false".strip()
-    os.environ.setdefault("JAX_DISABLE_MOST_OPTIMIZATIONS", "1")
+    if not DEFAULT_FLAGS:
+        if jaxlib < (0, 11):  # later versions have the newer emitters alone, and end at the name of this flag
+            flags = os.environ.get("XLA_FLAGS", "")
+            os.environ["XLA_FLAGS"] = f"{flags} --xla_cpu_use_fusion_emitters=false".strip()
+        os.environ.setdefault("JAX_DISABLE_MOST_OPTIMIZATIONS", "1")
 
 # Tracing leaves many small objects that live: looking through them all as often as Python does takes up to a tenth of the time.
 gc.set_threshold(100_000, 50, 100)
@@ -34,23 +43,23 @@ gc.set_threshold(100_000, 50, 100)
 REAL = Path(__file__).resolve().parents[2] / "shared"
 
 
-# The files that take longest, one worker each: begun first, so that none is left for one worker at the end.
 LONG = (
-    "test_cli",
-    "test_sweep",
-    "test_thesis",
-    "test_training",
-    "test_soft_rendering",
-    "test_scaling",
-    "test_processes",
-    "test_evaluation",
-    "test_policy",
+    "tests/cli/test_cli.py",
+    "tests/train/test_sweep.py",
+    "tests/eval/thesis/test_thesis.py",
+    "tests/train/test_training.py",
+    "tests/mevs_jax/rendering/test_soft.py",
+    "tests/train/test_scaling.py",
+    "tests/train/test_processes.py",
+    "tests/eval/walks/test_evaluation.py",
 )
+"""The files that take longest. They begin first, so that no worker is left with one of them at the end."""
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     def place(item: pytest.Item) -> int:
-        return LONG.index(item.path.stem) if item.path.stem in LONG else len(LONG)
+        file = item.nodeid.split("::")[0]
+        return LONG.index(file) if file in LONG else len(LONG)
 
     items.sort(key=place)
 
@@ -65,7 +74,7 @@ def open3d_or_skip() -> None:
 
 @pytest.fixture
 def fully_compiled() -> Iterator[None]:
-    """For tests whose programs are to have all optimisations, though by the older emitters too where there are any."""
+    """For tests whose programs need all optimisations. The older emitters stay, where the installed XLA has them."""
     import jax
 
     before = jax.config.read("jax_disable_most_optimizations")
@@ -74,15 +83,77 @@ def fully_compiled() -> Iterator[None]:
     jax.config.update("jax_disable_most_optimizations", before)
 
 
+def made_once(factory: pytest.TempPathFactory, name: str, make: Callable[[Path], None]) -> Path:
+    """A folder that the first worker to need it makes, for all workers of this test session. It must not be written to."""
+    shared = factory.getbasetemp()
+    if "PYTEST_XDIST_WORKER" in os.environ:
+        shared = shared.parent  # each worker has a folder of its own in it
+    folder, done = shared / f"shared_{name}", shared / f"shared_{name}.done"
+    with (shared / f"shared_{name}.lock").open("w") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        if not done.exists():
+            shutil.rmtree(folder, ignore_errors=True)
+            make(folder)
+            done.touch()
+    return folder
+
+
 @pytest.fixture(scope="session")
 def data(tmp_path_factory) -> Path:
-    """The data set of the preset `tiny`, to be read and not written to, where a module has no other of this name."""
+    """The data set of the preset `tiny`, for reading only. Some modules have another fixture of this name."""
     from data_pipeline.dataset.builder import prepare
     from eval.settings import TINY
 
-    folder = tmp_path_factory.mktemp("tiny") / "data"
-    prepare(TINY.dataset, folder)
-    return folder
+    return made_once(tmp_path_factory, "data", lambda folder: prepare(TINY.dataset, folder))
+
+
+@pytest.fixture(scope="session")
+def turned(tmp_path_factory) -> Path:
+    """As `data`, but the cameras of each object are turned; for reading only."""
+    from dataclasses import replace
+
+    from data_pipeline.dataset.builder import prepare
+    from eval.settings import TINY
+
+    config = replace(TINY.dataset, capture=replace(TINY.dataset.capture, turned=True))
+    return made_once(tmp_path_factory, "turned", lambda folder: prepare(config, folder))
+
+
+@pytest.fixture(scope="session")
+def whole(tmp_path_factory) -> Path:
+    """One run of the preset `tiny` by the command line, never interrupted, for reading only."""
+
+    def make(folder: Path) -> None:
+        command = [sys.executable, "-m", "mevs_jax", "run", "--preset", "tiny", "--out", str(folder)]
+        result = subprocess.run(command, capture_output=True, text=True, timeout=900)
+        assert result.returncode == 0, result.stderr
+        assert "Report:" in result.stdout
+
+    return made_once(tmp_path_factory, "whole", make)
+
+
+@pytest.fixture(scope="session")
+def fusion():
+    """A learned fusion of arbitrary weights, of five features."""
+    from tests.reference.choosing import CLASSES, fusion_of
+
+    return fusion_of(5, CLASSES)
+
+
+@pytest.fixture(scope="session")
+def policy():
+    """A view policy of arbitrary weights."""
+    from tests.reference.choosing import some_policy
+
+    return some_policy()
+
+
+@pytest.fixture(scope="session")
+def adding():
+    """The sum of logits, as a fusion."""
+    from tests.reference.choosing import adding_fusion
+
+    return adding_fusion()
 
 
 @pytest.fixture

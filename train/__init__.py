@@ -1,1 +1,1 @@
-"""Shards train networks."""
+"""Training of the networks on the shards that `data_pipeline` writes."""

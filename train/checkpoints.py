@@ -1,6 +1,6 @@
-"""What a training run leaves on disk: its latest state, its best one, and how far it got. Orbax does the writing.
+"""Checkpoints of a training run: its latest state, its best state, and its progress. Orbax writes them.
 
-Each save appears whole under its step, or not at all; older ones are removed after. Training goes on while it is written.
+A save appears completely under its step, or not at all; older saves are removed afterwards. Training continues during writing.
 """
 
 from __future__ import annotations
@@ -17,11 +17,11 @@ import orbax.checkpoint as ocp
 from train.devices import is_lost_process
 from train.preemption import interrupts_held
 
-logging.getLogger("absl").setLevel(logging.ERROR)  # Orbax tells every step of every save
+logging.getLogger("absl").setLevel(logging.ERROR)  # Orbax logs every step of every save
 
 
 def _placed(leaf: Any) -> Any:
-    """A shape without a place is on a device of this process; arrays are where they are."""
+    """Returns a shape without a sharding as one on a device of this process; anything else unchanged."""
     if isinstance(leaf, jax.ShapeDtypeStruct) and leaf.sharding is None:
         here = jax.sharding.SingleDeviceSharding(jax.local_devices()[0])
         return jax.ShapeDtypeStruct(leaf.shape, leaf.dtype, sharding=here)
@@ -29,7 +29,7 @@ def _placed(leaf: Any) -> Any:
 
 
 class Checkpoints:
-    """Two slots, `latest` and `best`, each holding one (state, progress): a tree of arrays, and plain numbers."""
+    """Two slots, `latest` and `best`, each holding one state (a tree of arrays) and its progress (plain numbers)."""
 
     def __init__(self, folder: Path):
         options = ocp.CheckpointManagerOptions(
@@ -41,18 +41,23 @@ class Checkpoints:
 
     @interrupts_held()
     def save(self, slot: str, step: int, state: Any, progress: dict[str, Any]) -> None:
+        """Starts to save into a slot; does nothing if the slot already holds this step."""
         manager = self._slots[slot]
         if manager.latest_step() == step:
             return
         for other in self._slots.values():
-            other.wait_until_finished()  # what `latest` says of `best` has to be there before
+            other.wait_until_finished()  # `best` must be complete before a `latest` that refers to it
         manager.save(
             step,
             args=ocp.args.Composite(state=ocp.args.StandardSave(state), progress=ocp.args.JsonSave(deepcopy(progress))),
         )
 
     def restore(self, slot: str, like: Any) -> tuple[Any, dict[str, Any]] | None:
-        """The newest of a slot, shaped and placed as `like`, which may be shapes alone; None where nothing was saved."""
+        """Returns state and progress of a slot's newest save, or None if there is none.
+
+        Args:
+            like: a tree of arrays or shapes, whose shapes and placement the restored state gets.
+        """
         manager = self._slots[slot]
         step = manager.latest_step()
         if step is None:
@@ -64,7 +69,7 @@ class Checkpoints:
         return restored["state"], restored["progress"]
 
     def latest_step(self, slot: str) -> int:
-        """The newest step of a slot; 0 where nothing was saved."""
+        """Returns the step of a slot's newest save; 0 if there is none."""
         return self._slots[slot].latest_step() or 0
 
     @interrupts_held()
@@ -76,5 +81,7 @@ class Checkpoints:
         return self
 
     def __exit__(self, kind: type | None, error: BaseException | None, trace: TracebackType | None) -> None:
-        if error is None or not is_lost_process(error):  # a lost process never finishes its part of a save
+        if error is None or not is_lost_process(
+            error
+        ):  # with a lost process, waiting for its part of a save would never end
             self.close()

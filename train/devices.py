@@ -1,7 +1,7 @@
-"""Which devices a training runs on, and where its arrays lie: one mesh, from a laptop's CPU to a pod.
+"""The device mesh of a training and the placement of its arrays, from one CPU to a pod.
 
-The mesh has two axes. Batches are split along `data`; weights are copied along it, and those that are large enough are split
-along `model`, by their last axis. The rest is the compiler's work.
+The mesh has two axes. Batches are split along `data`. Weights are copied along `data`; large ones are split along `model`, by
+their last axis. The compiler derives the rest.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from typing import Any
 
 import jax
 import numpy as np
-from jax.sharding import Mesh, NamedSharding, PartitionSpec
+from jax.sharding import AbstractMesh, Mesh, NamedSharding, PartitionSpec
 
 from data_pipeline.errors import DataError
 from train.step import Task
@@ -23,13 +23,13 @@ _SMALLEST_SPLIT = 2**12
 
 
 def join_processes() -> None:
-    """Makes this process one of several that train together; to be called before JAX computes anything.
+    """Joins this process to the others of a multi-process training; must be called before JAX computes anything.
 
-    On Slurm, Open MPI, Kubernetes and Cloud TPUs JAX finds the others by itself; elsewhere the environment says where they are:
+    On Slurm, Open MPI, Kubernetes and Cloud TPUs, JAX finds the other processes. Elsewhere, environment variables name them:
     JAX_COORDINATOR_ADDRESS (host:port of process 0), JAX_NUM_PROCESSES and JAX_PROCESS_ID.
 
     Raises:
-        DataError: where the others cannot be found or reached.
+        DataError: if the other processes cannot be found or reached.
     """
     numbers = {}
     try:
@@ -45,17 +45,20 @@ def join_processes() -> None:
 
 
 def is_first() -> bool:
-    """Whether this process is the one that writes and speaks for all."""
+    """Returns whether this process is the one that writes files and messages for all."""
     return jax.process_index() == 0
 
 
 def device_mesh(model: int = 1) -> Mesh:
-    """All devices of all processes, `model` of them to a copy of the weights.
+    """Returns the mesh of all devices of all processes.
 
-    A process's devices lie together along `data`, so that its part of a batch is one piece.
+    A process's devices are adjacent along `data`, so that its part of a batch is contiguous.
+
+    Args:
+        model: number of devices that share one copy of the weights.
 
     Raises:
-        DataError: where the devices cannot be grouped so.
+        DataError: if `model` does not divide the devices of a process.
     """
     devices = sorted(jax.devices(), key=lambda device: (device.process_index, device.id))
     local = jax.local_device_count()
@@ -67,7 +70,7 @@ def device_mesh(model: int = 1) -> Mesh:
 
 
 def check_batch(task: Task, mesh: Mesh) -> None:
-    """Raises `DataError` where a batch cannot be split over the mesh."""
+    """Raises `DataError` if a batch cannot be split equally over the mesh and the processes."""
     config, processes, devices = task.optimiser, jax.process_count(), mesh.shape[DATA]
     if config.parts < 1 or config.batch_size % (devices * config.parts):
         parts = f" in {config.parts} parts" if config.parts != 1 else ""
@@ -82,11 +85,11 @@ def check_batch(task: Task, mesh: Mesh) -> None:
         )
 
 
-def parameter_sharding(mesh: Mesh, tree: Any) -> Any:
-    """Where every array of a tree belongs: large ones split along `model` by their last axis, all others everywhere."""
+def parameter_sharding(mesh: Mesh | AbstractMesh, tree: Any) -> Any:
+    """Returns the sharding of every array of a tree: large ones split along `model` by the last axis, others copied."""
     model = mesh.shape[MODEL]
 
-    def of(leaf: jax.Array) -> NamedSharding:
+    def of(leaf: jax.Array | jax.ShapeDtypeStruct) -> NamedSharding:
         splits = model > 1 and leaf.ndim > 1 and leaf.size >= _SMALLEST_SPLIT and leaf.shape[-1] % model == 0
         return NamedSharding(mesh, PartitionSpec(*[None] * (leaf.ndim - 1), MODEL) if splits else PartitionSpec())
 
@@ -94,7 +97,7 @@ def parameter_sharding(mesh: Mesh, tree: Any) -> Any:
 
 
 def place(tree: Any, sharding: Any) -> Any:
-    """Puts arrays that every process holds whole where they belong."""
+    """Distributes arrays that every process holds completely; `sharding` is a tree like `tree`."""
 
     def put(leaf: jax.Array, where: NamedSharding) -> jax.Array:
         whole = np.asarray(leaf)
@@ -104,14 +107,16 @@ def place(tree: Any, sharding: Any) -> Any:
 
 
 def place_batch(mesh: Mesh, batch: Any) -> Any:
-    """One batch over all devices, from this process's part of it."""
+    """Returns a batch spread over all devices, assembled from the parts that the processes hold."""
     split = NamedSharding(mesh, PartitionSpec(DATA))
     return jax.tree.map(lambda part: jax.make_array_from_process_local_data(split, part), batch)
 
 
 def summed_over(mesh: Mesh, function: Callable) -> Callable:
-    """`function(parameters, statistics, batch, weights)`, which adds up over a batch, of one that lies on all devices: each adds
-    up its own part as it likes, in however many pieces."""
+    """Returns `function(parameters, statistics, batch, weights)`, which sums over a batch, for a batch spread over all devices.
+
+    Every device applies `function` to its own part; the results are added.
+    """
 
     def own(*arguments: Any) -> Any:
         return jax.tree.map(lambda part: jax.lax.psum(part, DATA), function(*arguments))
@@ -124,7 +129,7 @@ _LOST = ("gloo", "coordination service", "heartbeat", "connection closed by peer
 
 
 def is_lost_process(error: BaseException) -> bool:
-    """Whether an error of JAX's runtime says that another process is gone."""
+    """Returns whether an error of JAX's runtime means that another process of this training has ended or is unreachable."""
     chain, link = [], error
     while link is not None and link not in chain:
         chain.append(link)

@@ -1,8 +1,8 @@
-"""The training loop: one function, read from top to bottom, for every network of this project, on one device or on many.
+"""The training loop of every network in this project, on one device or many.
 
-A `Task` says what is particular: the network, its loss, its inputs. Everything else is here: batches, steps, validation by
-object, early stopping, checkpoints, metrics. A run that was stopped, however rudely, goes on from its last checkpoint and ends
-with the same weights, because a batch and a key depend on the seeds and the step alone; on as many devices as there are then.
+A `Task` defines the network, its inputs and its loss. This module does the rest: batches, steps, validation by object, early
+stopping, checkpoints, metrics. A run that was interrupted in any way resumes from its last checkpoint, on whatever devices there
+are then, and ends with the same weights: batches and random keys depend only on the seeds and the step.
 """
 
 from __future__ import annotations
@@ -34,6 +34,7 @@ from data_pipeline.files import as_read, read_json, write_json, write_text
 from data_pipeline.progress import console, progress_bar
 from train.checkpoints import Checkpoints
 from train.devices import DATA, check_batch, device_mesh, is_first, parameter_sharding, place, place_batch, summed_over
+from train.kept import check_config
 from train.optimiser import learning_rate
 from train.preemption import Preempted, Preemption
 from train.starting_weights import StartingWeights
@@ -41,27 +42,33 @@ from train.step import Metrics, Task, TrainState, abstract_state, evaluate_step_
 
 
 class Lead:
-    """How far the host is ahead of the devices: enough to keep them busy, not so far that errors are heard of late."""
+    """Limits how many steps the host dispatches ahead of the devices.
+
+    A few steps keep the devices busy; with more, errors would be reported late.
+    """
 
     def __init__(self, steps: int = 4):
         self._steps, self._running = steps, deque[jax.Array]()
 
     def limit(self, result: jax.Array) -> None:
-        """Takes a result of the newest step, and waits for that of some steps before."""
+        """Takes a result of the newest step and waits for the result from `steps` steps earlier."""
         self._running.append(result)
         if len(self._running) > self._steps:
             self._running.popleft().block_until_ready()
 
 
 def steps_of_an_epoch(task: Task, statistics: DatasetStatistics) -> int:
-    """Steps between two validations: a whole number of passes over the training objects' views."""
+    """Returns the number of steps between two validations: enough for `epoch_views` views (or all) of each training object."""
     config, objects = task.optimiser, statistics.objects_of(training_splits(task.batches))
     objects = len(objects_kept(objects, task.batches))
     return steps_per_epoch(objects * (config.epoch_views or statistics.views) // config.views_per_object, task.batches)
 
 
 def class_weights_of(task: Task, statistics: DatasetStatistics) -> np.ndarray:
-    """What a validation view of each class counts."""
+    """Returns the weight of a validation view of each class, (classes,).
+
+    All are 1, unless training is `balanced`: then every class weighs the same in total.
+    """
     objects = np.array(
         [
             sum(statistics.counts[split][name] for split in validation_splits(task.batches))
@@ -76,10 +83,13 @@ def class_weights_of(task: Task, statistics: DatasetStatistics) -> np.ndarray:
 def validation_set(
     task: Task, data: Path, statistics: DatasetStatistics, devices: int
 ) -> list[tuple[dict[str, np.ndarray], np.ndarray]]:
-    """This process's part of the validation views, in batches of one size, each with the weights of its views.
+    """Returns this process's part of the validation views, as batches of equal size with the weight of every view.
 
-    `devices` of all processes share a batch. Weights are 1 (where training is `balanced`, such that every class weighs the same),
-    and 0 for what fills batches up, so that all of them, in all processes, are of one program.
+    Weights are those of `class_weights_of`, and 0 for views that only fill up a batch. With equal sizes, one compiled program
+    serves all batches in all processes.
+
+    Args:
+        devices: devices, of all processes together, that share a batch.
     """
     index, processes = jax.process_index(), jax.process_count()
     objects = statistics.objects_of(validation_splits(task.batches))
@@ -99,20 +109,22 @@ def validation_set(
 
 
 def weighted_means(found: list[Metrics]) -> dict[str, Any]:
-    """Means of every metric, from the sums that `evaluate_step_of` makes of each batch."""
+    """Returns the mean of every metric from the sums that `evaluate_step_of` returns for each batch."""
     sums = {name: np.sum([part[name] for part in found], axis=0, dtype=np.float64) for name in found[0]}
     return {name: total / sums["views"] for name, total in sums.items() if name != "views"}
 
 
 def validate(evaluate_step: Callable, state: TrainState, batches: list, mesh: Mesh) -> dict[str, float]:
-    """Mean of every metric over the validation views of all processes."""
+    """Returns the mean of every metric over the validation views of all processes."""
     found = [evaluate_step(state.parameters, state.statistics, *place_batch(mesh, batch)) for batch in batches]
     return {name: float(mean) for name, mean in weighted_means(found).items()}
 
 
 class MetricsLog:
-    """Metrics as JSON lines and for TensorBoard, written by the first process; on resuming, what was logged after the
-    checkpoint is taken back."""
+    """Writes metrics as JSON lines and for TensorBoard, from the first process only.
+
+    On resuming, lines logged after the checkpoint are removed.
+    """
 
     def __init__(self, folder: Path, step: int):
         self._writes = is_first()
@@ -122,7 +134,7 @@ class MetricsLog:
         lines = self._path.read_text().splitlines() if self._path.exists() else []
         kept = [line for line in lines if line.endswith("}") and json.loads(line)["step"] <= step]
         write_text(self._path, "".join(line + "\n" for line in kept))
-        from tensorboardX import SummaryWriter  # which imports PyTorch, where that is installed
+        from tensorboardX import SummaryWriter  # imported late: it imports PyTorch if that is installed
 
         self._board = SummaryWriter(str(folder / "tensorboard"), purge_step=step + 1)
 
@@ -140,7 +152,7 @@ class MetricsLog:
 
 
 def identity_of(task: Task, statistics: DatasetStatistics, start: StartingWeights | None = None) -> dict[str, Any]:
-    """What makes a run this one and no other, as `config.json` holds it."""
+    """Returns what identifies a run, as stored in its `config.json`: task, data set, starting weights."""
     return as_read({"task": asdict(task), "data": statistics.fingerprint, "start": start and start.name})  # type: ignore[call-overload]
 
 
@@ -152,21 +164,26 @@ def fit(
     start: StartingWeights | None = None,
     mesh: Mesh | None = None,
 ) -> dict[str, Any]:
-    """Trains `task` on the data set in `data`, into `folder`, from `start` or random weights; returns the run's summary.
+    """Trains a network and returns the run's summary.
 
-    A finished run is returned as it is, an unfinished one goes on. `mesh` is all devices unless given.
+    The summary of a finished run is returned without training; an unfinished run is resumed.
+
+    Args:
+        task: what to train.
+        data: folder of the data set.
+        statistics: those of the data set.
+        folder: where the run is stored.
+        start: initial weights; random if None.
+        mesh: devices to train on; all if None.
 
     Raises:
-        DataError: where the folder holds a run of another configuration, or the devices cannot share a batch.
+        DataError: if the folder holds a run with another configuration, or the devices cannot share a batch.
         Preempted: after SIGTERM, once everything is saved.
-        FloatingPointError: where the loss is no longer a number.
+        FloatingPointError: if the training loss is no longer finite.
     """
     config = task.optimiser
     identity = identity_of(task, statistics, start)
-    if (folder / "config.json").exists() and read_json(folder / "config.json") != identity:
-        raise DataError(
-            f"{folder} holds a network trained with other settings; choose another --out, or delete that folder"
-        )
+    check_config(folder, identity, "a network trained")
     if (folder / "summary.json").exists():
         return read_json(folder / "summary.json")
     mesh = mesh or device_mesh()
@@ -180,7 +197,7 @@ def fit(
     structure, state = initial_state(task, config.seed, start)
     where = parameter_sharding(mesh, state)
     state = place(state, where)
-    # The state is given up to the step that changes it, and stays where it is.
+    # The old state is donated to the step, so that the new one takes its memory and keeps its placement.
     train_step = jax.jit(train_step_of(task, structure, epoch_steps), donate_argnums=0, out_shardings=(where, None))
     evaluate_step = jax.jit(summed_over(mesh, evaluate_step_of(task, structure)))
     validation = validation_set(task, data, statistics, mesh.shape[DATA])
@@ -190,7 +207,7 @@ def fit(
     with Checkpoints(folder) as checkpoints, progress_bar("views") as bar, Preemption() as preemption:
         if (saved := checkpoints.restore("latest", state)) is not None:
             state, progress = saved
-            console.print(f"{task.name}: going on after epoch {progress['epoch']}, step {int(state.step)}")
+            console.print(f"{task.name}: resuming after epoch {progress['epoch']}, step {int(state.step)}")
         step = int(state.step)
         log = MetricsLog(folder, step)
         batches = train_batches(data, task.batches, first_step=step)
@@ -233,7 +250,7 @@ def fit(
             log.write(
                 step, rates | {f"train/{k}": v for k, v in means.items()} | {f"val/{k}": v for k, v in checked.items()}
             )
-            # After the log: resuming takes back lines beyond the checkpoint, but cannot invent one that is missing.
+            # Saved after the log is written: resuming can remove lines beyond the checkpoint, but cannot restore a missing one.
             checkpoints.save("latest", step, state, progress)
             note = ", ".join(f"{name} {value:.4f}" for name, value in checked.items())
             bar.update(line, note=f"val {note}")
@@ -256,10 +273,10 @@ def fit(
 
 
 def load_best(task: Task, folder: Path) -> nnx.Module:
-    """The network of the best epoch.
+    """Returns the network with the weights of the best epoch.
 
     Raises:
-        DataError: where nothing was trained, or the network there has another shape than `task`'s.
+        DataError: if the folder holds no trained network, or one of another shape than `task` describes.
     """
     if not (folder / "best").is_dir():
         raise DataError(f"no trained {task.name} in {folder}; train one with: mevs train")
@@ -269,14 +286,14 @@ def load_best(task: Task, folder: Path) -> nnx.Module:
         if name in saved and saved[name] != wanted[name]:
             raise DataError(
                 f"the {task.name} in {folder} was trained for {saved[name]} {name}, the data set has {wanted[name]}; "
-                f"train another in another --out, or evaluate it on its own data set"
+                f"train a new one with another --out, or evaluate this one on its own data set"
             )
     layers = [{**config["network_config"], "dropout": None} for config in (saved, wanted)]
     if layers[0] != layers[1]:
         raise DataError(
-            f"the {task.name} in {folder} has other layers than asked for; use the settings it was trained with"
+            f"the {task.name} in {folder} has other layers than the settings describe; use the settings it was trained with"
         )
-    optimiser = replace(task.optimiser, method=saved["optimiser"]["method"])  # whose moments lie beside the weights
+    optimiser = replace(task.optimiser, method=saved["optimiser"]["method"])  # the checkpoint holds its moments too
     structure, like = abstract_state(replace(task, optimiser=optimiser))  # type: ignore[type-var]
     with Checkpoints(folder) as checkpoints:
         restored = checkpoints.restore("best", like)

@@ -1,4 +1,4 @@
-"""What a trained network outputs for every view of every object of a split."""
+"""Outputs of a trained network for every view of every object of a split."""
 
 from __future__ import annotations
 
@@ -19,15 +19,15 @@ from train.devices import device_mesh, parameter_sharding, place, place_batch
 from train.step import Batch, Task
 
 Ask = Callable[[Any, Task, Batch], jax.Array]
-"""A network, its task and a batch to what is wanted of each view, (views, numbers)."""
+"""A function of a network, its task and a batch that returns an output of each view, (views, numbers)."""
 
 
-def _answer(network: Any, task: Task, batch: Batch) -> jax.Array:
+def _output(network: Any, task: Task, batch: Batch) -> jax.Array:
     return network(task.inputs(batch))
 
 
 @partial(jax.jit, static_argnames=("task", "structure", "ask"))
-def _look(
+def _outputs_of_batch(
     task: Task,
     structure: nnx.GraphDef,
     state: nnx.State,
@@ -42,14 +42,15 @@ def network_outputs(
     split: str,
     task: Task,
     network: nnx.Module,
-    ask: Ask = _answer,
+    ask: Ask = _output,
     chosen: np.ndarray | None = None,
 ) -> np.ndarray:
-    """What a network says of every view of every object of a split, (objects, views, classes or views).
+    """Returns an output of a network for every view of every object of a split, (objects, views, numbers).
 
     Args:
-        ask: what is wanted of it; its outputs unless given.
-        chosen: positions of some objects in the split, in order; all of them unless given.
+        data: folder of the data set.
+        ask: computes the output of a batch; by default, what the network returns for the task's inputs.
+        chosen: positions of objects in the split, in order; all if None.
     """
     structure, state = nnx.split(network)
     mesh = device_mesh()
@@ -58,13 +59,13 @@ def network_outputs(
     objects = len(chosen)
     batches = evaluation_batches(data, split, points=task.batches.points, images=task.batches.images, chosen=chosen)
     with progress_bar("objects") as bar:
-        line = bar.add_task(f"Looking at {split} objects: {task.name}", total=objects, note="")
+        line = bar.add_task(f"Evaluating {task.name} on {split} objects", total=objects, note="")
         out = []
         while chunk := list(islice(batches, mesh.size)):
             filled = [*chunk, *chunk[:1] * (mesh.size - len(chunk))]
             batch = {name: np.concatenate([one[name] for one in filled]) for name in filled[0]}
-            # Fetched after the loop: the next objects are read while the devices look at these.
-            out.append(_look(task, structure, state, place_batch(mesh, batch), ask))
+            # Fetched only after the loop, so that the next objects are read while the devices compute.
+            out.append(_outputs_of_batch(task, structure, state, place_batch(mesh, batch), ask))
             bar.advance(line, len(chunk))
     found = np.concatenate([np.asarray(part) for part in out])
     return found.reshape(len(out) * mesh.size, -1, found.shape[-1])[:objects]

@@ -1,4 +1,4 @@
-"""A machine that is about to be taken away says so with SIGTERM: save, and leave."""
+"""Saving and leaving on SIGTERM, which clusters send before they take a machine away."""
 
 from __future__ import annotations
 
@@ -15,53 +15,51 @@ from jax.experimental import multihost_utils
 
 @contextmanager
 def interrupts_held() -> Iterator[None]:
-    """Holds an interrupt back to the end of the block: one that falls into Orbax's threads leaves them waiting for each other."""
+    """Delays interrupts until the end of the block; an interrupt during Orbax's work would leave its threads in a deadlock."""
     if threading.current_thread() is not threading.main_thread():
-        yield  # gets no signals
+        yield  # only the main thread receives signals
         return
-    heard: list[tuple[int, FrameType | None]] = []
-    numbers = [
-        signal.SIGINT,
-        *([signal.SIGALRM] if hasattr(signal, "SIGALRM") else []),
-    ]  # the alarm repeats an interrupt
+    received: list[tuple[int, FrameType | None]] = []
+    # SIGALRM too: the command line repeats an interrupt by an alarm.
+    numbers = [signal.SIGINT, *([signal.SIGALRM] if hasattr(signal, "SIGALRM") else [])]
     before: dict[int, Any] = {
-        number: signal.signal(number, lambda *arguments: heard.append(arguments)) for number in numbers
+        number: signal.signal(number, lambda *arguments: received.append(arguments)) for number in numbers
     }
     try:
         yield
     finally:
         for number, handler in before.items():
             signal.signal(number, handler)
-        if heard and callable(before[heard[0][0]]):
-            before[heard[0][0]](*heard[0])
+        if received and callable(before[received[0][0]]):
+            before[received[0][0]](*received[0])
 
 
 class Preempted(Exception):
-    """The training was asked to end, and saved what it had done."""
+    """Raised when a training was stopped by SIGTERM, after it saved its state."""
 
 
 class Preemption:
-    """Listens for SIGTERM while it is entered. Several processes agree on the step after which they all leave."""
+    """Context manager that notices SIGTERM. Several processes agree on the step after which they all stop."""
 
     def __init__(self) -> None:
         self.asked = False
-        # A library's loop in another thread gets no signals; several processes listen through JAX.
-        self._listens = jax.process_count() == 1 and threading.current_thread() is threading.main_thread()
+        # Only the main thread receives signals; with several processes, JAX handles SIGTERM.
+        self._handles = jax.process_count() == 1 and threading.current_thread() is threading.main_thread()
 
     def __enter__(self) -> Preemption:
-        if self._listens:
-            self._before = signal.signal(signal.SIGTERM, self._hear)
+        if self._handles:
+            self._before = signal.signal(signal.SIGTERM, self._on_signal)
         return self
 
     def __exit__(self, kind: type | None, error: BaseException | None, trace: TracebackType | None) -> None:
-        if self._listens:
+        if self._handles:
             signal.signal(signal.SIGTERM, self._before)
 
-    def _hear(self, number: int, frame: FrameType | None) -> None:
+    def _on_signal(self, number: int, frame: FrameType | None) -> None:
         self.asked = True
 
     def after(self, step: int) -> bool:
-        """Whether to leave after this step, of which every process asks in turn."""
+        """Returns whether to stop after this step; every process must call it for every step."""
         if jax.process_count() > 1:
             self.asked = multihost_utils.reached_preemption_sync_point(step) or self.asked
         return self.asked

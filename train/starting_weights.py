@@ -1,7 +1,7 @@
-"""Weights to begin with: a torchvision file, or a classifier trained here before.
+"""Initial weights of a training: from a torchvision file, or from a classifier trained before.
 
-A `.pth` file is a pickle, and unpickling runs whatever the file says. Here only the few names that a file of weights needs
-are known, none of them PyTorch's own code, and any other stops the reading; `.safetensors` files hold nothing but arrays.
+A `.pth` file is a pickle, and unpickling can run any code. The reader here accepts only the few names that a file of weights
+needs, runs none of PyTorch's code, and refuses any other name. `.safetensors` files hold nothing but arrays.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from collections import OrderedDict
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, BinaryIO, ClassVar
+from typing import Any, ClassVar
 
 import ml_dtypes
 import numpy as np
@@ -44,11 +44,11 @@ _LEGACY_MAGIC = 0x1950A86A20F9469CFC6C
 
 @dataclass(frozen=True)
 class StartingWeights:
-    """What a network begins with.
+    """Initial weights of a network.
 
     Attributes:
-        name: of the weights, and what tells them from others; a part of the identity of a training run.
-        put: fills a new network.
+        name: identifies the weights; part of the identity of a training run.
+        put: writes the weights into a new network.
     """
 
     name: str
@@ -60,7 +60,7 @@ class StartingWeights:
 
 @dataclass(frozen=True)
 class _Storage:
-    """A flat array of a file; its numbers may come after the pickle that speaks of it, so tensors are made last."""
+    """A flat array of a file. Its numbers may follow the pickle that refers to it, so tensors are built last."""
 
     key: str
     dtype: Any
@@ -93,7 +93,7 @@ def _parameter(tensor: _Tensor, *rest: Any) -> _Tensor:
 
 
 class _WeightsUnpickler(pickle.Unpickler):
-    """Knows ordered dictionaries, tensors and storages, and refuses the rest."""
+    """Unpickles ordered dictionaries, tensors and storages, and refuses everything else."""
 
     _known: ClassVar[dict[tuple[str, str], Any]] = {
         ("collections", "OrderedDict"): OrderedDict,
@@ -128,7 +128,7 @@ def _zip_state(content: bytes) -> tuple[Any, Callable[[_Storage], np.ndarray]]:
     return state, lambda storage: np.frombuffer(archive.read(f"{root}data/{storage.key}"), storage.dtype)
 
 
-def _legacy_state(file: BinaryIO) -> tuple[Any, Callable[[_Storage], np.ndarray]]:
+def _legacy_state(file: io.BytesIO) -> tuple[Any, Callable[[_Storage], np.ndarray]]:
     if _WeightsUnpickler(file).load() != _LEGACY_MAGIC:
         raise ValueError("it does not begin as a file of weights does")
     for _ in range(2):  # version, and the writer's machine
@@ -144,7 +144,10 @@ def _legacy_state(file: BinaryIO) -> tuple[Any, Callable[[_Storage], np.ndarray]
 
 
 def _flat(state: Any) -> dict[str, _Tensor]:
-    """The tensors by name, out of `state_dict` and without `module.` where a training script put them there."""
+    """Returns the tensors of a state dict by name.
+
+    A `state_dict` entry is unpacked, and the prefix `module.`, which some training scripts add, is removed.
+    """
     if isinstance(state, dict) and isinstance(state.get("state_dict"), dict):
         state = state["state_dict"]
     if not isinstance(state, dict) or not all(isinstance(value, _Tensor) for value in state.values()):
@@ -153,10 +156,10 @@ def _flat(state: Any) -> dict[str, _Tensor]:
 
 
 def read_state_dict(path: Path) -> dict[str, np.ndarray]:
-    """The arrays of a `.safetensors` file or of a PyTorch file (`.pth`, `.pt`, either of its formats), by torch's names.
+    """Returns the arrays of a `.safetensors` or PyTorch file (`.pth`, `.pt`, zip or legacy format) by PyTorch's names.
 
     Raises:
-        DataError: a file that cannot be read, is no state dict, or wants more than arrays.
+        DataError: if the file cannot be read, is no state dict, or refers to anything but arrays.
     """
     try:
         content = path.read_bytes()
@@ -194,17 +197,19 @@ def read_state_dict(path: Path) -> dict[str, np.ndarray]:
 
 
 def resnet_depth(state: dict[str, np.ndarray]) -> int:
-    """18 or 34, by the blocks of the third stage; 0 for another network."""
+    """Returns the depth of a ResNet, 18 or 34, by the blocks of its third stage; 0 for any other network."""
     if "layer1.0.conv3.weight" in state:
         return 0
     return {"1": 18, "5": 34}.get(max((n.split(".")[1] for n in state if n.startswith("layer3.")), default=""), 0)
 
 
 def weights_from_torch(paths: tuple[Path, ...], depth: int) -> StartingWeights:
-    """The ImageNet weights of a ResNet of that depth, from the one of `paths` that has them; the head stays as it is.
+    """Returns ImageNet weights of a ResNet, from the first of `paths` that holds one of this depth.
+
+    The head of the network that they are put into keeps its values.
 
     Raises:
-        DataError: where none has them, or one cannot be read.
+        DataError: if no file holds such a ResNet, or a file cannot be read.
     """
     for path in paths:
         state = read_state_dict(path)
@@ -227,7 +232,7 @@ def weights_from_torch(paths: tuple[Path, ...], depth: int) -> StartingWeights:
 
 
 def weights_from_network(trained: nnx.Module, name: str) -> StartingWeights:
-    """All weights of a network trained before, its head too."""
+    """Returns all weights of a trained network, including its head."""
 
     def put(network: nnx.Module) -> None:
         nnx.update(network, nnx.state(trained))

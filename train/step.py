@@ -1,13 +1,13 @@
-"""One step of training, a pure function of state, batch and hyper-parameters: jit it for a network, vmap it for a sweep.
+"""One training step as a pure function of state, batch and hyper-parameters: jit it for one network, vmap it for a sweep.
 
-The batch may lie on one device or on thousands: the sums over it, batch norm's among them, are over the whole of it, and a
-sample's random numbers depend on its place in it. So the number of devices changes the rounding of a result, and no more.
+The batch may be spread over any number of devices. Sums, those of batch norm included, are over the whole batch, and the random
+numbers of a sample depend on its position in the batch. So the number of devices changes nothing but rounding.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any, Protocol
+from typing import Any, Protocol, runtime_checkable
 
 import flax.struct
 import jax
@@ -26,14 +26,14 @@ Metrics = dict[str, jax.Array]
 
 @flax.struct.dataclass
 class Hyperparameters:
-    """What may differ between members of a sweep: numbers that one compiled program takes.
+    """Numbers that may differ between members of a sweep; arguments of the compiled step.
 
     Attributes:
-        learning_rate: at the start.
-        weight_decay: decoupled.
-        dropout: rate before the last layer, where a network has it.
-        augmentation: strength, in [0, 1].
-        seed: of initial weights, augmentation and dropout.
+        learning_rate: initial learning rate.
+        weight_decay: decoupled weight decay.
+        dropout: dropout rate before the last layer, for networks that have dropout.
+        augmentation: strength of the augmentation, in [0, 1].
+        seed: seed of initial weights, augmentation and dropout.
     """
 
     learning_rate: Any
@@ -53,8 +53,9 @@ class Hyperparameters:
         )
 
 
+@runtime_checkable
 class Task(Protocol):
-    """What one network adds to training."""
+    """What training needs to know of one kind of network."""
 
     @property
     def name(self) -> str: ...
@@ -67,36 +68,36 @@ class Task(Protocol):
 
     @property
     def metrics(self) -> tuple[str, ...]:
-        """Names of what `loss` and `evaluate` return, `loss` among them."""
+        """Names of the metrics that `loss` and `evaluate` return; includes `"loss"`."""
 
     @property
     def hyperparameters(self) -> Hyperparameters: ...
 
     def network(self, rngs: nnx.Rngs) -> Any:
-        """A new network."""
+        """Returns a new network with random weights."""
 
     def inputs(self, batch: Batch) -> jax.Array:
-        """What it looks at, of every view of a batch."""
+        """Returns the network's inputs for every view of a batch."""
 
     def loss(
         self, network: Any, batch: Batch, key: jax.Array, samples: jax.Array, hyper: Hyperparameters
     ) -> tuple[jax.Array, Metrics]:
-        """Mean training loss and metrics of a batch, `samples` views into the training."""
+        """Returns mean training loss and mean metrics of a batch; `samples` views were trained on before."""
 
     def evaluate(self, network: Any, batch: Batch) -> Metrics:
-        """Metrics of every view of a batch, each (views,); no augmentation, no dropout."""
+        """Returns the metrics of every view of a batch, each (views,), without augmentation and dropout."""
 
 
 @flax.struct.dataclass
 class TrainState:
-    """All that a step changes.
+    """Everything that a training step changes.
 
     Attributes:
-        step: steps done.
-        parameters: what is learned.
-        statistics: of batch norm.
-        moments: of the gradients, what the optimiser remembers.
-        sums: of the metrics, over the steps of this epoch.
+        step: number of steps done.
+        parameters: trainable weights.
+        statistics: running statistics of batch norm.
+        moments: state of the optimiser.
+        sums: sums of the metrics over the steps of this epoch.
     """
 
     step: jax.Array
@@ -109,7 +110,7 @@ class TrainState:
 def initial_state(
     task: Task, seed: jax.Array | int, start: StartingWeights | None = None
 ) -> tuple[nnx.GraphDef, TrainState]:
-    """The structure of a new network, and the state before the first step."""
+    """Returns the structure of a new network and the state before the first step; weights are random unless `start` is given."""
     network = task.network(nnx.Rngs(jax.random.key(seed)))
     if start is not None:
         start.put(network)
@@ -120,16 +121,16 @@ def initial_state(
 
 
 def abstract_state(task: Task) -> tuple[nnx.GraphDef, TrainState]:
-    """As `initial_state`, with shapes for arrays: what a checkpoint is read into. Nothing is drawn."""
+    """Returns `initial_state` with shapes in place of arrays, as the target for reading a checkpoint."""
     return jax.eval_shape(lambda: initial_state(task, 0))
 
 
 def train_step_of(
     task: Task, structure: nnx.GraphDef, epoch_steps: int
 ) -> Callable[[TrainState, Batch, Hyperparameters], tuple[TrainState, jax.Array]]:
-    """The training step of a network, to the new state and the loss, for jit or vmap.
+    """Returns the training step of a network, for jit or vmap: (state, batch, hyper-parameters) to (new state, loss).
 
-    The gradient is that of the mean over the whole batch, however many `parts` it comes in.
+    The gradient is that of the mean loss over the whole batch, also where the batch is processed in several `parts`.
     """
     config = task.optimiser
     method, rate = descent(config), learning_rate(config, epoch_steps * config.epochs)
@@ -144,7 +145,7 @@ def train_step_of(
         return gradients, metrics, changed
 
     def accumulated(state: TrainState, batch: Batch, key: jax.Array, hyper: Hyperparameters):
-        # Every parts-th view makes a part, so that each device's views are spread over all parts and stay where they are.
+        # A part is every `parts`-th view: each device then holds an equal share of every part, and no view is moved.
         split = {
             name: array.reshape(-1, config.parts, *array.shape[1:]).swapaxes(0, 1) for name, array in batch.items()
         }
@@ -168,7 +169,7 @@ def train_step_of(
         direction, moments = method.update(gradients, state.moments, state.parameters)
         step_size = rate(state.step, hyper.learning_rate)
         parameters = jax.tree.map(
-            lambda old, way: old - step_size * (way + hyper.weight_decay * old), state.parameters, direction
+            lambda old, update: old - step_size * (update + hyper.weight_decay * old), state.parameters, direction
         )
         first = state.step % epoch_steps == 0
         sums = {name: jnp.where(first, 0.0, state.sums[name]) + metrics[name] for name in state.sums}
@@ -180,7 +181,10 @@ def train_step_of(
 def evaluate_step_of(
     task: Task, structure: nnx.GraphDef
 ) -> Callable[[nnx.State, nnx.State, Batch, jax.Array], Metrics]:
-    """Sums of every metric over the views of a batch, by weight, and the sum of the weights (`views`)."""
+    """Returns the evaluation step: (parameters, statistics, batch, weights) to the weighted sum of every metric over the views.
+
+    The sum of the weights is returned as `"views"`.
+    """
 
     def evaluate_step(parameters: nnx.State, statistics: nnx.State, batch: Batch, weights: jax.Array) -> Metrics:
         found = task.evaluate(nnx.merge(structure, parameters, statistics), batch)

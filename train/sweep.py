@@ -1,8 +1,8 @@
-"""Many configurations of one network trained as one program: the training step, vmapped over states and hyper-parameters.
+"""Training of many configurations of one network as one program: the training step vmapped over states and hyper-parameters.
 
-All members see the same batches, so the data is read once for all of them; each device trains its share. A member that gets
-no better for `patience` epochs, or whose loss is no number any more, is left as it is while the others go on. A member ends
-as it would have ended alone.
+All members get the same batches, so the data is read once; each device trains its share of the members. A member that does not
+improve for `patience` epochs, or whose loss is not finite, is no longer changed while the others continue. Each member ends with
+the result that it would reach if trained alone.
 """
 
 from __future__ import annotations
@@ -26,6 +26,7 @@ from data_pipeline.files import as_read, read_json, write_json, write_text
 from data_pipeline.progress import console, progress_bar
 from train.checkpoints import Checkpoints
 from train.devices import DATA, device_mesh
+from train.kept import check_config
 from train.loop import Lead, identity_of, steps_of_an_epoch, validation_set, weighted_means
 from train.preemption import Preempted, Preemption
 from train.step import Hyperparameters, TrainState, abstract_state, evaluate_step_of, initial_state, train_step_of
@@ -38,34 +39,34 @@ Range = tuple[float, float]
 
 @dataclass(frozen=True)
 class SweepConfig:
-    """Which configurations are tried; a range whose ends are equal fixes what it is of."""
+    """The configurations of a sweep. A range with equal ends fixes the value."""
 
     network: Literal["entropy", "classifier"] = "entropy"
-    """which network"""
+    """the network to train"""
     members: int = 16
-    """configurations, drawn from the ranges by a Sobol sequence"""
+    """number of configurations, drawn from the ranges by a Sobol sequence"""
     learning_rate: Range = (3e-4, 1e-2)
-    """even in its logarithm"""
+    """range of the learning rate, uniform in its logarithm"""
     weight_decay: Range = (1e-4, 1e-1)
-    """even in its logarithm"""
+    """range of the weight decay, uniform in its logarithm"""
     dropout: Range = (0.0, 0.5)
-    """of the entropy predictor; the classifier has none"""
+    """range of the dropout rate of the entropy predictor; the classifier has none"""
     augmentation: Range = (0.0, 1.0)
-    """strength of what the network's augmentation switches on"""
+    """range of the strength of the augmentations that the network's settings switch on"""
     same_start: bool = False
-    """give all members the network's seed; else member i has i more than that, for other weights and draws"""
+    """give all members the network's seed; else member i has that seed + i, and so other initial weights and random draws"""
     seed: int = 0
-    """of the draw"""
+    """seed of the drawn configurations"""
 
 
 @dataclass(frozen=True)
 class Member:
-    """One configuration, and what became of it.
+    """One configuration and its result.
 
     Attributes:
         best: validation metrics of the best epoch.
-        epochs: trained.
-        diverged: its loss was no number any more.
+        epochs: number of epochs trained.
+        diverged: whether its loss became infinite or NaN.
     """
 
     learning_rate: float
@@ -84,22 +85,23 @@ class Member:
 
 
 def draw_members(config: SweepConfig, task: SweepTask) -> list[Member]:
-    """The configurations of a sweep.
+    """Returns the configurations of a sweep.
 
     Raises:
-        DataError: for a range that cannot be drawn from.
+        DataError: if there are no members, or a range is not valid.
     """
     if config.members < 1:
         raise DataError(f"--sweep.members {config.members} is too few; it must be at least 1")
     ranges = {"learning_rate": config.learning_rate, "weight_decay": config.weight_decay}
     for name, (low, high) in ranges.items():
         if not 0 < low <= high:
-            raise DataError(f"--sweep.{name.replace('_', '-')} {low} {high} must go up from more than 0")
+            raise DataError(f"--sweep.{name.replace('_', '-')} {low} {high} must be a range above 0, smaller end first")
     shares = {"dropout": config.dropout, "augmentation": config.augmentation}
     for name, (low, high) in shares.items():
         if not 0 <= low <= high <= 1 or (name == "dropout" and high == 1):
-            raise DataError(f"--sweep.{name} {low} {high} must go up within 0 and 1")
-    from scipy.stats import qmc  # which takes a third of a second to import
+            limits = "[0, 1)" if name == "dropout" else "[0, 1]"
+            raise DataError(f"--sweep.{name} {low} {high} must be a range within {limits}, smaller end first")
+    from scipy.stats import qmc  # imported late: it takes a third of a second
 
     low, high = np.array([*(np.log(pair) for pair in ranges.values()), *shares.values()]).T
     drawn = qmc.Sobol(len(low), seed=config.seed).random_base2(int(np.ceil(np.log2(config.members))))
@@ -119,7 +121,7 @@ def draw_members(config: SweepConfig, task: SweepTask) -> list[Member]:
 
 
 def task_of(task: SweepTask, member: Member) -> SweepTask:
-    """What `train.loop.fit` would train alone to get the same network."""
+    """Returns the task with which `train.loop.fit` trains the same network alone."""
     optimiser = replace(
         task.optimiser, learning_rate=member.learning_rate, weight_decay=member.weight_decay, seed=member.seed
     )
@@ -142,33 +144,48 @@ def sweep(
     config: SweepConfig,
     mesh: Mesh | None = None,
 ) -> list[Member]:
-    """Trains all members; returns them, and leaves `members.json` and the best one as a run of its own (`network/`).
+    """Trains all members and returns them with their results.
 
-    An interrupted sweep goes on from its last epoch.
+    Writes `members.json`, and the best member as a run of its own in `network/`. An interrupted sweep resumes after its last
+    complete epoch; a finished one is read from `members.json`.
+
+    Args:
+        task: the network's training; each member changes its hyper-parameters.
+        data: folder of the data set.
+        statistics: those of the data set.
+        folder: where the sweep is stored.
+        config: the ranges to draw from.
+        mesh: devices to train on; all if None.
 
     Raises:
-        DataError: for a configuration that cannot be drawn or shared out, or a folder with another sweep.
+        DataError: if the ranges are not valid, the devices cannot share the members equally, the folder holds another sweep, or
+            every member diverged.
         Preempted: after SIGTERM, at the end of an epoch.
     """
     identity = as_read({"task": asdict(task), "sweep": asdict(config), "data": statistics.fingerprint})
-    if (folder / "config.json").exists() and read_json(folder / "config.json") != identity:
-        raise DataError(f"{folder} holds a sweep made with other settings; choose another --out, or delete that folder")
+    check_config(folder, identity, "a sweep made")
     members = draw_members(config, task)
     if (folder / "members.json").exists():
         return [Member(**member) for member in read_json(folder / "members.json")]
     mesh = mesh or device_mesh()
     if len(members) % mesh.size:
-        raise DataError(f"--sweep.members {len(members)} cannot be shared equally by {mesh.size} devices")
+        raise DataError(
+            f"--sweep.members {len(members)} cannot be shared equally by {mesh.size} devices; choose a multiple"
+        )
     write_json(folder / "config.json", identity)
 
     optimiser = task.optimiser
     epoch_steps = steps_of_an_epoch(task, statistics)
     hyper = jax.tree.map(lambda *numbers: np.stack(numbers), *(task_of(task, m).hyperparameters for m in members))
     structure, _ = abstract_state(task)
-    apart = NamedSharding(mesh, PartitionSpec(DATA))
+    by_member = NamedSharding(mesh, PartitionSpec(DATA))
 
     def over_members(function: Callable, arguments: str) -> Callable:
-        """`function` for all members, shared out; each of its arguments is of a member (m) or the same for all (s)."""
+        """Returns `function` mapped over all members, which the devices share.
+
+        Args:
+            arguments: a letter for each argument: m (one value per member) or s (the same for all).
+        """
         axes = tuple(0 if kind == "m" else None for kind in arguments)
         specs = tuple(PartitionSpec(DATA) if kind == "m" else PartitionSpec() for kind in arguments)
         vmapped = jax.vmap(function, axes)
@@ -185,14 +202,14 @@ def sweep(
     keep = jax.jit(
         over_members(lambda better, new, old: jax.tree.map(lambda a, b: jnp.where(better, a, b), new, old), "mmm")
     )
-    state = jax.jit(over_members(lambda seed: initial_state(task, seed)[1], "m"))(jax.device_put(hyper.seed, apart))
-    hyper = jax.device_put(hyper, apart)
+    state = jax.jit(over_members(lambda seed: initial_state(task, seed)[1], "m"))(jax.device_put(hyper.seed, by_member))
+    hyper = jax.device_put(hyper, by_member)
     best = jax.tree.map(jnp.copy, (state.parameters, state.statistics))
 
     progress: dict[str, Any] = {"epoch": 0, "seconds": 0.0, "histories": [[] for _ in members]}
-    validation = validation_set(task, data, statistics, devices=1)  # every member sees all of a batch
+    validation = validation_set(task, data, statistics, devices=1)  # every member is evaluated on the whole batch
 
-    def goes_on(member: Member) -> bool:
+    def is_training(member: Member) -> bool:
         return not member.diverged and member.epochs - member.best_epoch < optimiser.patience
 
     lead = Lead()
@@ -200,7 +217,7 @@ def sweep(
         if (saved := checkpoints.restore("latest", (state, best))) is not None:
             (state, best), progress = saved
             members = [Member(**member) for member in progress.pop("members")]
-            console.print(f"Sweep: going on after epoch {progress['epoch']}")
+            console.print(f"Sweep: resuming after epoch {progress['epoch']}")
         batches = train_batches(data, task.batches, first_step=progress["epoch"] * epoch_steps)
         line = bar.add_task(
             f"Sweep of {len(members)}: {task.name}",
@@ -208,9 +225,9 @@ def sweep(
             completed=progress["epoch"] * epoch_steps * optimiser.batch_size,
             note="",
         )
-        while progress["epoch"] < optimiser.epochs and any(map(goes_on, members)):
+        while progress["epoch"] < optimiser.epochs and any(map(is_training, members)):
             started = time.perf_counter()
-            training = np.array([goes_on(member) for member in members])
+            training = np.array([is_training(member) for member in members])
             for _ in range(epoch_steps):
                 state, loss = train_step(training, state, next(batches), hyper)
                 lead.limit(loss)
@@ -226,8 +243,8 @@ def sweep(
             )
             leader = min(members, key=lambda member: member.loss)
             console.print(
-                f"Sweep of {len(members)}, epoch {progress['epoch']}/{optimiser.epochs}: {sum(map(goes_on, members))} go on, "
-                f"best val loss {leader.loss:.4f}"
+                f"Sweep of {len(members)}, epoch {progress['epoch']}/{optimiser.epochs}: "
+                f"{sum(map(is_training, members))} still train, best val loss {leader.loss:.4f}"
             )
             if preemption.after(progress["epoch"]):
                 raise Preempted(f"the sweep was asked to end after epoch {progress['epoch']}")
@@ -243,7 +260,7 @@ def _after_epoch(
     checked: dict[str, Any],
     progress: dict[str, Any],
 ) -> tuple[list[Member], np.ndarray]:
-    """Members with this epoch counted, and which of them were never better."""
+    """Returns the members with this epoch's results, and for each whether this is its best epoch so far."""
     after, better = [], np.zeros(len(members), bool)
     for index, member in enumerate(members):
         if training[index]:
@@ -271,7 +288,7 @@ def _export(
     best: Any,
     epoch_steps: int,
 ) -> None:
-    """Writes the best member as `train.loop.fit` would have left it, into `network/`."""
+    """Writes the best member into `network/`, in the form in which `train.loop.fit` stores a run."""
     index = int(np.argmin([member.loss for member in members]))
     member, alone = members[index], task_of(task, members[index])
     if member.best is None:

@@ -1,4 +1,4 @@
-"""The thesis's networks: four classifiers, two of which go on from another, and PointNet++ for two lattices and two frames."""
+"""The thesis's eight networks: four classifiers, two fine-tuned from another, and PointNet++ for two lattices and two frames."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from train.tasks.classifier import ClassifierConfig, ClassifierTask, ResNetConfi
 from train.tasks.entropy import EntropyConfig, EntropyTask
 
 VIEWS = (10, 40)
-"""The thesis's two data sets, by views of an object."""
+"""The thesis's two data sets, by number of views per object."""
 Frame = Literal["world", "camera"]
 FRAMES: tuple[Frame, ...] = ("world", "camera")
 
@@ -25,12 +25,12 @@ class Backbone:
     """One of the thesis's classifiers (§5.3.3, Table 5).
 
     Attributes:
-        name: of its folder.
-        title: the thesis's.
-        depth: of the ResNet.
-        images: what it looks at.
-        views: the data set it is trained on.
-        start: the backbone it goes on from; None for ImageNet's weights, or random ones where there are none.
+        name: name of its folder.
+        title: name in the thesis.
+        depth: depth of the ResNet.
+        images: its input.
+        views: views per object of the data set it is trained on.
+        start: name of the backbone whose weights it starts from; None: ImageNet's weights if they are given, else random ones.
     """
 
     name: str
@@ -48,34 +48,34 @@ BACKBONES = (
     Backbone("resnet34_depth_40", "ResNet-34 (40 views/object, depth)", 34, "depth", 40),
 )
 PIPELINE = tuple(backbone for backbone in BACKBONES if backbone.views == 40)
-"""Those that are walked with (§5.3.3: "the last 3 models in Table 6")."""
+"""The backbones that view selection is evaluated with (§5.3.3: "the last 3 models in Table 6")."""
 
 
 @dataclass(frozen=True)
 class ThesisConfig:
-    """What `mevs study thesis` sets beyond the settings of a single run, from which all else is taken."""
+    """Settings of `mevs study thesis` beyond those of a single run."""
 
     resnet18: OptimiserConfig = OptimiserConfig(weight_decay=1e-4)
-    """how the first ResNet-18 is trained"""
+    """training of the first ResNet-18"""
     resnet34: OptimiserConfig = OptimiserConfig(weight_decay=1e-4)
-    """how ResNet-34 is trained"""
+    """training of ResNet-34"""
     fine_tuning: OptimiserConfig = OptimiserConfig(weight_decay=1e-4)
-    """how classifiers are trained that go on from another"""
+    """training of the classifiers that start from another one's weights"""
     resnet34_width: int = 64
     """channels of ResNet-34's first stage"""
     timing_runs: int = 50
-    """of PointNet++ on each class, for the thesis's Table 3"""
+    """timed runs of PointNet++ on each class, for the thesis's Table 3"""
     ascent_runs: int = 3
-    """objects of each class that are climbed on, for the thesis's Table 2"""
+    """objects of each class on which the viewpoint is optimised, for the thesis's Table 2"""
     ascent_starts: int = 8
-    """viewpoints to climb from; the thesis's times are of one"""
+    """initial viewpoints of each optimisation; the thesis's times are of one"""
     ascent_resolution: int = 64
-    """pixels along each side of what is rendered on the way"""
+    """resolution of the rendered images in pixels per side"""
 
 
 @dataclass(frozen=True)
 class ThesisFolder:
-    """Where everything of a thesis run lies."""
+    """Paths within the folder of a thesis run."""
 
     out: Path
 
@@ -89,7 +89,7 @@ class ThesisFolder:
         return self.out / "entropy" / f"{views}_{frame}"
 
     def networks(self) -> dict[str, Path]:
-        """The folders of all eight, by name."""
+        """Returns the folders of all eight networks, by name."""
         out = {backbone.name: self.backbone(backbone.name) for backbone in BACKBONES}
         return out | {f"entropy_{views}_{frame}": self.entropy(views, frame) for views in VIEWS for frame in FRAMES}
 
@@ -98,7 +98,7 @@ class ThesisFolder:
 
 
 def backbone_network(backbone: Backbone, classifier: ClassifierConfig, thesis: ThesisConfig) -> ResNetConfig:
-    """The shape of a backbone, under the settings of a run."""
+    """Returns the network configuration of a backbone under the settings of a run."""
     width = classifier.network.width if backbone.depth == 18 else thesis.resnet34_width
     return replace(classifier.network, depth=backbone.depth, width=width)
 
@@ -106,10 +106,10 @@ def backbone_network(backbone: Backbone, classifier: ClassifierConfig, thesis: T
 def first_weights(
     classifier: ClassifierConfig, thesis: ThesisConfig, pretrained: tuple[Path, ...]
 ) -> dict[str, StartingWeights | None]:
-    """What the backbones begin with that go on from no other, by name.
+    """Returns the initial weights of the backbones that start from no other backbone, by name.
 
     Raises:
-        DataError: where the files cannot be read, or one that is needed is not among them.
+        DataError: if a file cannot be read, or no file fits a backbone.
     """
     return {
         backbone.name: starting_weights(pretrained, backbone_network(backbone, classifier, thesis))
@@ -121,7 +121,7 @@ def first_weights(
 def backbone_task(
     backbone: Backbone, classifier: ClassifierConfig, thesis: ThesisConfig, statistics: DatasetStatistics
 ) -> ClassifierTask:
-    """How a backbone is trained, under the settings of a run."""
+    """Returns the training task of a backbone under the settings of a run."""
     alone = thesis.resnet18 if backbone.depth == 18 else thesis.resnet34
     config = replace(
         classifier,
@@ -134,7 +134,7 @@ def backbone_task(
 
 
 def entropy_task(frame: Frame, entropy: EntropyConfig, statistics: DatasetStatistics) -> EntropyTask:
-    """How PointNet++ is trained for a lattice and a frame: the same but for the frame."""
+    """Returns the training task of PointNet++ for a lattice and a frame; only the frame differs from the run's settings."""
     config = replace(entropy, network=replace(entropy.network, frame=frame))
     task = EntropyTask.of(config, statistics.views, statistics.entropy_max, statistics.camera)
     return replace(task, name=f"PointNet++ ({statistics.views} views, {frame} frame)")
@@ -147,7 +147,7 @@ def train_thesis(
     thesis: ThesisConfig,
     first: dict[str, StartingWeights | None],
 ) -> None:
-    """Trains all eight networks, skipping those that are done; `first` is what `first_weights` gives."""
+    """Trains all eight networks, skipping those that are finished; `first` is the result of `first_weights`."""
     for backbone in BACKBONES:
         statistics = folder.statistics(backbone.views)
         task = backbone_task(backbone, classifier, thesis, statistics)
@@ -163,7 +163,7 @@ def train_thesis(
 def _weights_before(
     backbone: Backbone, folder: ThesisFolder, classifier: ClassifierConfig, thesis: ThesisConfig
 ) -> StartingWeights:
-    """The weights of the backbone that this one goes on from."""
+    """Returns the weights of the backbone that this one starts from."""
     before = next(other for other in BACKBONES if other.name == backbone.start)
     task = backbone_task(before, classifier, thesis, folder.statistics(before.views))
     trained = folder.backbone(before.name)

@@ -24,14 +24,12 @@ import numpy as np
 from data_pipeline.capture.casting import Capture, CaptureConfig, Rig, check_camera, load_capture, rig_for
 from data_pipeline.capture.workers import capture_all, capture_path
 from data_pipeline.dataset.beam import beam_options, capture_by_beam, examples_by_beam
-from data_pipeline.dataset.inputs import metric_depth
 from data_pipeline.dataset.statistics import (
     SPLITS,
     SUMMARY,
     DatasetStatistics,
     StatisticsCollector,
     load_statistics,
-    report_left_out,
 )
 from data_pipeline.errors import DataError
 from data_pipeline.files import read_json, write_json
@@ -43,21 +41,6 @@ from data_pipeline.objects.sources import Reading, mesh_zip, open_source
 from data_pipeline.progress import console, progress_bar
 from mevs_jax.entropy import level_entropy
 from mevs_jax.viewpoints import viewpoint_lattice
-
-__all__ = [
-    "SPLITS",
-    "DataConfig",
-    "DatasetStatistics",
-    "example_of",
-    "load_statistics",
-    "metric_depth",
-    "open_objects",
-    "open_split",
-    "prepare",
-    "report_left_out",
-    "split_objects",
-    "view_entropies",
-]
 
 
 SOURCE_STATE = "source.json"

@@ -7,7 +7,7 @@ import math
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Float, Int, Integer
 
 from data_pipeline.capture.casting import DEPTH_SCALE, CaptureConfig
 from mevs_jax.cameras import Camera, pixel_directions, unproject
@@ -19,7 +19,7 @@ def metric_depth(stored: jax.Array | np.ndarray) -> jax.Array:
 
 
 def image_input(
-    view: Int[Array, "height width"], images: str, channels: int, camera: CaptureConfig
+    view: Integer[Array, "height width"], images: str, channels: int, camera: CaptureConfig
 ) -> Float[Array, "height width channels"]:
     """Returns one stored view as an image in [0, 1], background 0, repeated over the channels.
 
@@ -38,7 +38,7 @@ def image_input(
     return jnp.repeat(pixels[..., None], channels, axis=-1)
 
 
-def depth_and_normals(view: Int[Array, "height width"], camera: CaptureConfig) -> Float[Array, "height width 4"]:
+def depth_and_normals(view: Integer[Array, "height width"], camera: CaptureConfig) -> Float[Array, "height width 4"]:
     """Returns depth (as `image_input`) and the unit surface normal of each pixel in the camera's frame, 0 for background.
 
     A normal is that of the plane through the point of a pixel and one neighbour along each image axis, the one closer in
@@ -67,7 +67,7 @@ def depth_and_normals(view: Int[Array, "height width"], camera: CaptureConfig) -
 
 def cloud_input(
     pixels: Int[Array, " points"],
-    pixel_depth: Int[Array, " points"],
+    pixel_depth: Integer[Array, " points"],
     pose: Float[Array, "4 4"],
     camera: CaptureConfig,
     frame: str,

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 
@@ -34,6 +34,7 @@ class Mesh:
     extent: np.ndarray
 
 
+@runtime_checkable
 class Recipe(Protocol):
     """Makes one mesh. Recipes are small and picklable, so that worker processes receive them instead of meshes."""
 

@@ -14,13 +14,27 @@ from data_pipeline.objects.mesh import Mesh
 
 
 def _open3d() -> Any:
-    try:
-        import open3d
-    except (ImportError, OSError) as error:
-        raise DataError(
-            f"reconstruction and voxelisation need Open3D, which cannot be loaded here ({error}); install libusb-1.0 and libgl1"
-        ) from error
+    import open3d
+
     return open3d
+
+
+def why_no_open3d() -> str | None:
+    """Returns why Open3D cannot be loaded here, and what to do, in a clause; None if it can be."""
+    try:
+        _open3d()
+    except (ImportError, OSError) as error:
+        return (
+            f"Open3D cannot be loaded here ({error}); it needs packages of the system, "
+            f"on Debian and Ubuntu: apt-get install libgl1 libgomp1 libusb-1.0-0 libx11-6"
+        )
+    return None
+
+
+def require_open3d() -> None:
+    """Raises `DataError` if Open3D cannot be loaded. Call it before work that would be lost otherwise."""
+    if (reason := why_no_open3d()) is not None:
+        raise DataError(f"reconstruction and voxelisation need Open3D, but {reason}")
 
 
 def _surface(mesh: Mesh) -> Any:

@@ -1,11 +1,11 @@
-"""What the networks of `mevs study learned` reach: on each lattice, without a pose, on classes never chosen for, and how fast.
+"""Measurements of `mevs study learned`: each lattice, unknown poses, classes left out of policy training, and decision time.
 
-What is found is kept in files of the seed's folder; what is there is not measured again.
+Results are stored in the folder of the seed and reused.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import fields, replace
 from functools import partial
 from pathlib import Path
@@ -20,36 +20,38 @@ from jaxtyping import Array
 from data_pipeline.dataset.builder import open_split
 from data_pipeline.dataset.inputs import depth_and_normals
 from data_pipeline.dataset.statistics import load_statistics
-from data_pipeline.files import as_read, read_json, write_json, write_npz
+from data_pipeline.files import read_json, write_npz
 from data_pipeline.progress import console
 from eval.learned.stopping import MOVEMENT_COSTS, VIEW_COSTS
 from eval.learned.study import ByObject, novel_classes, seeds_together, study
-from eval.learned.walks import OnLattice
+from eval.learned.walks import Learner, OnLattice
 from eval.numbers.timing import milliseconds
 from eval.tables import load_view_tables
 from eval.thesis.results import machine
 from mevs_jax.models import Recogniser
 from mevs_jax.models.view_policy import expected_gain
 from mevs_jax.viewpoints import viewpoint_lattice
-from train.choosing.stages import Stages, lattice_data
-from train.kept import made_by
+from train.choosing.stages import VARIANTS, Stages, lattice_data
+from train.kept import kept_json, made_by
 from train.loop import load_best
 
-_FORM = 5
-"""Of what is kept of walks; with another one they are walked again."""
+_FORM = 6
+"""Version of the stored walks; another version makes them stale."""
 
 
 def train_all(stages: Stages) -> None:
-    """Every network of one seed, but those that only one part of what is measured asks for."""
+    """Trains the networks of one seed that all measurements need; the others are trained when `measure` needs them."""
     stages.prepare()
     stages.train_recogniser()
     stages.policy("learned")
 
 
 def measure(stages: Stages) -> dict[str, Any]:
-    """What one seed's networks reach by number of candidate views. With the first seed, also where nobody knows which way the
-    objects face, among directions of their own around every object, ablations, classes never chosen for, and objects turned
-    anyhow."""
+    """Returns the metrics of one seed, by number of candidate views.
+
+    The first seed also has unknown yaw, separate candidate directions for each object, ablations, classes left out of policy
+    training, and objects in any rotation.
+    """
     own, config = stages.dataset.capture.views, stages.config
 
     def on_lattice(views: int, **given: Any) -> dict[str, Any]:
@@ -72,7 +74,7 @@ def measure(stages: Stages) -> dict[str, Any]:
 
 
 def together(seeds: Sequence[Stages], found: Sequence[dict[str, Any]]) -> dict[str, Any]:
-    """What all seeds reach on average, by number of candidate views; `found` is what `measure` gave for each."""
+    """Means over all seeds, by number of candidate views; `found` holds the result of `measure` for each seed."""
     lattices = {}
     for views, first in found[0]["lattices"].items():
         each = []
@@ -88,28 +90,30 @@ def together(seeds: Sequence[Stages], found: Sequence[dict[str, Any]]) -> dict[s
     return lattices
 
 
-def _kept(path: Path, identity: dict[str, Any], find: Callable[[], dict[str, Any]]) -> dict[str, Any]:
-    """What the file holds under this identity, else what is found now."""
-    identity = as_read(identity)
-    if not path.exists() or read_json(path)["identity"] != identity:
-        write_json(path, find() | {"identity": identity})
-    return read_json(path)
+def learner_of(stages: Stages, name: str) -> Learner:
+    """Returns a variant of the view policy by its name in `VARIANTS`, trained first if it is not yet."""
+    variant = VARIANTS[name]
+    made_as = variant.network or name
+    fusion = stages.fusion(posed=variant.posed, summed=True) if variant.summed else None
+    return Learner(name, variant.title, stages.policy(made_as), variant.by, made_as, fusion)
 
 
 def _walks(
     stages: Stages, views: str, data: Path, ablations: tuple[str, ...] = (), posed: bool = True
 ) -> dict[str, Any]:
-    """Every policy's walks among the views of a data set, which the features kept are named after; or those of the method and its
-    ablations."""
+    """Metrics of the walks on one data set, of all policies or of the method and its ablations.
+
+    `views` names the data set in the files of features and walks.
+    """
     config, method = stages.config, "learned" if posed else "learned_unposed"
     shared = posed and data != stages.turned
     names = [method, *ablations, *["learned_and_table"] * (shared and not ablations)]
     if "cloud" in names and not stages.has_clouds:
         console.print(
-            f"Left out: the view policy that sees clouds; PointNet++ is trained by: mevs train --out {stages.out}"
+            f"The ablation with PointNet++ embeddings is left out; train PointNet++ with: mevs train --out {stages.out}"
         )
         names.remove("cloud")
-    learners = [stages.learner(name) for name in names]
+    learners = [learner_of(stages, name) for name in names]
     learners[0] = replace(learners[0], name="learned")
     costs = posed and not ablations and data == stages.out / "data"
     kind = ("" if posed else "_unposed") + ("_ablations" if ablations else "")
@@ -123,12 +127,12 @@ def _walks(
 
     def walk() -> dict[str, Any]:
         validation, test = map(objects_of, ("val", "test"))
-        known = "" if posed else ", which way they face unknown"
+        pose = "" if posed else ", unknown yaw"
         objects, count, _ = test.features.logits.shape
-        around = " of its own around each" if data == stages.turned else ""
-        around = ", objects turned anyhow" if stages.upright is not None else around
+        around = ", separate for each object" if data == stages.turned else ""
+        around = ", objects in any rotation" if stages.upright is not None else around
         console.print(
-            f"Walking {objects} test objects, {count} candidate views{around}{known}{', ablations' * bool(ablations)}"
+            f"Walking {objects} test objects, {count} candidate views{around}{pose}{', ablations' * bool(ablations)}"
         )
         found, each = study(
             stages.fusion(posed=posed),
@@ -161,18 +165,18 @@ def _walks(
             costs and [VIEW_COSTS, MOVEMENT_COSTS],
         ],
     }
-    return _kept(path, identity, walk)
+    return kept_json(path, identity, walk)
 
 
 def _rotated(stages: Stages) -> dict[str, Any]:
-    """Walks around objects turned by any rotation, which the recogniser was trained further on."""
-    turned_anyhow = stages.rotated()
-    turned_anyhow.train_recogniser()
-    return _walks(turned_anyhow, "turned", stages.turned, posed=False)
+    """Metrics for objects in any rotation, after further training of the recogniser on such objects."""
+    rotated = stages.rotated()
+    rotated.train_recogniser()
+    return _walks(rotated, "turned", stages.turned, posed=False)
 
 
 def _novel(stages: Stages) -> dict[str, Any]:
-    """How policies do on the classes that they were trained without; encoder and fusion know all."""
+    """Metrics of policies on classes that they were trained without; encoder and fusion were trained on all classes."""
     views, classes = stages.dataset.capture.views, len(stages.statistics.classes)
     data = lattice_data(stages.dataset, stages.out, views)
     half = classes // 2
@@ -191,17 +195,17 @@ def _novel(stages: Stages) -> dict[str, Any]:
             stages.fusion(), policies, stages.policy(), test, stages.config.max_views, stages.config.draws, stages.seed
         )
 
-    return _kept(stages.folder / "walks_novel.json", identity, walk)
+    return kept_json(stages.folder / "walks_novel.json", identity, walk)
 
 
 def _decision(stages: Stages) -> dict[str, Any]:
     policy = read_json(stages.policy_folder() / "summary.json")["identity"]
     identity = {"policy": policy, "machine": machine(), "candidates": stages.dataset.capture.views}
-    return _kept(stages.folder / "decision.json", identity, partial(_decision_times, stages))
+    return kept_json(stages.folder / "decision.json", identity, partial(_decision_times, stages))
 
 
 def _decision_times(stages: Stages, calls: int = 200) -> dict[str, Any]:
-    """Time of one decision among all candidate views (ms), from features that are there and from the newest depth image on."""
+    """Time of one decision among all candidate views (ms), from stored features and from the latest depth image."""
     task, camera, most = stages.task(), stages.dataset.capture, stages.config.max_views
     recogniser = load_best(task, stages.recogniser_folder())
     assert isinstance(recogniser, Recogniser)
@@ -242,13 +246,13 @@ def _decision_times(stages: Stages, calls: int = 200) -> dict[str, Any]:
 
 
 def _entropy_tables(out: Path, data: Path, split: str) -> Path | None:
-    """Where `mevs run` has put what the entropy predictor says of this data set, if it has."""
+    """Path of the view tables of `mevs run` for this data set, or None."""
     path = out / "tables" / f"{split}.npz"
     return path if data == out / "data" and path.exists() else None
 
 
 def _entropies(out: Path, data: Path, split: str) -> tuple[np.ndarray | None, np.ndarray | None]:
-    """What the entropy predictor of the run says of every view, and the true entropies, where they are known."""
+    """Predicted and true entropies of the split, or None for each without view tables of `mevs run`."""
     path = _entropy_tables(out, data, split)
     if path is None:
         return None, None

@@ -1,4 +1,4 @@
-"""The page of `mevs study learned`: learned fusion and learned choice beside every other policy, with intervals."""
+"""The page of `mevs study learned`: learned fusion and learned view selection compared with all other policies."""
 
 from __future__ import annotations
 
@@ -12,13 +12,12 @@ from data_pipeline.dataset.statistics import DatasetStatistics
 from data_pipeline.files import write_text
 from eval.learned.study import BASELINES
 from eval.report import figures
-from eval.report.html import ReportInputs, difference, document, image, percent, signed, span, table
-from eval.walks.ladder import KNOWS
+from eval.report.html import ReportInputs, difference, document, image, percent, rows_by_knowledge, signed, span, table
 
 METHOD = "learned"
 """The policy that the page is about."""
 _SHOWN = (0, 1, 2, 3, 5, 7)
-"""Steps of walks in tables, from the first view."""
+"""Steps of a walk that the tables show; 0 is the first view."""
 
 
 def _accuracy(share: float, interval: list[float]) -> str:
@@ -26,39 +25,35 @@ def _accuracy(share: float, interval: list[float]) -> str:
 
 
 def _ladder(found: dict[str, Any]) -> str:
-    rows, known, with_gap = [], None, bool(found["gap_closed"])
+    rows, with_gap = [], bool(found["gap_closed"])
     steps = [step for step in _SHOWN if step < len(found["policies"]["random"]["after_views"])]
     for name, policy in found["policies"].items():
-        if policy["knows"] != known:
-            known = policy["knows"]
-            rows.append([f'<b class="note">Knows {html.escape(KNOWS[known])}</b>'])
         cells = [_accuracy(*cell) for cell in zip(policy["after_views"], policy["interval"], strict=True)]
         closed = ["–" if share is None else signed(share, 0).lstrip("+") for share in found["gap_closed"].get(name, ())]
-        rows.append(
-            [
-                html.escape(policy["title"]),
-                *(cells[step] if step < len(cells) else "" for step in steps),
-                *[" / ".join(closed)] * with_gap,
-            ]
-        )
-    header = ["next view chosen by", *(str(step + 1) for step in steps), *["% of the gap"] * with_gap]
-    note = "Accuracy (%) after exactly so many views, with 95 % intervals over objects."
+        row = [
+            html.escape(policy["title"]),
+            *(cells[step] if step < len(cells) else "" for step in steps),
+            *[" / ".join(closed)] * with_gap,
+        ]
+        rows.append((policy["knows"], row))
+    header = ["next view chosen by", *(str(step + 1) for step in steps), *["gap closed (%)"] * with_gap]
+    note = "Accuracy (%) after exactly the given number of views, with 95 % intervals over objects."
     if with_gap:
         note += (
-            " Gap: of the way from random to the label-free oracle after 2 / 3 / 4 views. The oracles try every view and walk "
-            f"from {found['trying_starts']} of the {found['views']} starts, on which the gap is read; the label oracle finds "
-            "views that are right by luck."
+            " Gap closed: gain over random, in percent of the gain of the label-free oracle, after 2 / 3 / 4 views. The oracles "
+            f"try every view and walk from {found['trying_starts']} of the {found['views']} start views; the gap is computed on "
+            "these. The label oracle also finds views that are right by chance."
         )
-    return table(header, rows) + f"<p class='note'>{note}</p>"
+    return table(header, rows_by_knowledge(rows)) + f"<p class='note'>{note}</p>"
 
 
 def _against(found: dict[str, Any], bases: tuple[str, ...] = BASELINES) -> str:
-    """Paired differences, in accuracy and in what beliefs say of the true class."""
+    """Paired differences in accuracy and in the log-probability of the true class."""
     rows, steps = [], (1, 2, 3)
     for base in bases:
         if base not in found["policies"]:
             continue
-        rows.append([f'<b class="note">Above “{html.escape(found["policies"][base]["title"])}”</b>'])
+        rows.append([f'<b class="note">Difference from “{html.escape(found["policies"][base]["title"])}”</b>'])
         for name, policy in found["policies"].items():
             if name not in found["against"][base] or policy["knows"] in ("nothing", "truth"):
                 continue
@@ -70,18 +65,19 @@ def _against(found: dict[str, Any], bases: tuple[str, ...] = BASELINES) -> str:
                 rows[-1] += cells + [""] * (len(steps) - len(cells))
     header = [f"{step + 1} views{unit}" for unit in ("", ", nat/100") for step in steps]
     return table(["next view chosen by", *header], rows) + (
-        "<p class='note'>Left: differences in accuracy. Right: in the log-probability of the true class, which tells smaller "
-        "ones apart. With 95 % intervals over objects; faint where they hold zero.</p>"
+        "<p class='note'>Left: differences in accuracy, in percentage points. Right: differences in the log-probability of "
+        "the true class, in hundredths of a nat; they resolve smaller differences. With 95 % intervals over objects; grey if "
+        "the interval contains zero.</p>"
     )
 
 
 def _ablations(metrics: dict[str, Any]) -> str:
-    """What each part of the method is good for."""
+    """The effect of each part of the method."""
     if "ablations" not in metrics["seeds"][0]:
         return ""
     ((_, found),) = metrics["seeds"][0]["ablations"].items()
     return (
-        "<h2>What each part is good for</h2><p>The view policy, and the same with one thing done otherwise; same starts.</p>"
+        "<h2>Ablations</h2><p>The view policy, and variants that each change one thing, from the same start views.</p>"
         + _ladder(found)
         + _against(found, ("random", METHOD))
     )
@@ -116,26 +112,26 @@ def _confidence(found: dict[str, Any]) -> str:
         for row in policy["stopping"]
     ]
     return (
-        table(["views", "calibration error (%)", "by chance", "95 of 100 below"], errors)
-        + "<p class='note'>By chance: what would be measured, on so many objects, of someone whose confidence is never off.</p>"
-        + "<p>Stopping once the calibrated risk is at most so much, or at the last view.</p>"
-        + table(["risk", "sure (%)", "of those wrong (%)", "accuracy (%)", "views"], rows)
+        table(["views", "calibration error (%)", "by chance: mean", "by chance: 95th percentile"], errors)
+        + "<p class='note'>By chance: the error measured on as many objects for a perfectly calibrated confidence.</p>"
+        + "<p>Stopping as soon as the calibrated risk is at most the given value, or at the last view.</p>"
+        + table(["risk", "confident (%)", "of those wrong (%)", "accuracy (%)", "views"], rows)
     )
 
 
 def _costs(found: dict[str, Any]) -> str:
-    """When to stop and how far to go."""
+    """Stopping rules, and the distance travelled with a movement cost."""
     costs = found.get("costs")
     if costs is None:
         return ""
     walks = html.escape(found["policies"][costs["thesis_walks"]]["title"])
     header = ["accuracy (%)", "views", "by calibrated risk: accuracy (%)", "views", "fewer views"]
     thesis = [[f"{row['threshold']:g}", *_both_rules(row)] for row in costs["beside_thesis"]]
-    paying = [[f"{-row['threshold']:g}", *_both_rules(row)] for row in costs["not_paying"]]
+    by_gain = [[f"{-row['threshold']:g}", *_both_rules(row)] for row in costs["not_paying"]]
     steps = [step for step in (1, 3, 7) if step < len(costs["moving"][0]["way"])]
-    ways = [
+    moving = [
         [
-            f"{row['price']:g}",
+            f"{row['cost']:g}",
             *(
                 cell
                 for step in steps
@@ -148,17 +144,20 @@ def _costs(found: dict[str, Any]) -> str:
         for row in costs["moving"]
     ]
     return (
-        "<h3>Beside the thesis's rule</h3>"
-        f"<p>The thesis's rule: walks by “{walks}”, the sum of logits, and a threshold on its confidence as it is. Beside it "
-        "the view policy, stopping at the calibrated risk with which it is as accurate on validation objects; – where it never "
-        "is.</p>"
+        "<h3>Comparison with the thesis's stopping rule</h3>"
+        f"<p>The thesis's rule: walks by “{walks}”, the sum of logits, and a threshold on its uncalibrated confidence. The view "
+        "policy stops at the calibrated risk that gives the same accuracy on validation objects (– if there is none).</p>"
         + table(["threshold", *header], thesis)
-        + "<h3>Until it does not pay</h3><p>Stopping once the best view left is expected to raise the true class's "
-        "log-probability by less than a view costs (nats); and by risk, at equal accuracy on validation objects.</p>"
-        + table(["cost of a view", *header], paying)
-        + "<h2>Going there</h2><p>Accuracy and way of the camera, where a radian costs so much of the log-probability (nats) "
-        "that a view brings; from some of the starts, as the oracles.</p>"
-        + table(["cost", *(title for step in steps for title in (f"{step + 1} views", "way"))], ways)
+        + "<h3>Stopping when a further view does not pay</h3><p>Stopping as soon as the expected gain of the best remaining "
+        "view, in the log-probability of the true class (nats), is below the cost of a view; compared with stopping by "
+        "calibrated risk at equal accuracy on validation objects.</p>"
+        + table(["cost of a view", *header], by_gain)
+        + "<h2>Movement cost</h2><p>Accuracy (%) and distance travelled when each radian of movement has the given cost (nats), "
+        "which is subtracted from the expected gain. Walks begin at the start views of the oracles.</p>"
+        + table(
+            ["movement cost", *(title for step in steps for title in (f"{step + 1} views", "distance travelled"))],
+            moving,
+        )
     )
 
 
@@ -174,68 +173,69 @@ def _both_rules(row: dict[str, Any]) -> list[str]:
 
 
 def _gain_of_two(against: dict[str, Any], method: str = METHOD) -> str:
-    """Points of two views above those of another policy."""
+    """The gain after two views over another policy."""
     gain = against[method]
     return difference(gain["difference"][1], gain["interval"][1])
 
 
 def _lead(metrics: dict[str, Any], views: str) -> str:
-    """What it comes to, the mean of all seeds."""
+    """The main results, as means over all seeds."""
     each, together = [seed["lattices"][views] for seed in metrics["seeds"]], metrics["together"][views]
     method, random = (together["policies"][name]["after_views"] for name in (METHOD, "random"))
-    gains, first, tabled = together["against"]["random"], each[0], ""
+    gains, first, with_table = together["against"]["random"], each[0], ""
     if "learned_and_table" in gains:
         known = together["policies"]["learned_and_table"]["after_views"]
-        tabled = (
-            f" Joined with a table of what views of each class show, the policy reaches {percent(known[1])} %: "
+        with_table = (
+            f" Combined with a table of mean logits by class and view, the policy reaches {percent(known[1])} %: "
             f"{_gain_of_two(gains, 'learned_and_table')}."
         )
     single = fmean(found["single_view"] for found in each)
     every, summed = (fmean(found["random_sets"][-1][name]["accuracy"] for found in each) for name in ("learned", "sum"))
-    trainings = f" Means of {len(each)} trainings; what follows is of the first, unless said otherwise." * (
+    trainings = f" Means of {len(each)} seeds; the numbers below are of the first seed unless stated otherwise." * (
         len(each) > 1
     )
     return (
-        f'<p class="lead">Two views are recognised with {percent(method[1])} % accuracy where the second is chosen, '
-        f"{percent(random[1])} % where it is drawn: {_gain_of_two(gains)} points.{tabled} "
-        f"One view alone: {percent(random[0])} %, by its own logits {percent(single)} %; all "
-        f"{first['random_sets'][-1]['views']} fused: {percent(every)} %, summed: {percent(summed)} %.{trainings}</p>"
-        f'<p class="note">Over {first["objects"]} test objects and every start view; all policies share fusion, objects and '
-        f"starts. Everything fitted or chosen is so on {first['validation_objects']} validation objects. The views of these "
-        "lattices were never trained on: training saw other directions around other objects.</p>"
+        f'<p class="lead">Accuracy after two views is {percent(method[1])} % if the policy chooses the second and '
+        f"{percent(random[1])} % if it is random: {_gain_of_two(gains)} points.{with_table} "
+        f"Accuracy from one view is {percent(random[0])} %, and {percent(single)} % from its logits without the fusion; from all "
+        f"{first['random_sets'][-1]['views']} views it is {percent(every)} % fused and {percent(summed)} % summed.{trainings}</p>"
+        f'<p class="note">Over {first["objects"]} test objects and every start view. All policies use the same fusion, '
+        "objects and "
+        f"start views. Everything is fitted or chosen on {first['validation_objects']} validation objects. The views of these "
+        "lattices are not in the training data, which has other directions around other objects.</p>"
     )
 
 
 def _unposed(metrics: dict[str, Any]) -> str:
-    """Where it is unknown which way the objects face, beside where it is known, on the same starts."""
-    (views, blind), *_ = metrics["seeds"][0]["unposed"].items()
+    """Results for objects of unknown yaw, compared with a known pose from the same start views."""
+    (views, unposed), *_ = metrics["seeds"][0]["unposed"].items()
     posed = metrics["seeds"][0]["lattices"][views]["policies"]
     rows = []
-    for name, policy in blind["policies"].items():
+    for name, policy in unposed["policies"].items():
         if policy["knows"] != "truth":
             for title, found in ((policy["title"], policy), ("… pose known", posed[name])):
                 cells = zip(found["after_views"], found["interval"], strict=True)
                 rows.append([html.escape(title), *(_accuracy(*cell) for cell in cells)])
     return (
-        "<h2>Facing any way</h2>"
-        "<p>Objects are turned about the vertical by an angle that nobody knows: fusion and policy are told directions "
-        "relative to the first view's alone. After two views the policy is "
-        f"{_gain_of_two(blind['against']['random'])} points above random. What is learned of single views of a "
-        "lattice, as in the best fixed order, is of no use here.</p>"
+        "<h2>Unknown yaw</h2>"
+        "<p>Objects are turned about the vertical by an unknown angle; fusion and policy receive directions relative to the "
+        "first view only. After two views the policy's gain over random is "
+        f"{_gain_of_two(unposed['against']['random'])} points. Knowledge about single views of the lattice, such as the best "
+        "fixed order, cannot be used here.</p>"
         + table(["next view chosen by", *(str(step + 1) for step in range(len(rows[0]) - 1))], rows)
     )
 
 
 def _rotated(metrics: dict[str, Any]) -> str:
-    """Where objects are turned by any rotation."""
+    """Results for objects in any rotation."""
     if "rotated" not in metrics["seeds"][0]:
         return ""
     ((_, found),) = metrics["seeds"][0]["rotated"].items()
     every = found["random_sets"][-1]
     return (
-        "<h2>Turned anyhow</h2>"
-        "<p>Objects are turned by any rotation, which nobody knows: they lie, stand on their heads, lean. The recognisers were "
-        "trained some epochs further on objects turned so. "
+        "<h2>Any rotation</h2>"
+        "<p>Objects are turned by an unknown rotation about any axis. The recognisers were trained for some further epochs on "
+        "objects rotated in the same way. "
         f"All {every['views']} views fused: {percent(every['learned']['accuracy'])} %.</p>"
         + _ladder(found)
         + _against(found)
@@ -243,11 +243,11 @@ def _rotated(metrics: dict[str, Any]) -> str:
 
 
 def _scattered(metrics: dict[str, Any]) -> str:
-    """Where every object has candidate directions of its own."""
+    """Results with separate candidate directions for each object."""
     ((views, found),) = metrics["seeds"][0]["scattered"].items()
     return (
-        "<h2>Candidates anywhere</h2>"
-        f"<p>Each object has {views} candidate directions of its own, a lattice turned at random, none of them twice.</p>"
+        "<h2>Candidate directions that differ between objects</h2>"
+        f"<p>Each object has {views} candidate directions of its own, from a randomly rotated lattice.</p>"
         + _ladder(found)
         + _against(found)
     )
@@ -259,7 +259,10 @@ def _novel(metrics: dict[str, Any], classes: list[str]) -> str:
         return ""
     steps = range(1, min(4, len(found["gain"]["trained_with"]["difference"])))
     rows = []
-    for name, title in (("trained_without", "never saw these classes"), ("trained_with", "saw all")):
+    for name, title in (
+        ("trained_without", "trained without these classes"),
+        ("trained_with", "trained with all classes"),
+    ):
         gain = found["gain"][name]
         rows.append([title, *(difference(gain["difference"][step], gain["interval"][step]) for step in steps)])
     each = [
@@ -271,11 +274,11 @@ def _novel(metrics: dict[str, Any], classes: list[str]) -> str:
         for pair in found["pairs"]
     ]
     return (
-        "<h2>Classes never chosen for</h2>"
-        f"<p>Points above random on the {found['objects']} test objects of pairs of classes that a policy was trained without; "
-        "encoder and fusion were trained on all classes.</p>"
+        "<h2>Classes left out of policy training</h2>"
+        f"<p>Gain over random in percentage points on the {found['objects']} test objects of pairs of classes that a policy was "
+        "trained without. Encoder and fusion were trained on all classes.</p>"
         + table(["policy", *(f"{step + 1} views" for step in steps)], rows)
-        + table(["classes", "objects", "random, 2 views", "never saw these", "saw all"], each)
+        + table(["classes", "objects", "random, 2 views", "trained without these", "trained with all"], each)
     )
 
 
@@ -283,18 +286,18 @@ def _decision(metrics: dict[str, Any]) -> str:
     found = metrics["seeds"][0]["decision"]
     ran_on = found["identity"]["machine"]
     features, image = (
-        "{:.1f} ms (99 %: {:.1f})".format(*(found[name][share] for share in ("p50", "p99")))
+        "{:.1f} ms (99th percentile: {:.1f})".format(*(found[name][share] for share in ("p50", "p99")))
         for name in ("from_features", "from_image")
     )
     return (
-        f"<p>One decision among {found['identity']['candidates']} candidates takes {features} from what was seen so far, "
-        f"{image} from the newest depth image on: {html.escape(ran_on['cpu'])}, {ran_on['cores']} cores; "
+        f"<p>One decision among {found['identity']['candidates']} candidates takes {features} from stored features, "
+        f"and {image} from the latest depth image: {html.escape(ran_on['cpu'])}, {ran_on['cores']} cores; "
         f"{html.escape(ran_on['device'])}.</p>"
     )
 
 
 def _seeds(metrics: dict[str, Any], views: str) -> str:
-    """The mean of all seeds, the main rows of every one, and what the method is above others."""
+    """Means over all seeds, and the main results of each seed."""
     if len(metrics["seeds"]) < 2:
         return ""
     each = [found["lattices"][views] for found in metrics["seeds"]]
@@ -310,27 +313,27 @@ def _seeds(metrics: dict[str, Any], views: str) -> str:
             cells = zip(gain["difference"][1:4], gain["interval"][1:4], strict=True)
             gains.append([html.escape(titles[base]), str(seed), *(difference(*cell) for cell in cells)])
     return (
-        "<h2>Other random weights</h2><p>Everything trained anew from other weights and batches. Means of "
-        f"{len(each)} seeds, taken of each object first:</p>"
+        "<h2>Other random seeds</h2><p>Everything is trained again from other initial weights and batches. Means over "
+        f"{len(each)} seeds, first for each object:</p>"
         + _ladder(metrics["together"][views])
         + _against(metrics["together"][views])
-        + f"<p>Calibration error (%) of the view policy after 1 to {len(errors)} views, mean of the seeds: "
+        + f"<p>Calibration error (%) of the view policy after 1 to {len(errors)} views, mean over the seeds: "
         + f"{', '.join(map(percent, errors))}.</p><p>Each seed:</p>"
         + table(["next view chosen by", "seed", "1 view", "2", "3", "4"], rows)
-        + table(["view policy above", "seed", "2 views", "3", "4"], gains)
+        + table(["view policy minus", "seed", "2 views", "3", "4"], gains)
     )
 
 
 def active_section(inputs: ReportInputs) -> str:
-    """For the report of the whole run; empty where `mevs study learned` was not run."""
+    """The section of the run's report; empty if `mevs study learned` was not run."""
     if inputs.learned is None:
         return ""
     views, found = next(iter(inputs.learned["seeds"][0]["lattices"].items()))
-    return "<h2>Learning to fuse and to choose</h2>" + _lead(inputs.learned, views) + _ladder(found)
+    return "<h2>Learned fusion and view selection</h2>" + _lead(inputs.learned, views) + _ladder(found)
 
 
 def write_learned_page(metrics: dict[str, Any], statistics: DatasetStatistics, path: Path) -> None:
-    """Writes the page; it needs no other file. Numbers are of the first seed, unless said otherwise."""
+    """Writes the page, which needs no other file. Numbers are of the first seed unless the page states otherwise."""
     parts = []
     for number, (views, found) in enumerate(metrics["seeds"][0]["lattices"].items()):
         titles = {name: policy["title"] for name, policy in found["policies"].items()}
@@ -341,13 +344,13 @@ def write_learned_page(metrics: dict[str, Any], statistics: DatasetStatistics, p
         parts.append(
             image(
                 figures.accuracy_of_choices(curves, titles, found["random_sets"][-1]["learned"]["accuracy"]),
-                "Accuracy by number of views, all starts; bands: 95 % intervals over objects.",
+                "Accuracy by number of views, over all start views; bands: 95 % intervals over objects.",
             )
         )
         parts.append(_against(found))
         if not number:
             parts.append("<h2>Fusing random views</h2>" + _sets(found))
-            parts.append("<h2>How sure it may be</h2>" + _confidence(found) + _costs(found))
+            parts.append("<h2>Confidence and calibration</h2>" + _confidence(found) + _costs(found))
             parts.append(
                 _decision(metrics)
                 + _ablations(metrics)
@@ -357,6 +360,6 @@ def write_learned_page(metrics: dict[str, Any], statistics: DatasetStatistics, p
                 + _novel(metrics, statistics.classes)
                 + _seeds(metrics, views)
             )
-    left_out = f"<p>{statistics.left_out_count} objects were left out for lack of a surface.</p>"
-    title = f"Learning where to look next: {html.escape(statistics.source)}"
+    left_out = f"<p>{statistics.left_out_count} objects without a surface were left out.</p>"
+    title = f"Learned view selection: {html.escape(statistics.source)}"
     write_text(path, document(title, "".join(parts) + left_out))

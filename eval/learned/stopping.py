@@ -1,7 +1,7 @@
-"""What a further view costs: when to stop, beside the thesis's rule, and how far the camera moves.
+"""Stopping rules compared with the thesis's rule, and walks with a movement cost.
 
-A rule is a signal along walks, a confidence say, and stops where it first reaches a threshold, or at the last view. Rules are
-compared at equal accuracy: the threshold of ours is the one with which it is as accurate as the other on validation
+A rule has a signal along a walk, such as a confidence. It stops where the signal first reaches a threshold, or at the last view.
+Rules are compared at equal accuracy: our threshold is the least that matches the accuracy of the other rule on validation
 objects, and is then used on test objects.
 """
 
@@ -18,9 +18,9 @@ import numpy as np
 from flax import nnx
 from jaxtyping import Array, Bool, Float, Int
 
-from eval.learned.walks import Contender, Learner, OnLattice, beliefs_of, given_to, walk_all
+from eval.learned.walks import Contender, Learner, OnLattice, beliefs_of, policy_parameters, walk_all
 from eval.numbers.comparison import intervals
-from eval.numbers.confidence import stops_at, walked
+from eval.numbers.confidence import logits_along, stops_at
 from eval.walks.grid import THRESHOLDS
 from mevs_jax.arrays import AnyArray
 from mevs_jax.beliefs import CalibratedFusion, running_sum
@@ -32,19 +32,19 @@ from train.choosing.features import Features
 from train.choosing.policy import graph_of, learned_policy
 
 VIEW_COSTS = (0.2, 0.1, 0.05, 0.02, 0.01, 0.005)
-"""What a view costs, in the policy's utility: nats of the true class's log-probability, unless it was trained otherwise."""
+"""Costs of a view, in the unit of the policy's gain: nats of the true class's log-probability, unless trained otherwise."""
 MOVEMENT_COSTS = (0.0, 0.002, 0.005, 0.01, 0.02, 0.05)
-"""What a radian costs, in the same unit."""
+"""Costs of a radian of movement, in the same unit."""
 
 
 @dataclass(frozen=True)
 class Signal:
-    """A rule's signal along walks, and whether the answer would be right.
+    """The signal of a stopping rule along walks.
 
     Attributes:
-        value: (objects, walks, steps); it is enough where it is at least the threshold.
-        right: the same shape.
-        weight: (objects,) of the objects, 1 on average.
+        value: (objects, walks, steps); a walk stops where it is at least the threshold.
+        right: (objects, walks, steps) whether the prediction is right.
+        weight: (objects,) weights of the objects, 1 on average.
     """
 
     value: Float[np.ndarray, "objects walks steps"]
@@ -52,7 +52,7 @@ class Signal:
     weight: Float[np.ndarray, " objects"]
 
     def stopped(self, threshold: float) -> tuple[Float[np.ndarray, " objects"], Float[np.ndarray, " objects"]]:
-        """Accuracy and views of each object, means over its walks."""
+        """Accuracy and number of views of each object, as means over its walks."""
         at = stops_at(self.value >= threshold)
         answer = np.take_along_axis(self.right, at[..., None], axis=-1)[..., 0]
         return answer.mean(axis=1), (at + 1).mean(axis=1)
@@ -61,7 +61,7 @@ class Signal:
         return float(np.mean(self.weight * self.stopped(threshold)[0]))
 
     def threshold_for(self, accuracy: float) -> float | None:
-        """The least threshold, of a hundred, with which it is so accurate; None where none is."""
+        """The least of about a hundred thresholds that reaches this accuracy, or None."""
         for threshold in [*np.unique(np.quantile(self.value, np.linspace(0, 1, 101))), self.value.max() + 1]:
             if self.accuracy(threshold) >= accuracy:
                 return float(threshold)
@@ -69,20 +69,20 @@ class Signal:
 
 
 def confidences(beliefs: Float[AnyArray, "objects walks steps classes"], labels: Int[AnyArray, " objects"]) -> Signal:
-    """How sure a belief is of its most likely class, and whether that is the right one."""
+    """The probability of the most likely class as a signal."""
     right = jnp.argmax(jnp.asarray(beliefs), axis=-1) == labels[:, None, None]
     confidence = jnp.max(jax.nn.softmax(jnp.asarray(beliefs), axis=-1), axis=-1)
     weight = class_weights(labels, beliefs.shape[-1])
     return Signal(np.asarray(confidence), np.asarray(right), np.asarray(weight))
 
 
-def beside(
+def compare_rules(
     others: Sequence[Signal], ours: Sequence[Signal], thresholds: Sequence[float] = THRESHOLDS
 ) -> list[dict[str, Any]]:
-    """Views used by another rule at each of its thresholds, and by ours where it is as accurate on validation objects.
+    """Accuracy and views of another rule at each of its thresholds, and of ours at equal accuracy on validation objects.
 
     Args:
-        others, ours: on validation and on test objects.
+        others, ours: the signals of each rule on validation and on test objects.
     """
     rows = []
     for threshold in thresholds:
@@ -109,7 +109,7 @@ def beside(
 
 @dataclass(frozen=True)
 class WalkRecord:
-    """A policy's walks on validation and on test objects, the fused beliefs along them, and how sure they are, calibrated."""
+    """A policy's walks on validation and on test objects, with fused beliefs and calibrated confidences along them."""
 
     views: Sequence[Int[np.ndarray, "objects walks steps"]]
     beliefs: Sequence[Float[np.ndarray, "objects walks steps classes"]]
@@ -150,13 +150,13 @@ def best_gains(
     views: Int[np.ndarray, "objects walks steps"],
     beliefs: Float[AnyArray, "objects walks steps classes"],
 ) -> Float[np.ndarray, "objects walks steps"]:
-    """What the best view that is left is expected to bring after each step of each walk."""
-    structure, given = nnx.graphdef(learner.network), given_to(learner, fusion)
+    """Expected gain of the best remaining view after each step of each walk."""
+    structure, given = nnx.graphdef(learner.network), policy_parameters(learner, fusion)
     at_once = max(1, 256 // views.shape[1])
     return in_chunks(partial(_best_gains_of_some, given, structure=structure), (data, views, beliefs), at_once)
 
 
-def _priced(given: tuple[tuple[nnx.State, Array], Array], structure: nnx.GraphDef) -> Policy:
+def _with_cost(given: tuple[tuple[nnx.State, Array], Array], structure: nnx.GraphDef) -> Policy:
     return with_movement(learned_policy(given[0], structure), given[1])
 
 
@@ -169,32 +169,32 @@ def moving(
     max_views: int,
     every: int,
 ) -> list[dict[str, Any]]:
-    """Accuracy and way (radians) after each number of views, by price of the way; from every so many-th start."""
-    policy_of = partial(_priced, structure=nnx.graphdef(learner.network))
-    contender = Contender("priced", "", "learned", policy_of, every=every)
+    """Accuracy and distance travelled (radians) after each number of views, by movement cost, from every n-th start view."""
+    policy_of = partial(_with_cost, structure=nnx.graphdef(learner.network))
+    contender = Contender("with_cost", "", "learned", policy_of, every=every)
     directions, rows = test.features.directions, []
     distances = np.asarray(graph_of(directions[0]).distances)
-    for price in MOVEMENT_COSTS:
-        given = given_to(learner, fusion), jnp.float32(price)
+    for cost in MOVEMENT_COSTS:
+        given = policy_parameters(learner, fusion), jnp.float32(cost)
         views = walk_all(key, contender, given, fusion, test.table(True), directions, knowledge, max_views)
         steps = distances[views[:, :, :-1], views[:, :, 1:]]
-        way = np.concatenate([np.zeros_like(steps[..., :1]), np.cumsum(steps, axis=-1)], axis=-1)
+        travelled = np.concatenate([np.zeros_like(steps[..., :1]), np.cumsum(steps, axis=-1)], axis=-1)
         right = (
             beliefs_of(fusion, test.features, views).argmax(axis=-1) == np.asarray(test.features.labels)[:, None, None]
         )
         after = right.mean(axis=1).T
         rows.append(
             {
-                "cost": price,
+                "cost": cost,
                 "after_views": after.mean(axis=1).tolist(),
                 "interval": intervals(after),
-                "way": way.mean(axis=(0, 1)).tolist(),
+                "way": travelled.mean(axis=(0, 1)).tolist(),
             }
         )
     return rows
 
 
-def what_it_costs(
+def cost_metrics(
     key: Array,
     learner: Learner,
     fusion: CalibratedFusion,
@@ -205,15 +205,16 @@ def what_it_costs(
     max_views: int,
     every: int,
 ) -> dict[str, Any]:
-    """When the method stops, beside the thesis's rule and beside what the next view would bring; and how far it goes.
+    """Metrics of the method's stopping rule compared with two others, and of its walks with a movement cost.
 
-    The thesis's rule: walks by predicted entropy (at random, where there is none), sums of logits, and a threshold on their
-    confidence as it is. Where the way has a price, walks begin at every so many-th start.
+    The other rules are the thesis's rule and the expected gain of the next view. The thesis's rule: walks by predicted
+    entropy (or random ones without a predictor), sums of logits, and a threshold on their uncalibrated confidence. Walks
+    with a movement cost begin at every n-th start view.
     """
     walked_by = next(name for name in ("predicted_entropy", "random") if name in records)
     both, method = (validation.features, test.features), records[learner.name]
     thesis = [
-        confidences(jax.vmap(jax.vmap(running_sum))(walked(jnp.asarray(views), data.logits)), data.labels)
+        confidences(jax.vmap(jax.vmap(running_sum))(logits_along(jnp.asarray(views), data.logits)), data.labels)
         for data, views in zip(both, records[walked_by].views, strict=True)
     ]
     gains = [
@@ -222,7 +223,7 @@ def what_it_costs(
     ]
     return {
         "thesis_walks": walked_by,
-        "beside_thesis": beside(thesis, method.confidence),
-        "not_paying": beside(gains, method.confidence, [-price for price in VIEW_COSTS]),
+        "beside_thesis": compare_rules(thesis, method.confidence),
+        "not_paying": compare_rules(gains, method.confidence, [-cost for cost in VIEW_COSTS]),
         "moving": moving(key, learner, fusion, test, knowledge, max_views, every),
     }

@@ -1,7 +1,7 @@
-"""How well views are chosen where a learned fusion makes the belief: walks of every object from every start, and what they say.
+"""Evaluation of view policies with a learned fusion: walks of every object from every start view, and their metrics.
 
-All policies share starts, fusion and objects, so every difference is paired. Temperatures are fitted once more for each
-policy, on its own walks over validation objects: one that picks telling views makes beliefs of another kind than one that draws.
+All policies share start views, fusion and objects, so every difference is paired. Temperatures are fitted for each policy on its
+own walks over validation objects, because the beliefs along well-chosen views differ from those along random views.
 """
 
 from __future__ import annotations
@@ -16,14 +16,14 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from data_pipeline.progress import console
-from eval.learned.stopping import Signal, WalkRecord, confidences, what_it_costs
+from eval.learned.stopping import Signal, WalkRecord, confidences, cost_metrics
 from eval.learned.walks import (
     Contender,
     Learner,
     OnLattice,
     beliefs_of,
     contenders,
-    given_to,
+    policy_parameters,
     random_walker,
     walk_all,
     walker,
@@ -48,12 +48,12 @@ from train.choosing.features import Features, sets_of_size
 
 @dataclass(frozen=True)
 class ByObject:
-    """How a policy does on each test object, a mean over its walks.
+    """Results of a policy on each test object, as means over its walks.
 
     Attributes:
-        right: (steps, objects) share of the walks that are right after so many views.
+        right: (steps, objects) share of the walks with the right prediction after 1, 2, … views.
         likelihood: (steps, objects) log-probability of the true class.
-        from_some: (steps, objects) `right` of the walks from the starts that oracles walk from.
+        from_some: (steps, objects) `right` of the walks from the start views that the oracles use.
     """
 
     right: Float[np.ndarray, "steps objects"]
@@ -68,11 +68,18 @@ def _refit(beliefs: Array, labels: Array) -> Float[Array, " steps"]:
     return jax.vmap(fit_temperature, (1, None, None))(flat, truth, class_weights(truth, flat.shape[-1]))
 
 
-def judged(
+def walk_metrics(
     beliefs: Sequence[Float[AnyArray, "objects walks steps classes"]], labels: Sequence[Int[AnyArray, " objects"]]
 ) -> tuple[dict[str, Any], list[Signal], Float[np.ndarray, "steps objects"]]:
-    """One policy's numbers, and its confidence, on walks over validation objects, where temperatures are fitted, and over test
-    objects; and the log-probability that it gives the class of each test object, a mean over its walks."""
+    """Metrics of one policy.
+
+    Args:
+        beliefs, labels: of walks over validation objects, on which temperatures are fitted, and over test objects.
+
+    Returns:
+        The metrics on test objects, the calibrated confidences on both, and for each test object the mean log-probability of its
+        class.
+    """
     temperatures = _refit(beliefs[0], labels[0])
     signals = [
         confidences(belief / temperatures[:, None], known) for belief, known in zip(beliefs, labels, strict=True)
@@ -102,8 +109,11 @@ def judged(
 def fixed_order_scores(
     fusion: CalibratedFusion, data: Features, most: int, starts: int = 8, objects: int = 300
 ) -> np.ndarray:
-    """Scores of the fixed order that does best on some validation objects from some starts, the first `most` of it; the rest
-    follows by how far it is from those before."""
+    """Scores (views,) of a fixed order of views; the first view of the order has the largest score.
+
+    A greedy search chooses the first `most` views by their class-balanced accuracy on some validation objects from some start
+    views. Each later view is the farthest from those before it.
+    """
     some = jnp.asarray(np.unique(np.linspace(0, len(data.labels) - 1, objects).astype(int)))
     data = jax.tree.map(lambda leaf: leaf[some], data)
     views = data.features.shape[1]
@@ -112,7 +122,7 @@ def fixed_order_scores(
 
     @jax.jit
     def right_with(seen: Array) -> Array:
-        """Share right with the views (sets, slots) seen, −1 for none."""
+        """Class-balanced accuracy with the views (sets, slots) seen; −1 marks an empty slot."""
 
         def of_set(one: Array) -> Array:
             beliefs = fusion(
@@ -144,25 +154,25 @@ def fixed_order_scores(
 
 
 def learn(fusion: CalibratedFusion, data: Features, most: int) -> Knowledge:
-    """What `fixed_order` and `information_gain` know, from validation objects on the lattice."""
+    """The knowledge of `fixed_order` and `information_gain`, from validation objects on the lattice."""
     logits = jax.nn.log_softmax(data.logits / fusion.single, axis=-1)
     return Knowledge(jnp.asarray(fixed_order_scores(fusion, data, most)), class_view_table(logits, data.labels))
 
 
 BASELINES = ("random", "farthest", "fixed_order")
-"""What a policy that learns is compared with."""
+"""The policies with which learned policies are compared."""
 _TRYING_STARTS = 8
-"""Those who try every candidate walk from about so many views, spread over the lattice, and so do those who pay for the way."""
+"""Approximate number of start views, spread over the lattice, for oracles and for walks with a movement cost."""
 _GAP = 3
-"""The gap between random and the label-free oracle is read after 2 views and the next, up to so many further ones."""
+"""Numbers of views, from 2 on, at which the gap between random and the label-free oracle is computed."""
 
 
 def random_sets_study(
     fusion: CalibratedFusion, validation: Features, test: Features, draws: int = 8
 ) -> list[dict[str, Any]]:
-    """How accurate and how well calibrated random sets of every size are, by the sum of logits and by the learned fusion.
+    """Accuracy and calibration of random sets of views by size, for the sum of logits and for the learned fusion.
 
-    The same sets for both. The fusion's temperatures are its own; the sum's are fitted here, on validation objects.
+    Both use the same sets. The fusion has its own temperatures; those of the sum are fitted here on validation objects.
     """
     views = test.features.shape[1]
 
@@ -209,17 +219,17 @@ def study(
     costs: bool = False,
     others: bool = True,
 ) -> tuple[dict[str, Any], dict[str, ByObject]]:
-    """Every number about one lattice of candidate views; and each policy's by object.
+    """Returns all metrics of one lattice of candidate views, and the results of each policy by object.
 
     Args:
-        fusion: of the recogniser whose features these are.
-        learners: trained view policies, the method first and then what it is compared with.
-        max_views: of a walk.
-        draws: walks from each start of policies that draw.
-        oracle_views: how far oracles walk.
-        fitting_starts: temperatures are fitted on walks from every so many-th start.
-        costs: whether to tell too when the method would stop and what it does where the way has a price.
-        others: whether policies but these and random selection walk, and random sets are fused.
+        fusion: of the recogniser that computed the features.
+        learners: trained view policies; the first is the method, the others are compared with it.
+        max_views: length of a walk.
+        draws: walks of random policies from each start view.
+        oracle_views: length of the oracles' walks.
+        fitting_starts: temperatures are fitted on walks from every n-th start view.
+        costs: whether to add the metrics of stopping and of movement cost.
+        others: whether to evaluate the other policies and random sets as well.
     """
     points, labels = test.features.directions[0], test.features.labels
     shared = fusion.posed and bool(jnp.allclose(test.features.directions, points, atol=1e-4))
@@ -239,12 +249,12 @@ def study(
         found["random_sets"] = random_sets_study(fusion, validation.features, test.features, draws)
     each: dict[str, ByObject] = {}
     parameters: dict[str, Any] = {"belief_oracle": fusion, "label_oracle": fusion}
-    parameters |= {learner.name: given_to(learner, fusion) for learner in learners}
+    parameters |= {learner.name: policy_parameters(learner, fusion) for learner in learners}
     fusions = {learner.name: learner.fusion or fusion for learner in learners}
     records: dict[str, WalkRecord] = {}
     entropies = shared and test.predicted_entropy is not None and test.entropy is not None
-    asked = contenders(learners, draws, oracle_views, apart, entropies, shared)
-    for contender in asked if others else [random_walker(draws), *map(walker, learners)]:
+    policies = contenders(learners, draws, oracle_views, apart, entropies, shared)
+    for contender in policies if others else [random_walker(draws), *map(walker, learners)]:
         name, own, walks, beliefs = contender.name, fusions.get(contender.name, fusion), [], []
         for split, data in enumerate((validation, test)):
             every = contender.every if data is test else max(contender.every, fitting_starts)
@@ -260,30 +270,32 @@ def study(
             )
             walks.append(views)
             beliefs.append(beliefs_of(own, data.features, views))
-        judgement, signals, likelihood = judged(beliefs, [data.features.labels for data in (validation, test)])
+        metrics, signals, likelihood = walk_metrics(beliefs, [data.features.labels for data in (validation, test)])
         right = signals[1].right
         records[name] = WalkRecord(walks, beliefs, signals)
         by_start = right.reshape(len(right), -1, contender.draws, right.shape[-1]).mean(axis=2)
         from_some = by_start if contender.every > 1 else by_start[:, some_starts]
         each[name] = ByObject(by_start.mean(axis=1).T, likelihood, from_some.mean(axis=1).T)
-        found["policies"][name] = {"title": contender.title, "knows": contender.knows, **judgement}
-        console.print(f"{contender.title}: " + " ".join(f"{100 * share:.1f}" for share in judgement["after_views"]))
+        found["policies"][name] = {"title": contender.title, "knows": contender.knows, **metrics}
+        console.print(f"{contender.title}: " + " ".join(f"{100 * share:.1f}" for share in metrics["after_views"]))
     if costs:
         key, method = jax.random.key(seed), learners[0]
-        found["costs"] = what_it_costs(key, method, fusion, validation, test, knowledge, records, max_views, apart)
+        found["costs"] = cost_metrics(key, method, fusion, validation, test, knowledge, records, max_views, apart)
     return found | compared(each, learners[0].name), each
 
 
 def compared(each: Mapping[str, ByObject], method: str) -> dict[str, Any]:
-    """Paired differences of every policy from the baselines and from the method, by baseline; and how much of the way from
-    random to the label-free oracle each goes."""
+    """Paired differences of every policy from the baselines and from the method, and the share of the gap that each closes.
+
+    The gap is the gain of the label-free oracle over random.
+    """
     from_some = {name: policy.from_some.mean(axis=1) for name, policy in each.items()}
     against = {
         base: {
             name: _difference(mine.right, each[base].right)
             | {"likelihood": _difference(mine.likelihood, each[base].likelihood)}
             for name, mine in each.items()
-            if name not in (base, "belief_oracle", "label_oracle")  # which walk from some starts only
+            if name not in (base, "belief_oracle", "label_oracle")  # the oracles walk from some start views only
         }
         for base in (*BASELINES, method)
         if base in each
@@ -299,11 +311,11 @@ def compared(each: Mapping[str, ByObject], method: str) -> dict[str, Any]:
 def seeds_together(
     found: Sequence[dict[str, Any]], seeds: Sequence[Mapping[str, ByObject]], method: str
 ) -> dict[str, Any]:
-    """What the same policies reach on average over several seeds, by object first, since the objects are the same.
+    """Means over several seeds; each object is averaged first, since all seeds have the same objects.
 
     Args:
-        found: what `study` found with each seed.
-        seeds: what each policy does by object, for each seed.
+        found: the metrics that `study` returned for each seed.
+        seeds: the results of each policy by object, for each seed.
     """
 
     def mean(name: str) -> ByObject:
@@ -335,11 +347,11 @@ def novel_classes(
     draws: int,
     seed: int = 0,
 ) -> dict[str, Any]:
-    """How policies do on objects of classes that they were trained without, beside random and beside one that knows all classes.
+    """Results of policies on classes that they were trained without, with random selection and a fully trained policy.
 
     Args:
-        policies: the classes that each was trained without, and the policy.
-        whole: the policy that was trained on all.
+        policies: pairs of the classes that a policy was trained without, and the policy.
+        whole: the policy that was trained on all classes.
     """
     after: dict[str, list[np.ndarray]] = {"random": [], "trained_without": [], "trained_with": []}
     rows = []
@@ -347,7 +359,7 @@ def novel_classes(
         some = test.some(np.flatnonzero(np.isin(test.labels, classes)))
         learners = Learner("trained_without", "", policy), Learner("trained_with", "", whole)
         walkers: list[tuple[Contender, Any]] = [(random_walker(draws), None)]
-        walkers += [(walker(one), given_to(one, fusion)) for one in learners]
+        walkers += [(walker(one), policy_parameters(one, fusion)) for one in learners]
         for contender, given in walkers:
             table, key = OnLattice(some).table(contender.believes), jax.random.key(seed)
             views = walk_all(key, contender, given, fusion, table, some.directions, None, max_views)
@@ -367,7 +379,7 @@ def _difference(mine: np.ndarray, base: np.ndarray) -> dict[str, Any]:
 
 
 def _gap_closed(mine: np.ndarray, random: np.ndarray, oracle: np.ndarray) -> list[float | None]:
-    """Share of the way from random to the oracle, from 2 views on; None where the oracle is no better."""
+    """Gain over random as a share of the oracle's gain, from 2 views on; None where the oracle has no gain."""
     steps = slice(1, min(len(oracle), 1 + _GAP))
     gains = zip(mine[steps] - random[steps], oracle[steps] - random[steps], strict=True)
     return [float(gain / gap) if gap > 0 else None for gain, gap in gains]

@@ -1,4 +1,4 @@
-"""Who walks in the study of learned choice, and the walks: every policy from every start, by the same fusion."""
+"""The policies of the study of learned view selection, and their walks from every start view with the same fusion."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ class OnLattice:
 
     Attributes:
         features: of every view.
-        predicted_entropy: (objects, views, views) what the entropy predictor says of every view after each, if it was asked.
+        predicted_entropy: (objects, views, views) predicted normalised entropies, if known; row i after seeing view i.
         entropy: (objects, views) true normalised entropies, if known.
     """
 
@@ -56,14 +56,14 @@ class Contender:
     """A policy in the study.
 
     Attributes:
-        name: in `metrics.json`.
-        title: in the report.
-        knows: as in `eval.ladder.KNOWS`.
-        policy_of: parameters to the policy.
-        believes: whether it looks at the belief; one that does not walks without fusing.
-        draws: walks from each start.
-        max_views: views of its walks, where fewer than the study's.
-        every: it walks from every so many-th start alone.
+        name: its name in `metrics.json`.
+        title: its name in the report.
+        knows: a key of `eval.walks.ladder.KNOWS`.
+        policy_of: function from parameters to the policy.
+        believes: whether it uses the belief; a policy that does not walks without fusion.
+        draws: walks from each start view.
+        max_views: length of its walks; 0 for that of the study.
+        every: it walks from every n-th start view.
     """
 
     name: str
@@ -78,16 +78,16 @@ class Contender:
 
 @dataclass(frozen=True)
 class Learner:
-    """A trained view policy in the study, and how it is asked; the other fields are a contender's."""
+    """A trained view policy in the study; `name` and `title` are as in `Contender`."""
 
     name: str
     title: str
     network: ViewPolicy
     by: By = "belief"
     made_as: str = ""
-    """name of the variant whose network it is"""
+    """name of the variant under which the network was trained"""
     fusion: CalibratedFusion | None = None
-    """its own, where it is not the study's"""
+    """its own fusion, if it differs from that of the study"""
 
 
 def _named(_: Any, name: str) -> Policy:
@@ -103,13 +103,13 @@ def random_walker(draws: int) -> Contender:
 
 
 def walker(learner: Learner) -> Contender:
-    """Whose parameters are `given_to` it."""
+    """The contender of a learner; its parameters are those of `policy_parameters`."""
     policy_of = partial(learned_policy, structure=nnx.graphdef(learner.network), by=learner.by)
     return Contender(learner.name, learner.title, "learned", policy_of)
 
 
-def given_to(learner: Learner, fusion: CalibratedFusion) -> tuple[nnx.State, Array]:
-    """The network's weights, and the temperature of single views."""
+def policy_parameters(learner: Learner, fusion: CalibratedFusion) -> tuple[nnx.State, Array]:
+    """The parameters of the learner's policy: the network's weights and the temperature of single views."""
     return nnx.state(learner.network, nnx.Param), fusion.single
 
 
@@ -152,10 +152,10 @@ def walk_all(
     knowledge: Knowledge | None,
     max_views: int,
 ) -> Int[np.ndarray, "objects walks steps"]:
-    """The views of walks from every start, or from some, `contender.draws` from each.
+    """The views of walks, `contender.draws` from each of its start views.
 
     Args:
-        directions: to the views, which stand to each other in the same way around every object.
+        directions: unit vectors to the views; the angles between views must be the same for all objects.
     """
     graph = ViewGraph.from_points(np.asarray(directions[0], np.float64))
     keys = jax.vmap(jax.random.fold_in, (None, 0))(key, jnp.arange(len(tables.label)))
@@ -186,14 +186,14 @@ def beliefs_of(
 def contenders(
     learners: Sequence[Learner], draws: int, oracle_views: int, oracle_starts: int, entropies: bool, shared: bool
 ) -> list[Contender]:
-    """All policies of the study, in the order in which they are shown.
+    """All policies of the study, in the order of the tables.
 
     Args:
-        learners: those that were trained.
-        draws: walks from each start of those that draw.
-        oracle_views, oracle_starts: how far oracles walk, which try every candidate, and from every so many-th start.
+        learners: the trained policies.
+        draws: walks of random policies from each start view.
+        oracle_views, oracle_starts: oracles take this many views, from every n-th start view.
         entropies: whether predicted and true depth entropies are known.
-        shared: whether all objects have the same candidates in a known pose, so that some are known to be good ones.
+        shared: whether all objects have the same candidate views in a known pose; only then do policies know about single views.
     """
     found = [random_walker(draws), _by_name("farthest", "farthest from those seen", "nothing", believes=False)]
     if entropies:

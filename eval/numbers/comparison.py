@@ -1,6 +1,6 @@
-"""What the grid says, with intervals: accuracies, differences from random, area under the curve, views to reach an accuracy.
+"""Metrics of the grid with intervals: accuracies, differences from random, area under the curve, views to reach an accuracy.
 
-Everything is resampled over objects with the same draws, so every difference is paired, whatever is compared.
+The bootstrap resamples objects with the same draws everywhere, so every difference is paired.
 """
 
 from __future__ import annotations
@@ -15,9 +15,9 @@ from eval.walks.grid import Results
 from mevs_jax.metrics import bootstrap_interval, bootstrap_means
 
 _KEY = 1
-"""Of the bootstrap: the same objects are drawn for every cell."""
+"""Seed of the bootstrap; every cell uses the same resampled objects."""
 REFERENCE_VIEWS = (3, 5, 9)
-"""How many random views the others are compared with in `views_to_reach`."""
+"""Numbers of views after which the baseline's accuracy is the target in `views_to_reach`."""
 
 
 @jax.jit
@@ -28,23 +28,23 @@ def _intervals(values: jax.Array) -> jax.Array:
 
 
 def intervals(values: np.ndarray) -> list:
-    """95 % intervals of means over the last axis, objects; for a single cell, two numbers."""
+    """95 % intervals of means over the last axis, the objects; two numbers for a single cell."""
     return np.asarray(_intervals(jnp.asarray(values, jnp.float32)), float).tolist()
 
 
-def class_mean(right: np.ndarray, labels: np.ndarray) -> np.ndarray:
-    """Mean recall over the classes that occur, from (…, objects)."""
+def class_mean(right: np.ndarray, labels: np.ndarray) -> np.ndarray | np.floating:
+    """Mean recall (…) over the classes that occur, from `right` (…, objects)."""
     return np.stack([right[..., labels == label].mean(axis=-1) for label in np.unique(labels)]).mean(axis=0)
 
 
 def cells(results: Results) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """`right`, `used`, `after`, `travelled` of the first backbone, each with the objects last."""
+    """`right`, `used`, `after` and `travelled` of the first backbone, each with the objects as the last axis."""
     arrays = results.right, results.used, results.after, results.travelled
     return tuple(np.moveaxis(np.asarray(array[0]), 0, -1) for array in arrays)  # type: ignore[return-value]
 
 
 def summarise(results: Results, labels: np.ndarray) -> dict[str, Any]:
-    """One policy's numbers, (MV, CT) or by number of views, and their intervals."""
+    """Metrics of one policy with their intervals, (MV, CT) or by number of views."""
     right, used, after, travelled = cells(results)
     return {
         "accuracy": right.mean(axis=-1).tolist(),
@@ -60,7 +60,7 @@ def summarise(results: Results, labels: np.ndarray) -> dict[str, Any]:
 
 
 def difference(results: Results, base: Results) -> dict[str, Any]:
-    """One policy minus another on the same objects and starts."""
+    """Differences of one policy from another on the same objects and start views."""
     (right, used, after, _), (base_right, base_used, base_after, _) = cells(results), cells(base)
     gain, gain_after, gain_used = right - base_right, after - base_after, used - base_used
     return {
@@ -74,8 +74,9 @@ def difference(results: Results, base: Results) -> dict[str, Any]:
     }
 
 
-def first_reaching(curve: np.ndarray, target: np.ndarray) -> np.ndarray:
-    """Number of views, interpolated, at which each curve (…, steps) first reaches its target (…); inf where never."""
+def first_reaching(curve: np.ndarray, target: np.ndarray | np.floating) -> np.ndarray:
+    """Interpolated number of views at which each curve (…, steps) first reaches its target (…); inf if it never does."""
+    target = np.asarray(target)
     reached = curve >= target[..., None]
     at = reached.argmax(axis=-1)
     high = np.take_along_axis(curve, at[..., None], axis=-1)[..., 0]
@@ -85,7 +86,7 @@ def first_reaching(curve: np.ndarray, target: np.ndarray) -> np.ndarray:
 
 
 def views_to_reach(results: dict[str, Results], baseline: str = "random") -> dict[str, Any]:
-    """How many views each policy needs to be as accurate as the baseline after 3, 5 and 9; None where it never is."""
+    """Number of views that each policy needs for the baseline's accuracy after 3, 5 and 9 views; None if it never reaches it."""
     curves = {name: cells(result)[2] for name, result in results.items()}
 
     @jax.jit

@@ -1,7 +1,7 @@
-"""How sure the fused belief may be: five ways to read it, how well each is calibrated, and stopping by calibrated risk.
+"""Confidence of the fused belief: five ways to compute it, the calibration of each, and stopping by calibrated risk.
 
-Everything that is fitted is fitted on walks over validation objects, for each policy its own: a policy that picks telling views
-makes beliefs of another kind than one that draws.
+All fitted parameters are fitted on walks over validation objects, separately for each policy, because the beliefs along
+well-chosen views differ from those along random views.
 """
 
 from __future__ import annotations
@@ -34,8 +34,8 @@ READINGS = {
 }
 
 
-def walked(views: Int[Array, "objects starts steps"], logits: Float[Array, "objects views classes"]) -> Array:
-    """Logits along every walk, (objects, starts, steps, classes); zeros beyond a walk's end."""
+def logits_along(views: Int[Array, "objects starts steps"], logits: Float[Array, "objects views classes"]) -> Array:
+    """Logits along every walk, (objects, starts, steps, classes); zeros beyond the end of a walk."""
 
     def one(views: Array, logits: Array) -> Array:
         return jnp.where(views[..., None] >= 0, logits[views], 0.0)
@@ -45,7 +45,7 @@ def walked(views: Int[Array, "objects starts steps"], logits: Float[Array, "obje
 
 @jax.jit
 def _fit(logits: Array, labels: Array) -> dict[str, Array]:
-    """Temperatures (steps,) of the fitted readings, from walks (objects, starts, steps, classes)."""
+    """Temperatures (steps,) by reading, fitted on walks (objects, starts, steps, classes)."""
     _, starts, steps, classes = logits.shape
     beliefs = jax.vmap(running_sum)(logits.reshape(-1, steps, classes))
     truth = jnp.repeat(labels, starts)
@@ -67,13 +67,13 @@ def _mixed(logits: Array) -> Array:
 
 @jax.jit
 def _discounted(logits: Array, temperatures: Array) -> Array:
-    """Log-probabilities of all other readings, which differ in their temperatures (steps,) alone."""
+    """Log-probabilities of all other readings, which differ only in their temperatures (steps,)."""
     return jax.vmap(jax.vmap(lambda walk: discounted(running_sum(walk), temperatures)))(logits)
 
 
 @jax.jit
 def _score(log_probabilities: Array, labels: Array) -> dict[str, Array]:
-    """Calibration and, for every walk, confidence and correctness after each number of views."""
+    """Calibration after each number of views, with the confidence and correctness of every walk."""
     objects, starts, steps, classes = log_probabilities.shape
     log_probabilities, truth = log_probabilities.reshape(-1, steps, classes), jnp.repeat(labels, starts)
     confidence = jnp.exp(jnp.max(log_probabilities, axis=-1))
@@ -89,14 +89,14 @@ def _score(log_probabilities: Array, labels: Array) -> dict[str, Array]:
 
 
 def stops_at(enough: np.ndarray) -> np.ndarray:
-    """The first step (…) of walks (…, steps) where it is enough, else their last."""
+    """The first step (…) of walks (…, steps) at which `enough` is true, or the last step."""
     return np.where(enough.any(axis=-1), enough.argmax(axis=-1), enough.shape[-1] - 1)
 
 
 def stopping(confidence: np.ndarray, right: np.ndarray) -> list[dict[str, Any]]:
-    """Stops at the first step whose risk, 1 − confidence, is at most each of `RISKS`; else goes to the end of the walk.
+    """Stops at the first step with a risk, 1 − confidence, of at most each of `RISKS`, or at the end of the walk.
 
-    A walk that stops so promises a wrong answer at most that often. `error` is how often those answers are wrong.
+    The predictions of the walks that stop early should be wrong at most as often as the risk; `error` is how often they are.
     """
     rows = []
     for risk in RISKS:
@@ -109,7 +109,7 @@ def stopping(confidence: np.ndarray, right: np.ndarray) -> list[dict[str, Any]]:
                 "risk": risk,
                 "sure": float(stops.mean()),
                 "error": float(by_object[0].mean() / by_object[1].mean()) if stops.any() else None,
-                # Wrong although sure, minus what was promised, as a share of all walks: above zero is a broken promise.
+                # Share of walks that are confident and wrong, minus the share that the risk allows; above zero it is exceeded.
                 "excess": intervals(by_object[0] - risk * by_object[1]),
                 "accuracy": float(answer.mean()),
                 "views": float((at + 1).mean()),
@@ -126,9 +126,9 @@ def confidence_of(
     logits: np.ndarray,
     labels: np.ndarray,
 ) -> dict[str, Any]:
-    """Everything about the confidence of one policy's walks; views are (objects, starts, steps)."""
-    fitting = walked(jnp.asarray(validation_views), jnp.asarray(validation_logits))
-    testing = walked(jnp.asarray(views), jnp.asarray(logits))
+    """All confidence metrics of one policy's walks; views are (objects, starts, steps)."""
+    fitting = logits_along(jnp.asarray(validation_views), jnp.asarray(validation_logits))
+    testing = logits_along(jnp.asarray(views), jnp.asarray(logits))
     temperatures = _fit(fitting, jnp.asarray(validation_labels))
     out: dict[str, Any] = {"readings": {}}
     for reading in READINGS:

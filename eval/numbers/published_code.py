@@ -1,4 +1,4 @@
-"""What the thesis's published code does otherwise than its text, and what each of that does to its Tables 7 and 12."""
+"""Differences between the thesis's text and its published code, and their effect on its Tables 7 and 12."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from eval.numbers.comparison import cells, intervals
 from eval.walks.grid import Results
 
 THESIS_GAINS = {10: {"table": 7, "mean": 0.0111, "above_zero": 48}, 40: {"table": 12, "mean": 0.0006, "above_zero": 29}}
-"""By number of views: the thesis's gain over random, mean of its 56 cells, and how many of them are above zero."""
+"""By number of views: the mean of the thesis's gain over random in its 56 cells, and the number of cells above zero."""
 
 ROWS = (
     ("text", "the thesis's text", "random", "predicted_entropy", False),
@@ -20,18 +20,18 @@ ROWS = (
     ("validation_by_view", "classifier validated by view", "random", "predicted_entropy", True),
     ("published_code", "the published code: all of its three", "random_with_repetition", "scrambled_entropy", True),
 )
-"""Name, title, baseline, policy, and whether the classifier is the one that was validated by view."""
+"""Name, title, baseline, policy, and whether the classifier was validated by view."""
 
 
 def compatibility(
     ours: dict[str, Results], by_view: dict[str, Results] | None, views: int, leak: dict[str, dict[str, float]] | None
 ) -> dict[str, Any]:
-    """Gain over random in the thesis's grid under each switch; rows whose classifier was not trained are None.
+    """Gain over random in the thesis's grid for each row of `ROWS`; None where the classifier was not trained.
 
     Args:
         ours: results with the classifier validated by object.
-        by_view: with the one validated by view, if there is one.
-        views: candidate viewpoints, which say what table of the thesis this is.
+        by_view: results with the classifier validated by view, if there is one.
+        views: number of candidate viewpoints, which decides the table of the thesis.
         leak: accuracy on single views, `validation` and `test`, of both classifiers.
     """
     rows: dict[str, Any] = {}

@@ -1,4 +1,4 @@
-"""From view tables to `metrics.json`: all that the report says, as numbers."""
+"""From view tables to `metrics.json`: all numbers of the report."""
 
 from __future__ import annotations
 
@@ -24,17 +24,17 @@ from mevs_jax.policies.base import Knowledge
 from mevs_jax.viewpoints import ViewGraph
 
 HEADLINE_CT, HEADLINE_MV = 0.99, 4
-"""The cell of the thesis's first test and of its confusion matrices (§5.3)."""
+"""The cell of the grid used in the thesis's first test and confusion matrices (§5.3)."""
 BASELINE = "random"
 CONFIDENCE_OF = ("random", "predicted_entropy", "information_gain")
-"""Whose confidence is looked into."""
+"""Policies whose confidence is evaluated."""
 MOVING = ("predicted_entropy", "information_gain")
 MOVEMENT_COSTS = (0.02, 0.05, 0.1, 0.2, 0.5)
-"""In units of the policy's score (normalised entropy, nats) per radian of the way."""
+"""In units of the policy's score (normalised entropy or nats) per radian of movement."""
 
 
 def single_view(tables: ViewTables, classes: int) -> dict[str, Any]:
-    """How well one view is classified, over all views of all objects."""
+    """Accuracy on single views, over all views of all objects."""
     predictions = tables.logits.argmax(-1)
     right = predictions == tables.labels[:, None]
     views = predictions.shape[1]
@@ -53,12 +53,12 @@ def single_view(tables: ViewTables, classes: int) -> dict[str, Any]:
 
 
 def entropy_errors(tables: ViewTables, statistics: DatasetStatistics) -> dict[str, Any]:
-    """Squared error of the predicted entropies, beside two predictors that look at nothing.
+    """Squared error of the predicted entropies, and of two predictors that receive no view.
 
-    The mean map is the training split's mean entropy of each view; the class-mean map is the same by class, told the true
-    class. All on normalised entropies.
+    The mean map is the training split's mean entropy of each view; the class-mean map is the mean over the true class. All
+    entropies are normalised.
     """
-    true = tables.entropy[:, None, :]  # (objects, 1, views): every view predicts the whole map
+    true = tables.entropy[:, None, :]  # (objects, 1, views): a prediction from any view is compared with the same map
     network = np.square(tables.predicted_entropy - true).mean(axis=(1, 2))
     mean_map = np.square(np.array(statistics.mean_map) - tables.entropy).mean(axis=1)
     class_map = np.square(np.array(statistics.class_mean_maps)[tables.labels] - tables.entropy).mean(axis=1)
@@ -81,9 +81,9 @@ def entropy_errors(tables: ViewTables, statistics: DatasetStatistics) -> dict[st
 
 
 def best_pair(tables: ViewTables, reachable: np.ndarray) -> dict[str, Any]:
-    """The share of objects that the pair of views most in favour of their label gets right.
+    """Accuracy with the pair of views whose sum of logits gives the true label the highest probability.
 
-    It knows the label and is free to start anywhere: about what two views could do at most.
+    It uses the label and may start anywhere, so it is approximately an upper bound for two views.
     """
     logits = jnp.asarray(tables.logits[:, np.flatnonzero(reachable)])
 
@@ -97,7 +97,7 @@ def best_pair(tables: ViewTables, reachable: np.ndarray) -> dict[str, Any]:
 
 
 def headline_confusion(views: np.ndarray, tables: ViewTables, max_views: int) -> np.ndarray:
-    """Confusion at the headline cell from walks (objects, starts, steps), each object weighing one."""
+    """Confusion matrix at the headline cell, from walks (objects, starts, steps); each object has weight one."""
     walks = np.take_along_axis(tables.logits[:, None], np.maximum(views, 0)[..., None], axis=2)
     beliefs = np.cumsum(np.where(views[..., None] >= 0, walks, 0), axis=2)[:, :, :max_views]
     shifted = np.exp(beliefs - beliefs.max(axis=-1, keepdims=True))
@@ -113,7 +113,11 @@ def headline_confusion(views: np.ndarray, tables: ViewTables, max_views: int) ->
 def exactly_random(
     results: Results, logits: jax.Array, labels: jax.Array, reachable: np.ndarray
 ) -> tuple[Results, int]:
-    """`results` of random selection with exact expectations where there are not too many subsets, and up to how many views."""
+    """Replaces `results` of random selection by exact expectations where there are few enough subsets of views.
+
+    Returns:
+        The results, and the number of views up to which they are exact.
+    """
     max_views = results.after.shape[-1]
     right, used, after = expected_random(logits, labels, reachable, THRESHOLDS, max_views)
     exact = after.shape[-1]
@@ -129,23 +133,23 @@ def exactly_random(
     )
 
 
-def accuracy_by_way(results: Results) -> dict[str, list[float]]:
-    """Mean accuracy and mean way after each number of views."""
+def accuracy_by_distance(results: Results) -> dict[str, list[float]]:
+    """Mean accuracy and mean distance travelled after each number of views."""
     _, _, after, travelled = cells(results)
     return {"after_views": after.mean(axis=-1).tolist(), "travelled": travelled.mean(axis=-1).tolist()}
 
 
 def reachable_views(viewpoints: np.ndarray, lowest_elevation: float) -> np.ndarray:
-    """Which viewpoints are at least so many degrees above the horizon, (views,) bool.
+    """Whether each viewpoint is at least at the lowest elevation (degrees), (views,) bool.
 
     Raises:
-        ValueError: where fewer than two are.
+        ValueError: fewer than two viewpoints are.
     """
     elevation = np.degrees(np.arcsin(np.clip(viewpoints[:, 2], -1, 1)))
     reachable = elevation >= lowest_elevation - 1e-6
     if reachable.sum() < 2:
         raise ValueError(
-            f"only {reachable.sum()} of {len(viewpoints)} viewpoints are {lowest_elevation:g}° above the horizon or higher; "
+            f"only {reachable.sum()} of {len(viewpoints)} viewpoints have an elevation of at least {lowest_elevation:g}°; "
             f"choose a lower --evaluation.lowest-elevation"
         )
     return reachable
@@ -171,11 +175,11 @@ def run_study(
     """All metrics of the test split.
 
     Args:
-        tables: of the test objects.
-        validation: of the validation objects, from which policies and temperatures learn.
-        statistics: of the data set.
-        config: what is evaluated.
-        by_view: of the test objects by the classifier that was validated by view, for the compatibility table.
+        tables: view tables of the test objects.
+        validation: view tables of the validation objects, on which knowledge and temperatures are fitted.
+        statistics: statistics of the data set.
+        config: settings of the evaluation.
+        by_view: view tables of the test objects by the classifier validated by view, for the compatibility table.
         leak: accuracy on single views, `validation` and `test`, of both classifiers.
     """
     viewpoints = np.array(statistics.viewpoints)
@@ -196,7 +200,7 @@ def run_study(
     validation_walks = _walk(validation, fitting, graph, knowledge, config, reachable=reachable)
 
     def starts_of(result: Results) -> np.ndarray:
-        """The kept walks from views in reach, (objects, starts, steps)."""
+        """The stored walks from reachable views, (objects, starts, steps)."""
         return np.asarray(result.views)[0, :, can_reach, 0].swapaxes(0, 1)
 
     confidence = {
@@ -212,13 +216,15 @@ def run_study(
     }
 
     movement: dict[str, list[dict[str, Any]]] = {
-        name: [{"cost": 0.0} | accuracy_by_way(results[name])] for name in MOVING
+        name: [{"cost": 0.0} | accuracy_by_distance(results[name])] for name in MOVING
     }
     moving = tuple(rung for rung in rungs if rung.policy in MOVING)
     for cost in MOVEMENT_COSTS:
-        priced = _walk(tables, moving, graph, knowledge, config, reachable=reachable, movement_cost=jnp.float32(cost))
-        for name, result in priced.items():
-            movement[name].append({"cost": cost} | accuracy_by_way(result))
+        with_cost = _walk(
+            tables, moving, graph, knowledge, config, reachable=reachable, movement_cost=jnp.float32(cost)
+        )
+        for name, result in with_cost.items():
+            movement[name].append({"cost": cost} | accuracy_by_distance(result))
 
     other = None
     if by_view is not None:

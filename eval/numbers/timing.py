@@ -1,8 +1,8 @@
 """Time and memory of one decision (thesis Tables 3 and 9, and the times of Appendix A).
 
-Times are of single calls, device-synchronised, after warming up; they are reports of this machine, not tests. Memory is what
-XLA plans for the program (weights, inputs and all temporaries together), and beside it the device's own peak where the device
-reports one, each measured in a process of its own, since a peak never goes down.
+Times are of single calls after a warm-up, with device synchronisation. They describe this machine and are not tests.
+Memory is what XLA plans for the program (weights, inputs and all temporaries), and the device's own peak if the
+device reports one. Each peak is measured in a separate process, because the peak of a process never decreases.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ _WARM_UP = 3
 
 
 def milliseconds(call: Callable[[Any], Any], inputs: Sequence[Any]) -> np.ndarray:
-    """Time of a call with each of the inputs, until its result is there, (inputs,)."""
+    """Time in milliseconds of a call with each of the inputs, until its result is ready, (inputs,)."""
     for _ in range(_WARM_UP):
         jax.block_until_ready(call(inputs[0]))
     times = np.empty(len(inputs))
@@ -48,7 +48,7 @@ def milliseconds(call: Callable[[Any], Any], inputs: Sequence[Any]) -> np.ndarra
 def time_predictor(
     data: Path, task: EntropyTask, network: nnx.Module, labels: np.ndarray, classes: list[str], runs: int
 ) -> dict[str, list[float]]:
-    """Mean and standard deviation (ms) of PointNet++ on one cloud, by class: random test objects from random views."""
+    """Mean and standard deviation (ms) of PointNet++ on one cloud, by class, over random views of random test objects."""
     structure, state = nnx.split(network)
     predict = jax.jit(lambda state, cloud: nnx.merge(structure, state)(cloud))
     source, random = open_split(data, "test"), np.random.default_rng(0)
@@ -69,7 +69,7 @@ def time_predictor(
 
 
 def time_local_maxima(views: int, runs: int = 200, objects: int = 1000) -> dict[str, float]:
-    """Milliseconds for the local maxima of one object's map, alone and as one of many in a batch."""
+    """Time in milliseconds to find the local maxima of one object's map, alone and per object in a batch."""
     graph = ViewGraph.from_points(fibonacci_sphere(views))
     maps = jax.random.uniform(jax.random.key(0), (objects, views))
     alone = jax.jit(lambda entropies: local_maxima(entropies, graph.neighbours))
@@ -81,7 +81,7 @@ def time_local_maxima(views: int, runs: int = 200, objects: int = 1000) -> dict[
 
 
 def time_ascent(method: Method, meshes: dict[str, list[Mesh]], starts: int, resolution: int) -> dict[str, Any]:
-    """Seconds of climbs on each class's objects, mean and standard deviation, and megabytes planned for one object."""
+    """Mean and standard deviation (seconds) of gradient ascent on the objects of each class, and megabytes for one object."""
     things = {name: [jnp.asarray(method.prepare(mesh)) for mesh in some] for name, some in meshes.items()}
     first = next(iter(things.values()))[0]
     compiled = jax.jit(lambda thing: ascend_on_sphere(method, thing, starts, resolution).values).lower(first).compile()
@@ -102,20 +102,20 @@ def time_ascent(method: Method, meshes: dict[str, list[Mesh]], starts: int, reso
 
 
 def _planned(compiled: Any) -> float | None:
-    """Megabytes that XLA plans for a program: arguments, results and temporaries."""
+    """Megabytes that XLA plans for a program: arguments, results and temporaries; None if unknown."""
     plan = compiled.memory_analysis()
     parts = ("argument_size_in_bytes", "output_size_in_bytes", "temp_size_in_bytes")
     return sum(getattr(plan, part) for part in parts) / 1e6 if plan else None
 
 
 def decision_memory(classify: ClassifierTask, predict: EntropyTask | None) -> dict[str, float | None]:
-    """Megabytes of one decision by networks of these sizes: what they see of a view → logits and the next view.
+    """Memory in megabytes of one decision by networks of these sizes: from the inputs of a view to logits and the next view.
 
     Args:
-        predict: None for random selection, which needs no other network than the classifier.
+        predict: None for random selection, which needs only the classifier.
 
     Returns:
-        `planned` by XLA, and the `device_peak` of this process, None where the device does not tell.
+        `planned` by XLA, and the `device_peak` of this process, None if the device does not report it.
     """
     side, views = classify.camera.resolution, predict.views if predict else 40
     graph = ViewGraph.from_points(fibonacci_sphere(views))
@@ -147,11 +147,11 @@ def decision_memory(classify: ClassifierTask, predict: EntropyTask | None) -> di
 
 
 def decision_memory_alone(classify: ClassifierTask, predict: EntropyTask | None) -> dict[str, float | None]:
-    """The same in a process of its own where the device reports peaks, which are over all that a process ever did."""
+    """`decision_memory` in a separate process if the device reports peaks, which cover the whole life of a process."""
     if not jax.devices()[0].memory_stats():
         return decision_memory(classify, predict)
     before = os.environ.get("XLA_PYTHON_CLIENT_PREALLOCATE")
-    os.environ["XLA_PYTHON_CLIENT_PREALLOCATE"] = "false"  # this process holds most of the device already
+    os.environ["XLA_PYTHON_CLIENT_PREALLOCATE"] = "false"  # this process has already allocated most of the device
     try:
         with ProcessPoolExecutor(1, multiprocessing.get_context("spawn")) as pool:
             return pool.submit(decision_memory, classify, predict).result()

@@ -1,7 +1,7 @@
-"""The best view of one object by climbing: the thesis's methods by differentiable rendering (§4.2.1), all starts together.
+"""The best view of one object by gradient ascent: the thesis's methods by differentiable rendering (§4.2.1).
 
-A method says what an object becomes before it is rendered, and the objective. `mevs draw ascent` runs it for one object
-and draws it; `benchmarks/ascent.py` measures how good the views are that are found so.
+A method defines the representation that is rendered, and the objective. All start views run together. `mevs draw ascent` runs a
+method on one object and draws it; `benchmarks/ascent.py` measures the quality of the views that are found.
 """
 
 from __future__ import annotations
@@ -26,8 +26,9 @@ from data_pipeline.dataset.builder import DataConfig, open_objects
 from data_pipeline.errors import DataError, EmptyMesh
 from data_pipeline.files import write_bytes
 from data_pipeline.objects.mesh import Mesh, ObjectEntry
-from data_pipeline.objects.reconstruction import decimate, voxelise
+from data_pipeline.objects.reconstruction import decimate, require_open3d, voxelise
 from data_pipeline.objects.sources import load_object
+from eval.projections import longitude_latitude
 from mevs_jax.cameras import Camera, cameras_at
 from mevs_jax.rendering import (
     Ascent,
@@ -42,19 +43,19 @@ from mevs_jax.rendering import (
 from mevs_jax.viewpoints import fibonacci_sphere
 
 FACES = 500
-"""a mesh is decimated to so many"""
+"""largest number of faces of a mesh after decimation"""
 _PADDED = 512
 
 
 @dataclass(frozen=True)
 class Method:
-    """One way to climb.
+    """A method by differentiable rendering.
 
     Attributes:
-        prepare: an object's mesh to what is rendered, of one shape for all objects.
-        picture: that and a camera to an image, for people; NaN where nothing is seen.
-        objective: that and a camera to what is climbed.
-        title: for people.
+        prepare: converts a mesh to the representation that is rendered; its shape is the same for all objects.
+        picture: renders the representation from a camera for display; NaN where nothing is seen.
+        objective: the objective of the representation and a camera, which is maximised.
+        title: the name of the objective in figures and messages.
     """
 
     prepare: Callable[[Mesh], Any]
@@ -64,7 +65,7 @@ class Method:
 
 
 def padded_triangles(mesh: Mesh, faces: int) -> Float[np.ndarray, "faces 3 3"]:
-    """The corners of exactly so many faces, the rest without area, which is not seen."""
+    """The corners of exactly `faces` triangles; the padding has no area and is not visible."""
     padded = np.zeros((faces, 3, 3), np.float32)
     kept = mesh.faces[:faces]
     padded[: len(kept)] = mesh.vertices[kept]
@@ -104,21 +105,21 @@ METHODS: dict[str, Method] = {
 
 @dataclass(frozen=True)
 class AscentConfig:
-    """Climbing to the best view of one object."""
+    """Settings of the gradient ascent on one object."""
 
     object: str | None = None
-    """its name, as in the data set; the first test object unless given"""
+    """name of the object in the data set; the first test object if not given"""
     method: Literal["volume", "mesh"] = "volume"
     """volume: opacity entropy of a grid of densities (after DiffDVR); mesh: depth entropy of a softly rendered mesh of at most
     500 faces"""
     starts: int = 40
-    """viewpoints to climb from"""
+    """number of start views"""
     resolution: int = 64
-    """pixels along each side of what is rendered"""
+    """pixels along each side of the rendered images"""
 
 
 def ascend_on_sphere(method: Method, thing: Any, starts: int, resolution: int) -> Ascent:
-    """From Fibonacci viewpoints on `thing`, as the method prepared it."""
+    """Gradient ascent on `thing`, as returned by `method.prepare`, from Fibonacci viewpoints."""
     return ascend(
         lambda pose: method.objective(thing, Camera(pose, resolution=resolution)),
         cameras_at(fibonacci_sphere(starts)).pose,
@@ -126,16 +127,16 @@ def ascend_on_sphere(method: Method, thing: Any, starts: int, resolution: int) -
 
 
 def look_everywhere(method: Method, thing: Any, directions: np.ndarray, resolution: int) -> Float[Array, " views"]:
-    """The objective from every direction (views, 3)."""
+    """The objective (views,) from every direction (views, 3)."""
     poses = cameras_at(directions.astype(np.float32)).pose
     return jax.lax.map(lambda pose: method.objective(thing, Camera(pose, resolution=resolution)), poses)
 
 
 def find(data: DataConfig, name: str | None) -> ObjectEntry:
-    """An object by its name, or the first test object.
+    """Returns the object with this name, or the first test object.
 
     Raises:
-        DataError: where there is no such object.
+        DataError: there is no such object.
     """
     entries = open_objects(data).entries
     if name is None:
@@ -144,23 +145,24 @@ def find(data: DataConfig, name: str | None) -> ObjectEntry:
         if entry.name == name:
             return entry
     raise DataError(
-        f"{data.source} has no object {name!r}; its first are {', '.join(entry.name for entry in entries[:3])}"
+        f"{data.source} has no object {name!r}; its first objects are {', '.join(entry.name for entry in entries[:3])}"
     )
 
 
 def ascend_on(data: DataConfig, config: AscentConfig, out: Path) -> tuple[str, Path]:
-    """Climbs on one object; returns what was found in a sentence, and where the animation is.
+    """Runs gradient ascent on one object; returns a sentence with the result, and the path of the animation.
 
     Raises:
-        DataError: where there is no such object, or nothing to see of it.
+        DataError: there is no such object, or its mesh is empty.
     """
     if config.starts < 2 or config.resolution < 8:
         raise DataError("--ascent.starts must be at least 2 and --ascent.resolution at least 8")
+    require_open3d()
     entry, method = find(data, config.object), METHODS[config.method]
     try:
         thing = jnp.asarray(method.prepare(load_object(entry)))
     except EmptyMesh as reason:
-        raise DataError(f"{entry.name} shows nothing ({reason}); choose another --ascent.object") from reason
+        raise DataError(f"{entry.name} cannot be rendered ({reason}); choose another --ascent.object") from reason
     found = jax.jit(lambda thing: ascend_on_sphere(method, thing, config.starts, config.resolution))(thing)
     order, kept = distinct_optima(found.poses, found.values)
     best = int(order[0])
@@ -174,7 +176,7 @@ def ascend_on(data: DataConfig, config: AscentConfig, out: Path) -> tuple[str, P
 
 
 def animation(method: Method, thing: Any, found: Ascent, resolution: int, frames_a_second: int = 8) -> bytes:
-    """A GIF: what the camera sees on the best start's way, beside the objective over all directions and everyone's way."""
+    """Returns a GIF: the images along the best path, and all paths on a map of the objective."""
     longitude, latitude = np.meshgrid(np.linspace(-180, 180, 49), np.linspace(-90, 90, 25))
     along, up = np.radians(longitude), np.radians(latitude)
     directions = np.stack([np.cos(up) * np.cos(along), np.cos(up) * np.sin(along), np.sin(up)], axis=-1)
@@ -183,7 +185,7 @@ def animation(method: Method, thing: Any, found: Ascent, resolution: int, frames
     draw = jax.jit(lambda thing, pose: method.picture(thing, Camera(pose, resolution=resolution)))
     best, steps = int(np.argmax(found.values)), int(np.max(found.steps)) + 1
     paths = np.asarray(found.path)[:, :steps] / 2
-    degrees = np.degrees(np.arctan2(paths[..., 1], paths[..., 0])), np.degrees(np.arcsin(np.clip(paths[..., 2], -1, 1)))
+    degrees = longitude_latitude(paths)
     poses = cameras_at(paths[best]).pose
 
     figure, (view, sphere) = plt.subplots(1, 2, figsize=(8.4, 3.6), width_ratios=(1, 1.7), layout="constrained")
@@ -193,7 +195,7 @@ def animation(method: Method, thing: Any, found: Ascent, resolution: int, frames
     sphere.pcolormesh(longitude, latitude, field, cmap="magma", shading="gouraud")
     sphere.set(xlabel="longitude (°)", ylabel="latitude (°)", title=method.title, xlim=(-180, 180), ylim=(-90, 90))
     others = sphere.scatter([], [], s=9, color="white", alpha=0.8)
-    (way,) = sphere.plot([], [], ".-", color="#22d3ee", linewidth=1.2, markersize=3)
+    (path_line,) = sphere.plot([], [], ".-", color="#22d3ee", linewidth=1.2, markersize=3)
     here = sphere.scatter([], [], s=60, facecolor="none", edgecolor="#22d3ee", linewidth=2)
 
     def frame(step: int) -> None:
@@ -201,8 +203,8 @@ def animation(method: Method, thing: Any, found: Ascent, resolution: int, frames
         title.set_text(f"step {step}: {float(found.path_values[best, step]):.3f}")
         others.set_offsets(np.stack([degrees[0][:, step], degrees[1][:, step]], axis=1))
         line = np.stack([degrees[0][best, : step + 1], degrees[1][best, : step + 1]])
-        jumps = np.flatnonzero(np.abs(np.diff(line[0])) > 180) + 1  # across the chart's edge
-        way.set_data(*np.insert(line, jumps, np.nan, axis=1))
+        jumps = np.flatnonzero(np.abs(np.diff(line[0])) > 180) + 1  # where the path crosses the edge of the map
+        path_line.set_data(*np.insert(line, jumps, np.nan, axis=1))
         here.set_offsets(line[:, -1:].T)
 
     frames = [*range(steps), *[steps - 1] * 8]

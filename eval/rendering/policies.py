@@ -1,8 +1,9 @@
-"""Policies by differentiable rendering (thesis §4.2.1): look next where a climb over the sphere ends.
+"""Policies by differentiable rendering (thesis §4.2.1): the next view is an optimum found by gradient ascent over the sphere.
 
-For each test object and each of its views, what that view alone shows becomes a surface (Poisson) or a grid of densities, and
-the camera climbs on it; once more on the whole object, which no robot has, as the upper bound. What is kept is a score for every
-candidate view. `mevs study rendering` makes these tables object by object, then evaluates and reports again.
+For each view of each test object, the points of that view are converted to a surface (Poisson reconstruction) or a
+grid of densities, on which gradient ascent runs. As an upper bound it also runs on the whole object, which a robot
+does not have. The result is a score for every candidate view. `mevs study rendering` computes these tables for one
+object after another, then evaluates and reports again.
 """
 
 from __future__ import annotations
@@ -27,7 +28,14 @@ from data_pipeline.dataset.statistics import DatasetStatistics
 from data_pipeline.errors import DataError
 from data_pipeline.files import npz_of, write_npz
 from data_pipeline.objects.mesh import Mesh, ObjectEntry
-from data_pipeline.objects.reconstruction import decimate, normals_towards, reconstruct, voxelise, voxelise_cloud
+from data_pipeline.objects.reconstruction import (
+    decimate,
+    normals_towards,
+    reconstruct,
+    require_open3d,
+    voxelise,
+    voxelise_cloud,
+)
 from data_pipeline.objects.sources import load_object
 from data_pipeline.progress import console, progress_bar
 from eval.numbers.comparison import difference, summarise
@@ -41,21 +49,21 @@ from mevs_jax.rendering import corners_of_cells, distinct_optima
 from mevs_jax.viewpoints import ViewGraph
 
 COMPARED = ("random", "farthest", "predicted_entropy", "oracle_entropy")
-"""The other policies on the same objects."""
+"""The policies that are evaluated on the same objects for comparison."""
 
 
 @dataclass(frozen=True)
 class RenderingConfig:
-    """Where differentiable rendering would look next, for many test objects."""
+    """Settings of the policies by differentiable rendering."""
 
     objects: int = 200
-    """test objects, spread evenly over the split"""
+    """number of test objects, spread evenly over the split"""
     starts: int = 6
-    """viewpoints to climb from"""
+    """number of start views of the gradient ascent"""
     resolution: int = 32
-    """pixels along each side of what is rendered"""
+    """pixels along each side of the rendered images"""
     faces: int = 200
-    """of a surface at most"""
+    """largest number of faces of a surface"""
 
 
 @dataclass(frozen=True)
@@ -63,10 +71,10 @@ class AscentScores:
     """Scores of candidate views for the chosen test objects.
 
     Attributes:
-        chosen: (objects,) their positions in the split.
-        scores: by method, (objects, views, views); row i is what to look at after seeing view i.
-        without_surface: views from which too little was seen for a surface; nothing can be climbed there.
-        config: how they were made.
+        chosen: (objects,) positions of the objects in the split.
+        scores: by policy, (objects, views, views); row i holds the scores after seeing view i.
+        without_surface: number of views that show too little for a surface.
+        config: settings with which the scores were computed.
     """
 
     chosen: np.ndarray
@@ -78,10 +86,10 @@ class AscentScores:
 def view_scores(
     poses: Float[Array, "starts 4 4"], values: Float[Array, " starts"], points: Float[Array, "views 3"]
 ) -> Float[Array, " views"]:
-    """Scores of candidate views from where climbs ended.
+    """Scores of candidate views from the ends of gradient ascents.
 
-    Distinct optima, from the best on, each take the candidate nearest to them that is not taken yet, and these come first in
-    that order. The other candidates follow by how near they are to the best optimum.
+    Each distinct optimum, from the best on, takes the nearest candidate that is not yet taken; these candidates come
+    first, in that order. The other candidates follow by their distance to the best optimum.
     """
     order, kept = distinct_optima(poses, values)
     directions = poses[order, :3, 3]
@@ -107,7 +115,7 @@ def _scores(method: str, things: Array, points: Array, config: RenderingConfig) 
 
 
 def _surface(points: np.ndarray, camera: np.ndarray, faces: int) -> np.ndarray | None:
-    """A surface through what a camera saw, as triangles; None where there is too little."""
+    """A surface through the points that a camera saw, as triangles; None if there are too few points."""
     try:
         return padded_triangles(reconstruct(points, normals_towards(points, camera), faces), faces)
     except DataError:
@@ -117,16 +125,17 @@ def _surface(points: np.ndarray, camera: np.ndarray, faces: int) -> np.ndarray |
 def scores_of_object(
     mesh: Mesh, depth: np.ndarray, poses: np.ndarray, field_of_view: float, points: Array, config: RenderingConfig
 ) -> dict[str, np.ndarray]:
-    """Scores after each view of one object, by method.
+    """Scores after each view of one object, by policy.
 
     Args:
         mesh: the whole object.
-        depth: (views, resolution, resolution) metric, 0 where nothing was hit.
-        poses: (views, 4, 4) of the cameras that saw it.
-        points: (views, 3) unit vectors to the candidates.
+        depth: (views, resolution, resolution) metric depth, 0 where nothing was hit.
+        poses: (views, 4, 4) poses of the cameras.
+        points: (views, 3) unit vectors to the candidate views.
 
     Returns:
-        (views, views) by the names of `ASCENT_RUNGS`, and `without_surface`, how many views show too little for one.
+        Scores (views, views) for each policy of `ASCENT_RUNGS`, and `without_surface`, the number of views that show too
+        little for a surface.
     """
     volumes, surfaces, missing = [], [], 0
     nothing = np.zeros((config.faces, 3, 3), np.float32)
@@ -151,13 +160,13 @@ def scores_of_object(
 
 
 def _folder(out: Path, statistics: DatasetStatistics, config: RenderingConfig) -> Path:
-    """Of one data set and one way to climb."""
+    """The folder of the scores of one data set with these settings."""
     made = (str(value) for name, value in asdict(config).items() if name != "objects")
     return out / "rendering" / "_".join((statistics.fingerprint, *made))
 
 
 def chosen_objects(config: RenderingConfig, objects: int) -> np.ndarray:
-    """Positions of the chosen objects in a split of so many."""
+    """Positions of the chosen objects in a split of `objects` objects."""
     return np.unique(np.linspace(0, objects - 1, min(config.objects, objects)).round().astype(int))
 
 
@@ -178,7 +187,7 @@ def _ascend_one(job: _Job, data: Path, statistics: DatasetStatistics, folder: Pa
 def _start_worker(data: Path, statistics: DatasetStatistics, folder: Path, config: RenderingConfig) -> None:
     global _worker
     _worker = partial(_ascend_one, data=data, statistics=statistics, folder=folder, config=config)
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent answers Ctrl-C and ends its workers
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent process handles Ctrl-C and ends its workers
 
 
 def _work(job: _Job) -> None:
@@ -187,24 +196,26 @@ def _work(job: _Job) -> None:
 
 
 def ascend_objects(dataset: DataConfig, statistics: DatasetStatistics, out: Path, config: RenderingConfig) -> None:
-    """Climbs on the chosen test objects, each into a file of its own; those that are there are not climbed on again.
+    """Computes the scores of the chosen test objects and stores each object in its own file; stored objects are skipped.
 
-    On a CPU several processes at a time: a climb uses one core.
+    On a CPU several processes run at a time, because one ascent uses one core.
     """
     if min(config.objects, config.starts - 1, config.faces) < 1 or config.resolution < 8:
         raise DataError(
-            "--rendering.objects and faces must be at least 1, --rendering.starts 2 and --rendering.resolution 8"
+            "--rendering.objects and --rendering.faces must be at least 1, --rendering.starts at least 2 and "
+            "--rendering.resolution at least 8"
         )
+    require_open3d()
     entries = {entry.name: entry for entry in open_objects(dataset).entries}
     names = objects_of(out / "data", "test", statistics)[0]
     folder, chosen = _folder(out, statistics, config), chosen_objects(config, len(names))
     for at in chosen:
         if names[at] not in entries:
-            raise DataError(f"{dataset.source} has no object {names[at]!r}; give the --data that {out} was made of")
+            raise DataError(f"{dataset.source} has no object {names[at]!r}; pass the --data from which {out} was made")
     jobs = [(int(at), entries[names[at]]) for at in chosen if not npz_of(folder, names[at]).exists()]
     given = out / "data", statistics, folder, config
     with progress_bar("objects") as bar:
-        line = bar.add_task("Climbing", total=len(chosen), completed=len(chosen) - len(jobs), note="")
+        line = bar.add_task("Gradient ascent", total=len(chosen), completed=len(chosen) - len(jobs), note="")
         workers = min(len(jobs), os.cpu_count() or 1)
         if jax.default_backend() != "cpu" or workers < 2:
             for job in jobs:
@@ -217,7 +228,7 @@ def ascend_objects(dataset: DataConfig, statistics: DatasetStatistics, out: Path
 
 
 def load_ascent_scores(out: Path, statistics: DatasetStatistics, config: RenderingConfig) -> AscentScores | None:
-    """What was climbed, or None where some chosen objects are missing."""
+    """Returns the stored scores, or None if some chosen objects are missing."""
     folder = _folder(out, statistics, config)
     if not folder.exists():
         return None
@@ -239,9 +250,9 @@ def load_ascent_scores(out: Path, statistics: DatasetStatistics, config: Renderi
 def ascent_study(
     tables: ViewTables, statistics: DatasetStatistics, climbed: AscentScores, config: GridConfig
 ) -> dict[str, Any]:
-    """The ladder of these policies beside others, on the chosen objects, from every start.
+    """Metrics of these policies and of some others on the chosen objects, from every start view.
 
-    Every difference is paired by object: from random selection, and from the thesis's predicted entropy.
+    Differences from random selection and from the thesis's predicted entropy are paired by object.
     """
     viewpoints = np.array(statistics.viewpoints)
     can_reach = reachable_views(viewpoints, config.lowest_elevation)

@@ -1,4 +1,4 @@
-"""The report's figures, each a function of numbers to a matplotlib figure; the report decides where they go."""
+"""The report's figures: functions that take numbers and return a matplotlib figure."""
 
 from __future__ import annotations
 
@@ -13,6 +13,8 @@ import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.figure import Figure
 
+from eval.projections import longitude_latitude
+
 COLOURS = {
     "random": "#6b7280",
     "farthest": "#0d9488",
@@ -22,7 +24,7 @@ COLOURS = {
     "information_gain": "#dc2626",
     "belief_oracle": "#111827",
 }
-"""Of the policies that are drawn as lines; the others are in tables and in the ladder's picture."""
+"""Of the policies drawn as lines. The others appear in tables and in the figure of gains."""
 KNOWS_COLOURS = {
     "nothing": "#6b7280",
     "networks": "#2563eb",
@@ -46,7 +48,7 @@ plt.rcParams.update(
 
 
 def accuracy_after_views(policies: dict[str, dict[str, Any]], titles: dict[str, str], all_views: float) -> Figure:
-    """Accuracy after exactly n views, all starts, with 95 % bands over objects."""
+    """Accuracy after each number of views, over all start views, with 95 % bands over objects."""
     figure, axis = plt.subplots(figsize=(7.2, 4.2), layout="constrained")
     for name, colour in COLOURS.items():
         values = 100 * np.array(policies[name]["after_views"])
@@ -55,13 +57,13 @@ def accuracy_after_views(policies: dict[str, dict[str, Any]], titles: dict[str, 
         axis.plot(steps, values, "o-", color=colour, label=titles[name], markersize=3.5)
         axis.fill_between(steps, low, high, color=colour, alpha=0.06, linewidth=0)
     axis.axhline(100 * all_views, color="#111827", linestyle=":", linewidth=1, label="all views summed")
-    axis.set(xlabel="views looked at", ylabel="test accuracy (%)", title="Accuracy by number of views")
+    axis.set(xlabel="number of views", ylabel="test accuracy (%)", title="Accuracy by number of views")
     axis.legend(frameon=False, fontsize=8, loc="lower right")
     return figure
 
 
 def accuracy_of_choices(policies: dict[str, dict[str, Any]], titles: dict[str, str], all_views: float) -> Figure:
-    """Accuracy after exactly n views of any policies, coloured by what they know, with 95 % bands over objects."""
+    """Accuracy after each number of views, coloured by what each policy knows, with 95 % bands over objects."""
     figure, axis = plt.subplots(figsize=(7.2, 4.6), layout="constrained")
     lines = {known: itertools.cycle(("o-", "s--", "^:", "v-.", "D-")) for known in KNOWS_COLOURS}
     for name, policy in policies.items():
@@ -70,7 +72,7 @@ def accuracy_of_choices(policies: dict[str, dict[str, Any]], titles: dict[str, s
         axis.plot(steps, values, next(lines[policy["knows"]]), color=colour, label=titles[name], markersize=3.5)
         axis.fill_between(steps, low, high, color=colour, alpha=0.05, linewidth=0)
     axis.axhline(100 * all_views, color="#111827", linestyle=":", linewidth=1, label="all views fused")
-    axis.set(xlabel="views looked at", ylabel="test accuracy (%)", title="Accuracy by number of views")
+    axis.set(xlabel="number of views", ylabel="test accuracy (%)", title="Accuracy by number of views")
     axis.set_xticks(range(1, 1 + max(len(policy["after_views"]) for policy in policies.values())))
     axis.legend(frameon=False, fontsize=8, loc="lower right")
     return figure
@@ -79,7 +81,10 @@ def accuracy_of_choices(policies: dict[str, dict[str, Any]], titles: dict[str, s
 def ladder_gains(
     against: dict[str, dict[str, Any]], ladder: Sequence[dict[str, str]], views: Sequence[int], exclude: Sequence[str]
 ) -> Figure:
-    """Points above random after so many views, a panel each, with paired 95 % intervals; hollow where zero is inside."""
+    """Gain over random in percentage points with paired 95 % intervals, a panel for each number of views.
+
+    Markers are hollow where the interval contains zero.
+    """
     rungs = [rung for rung in ladder if rung["policy"] in against and rung["policy"] not in exclude]
     figure, axes = plt.subplots(
         1, len(views), figsize=(8.4, 0.34 * len(rungs) + 1.1), sharey=True, layout="constrained", squeeze=False
@@ -95,7 +100,7 @@ def ladder_gains(
                 gain, row, "o", color=colour, markersize=5, markerfacecolor="white" if low <= 0 <= high else colour
             )
         axis.axvline(0, color="#111827", linewidth=1)
-        axis.set(xlabel="points above random", title=f"After {count} views")
+        axis.set(xlabel="gain over random (percentage points)", title=f"After {count} views")
         axis.grid(axis="x", color="#e5e7eb", linewidth=0.6)
         axis.set_axisbelow(True)
     axes[0][0].set_yticks(range(len(rungs)), [rung["title"].lstrip("— ") for rung in rungs])
@@ -103,42 +108,40 @@ def ladder_gains(
     return figure
 
 
-def accuracy_by_way(
+def accuracy_by_distance(
     policies: dict[str, dict[str, Any]], titles: dict[str, str], movement: dict[str, list[dict[str, Any]]]
 ) -> Figure:
-    """Accuracy against the way of the camera; fainter lines pay for the way."""
+    """Accuracy against the distance that the camera travelled; the fainter lines have a movement cost."""
     figure, axis = plt.subplots(figsize=(7.2, 4.2), layout="constrained")
     for name, colour in COLOURS.items():
         if name == "belief_oracle":
             continue
-        way, values = np.degrees(policies[name]["travelled"]), 100 * np.array(policies[name]["after_views"])
-        axis.plot(way, values, "o-", color=colour, label=titles[name], markersize=3.5)
+        distance, values = np.degrees(policies[name]["travelled"]), 100 * np.array(policies[name]["after_views"])
+        axis.plot(distance, values, "o-", color=colour, label=titles[name], markersize=3.5)
     for name, runs in movement.items():
-        priced = [run for run in runs if run["cost"] > 0]
-        for alpha, run in zip(np.linspace(0.7, 0.3, len(priced)), priced, strict=True):
-            way, values = np.degrees(run["travelled"]), 100 * np.array(run["after_views"])
-            axis.plot(way, values, "-", color=COLOURS[name], alpha=alpha, linewidth=1)
-            axis.annotate(f"{run['cost']:g}", (way[-1], values[-1]), fontsize=6, color=COLOURS[name], alpha=alpha)
-    axis.set(xlabel="way of the camera (°)", ylabel="test accuracy (%)", title="Accuracy by distance travelled")
+        with_cost = [run for run in runs if run["cost"] > 0]
+        for alpha, run in zip(np.linspace(0.7, 0.3, len(with_cost)), with_cost, strict=True):
+            distance, values = np.degrees(run["travelled"]), 100 * np.array(run["after_views"])
+            axis.plot(distance, values, "-", color=COLOURS[name], alpha=alpha, linewidth=1)
+            axis.annotate(f"{run['cost']:g}", (distance[-1], values[-1]), fontsize=6, color=COLOURS[name], alpha=alpha)
+    axis.set(xlabel="distance travelled (°)", ylabel="test accuracy (%)", title="Accuracy by distance travelled")
     axis.legend(frameon=False, fontsize=8, loc="lower right")
     return figure
 
 
 def calibration_by_views(readings: dict[str, dict[str, Any]], titles: dict[str, str]) -> Figure:
-    """Expected calibration error after each number of views, a line for each way to read the belief."""
+    """Expected calibration error after each number of views, a line for each way to compute the confidence."""
     figure, axis = plt.subplots(figsize=(8.2, 3.0), layout="constrained")
     for name, colour in zip(readings, ("#d97706", "#0d9488", "#9333ea", "#dc2626", "#6b7280"), strict=True):
         values = 100 * np.array(readings[name]["ece"])
         axis.plot(np.arange(1, len(values) + 1), values, "o-", color=colour, label=titles[name], markersize=3.5)
-    axis.set(
-        xlabel="views looked at", ylabel="expected calibration error (%)", title="How far confidence is off", ylim=0
-    )
+    axis.set(xlabel="number of views", ylabel="expected calibration error (%)", title="Calibration error", ylim=0)
     figure.legend(frameon=False, fontsize=8, loc="outside right center")
     return figure
 
 
 def reliability_curves(readings: dict[str, dict[str, Any]], titles: dict[str, str], views: Sequence[int]) -> Figure:
-    """Accuracy against confidence in bins, a panel for each number of views; dots grow with the share of answers."""
+    """Accuracy against confidence in bins, a panel for each number of views; larger dots hold more of the predictions."""
     names = [name for name in readings if "reliability" in readings[name]]
     figure, axes = plt.subplots(
         1, len(views), figsize=(2.5 * len(views), 2.9), sharey=True, layout="constrained", squeeze=False
@@ -166,7 +169,7 @@ def difference_grid(
     max_views: Sequence[int],
     title: str,
 ) -> Figure:
-    """The thesis's Table 7 as a picture: points above random in each (MV, CT) cell, bold where its interval leaves out 0."""
+    """The thesis's Table 7 as a figure: gain over random in points by MV and CT, bold where the interval excludes 0."""
     values = 100 * np.array(difference)
     largest = max(0.5, np.abs(values).max())
     figure, axis = plt.subplots(figsize=(5.4, 3.6), layout="constrained")
@@ -184,13 +187,13 @@ def difference_grid(
         )
     axis.set_xticks(range(len(thresholds)), [f"{ct:g}" for ct in thresholds])
     axis.set_yticks(range(len(max_views)), [str(mv) for mv in max_views])
-    axis.set(xlabel="confidence threshold", ylabel="most views", title=title)
+    axis.set(xlabel="confidence threshold", ylabel="limit on views", title=title)
     axis.spines[:].set_visible(False)
     return figure
 
 
 def confusions(matrices: dict[str, np.ndarray], classes: Sequence[str]) -> Figure:
-    """Confusion in percent of the true class, a panel per policy."""
+    """Confusion matrices in percent of the true class, a panel for each policy."""
     figure, axes = plt.subplots(
         1, len(matrices), figsize=(4.6 * len(matrices), 4.4), layout="constrained", sharey=True, squeeze=False
     )
@@ -227,10 +230,10 @@ def entropy_histogram(counts: Sequence[int], mean: float, std: float) -> Figure:
 
 
 def entropy_errors(entropy: dict[str, Any]) -> Figure:
-    """Error of the network beside two predictors that look at nothing."""
+    """Error of the network and of two predictors that receive no view."""
     rows = [
         ("mean map", "mean_map", "#9ca3af"),
-        ("class-mean map\n(told the class)", "class_mean_map", "#d1d5db"),
+        ("class-mean map\n(given the class)", "class_mean_map", "#d1d5db"),
         ("PointNet++", "pointnet2", "#2563eb"),
     ]
     figure, axis = plt.subplots(figsize=(4.6, 2.6), layout="constrained")
@@ -259,11 +262,8 @@ def view_map(
     title: str,
     limits: tuple[float, float],
 ) -> Figure:
-    """Views in a Mercator-like chart (thesis Figs. 7 and 11), coloured by entropy; local maxima are ringed."""
-    longitude, latitude = (
-        np.degrees(np.arctan2(points[:, 1], points[:, 0])),
-        np.degrees(np.arcsin(np.clip(points[:, 2], -1, 1))),
-    )
+    """Viewpoints by longitude and latitude, coloured by entropy, with rings around local maxima (thesis Figs. 7 and 11)."""
+    longitude, latitude = longitude_latitude(points)
     figure, axis = plt.subplots(figsize=(4.8, 2.8), layout="constrained")
     for i, j in np.argwhere(np.triu(neighbours)):
         if abs(longitude[i] - longitude[j]) < 180:
@@ -278,7 +278,7 @@ def view_map(
 
 
 def contact_sheet(images: np.ndarray, labels: Sequence[str]) -> Figure:
-    """Rows of views, (rows, columns, height, width) uint8, a name beside each row."""
+    """Images (rows, columns, height, width) uint8 as one sheet, with a label for each row."""
     rows, columns, height, width = images.shape
     sheet = images.transpose(0, 2, 1, 3).reshape(rows * height, columns * width)
     figure, axis = plt.subplots(figsize=(8, 8 * rows / columns), layout="constrained")
@@ -291,7 +291,7 @@ def contact_sheet(images: np.ndarray, labels: Sequence[str]) -> Figure:
 
 
 def episode_strip(images: Sequence[np.ndarray], captions: Sequence[str], title: str) -> Figure:
-    """The views of one walk in their order, a caption under each."""
+    """The views of one walk in order, with a caption under each."""
     figure, axes = plt.subplots(1, len(images), figsize=(1.7 * len(images), 2.3), layout="constrained", squeeze=False)
     for axis, image, caption in zip(axes[0], images, captions, strict=True):
         axis.imshow(image, cmap="gray", vmin=0, vmax=255)
@@ -303,7 +303,7 @@ def episode_strip(images: Sequence[np.ndarray], captions: Sequence[str], title: 
 
 
 def losses(histories: dict[str, list[dict[str, float]]]) -> Figure:
-    """Training and validation loss by epoch, a panel per network."""
+    """Training and validation loss by epoch, a panel for each network."""
     figure, axes = plt.subplots(
         1, len(histories), figsize=(4.4 * len(histories), 2.8), layout="constrained", squeeze=False
     )

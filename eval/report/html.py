@@ -1,4 +1,4 @@
-"""What the report's sections are written with: HTML tables, pictures inside the page, numbers as people read them."""
+"""Building blocks of the report: HTML tables, embedded figures, formatted numbers."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ import html
 import io
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import groupby
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +16,7 @@ from matplotlib.figure import Figure
 
 from data_pipeline.dataset.statistics import DatasetStatistics
 from eval.tables import ViewTables
+from eval.walks.ladder import KNOWS, Knows
 
 STYLE = """
 body{font:15px/1.55 system-ui,sans-serif;color:#111827;max-width:60rem;margin:2rem auto;padding:0 1rem}
@@ -33,7 +35,7 @@ details{margin:1rem 0}summary{cursor:pointer}.wide{overflow-x:auto}.wide td,.wid
 
 @dataclass(frozen=True)
 class ReportInputs:
-    """Everything the page is made of, as the stages before left it."""
+    """The results of the earlier stages from which the page is written."""
 
     statistics: DatasetStatistics
     metrics: dict[str, Any]
@@ -44,18 +46,18 @@ class ReportInputs:
     preset: str
     settings: dict[str, Any]
     learned: dict[str, Any] | None = None
-    """of `mevs study learned`, where it was run"""
+    """metrics of `mevs study learned`, if it was run"""
 
 
 def drawn(figure: Figure, kind: str) -> bytes:
-    """A figure as the content of an SVG or PNG file."""
+    """Returns the content of an SVG or PNG file with the figure."""
     buffer = io.BytesIO()
     figure.savefig(buffer, format=kind, **({"metadata": {"Date": None}} if kind == "svg" else {"dpi": 130}))
     return buffer.getvalue()
 
 
 def embedded(content: bytes, kind: str, caption: str, name: str = "") -> str:
-    """A picture inside the page; with a name, such as "Figure 5", it is captioned with it and can be linked to."""
+    """HTML of an embedded image; a name such as "Figure 5" starts the caption and becomes a link target."""
     mime = "svg+xml" if kind == "svg" else kind
     anchor = f' id="{name.lower().replace(" ", "-")}"' if name else ""
     label = f"<b>{html.escape(name)}.</b> " if name else ""
@@ -72,7 +74,7 @@ def image(figure: Figure, caption: str, kind: str = "svg") -> str:
 
 
 def document(title: str, body: str) -> str:
-    """A whole page that needs no other file."""
+    """A complete HTML page that needs no other file."""
     return (
         f'<!doctype html><html lang="en"><meta charset="utf-8"><meta name="viewport" content="width=device-width">'
         f"<title>{title}</title><style>{STYLE}</style><h1>{title}</h1>{body}</html>\n"
@@ -80,7 +82,7 @@ def document(title: str, body: str) -> str:
 
 
 def table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    """Cells are HTML, headings text; a row of a single cell goes across the whole table."""
+    """An HTML table. Cells are HTML, headings are plain text; a row of one cell spans the table."""
     head = "".join(f"<th>{html.escape(cell)}</th>" for cell in header)
     body = "".join(
         "<tr>"
@@ -91,12 +93,21 @@ def table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
     return f"<table><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table>"
 
 
+def rows_by_knowledge(rows: Sequence[tuple[Knows, Sequence[str]]]) -> list[Sequence[str]]:
+    """Table rows, with a heading row before each change in what the policies know."""
+    out: list[Sequence[str]] = []
+    for knows, group in groupby(rows, key=lambda row: row[0]):
+        out.append([f'<b class="note">Uses {html.escape(KNOWS[knows])}</b>'])
+        out.extend(row for _, row in group)
+    return out
+
+
 def percent(value: float) -> str:
     return f"{100 * value:.1f}"
 
 
 def signed(value: float, digits: int = 1) -> str:
-    """In points, with a sign, a real minus, and no sign where it rounds to zero."""
+    """A share in percentage points with its sign; a value that rounds to zero has none."""
     text = f"{100 * value:+.{digits}f}".replace("-", "−")
     return text[1:] if float(text[1:]) == 0 else text
 
@@ -106,7 +117,7 @@ def span(interval: Sequence[float]) -> str:
 
 
 def difference(value: float, interval: Sequence[float], digits: int = 1) -> str:
-    """In points; faint where the interval holds zero."""
+    """A difference of shares in percentage points with its interval, grey if the interval contains zero."""
     low, high = (signed(end, digits) for end in interval)
     text = f"{signed(value, digits)} <small>[{low}, {high}]</small>"
     return f'<span class="faint">{text}</span>' if interval[0] <= 0 <= interval[1] else text

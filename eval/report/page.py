@@ -1,4 +1,4 @@
-"""The report: one self-contained page that says what was done, what came out, and how sure one may be of it."""
+"""The report: one self-contained page with the results, their intervals, and how they were obtained."""
 
 from __future__ import annotations
 
@@ -54,11 +54,15 @@ def _data_section(inputs: ReportInputs) -> str:
         f"{camera.field_of_view:g}° field of view from {camera.distance:g} radii away. "
         f"Points seen per view: {statistics.points_mean:,.0f} ± "
         f"{statistics.points_std:,.0f}. "
-        f"Entropies are normalised by the training split's largest, {statistics.entropy_max:.2f} bits.</p>"
+        f"Entropies are divided by the largest of the training split, {statistics.entropy_max:.2f} bits.</p>"
         + table(["class", "train", "val", "test"], [*rows, ["<b>all</b>", *totals]])
         + f"<p>{statistics.left_out_count} objects were left out "
         + f"({len(statistics.left_out['train'])} of training, {len(statistics.left_out['test'])} of test).</p>"
-        + (f"<details><summary>Which, and why</summary><ul>{''.join(left_out)}</ul></details>" if left_out else "")
+        + (
+            f"<details><summary>Objects left out, with reasons</summary><ul>{''.join(left_out)}</ul></details>"
+            if left_out
+            else ""
+        )
         + image(
             figures.contact_sheet(sheet, [statistics.classes[label] for label in sorted(chosen)]),
             f"One test object of each class from {len(views)} of the {statistics.views} viewpoints.",
@@ -92,14 +96,14 @@ def _entropy_section(inputs: ReportInputs) -> str:
         for weights, title in ((true, "true"), (predicted, "predicted after view 0"))
     ]
     low, high = entropy["better_than_mean_map"]
-    gain = "beats" if low > 0 else "does not beat"
+    verdict = "is better" if low > 0 else "is not better"
     rows = [[html.escape(name), f"{value:.4f}"] for name, value in entropy["by_class"].items() if value is not None]
     return (
         f"<h2>Predicting depth entropy</h2><p>From one partial cloud, PointNet++ predicts the normalised entropy of every view "
         f"with a mean squared error of {entropy['pointnet2']:.4f} "
-        f"({100 * (entropy['explained_variance'] or 0):.0f} % of the variance explained). It {gain} the mean map, which looks at "
-        f"nothing (difference in error {low:+.4f} to {high:+.4f}). The class-mean map is told the true class.</p>"
-        + image(figures.entropy_errors(entropy), "Test objects, all views as input; 95 % intervals over objects.")
+        f"({100 * (entropy['explained_variance'] or 0):.0f} % of the variance explained). It {verdict} than the mean map, which "
+        f"receives no view (difference in error {low:+.4f} to {high:+.4f}). The class-mean map is given the true class.</p>"
+        + image(figures.entropy_errors(entropy), "Test objects, every view as input; 95 % intervals over objects.")
         + '<div class="figures">'
         + "".join(
             image(m, f"{tables.names[example]}, an object of median error. Red rings: local maxima.") for m in maps
@@ -123,9 +127,9 @@ def _training_section(inputs: ReportInputs) -> str:
     return (
         "<h2>Training</h2>"
         + table(["network", "best epoch", "epochs", "best validation loss", "time"], rows)
-        + image(figures.losses(inputs.histories), "Validation is on objects never trained on.")
-        + f"<p>Single views: {percent(min(by_view))} % at the worst viewpoint, {percent(max(by_view))} % at the best; class "
-        f"accuracy {percent(inputs.metrics['single_view']['class_accuracy'])} %.</p>"
+        + image(figures.losses(inputs.histories), "Validation objects are never trained on.")
+        + f"<p>Accuracy on single views: {percent(min(by_view))} % at the worst viewpoint, {percent(max(by_view))} % at the "
+        f"best; class accuracy {percent(inputs.metrics['single_view']['class_accuracy'])} %.</p>"
     )
 
 
@@ -133,9 +137,9 @@ def _methods_section(inputs: ReportInputs) -> str:
     settings = html.escape(json.dumps(inputs.settings, indent=1, default=str))
     device = jax.devices()[0]
     return (
-        "<h2>How this was made</h2><p>Splits are by object; nothing was chosen on test objects. Every object is walked from "
-        f"every start view that can be reached; policies that draw are averaged over {draws(inputs.metrics)}. "
-        f"What policies may know of other objects, and all temperatures, is learned on "
+        "<h2>Methods</h2><p>Splits are by object; nothing was chosen on test objects. Walks start from every reachable view of "
+        f"every object. Results of random policies are means over {draws(inputs.metrics)}. "
+        f"The policies' knowledge of other objects, and all temperatures, are fitted on "
         f"{inputs.metrics['validation_objects']} validation objects. Preset "
         f"<code>{html.escape(inputs.preset)}</code>, JAX {jax.__version__} on {html.escape(device.device_kind)} "
         f"({html.escape(platform.machine())}, Python {platform.python_version()}).</p>"
@@ -164,7 +168,7 @@ _SECTIONS = (
 
 
 def write_report(inputs: ReportInputs, path: Path) -> None:
-    """Writes the page; it needs no other file."""
+    """Writes the report as one page that needs no other file."""
     body = "".join(section(inputs) for section in _SECTIONS)
-    title = f"Where to look next: {html.escape(inputs.statistics.source)}"
+    title = f"Next-best-view selection: {html.escape(inputs.statistics.source)}"
     write_text(path, document(title, body))

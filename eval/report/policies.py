@@ -1,4 +1,4 @@
-"""The report's sections on choosing views: the ladder first, then what the way costs, confidence, the grid, the switches."""
+"""The report's sections on view selection: accuracy, distance travelled, confidence, the thesis's grid, its published code."""
 
 from __future__ import annotations
 
@@ -12,8 +12,7 @@ import numpy as np
 from data_pipeline.dataset.builder import open_split
 from eval.numbers.confidence import READINGS
 from eval.report import figures
-from eval.report.html import ReportInputs, difference, image, percent, signed, span, table
-from eval.walks.ladder import KNOWS
+from eval.report.html import ReportInputs, difference, image, percent, rows_by_knowledge, signed, span, table
 from mevs_jax.policies.base import Scene
 from mevs_jax.policies.registry import POLICIES
 from mevs_jax.selection import Episode, ViewTable, select_from_table
@@ -33,7 +32,7 @@ def _titles(metrics: dict[str, Any]) -> dict[str, str]:
 
 
 def _steps(metrics: dict[str, Any], wanted: Sequence[int]) -> list[int]:
-    """Those numbers of views that were walked."""
+    """The wanted numbers of views that the walks reach."""
     return [step for step in wanted if step <= len(metrics["policies"]["random"]["after_views"])]
 
 
@@ -41,22 +40,21 @@ def lead(inputs: ReportInputs) -> str:
     metrics = inputs.metrics
     single, policies = metrics["single_view"], metrics["policies"]
     sentences = [
-        f"One view is recognised with {percent(single['accuracy'])} % accuracy, two random ones with "
-        f"{percent(policies['random']['after_views'][1])} %, all {metrics['views']} summed with "
-        f"{percent(single['all_views'])} %."
+        f"Accuracy is {percent(single['accuracy'])} % from one view, {percent(policies['random']['after_views'][1])} % from two "
+        f"random views, and {percent(single['all_views'])} % from the sum of all {metrics['views']}."
     ]
     for name, called in (
-        ("predicted_entropy", "The thesis's policy, PointNet++ entropy,"),
-        ("oracle_entropy", "Perfect knowledge of the entropies"),
-        ("information_gain", "Expected information gain"),
+        ("predicted_entropy", "the thesis's policy (PointNet++ entropy)"),
+        ("oracle_entropy", "perfect knowledge of the entropies"),
+        ("information_gain", "expected information gain"),
     ):
         result = metrics["against_random"][name]
         verdict = _verdict(result["after_views_difference"][1], result["after_views_interval"][1])
-        sentences.append(f"{called} is, at two views, {verdict}.")
+        sentences.append(f"At two views, {called} is {verdict}.")
     return (
         f'<p class="lead">{" ".join(sentences)}</p><p class="note">Over {metrics["objects"]} test objects and '
-        f"{metrics['starts']} start views of each; all policies see the same objects, starts and logits; a difference counts "
-        f"when its 95 % interval, paired by object, leaves out zero.</p>"
+        f"{metrics['starts']} start views of each. All policies have the same objects, start views and logits. Two "
+        f"policies are called distinguishable if the 95 % interval of their difference, paired by object, excludes zero.</p>"
     )
 
 
@@ -65,12 +63,9 @@ def ladder_section(inputs: ReportInputs) -> str:
     policies, against = metrics["policies"], metrics["against_random"]
     steps = _steps(metrics, (2, 3, 4, 6, 9))
     reach = metrics["views_to_reach"].get("5") or metrics["views_to_reach"].get("3")
-    rows, details, known = [], [], None
+    rows, details = [], []
     for rung in metrics["ladder"]:
         name, result = rung["policy"], policies[rung["policy"]]
-        if rung["knows"] != known:
-            known = rung["knows"]
-            rows.append([f'<b class="note">Knows {html.escape(KNOWS[known])}</b>'])
         row = [html.escape(rung["title"])]
         for step in steps:
             cell = f"<b>{percent(result['after_views'][step - 1])}</b>"
@@ -86,7 +81,7 @@ def ladder_section(inputs: ReportInputs) -> str:
             views = reach["views"][name]
             low, high = ("∞" if end is None else f"{end:.1f}" for end in reach["interval"][name])
             row.append(("never" if views is None else f"<b>{views:.1f}</b>") + f"<br><small>[{low}, {high}]</small>")
-        rows.append(row)
+        rows.append((rung["knows"], row))
         every = _steps(metrics, range(1, 10))
         details.append(
             [html.escape(rung["title"])]
@@ -100,47 +95,49 @@ def ladder_section(inputs: ReportInputs) -> str:
     if reach:
         target = next(key for key, value in metrics["views_to_reach"].items() if value is reach)
         header.append(f"views to reach {percent(reach['accuracy'])} %")
-        reach_note = f" The last column: views it takes to be as accurate as {target} random ones."
+        reach_note = f" Last column: number of views needed for the accuracy of {target} random views."
     else:
         reach_note = ""
     exact = metrics["random_exact_up_to"]
     return (
-        "<h2>The ladder: who chooses the next view</h2><p>Accuracy (%) after exactly so many views, and below it the difference "
-        "from random in points with its 95 % interval; <span class='faint'>grey</span> where it cannot be told from zero. "
+        "<h2>Accuracy by policy</h2><p>Accuracy (%) after exactly the given number of views. Below it: the difference from "
+        "random in percentage points with its 95 % interval, in <span class='faint'>grey</span> if the interval contains zero. "
         f"Area: mean accuracy over 1 to {len(policies['random']['after_views'])} views.{reach_note}</p>"
-        + table(header, rows)
-        + f"<p class='note'>Random without repetition is an exact expectation up to {exact} views"
-        + ("" if exact >= len(policies["random"]["after_views"]) else f", beyond that a mean over {draws(metrics)}")
-        + ". The label oracles are optimistic: they find views that are right by luck. If two views could be had anywhere and "
-        f"the label were known, {percent(metrics['best_pair']['accuracy'])} % "
-        f"[{span(metrics['best_pair']['interval'])}] would be right.</p>"
+        + table(header, rows_by_knowledge(rows))
+        + f"<p class='note'>Random selection without repetition is computed as an exact expectation up to {exact} views"
+        + (
+            ""
+            if exact >= len(policies["random"]["after_views"])
+            else f", and as a mean over {draws(metrics)} beyond that"
+        )
+        + ". The label oracles are optimistic, because they also find views that are right by chance. With the best pair of "
+        f"views for the known label, accuracy is {percent(metrics['best_pair']['accuracy'])} % "
+        f"[{span(metrics['best_pair']['interval'])}].</p>"
         + image(
             figures.ladder_gains(against, metrics["ladder"], _steps(metrics, (2, 4)), ("label_oracle", "pair_oracle")),
-            "Hollow: cannot be told from random. Grey knows nothing, blue what the networks say, red other objects, orange the "
-            "truth. The label oracles would be far to the right.",
+            "Hollow markers: not distinguishable from random. Colours by what a policy uses: grey nothing, blue predicted "
+            "entropies, red views of other objects, orange the truth. The label oracles are left out; they would lie far to "
+            "the right.",
         )
         + image(
             figures.accuracy_after_views(policies, _titles(metrics), metrics["single_view"]["all_views"]),
             "Bands: 95 % intervals over objects.",
         )
-        + "<details><summary>All numbers of views, with intervals</summary>"
+        + "<details><summary>Accuracy (%) after each number of views, with 95 % intervals</summary>"
         + table(["policy", *map(str, _steps(metrics, range(1, 10)))], details)
         + "</details>"
     )
 
 
 def ascent_section(inputs: ReportInputs) -> str:
-    """Empty where nothing was climbed."""
+    """The policies by differentiable rendering; empty if they were not evaluated."""
     found = inputs.metrics.get("climbing")
     if found is None:
         return ""
     steps = _steps(inputs.metrics, (2, 3, 4, 6))
-    against, rows, known = found["against"], [], None
+    against, rows = found["against"], []
     for rung in found["ladder"]:
         name = rung["policy"]
-        if rung["knows"] != known:
-            known = rung["knows"]
-            rows.append([f'<b class="note">Knows {html.escape(KNOWS[known])}</b>'])
         row = [html.escape(rung["title"])]
         for step in steps:
             cell = f"<b>{percent(found['policies'][name]['after_views'][step - 1])}</b>"
@@ -151,22 +148,23 @@ def ascent_section(inputs: ReportInputs) -> str:
                 else:
                     cell += "<br>–"
             row.append(cell)
-        rows.append(row)
+        rows.append((rung["knows"], row))
     settings = found["settings"]
     return (
-        "<h2>Choosing by differentiable rendering</h2><p>The thesis's other two methods: make a volume, or a surface of at most "
-        f"{settings['faces']} faces, of what the latest view shows, and climb over the sphere from {settings['starts']} starts "
-        f"to where it looks best, at {settings['resolution']}×{settings['resolution']} pixels. Distinct optima are looked at in "
-        "the order of their values. Accuracy (%) after so many views; below it the difference from random, and below that from "
-        "the thesis's predicted entropy, both with 95 % intervals.</p>"
-        + table(["next view chosen by", *(f"{step} views" for step in steps)], rows)
+        "<h2>Choosing by differentiable rendering</h2><p>The thesis's other two methods. They reconstruct a volume, or a "
+        f"surface of at most {settings['faces']} faces, from the latest view. Gradient ascent over the sphere from "
+        f"{settings['starts']} start views then maximises the objective, rendered at "
+        f"{settings['resolution']}×{settings['resolution']} pixels. The distinct optima are visited in the order of their "
+        "values. Accuracy (%) after the given number of views; below it the difference from random, and below that from the "
+        "thesis's predicted entropy, both with 95 % intervals.</p>"
+        + table(["next view chosen by", *(f"{step} views" for step in steps)], rows_by_knowledge(rows))
         + f"<p class='note'>{found['objects']} test objects, every start view. {found['views_without_surface']} of "
-        f"{found['views']:,} views show too little for a surface; after those the choice is arbitrary.</p>"
+        f"{found['views']:,} views show too little for a surface; the choice after such a view is arbitrary.</p>"
     )
 
 
 def draws(metrics: dict[str, Any]) -> str:
-    return f"{metrics['random_draws_per_start']} draws for each object and start"
+    return f"{metrics['random_draws_per_start']} draws for each object and start view"
 
 
 def movement_section(inputs: ReportInputs) -> str:
@@ -184,14 +182,14 @@ def movement_section(inputs: ReportInputs) -> str:
         for run in runs
     ]
     return (
-        "<h2>What the way costs</h2><p>A camera that moves pays for the way. Policies with a price take the view of highest "
-        "score − price × great-circle distance (in radians).</p>"
+        "<h2>Accuracy by distance travelled</h2><p>Policies with a movement cost choose the view with the largest "
+        "score − cost × great-circle distance (in radians).</p>"
         + image(
-            figures.accuracy_by_way(metrics["policies"], titles, metrics["movement"]),
-            "Dots: after 1, 2, 3, … views. Thin lines: the same policy with the price at their end.",
+            figures.accuracy_by_distance(metrics["policies"], titles, metrics["movement"]),
+            "Markers: after 1, 2, 3, … views. Thin lines: the same policy with the movement cost printed at its end.",
         )
-        + f"<details><summary>After {last[0]} views, by price</summary>"
-        + table(["policy", "cost", "accuracy (%)", "way"], rows)
+        + f"<details><summary>After {last[0]} views, by movement cost</summary>"
+        + table(["policy", "movement cost", "accuracy (%)", "distance travelled"], rows)
         + "</details>"
     )
 
@@ -211,35 +209,41 @@ def confidence_section(inputs: ReportInputs) -> str:
         ]
         for reading, values in readings.items()
     ]
-    header = ["reading", *(f"ECE, {s}" for s in steps), *(f"NLL, {s}" for s in steps), f"accuracy, {steps[-1]}"]
+    header = ["confidence from", *(f"ECE, {s}" for s in steps), *(f"NLL, {s}" for s in steps), f"accuracy, {steps[-1]}"]
     stops = []
-    for plain, mended in zip(readings["sum_of_logits"]["stopping"], readings["temperature"]["stopping"], strict=True):
+    for plain, calibrated in zip(
+        readings["sum_of_logits"]["stopping"], readings["temperature"]["stopping"], strict=True
+    ):
         row = [f"{100 * plain['risk']:g}"]
-        for cell in (plain, mended):
-            broken = cell["excess"][0] > 0
+        for cell in (plain, calibrated):
+            exceeded = cell["excess"][0] > 0
             error = "–" if cell["error"] is None else f"{100 * cell['error']:.1f}"
             row += [
-                f"<b>{error}</b>" if broken else error,
+                f"<b>{error}</b>" if exceeded else error,
                 f"{100 * cell['sure']:.0f}",
                 f"{cell['views']:.2f}",
                 percent(cell["accuracy"]),
             ]
         stops.append(row)
-    parts = ("wrong when sure", "sure", "views", "accuracy")
+    parts = ("error when confident", "confident", "views", "accuracy")
     return (
-        f"<h2>How sure it may be</h2><p>Walks by {html.escape(titles[name])}. Adding logits takes views of one object to be "
-        "independent, so confidence outruns accuracy. A temperature for each number of views, fitted on validation walks, mends "
-        "that and changes no answer; only the mean of probabilities can answer otherwise.</p>"
+        f"<h2>Confidence and calibration</h2><p>Walks by {html.escape(titles[name])}. Adding logits treats the views of one "
+        "object as independent, so confidence exceeds accuracy. A temperature for each number of views, fitted on validation "
+        "walks, corrects this and changes no prediction; only the mean of probabilities can change one.</p>"
         + image(
             figures.calibration_by_views(readings, READINGS),
-            "Expected calibration error, 15 bins, test objects; temperatures and exponent fitted on validation objects.",
+            "Expected calibration error (ECE), 15 bins, test objects. Temperatures and exponent are fitted on validation "
+            "objects.",
         )
         + table(header, rows)
-        + image(figures.reliability_curves(readings, READINGS, steps), "On the dotted line confidence is honest.")
-        + "<p>Stopping as soon as the risk, 1 − confidence, is at most what is asked for (columns in %; <b>bold</b>: wrong more "
-        "often than promised, by its 95 % interval):</p>"
+        + "<p class='note'>After the given number of views: ECE and accuracy in %, negative log-likelihood (NLL) in nats.</p>"
+        + image(
+            figures.reliability_curves(readings, READINGS, steps), "On the dotted line, confidence equals accuracy."
+        )
+        + "<p>Stopping as soon as the risk, 1 − confidence, is at most the requested risk. Columns except views in %; "
+        "<b>bold</b>: the error exceeds the requested risk by its 95 % interval.</p>"
         + table(
-            ["risk asked for", *(f"{part}, summed" for part in parts), *(f"{part}, calibrated" for part in parts)],
+            ["requested risk", *(f"{part}, summed" for part in parts), *(f"{part}, calibrated" for part in parts)],
             stops,
         )
     )
@@ -290,9 +294,9 @@ def compatibility_section(inputs: ReportInputs) -> str:
             f"validated by object, {percent(theirs['validation'])} % and {percent(theirs['test'])} % by view.</p>"
         )
     return (
-        "<h2>What the published code changes</h2><p>Gain of the PointNet++ policy over random in the grid above, in "
-        "points: first as the thesis's text has it, then with one thing as in its published code (or, for all "
-        "clouds, otherwise).</p>"
+        "<h2>Differences between the thesis and its published code</h2><p>Gain of the PointNet++ policy over random in the grid "
+        "above, in percentage points: first as the thesis's text describes it, then with one change at a time, and last with all "
+        "changes of the published code. The use of all clouds is not part of the published code.</p>"
         + table(["switch", "mean of the grid", "cells above zero", *(f"CT 0.99, MV {mv}" for mv in limits)], rows)
         + note
     )
@@ -303,7 +307,8 @@ def grid_section(inputs: ReportInputs) -> str:
     policies, against, titles = metrics["policies"], metrics["against_random"], _titles(metrics)
     shown = ("predicted_entropy", "oracle_entropy", "information_gain")
     parts = [
-        "<h2>The thesis's grid</h2><p>Stop at a confidence threshold (CT, columns) or after the most views (MV, rows).</p>",
+        "<h2>The thesis's grid</h2><p>A walk stops at a confidence threshold (CT, columns) or at a limit on views (MV, "
+        "rows).</p>",
         '<div class="figures">',
     ]
     for name in shown:
@@ -317,7 +322,7 @@ def grid_section(inputs: ReportInputs) -> str:
                     metrics["max_views"],
                     f"{titles[name]} − random",
                 ),
-                f"Percentage points (thesis Tables 7 and 12). Bold where its interval leaves out zero: "
+                f"Percentage points (thesis Tables 7 and 12). Bold: the 95 % interval excludes zero, in "
                 f"{((low > 0) | (high < 0)).sum()} of {low.size} cells.",
             )
         )
@@ -346,14 +351,14 @@ def grid_section(inputs: ReportInputs) -> str:
     parts.append(
         image(
             figures.confusions(matrices, inputs.statistics.classes),
-            f"Percent of each true class; CT {headline['threshold']}, MV {headline['max_views']} (thesis Fig. 23).",
+            f"Percentages of each true class; CT {headline['threshold']}, MV {headline['max_views']} (thesis Fig. 23).",
         )
     )
     return "".join(parts) + _example_walk(inputs)
 
 
 def _example_walk(inputs: ReportInputs) -> str:
-    """The first object that one view gets wrong and the predicted-entropy walk gets right; else the first object."""
+    """A walk of the predicted-entropy policy that starts with a wrong prediction and ends with the right one, if there is one."""
     tables, statistics = inputs.tables, inputs.statistics
     graph = ViewGraph.from_points(np.array(statistics.viewpoints))
     stacked = tables.stacked()
@@ -378,10 +383,10 @@ def _example_walk(inputs: ReportInputs) -> str:
     images = open_split(inputs.data, "test")[index]["image"]
     views = np.asarray(episode.views)
     captions = [
-        f"view {view}: {statistics.classes[int(p)]}\n{100 * float(c):.0f} % sure"
+        f"view {view}: {statistics.classes[int(p)]}\n{100 * float(c):.0f} % confident"
         for view, p, c in zip(views, episode.predictions, episode.confidences, strict=True)
     ]
-    title = f"{tables.names[index]}: what the policy looked at, and what it believed"
+    title = f"{tables.names[index]}: the views chosen, and the prediction after each"
     return image(
         figures.episode_strip([images[view] for view in views], captions, title),
         "One walk of the PointNet++ policy.",

@@ -1,4 +1,4 @@
-"""What a sweep found: a table of its members, best first, and a parallel-coordinates plot."""
+"""The report of a sweep: a table of its members and a parallel-coordinates plot."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
 
 from data_pipeline.files import write_bytes, write_text
+from eval.report.markdown import markdown_table
 from train.sweep import Member
 
 _AXES = {
@@ -25,18 +26,21 @@ _LOGARITHMIC = ("learning_rate", "weight_decay", "loss")
 
 
 def sweep_table(members: Sequence[Member]) -> str:
-    """Markdown; members best first, those that diverged last."""
-    rows = ["| " + " | ".join(["member", *_AXES.values(), "epochs"]) + " |", "|" + "---|" * (len(_AXES) + 2)]
+    """A Markdown table of the members, best first and diverged ones last."""
+    rows = []
     for member in sorted(members, key=lambda member: member.loss):
         loss = "diverged" if member.best is None else f"{member.loss:.5f}"
         numbers = [f"{member.learning_rate:.2e}", f"{member.weight_decay:.2e}", f"{member.dropout:.2f}"]
         numbers += [f"{member.augmentation:.2f}", str(member.best_epoch), loss, str(member.epochs)]
-        rows.append("| " + " | ".join([str(members.index(member)), *numbers]) + " |")
-    return "\n".join(rows) + "\n"
+        rows.append([str(members.index(member)), *numbers])
+    return markdown_table(["member", *_AXES.values(), "epochs"], rows) + "\n"
 
 
 def parallel_coordinates(members: Sequence[Member]) -> Figure:
-    """A line a member over the axes of a sweep, darker the better; members without a finite loss are left out and counted."""
+    """A line for each member over the swept parameters, darker for a lower loss.
+
+    Members without a finite loss are left out; the title counts them.
+    """
     finite = [member for member in members if member.best is not None]
     names = [name for name in _AXES if len({getattr(member, name) for member in finite}) > 1]
     columns, ticks = [], []

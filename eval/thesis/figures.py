@@ -1,4 +1,4 @@
-"""The thesis's figures of data and results: 5–11 and 17–25. (1–4 and 12–16 are drawings of ideas and networks.)"""
+"""The thesis's figures of data and results: 5–11 and 17–25. (1–4 and 12–16 are diagrams of ideas and networks.)"""
 
 from __future__ import annotations
 
@@ -16,26 +16,25 @@ from matplotlib.ticker import MaxNLocator
 from data_pipeline.dataset.builder import open_split
 from data_pipeline.dataset.inputs import metric_depth
 from data_pipeline.dataset.statistics import DatasetStatistics
+from eval.projections import mercator, mercator_ordinate
 from eval.report import figures
 from eval.thesis.results import LatticeTables
 from mevs_jax.viewpoints import ViewGraph, local_maxima
 from train.thesis_networks import BACKBONES, FRAMES, Frame, ThesisFolder
 
 _RING: dict[str, Any] = {"facecolors": "none", "edgecolors": "#dc2626", "linewidths": 1.6}
-_NEAREST_POLE = 85.0
-"""Degrees of latitude beyond which the Mercator projection is cut off."""
 
 
 @dataclass(frozen=True)
 class FigureInputs:
-    """What figures are drawn from.
+    """The data that the figures show.
 
     Attributes:
-        folder: of the run.
-        results: as in `thesis.json`.
-        statistics, tables: of each lattice; tables of the test objects.
-        histories: of each network's training, by the name of its folder.
-        example: index of the test object that stands for all.
+        folder: folder of the run.
+        results: content of `thesis.json`.
+        statistics, tables: by number of views; the tables are of the test objects.
+        histories: training history of each network, by the name of its folder.
+        example: index of the test object that is shown as an example.
     """
 
     folder: ThesisFolder
@@ -51,7 +50,7 @@ class FigureInputs:
 
 @dataclass(frozen=True)
 class ThesisFigure:
-    """A figure of the thesis: its number, how it is drawn, and what it shows."""
+    """A figure of the thesis: its number, the function that draws it, and its caption."""
 
     number: str
     draw: Callable[[FigureInputs], Figure]
@@ -74,7 +73,7 @@ def class_distribution(inputs: FigureInputs) -> Figure:
     views = axis.twinx()
     views.set_ylim(0, axis.get_ylim()[1] * statistics.views)
     views.spines.right.set_visible(True)
-    views.set_ylabel(f"views ({statistics.views} an object)")
+    views.set_ylabel(f"views ({statistics.views} per object)")
     figure.legend(frameon=False, ncols=2, loc="outside upper center")
     return figure
 
@@ -167,18 +166,10 @@ def view_graphs(inputs: FigureInputs) -> Figure:
     return figure
 
 
-def _mercator(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Longitude in degrees, and the Mercator ordinate in the same unit."""
-    longitude = np.degrees(np.arctan2(points[:, 1], points[:, 0]))
-    latitude = np.clip(np.degrees(np.arcsin(np.clip(points[:, 2], -1, 1))), -_NEAREST_POLE, _NEAREST_POLE)
-    return longitude, np.degrees(np.log(np.tan(np.radians(45 + latitude / 2))))
-
-
 def _map(axis: Axes, points: np.ndarray, **colour: Any) -> Any:
-    longitude, height = _mercator(points)
+    longitude, height = mercator(points)
     parallels = np.array([-80, -60, -30, 0, 30, 60, 80])
-    ticks = np.degrees(np.log(np.tan(np.radians(45 + parallels / 2))))
-    axis.set_yticks(ticks, [f"{p}°".replace("-", "−") for p in parallels])
+    axis.set_yticks(mercator_ordinate(parallels), [f"{p}°".replace("-", "−") for p in parallels])
     axis.set(xlim=(-185, 185), xticks=[-180, -90, 0, 90, 180], xlabel="longitude (°)", ylabel="latitude")
     axis.grid(color="#f3f4f6", linewidth=0.7)
     axis.set_axisbelow(True)
@@ -186,8 +177,8 @@ def _map(axis: Axes, points: np.ndarray, **colour: Any) -> Any:
 
 
 def _map_edges(axis: Axes, points: np.ndarray, neighbours: np.ndarray) -> None:
-    """Edges of the graph; those across ±180° leave the map on one side and come back on the other."""
-    longitude, height = _mercator(points)
+    """Draws the edges of the graph; edges across ±180° leave the map on one side and continue on the other."""
+    longitude, height = mercator(points)
     for i, j in np.argwhere(np.triu(neighbours)):
         x, y = longitude[[i, j]], height[[i, j]]
         if abs(x[0] - x[1]) <= 180:
@@ -202,7 +193,7 @@ def mercator_order_and_entropies(inputs: FigureInputs) -> Figure:
     points, weights = np.array(inputs.statistics[40].viewpoints), inputs.tables[40].entropy[inputs.example]
     figure, (order, entropies) = plt.subplots(1, 2, figsize=(10, 3.9), layout="constrained")
     _map(order, points, color="#bfdbfe")
-    for number, (x, y) in enumerate(zip(*_mercator(points), strict=True)):
+    for number, (x, y) in enumerate(zip(*mercator(points), strict=True)):
         order.annotate(str(number), (x, y), ha="center", va="center", fontsize=6.5, zorder=4)
     order.set_title("(a) canonical order")
     dots = _map(entropies, points, c=weights, cmap="viridis", vmin=0, vmax=1)
@@ -221,7 +212,7 @@ def graph_with_maxima(inputs: FigureInputs) -> Figure:
     _map(axes[0], points, color="#bfdbfe")
     axes[0].set_title("(a) neighbours")
     dots = _map(axes[1], points, c=weights, cmap="viridis", vmin=0, vmax=1)
-    longitude, height = _mercator(points)
+    longitude, height = mercator(points)
     axes[1].scatter(longitude[maxima], height[maxima], s=190, zorder=4, **_RING)
     axes[1].set_title(f"(b) {maxima.sum()} local maxima")
     figure.colorbar(dots, ax=axes[1], label="normalised depth entropy")
@@ -233,7 +224,7 @@ _EXAMPLE_NODES = {
     "F": (6, 0.5, 6), "G": (1, 1, 4), "H": (2.5, 0.8, 24), "I": (3, 1.2, 11), "J": (4, 1, 10),
 }  # fmt: skip
 _EXAMPLE_EDGES = ("AB", "AC", "AD", "BC", "BE", "CF", "CG", "DG", "EF", "EH", "EJ", "FI", "GJ")
-"""Of the thesis's Fig. 21: places, weights and neighbours, from `check_functionality.py` of its published code."""
+"""The graph of the thesis's Fig. 21 (positions, weights, edges), from `check_functionality.py` of its published code."""
 
 
 def example_graph(inputs: FigureInputs) -> Figure:
@@ -342,7 +333,7 @@ def accuracy_grid(views: int) -> Callable[[FigureInputs], Figure]:
                 axis.scatter(x, values[row], color=colour, alpha=alpha, s=18, zorder=3, label=name if last else None)
         axis.set_xticks(range(len(thresholds)), [f"{ct:g}" for ct in thresholds])
         axis.set(
-            xlabel=f"confidence threshold (in each: {limits[0]} to {limits[-1]} views at most, left to right)",
+            xlabel=f"confidence threshold (for each, left to right: limit of {limits[0]} to {limits[-1]} views)",
             ylabel="accuracy (%)",
             title=f"{views} views, mean of the three backbones",
         )
@@ -382,38 +373,46 @@ def confusion_difference(inputs: FigureInputs) -> Figure:
 
 
 FIGURES = (
-    ThesisFigure("5", class_distribution, "Classes of the data set; validation objects are taken from training."),
-    ThesisFigure("6", lattices, "Fibonacci lattices of 10 and 40 viewpoints; the ten are not among the forty."),
+    ThesisFigure(
+        "5",
+        class_distribution,
+        "Number of objects in each class; validation objects are taken from the training split.",
+    ),
+    ThesisFigure("6", lattices, "Fibonacci lattices of 10 and 40 viewpoints; the 10 viewpoints are not among the 40."),
     ThesisFigure(
         "7",
         mercator_order_and_entropies,
-        "Forty viewpoints in Mercator's projection: their order, and the depth entropies of one test object.",
+        "The 40 viewpoints in the Mercator projection: their order, and the depth entropies of one test object.",
     ),
-    ThesisFigure("8", points_per_view, "Points of a view by class: median, quartiles, 5th and 95th percentiles."),
-    ThesisFigure("9", entropy_distribution, "Depth entropies of all views, by split, each with its own scale."),
+    ThesisFigure("8", points_per_view, "Points per view by class: median, quartiles, 5th and 95th percentiles."),
+    ThesisFigure("9", entropy_distribution, "Depth entropies of all views by split; each split has its own scale."),
     ThesisFigure(
-        "10", view_graphs, "Viewpoints with the entropies of one test object, their graph (convex hull), and both."
+        "10", view_graphs, "Viewpoints with the entropies of one test object, the view graph (convex hull), and both."
     ),
     ThesisFigure(
         "11",
         graph_with_maxima,
-        "The view graph and the local maxima (red rings) of one test object; dotted edges go around the back.",
+        "The view graph and the local maxima (red rings) of one test object; dotted edges cross ±180° longitude.",
     ),
     ThesisFigure(
         "17",
         entropy_losses,
-        "PointNet++: losses in training; those of training are means over an epoch, with augmentation where it is on.",
-    ),
-    ThesisFigure("18", backbone_losses((0, 1)), "ResNet-18 on images: training on 10 views, and going on with 40."),
-    ThesisFigure("19", backbone_losses((2, 3)), "ResNet-18 on depth, going on from images, and ResNet-34 on depth."),
-    ThesisFigure("20", accuracy_grid(10), "Table 10 as a picture. Green: PointNet++ above random; red: below."),
-    ThesisFigure("21", example_graph, "The thesis's example graph: local maxima E, D, C, I."),
-    ThesisFigure(
-        "22", best_and_worst_depths, "Depths from the views of highest and lowest entropy of one test object."
+        "Losses of PointNet++. Training losses are means over an epoch, with augmentation if it is on.",
     ),
     ThesisFigure(
-        "23", confusion_matrices, "Confusion in % of the true class: 10 views, CT 0.99, MV 4, ResNet-18 on images."
+        "18", backbone_losses((0, 1)), "ResNet-18 on images: training on 10 views, and fine-tuning on 40 views."
     ),
-    ThesisFigure("24", confusion_difference, "Difference of the two confusion matrices."),
-    ThesisFigure("25", accuracy_grid(40), "Table 11 as a picture. Green: PointNet++ above random; red: below."),
+    ThesisFigure("19", backbone_losses((2, 3)), "ResNet-18 on depth, initialised from images, and ResNet-34 on depth."),
+    ThesisFigure("20", accuracy_grid(10), "Table 10 as a figure. Green: PointNet++ above random; red: below."),
+    ThesisFigure("21", example_graph, "The thesis's example graph, with local maxima E, D, C and I."),
+    ThesisFigure(
+        "22", best_and_worst_depths, "Depth images of one test object from the views of highest and lowest entropy."
+    ),
+    ThesisFigure(
+        "23",
+        confusion_matrices,
+        "Confusion matrices in % of the true class: 10 views, CT 0.99, MV 4, ResNet-18 on images.",
+    ),
+    ThesisFigure("24", confusion_difference, "Difference between the two confusion matrices of Figure 23."),
+    ThesisFigure("25", accuracy_grid(40), "Table 11 as a figure. Green: PointNet++ above random; red: below."),
 )

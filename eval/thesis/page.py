@@ -1,4 +1,4 @@
-"""The thesis beside our run, in its own order: a page, the same as Markdown, and every figure as PNG and SVG."""
+"""The report of the thesis's reproduction: an HTML page, the same in Markdown, and every figure as PNG and SVG."""
 
 from __future__ import annotations
 
@@ -10,7 +10,8 @@ import matplotlib.pyplot as plt
 from data_pipeline.files import write_bytes, write_text
 from eval.report.html import document, drawn, embedded, table
 from eval.thesis.figures import FIGURES, FigureInputs, ThesisFigure
-from eval.thesis.tables import ThesisTable, all_tables, markdown, shown_cells
+from eval.thesis.layout import ThesisTable
+from eval.thesis.tables import all_tables, markdown, shown_cells
 
 CHAPTERS = (
     ("The data (§4.1)", ("F5", "F6", "F7", "F8", "F9", "F10", "F11")),
@@ -20,7 +21,7 @@ CHAPTERS = (
     ("Memory (§5.3.4)", ("T9",)),
     ("Appendices", ("F21", "F22", "F23", "F24", "T10", "F25", "T11", "T12", "T13", "T14", "T15")),
 )
-"""Tables and figures in the order in which the thesis has them."""
+"""Tables and figures in the order of the thesis."""
 
 
 def _table_html(shown: ThesisTable) -> str:
@@ -34,12 +35,12 @@ def _table_html(shown: ThesisTable) -> str:
     return (
         f'<h3 id="table-{shown.number}">Table {shown.number}. {html.escape(shown.title)}</h3>'
         f'<div class="wide">{table(["", *shown.columns], rows)}</div>'
-        f'<p class="note">{html.escape(shown.note)} In brackets: the thesis.</p>'
+        f'<p class="note">{html.escape(shown.note)} In parentheses: the thesis.</p>'
     )
 
 
 def _save_figure(shown: ThesisFigure, inputs: FigureInputs, folder: Path) -> str:
-    """Draws a figure, saves it as PNG and SVG, and returns it for the page."""
+    """Draws a figure, saves it as PNG and SVG, and returns its HTML."""
     figure = shown.draw(inputs)
     files = {kind: drawn(figure, kind) for kind in ("png", "svg")}
     plt.close(figure)
@@ -49,12 +50,12 @@ def _save_figure(shown: ThesisFigure, inputs: FigureInputs, folder: Path) -> str
 
 
 def write_thesis_report(inputs: FigureInputs, lead: str, folder: Path) -> Path:
-    """Writes `index.html`, `thesis.md` and `figures/` into `folder`; returns the page.
+    """Writes `index.html`, `thesis.md` and `figures/` into `folder`; returns the path of the page.
 
     Args:
-        inputs: what everything is drawn from.
-        lead: what was run, in a sentence.
-        folder: where to.
+        inputs: the results from which tables and figures are made.
+        lead: a sentence that describes the run.
+        folder: the folder of the report.
     """
     tables = {f"T{shown.number}": shown for shown in all_tables(inputs.results)}
     pictures = {f"F{shown.number}": shown for shown in FIGURES}
@@ -73,7 +74,7 @@ def write_thesis_report(inputs: FigureInputs, lead: str, folder: Path) -> Path:
                     f"![Figure {shown.number}](figures/figure_{int(shown.number):02d}.png)\n\n"
                     f"**Figure {shown.number}.** {shown.caption}\n"
                 )
-    title = "The thesis, reproduced"
+    title = "Reproduction of the thesis"
     write_text(folder / "thesis.md", f"# {title}\n\n{lead}\n\n" + "\n".join(text))
     path = folder / "index.html"
     write_text(path, document(title, f'<p class="lead">{html.escape(lead)}</p>' + "".join(page)))

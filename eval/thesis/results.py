@@ -1,4 +1,4 @@
-"""From the thesis's networks to `thesis.json`: every number that its tables and figures show."""
+"""From the outputs of the thesis's networks to `thesis.json`: all numbers of its tables and figures."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ ORACLE_MV = 5
 
 @dataclass(frozen=True)
 class LatticeTables:
-    """What all networks say of the objects of one split and one lattice.
+    """The outputs of all networks for the objects of one split and one lattice.
 
     Attributes:
         names, labels, entropy: as in `ViewTables`.
@@ -43,7 +43,7 @@ class LatticeTables:
     predicted_entropy: dict[Frame, np.ndarray]
 
     def stacked(self, frame: Frame) -> ViewTable:
-        """With the three backbones that are walked with as an axis of the logits."""
+        """Returns a `ViewTable` whose logits have an axis of the three backbones of the pipeline."""
         logits = np.stack([self.logits[backbone.name] for backbone in PIPELINE], axis=1)
         of_frame = jnp.asarray(self.predicted_entropy[frame])
         return ViewTable(jnp.asarray(logits), of_frame, jnp.asarray(self.entropy), jnp.asarray(self.labels))
@@ -73,9 +73,9 @@ def _by_class(errors: np.ndarray, labels: np.ndarray, classes: Sequence[str]) ->
 
 
 def entropy_learning(lattice: LatticeTables, statistics: DatasetStatistics) -> dict[str, Any]:
-    """Errors of the predicted entropies on test objects, by frame and class, beside two predictors that look at nothing.
+    """Errors of the predicted entropies on test objects by frame and class, and of two predictors that receive no view.
 
-    `every_side` is the error of the mean prediction over the clouds of all views: about as far as one gets by looking.
+    `every_side` is the error of the mean prediction over the clouds of all views, approximately the best that clouds allow.
     """
     true, labels, classes = lattice.entropy, lattice.labels, statistics.classes
     errors = {frame: np.square(lattice.predicted_entropy[frame] - true[:, None]).mean(axis=-1) for frame in FRAMES}
@@ -109,13 +109,13 @@ def entropy_learning(lattice: LatticeTables, statistics: DatasetStatistics) -> d
 
 
 POLICIES = ("random", "random_with_repetition", "predicted_entropy", "oracle_entropy")
-"""Of the ladder, those that the thesis has."""
+"""The policies of `ladder` that the thesis evaluates."""
 
 
 def walk(
     lattice: LatticeTables, graph: ViewGraph, config: GridConfig, frame: Frame, rungs: tuple[Rung, ...]
 ) -> dict[str, Results]:
-    """Every policy's grid, (backbones, objects, MV, CT); random selection in exact expectation where that can be."""
+    """The grid (backbones, objects, MV, CT) of every policy; random selection in exact expectation where possible."""
     table = lattice.stacked(frame)
     max_views = min(config.max_views, lattice.entropy.shape[1])
     found = run_grid(jax.random.key(config.seed), table, graph, None, rungs, max_views=max_views)
@@ -126,7 +126,7 @@ def walk(
 
 
 def _gain(policy: Results, base: Results, field: str = "right") -> dict[str, Any]:
-    """One policy minus another, mean of the backbones, (MV, CT), with intervals over objects."""
+    """Difference between two policies, mean over backbones, (MV, CT), with intervals over objects."""
     each = np.asarray(getattr(policy, field)) - np.asarray(getattr(base, field))
     gain = np.moveaxis(each.mean(axis=0), 0, -1)
     return {
@@ -142,13 +142,13 @@ def _accuracy(results: Results) -> dict[str, Any]:
     right, used = np.asarray(results.right), np.asarray(results.used)
     return {
         "accuracy": right.mean(axis=1).tolist(),  # (backbones, MV, CT)
-        "interval": intervals(np.moveaxis(right.mean(axis=0), 0, -1)),  # of the backbones' mean
+        "interval": intervals(np.moveaxis(right.mean(axis=0), 0, -1)),  # of the mean over backbones
         "views_used": used.mean(axis=1).tolist(),
     }
 
 
 def best_cells(test: Results, validation: Results, labels: np.ndarray) -> list[dict[str, Any]]:
-    """For each backbone its best cell: chosen on the test objects as in the thesis, and chosen on validation objects."""
+    """The best cell of each backbone, chosen on test objects as in the thesis, and chosen on validation objects."""
     out = []
     for right, held_out in zip(np.asarray(test.right), np.asarray(validation.right), strict=True):
         by_cell = np.moveaxis(right, 0, -1)
@@ -170,7 +170,7 @@ def best_cells(test: Results, validation: Results, labels: np.ndarray) -> list[d
 def pipeline(
     test: LatticeTables, validation: LatticeTables, statistics: DatasetStatistics, config: GridConfig
 ) -> dict[str, Any]:
-    """The thesis's multi-view grid on one lattice: Tables 7–8 and 10–15, and the confusion of Fig. 23."""
+    """The thesis's multi-view grid on one lattice: Tables 7–8 and 10–15, and the confusion matrices of Fig. 23."""
     graph = ViewGraph.from_points(np.array(statistics.viewpoints))
     rungs = (*(rung for rung in ladder(config.draws) if rung.policy in POLICIES), SCRAMBLED)
     found = walk(test, graph, config, "world", rungs)
@@ -179,7 +179,7 @@ def pipeline(
     max_views = found["random"].after.shape[-1]
     confusion = {}
     for name in ("random", "predicted_entropy"):
-        walks = np.asarray(found[name].views)[0, :, :, 0]  # by the backbone of the thesis's first test
+        walks = np.asarray(found[name].views)[0, :, :, 0]  # with the backbone of the thesis's first test
         of = test.of(PIPELINE[0].name, "world")
         confusion[name] = headline_confusion(walks, of, min(HEADLINE_MV, max_views)).tolist()
     camera_found = {f"camera_{name}": results for name, results in camera.items()}
@@ -211,7 +211,7 @@ NO_ACCELERATOR = "none but the CPU"
 
 
 def machine() -> dict[str, Any]:
-    """What ran all this (Table 1)."""
+    """The machine that computed the results (Table 1)."""
     device = jax.devices()[0]
     memory = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") / 2**30 if hasattr(os, "sysconf") else None
     return {
@@ -240,7 +240,7 @@ def all_results(
     statistics: dict[int, DatasetStatistics],
     config: GridConfig,
 ) -> dict[str, Any]:
-    """Everything that is computed from the networks' outputs, by lattice where it depends on it."""
+    """All results that are computed from the outputs of the networks, most of them by lattice."""
     return {
         "objects": {str(views): len(lattice.labels) for views, lattice in test.items()},
         "classes": next(iter(statistics.values())).classes,

@@ -1,7 +1,7 @@
-"""`mevs study thesis`: every network, table and figure of the thesis, from one run directory; each stage skips what is done.
+"""`mevs study thesis`: every network, table and figure of the thesis in one run directory; each stage skips completed work.
 
-The directory holds both data sets (`views10/`, `views40/`), the networks (`backbones/`, `entropy/`), what they say of every
-view (`outputs/`), `timing.json`, `thesis.json` and the report (`report/`).
+The directory holds both data sets (`views10/`, `views40/`), the networks (`backbones/`, `entropy/`), their outputs for every view
+(`outputs/`), `timing.json`, `thesis.json` and the report (`report/`).
 """
 
 from __future__ import annotations
@@ -16,7 +16,8 @@ from flax import nnx
 from data_pipeline.dataset.builder import open_objects, prepare
 from data_pipeline.dataset.statistics import report_left_out
 from data_pipeline.errors import DataError
-from data_pipeline.files import as_read, read_json, write_json
+from data_pipeline.files import read_json
+from data_pipeline.objects.reconstruction import why_no_open3d
 from data_pipeline.objects.sources import load_object
 from data_pipeline.progress import console
 from eval.numbers.timing import decision_memory_alone, time_ascent, time_local_maxima, time_predictor
@@ -28,7 +29,7 @@ from eval.tables import objects_of
 from eval.thesis.figures import FigureInputs
 from eval.thesis.page import write_thesis_report
 from eval.thesis.results import NO_ACCELERATOR, LatticeTables, all_results, machine
-from train.kept import kept_array, made_by
+from train.kept import kept_array, kept_json, made_by
 from train.loop import load_best
 from train.outputs import network_outputs
 from train.tasks.classifier import ClassifierTask
@@ -49,7 +50,7 @@ from train.thesis_networks import (
 
 
 def make_thesis_data(settings: Settings, folder: ThesisFolder) -> None:
-    """Both data sets, of the same objects and splits."""
+    """Makes both data sets, which have the same objects and splits."""
     for views in VIEWS:
         dataset = replace(settings.dataset, capture=replace(settings.dataset.capture, views=views))
         report_left_out(prepare(dataset, folder.data(views)))
@@ -66,7 +67,7 @@ def lattice_tables(
     backbones: tuple[Backbone, ...] = BACKBONES,
     frames: tuple[Frame, ...] = FRAMES,
 ) -> LatticeTables:
-    """What the networks say of one split of one data set."""
+    """The outputs of the networks for one split of one data set."""
     statistics, data = folder.statistics(views), folder.data(views)
 
     def outputs(name: str, network: Path, task: ClassifierTask | EntropyTask) -> np.ndarray:
@@ -119,8 +120,11 @@ def _timing(settings: Settings, folder: ThesisFolder, tables: dict[int, LatticeT
 
 
 def _ascents(settings: Settings, tables: LatticeTables, classes: list[str]) -> dict[str, Any]:
+    """Times and memory of the methods by differentiable rendering, or `missing`: why they cannot be measured here."""
     thesis = settings.thesis
     runs, starts, resolution = thesis.ascent_runs, thesis.ascent_starts, thesis.ascent_resolution
+    if (missing := why_no_open3d()) is not None:
+        return {"runs": runs, "starts": starts, "resolution": resolution, "missing": missing}
     meshes = {}
     entries = {entry.name: entry for entry in open_objects(settings.dataset).entries}
     for label, name in enumerate(classes):
@@ -133,37 +137,38 @@ def _ascents(settings: Settings, tables: LatticeTables, classes: list[str]) -> d
 
 
 def measure(settings: Settings, folder: ThesisFolder, tables: dict[int, LatticeTables]) -> dict[str, Any]:
-    """Machine, times and memory; measured once, and again on another machine or with networks of another size."""
+    """Machine, times and memory; measured again only on another machine or with other settings."""
     ran_on = machine()
     thesis = settings.thesis
     counts = thesis.timing_runs, thesis.ascent_runs, thesis.ascent_starts, thesis.ascent_resolution
-    identity = as_read([ran_on, counts, asdict(settings.entropy.network)])
-    path = folder.out / "timing.json"
-    if path.exists() and (found := read_json(path))["identity"] == identity:
-        return found
-    console.print(f"Timing {counts[0]} decisions and {counts[1]} climbs a class, and measuring their memory")
-    found = {
-        "identity": identity,
-        "machine": ran_on,
-        "timing": _timing(settings, folder, tables),
-        "memory": _memory(settings, folder),
-        "ascent": _ascents(settings, tables[40], folder.statistics(40).classes),
-    }
-    write_json(path, found)
-    return found
+    identity = [ran_on, counts, asdict(settings.entropy.network), *([] if why_no_open3d() is None else ["no Open3D"])]
+
+    def compute() -> dict[str, Any]:
+        console.print(
+            f"Timing {counts[0]} decisions and {counts[1]} gradient ascents per class, and measuring their memory"
+        )
+        return {
+            "identity": identity,
+            "machine": ran_on,
+            "timing": _timing(settings, folder, tables),
+            "memory": _memory(settings, folder),
+            "ascent": _ascents(settings, tables[40], folder.statistics(40).classes),
+        }
+
+    return kept_json(folder.out / "timing.json", identity, compute)
 
 
 # ------------------------------------------------------------------------------------------------------------- everything
 
 
 def _example(tables: LatticeTables, classes: list[str]) -> int:
-    """The first test object of the thesis's example class, bathtubs, or of the first class there is."""
+    """Index of the first bathtub, the thesis's example class, among the test objects; without bathtubs, 0."""
     label = classes.index("bathtub") if "bathtub" in classes else int(tables.labels[0])
     return int(np.flatnonzero(tables.labels == label)[0])
 
 
 def _training(folder: ThesisFolder, histories: dict[str, list[dict[str, float]]]) -> dict[str, Any]:
-    """Losses and beginnings of the classifiers (Table 5), and how long every network took."""
+    """Losses and initial weights of the classifiers (Table 5), and training times of all networks."""
     summaries = {name: read_json(network / "summary.json") for name, network in folder.networks().items()}
     backbones = {
         backbone.name: {
@@ -182,33 +187,33 @@ def _training(folder: ThesisFolder, histories: dict[str, list[dict[str, float]]]
 
 
 def evaluate_thesis(settings: Settings, folder: ThesisFolder) -> FigureInputs:
-    """All numbers, as written to `thesis.json`, and what else the report is drawn from."""
+    """Returns all numbers, as written to `thesis.json`, and the other inputs of the report."""
     statistics = {views: folder.statistics(views) for views in VIEWS}
     histories = {name: read_history(network) for name, network in folder.networks().items()}
     test = {views: lattice_tables(settings, folder, views, "test") for views in VIEWS}
     measured = measure(settings, folder, test)
     made = made_by(statistics[40], *folder.networks().values())
-    identity = as_read([made, asdict(settings.evaluation), measured])
-    path = folder.out / "thesis.json"
-    results = read_json(path) if path.exists() else {"identity": None}
-    if results["identity"] != identity:
+    identity = [made, asdict(settings.evaluation), measured]
+
+    def compute() -> dict[str, Any]:
         validation = {views: lattice_tables(settings, folder, views, "val", PIPELINE, ("world",)) for views in VIEWS}
         console.print(f"Walking {len(test[40].labels)} test objects with {len(PIPELINE)} classifiers on two lattices")
         results = all_results(test, validation, statistics, settings.evaluation) | _training(folder, histories)
         results |= {name: measured[name] for name in ("machine", "timing", "memory", "ascent")}
-        results |= {"identity": identity, "left_out": {str(v): s.left_out for v, s in statistics.items()}}
-        write_json(path, results)
+        return results | {"identity": identity, "left_out": {str(v): s.left_out for v, s in statistics.items()}}
+
+    results = kept_json(folder.out / "thesis.json", identity, compute)
     return FigureInputs(folder, results, statistics, test, histories, _example(test[40], statistics[40].classes))
 
 
 def reproduce(settings: Settings, preset: str, out: Path, pretrained: tuple[Path, ...] = ()) -> Path:
-    """Makes data, networks, tables and figures in `out`; returns the page.
+    """Makes data, networks, tables and figures in `out`; returns the path of the page.
 
     Raises:
-        DataError: settings that the thesis's grid cannot be had with, or a directory that holds another run.
+        DataError: the settings do not allow the thesis's grid, or the directory holds another run.
     """
     if settings.evaluation.lowest_elevation > -90:
-        raise DataError("mevs study thesis walks from every view; leave --evaluation.lowest-elevation as it is")
+        raise DataError("mevs study thesis walks from every view; leave out --evaluation.lowest-elevation")
     check_evaluation(settings.evaluation)
     thesis = settings.thesis
     if thesis.ascent_runs < 1 or thesis.ascent_starts < 2 or thesis.ascent_resolution < 8:
@@ -216,6 +221,8 @@ def reproduce(settings: Settings, preset: str, out: Path, pretrained: tuple[Path
             "--thesis.ascent-runs must be at least 1, --thesis.ascent-starts at least 2 and "
             "--thesis.ascent-resolution at least 8"
         )
+    if (missing := why_no_open3d()) is not None:
+        console.print(f"Tables 2 and 9 will lack differentiable rendering: {missing}. All else is made.")
     first = first_weights(settings.classifier, thesis, pretrained)
     folder = ThesisFolder(out)
     make_thesis_data(settings, folder)
@@ -228,7 +235,7 @@ def reproduce(settings: Settings, preset: str, out: Path, pretrained: tuple[Path
     camera = statistics.camera
     lead = (
         f"{statistics.source}, preset {preset}: views of {camera.resolution}×{camera.resolution} pixels, "
-        f"{results['objects']['40']} test objects, {statistics.left_out_count} of all objects left out, "
-        f"{minutes:.0f} minutes of training on {where}. Ours first, the thesis's in brackets."
+        f"{results['objects']['40']} test objects, {statistics.left_out_count} objects left out, "
+        f"{minutes:.0f} minutes of training on {where}. Numbers of this run, with those of the thesis in parentheses."
     )
     return write_thesis_report(inputs, lead, out / "report")

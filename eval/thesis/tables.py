@@ -1,51 +1,18 @@
-"""The thesis's Tables 1–15: our numbers, its numbers, and in a sentence why they differ."""
+"""The thesis's Tables 1–15: our numbers, its numbers, and a note on why they differ."""
 
 from __future__ import annotations
 
-import json
 from collections.abc import Sequence
-from dataclasses import dataclass
-from functools import cache
 from itertools import product
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from eval.rendering.ascent import FACES
+from eval.report.markdown import markdown_table
+from eval.thesis.layout import Cell, Row, ThesisTable, thesis_numbers
 from eval.thesis.results import ORACLE_MV
 from train.thesis_networks import BACKBONES, FRAMES, PIPELINE
-
-Cell = str | float | None
-
-
-@dataclass(frozen=True)
-class Row:
-    """One row: our cells and the thesis's, None where there is none. `bold` marks ours whose interval leaves out zero."""
-
-    name: str
-    ours: Sequence[Cell]
-    thesis: Sequence[Cell] = ()
-    bold: Sequence[bool] = ()
-
-
-@dataclass(frozen=True)
-class ThesisTable:
-    """A table as it is shown: numbers with `digits` behind the point, `signed` for differences."""
-
-    number: int
-    title: str
-    columns: Sequence[str]
-    rows: Sequence[Row]
-    note: str
-    digits: int = 2
-    signed: bool = False
-
-
-@cache
-def thesis_numbers() -> dict[str, Any]:
-    """The tables of the thesis as it prints them; see `numbers.json`."""
-    return json.loads(Path(__file__).with_name("numbers.json").read_text())
 
 
 def _percent(values: Any) -> list[float]:
@@ -53,7 +20,7 @@ def _percent(values: Any) -> list[float]:
 
 
 def _points(value: float) -> str:
-    """In percentage points, with a sign and a real minus."""
+    """A share in percentage points, with a sign."""
     return f"{100 * value:+.2f}".replace("-", "−")
 
 
@@ -62,7 +29,7 @@ def _ct(results: dict[str, Any]) -> list[str]:
 
 
 def _mean_of_backbones(policy: dict[str, Any], name: str) -> np.ndarray:
-    """(MV, CT)."""
+    """Mean over backbones, (MV, CT)."""
     return np.mean(policy[name], axis=0)
 
 
@@ -84,22 +51,22 @@ def machine_table(results: dict[str, Any]) -> ThesisTable:
             Row("Framework", [f"JAX {ours['jax']}"], ["PyTorch 1.7.1, CUDA 11.0"]),
             Row("Python", [ours["python"]], ["3.7"]),
         ],
-        "What ran everything below.",
+        "The machine of all results below.",
     )
 
 
 def rendering_times(results: dict[str, Any]) -> ThesisTable:
     thesis, ours = thesis_numbers()["table_2"], results["ascent"]
     names = [*results["classes"], "all"]
-    seconds = {method: ours[method]["seconds"] for method in ("mesh", "volume")}
+    seconds = {method: ours[method]["seconds"] for method in ("mesh", "volume") if method in ours}
     rows = [
         Row(
             name,
-            [number for of_method in seconds.values() for number in of_method[name]],
+            [n for of_method in seconds.values() for n in of_method[name]] or [None] * 4,
             thesis["rows"].get(name, [None] * 4),
         )
         for name in names
-        if name in seconds["mesh"]
+        if not seconds or name in seconds["mesh"]
     ]
     return ThesisTable(
         2,
@@ -107,9 +74,13 @@ def rendering_times(results: dict[str, Any]) -> ThesisTable:
         thesis["columns"],
         rows,
         f"Ours: depth entropy of a soft mesh of at most {FACES} faces, and opacity entropy of a 32³ volume, both at "
-        f"{ours['resolution']}×{ours['resolution']} pixels; all {ours['starts']} starts of an object together, {ours['runs']} "
-        "objects a class, on the machine of Table 1. The thesis: one start, on its GPU.",
+        f"{ours['resolution']}×{ours['resolution']} pixels; all {ours['starts']} start views of an object together, "
+        f"{ours['runs']} objects per class, on the machine of Table 1. The thesis: one start view, on its GPU.{_missing(ours)}",
     )
+
+
+def _missing(ascent: dict[str, Any]) -> str:
+    return f" Not measured: {ascent['missing']}." if "missing" in ascent else ""
 
 
 def predictor_times(results: dict[str, Any]) -> ThesisTable:
@@ -124,8 +95,8 @@ def predictor_times(results: dict[str, Any]) -> ThesisTable:
         for name in names
     ]
     maxima = ", ".join(
-        f"{ours[views]['local_maxima']['alone']:.3f} ms alone and {1000 * ours[views]['local_maxima']['batched']:.2f} µs each "
-        f"in a batch of 1,000 for {views} views"
+        f"{ours[views]['local_maxima']['alone']:.3f} ms alone and {1000 * ours[views]['local_maxima']['batched']:.2f} µs per "
+        f"object in a batch of 1,000 for {views} views"
         for views in ("10", "40")
     )
     return ThesisTable(
@@ -133,8 +104,8 @@ def predictor_times(results: dict[str, Any]) -> ThesisTable:
         "Time of PointNet++ by class (ms)",
         ["10 views, mean", "sd", "40 views, mean", "sd"],
         rows,
-        f"One cloud, {ours['runs']} runs a class, waiting for the device each time; the network is of the size of this run, on "
-        f"the machine of Table 1. Local maxima (Appendix A; the thesis 0.144 and 0.584 ms): {maxima}.",
+        f"One cloud, {ours['runs']} runs per class with device synchronisation, for the network size of this run on "
+        f"the machine of Table 1. Local maxima (Appendix A; in the thesis 0.144 and 0.584 ms): {maxima}.",
         digits=3,
     )
 
@@ -147,8 +118,8 @@ def entropy_table(results: dict[str, Any]) -> ThesisTable:
         for views in ("10", "40"):
             found = results["entropy"][views]
             frames = {frame: found["frames"][frame]["by_class"].get(name, [None, None]) for frame in FRAMES}
-            blind = [found[predictor].get(name, [None])[0] for predictor in ("mean_map", "class_mean_map")]
-            ours += [*frames["world"], frames["camera"][0], *blind]
+            baselines = [found[predictor].get(name, [None])[0] for predictor in ("mean_map", "class_mean_map")]
+            ours += [*frames["world"], frames["camera"][0], *baselines]
         theirs = thesis.get(name, [None] * 4)
         rows.append(Row(name, ours, [*theirs[:2], None, None, None, *theirs[2:], None, None, None]))
     parts = [
@@ -156,7 +127,7 @@ def entropy_table(results: dict[str, Any]) -> ThesisTable:
     ]
     shares = "; ".join(
         f"{views} views: {100 * results['entropy'][views]['frames']['world']['explained_variance']:.1f} % in the world frame, "
-        f"{100 * results['entropy'][views]['frames']['camera']['explained_variance']:.1f} % in the camera's"
+        f"{100 * results['entropy'][views]['frames']['camera']['explained_variance']:.1f} % in the camera frame"
         for views in ("10", "40")
     )
     differences = []
@@ -164,27 +135,26 @@ def entropy_table(results: dict[str, Any]) -> ThesisTable:
         found = results["entropy"][views]["camera_minus_world"]
         low, high = found["interval"]
         differences.append(f"{found['mse']:+.4f} [{low:+.4f}, {high:+.4f}] for {views} views".replace("-", "−"))
-    # Where predicting is no better than looking at nothing.
+    # Classes on which the network is no better than a predictor that receives no view.
     above: dict[str, list[str]] = {frame: [] for frame in FRAMES}
     for frame, views in product(FRAMES, ("10", "40")):
         found = results["entropy"][views]
         for name, (error, _) in found["frames"][frame]["by_class"].items():
             if error >= min(found["mean_map"][name][0], found["class_mean_map"][name][0]):
-                every_side = f" ({found['every_side'][name][0]:.4f} by the mean over clouds from every side)"
-                above[frame].append(f"{name} of {views} views{every_side if frame == 'world' else ''}")
+                every_side = f" ({found['every_side'][name][0]:.4f} with the mean prediction over clouds of all views)"
+                above[frame].append(f"{name} with {views} views{every_side if frame == 'world' else ''}")
     return ThesisTable(
         4,
         "Squared error of predicted entropies by class",
         parts,
         rows,
-        "Test objects, which the thesis chose its checkpoints on and we did not; normalised by each training split's largest "
-        "entropy. The thesis's clouds lose the camera's pose; ours are in the world frame, each point with the "
-        "direction to the camera unless that was switched off, and in the camera's, without, for comparison. "
-        "Mean maps look at nothing; the class map, the mean of a class, is told the true class. Variance explained, "
-        f"{shares}. Error in the camera's frame minus the world's, paired by object: {', '.join(differences)}. Not below both "
-        f"trivial predictors: in the world frame {', '.join(above['world']) or 'none'}; in the camera's "
-        f"{', '.join(above['camera']) or 'none'}. From the thesis's means and its standard "
-        "deviation of 0.156: 51 % and 30 %.",
+        "On test objects, normalised by the largest entropy of each training split; the thesis chose its checkpoints on these "
+        "objects, this run did not. The thesis's clouds do not hold the camera pose. Ours are in the world frame, where each "
+        "point has the direction to the camera unless that is switched off; for comparison, also in the camera frame, without "
+        "directions. The mean map receives no view; the class map, the mean of a class, is given the true class. Variance "
+        f"explained, {shares}; from the thesis's means and its standard deviation of 0.156: 51 % and 30 %. Error in the "
+        f"camera frame minus the world frame, paired by object: {', '.join(differences)}. Not below both trivial predictors: "
+        f"in the world frame {', '.join(above['world']) or 'none'}; in the camera frame {', '.join(above['camera']) or 'none'}.",
         digits=4,
     )
 
@@ -205,8 +175,8 @@ def losses_table(results: dict[str, Any]) -> ThesisTable:
         "Best losses of the classifiers",
         ["training loss", "validation loss"],
         rows,
-        "Validation is on objects never trained on; the thesis puts aside views, so that an object is on both sides. Training "
-        f"losses are with augmentation. Began with: {started}.",
+        "Validation objects are never trained on; the thesis holds out views, so the same objects are in both splits. Training "
+        f"losses are with augmentation. Initial weights: {started}.",
         digits=3,
     )
 
@@ -222,7 +192,7 @@ def single_view_table(results: dict[str, Any]) -> ThesisTable:
         "Accuracy of the classifiers on single views (%)",
         ["10-view data", "40-view data"],
         rows,
-        "All views of all test objects; each classifier on images of the kind that it was trained on.",
+        "All views of all test objects; each classifier receives the kind of image that it was trained on.",
     )
 
 
@@ -240,9 +210,9 @@ def gain_table(number: int, views: str, results: dict[str, Any]) -> ThesisTable:
     ]
     switches = {
         "text": "PointNet++ minus random",
-        "camera": "with clouds in the camera's frame",
+        "camera": "with clouds in the camera frame",
         "repetition": "random with repetition, as in the published code",
-        "published_code": "camera's frame, repetition, and the list sorted in place",
+        "published_code": "camera frame, repetition, and the list sorted in place",
         "oracle": "the oracle minus random",
     }
     means = []
@@ -258,9 +228,9 @@ def gain_table(number: int, views: str, results: dict[str, Any]) -> ThesisTable:
         f"Gain of PointNet++ over random selection, {views} views (points)",
         _ct(results),
         rows,
-        "Mean of the three backbones, every start view of every test object; bold where the 95 % interval over objects leaves "
-        f"out zero. Mean of all cells: {'; '.join(means)}. The thesis: {theirs}, from three runs (five for 40 views) in rows 2–5 "
-        "and single runs below.",
+        "Mean of the three backbones, over every start view of every test object; bold if the 95 % interval over objects "
+        f"excludes zero. Mean of all cells: {'; '.join(means)}. The thesis: {theirs}, from three runs (five for 40 views) in "
+        "rows 2–5 and from single runs below.",
         digits=2,
         signed=True,
     )
@@ -284,15 +254,16 @@ def best_table(results: dict[str, Any]) -> ThesisTable:
         "Best cell of every pipeline (%)",
         ["chosen on test", "by class", "cell", "chosen on validation", "by class", "cell"],
         rows,
-        "The thesis reports the maximum of its grid over the test objects; so do the first columns. What was chosen on "
-        "validation objects is what one may expect of new ones. By class: mean recall.",
+        "The thesis reports the maximum of its grid on test objects, as do the first columns. The accuracy of the cell chosen on "
+        "validation objects is the one to expect for new objects. By class: mean recall.",
     )
 
 
 def memory_table(results: dict[str, Any]) -> ThesisTable:
     thesis, ours = thesis_numbers()["table_9"]["rows"], dict(results["memory"])
     for name, method in (("Neural Renderer", "mesh"), ("DiffDVR", "volume")):
-        ours[name] = results["ascent"][method]["memory"]
+        if method in results["ascent"]:
+            ours[name] = results["ascent"][method]["memory"]
     rows = [
         Row(name, [ours[name]["planned"], ours[name]["device_peak"]] if name in ours else [None, None], [*values, None])
         for name, values in thesis.items()
@@ -300,10 +271,11 @@ def memory_table(results: dict[str, Any]) -> ThesisTable:
     return ThesisTable(
         9,
         "Memory of one decision (MB)",
-        ["planned by XLA", "device's peak"],
+        ["planned by XLA", "peak of the device"],
         rows,
-        "Networks of the sizes of this run; weights, inputs and temporaries of one compiled decision. CPUs report no peak. The "
-        "thesis's are PyTorch's peak on a GPU. Neural Renderer and DiffDVR: all of Table 2's starts on one object.",
+        "Weights, inputs and temporaries of one compiled decision, for the network sizes of this run. CPUs report no peak. The "
+        "thesis reports PyTorch's peak on a GPU. Neural Renderer and DiffDVR: all start views of Table 2 on one object."
+        f"{_missing(results['ascent'])}",
         digits=2,
     )
 
@@ -316,7 +288,7 @@ def _pairs(
     max_views: Sequence[int],
     note: str,
 ) -> ThesisTable:
-    """Rows of random and PointNet++ in turn, as the thesis has them."""
+    """A table with alternating rows for random and PointNet++, as in the thesis."""
     thesis, rows = thesis_numbers()[f"table_{number}"], []
     for index, mv in enumerate(max_views):
         for short, grid in grids.items():
@@ -331,14 +303,14 @@ def accuracy_table(number: int, views: str, results: dict[str, Any]) -> ThesisTa
         for short, name in (("random", "random"), ("pcd", "predicted_entropy"))
     }
     note = (
-        "Mean of the three backbones. Every start view of every test object, random selection in exact expectation; the thesis "
-        "draws a start at random, and its random policy may look at a view twice. 'pcd' is PointNet++."
+        "Mean of the three backbones, over every start view of every test object; random selection in exact expectation. The "
+        "thesis draws a random start view, and its random policy may repeat a view. 'pcd' is PointNet++."
     )
     return _pairs(number, f"Accuracy of all pipelines, {views} views (%)", results, grids, found["max_views"], note)
 
 
 def _views_used(results: dict[str, Any], policy: str) -> list[list[float]]:
-    """Mean over backbones and both lattices, (MV, CT), the first row being one view."""
+    """Mean over backbones and both lattices, (MV, CT); the first row is for one view."""
     lattices = [_mean_of_backbones(found["policies"][policy], "views_used") for found in results["pipeline"].values()]
     rows = min(map(len, lattices))
     return [[1.0] * len(results["thresholds"]), *np.mean([lattice[:rows] for lattice in lattices], axis=0).tolist()]
@@ -348,7 +320,7 @@ def views_table(results: dict[str, Any]) -> ThesisTable:
     grids = {short: _views_used(results, name) for short, name in (("random", "random"), ("pcd", "predicted_entropy"))}
     max_views = range(1, len(grids["random"]) + 1)
     note = "Mean of the three backbones and both lattices."
-    return _pairs(13, "Views looked at", results, grids, max_views, note)
+    return _pairs(13, "Number of views used", results, grids, max_views, note)
 
 
 def views_gain_table(results: dict[str, Any]) -> ThesisTable:
@@ -360,10 +332,10 @@ def views_gain_table(results: dict[str, Any]) -> ThesisTable:
     ]
     return ThesisTable(
         14,
-        "Views looked at, PointNet++ minus random",
+        "Number of views used, PointNet++ minus random",
         _ct(results),
         rows,
-        "The thesis's caption says decrease, its numbers are these: below zero means fewer views.",
+        "The thesis's caption calls this the decrease, but its numbers have this sign: below zero means fewer views.",
         digits=3,
         signed=True,
     )
@@ -383,9 +355,9 @@ def oracle_table(results: dict[str, Any]) -> ThesisTable:
         "Accuracy of the oracle, 40 views (%)",
         _ct(results),
         rows,
-        "Knows the true entropies of all views. Over all cells up to nine views it is "
-        f"{_points(gain['mean'])} [{low}, {high}] points from random selection; the thesis's own Tables 15 and 11 differ by "
-        "−0.72 up to five views.",
+        "The oracle is given the true entropies of all views. Its gain over random selection is "
+        f"{_points(gain['mean'])} [{low}, {high}] points over all cells up to nine views; in the thesis's own Tables 15 and "
+        "11 it is −0.72 points up to five views.",
     )
 
 
@@ -414,7 +386,7 @@ def all_tables(results: dict[str, Any]) -> list[ThesisTable]:
 
 
 def cell_text(value: Cell, table: ThesisTable) -> str:
-    """A cell as people read it."""
+    """A cell as formatted text."""
     if value is None:
         return "–"
     if isinstance(value, str):
@@ -424,7 +396,7 @@ def cell_text(value: Cell, table: ThesisTable) -> str:
 
 
 def shown_cells(row: Row, table: ThesisTable) -> list[tuple[str, bool, str]]:
-    """Of each cell: ours, whether it is bold, and the thesis's, empty where it has none."""
+    """For each cell: our text, whether it is bold, and the text of the thesis (empty if missing)."""
     bold = [*row.bold, *[False] * (len(row.ours) - len(row.bold))]
     thesis = [*row.thesis, *[None] * (len(row.ours) - len(row.thesis))]
     return [
@@ -434,13 +406,13 @@ def shown_cells(row: Row, table: ThesisTable) -> list[tuple[str, bool, str]]:
 
 
 def markdown(table: ThesisTable) -> str:
-    """The table with the thesis's numbers in brackets behind ours."""
-    lines = [f"**Table {table.number}. {table.title}**", "", f"| | {' | '.join(table.columns)} |"]
-    lines.append("|---" * (len(table.columns) + 1) + "|")
+    """The table in Markdown; the numbers of the thesis follow ours in parentheses."""
+    rows = []
     for row in table.rows:
         cells = [
             (f"**{ours}**" if bold else ours) + (f" ({theirs})" if theirs else "")
             for ours, bold, theirs in shown_cells(row, table)
         ]
-        lines.append(f"| {row.name} | {' | '.join(cells)} |")
-    return "\n".join([*lines, "", f"{table.note} In brackets: the thesis.", ""])
+        rows.append([row.name, *cells])
+    shown = markdown_table(["", *table.columns], rows)
+    return f"**Table {table.number}. {table.title}**\n\n{shown}\n\n{table.note} In parentheses: the thesis.\n"

@@ -1,8 +1,9 @@
-"""Random selection without repetition, in exact expectation: over all starts and all draws at once.
+"""Exact expectation of random selection without repetition, over all start views and all draws.
 
-What such a walk knows after k looks depends on *which* views it has seen, not on their order. So the walk is a Markov chain on
-subsets: P(S) = Σ_{v ∈ S} P(S \\ v, not stopped) / (views left). With 10 views that covers every subset; with 40, those of up to
-three views (10,700 of them), and larger limits on views are left to draws.
+The belief of such a walk after k views depends on *which* views it has seen, not on their order. So the walk is a
+Markov chain on subsets: P(S) = Σ_{v ∈ S} P(S \\ v, not stopped) / (views left). With 10 views this covers every
+subset; with 40 it covers those of up to three views (10,700 subsets). Larger limits on views are estimated from
+draws.
 """
 
 from __future__ import annotations
@@ -20,16 +21,16 @@ from jaxtyping import Array, Float, Int
 from mevs_jax.metrics import is_right
 
 LARGEST = 12_000
-"""The most subsets that are worth going through for an object."""
+"""Largest number of subsets, over all sizes, to evaluate for an object."""
 
 
 @dataclass(frozen=True)
 class Subsets:
-    """All subsets of one size of the views that can be reached.
+    """All subsets of one size of the reachable views.
 
     Attributes:
         members: (subsets, size) views.
-        without: (subsets, size) where the subset without its i-th member is in the list of the size below.
+        without: (subsets, size) index, in the list of the next smaller size, of the subset without its i-th member.
     """
 
     members: np.ndarray
@@ -37,7 +38,7 @@ class Subsets:
 
 
 def all_subsets(views: np.ndarray, largest: int) -> list[Subsets]:
-    """The subsets of `views` by size, from 1 up to `largest`, or as far as `LARGEST` allows."""
+    """The subsets of `views` by size, from 1 up to `largest`, or fewer if `LARGEST` is exceeded."""
     found: list[Subsets] = []
     below: dict[tuple[int, ...], int] = {(): 0}
     total = 0
@@ -59,10 +60,15 @@ def expected_of_object(
     candidates: int,
     thresholds: tuple[float, ...],
 ) -> tuple[Float[Array, "sizes CT"], Float[Array, "sizes CT"], Float[Array, " sizes"]]:
-    """One object: probability of ending right and views used, by limit on views and threshold; and right after so many."""
+    """Expected results of random selection on one object.
+
+    Returns:
+        The probability of a right final prediction and the number of views used, by limit on views and threshold; and the
+        probability of a right prediction after each number of views.
+    """
     levels = jnp.array(thresholds)
     belief = jnp.zeros((1, logits.shape[1]))
-    walking = jnp.ones((1, len(thresholds)))  # probability that a walk has come by here and goes on
+    walking = jnp.ones((1, len(thresholds)))  # probability that a walk has reached this subset and continues
     settled, used = jnp.zeros(len(thresholds)), jnp.zeros(len(thresholds))
     cells, used_cells, after = [], [], []
     for size, subsets in enumerate(sizes, start=1):
@@ -85,8 +91,16 @@ def expected_random(
     reachable: np.ndarray,
     thresholds: tuple[float, ...],
     max_views: int,
-) -> tuple[Float[Array, "backbones objects sizes CT"], ...]:
-    """`right` and `used` (backbones, objects, sizes, CT) and `after` (backbones, objects, sizes), as far as sizes go."""
+) -> tuple[
+    Float[Array, "backbones objects sizes CT"],
+    Float[Array, "backbones objects sizes CT"],
+    Float[Array, "backbones objects sizes"],
+]:
+    """Expected results of random selection on every object, for the sizes of `all_subsets`.
+
+    Returns:
+        `right` and `used` (backbones, objects, sizes, CT), and `after` (backbones, objects, sizes).
+    """
     views = np.flatnonzero(reachable)
     sizes = all_subsets(views, max_views)
     one = partial(expected_of_object, sizes=sizes, candidates=len(views), thresholds=thresholds)
@@ -96,4 +110,5 @@ def expected_random(
         over_backbones = jax.vmap(one, (0, None))
         return jax.lax.map(lambda item: over_backbones(*item), (logits, labels), batch_size=4)
 
-    return tuple(jnp.moveaxis(values, 0, 1) for values in every(logits, labels))
+    right, used, after = (jnp.moveaxis(values, 0, 1) for values in every(logits, labels))
+    return right, used, after

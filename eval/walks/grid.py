@@ -1,12 +1,13 @@
-"""The whole study as one program: objects × start views × draws × policies × backbones × thresholds × limits on views.
+"""The thesis's grid as one program: objects × start views × draws × policies × backbones × thresholds × limits on views.
 
-What a walk visits depends on neither the confidence threshold (CT) nor the limit on views (MV). So each object is walked once
-from each start to the largest MV, and every cell is read from that walk: cells of a policy share their randomness, policies
-their starts, and all differences are paired. A policy that does not look at the belief walks once for all backbones: `vmap`
-finds that out by itself, since only the logits have an axis of backbones.
+The views of a walk depend on neither the confidence threshold (CT) nor the limit on views (MV). So each object is
+walked once from each start view up to the largest MV, and every cell is computed from that walk. The cells of a
+policy share their random draws, all policies share their start views, and all differences are paired. A policy that
+does not use the belief walks once for all backbones: `vmap` does this by itself, because only the logits have an axis
+of backbones.
 
-Objects go through in chunks, so memory is bounded; with several devices each takes its share of the objects. An object's
-random draws depend on the seed and its position alone, so neither chunks nor devices change a result.
+Objects are processed in chunks, which bounds the memory; several devices share the objects. The random draws of an object depend
+only on the seed and its position, so neither chunks nor devices change a result.
 """
 
 from __future__ import annotations
@@ -34,28 +35,28 @@ _WALKS_AT_ONCE = 2**12
 
 @dataclass(frozen=True)
 class GridConfig:
-    """What is evaluated."""
+    """Settings of the evaluation."""
 
     max_views: int = LAST_MV
-    """largest MV; rows go from 2 up to it"""
+    """largest limit on views (MV); the grid starts at 2"""
     draws: int = 64
-    """walks per object and start of a policy that draws, averaged, where the expectation is not exact"""
+    """walks of a random policy from each start view of an object, which are averaged where the expectation is not exact"""
     lowest_elevation: float = -90.0
-    """views lower than this, in degrees above the horizon, are out of the camera's reach"""
+    """views below this elevation, in degrees, are unreachable"""
     seed: int = 0
-    """of the policies that draw and of the bootstrap"""
+    """seed of random policies and of the bootstrap"""
 
 
 @flax.struct.dataclass
 class Results:
-    """What a policy reached on each object, averaged over its starts and draws.
+    """Results of a policy on each object, averaged over start views and draws.
 
     Attributes:
-        right: (backbones, objects, MV, CT) share of walks that end in the right class.
-        used: the same shape, views used.
-        after: (backbones, objects, steps) share right after exactly 1, 2, … views, never stopping.
-        travelled: the same shape, great-circle way in radians.
-        views: (backbones, objects, starts, draws, steps) where the walks went, −1 beyond their end; the first draw only.
+        right: (backbones, objects, MV, CT) share of walks with the right final prediction.
+        used: (backbones, objects, MV, CT) mean number of views used.
+        after: (backbones, objects, steps) share with the right prediction after exactly 1, 2, … views, without stopping.
+        travelled: (backbones, objects, steps) mean great-circle distance travelled, in radians.
+        views: (backbones, objects, starts, draws, steps) views of the walks, −1 beyond their end; only the first draw.
     """
 
     right: Float[Array, "*batch MV CT"]
@@ -72,13 +73,13 @@ def read_object(
     views: Int[Array, "steps walks"],
     weights: Float[Array, " walks"],
 ) -> tuple[Float[Array, "MV CT"], Float[Array, "MV CT"], Float[Array, " steps"], Float[Array, " steps"]]:
-    """Everything that full walks of one object say: `right`, `used`, `after` and `travelled` of `Results`.
+    """Computes `right`, `used`, `after` and `travelled` of `Results` from full walks of one object.
 
-    Walks are the last axis of everything here, so that a CPU's vectors run along them, not along ten classes; and what XLA does
-    slowly on CPUs, argmax and cumulative sums, is written otherwise.
+    Walks are the last axis of all arrays, so that a CPU's vector instructions run along the walks and not along ten
+    classes. Argmax and cumulative sums are avoided, because XLA is slow at them on CPUs.
 
     Args:
-        weights: of the walks; they sum to 1.
+        weights: weights of the walks, with sum 1.
     """
     thresholds = jnp.array(THRESHOLDS)[:, None]
     none = jnp.zeros(views.shape[1])
@@ -86,22 +87,22 @@ def read_object(
 
     Carry = tuple[Array, Array, Array, Array, Array]
 
-    def look(carry: Carry, step: tuple[Array, Array]) -> tuple[Carry, tuple[Array, ...]]:
-        belief, way, walking, settled, used = carry
+    def step_of_walk(carry: Carry, step: tuple[Array, Array]) -> tuple[Carry, tuple[Array, ...]]:
+        belief, distance, walking, settled, used = carry
         previous, view = step
-        valid = view >= 0  # a walk ends early where nothing is left in reach
+        valid = view >= 0  # a walk ends early if no reachable view is left
         belief += jnp.where(valid, logits.T[:, view], 0.0)
-        way += jnp.where(valid, distances[previous, view], 0.0)
+        distance += jnp.where(valid, distances[previous, view], 0.0)
         used += walking * valid
         right = is_right(belief, label, axis=0)
         confidence = 1 / jnp.sum(jnp.exp(belief - jnp.max(belief, axis=0)), axis=0)
-        seen = (settled + walking * right) @ weights, used @ weights, right @ weights, way @ weights
+        seen = (settled + walking * right) @ weights, used @ weights, right @ weights, distance @ weights
         stops = walking * (confidence >= thresholds)
-        return (belief, way, walking - stops, settled + stops * right, used), seen
+        return (belief, distance, walking - stops, settled + stops * right, used), seen
 
     start = jnp.zeros((logits.shape[1], views.shape[1])), none, nothing + 1, nothing, nothing
     previous = jnp.concatenate([views[:1], views[:-1]])
-    right, used, after, travelled = jax.lax.scan(look, start, (previous, views))[1]
+    right, used, after, travelled = jax.lax.scan(step_of_walk, start, (previous, views))[1]
     return right[FIRST_MV - 1 :], used[FIRST_MV - 1 :], after, travelled
 
 
@@ -117,20 +118,20 @@ def run_grid(
     reachable: Bool[Array, " views"] | None = None,
     movement_cost: Float[Array, ""] | float | None = None,
 ) -> dict[str, Results]:
-    """Walks every object from every start by every policy and reads the whole grid.
+    """Walks every object from every start view by every policy and computes the whole grid.
 
     Args:
-        key: for policies that draw.
-        tables: (objects, …) of each field, logits (objects, backbones, views, classes).
+        key: for random policies.
+        tables: view tables with a leading axis of objects; logits (objects, backbones, views, classes).
         graph: the candidate views.
-        knowledge: what was learned on other objects, with a leading axis of backbones; None where no policy asks for it.
+        knowledge: statistics of other objects, with a leading axis of backbones; None if no policy needs them.
         rungs: the policies.
         max_views: the largest MV.
-        reachable: where the camera can go, and start; None for everywhere.
-        movement_cost: taken off the policies' scores per radian of the way.
+        reachable: the views that the camera can visit and start from; None for all.
+        movement_cost: subtracted from the policies' scores for each radian of movement.
 
     Returns:
-        Results by policy. Starts out of reach weigh nothing.
+        Results by policy. Unreachable start views have weight zero.
     """
     objects, starts = tables.label.shape[0], graph.points.shape[0]
     start_weight = jnp.ones(starts) if reachable is None else reachable.astype(jnp.float32)

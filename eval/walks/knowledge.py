@@ -1,4 +1,4 @@
-"""What policies may know from other objects, learned on the validation split: a class × view table and a fixed order of views."""
+"""Knowledge of policies about other objects, from the validation split: a class × view table and a fixed order of views."""
 
 from __future__ import annotations
 
@@ -12,20 +12,20 @@ from mevs_jax.policies.base import Knowledge
 def class_view_table(
     logits: Float[Array, "objects views classes"], labels: Int[Array, " objects"]
 ) -> Float[Array, "classes views classes"]:
-    """Entry [y, j]: mean logits at view j of the objects of class y; zeros for a class without objects."""
+    """Returns mean logits: entry [y, j] is over view j of the objects of class y, zero for a class without objects."""
     member = jax.nn.one_hot(labels, logits.shape[-1])
     return jnp.einsum("oy,ovc->yvc", member, logits) / jnp.maximum(jnp.sum(member, axis=0), 1)[:, None, None]
 
 
 def greedy_order(logits: Float[Array, "objects views classes"], labels: Int[Array, " objects"]) -> Int[Array, " views"]:
-    """Views in the order in which a greedy search adds them: each time the one that is best on top of those before.
+    """Views in the order of a greedy search, which adds the view that gives the best accuracy together with those before it.
 
-    Best means the most right answers over all objects and all start views, the start seen first; of equals the lowest index.
+    The accuracy is over all objects and all start views, with the start view seen first. Ties go to the lowest index.
     """
     views = logits.shape[1]
 
     def right_with(view: Array, beliefs: Array, holds: Array) -> Array:
-        """Right answers if every walk, by object and start, looked at `view` as well; it adds nothing where seen."""
+        """Accuracy if every walk (by object and start view) also sees `view`; a view seen before adds nothing."""
         fused = beliefs + jnp.where(holds[:, view], 0.0, 1.0)[None, :, None] * logits[:, view][:, None]
         own = jnp.take_along_axis(fused, labels[:, None, None], axis=-1)
         return jnp.mean(jnp.all(fused <= own, axis=-1))
@@ -44,7 +44,7 @@ def greedy_order(logits: Float[Array, "objects views classes"], labels: Int[Arra
 
 @jax.jit
 def learn(logits: Float[Array, "objects views classes"], labels: Int[Array, " objects"]) -> Knowledge:
-    """Both, from the logits of objects that are not tested on."""
+    """Computes the table and the order from the logits of objects that are not test objects."""
     views = logits.shape[1]
     order = greedy_order(logits, labels)
     scores = jnp.zeros(views).at[order].set(views - jnp.arange(views, dtype=jnp.float32))

@@ -1,4 +1,4 @@
-"""The ladder: the policies that are compared, in the order in which they are shown, with what each may know."""
+"""The policies that are compared, in the order of the tables, with the information that each may use."""
 
 from __future__ import annotations
 
@@ -8,13 +8,14 @@ from typing import Literal
 Knows = Literal["nothing", "networks", "others", "learned", "rendering", "truth"]
 
 KNOWS: dict[Knows, str] = {
-    "nothing": "nothing of the object",
-    "networks": "what the entropy predictor says of the views seen",
-    "others": "what views show of other (validation) objects",
-    "learned": "what looking was worth on validation objects",
-    "rendering": "what a surface or volume through the latest view's points would look like from elsewhere",
-    "truth": "the object itself, which no robot does",
+    "nothing": "no information about the object",
+    "networks": "entropies predicted from the views seen",
+    "others": "statistics of other (validation) objects",
+    "learned": "a network trained on gains of views that were measured on validation objects",
+    "rendering": "renderings of a surface or volume reconstructed from the latest view",
+    "truth": "the object itself, which is not available to a robot",
 }
+"""What the policies of each kind use, as shown in the report."""
 
 
 @dataclass(frozen=True)
@@ -23,9 +24,9 @@ class Rung:
 
     Attributes:
         policy: its name in `mevs_jax.POLICIES`.
-        title: for people.
-        knows: see `KNOWS`.
-        draws: walks per object and start, averaged; 1 where nothing is drawn.
+        title: its name in the report.
+        knows: the information that it uses, a key of `KNOWS`.
+        draws: walks that are averaged for each object and start view; 1 for a deterministic policy.
     """
 
     policy: str
@@ -35,19 +36,19 @@ class Rung:
 
 
 SCRAMBLED = Rung("scrambled_entropy", "sorted in place", "networks")
-"""The thesis's policy as its published code has it: no rung of the ladder, but part of what that code changes."""
+"""The thesis's policy as its published code implements it. It is not part of `ladder`; the compatibility table shows it."""
 
 ASCENT_RUNGS = (
-    Rung("diff_volume", "climbing on a volume", "rendering"),
-    Rung("diff_mesh", "climbing on a surface", "rendering"),
-    Rung("diff_volume_whole", "climbing on the whole volume", "truth"),
-    Rung("diff_mesh_whole", "climbing on the whole mesh", "truth"),
+    Rung("diff_volume", "ascent on a volume", "rendering"),
+    Rung("diff_mesh", "ascent on a surface", "rendering"),
+    Rung("diff_volume_whole", "ascent on the whole volume", "truth"),
+    Rung("diff_mesh_whole", "ascent on the whole mesh", "truth"),
 )
-"""Differentiable rendering, on fewer objects than the rest of the ladder and in a table of its own."""
+"""The policies by differentiable rendering. They have a table of their own, on fewer objects."""
 
 
 def ladder(draws: int) -> tuple[Rung, ...]:
-    """All rungs; `draws` walks per object and start for those that draw. The first is what others are compared with."""
+    """Returns all policies; random ones walk `draws` times from each start view. The first is the baseline of the others."""
     return (
         Rung("random", "random", "nothing", draws),
         Rung("random_with_repetition", "random, with repetition", "nothing", draws),

@@ -1,8 +1,8 @@
-"""Live mode: the selection loop with the networks inside it, looking at images and clouds instead of a table.
+"""Live mode: the selection loop runs the networks on images and clouds instead of reading a view table.
 
-The same `select_views`, the same policies, another `observe`: it takes the chosen view's image and cloud and runs both networks
-on them, in the `lax.while_loop`, vmapped over objects. That is what an accelerator or a robot runs, and it checks the table
-mode of the study: both must walk the same views (`compare_with_tables`).
+`select_views` and the policies are the same as in table mode. Only `observe` differs: it runs both networks on the
+image and cloud of the chosen view, inside the `lax.while_loop`, vmapped over objects. An accelerator or a robot runs
+this mode. It also checks the table mode of the study: both must choose the same views (`compare_with_tables`).
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from flax import nnx
-from jaxtyping import Array, Int
+from jaxtyping import Array, Int, Integer
 
 from data_pipeline.dataset.batches import evaluation_batches
 from data_pipeline.progress import progress_bar
@@ -36,20 +36,20 @@ _CLOUD = ("pixels", "pixel_depth", "pose")
 
 @flax.struct.dataclass
 class Captures:
-    """What the camera would see of an object from every view.
+    """Images and clouds of an object from every view.
 
     Attributes:
-        images: (views, height, width) as stored: depth or shaded image.
-        clouds: the sampled points of each view, as `EntropyTask.inputs` takes them.
+        images: (views, height, width) depth or shaded images as stored.
+        clouds: the sampled points of each view, in the form that `EntropyTask.inputs` takes.
     """
 
-    images: Int[Array, "*batch views height width"]
+    images: Integer[Array, "*batch views height width"]
     clouds: dict[str, Array]
 
 
 @dataclass(frozen=True)
 class Networks:
-    """Both networks and what turns captures into their inputs."""
+    """Both networks, and the tasks that convert captures to their inputs."""
 
     classify: ClassifierTask
     classifier: nnx.Module
@@ -58,7 +58,10 @@ class Networks:
 
 
 class LiveWalker:
-    """Walks objects with the networks in the loop, on all devices; one program for each policy and number of objects."""
+    """Walks objects with the networks in the loop, on all devices.
+
+    One program is compiled for each policy and number of objects.
+    """
 
     def __init__(self, networks: Networks, graph: ViewGraph):
         self._graph, self._tasks = graph, (networks.classify, networks.predict)
@@ -78,12 +81,12 @@ class LiveWalker:
         max_views: int,
         threshold: float | None = None,
     ) -> Episode:
-        """Episodes of several objects; `keys`, `captures`, `starts` and all of `scenes` have an axis of objects.
+        """Returns the episodes of several objects; `keys`, `captures`, `starts` and all of `scenes` have an axis of objects.
 
         Args:
             policy: a name in `POLICIES`.
-            max_views: MV.
-            threshold: CT; None to go on to `max_views`.
+            max_views: limit on views (MV).
+            threshold: confidence threshold (CT); None to continue to `max_views`.
         """
         return self._walk(self._states, keys, captures, scenes, starts, policy, max_views, threshold)
 
@@ -113,18 +116,18 @@ class LiveConfig:
     """The check of live mode against table mode."""
 
     objects: int = 500
-    """test objects that are walked"""
+    """number of test objects"""
     at_once: int = 64
-    """of them in one batch"""
+    """objects in one batch"""
     max_views: int = 9
-    """looks at each"""
+    """views of each object"""
     policies: tuple[str, ...] = ()
-    """their names; all of them unless given"""
+    """names of policies; all if empty"""
 
 
 @dataclass(frozen=True)
 class Agreement:
-    """Walks of one policy, table and live: how many are the same, and the largest difference of confidences along those."""
+    """Walks of one policy in both modes: number, how many are the same, largest difference of confidences along the same ones."""
 
     walks: int
     same: int
@@ -141,7 +144,7 @@ def compare_with_tables(
     *,
     config: LiveConfig,
 ) -> dict[str, Agreement]:
-    """Walks the first objects of a split in both modes, object i from view i mod views, by the same keys."""
+    """Walks the first objects of a split in both modes with the same keys, object i from view i modulo the number of views."""
     policies = config.policies or tuple(POLICIES)
     walker = LiveWalker(networks, graph)
     views, stacked = graph.points.shape[0], tables.stacked()
@@ -168,7 +171,7 @@ def compare_with_tables(
         line = bar.add_task("Walking live", total=objects, note="")
         for first in range(0, objects, at_once):
             chunk = [_captures(next(batches), networks) for _ in range(min(at_once, objects - first))]
-            # A last, shorter chunk is filled up, not recompiled.
+            # A shorter last chunk is padded, so that nothing is compiled again.
             index = np.resize(np.arange(len(chunk)), at_once)
             captures = jax.tree.map(lambda *leaves: np.stack(leaves), *(chunk[i] for i in index))
             index += first

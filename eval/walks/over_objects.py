@@ -1,4 +1,4 @@
-"""Objects shared out to all devices: each runs the same program on its part, and none waits for another."""
+"""Distribution of objects over all devices; each runs the same program on its part, without communication."""
 
 from __future__ import annotations
 
@@ -12,12 +12,14 @@ from jax.sharding import Mesh, PartitionSpec
 
 
 def over_objects(function: Callable[[Any], Any], arguments: Any, multiple: int = 1) -> Any:
-    """`function(arguments)`, where every array on both sides has a leading axis of objects; for use under jit.
+    """Returns `function(arguments)`, with the objects split between all devices; for use under jit.
+
+    Every array of the arguments and of the result has a leading axis of objects.
 
     Args:
-        function: treats objects one by one, so that it may be given some of them.
+        function: a function that treats objects independently of each other.
         arguments: a tree of arrays.
-        multiple: each device is given a multiple of so many objects; the first is repeated to make up the number.
+        multiple: each device receives a multiple of this number of objects; the first object is repeated as padding.
     """
     devices = jax.devices()
     objects = jax.tree.leaves(arguments)[0].shape[0]

@@ -81,25 +81,25 @@ def parse(name: str, arguments: list[str]) -> Invocation:
     else:
         preset = preset or "small"
         base = PRESETS[preset]
-    kind = _options_with_settings(command, base)
+    groups = list(command.settings)
+    made_before_run_json = run is None and (folder / "classifier" / "config.json").exists()
+    if made_before_run_json:  # by version 0.1: its settings have to be given again
+        groups += [group for group in ("dataset", "classifier", "entropy") if group not in groups]
+    kind = _options_with_settings(command, {group: getattr(base, group) for group in groups})
     arguments = ["--help" if argument == "--help-all" else argument for argument in arguments]
     options: Any = tyro.cli(kind, prog=f"mevs {name}", description=f"{command.title}.", args=arguments)
-    return Invocation(options, settings_of(options, command, base), preset, folder, arguments)
+    return Invocation(options, settings_of(options, groups, base), preset, folder, arguments)
 
 
-def _options_with_settings(command: Command, base: Settings) -> type:
-    """The command's options with its groups of settings beside them."""
-    groups = [(group, type(value), dataclasses.field(default=value)) for group, value in _groups(command, base).items()]
-    return dataclasses.make_dataclass(command.options, groups, bases=(_class_of(command),), frozen=True)
+def _options_with_settings(command: Command, groups: dict[str, Any]) -> type:
+    """The command's options with groups of settings, and their defaults, beside them."""
+    fields = [(group, type(value), dataclasses.field(default=value)) for group, value in groups.items()]
+    return dataclasses.make_dataclass(command.options, fields, bases=(_class_of(command),), frozen=True)
 
 
-def _groups(command: Command, base: Settings) -> dict[str, Any]:
-    return {group: getattr(base, group) for group in command.settings}
-
-
-def settings_of(options: Any, command: Command, base: Settings) -> Settings:
-    """All settings: the command's own as given, the others as they were; short options override."""
-    settings = replace(base, **{group: getattr(options, group) for group in command.settings})
+def settings_of(options: Any, groups: list[str], base: Settings) -> Settings:
+    """All settings: these groups as given, the others as they were; short options override."""
+    settings = replace(base, **{group: getattr(options, group) for group in groups})
     dataset = settings.dataset
     if getattr(options, "data", None) is not None:
         dataset = replace(dataset, source=options.data)

@@ -1,7 +1,7 @@
-"""Training of small networks on data that fits into memory: an epoch is one program, and what is kept is a running mean.
+"""Training of small networks on data that fits into memory, an epoch as one compiled program.
 
-AdamW with warm-up and cosine decay; the weights that are validated and returned are a running mean of the trained ones
-(Polyak), those of the epoch that is best on validation data.
+AdamW with warm-up and cosine decay. The weights that are validated and returned are a running mean of the trained weights (Polyak
+averaging), after the epoch that is best on validation data.
 """
 
 from __future__ import annotations
@@ -22,26 +22,31 @@ Data = TypeVar("Data")
 
 @dataclass(frozen=True)
 class AveragedConfig:
-    """How such a network is trained."""
+    """Settings of `fit_averaged`."""
 
     epochs: int = 10
-    """looks at each sample"""
+    """passes over the samples"""
     batch_size: int = 128
     """samples in a batch"""
     learning_rate: float = 1e-3
-    """of AdamW, at its highest"""
+    """peak learning rate of AdamW"""
     weight_decay: float = 0.01
-    """decoupled"""
+    """decoupled weight decay"""
     averaging: float = 0.995
-    """share of the running mean of the weights that a step keeps"""
+    """decay of the running mean of the weights in each step"""
     seed: int = 0
-    """of weights, batches and all that is drawn"""
+    """seed of initial weights, batches and all other random draws"""
 
 
 def mean_losses(
     losses_of: Callable[[nnx.State, Data], dict[str, Array]], data: Data, size: int
 ) -> Callable[[nnx.State], dict[str, float]]:
-    """For `fit_averaged` to validate with: means of the losses of some weights over parts of about so many samples."""
+    """Returns a `validate` function for `fit_averaged`: weights to their mean losses over the data.
+
+    Args:
+        losses_of: weights and samples to mean losses by name.
+        size: the data is evaluated in parts of about this many samples.
+    """
     samples = len(jax.tree.leaves(data)[0])
     parts = np.array_split(np.arange(samples), max(1, samples // size))
 
@@ -59,12 +64,15 @@ def fit_averaged(
     data: Data,
     validate: Callable[[nnx.State], dict[str, float]] | None,
 ) -> tuple[nnx.State, list[dict[str, float]]]:
-    """The mean weights of the best epoch, or those given where there is no epoch, and the losses by epoch.
+    """Returns the averaged weights of the best epoch, and the losses of every epoch.
+
+    Without epochs, the weights are the given `parameters`.
 
     Args:
         loss_of: weights, a batch and a key to the mean loss.
+        parameters: initial weights.
         data: a tree of arrays with a leading axis of samples.
-        validate: mean weights to losses, whose sum decides which epoch is best; without, the last is.
+        validate: averaged weights to losses, the sum of which decides which epoch is best; if None, the last epoch is taken.
     """
     samples = len(jax.tree.leaves(data)[0])
     batch = min(config.batch_size, samples)

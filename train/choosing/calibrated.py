@@ -1,4 +1,4 @@
-"""A fusion with temperatures fitted on validation objects, one for each number of views."""
+"""Calibration of a fusion: temperatures fitted on validation objects, one for each number of views."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from train.choosing.chunks import in_chunks
 from train.choosing.features import Features, sets_of_size
 
 _CALIBRATED = (1, 2, 3, 4, 5, 6, 8, 12, 16, 24, 32, 40)
-"""Numbers of views at which a temperature is fitted; between them it is interpolated."""
+"""Numbers of views for which a temperature is fitted; temperatures between them are interpolated."""
 
 
 def calibrated(
@@ -29,28 +29,28 @@ def calibrated(
     posed: bool = True,
     draws: int = 4,
 ) -> CalibratedFusion:
-    """With temperatures fitted on random sets of views of validation objects, every class weighing the same.
+    """Returns the fusion with temperatures fitted on random sets of views of validation objects; all classes weigh the same.
 
     Args:
-        prior: log-probabilities of the classes in training; the validation's logits of single views are without it already.
+        prior: log-probabilities of the classes in training; it is already subtracted from the single-view logits of `validation`.
         posed: whether the objects' pose is known.
-        draws: sets of each size for each object.
+        draws: number of sets of each size for each object.
     """
     structure, weights = nnx.split(network)
     objects, views, classes = validation.logits.shape
     sizes = [size for size in _CALIBRATED if size <= views]
-    as_it_is = CalibratedFusion(structure, weights, prior, jnp.ones(1), jnp.float32(1), posed)
+    uncalibrated = CalibratedFusion(structure, weights, prior, jnp.ones(1), jnp.float32(1), posed)
 
     def fitted(beliefs: AnyArray, truth: Array) -> Array:
         return fit_temperature(beliefs.reshape(-1, classes), truth, class_weights(truth, classes))
 
     def temperature(size: int) -> float:
-        beliefs = beliefs_of_sets(as_it_is, validation, sets_of_size(objects, views, size, draws))
+        beliefs = beliefs_of_sets(uncalibrated, validation, sets_of_size(objects, views, size, draws))
         return float(fitted(beliefs, jnp.tile(validation.labels, draws)))
 
     every = np.exp(np.interp(np.log(np.arange(1, views + 1)), np.log(sizes), np.log([*map(temperature, sizes)])))
     single = fitted(validation.logits, jnp.repeat(validation.labels, views))
-    return replace(as_it_is, temperatures=jnp.asarray(every, jnp.float32), single=single)
+    return replace(uncalibrated, temperatures=jnp.asarray(every, jnp.float32), single=single)
 
 
 @jax.jit
@@ -62,6 +62,6 @@ def _beliefs_of_some_sets(fusion: CalibratedFusion, some: tuple[Features, Array]
 def beliefs_of_sets(
     fusion: CalibratedFusion, data: Features, present: Bool[AnyArray, "draws objects views"]
 ) -> Float[np.ndarray, "draws objects classes"]:
-    """Log-probabilities after each set of views."""
+    """Returns the log-probabilities of the classes after each set of views."""
     sets = np.asarray(present).swapaxes(0, 1)
     return in_chunks(partial(_beliefs_of_some_sets, fusion), (data, sets), 16).swapaxes(0, 1)

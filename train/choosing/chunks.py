@@ -1,4 +1,4 @@
-"""Many objects through a compiled program, some at a time: one shape for all of them, and memory for some."""
+"""Applying a compiled program to many objects in chunks of one shape, which limits memory and compiles once."""
 
 from __future__ import annotations
 
@@ -10,10 +10,12 @@ import numpy as np
 
 
 def in_chunks(function: Callable[[Any], Any], objects: Any, size: int) -> Any:
-    """`function(objects)`, as arrays of the host, where both are trees of arrays with a leading axis of objects.
+    """Returns `function(objects)` as arrays on the host, computed in chunks.
 
     Args:
-        function: treats objects one by one, so that it may be given `size` of them; the last chunk is filled up with its first.
+        function: maps a tree of arrays with a leading axis of objects to another such tree, each object independently.
+        objects: a tree of arrays with a leading axis of objects.
+        size: objects in a chunk; the last chunk is filled up by repeating its objects.
     """
     count = len(jax.tree.leaves(objects)[0])
     size, done = min(size, count), []

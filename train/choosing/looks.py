@@ -1,4 +1,7 @@
-"""What is computed of each view of a batch for the learned study: features, logits, directions, embeddings."""
+"""What the learned study computes for each view of a batch: features, logits, directions, labels, embeddings.
+
+These are `ask` functions for `train.outputs.network_outputs`.
+"""
 
 from __future__ import annotations
 
@@ -18,27 +21,32 @@ from train.tasks.recogniser import RecogniserTask, views_by_object
 
 
 def see(network: Recogniser, task: Task, batch: Batch) -> jax.Array:
-    """Features, logits, direction and label of every view, side by side."""
+    """Returns features, logits, direction and label of every view, concatenated: (views, features + classes + 3 + 1)."""
     assert isinstance(task, RecogniserTask)
-    return _seen(network, task.inputs(batch), task.directions(batch), batch)
+    return _see_images(network, task.inputs(batch), task.directions(batch), batch)
 
 
-def _seen(network: Recogniser, images: Array, directions: Array, batch: Batch) -> jax.Array:
+def _see_images(network: Recogniser, images: Array, directions: Array, batch: Batch) -> jax.Array:
     label = batch["label"][:, None].astype(jnp.float32)
     return jnp.concatenate([network.see(images), directions, label], axis=-1)
 
 
-def _seen_after(changes: Array, network: Recogniser, task: RecogniserTask, batch: Batch) -> jax.Array:
-    """`see` of objects whose points were multiplied by these matrices, one for each."""
+def _see_changed_by(changes: Array, network: Recogniser, task: RecogniserTask, batch: Batch) -> jax.Array:
+    """Returns `see` of transformed objects.
+
+    Args:
+        changes: (objects, 3, 3) matrices that the objects' points are multiplied by.
+    """
     images, poses = (views_by_object(array, task.camera.views) for array in (task.inputs(batch), batch["pose"]))
     images, directions = jax.vmap(partial(views_after, camera=task.camera))(changes, images, poses)
-    return _seen(network, images.reshape(-1, *images.shape[2:]), directions.reshape(-1, 3), batch)
+    return _see_images(network, images.reshape(-1, *images.shape[2:]), directions.reshape(-1, 3), batch)
 
 
 def see_rotated(network: Recogniser, task: Task, batch: Batch) -> jax.Array:
-    """`see` of turned views after the object was turned, by the rotation after which its cameras stand as in the lattice again.
+    """Returns `see` of objects turned so that their cameras are in the directions of the lattice again.
 
-    Turns are drawn evenly among all rotations, and so are these.
+    For data sets made with `turned`, where the lattice around each object is turned by a random rotation. Those rotations are
+    uniform over all rotations, and so are the ones applied here.
     """
     assert isinstance(task, RecogniserTask)
     lattice = jnp.asarray(viewpoint_lattice(task.camera.views, task.camera.lattice), jnp.float32)
@@ -47,23 +55,28 @@ def see_rotated(network: Recogniser, task: Task, batch: Batch) -> jax.Array:
         return jnp.linalg.solve(directions.T @ directions, directions.T @ lattice).T
 
     turns = jax.vmap(turn_back)(views_by_object(task.directions(batch), task.camera.views))
-    return _seen_after(turns, network, task, batch)
+    return _see_changed_by(turns, network, task, batch)
 
 
 @cache
 def see_changed(number: int) -> Ask:
-    """`see` of objects that are changed as in the recogniser's training, each in a way of its own, and otherwise by number."""
+    """Returns a `see` for objects that are augmented as in the recogniser's training.
+
+    Args:
+        number: seeds the augmentation; each object is changed by its own draw, another one for each number.
+    """
 
     def see(network: Recogniser, task: Task, batch: Batch) -> jax.Array:
         assert isinstance(task, RecogniserTask)
         drawn, augmentation = jax.random.fold_in(jax.random.key(1), number), task.augmentation
         positions = views_by_object(batch["position"], task.camera.views)[:, 0]
         changes = jax.vmap(lambda position: object_changes(jax.random.fold_in(drawn, position), 1, augmentation)[0])
-        return _seen_after(changes(positions), network, task, batch)
+        return _see_changed_by(changes(positions), network, task, batch)
 
     return see
 
 
 def embed(network: PointNet2, task: Task, batch: Batch) -> jax.Array:
+    """Returns PointNet++'s embedding of the partial cloud of every view, (views, embedding)."""
     assert isinstance(task, EntropyTask)
     return network.embed(task.inputs(batch))

@@ -1,9 +1,10 @@
-"""Training of the view policy on what looking was worth: exact, and free, since every view of a training object is at hand.
+"""Training of the view policy on the exact gain of each candidate view.
 
-For objects whose features are known from all candidate views, the belief after any set of views and one more is one call of
-the fusion. So for a state (a set seen) each candidate's label is by how much it raises the true class's log-probability. Encoder
-and fusion that trained on an object are sure of it from any view, and there would be little to learn: labels are of objects that
-they were not trained on. Later rounds add the states to which the policy itself leads (DAgger; Ross et al. 2011).
+For objects whose features are known from all candidate views, the belief after a set of views and one more view is one call of
+the fusion. So in a state (a set of views seen), the label of a candidate is its gain: by how much it raises the log-probability
+of the true class. Encoder and fusion are certain of objects that they were trained on from any view, so those objects would
+teach little; labels are of objects that they were not trained on. Later rounds add the states that the policy itself reaches
+(DAgger; Ross et al. 2011).
 """
 
 from __future__ import annotations
@@ -35,53 +36,53 @@ from train.choosing.features import Features
 
 Tree = TypeVar("Tree")
 Seen = tuple[CalibratedFusion, Features]
-"""Objects, as a recogniser sees and fuses them."""
+"""Features of some objects, and the fusion of the recogniser that computed them."""
 
 
 @dataclass(frozen=True)
 class PolicyConfig(AveragedConfig):
-    """The view policy and its training."""
+    """Architecture of the view policy, and settings of its training."""
 
     epochs: int = 8
-    """looks at each state, in every round"""
+    """passes over the states, in every round"""
     batch_size: int = 256
     """states in a batch"""
     width: int = 96
-    """of queries and tokens"""
+    """width of queries and tokens"""
     heads: int = 4
-    """of attention"""
+    """heads of attention"""
     blocks: int = 2
-    """of attention and layers"""
+    """blocks of attention and feed-forward layers"""
     most_seen: int = 6
-    """views in a state at most"""
+    """maximal number of views seen in a state"""
     walks: int = 3
-    """walks on each object in a round, each through states of 1 to most_seen views"""
+    """walks on each object in a round, each with a state of every size from 1 to most_seen views"""
     candidates: int = 12
-    """views not seen yet that a state is asked about"""
+    """views not seen yet whose gain is a training label, for each state"""
     rounds: int = 2
-    """the first walks at random, the others as the policy of the round before says (DAgger)"""
+    """rounds of training; walks of the first are random, those of later rounds follow the policy of the round before (DAgger)"""
     differences: float = 30.0
-    """how much errors of differences between candidates count, on which the choice depends, beside those of what each brings"""
+    """weight of the errors of differences between candidates, which decide the choice, against errors of the gains themselves"""
     utility: Utility = "log"
-    """what a belief is worth: the true class's probability, or its logarithm"""
+    """utility of a belief: the probability of the true class, or its logarithm"""
     floor: float = 0.01
-    """added to probabilities in logarithms: one object that all are wrong about must not outweigh all others"""
+    """added to probabilities before the logarithm, so that one object that is always misjudged does not outweigh all others"""
 
 
 @flax.struct.dataclass
 class Choices:
-    """States, and what each candidate would bring there.
+    """States of walks, and the gain of some candidates in each.
 
     Attributes:
-        belief: log-probabilities of what was seen.
-        views: log-probabilities of each view seen alone.
-        directions: of the views seen.
-        present: which of them there are.
-        candidates: directions of some views that were not seen.
-        gain: in utility that each brings.
-        label: the true class.
-        weight: how much the state counts.
-        clouds: embeddings of the partial clouds of the views seen, where they are used.
+        belief: log-probabilities of the classes after the views seen.
+        views: log-probabilities of the classes by each seen view alone.
+        directions: directions of the views seen.
+        present: which entries of `views` and `directions` are seen; others are padding.
+        candidates: directions of some views not seen.
+        gain: gain in utility by each candidate.
+        label: true class.
+        weight: weight of the state in the loss.
+        clouds: embeddings of the partial clouds of the views seen, if used.
     """
 
     belief: Float[Array, "states classes"]
@@ -96,7 +97,7 @@ class Choices:
 
 
 def graph_of(directions: Float[Array, "views 3"]) -> ViewGraph:
-    """Candidates without neighbours, which policies that learn do not ask for."""
+    """Returns a view graph of the directions without neighbours, which learned policies do not use."""
     views = directions.shape[0]
     distances = jnp.arccos(jnp.clip(directions @ directions.T, -1.0, 1.0))
     return ViewGraph(directions, jnp.zeros((views, views), bool), distances)
@@ -137,7 +138,13 @@ def walk(
     most: int,
     walks: int,
 ) -> Int[np.ndarray, "objects walks most"]:
-    """Views along walks from starts drawn at random, by `policy_of(parameters)`."""
+    """Returns the views of walks from random starts.
+
+    Args:
+        policy_of: `policy_of(parameters)` is the policy that chooses the views; a static argument of the compiled walk.
+        most: views of a walk.
+        walks: walks for each object.
+    """
     keys = jax.vmap(jax.random.fold_in, (None, 0))(key, jnp.arange(len(data.labels)))
     rest = fusion, policy_of, parameters, most, walks
     return in_chunks(lambda some: _walk_some(some, *rest), (keys, data), 64)
@@ -147,10 +154,10 @@ def walk(
 def _choices_of_some(fusion: CalibratedFusion, some: tuple[Features, Array, Array], config: PolicyConfig) -> Choices:
     most, by = some[1].shape[-1], (config.utility, config.floor)
 
-    def of_object(one: Features, walks: Array, asked: Array) -> Choices:
+    def of_object(one: Features, walks: Array, candidates: Array) -> Choices:
         single = jax.nn.log_softmax(one.logits / fusion.single, axis=-1)
 
-        def of_state(order: Array, count: Array, asked: Array) -> Choices:
+        def of_state(order: Array, count: Array, candidates: Array) -> Choices:
             present = jnp.arange(most) < count
             features, directions = one.features[order], one.directions[order]
             belief = fusion(features, directions, present)
@@ -162,14 +169,14 @@ def _choices_of_some(fusion: CalibratedFusion, some: tuple[Features, Array, Arra
                     jnp.concatenate([present, jnp.array([True])]),
                 )
 
-            after = jax.vmap(with_one_more)(asked)
+            after = jax.vmap(with_one_more)(candidates)
             gain = utility_of(after[:, one.labels], *by) - utility_of(belief[one.labels], *by)
-            known = belief, single[order], directions, present, one.directions[asked]
+            known = belief, single[order], directions, present, one.directions[candidates]
             clouds = None if one.clouds is None else one.clouds[order]
             return Choices(*known, gain, one.labels, jnp.float32(1), clouds)
 
         of_walk = jax.vmap(of_state, (None, 0, 0))
-        return jax.vmap(of_walk, (0, None, 0))(walks, jnp.arange(1, most + 1), asked)
+        return jax.vmap(of_walk, (0, None, 0))(walks, jnp.arange(1, most + 1), candidates)
 
     return jax.vmap(of_object)(*some)
 
@@ -177,7 +184,10 @@ def _choices_of_some(fusion: CalibratedFusion, some: tuple[Features, Array, Arra
 def unseen(
     walks: Int[np.ndarray, "objects walks most"], views: int, candidates: int, seed: int
 ) -> Int[np.ndarray, "objects walks most candidates"]:
-    """For every state along some walks a random choice of the views that were not seen yet, fewer where there are fewer."""
+    """Returns random views not seen yet for every state of some walks.
+
+    The number of views is `candidates`, or what the longest walk leaves unseen if that is less.
+    """
     most = walks.shape[-1]
     drawn = np.random.default_rng(seed).random((*walks.shape, views))
     seen = (walks[..., None, :, None] == np.arange(views)) & np.tri(most, dtype=bool)[:, :, None]
@@ -189,21 +199,25 @@ def choices_along(
     fusion: CalibratedFusion,
     data: Features,
     walks: Int[np.ndarray, "objects walks most"],
-    asked: Int[np.ndarray, "objects walks most candidates"],
+    candidates: Int[np.ndarray, "objects walks most candidates"],
     config: PolicyConfig,
 ) -> Choices:
-    """Every state along some walks, with what each candidate `asked` about would bring there; arrays of the host."""
-    found = in_chunks(partial(_choices_of_some, fusion, config=config), (data, walks, asked), 16)
+    """Returns every state of some walks with the gain of its candidates, as arrays on the host."""
+    found = in_chunks(partial(_choices_of_some, fusion, config=config), (data, walks, candidates), 16)
     return jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[3:]), found)
 
 
 def policy_loss(network: ViewPolicy, some: Choices, differences: float) -> dict[str, Array]:
-    """The parts of the loss, to be added: means over candidates of squared errors.
+    """Returns the terms of the loss, which are to be added: squared errors, averaged over candidates.
 
-    Of the gain that is expected, without and with knowing the true class; and, so many times, of how much more each candidate
-    brings than all do on average, with knowing it and by the belief. Squared, because the mean is wanted: a telling view changes
-    little most of the time and much now and then. Most of a gain's variance is how hard the object is, whichever view comes next:
-    without the differences that is what a network learns first.
+    * `gain`: of the predicted gain.
+    * `gain_if`: of the predicted gain given the true class.
+    * `differences`: of the gain minus the candidates' mean gain, both for the prediction given the true class and for its mean
+      over the belief; multiplied by `differences`.
+
+    Errors are squared because the mean of a gain is to be predicted: an informative view changes the belief little in most cases
+    and much in some. Most of the variance of a gain is how hard the object is, the same for all next views; without the term of
+    differences, a network learns that first.
     """
     gain, gain_if = network(some.belief, some.views, some.directions, some.present, some.candidates, some.clouds)
     own = jnp.take_along_axis(gain_if, some.label[:, None, None], axis=2)[:, :, 0]
@@ -225,17 +239,23 @@ def policy_loss(network: ViewPolicy, some: Choices, differences: float) -> dict[
 
 
 By = Literal["belief", "state", "table", "ahead"]
-"""How a view policy is asked: as `learned` has it, or two views ahead."""
+"""How a view policy scores candidates: the options of `mevs_jax.policies.learned.learned`, or "ahead" for `looking_ahead`."""
 
 
 def learned_policy(given: tuple[nnx.State, Array], structure: nnx.GraphDef, by: By = "belief") -> Policy:
-    """`learned` or `looking_ahead` of a network's weights and the temperature of single views, which a compiled program takes as
-    arguments."""
+    """Returns the policy `learned` or `looking_ahead` of a network.
+
+    Args:
+        given: weights and temperature of single views, which may be arguments of a compiled program.
+        structure: graph definition of the network.
+        by: how candidates are scored.
+    """
     network, temperature = nnx.merge(structure, given[0]), given[1]
     return looking_ahead(network, temperature) if by == "ahead" else learned(network, temperature, by=by)
 
 
 def new_policy(config: PolicyConfig, classes: int, posed: bool = True, cloud: int = 0) -> ViewPolicy:
+    """Returns a view policy with random weights; `posed` and `cloud` as of `ViewPolicy`."""
     return ViewPolicy(
         classes,
         width=config.width,
@@ -252,7 +272,7 @@ def new_policy(config: PolicyConfig, classes: int, posed: bool = True, cloud: in
 def _fit(
     config: PolicyConfig, network: ViewPolicy, train: Choices, validation: Choices | None
 ) -> tuple[ViewPolicy, list]:
-    """The weights of the best epoch, or of the last where there are no validation states."""
+    """Returns the trained network of the best epoch, or of the last without validation states, and its losses by epoch."""
     structure, parameters = nnx.split(network)
 
     def loss_of(parameters: nnx.State, some: Choices, key: Array) -> Array:
@@ -274,11 +294,11 @@ def train_policy(
     parts: Sequence[Seen],
     validation: Seen | None = None,
 ) -> tuple[ViewPolicy, list[list[dict[str, float]]]]:
-    """The policy after all rounds, and losses by round and epoch.
+    """Returns the policy after all rounds, and the losses by round and epoch.
 
     Args:
-        parts: objects to learn from, each part as seen and fused by a recogniser that was trained without it.
-        validation: other objects, that say which epoch is best; without, the last is.
+        parts: objects to learn from, each part with features and fusion of a recogniser that was trained without it.
+        validation: other objects, which decide which epoch is best; if None, the last epoch is taken.
     """
     fusion, data = parts[0]
     cloud = 0 if data.clouds is None else data.clouds.shape[-1]
@@ -301,18 +321,19 @@ def train_policy(
 
 
 def _gather(seen: Seen, guide: ViewPolicy | None, config: PolicyConfig, number: tuple[int, int]) -> Choices:
-    """Every state along walks on some objects, as a policy says or at random, and what candidates would bring there.
+    """Returns every state of new walks on some objects, with the gain of random candidates.
 
     Args:
-        number: of the round and the part, so that others draw other walks and candidates.
+        guide: the policy that chooses the views of the walks; random views if None.
+        number: numbers of the round and the part, which seed the walks and candidates.
     """
-    (fusion, data), (turn, part) = seen, number
-    key = jax.random.fold_in(jax.random.fold_in(jax.random.key(config.seed), turn), part)
+    (fusion, data), (round_number, part) = seen, number
+    key = jax.random.fold_in(jax.random.fold_in(jax.random.key(config.seed), round_number), part)
     policy_of: Callable[..., Policy] = _at_random if guide is None else _guided(nnx.graphdef(guide))
     given = (None if guide is None else nnx.state(guide)), fusion.single
     views = walk(key, fusion, data, policy_of, given, config.most_seen, config.walks)
-    asked = unseen(views, data.features.shape[1], config.candidates, config.seed + 100 * turn + part)
-    return choices_along(fusion, data, views, asked, config)
+    candidates = unseen(views, data.features.shape[1], config.candidates, config.seed + 100 * round_number + part)
+    return choices_along(fusion, data, views, candidates, config)
 
 
 def _at_random(_: Any) -> Policy:
@@ -321,15 +342,15 @@ def _at_random(_: Any) -> Policy:
 
 @cache
 def _guided(structure: nnx.GraphDef) -> Callable[..., Policy]:
-    """One function for all weights: walks are compiled for each."""
+    """Returns the same function for the same structure: walks are compiled once per function, not once per set of weights."""
     return partial(learned_policy, structure=structure)
 
 
 def _balanced(choices: Choices) -> Choices:
-    """Weighted so that every class counts the same."""
+    """Returns the states with weights that give every class the same total weight."""
     return replace(choices, weight=class_weights(choices.label, choices.belief.shape[-1]))
 
 
 def joined(parts: Sequence[Tree]) -> Tree:
-    """Trees of arrays of the host, one behind the other."""
+    """Returns trees of arrays on the host, concatenated along the first axis."""
     return jax.tree.map(lambda *leaves: np.concatenate(leaves), *parts)

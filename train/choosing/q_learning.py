@@ -1,12 +1,12 @@
-"""The learned baseline: Q-learning of the views to look at, as MVSelect does (Hou et al., CVPR 2024).
+"""The learned baseline: Q-learning of the next view, as in MVSelect (Hou et al., CVPR 2024).
 
-Where `train.policy` asks of every candidate how much it gained, here the walk alone is known: which view was taken, and by how
-much the belief in the true class rose. Values follow by bootstrapping from the next state's (DQN; Mnih et al. 2015), with a
-network that is the view policy's, so that nothing but the way of learning differs. Walks are ε-greedy; a round walks with the
-network of the round before, which is also the target, and trains on the walks of all rounds (the replay).
+`train.choosing.policy` learns from the gain of many candidates in each state. Here only walks are known: the view taken, and by
+how much the belief in the true class rose. Values are bootstrapped from the next state's values (DQN; Mnih et al. 2015). The
+network is that of the view policy, so that only the method of learning differs. Walks are ε-greedy. A round walks with the last
+round's network, which is also the target network, and trains on the walks of all rounds (the replay).
 
-What differs from MVSelect: a fusion by attention rather than the maximum, beliefs of recognisers that never saw the object,
-and rewards at every step rather than the last.
+Differences to MVSelect: fusion is by attention instead of the maximum, beliefs are of recognisers that were not trained on the
+object, and there is a reward at every step instead of only the last.
 """
 
 from __future__ import annotations
@@ -35,30 +35,30 @@ from train.choosing.policy import PolicyConfig, Seen, joined, learned_policy, ne
 
 @dataclass(frozen=True)
 class QLearningConfig(PolicyConfig):
-    """Q-learning of the view policy."""
+    """Settings of the view policy's training by Q-learning."""
 
     epochs: int = 3
-    """looks at each walk, in every round"""
+    """passes over the walks, in every round"""
     batch_size: int = 64
     """walks in a batch"""
     rounds: int = 6
-    """of walking and learning; the first walks at random"""
+    """rounds of walking and training; the first walks at random"""
     discount: float = 0.9
-    """what a gain one view later counts"""
+    """discount factor for the gain of one view later"""
     exploration: float = 0.2
-    """share of the views of later rounds that are drawn"""
+    """ε: share of views that are chosen at random, in rounds after the first"""
 
 
 @flax.struct.dataclass
 class Transitions:
-    """Walks, and what each of their views brought.
+    """Walks, and the gain by each of their views.
 
     Attributes:
-        beliefs: log-probabilities after each view.
-        views: those of each view alone.
-        order: which views.
+        beliefs: log-probabilities of the classes after each view.
+        views: log-probabilities of the classes by each view alone.
+        order: indices of the views.
         candidates: directions of all views of the object.
-        reward: [t]: rise in utility by view t + 1.
+        reward: gain in utility by view t + 1, at index t.
     """
 
     beliefs: Float[Array, "walks steps classes"]
@@ -94,13 +94,13 @@ def transitions_along(
     walks: Int[np.ndarray, "objects walks steps"],
     config: QLearningConfig,
 ) -> Transitions:
-    """What happened along some walks; arrays of the host."""
+    """Returns beliefs and rewards along some walks, as arrays on the host."""
     found = in_chunks(partial(_transitions_of_some, fusion, config=config), (data, walks), 64)
     return jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:]), found)
 
 
 def values(network: ViewPolicy, some: Transitions) -> Float[Array, "walks transitions candidates"]:
-    """What `network` expects of every candidate after every view but the last; −inf for those seen."""
+    """Returns the value of every candidate after every view but the last; −inf for candidates already seen."""
     steps = some.order.shape[-1]
 
     def of_walk(beliefs: Array, views: Array, order: Array, candidates: Array) -> Array:
@@ -118,7 +118,10 @@ def values(network: ViewPolicy, some: Transitions) -> Float[Array, "walks transi
 def temporal_difference(
     network: ViewPolicy, target: ViewPolicy, some: Transitions, discount: float
 ) -> Float[Array, "walks transitions"]:
-    """How far each value of a view taken is from its reward and what the target expects from there on; the last ends the walk."""
+    """Returns the value of each view taken minus its reward and the target's discounted value of the next state.
+
+    The last view ends the walk: nothing is added to its reward.
+    """
     taken = jnp.take_along_axis(values(network, some), some.order[:, 1:, None], axis=2)[:, :, 0]
     ahead = jnp.max(values(target, some), axis=2)[:, 1:]
     ahead = jnp.pad(ahead, ((0, 0), (0, 1)))
@@ -126,7 +129,11 @@ def temporal_difference(
 
 
 def exploring(given: tuple[nnx.State, Array], structure: nnx.GraphDef, share: float) -> Policy:
-    """Now and then any view, otherwise that of the highest value."""
+    """Returns the ε-greedy policy: random scores with probability `share`, else the network's values.
+
+    Args:
+        given: weights and temperature of single views.
+    """
     greedy = learned_policy(given, structure, by="state")
 
     def scores(key: Array, state: Any, scene: Any) -> Array:
@@ -142,7 +149,10 @@ def train_by_q_learning(
     parts: Sequence[Seen],
     validation: Seen | None = None,
 ) -> tuple[ViewPolicy, list[list[dict[str, float]]]]:
-    """The network after all rounds, to be asked `by="state"`, and losses by round and epoch; arguments as of `train_policy`."""
+    """Returns the network after all rounds, for use with `by="state"`, and the losses by round and epoch.
+
+    Arguments are those of `train_policy`.
+    """
     network = new_policy(config, parts[0][1].logits.shape[-1], parts[0][0].posed)
     structure, weights = nnx.split(network)
     replay: list[Transitions] = []
@@ -172,7 +182,11 @@ def _fit(
     train: Transitions,
     check: Transitions | None,
 ) -> tuple[nnx.State, list[dict[str, float]]]:
-    """From the target's weights on; the first round looks no further than the next view, since its target knows nothing."""
+    """Trains from the target's weights; returns the new weights and the losses by epoch.
+
+    Args:
+        ahead: whether the next state's value counts; not in the first round, where the target is untrained.
+    """
     discount = config.discount if ahead else 0.0
 
     def loss_of(parameters: nnx.State, some: Transitions, key: Array | None = None) -> Array:

@@ -1,10 +1,10 @@
-"""The stages of the learned study that train: views from random directions, a recogniser, features of every view, view policies.
+"""The training stages of the learned study: views from random directions, a recogniser, features of every view, view policies.
 
-Each stage skips what is done. Everything that is selected, fitted or learned from the recogniser's outputs, temperatures and
-policies among it, uses validation objects.
+Each stage is skipped if its result exists. Everything that is selected, fitted or learned from the recogniser's outputs, such as
+temperatures and policies, uses validation objects; only the ablations `crossed` and `known` learn from training objects.
 
-In a run's folder: `learned/turned/` (data), `learned/seed_0/` with `recogniser/`, `features/`, `policies/`, `fold_0/`, …; and
-`learned/seed_0_rotated/`, the same for objects under any rotation.
+Folders within a run's folder: `learned/turned/` (data), `learned/seed_0/` with `recogniser/`, `features/`, `policies/`,
+`fold_0/`, …, and `learned/seed_0_rotated/`, the same for objects turned by any rotation.
 """
 
 from __future__ import annotations
@@ -24,7 +24,6 @@ from data_pipeline.dataset.builder import DataConfig, open_split, prepare
 from data_pipeline.dataset.statistics import DatasetStatistics, load_statistics
 from data_pipeline.errors import DataError
 from data_pipeline.progress import console
-from eval.learned.walks import Learner
 from mevs_jax.beliefs import CalibratedFusion
 from mevs_jax.models import Recogniser, ViewPolicy
 from mevs_jax.models.set_fusion import SumFusion
@@ -43,54 +42,54 @@ from train.tasks.recogniser import RecogniserConfig, RecogniserTask
 
 @dataclass(frozen=True)
 class LearnedConfig:
-    """Learned fusion and learned choice."""
+    """Settings of the learned study: learned fusion and learned choice of views."""
 
     recogniser: RecogniserConfig = RecogniserConfig()
     folds: int = 2
-    """parts of the training objects, for the ablation that learns from them by recognisers that never saw a part"""
+    """parts of the training objects, for the ablation that learns from each part by a recogniser trained without it"""
     fold_epochs: int = 0
-    """of those recognisers; 0 for as many as the recogniser itself"""
+    """training epochs of those recognisers; 0: as many as for the recogniser itself"""
     changed: int = 3
-    """further looks of a policy at each object that it learns from, mirrored and stretched as in the recogniser's training"""
+    """augmented copies of each object that a policy learns from, mirrored and stretched as in the recogniser's training"""
     policy: PolicyConfig = PolicyConfig()
     q_learning: QLearningConfig = QLearningConfig()
-    """of the policy that learns from walks alone, to compare with"""
+    """training of the policy that learns from walks alone, for comparison"""
     seeds: int = 1
-    """whole trainings, each from other random weights"""
+    """number of complete trainings, each with other random weights"""
     max_views: int = 8
     """views of a walk"""
     draws: int = 8
-    """walks per object and start of policies that draw"""
+    """walks per object and start view, for policies that choose at random"""
     fitting_starts: int = 1
-    """temperatures are fitted on walks from every so many-th start"""
+    """n: temperatures are fitted on walks from every n-th start view"""
     lattices: tuple[int, ...] = (10,)
-    """further numbers of candidate views to test on, never trained on"""
+    """further numbers of candidate views to test on, which are not trained on"""
     ablations: tuple[str, ...] = ()
-    """variants of the policy to compare with, with the first seed: as_it_is, look_ahead, probability,
-    random_states, unchanged, crossed, known, summed, cloud (where `mevs train` has made PointNet++), q_learning"""
+    """variants of the policy to compare with, for the first seed: as_it_is, look_ahead, probability, random_states, unchanged,
+    crossed, known, summed, cloud (needs PointNet++, trained by `mevs train`), q_learning"""
     novel: int = 0
-    """pairs of classes that a policy is trained without and then tested on, with the first seed"""
+    """number of class pairs that a policy is trained without and then tested on, for the first seed"""
     rotation_epochs: int = 0
-    """further training of the recognisers, on objects turned by any rotation, which are then tested on too, with
-    the first seed; 0 for neither"""
+    """epochs of further training of the recogniser on objects turned by any rotation, which are then tested too, for the first
+    seed; 0: no such training and test"""
 
 
 @dataclass(frozen=True)
 class Variant:
-    """A way to train the view policy, or to ask it.
+    """A way to train the view policy, or to score candidates with it.
 
     Attributes:
-        title: in the report.
+        title: title in the report.
         posed: whether the objects' pose is known.
-        by: how it is asked; see `train.policy.By`.
-        network: of the variant whose network it asks; its own unless given.
-        changed: it learns from objects that are mirrored and stretched, too.
-        learns_from: validation objects; training objects in parts, each seen by a recogniser that was trained without it; or
-            training objects seen by the one that was trained on them.
-        cloud: it sees PointNet++'s embedding of every partial cloud too.
-        summed: beliefs are sums of logits, in training and on its walks.
-        q_learning: learned from walks alone.
-        settings: what is set otherwise than for the method.
+        by: how candidates are scored; see `train.choosing.policy.By`.
+        network: name of the variant whose network is used; its own if empty.
+        changed: whether it also learns from mirrored and stretched copies of the objects.
+        learns_from: "validation": validation objects; "parts": training objects in parts, each with the features of a recogniser
+            that was trained without it; "training": training objects, with the features of the recogniser trained on them.
+        cloud: whether it is also given PointNet++'s embedding of every partial cloud.
+        summed: whether beliefs are sums of logits, in training and on its walks.
+        q_learning: whether it is trained by Q-learning, from walks alone.
+        settings: settings that differ from `LearnedConfig.policy`.
     """
 
     title: str
@@ -109,46 +108,44 @@ VARIANTS = {
     "learned": Variant("view policy"),
     "learned_unposed": Variant("view policy", posed=False),
     "learned_and_table": Variant("view policy and table", by="table", network="learned"),
-    "as_it_is": Variant("… by what it expects of the state as it is", by="state", network="learned"),
+    "as_it_is": Variant("… by the gain expected in the state, not per class", by="state", network="learned"),
     "look_ahead": Variant("… two views ahead", by="ahead", network="learned"),
     "probability": Variant(
         "… by the rise of the probability, not of its logarithm", settings={"utility": "probability"}
     ),
     "random_states": Variant("… trained on random walks alone", settings={"rounds": 1}),
-    "unchanged": Variant("… learned from objects as they are", changed=False),
-    "crossed": Variant("… learned from training objects, by recognisers without them", learns_from="parts"),
-    "known": Variant("… learned from training objects, by the one that knows them", learns_from="training"),
-    "summed": Variant("… with the sum of logits for a fusion", summed=True),
-    "cloud": Variant("… and with PointNet++'s embedding of their clouds", cloud=True, changed=False),
+    "unchanged": Variant("… trained on unchanged objects", changed=False),
+    "crossed": Variant("… trained on training objects, by recognisers without them", learns_from="parts"),
+    "known": Variant("… trained on training objects, by their own recogniser", learns_from="training"),
+    "summed": Variant("… with the sum of logits as fusion", summed=True),
+    "cloud": Variant("… with PointNet++'s embedding of clouds as further input", cloud=True, changed=False),
     "q_learning": Variant("… Q-learning (as MVSelect)", by="state", q_learning=True),
 }
-"""The method, and what it is compared with to see what each part of it is good for."""
-
+"""The method (`learned…`), and the ablations that measure the effect of its parts."""
 
 ABLATIONS = tuple(name for name in VARIANTS if not name.startswith("learned"))
 
-
-_FURTHER = 0.4
-"""Learning rate of further training, beside that of the first."""
+_FURTHER_RATE = 0.4
+"""Learning rate of the further training on turned objects, relative to that of the first training."""
 
 
 def check_learned(config: LearnedConfig, views: int) -> None:
-    """Raises `DataError` for a study that cannot be made."""
+    """Raises `DataError` if the study cannot be run with these settings and this number of candidate views."""
     if config.folds < 2 or config.seeds < 1:
-        raise DataError("--learned.folds must be at least 2, and --learned.seeds at least 1")
+        raise DataError("--learned.folds must be at least 2 and --learned.seeds at least 1")
     if config.changed < 0:
         raise DataError(f"--learned.changed must be at least 0, got {config.changed}")
     for name in config.ablations:
         if name not in ABLATIONS:
-            raise DataError(f"unknown ablation {name!r} (--learned.ablations); it is one of {', '.join(ABLATIONS)}")
+            raise DataError(f"unknown ablation {name!r} in --learned.ablations; choose from {', '.join(ABLATIONS)}")
     walks = [config.policy.most_seen, config.max_views]
     if "q_learning" in config.ablations:
         walks.append(config.q_learning.most_seen)
     most, batch = max(walks), config.recogniser.optimiser
     if not 2 <= most < views:
         raise DataError(
-            f"walks of {most} views (--learned.max-views, --learned.policy.most-seen, --learned.q-learning.most-seen) need more "
-            f"than {most} candidate views, and at least 2; there are {views}"
+            f"walks of {most} views are not possible with {views} candidate views; set --learned.max-views, "
+            f"--learned.policy.most-seen and --learned.q-learning.most-seen to at least 2 and less than {views}"
         )
     if not batch.validation_views or 256 % batch.validation_views or batch.validation_views > views:
         raise DataError(
@@ -158,10 +155,17 @@ def check_learned(config: LearnedConfig, views: int) -> None:
 
 
 class Stages:
-    """One seed of the study in its folder: every stage, made or found.
+    """The stages of one seed of the study; each method returns its result, computed first if it is not stored.
 
-    `upright` are the same stages, for stages where objects are turned by any rotation: there recognisers go on from these, and
-    see the views of each object as if it, and not the lattice around it, had been turned.
+    Args:
+        config: settings of the study.
+        dataset: settings of the run's data set.
+        out: folder of the run.
+        seed: number of the seed.
+        entropy: settings of the run's entropy predictor, for policies that are given its embedding of clouds.
+        upright: the stages of the same seed for upright objects, if these are the stages for objects turned by any rotation. Then
+            recognisers start from those of `upright`, and features are of the views as if the object, and not the lattice around
+            it, had been turned.
     """
 
     def __init__(
@@ -179,10 +183,11 @@ class Stages:
         self._fusions: dict[tuple, CalibratedFusion] = {}
 
     def rotated(self) -> Stages:
+        """Returns the stages of this seed for objects turned by any rotation."""
         return Stages(self.config, self.dataset, self.out, self.seed, self.entropy, upright=self)
 
     def prepare(self) -> None:
-        """The views from turned directions."""
+        """Makes the data set of views from turned directions."""
         capture = replace(self.dataset.capture, turned=True)
         prepare(replace(self.dataset, capture=capture), self.turned)
 
@@ -191,13 +196,14 @@ class Stages:
         return load_statistics(self.turned)
 
     def task(self, fold: int | None = None) -> RecogniserTask:
+        """Returns the training task of the recogniser, or of the one trained without part `fold` of the training objects."""
         config, statistics = self.config, self.statistics
         optimiser = replace(config.recogniser.optimiser, seed=self.seed, data_seed=self.seed)
         if fold is not None and config.fold_epochs:
             optimiser = replace(optimiser, epochs=config.fold_epochs)
         augmentation = config.recogniser.augmentation
         if self.upright is not None:
-            rate = _FURTHER * optimiser.learning_rate
+            rate = _FURTHER_RATE * optimiser.learning_rate
             optimiser = replace(optimiser, epochs=config.rotation_epochs, learning_rate=rate)
             augmentation = replace(augmentation, turn=True)
         part = None if fold is None else (fold, config.folds)
@@ -208,10 +214,11 @@ class Stages:
         return self.folder / ("recogniser" if fold is None else f"fold_{fold}")
 
     def train_recogniser(self, fold: int | None = None) -> None:
+        """Trains the recogniser, or the one without part `fold`."""
         fit(self.task(fold), self.turned, self.statistics, self.recogniser_folder(fold), self._start(fold))
 
     def _start(self, fold: int | None) -> StartingWeights | None:
-        """What a recogniser goes on from, if from any."""
+        """Returns the initial weights of a recogniser: those for upright objects, or None for random ones."""
         if self.upright is None:
             return None
         task, folder = self.upright.task(fold), self.upright.recogniser_folder(fold)
@@ -230,7 +237,16 @@ class Stages:
         chosen: np.ndarray | None = None,
         ask: Ask | None = None,
     ) -> Features:
-        """What the recogniser sees of every view, kept in `features/` under this name."""
+        """Returns the recogniser's features of every view, stored in `features/`; the prior is subtracted from the logits.
+
+        Args:
+            name: name of the file.
+            data: folder of the data set.
+            split: split of the data set.
+            fold: if given, the recogniser without this part is used.
+            chosen: positions of objects in the split; all if None.
+            ask: computes the features of a batch; by default `see`, or `see_rotated` for turned objects.
+        """
         task, folder, classes = self.task(fold), self.recogniser_folder(fold), len(self.statistics.classes)
         ask = ask or (see if self.upright is None else see_rotated)
         seen = kept_array(
@@ -244,7 +260,7 @@ class Stages:
         return Features(jnp.asarray(features), jnp.asarray(logits) - self.prior, known, jnp.asarray(directions))
 
     def changed(self, count: int) -> list[Features]:
-        """The validation objects so many times, changed as in training, with the views that a policy learns from."""
+        """Returns features of `count` augmented copies of the validation objects, by the views that a policy learns from."""
         return [
             self.features(f"turned_val_changed_{number}", self.turned, "val", ask=see_changed(number))
             for number in range(count)
@@ -252,32 +268,34 @@ class Stages:
 
     @property
     def prior(self) -> Array:
-        """Log-probabilities of the classes in training. ModelNet10 trains on 883 chairs and 88 bathtubs, and tests on about as
-        many of each; nobody knows how often a robot meets which. So they are taken off all logits. Equal where it is trained on
-        as many of each."""
+        """Log-probabilities of the classes in training; equal for all classes if training is balanced.
+
+        They are subtracted from all logits: ModelNet10 trains on 883 chairs and 88 bathtubs, and tests on about as many of each,
+        and how often a robot meets each class is unknown.
+        """
         if self.config.recogniser.balanced:
             return jnp.full(len(self.statistics.classes), -jnp.log(len(self.statistics.classes)))
         counts = np.array([self.statistics.counts["train"][name] for name in self.statistics.classes], np.float32)
         return jnp.log(jnp.asarray(counts / counts.sum()))
 
     def fusion(self, fold: int | None = None, posed: bool = True, summed: bool = False) -> CalibratedFusion:
-        """The recogniser's fusion, or the sum of its logits, with temperatures; for objects of known or of unknown pose."""
-        asked = fold, posed, summed
-        if asked not in self._fusions:
+        """Returns the recogniser's fusion, or the sum of its logits, with temperatures, for objects of known or unknown pose."""
+        wanted = fold, posed, summed
+        if wanted not in self._fusions:
             validation = self.features("turned_val" if fold is None else f"fold_{fold}_val", self.turned, "val", fold)
             recogniser = load_best(self.task(fold), self.recogniser_folder(fold))
             assert isinstance(recogniser, Recogniser)
             network = SumFusion(recogniser.encoder.head, self.prior) if summed else recogniser.fusion
-            self._fusions[asked] = calibrated(network, validation, self.prior, posed)
-        return self._fusions[asked]
+            self._fusions[wanted] = calibrated(network, validation, self.prior, posed)
+        return self._fusions[wanted]
 
     @property
     def has_clouds(self) -> bool:
-        """Whether there is a PointNet++ to embed them."""
+        """Whether the run has a trained PointNet++, which `clouds` needs."""
         return self.entropy is not None and (self.out / "entropy" / "summary.json").exists()
 
     def clouds(self, data: Path, split: str) -> Float[Array, "objects views embedding"]:
-        """PointNet++'s embedding of the partial cloud of every view, kept in `learned/clouds/` for all seeds."""
+        """Returns PointNet++'s embedding of the partial cloud of every view, stored in `learned/clouds/` for all seeds."""
         folder, statistics = self.out / "entropy", load_statistics(self.out / "data")
         assert self.entropy is not None
         task = EntropyTask.of(self.entropy, statistics.views, statistics.entropy_max, statistics.camera)
@@ -289,7 +307,7 @@ class Stages:
         return jnp.asarray(found)
 
     def parts(self) -> list[Seen]:
-        """The training objects in parts, each as seen by the recogniser that was trained without it."""
+        """Returns the training objects in parts, each with features and fusion of the recogniser trained without it."""
         part_of, found = fold_of(len(open_split(self.turned, "train")), self.config.folds), []
         for fold in range(self.config.folds):
             held_out = np.flatnonzero(part_of == fold)
@@ -300,7 +318,12 @@ class Stages:
         return self.folder / "policies" / name
 
     def policy(self, name: str = "learned", without: tuple[int, ...] = ()) -> ViewPolicy:
-        """The view policy, as the variant of this name has it; `without` objects of some classes."""
+        """Returns the trained view policy of a variant.
+
+        Args:
+            name: name of the variant in `VARIANTS`.
+            without: classes whose objects it is not trained on.
+        """
         variant = VARIANTS[name]
         config = replace(self.config.policy, seed=self.seed, **variant.settings)
         if variant.q_learning:
@@ -314,7 +337,7 @@ class Stages:
             fusion = self.fusion(posed=variant.posed, summed=variant.summed)
             validation = fusion, seen.without(without)
             if variant.learns_from == "validation":
-                parts, check = [validation, *((fusion, look) for look in self.changed(changed))], None
+                parts, check = [validation, *((fusion, copy) for copy in self.changed(changed))], None
             elif variant.learns_from == "parts":
                 parts, check = self.parts(), validation
             else:
@@ -341,15 +364,9 @@ class Stages:
         untrained = nnx.eval_shape(lambda: new_policy(config, len(self.statistics.classes), variant.posed, cloud))
         return trained_once(folder, identity, untrained, train)
 
-    def learner(self, name: str) -> Learner:
-        variant = VARIANTS[name]
-        made_as = variant.network or name
-        fusion = self.fusion(posed=variant.posed, summed=True) if variant.summed else None
-        return Learner(name, variant.title, self.policy(made_as), variant.by, made_as, fusion)
-
 
 def lattice_data(dataset: DataConfig, out: Path, views: int) -> Path:
-    """The folder of the data set with so many candidate views, made if it is not there."""
+    """Returns the folder of the data set with `views` candidate views, made first if it does not exist."""
     own = dataset.capture.views == views
     folder = out / "data" if own else out / "learned" / f"lattice_{views}"
     prepare(replace(dataset, capture=replace(dataset.capture, views=views)), folder)

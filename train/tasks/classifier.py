@@ -1,4 +1,4 @@
-"""The classifier: one view to the logits of its class (thesis §5.2)."""
+"""The classifier: logits of the class from one view (thesis §5.2)."""
 
 from __future__ import annotations
 
@@ -25,50 +25,50 @@ from train.step import Batch, Hyperparameters, Metrics
 
 @dataclass(frozen=True)
 class ResNetConfig:
-    """Shape of the network."""
+    """Architecture of the network."""
 
     depth: Literal[10, 18, 34] = 18
     """18 or 34; 10 has half the blocks of 18"""
     width: int = 64
     """channels of the first stage"""
     channels: int = 3
-    """channels of the input; depth and grey images are replicated"""
+    """channels of the input; depth and grey images are repeated in all channels"""
     standardise: bool = True
-    """take off ImageNet's mean and divide by its standard deviation, for three channels"""
+    """subtract ImageNet's mean and divide by its standard deviation; only with three channels"""
     stem: Literal["convolution", "patches"] = "convolution"
-    """the first layer: ResNet's, or pieces of 4×4 pixels, a third faster on a CPU"""
+    """the first layer: ResNet's convolution, or patches of 4×4 pixels, a third faster on a CPU"""
 
 
 def starting_weights(files: tuple[Path, ...], network: ResNetConfig) -> StartingWeights | None:
-    """What a classifier of this shape begins with: the weights of the file that is of its depth; None without files.
+    """Returns the initial weights of a classifier from the file that holds its depth, or None without files.
 
     Raises:
-        DataError: where the files cannot be read, or none fits.
+        DataError: if a file cannot be read, or none fits the network.
     """
     if not files:
         return None
     if (network.width, network.channels) != (64, 3):
         raise DataError(
-            f"--pretrained weights are of a ResNet 64 channels wide that sees three, this one has {network.width} and "
-            f"{network.channels}; use --preset thesis, or --classifier.network.width 64 --classifier.network.channels 3"
+            f"--pretrained weights fit a ResNet of width 64 with 3 input channels, this one has width {network.width} and "
+            f"{network.channels} channels; use --preset thesis, or --classifier.network.width 64 --classifier.network.channels 3"
         )
     return weights_from_torch(files, network.depth)
 
 
 @dataclass(frozen=True)
 class ClassifierConfig:
-    """The classifier and its training."""
+    """Settings of the classifier and its training."""
 
     network: ResNetConfig = ResNetConfig()
     images: Literal["depth", "image"] = "depth"
-    """what it looks at: depth, or the shaded image"""
+    """its input: depth, or the shaded image"""
     augmentation: ImageAugmentation = ImageAugmentation()
     optimiser: OptimiserConfig = OptimiserConfig(weight_decay=1e-4)
 
 
 @dataclass(frozen=True)
 class ClassifierTask:
-    """Cross entropy on single views."""
+    """Training of the classifier by cross-entropy on single views."""
 
     network_config: ResNetConfig
     classes: int
@@ -115,7 +115,7 @@ class ClassifierTask:
         )
 
     def inputs(self, batch: Batch) -> jax.Array:
-        """Images (views, height, width, channels) of a batch."""
+        """Returns the images of a batch, (views, height, width, channels)."""
         convert = partial(image_input, images=self.images, channels=self.network_config.channels, camera=self.camera)
         return jax.vmap(convert)(batch[self.images])
 

@@ -1,4 +1,4 @@
-"""The entropy predictor: one partial cloud to the depth entropy of every candidate view (thesis §4.3.2 and §5.1)."""
+"""The entropy predictor: depth entropy of every candidate view from one partial point cloud (thesis §4.3.2 and §5.1)."""
 
 from __future__ import annotations
 
@@ -21,27 +21,27 @@ from train.step import Batch, Hyperparameters, Metrics
 
 @dataclass(frozen=True)
 class PointNet2Config:
-    """Shape of the network and of the clouds it reads."""
+    """Architecture of the network, and format of its point clouds."""
 
     points: int = 4096
-    """points of a cloud"""
+    """points in a cloud"""
     frame: Literal["world", "camera"] = "world"
-    """the frame of the clouds: world (the camera's pose is known) or camera (the thesis, whose clouds lose it)"""
+    """coordinate frame of the clouds: world (needs the camera's pose), or camera (as in the thesis, without the pose)"""
     directions: bool = True
-    """beside each point of a cloud in the world frame, the direction to the camera, in the place of the normals"""
+    """give each point of a cloud in the world frame the direction to the camera, in the columns meant for normals"""
     abstractions: tuple[Abstraction, ...] = THESIS_ABSTRACTIONS
     """the set-abstraction levels"""
     global_layers: tuple[int, ...] = (256, 512, 1024)
-    """layers over all centres"""
+    """widths of the layers over all centres"""
     head_layers: tuple[int, ...] = (512, 256)
-    """layers before the output"""
+    """widths of the layers before the output"""
     dropout: float = 0.5
-    """before the output"""
+    """dropout rate before the output"""
 
 
 @dataclass(frozen=True)
 class EntropyConfig:
-    """The entropy predictor and its training."""
+    """Settings of the entropy predictor and its training."""
 
     network: PointNet2Config = PointNet2Config()
     augmentation: CloudAugmentation = CloudAugmentation()
@@ -50,7 +50,7 @@ class EntropyConfig:
 
 @dataclass(frozen=True)
 class EntropyTask:
-    """Mean squared error on normalised entropies."""
+    """Training of the entropy predictor by mean squared error of normalised entropies."""
 
     network_config: PointNet2Config
     views: int
@@ -96,14 +96,14 @@ class EntropyTask:
         )
 
     def inputs(self, batch: Batch) -> jax.Array:
-        """Clouds (views, points, 3 or 6) of a batch."""
+        """Returns the clouds of a batch, (views, points, 3 or 6)."""
         shape = self.network_config
         directions = shape.directions and shape.frame == "world"
         convert = partial(cloud_input, camera=self.camera, frame=shape.frame, directions=directions)
         return jax.vmap(convert)(batch["pixels"], batch["pixel_depth"], batch["pose"])
 
     def momentum(self, samples: jax.Array) -> jax.Array:
-        """Batch-norm momentum after so many samples: 0.5, halved every 20,000, not below 0.01 (thesis code)."""
+        """Returns the batch-norm momentum after `samples` samples: 0.5, halved every 20,000, not below 0.01 (thesis code)."""
         return jnp.maximum(0.5 * 0.5 ** (samples // 20_000), 0.01)
 
     def loss(

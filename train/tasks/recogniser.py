@@ -1,6 +1,7 @@
-"""The recogniser: single views and any set of them to the class, encoder and set fusion trained together.
+"""The recogniser: class from single views and from any set of views; encoder and set fusion are trained together.
 
-Views come from directions all around (a data set made with `dataset.capture.turned`), so that no lattice is special.
+The views are from directions all around the object (a data set made with `dataset.capture.turned`), so that no lattice is
+preferred.
 """
 
 from __future__ import annotations
@@ -32,25 +33,27 @@ from train.tasks.classifier import ResNetConfig
 
 @dataclass(frozen=True)
 class RecogniserConfig:
-    """The recogniser and its training."""
+    """Settings of the recogniser and its training."""
 
     network: ResNetConfig = ResNetConfig(channels=4, standardise=False)
-    """the encoder, which sees depth and normals: four channels"""
+    """the encoder; its input is depth and normals in four channels"""
     fusion: SetFusionConfig = SetFusionConfig()
     """the set fusion"""
     augmentation: ViewAugmentation = ViewAugmentation()
-    """of training objects"""
+    """augmentation of training objects"""
     shift: int = 3
-    """pixels by which training images are shifted in each direction at most"""
+    """maximal shift of training images in pixels, in each direction"""
     balanced: bool = False
-    """train on as many objects of each class, those of rarer ones more often; else as many as there are"""
+    """draw equally many training objects of each class, objects of rarer classes more often; else each object equally often"""
     optimiser: OptimiserConfig = OptimiserConfig()
 
 
 @dataclass(frozen=True)
 class RecogniserTask:
-    """Cross entropy on every view alone, and on a random set of an object's views in the batch, of any size: half with the
-    object's pose known, half without."""
+    """Training of the recogniser by cross-entropy on single views and on random sets of an object's views in the batch.
+
+    The loss of a set is half that with the object's pose known, half that with it unknown.
+    """
 
     network_config: ResNetConfig
     fusion_config: SetFusionConfig
@@ -61,7 +64,7 @@ class RecogniserTask:
     balanced: bool
     optimiser: OptimiserConfig
     fold: tuple[int, int] | None = None
-    """trained without part k of n of the training objects"""
+    """(k, n): trained without part k of n parts of the training objects"""
     name: str = "recogniser"
 
     @classmethod
@@ -116,11 +119,11 @@ class RecogniserTask:
         return Recogniser(encoder, new_fusion(self.fusion_config, 8 * shape.width, self.classes, rngs))
 
     def inputs(self, batch: Batch) -> jax.Array:
-        """Images (views, height, width, 4) of a batch."""
+        """Returns the images of a batch, (views, height, width, 4)."""
         return jax.vmap(partial(depth_and_normals, camera=self.camera))(batch["depth"])
 
     def directions(self, batch: Batch) -> jax.Array:
-        """Unit vectors (views, 3) from the object to the cameras."""
+        """Returns the unit vectors from the object to the cameras, (views, 3)."""
         position = batch["pose"][:, :3, 3]
         return position / jnp.linalg.norm(position, axis=-1, keepdims=True)
 
@@ -138,13 +141,15 @@ class RecogniserTask:
         moves = jax.random.split(move, images.shape[:2])
         images = jax.vmap(jax.vmap(partial(augment_image, config=shift)))(moves, images)
         present = random_sets(sets, len(images), images.shape[1], images.shape[1])
-        found = _judged(*network(images, directions, present, train=True, key=drop), labels)
+        found = _metrics_of(*network(images, directions, present, train=True, key=drop), labels)
         means = {name: jnp.mean(values) for name, values in found.items()}
         return means["loss"], means
 
     def evaluate(self, network: Recogniser, batch: Batch) -> Metrics:
-        """`fused`: all views of an object in the batch together. Where objects are turned in training, they are so here, each the
-        same way every time."""
+        """Returns metrics of every view; the fused ones are of all views of an object in the batch together.
+
+        If training turns objects, they are turned here too, each by the same rotation every time.
+        """
         by_object = partial(views_by_object, views=self.optimiser.validation_views)
         images, directions = by_object(self.inputs(batch)), by_object(self.directions(batch))
         if self.augmentation.turn:
@@ -153,23 +158,28 @@ class RecogniserTask:
                 turns, images, by_object(batch["pose"])
             )
         labels = batch["label"].reshape(images.shape[:2])[:, 0]
-        found = _judged(*network(images, directions, jnp.ones(images.shape[:2], bool)), labels)
+        found = _metrics_of(*network(images, directions, jnp.ones(images.shape[:2], bool)), labels)
         return {name: values.reshape(-1) for name, values in found.items()}
 
 
-def _judged(each: jax.Array, posed: jax.Array, unposed: jax.Array, labels: jax.Array) -> Metrics:
-    """Metrics of every view, (objects, views), from logits of single views and of the objects."""
+def _metrics_of(each: jax.Array, posed: jax.Array, unposed: jax.Array, labels: jax.Array) -> Metrics:
+    """Returns metrics of every view, each (objects, views).
+
+    Args:
+        each: (objects, views, classes) logits of single views.
+        posed: (objects, classes) logits of all views with the pose known; `unposed`: with it unknown.
+    """
     labels = jnp.broadcast_to(labels[:, None], each.shape[:2])
     posed, unposed = (jnp.broadcast_to(logits[:, None], each.shape) for logits in (posed, unposed))
-    single, fused, blind = (
+    single, with_pose, without_pose = (
         optax.softmax_cross_entropy_with_integer_labels(logits, labels) for logits in (each, posed, unposed)
     )
-    right = {"accuracy": each, "fused_accuracy": posed, "unposed_accuracy": unposed}
-    return {"loss": single + (fused + blind) / 2} | {
-        name: (jnp.argmax(logits, -1) == labels).astype(jnp.float32) for name, logits in right.items()
+    logits_of = {"accuracy": each, "fused_accuracy": posed, "unposed_accuracy": unposed}
+    return {"loss": single + (with_pose + without_pose) / 2} | {
+        name: (jnp.argmax(logits, -1) == labels).astype(jnp.float32) for name, logits in logits_of.items()
     }
 
 
 def views_by_object(array: jax.Array, views: int) -> jax.Array:
-    """Of views one behind the other, so many for each object: (objects, views, …)."""
+    """Reshapes (objects · views, …) to (objects, views, …)."""
     return array.reshape(-1, views, *array.shape[1:])

@@ -1,0 +1,242 @@
+"""A job that survives being killed, and what each command adds to it."""
+
+from __future__ import annotations
+
+import html
+import json
+import os
+import shutil
+import signal
+import subprocess
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from data_pipeline.dataset.statistics import load_statistics
+from eval.learned.page import write_learned_page
+from eval.rendering import policies as rendering_policies
+from eval.settings import TINY
+from eval.stages import ascend_on_objects, learn_to_choose
+from tests.cli.conftest import MEVS, mevs
+from tests.conftest import open3d_or_skip
+
+
+def test_the_job_leaves_a_report_and_metrics(whole):
+    metrics = json.loads((whole / "metrics.json").read_text())
+    assert metrics["objects"] == 10
+    assert metrics["views"] == 6
+    page = (whole / "report" / "index.html").read_text()
+    assert "http" not in page.replace("http://www.w3.org", "").replace("https://www.w3.org", "")  # needs no other file
+    headings = [line.split("</h2>")[0] for line in page.split("<h2>")[1:]]
+    assert headings == [
+        "Accuracy by policy",
+        "Accuracy by distance travelled",
+        "Confidence and calibration",
+        "The thesis's grid",
+        "Differences between the thesis and its published code",
+        "Predicting depth entropy",
+        "Training",
+        "Data",
+        "Methods",
+    ]
+    for rung in metrics["ladder"]:
+        assert html.escape(rung["title"]) in page
+    assert "0 objects were left out" in page
+
+
+def test_a_second_run_redoes_nothing(whole, tmp_path):
+    out = tmp_path / "run"
+    shutil.copytree(whole, out)
+    before = {path: path.stat().st_mtime_ns for path in out.rglob("*") if path.is_file()}
+    result = mevs("run", "--preset", "tiny", "--out", out)
+    assert result.returncode == 0
+    assert before == {path: path.stat().st_mtime_ns for path in out.rglob("*") if path.is_file()}
+
+
+def test_networks_for_another_number_of_views_are_refused(whole, tmp_path, refuses):
+    for name in ("data", "classifier", "entropy"):
+        shutil.copytree(whole / name, tmp_path / name)
+    config = tmp_path / "entropy" / "config.json"
+    config.write_text(config.read_text().replace('"views": 6', '"views": 8'))
+    assert "was trained for 8 views, the data set has 6" in refuses("eval", "--preset", "tiny", "--out", tmp_path)
+
+
+UPRIGHT = replace(TINY.learned, rotation_epochs=0)
+
+
+@pytest.mark.parametrize(
+    "learned",
+    [replace(UPRIGHT, ablations=(), novel=0), pytest.param(UPRIGHT, marks=pytest.mark.slow)],
+    ids=["plain", "all"],
+)
+def test_learning_writes_a_page_and_is_not_repeated(learned, whole, tmp_path):
+    """What `mevs study learned` adds to a run; in the slow test with ablations and classes that are left out."""
+    out, settings = tmp_path / "run", replace(TINY, learned=learned)
+    shutil.copytree(whole, out)
+    page = learn_to_choose(settings, out).read_text()
+    summary = out / "learned" / "seed_0" / "policies" / "learned" / "summary.json"
+    made_once = summary.stat().st_mtime_ns
+    assert learn_to_choose(settings, out).read_text() == page
+    assert summary.stat().st_mtime_ns == made_once
+    said = [
+        "6 candidate views",
+        "Unknown yaw",
+        "Stopping when a further view does not pay",
+        "PointNet++ entropy (thesis)",
+        "view policy",
+    ]
+    for words in (*said, "label-free oracle", *["Classes left out of policy training"] * (learned.novel > 0)):
+        assert html.escape(words) in page
+    found = json.loads((out / "learned" / "metrics.json").read_text())
+    first = found["seeds"][0]
+    more = found | {"seeds": [first | {"rotated": first["unposed"]}, {"lattices": first["lattices"]}]}
+    write_learned_page(more, load_statistics(out / "data"), tmp_path / "more.html")
+    for words in (
+        "Means of 2 seeds",
+        "Any rotation",
+        *["Combined with a table", "Other random seeds"] * (learned.novel > 0),
+    ):
+        assert words in (tmp_path / "more.html").read_text()
+
+
+@pytest.mark.parametrize("ascends", [False, pytest.param(True, marks=pytest.mark.slow)], ids=["made up", "real"])
+def test_published_code_and_ascents_fill_their_tables(ascends, whole, tmp_path, monkeypatch):
+    """One evaluation of what `mevs study published-code` and `mevs study rendering` add to a run."""
+    open3d_or_skip()
+    if not ascends:  # they are compared with what they should be in tests/eval/rendering
+        random = np.random.default_rng(0)
+        made_up = lambda method, things, points, config: jnp.asarray(random.uniform(size=(len(things), len(points))))  # noqa: E731
+        monkeypatch.setattr(rendering_policies, "_scores", made_up)
+    out = tmp_path / "run"
+    shutil.copytree(whole, out)
+    assert "mevs study published-code" in (out / "report" / "index.html").read_text()
+    ascend_on_objects(TINY, out)
+    assert mevs("compat", "--preset", "tiny", "--out", out).returncode == 0
+    metrics = json.loads((out / "metrics.json").read_text())
+    made = metrics["compatibility"]
+    assert all(row["difference"] is not None for row in made["rows"].values())
+    assert set(made["single_view_accuracy"]) == {"classifier", "classifier_by_view"}
+    assert (metrics["climbing"]["objects"], metrics["climbing"]["views"]) == (1, 6)
+    assert {"random", "predicted_entropy", "diff_volume", "diff_mesh"} <= set(metrics["climbing"]["policies"])
+    page = (out / "report" / "index.html").read_text()
+    assert "Choosing by differentiable rendering" in page
+    assert "Learned fusion and view selection" in page
+    assert "mevs study published-code" not in page
+    before = json.loads((whole / "metrics.json").read_text())
+    assert before["compatibility"]["rows"]["text"] == made["rows"]["text"]
+
+
+@pytest.mark.parametrize(
+    "policies",
+    [
+        ("predicted_entropy",),
+        pytest.param(("random", "predicted_entropy", "information_gain"), marks=pytest.mark.slow),
+    ],
+    ids=len,
+)
+def test_live_walks_what_the_tables_say(policies, whole, tmp_path, refuses):
+    shutil.copytree(whole, tmp_path / "run")
+    arguments = ("live", "--preset", "tiny", "--live.objects", "6", "--out", tmp_path / "run", "--live.policies")
+    result = mevs(*arguments, *policies)
+    assert result.returncode == 0, result.stderr
+    found = json.loads((tmp_path / "run" / "live.json").read_text())
+    assert set(found) == set(policies)
+    for policy, agreement in found.items():
+        assert agreement["walks"] == agreement["same"] == 6, policy
+    assert "unknown policy 'fly'" in refuses(*arguments, "fly")
+
+
+@pytest.mark.slow
+def test_many_devices_say_what_one_does(whole, tmp_path, monkeypatch):
+    """View tables and live walks on four simulated devices, whose number divides neither the objects nor the chunks."""
+    out = tmp_path / "run"
+    shutil.copytree(whole, out)
+    shutil.rmtree(out / "tables")
+    (out / "metrics.json").unlink()
+    monkeypatch.setenv("JAX_NUM_CPU_DEVICES", "4")
+    result = mevs("eval", "--preset", "tiny", "--out", out)
+    assert result.returncode == 0, result.stderr
+    with np.load(out / "tables" / "test.npz") as mine, np.load(whole / "tables" / "test.npz") as theirs:
+        for name in ("logits", "predicted_entropy"):
+            np.testing.assert_allclose(mine[name], theirs[name], rtol=1e-4, atol=1e-5)
+    result = mevs("live", "--preset", "tiny", "--live.objects", "6", "--out", out, "--live.policies", "random")
+    assert result.returncode == 0, result.stderr
+    agreement = json.loads((out / "live.json").read_text())["random"]
+    assert agreement["walks"] == agreement["same"] == 6
+
+
+def test_a_sweep_without_members_is_refused(whole, tmp_path, refuses):
+    (tmp_path / "data").symlink_to(whole / "data")
+    arguments = ("sweep", "--preset", "tiny", "--out", tmp_path, "--sweep.members", "0")
+    assert "--sweep.members 0 is too few" in refuses(*arguments)
+
+
+@pytest.mark.slow
+def test_a_sweep_is_made_by_command(whole, tmp_path):
+    (tmp_path / "data").symlink_to(whole / "data")
+    result = mevs("sweep", "--preset", "tiny", "--out", tmp_path, "--sweep.members", "3")
+    assert result.returncode == 0, result.stderr
+    assert "Best of 3: validation loss" in result.stdout
+    assert len(json.loads((tmp_path / "sweep" / "entropy" / "members.json").read_text())) == 3
+
+
+def test_a_reach_that_leaves_nothing_is_refused(whole, refuses):
+    arguments = ("eval", "--preset", "tiny", "--out", whole, "--evaluation.lowest-elevation", "89")
+    assert "viewpoints have an elevation of at least 89°" in refuses(*arguments)
+    assert "must be at least 2" in refuses(*arguments[:5], "--evaluation.max-views", "1")
+
+
+def kill_when(out: Path, ready, sign: int) -> int:
+    """Starts the job, ends it once `ready(out)`, and returns its exit code."""
+    process = subprocess.Popen(
+        [*MEVS, "run", "--preset", "tiny", "--out", str(out)],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        start_new_session=True,
+    )
+    deadline = time.monotonic() + 300
+    while process.poll() is None and not ready(out) and time.monotonic() < deadline:
+        time.sleep(0.02)
+    assert process.poll() is None, "the job ended before it could be interrupted"
+    os.kill(process.pid, sign)
+    process.wait(60)
+    return process.returncode
+
+
+def ends_like(out: Path, whole: Path) -> None:
+    """The job in `out`, begun again, ends with the results of the job that was never interrupted."""
+    result = mevs("run", "--preset", "tiny", "--out", out)
+    assert result.returncode == 0, result.stderr
+    assert json.loads((out / "metrics.json").read_text()) == json.loads((whole / "metrics.json").read_text())
+    with np.load(out / "tables" / "test.npz") as a, np.load(whole / "tables" / "test.npz") as b:
+        np.testing.assert_array_equal(a["logits"], b["logits"])
+    assert list(out.rglob("*.partial*")) == []
+
+
+def has_trained_an_epoch(out: Path) -> bool:
+    log = out / "classifier" / "metrics.jsonl"
+    return log.exists() and log.stat().st_size > 0
+
+
+def test_an_interrupted_job_ends_with_the_same_metrics(whole, tmp_path):
+    """Interrupted after an epoch of the first network."""
+    shutil.copytree(whole / "data", tmp_path / "data")
+    assert kill_when(tmp_path, has_trained_an_epoch, signal.SIGINT) == 130
+    assert not (tmp_path / "metrics.json").exists()
+    ends_like(tmp_path, whole)
+
+
+@pytest.mark.slow
+def test_a_job_that_is_killed_again_and_again_ends_with_the_same_metrics(whole, tmp_path):
+    for ready, sign, code in (
+        (lambda out: len(list((out / "data" / "captures").glob("*.npz"))) > 5, signal.SIGKILL, -signal.SIGKILL),
+        (lambda out: (out / "data" / "shards").exists(), signal.SIGKILL, -signal.SIGKILL),
+        (has_trained_an_epoch, signal.SIGINT, 130),
+        (lambda out: (out / "entropy" / "config.json").exists(), signal.SIGKILL, -signal.SIGKILL),
+    ):
+        assert kill_when(tmp_path, ready, sign) == code
+    ends_like(tmp_path, whole)

@@ -1,0 +1,290 @@
+"""The command line as a user meets it: help, options, settings, and one sentence for bad input."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import trimesh
+
+import mevs_jax
+from data_pipeline.errors import DataError
+from eval.run_file import load_run
+from eval.settings import PRESETS, TINY
+from mevs_jax.cli import main as cli
+from mevs_jax.cli import parsing
+from mevs_jax.cli.commands import ALIASES, COMMANDS
+from tests.cli.conftest import MEVS, mevs, refused
+
+
+def cube_off() -> str:
+    cube = trimesh.creation.box((1, 2, 3))
+    rows = [f"OFF\n{len(cube.vertices)} {len(cube.faces)} 0"]
+    rows += [" ".join(map(str, vertex)) for vertex in cube.vertices] + [
+        "3 " + " ".join(map(str, face)) for face in cube.faces
+    ]
+    return "\n".join(rows) + "\n"
+
+
+def folder_with(root: Path, bad: str) -> Path:
+    """Two classes of cubes, one of them with a file of the content `bad`."""
+    for name in ("cup", "jug"):
+        for split in ("train", "test"):
+            (root / name / split).mkdir(parents=True)
+            for index in range(3):
+                (root / name / split / f"{index}.off").write_text(cube_off())
+    (root / "jug" / "train" / "1.off").write_text(bad)
+    return root
+
+
+BY_THREADS = ["--dataset.capture.backend", "rasterise"]  # other backends capture in processes, which import for seconds
+
+
+def no_such_file(root: Path) -> list:
+    return ["--data", root / "nowhere"]
+
+
+def not_a_mesh(root: Path) -> list:
+    return ["--data", folder_with(root / "set", "hello")]
+
+
+def truncated(root: Path) -> list:
+    return [*BY_THREADS, "--data", folder_with(root / "set", cube_off()[:80])]
+
+
+def not_finite(root: Path) -> list:
+    return [*BY_THREADS, "--data", folder_with(root / "set", cube_off().replace("0.5", "nan", 1))]
+
+
+def empty_class(root: Path) -> list:
+    folder = folder_with(root / "set", cube_off())
+    (folder / "vase" / "train").mkdir(parents=True)
+    return ["--data", folder]
+
+
+def zip_that_leaves(root: Path) -> list:
+    import zipfile
+
+    with zipfile.ZipFile(root / "a.zip", "w") as archive:
+        archive.writestr("../cup/train/a.off", cube_off())
+    return ["--data", root / "a.zip"]
+
+
+def one_view(root: Path) -> list:
+    return ["--views", "1"]
+
+
+def unwritable(root: Path) -> list:
+    (root / "file").write_text("in the way")
+    return ["--out", root / "file" / "run"]
+
+
+def no_archive(root: Path) -> list:
+    return ["--data", "modelnet10", "--archive", root / "ModelNet10.zip"]
+
+
+def weights_for_another(root: Path) -> list:
+    (root / "resnet18.pth").write_bytes(b"")
+    return ["--pretrained", root / "resnet18.pth"]
+
+
+def weights_that_are_none(root: Path) -> list:
+    return [*weights_for_another(root), "--classifier.network.width", "64", "--classifier.network.channels", "3"]
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (no_such_file, "no such file or folder: .*nowhere"),
+        (not_a_mesh, r"jug/train/1.off is not an OFF mesh"),
+        (truncated, r"jug/train/1.off is cut short"),
+        (not_finite, r"jug/train/1.off has \d vertices that are not finite"),
+        (empty_class, "class folder .*vase.train is empty"),
+        (zip_that_leaves, "a path that leaves its folder"),
+        (one_view, "--views 1 is too few"),
+        (unwritable, "cannot write to"),
+        (no_archive, r"--archive .*ModelNet10.zip cannot be read: No such file"),
+        (
+            weights_for_another,
+            r"of width 64 with 3 input channels, this one has width 8 and 1 channels; use --preset thesis",
+        ),
+        (weights_that_are_none, r"resnet18.pth is not a file of weights that can be read safely"),
+    ],
+    ids=lambda value: getattr(value, "__name__", ""),
+)
+def test_bad_input_gets_one_sentence_and_exit_code_2(tmp_path, make, message, refuses):
+    arguments = make(tmp_path)
+    if "--out" not in arguments:
+        arguments += ["--out", tmp_path / "run"]
+    assert re.search(message, refuses("run", "--preset", "tiny", *arguments))
+
+
+def test_unknown_words_are_refused_and_help_reads_well(tmp_path, refuses, at_once):
+    assert "unknown command 'fly'" in refused(mevs("fly"))
+    assert "unknown preset 'huge'" in refuses("run", "--preset", "huge")
+    assert "followed by one of thesis, learned, rendering, published-code; none was given" in refuses("study")
+    assert "'fly' is none of them" in refuses("check", "fly")
+    assert "no data set in" in refuses("train", "--out", tmp_path)
+    assert "cannot join the other processes" in refused(mevs("train", "--distributed", "--out", tmp_path))
+    for command, option in (("run", "--distributed"), ("run", "--beam"), ("report", "--data"), ("thesis", "--views")):
+        ended = at_once(*command.split(), option, "5", "--out", tmp_path)
+        assert (ended.returncode, ended.stdout) == (2, ""), command
+        assert option in ended.stderr, command
+    assert not (tmp_path / "run.json").exists()
+    shown = at_once("--help")
+    assert shown.returncode == 0
+    for word in ("run", "data", "train", "eval", "report", "--preset", "--data", "--views", "--out"):
+        assert word in shown.stdout
+    assert max(map(len, shown.stdout.splitlines())) <= 100
+
+
+@pytest.mark.parametrize("name", [*COMMANDS, *ALIASES])
+def test_a_command_shows_its_own_options(name, at_once):
+    shown = at_once(*name.split(), "--help")
+    assert shown.returncode == 0
+    assert "--out" in shown.stdout
+    assert len(shown.stdout.splitlines()) <= 80
+    command = COMMANDS[ALIASES.get(name, name)]
+    assert ("--data " in shown.stdout) == ("dataset" in command.settings)
+    for group in command.settings:
+        assert f"--{group}.*" in shown.stdout
+
+
+def test_all_settings_are_shown_when_they_are_asked_for(at_once):
+    for name, there, missing in (
+        ("run", "--classifier.optimiser.epochs", "--sweep."),
+        ("eval", "--evaluation.", "--dataset.capture"),
+    ):
+        shown = at_once(name, "--help-all")
+        assert shown.returncode == 0
+        assert there in shown.stdout
+        assert missing not in shown.stdout
+
+
+def test_help_and_the_library_are_there_at_once():
+    """Nothing heavy is imported for them: neither JAX nor, for the commands, tyro."""
+    for code, heavy in (
+        ("import mevs_jax", "jax"),
+        ("import mevs_jax.cli.main", "tyro"),
+        ("import mevs_jax.cli.parsing", "jax"),
+    ):
+        asked = f"{code}; import sys; sys.exit({heavy!r} in sys.modules)"
+        assert subprocess.run([sys.executable, "-c", asked]).returncode == 0, code
+
+
+def test_a_run_keeps_its_settings(whole, tmp_path, monkeypatch, capsys):
+    """Later stages start from `run.json`, other options override it, and what is printed is what is kept."""
+    kept = json.loads((whole / "run.json").read_text())
+    assert (kept["preset"], kept["settings"]["dataset"]["capture"]["views"]) == ("tiny", 6)
+    assert kept["arguments"][:3] == ["run", "--preset", "tiny"]
+    assert {"python", "jax", "mevs-jax"} <= set(kept["made_with"])
+    run = load_run(whole)
+    assert (run.preset, run.settings) == ("tiny", TINY)
+    call = parsing.parse("eval", ["--out", str(whole), "--seed", "3", "--evaluation.draws", "5"])
+    assert (call.preset, call.settings.evaluation.draws, call.settings.evaluation.seed) == ("tiny", 5, 3)
+    assert call.settings.classifier.optimiser.seed == call.settings.entropy.optimiser.data_seed == 3
+    assert call.settings.dataset == TINY.dataset
+    assert parsing.parse("eval", ["--out", str(whole), "--preset", "small"]).settings == PRESETS["small"]
+    monkeypatch.setattr(sys, "argv", ["test", "train", "--out", str(whole), "--print-config"])
+    cli.main()
+    assert json.loads(capsys.readouterr().out) == {name: kept[name] for name in ("preset", "settings")}
+    for name, change, said in (
+        ("unknown", {"settings": {"colour": 1}}, "settings has no setting 'colour'"),
+        (
+            "type",
+            {"settings": {"evaluation": {"draws": "many"}}},
+            "settings.evaluation.draws is 'many', not of type int",
+        ),
+        ("choice", {"settings": {"dataset": {"capture": {"backend": "magic"}}}}, "'magic', not one of"),
+        ("missing", {"preset": None}, None),
+    ):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "run.json").write_text(json.dumps(kept | change))
+        if said is not None:
+            with pytest.raises(DataError, match=re.escape(said)):
+                load_run(tmp_path / name)
+    (tmp_path / "run.json").write_text("{")
+    with pytest.raises(DataError, match="delete it, and give the options of the run again"):
+        load_run(tmp_path)
+
+
+def test_a_run_that_cannot_begin_leaves_no_settings(tmp_path, refuses):
+    refuses("run", "--preset", "tiny", "--views", "1", "--out", tmp_path / "new")
+    assert not (tmp_path / "new" / "run.json").exists()
+
+
+@pytest.mark.parametrize("arguments", [["--help"], ["run", "--help-all"]], ids=len)
+def test_a_reader_may_close_the_output(arguments):
+    """As `| head` does: no traceback, no complaint."""
+    reading, writing = os.pipe()
+    os.close(reading)
+    ended = subprocess.run([*MEVS, *arguments], stdout=writing, stderr=subprocess.PIPE, text=True)
+    os.close(writing)
+    assert ended.stderr == ""
+
+
+def test_the_library_alone_says_that_studies_need_a_checkout(tmp_path):
+    shutil.copytree(Path(mevs_jax.__file__).parent, tmp_path / "mevs_jax", ignore=shutil.ignore_patterns("__pycache__"))
+    asked = "import sys; sys.path.insert(0, sys.argv.pop(1)); from mevs_jax.cli.main import main; main()"
+    ended = subprocess.run(
+        [sys.executable, "-c", asked, tmp_path, "run"],
+        capture_output=True,
+        text=True,
+        cwd=tmp_path,
+        env=os.environ | {"PYTHONPATH": ""},
+    )
+    assert "studies run from a checkout of the project" in refused(ended)
+
+
+def test_an_interrupt_that_is_lost_is_given_again():
+    """Python ignores an interrupt that falls into a finaliser; here one does."""
+    script = """
+import os, signal, sys, time
+import mevs_jax
+from data_pipeline.errors import DataError
+from eval.run_file import load_run
+from mevs_jax.cli import main as cli
+from mevs_jax.cli import parsing
+from mevs_jax.cli.commands import ALIASES, COMMANDS
+
+class Loses:
+    def __del__(self):
+        os.kill(os.getpid(), signal.SIGINT)
+        time.sleep(0.1)
+
+def job(*arguments):
+    Loses()
+    time.sleep(300)
+
+cli._run, sys.argv = job, ["mevs", "run"]
+cli.main()
+"""
+    result = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, timeout=120)
+    assert result.returncode == 130
+    assert "Exception ignored" in result.stderr
+    assert "mevs: interrupted" in result.stderr
+
+
+@pytest.mark.skipif("CS_GNU_LIBC_VERSION" not in os.confstr_names, reason="large pages are asked of glibc")
+def test_jobs_begin_again_with_large_pages(monkeypatch):
+    """Once, with the arguments they had; and never where `main` is called from another program."""
+    begun = []
+    monkeypatch.setattr(os, "execv", lambda *command: begun.append(command))
+    monkeypatch.setattr(sys, "orig_argv", ["python", "-m", "mevs_jax", "run", "--views", "10"])
+    monkeypatch.delenv("GLIBC_TUNABLES", raising=False)
+    monkeypatch.setattr(sys, "argv", ["/usr/bin/notebook"])
+    cli._begin_with_large_pages()
+    assert not begun
+    for program in ("/somewhere/bin/mevs", "/somewhere/mevs_jax/__main__.py"):
+        monkeypatch.setattr(sys, "argv", [program])
+        monkeypatch.delenv("GLIBC_TUNABLES", raising=False)
+        cli._begin_with_large_pages()
+        assert os.environ["GLIBC_TUNABLES"] == "glibc.malloc.hugetlb=1"
+        cli._begin_with_large_pages()
+    assert begun == [(sys.executable, [sys.executable, "-m", "mevs_jax", "run", "--views", "10"])] * 2

@@ -1,0 +1,131 @@
+"""The study of learned choice: that learning pays, and how policies and stopping rules are compared."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from flax import nnx
+
+from eval.learned.stopping import Signal, compare_rules
+from eval.learned.study import fixed_order_scores, novel_classes, seeds_together, study
+from eval.learned.walks import Learner, OnLattice
+from eval.numbers.confidence import stops_at
+from tests.reference.choosing import VIEWS, by_state, telling
+from train.choosing.policy import (
+    PolicyConfig,
+    train_policy,
+    walk,
+)
+
+
+@pytest.mark.parametrize(
+    "every", [False, pytest.param(True, marks=pytest.mark.slow)], ids=["one learner", "every learner"]
+)
+def test_what_looking_was_worth_is_learned_and_the_study_says_so(every, adding):
+    """The further learners ask the same policy otherwise, as tests/mevs_jax/policies/test_learned.py checks step by step."""
+    parts = [(adding, telling(160, seed)) for seed in (0, 1)]
+    validation, test = telling(120, 2), telling(120, 3)
+    config = PolicyConfig(
+        width=16, heads=2, blocks=1, most_seen=3, walks=2, rounds=2, epochs=12, batch_size=64, learning_rate=5e-3
+    )
+    policy, histories = train_policy(config, parts, (adding, validation))
+    assert len(histories) == 2
+    assert histories[-1][-1]["gain"] < 0.7 * histories[0][0]["gain"]
+    others = (
+        Learner("as_it_is", "without belief", policy, "state"),
+        Learner("look_ahead", "two ahead", policy, "ahead"),
+        Learner("learned_and_table", "with a table", policy, "table"),
+    )
+    found, each = study(
+        adding,
+        [
+            Learner("learned", "view policy", policy),
+            *(others if every else ()),
+            Learner("unsure", "another fusion", policy, fusion=replace(adding, temperatures=jnp.full(1, 50.0))),
+        ],
+        OnLattice(validation),
+        OnLattice(test),
+        max_views=3,
+        draws=2,
+        oracle_views=3,
+        costs=True,
+    )
+    after = {name: result["after_views"] for name, result in found["policies"].items()}
+    same = seeds_together([found, found], [each, each], "learned")
+    close = partial(np.testing.assert_allclose, atol=1e-6)
+    jax.tree.map(close, same["against"], found["against"])  # the mean of two that are alike
+    jax.tree.map(close, same["gap_closed"], found["gap_closed"])
+    for key in ("interval", "calibration_error"):
+        close(same["policies"]["learned"][key], found["policies"]["learned"][key])
+    better = {
+        name: replace(policy, likelihood=policy.likelihood + (name == "learned")) for name, policy in each.items()
+    }
+    both = seeds_together([found, found], [each, better], "learned")
+    gain = both["against"]["random"]["learned"]["likelihood"]["difference"]
+    np.testing.assert_allclose(
+        gain, 0.5 + np.array(found["against"]["random"]["learned"]["likelihood"]["difference"]), atol=1e-5
+    )
+    # From view 0 the telling view can be known; random finds it in one case of five.
+    assert after["learned"][1] > after["random"][1] + 0.05
+    assert after["learned"][2] > after["random"][2] + 0.1
+    assert found["against"]["random"]["learned"]["interval"][2][0] > 0
+    assert found["gap_closed"]["learned"][1] > 0.4
+    assert found["trying_starts"] == 6  # all of them, where there are so few
+    assert after["label_oracle"][1] >= after["learned"][1]
+    for name in ("look_ahead", "learned_and_table") if every else ():
+        assert after[name][2] > after["random"][2] + 0.1
+    first = found["policies"]["unsure"]["temperatures"][0] / found["policies"]["learned"]["temperatures"][0]
+    assert first == pytest.approx(1 / 50, rel=1e-3)  # of a fusion of its own
+    costs = found["costs"]
+    assert costs["thesis_walks"] == "random"
+    ways = [row["way"] for row in costs["moving"]]
+    assert ways[0][0] == 0
+    assert ways[-1][1] <= ways[0][1]
+    np.testing.assert_allclose(
+        costs["moving"][0]["after_views"], after["learned"], atol=1e-6
+    )  # nothing paid: as it was
+    paying = [row["views"] for row in costs["not_paying"]]
+    assert paying == sorted(paying)  # the cheaper a view, the more
+    assert paying[0] < paying[-1]
+    assert set(found["policies"]) >= {"farthest", "fixed_order", "information_gain", "belief_oracle"}
+    assert [row["views"] for row in found["random_sets"]] == [1, 2, 3, 4, 5, 6]
+    without = novel_classes(adding, [((0, 2), policy), ((1, 3), policy)], policy, test, max_views=3, draws=2)
+    assert without["objects"] == 120
+    gain = np.array(after["learned"]) - after["random"]
+    for found_without in without["gain"].values():  # the same policy: what is found on all objects
+        np.testing.assert_allclose(found_without["difference"], gain, atol=0.02)
+    chosen = walk(
+        jax.random.key(0), adding, test, partial(by_state, structure=nnx.graphdef(policy)), nnx.state(policy), 3, 4
+    )
+    assert chosen.shape == (120, 4, 3)
+    assert all(len(set(order)) == 3 for order in chosen.reshape(-1, 3).tolist())
+
+
+def test_rules_are_compared_where_they_are_as_accurate():
+    """A walk is right from its second view on; one rule knows that, the other is as sure of the first view."""
+    objects, right = 40, np.array([False, True, True])
+    knows = Signal(np.tile([0.2, 0.9, 0.95], (objects, 2, 1)), np.tile(right, (objects, 2, 1)), np.ones(objects))
+    sure_late = replace(knows, value=np.tile([0.2, 0.3, 0.9], (objects, 2, 1)))
+    assert stops_at(knows.value >= 0.9).tolist() == [[1, 1]] * objects
+    assert stops_at(knows.value >= 0.99).tolist() == [[2, 2]] * objects  # never: to the end
+    assert [share.mean() for share in knows.stopped(0.1)] == [0, 1]
+    (row,) = compare_rules([sure_late] * 2, [knows] * 2, [0.8])
+    assert (row["accuracy"], row["views"]) == (1, 3)
+    assert (row["ours"]["accuracy"], row["ours"]["views"]) == (1, 2)
+    assert row["ours"]["views_difference"] == {"difference": -1, "interval": [-1, -1]}
+    never = replace(knows, right=np.zeros_like(knows.right))
+    assert compare_rules([sure_late] * 2, [never] * 2, [0.8])[0]["ours"] is None
+    half = replace(knows, right=knows.right & (np.arange(objects) % 2 == 0)[:, None, None])
+    weighed = replace(half, weight=np.where(np.arange(objects) % 2 == 0, 2.0, 0.0))
+    assert (half.accuracy(0.5), weighed.accuracy(0.5)) == (0.5, 1)
+
+
+def test_the_fixed_order_begins_with_the_views_that_tell_most(adding):
+    scores = fixed_order_scores(adding, telling(200, 5), 3)
+    assert sorted(np.argsort(-scores)[:3].tolist()) == [0, 2, 3]
+    assert sorted(scores.tolist()) == list(range(1, VIEWS + 1))

@@ -1,0 +1,31 @@
+"""The programs in `examples/` run as their first lines say."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+EXAMPLES = Path(__file__).resolve().parents[1] / "examples"
+
+
+@pytest.mark.parametrize(
+    ("name", "said"),
+    [
+        ("own_policy", "opposite: "),
+        ("load_and_ask", "view 0: "),
+        pytest.param("own_encoder", "validation accuracy", marks=pytest.mark.slow),
+    ],
+)
+def test_an_example_runs(name, said, whole, tmp_path):
+    command = [sys.executable, str(EXAMPLES / f"{name}.py"), str(whole), *[str(tmp_path)] * (name == "own_encoder")]
+    ended = subprocess.run(command, capture_output=True, text=True, timeout=600)
+    assert ended.returncode == 0, ended.stderr
+    assert said in ended.stdout
+    assert f"examples/{name}.py" in (EXAMPLES / f"{name}.py").read_text().splitlines()[0]
+
+
+def test_all_examples_are_run():
+    assert {path.stem for path in EXAMPLES.glob("*.py")} == {"own_policy", "own_encoder", "load_and_ask"}

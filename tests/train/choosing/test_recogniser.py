@@ -1,0 +1,128 @@
+"""Training the recogniser: turned and changed objects, and folds."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import replace
+from functools import partial
+from itertools import islice
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from flax import nnx
+from scipy.spatial.transform import Rotation
+
+from data_pipeline.dataset.augment import views_after
+from data_pipeline.dataset.batches import evaluation_batches
+from data_pipeline.dataset.statistics import load_statistics
+from data_pipeline.errors import DataError
+from eval.settings import TINY
+from mevs_jax.models import Recogniser
+from mevs_jax.viewpoints import viewpoint_lattice
+from train.choosing.looks import see_changed, see_rotated
+from train.choosing.stages import Stages, check_learned
+from train.loop import load_best, steps_of_an_epoch
+from train.tasks.recogniser import RecogniserTask
+
+
+def on_device(batches) -> list[dict[str, jax.Array]]:
+    return [jax.tree.map(jnp.asarray, batch) for batch in batches]
+
+
+def test_objects_turned_anyhow_are_seen_from_the_lattice_itself(turned):
+    """Undoing the turn of an object's cameras turns the object instead."""
+    statistics = load_statistics(turned)
+    task = RecogniserTask.of(TINY.learned.recogniser, 10, statistics.camera)
+    network = nnx.jit(lambda: task.network(nnx.Rngs(0)))()
+    batches = on_device(islice(evaluation_batches(turned, "train", images="depth"), 2))
+    features = network.encoder.head.in_features
+    together = {name: np.concatenate([batch[name] for batch in batches]) for name in batches[0]}
+    lattice = viewpoint_lattice(task.camera.views, task.camera.lattice)
+    see, after = nnx.jit(Recogniser.see), jax.jit(partial(views_after, camera=task.camera))
+    turned_back = nnx.jit(partial(see_rotated, task=task))(network, batch=together)
+    for index, found in enumerate(np.split(np.asarray(turned_back), 2)):
+        np.testing.assert_allclose(found[:, features + 10 : -1], lattice, atol=1e-4)
+        np.testing.assert_array_equal(found[:, -1], batches[index]["label"])
+        before = np.asarray(task.directions(batches[index]))
+        turn = Rotation.align_vectors(lattice, before)[0].as_matrix().astype(np.float32)
+        images, _ = after(jnp.asarray(turn), task.inputs(batches[index]), jnp.asarray(batches[index]["pose"]))
+        expected = np.asarray(see(network, images))
+        # A ray that falls between two pixels may fall to the other one after rounding.
+        assert np.median(np.abs(found[:, : features + 10] - expected)) < 1e-4
+        assert np.abs(turn - np.eye(3)).max() > 0.1
+
+
+def test_changed_objects_are_each_changed_in_a_way_of_their_own_and_the_same_every_time(turned):
+    task = RecogniserTask.of(TINY.learned.recogniser, 10, load_statistics(turned).camera)
+    network = nnx.jit(lambda: task.network(nnx.Rngs(0)))()
+    batches = on_device(islice(evaluation_batches(turned, "val", images="depth"), 5))
+    features, changes = network.encoder.head.in_features, []
+    asked = [nnx.jit(partial(see_changed(number), task=task)) for number in (0, 1)]
+    see, after = nnx.jit(Recogniser.see), jax.jit(partial(views_after, camera=task.camera))
+    for position, batch in enumerate(batches):
+        found, other = (np.asarray(ask(network, batch=batch)) for ask in asked)
+        before = np.asarray(task.directions(batch))
+        mirrored = [np.abs(np.abs(one[:, features + 10 : -1]) - np.abs(before)).max() < 1e-5 for one in (found, other)]
+        assert all(mirrored)  # in x, or not at all: TINY does not stretch
+        changes.append([bool(np.sign(one[0, features + 10] * before[0, 0]) < 0) for one in (found, other)])
+        assert (batch["position"] == position).all()
+        change = jnp.diag(jnp.array([-1.0 if changes[-1][0] else 1.0, 1.0, 1.0]))
+        images, _ = after(change, task.inputs(batch), jnp.asarray(batch["pose"]))
+        expected = np.asarray(see(network, images))
+        assert np.median(np.abs(found[:, : features + 10] - expected)) < 1e-4
+    alone = np.asarray(asked[0](network, batch=batches[3]))
+    both = {name: np.concatenate([batches[0][name], batches[3][name]]) for name in batches[0]}
+    np.testing.assert_allclose(np.split(np.asarray(asked[0](network, batch=both)), 2)[1], alone, atol=1e-4)
+    assert len({tuple(one) for one in changes}) > 1
+
+
+def test_recognisers_of_objects_turned_anyhow_go_on_from_the_others(turned, tmp_path):
+    config = replace(TINY.learned, rotation_epochs=1)
+    stages = Stages(config, TINY.dataset, tmp_path)
+    stages.turned = turned
+    stages.train_recogniser()
+    rotated = stages.rotated()
+    rotated.turned = turned
+    task, start = rotated.task(), rotated._start(None)
+    assert task.augmentation.turn
+    assert not stages.task().augmentation.turn
+    assert task.optimiser.epochs == 1
+    assert rotated.recogniser_folder() != stages.recogniser_folder()
+    begun = nnx.jit(lambda: task.network(nnx.Rngs(5)))()
+    assert start is not None
+    start.put(begun)
+    jax.tree.map(
+        np.testing.assert_array_equal,
+        nnx.state(begun),
+        nnx.state(load_best(stages.task(), stages.recogniser_folder())),
+    )
+    batch = next(evaluation_batches(turned, "val", images="depth"))
+    pair = {name: array[:2] for name, array in batch.items()}
+    losses = [nnx.jit(partial(RecogniserTask.evaluate, one)) for one in (task, stages.task())]
+    found = [np.asarray(losses[which](begun, pair)["loss"]) for which in (0, 0, 1)]
+    np.testing.assert_array_equal(found[0], found[1])  # the same turn every time
+    assert np.abs(np.asarray(found[0] - found[2])).max() > 1e-6
+
+
+def test_an_epoch_without_a_part_is_shorter(turned):
+    statistics = load_statistics(turned)
+    whole, part = (RecogniserTask.of(TINY.learned.recogniser, 10, statistics.camera, fold) for fold in (None, (0, 2)))
+    assert steps_of_an_epoch(part, statistics) < 0.6 * steps_of_an_epoch(whole, statistics)
+
+
+@pytest.mark.parametrize(
+    ("changes", "said"),
+    [
+        ({"folds": 1}, "--learned.folds must be at least 2"),
+        ({"seeds": 0}, "--learned.seeds at least 1"),
+        ({"changed": -1}, "--learned.changed must be at least 0, got -1"),
+        ({"ablations": ("magic",)}, "unknown ablation 'magic'"),
+        ({"max_views": 6}, "walks of 6 views are not possible with 6 candidate views"),
+    ],
+)
+def test_a_study_that_cannot_be_made_is_refused(changes, said):
+    check_learned(TINY.learned, 6)
+    with pytest.raises(DataError, match=re.escape(said)):
+        check_learned(replace(TINY.learned, **changes), 6)

@@ -1,0 +1,109 @@
+"""Trains in a process of its own, on as many simulated devices as asked for: `python scaling_worker.py '{"devices": 8, …}'`."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import signal
+import sys
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import jax
+from jax.sharding import Mesh
+
+import train.loop
+from data_pipeline.dataset.batches import train_batches
+from data_pipeline.dataset.statistics import load_statistics
+from eval.settings import TINY
+from eval.stages import tasks
+from train.devices import DATA, MODEL, device_mesh, parameter_sharding, place, place_batch
+from train.preemption import Preempted
+from train.step import initial_state, train_step_of
+
+_BRIEF = replace(TINY.classifier.optimiser, epochs=4, learning_rate=1e-4)
+
+SETTINGS = replace(
+    TINY,
+    classifier=replace(TINY.classifier, optimiser=_BRIEF),
+    entropy=replace(TINY.entropy, optimiser=_BRIEF),
+)
+"""Both networks with augmentation, PointNet++ with dropout. A low learning rate: once in some dozens of steps rounding decides
+whether a rectified unit is on, and what follows from that grows with the rate."""
+
+
+COLLECTIVES = re.compile(r"\b(all-reduce|all-gather|all-to-all|reduce-scatter|collective-permute)(?:-start)?\(")
+
+
+STRETCH = 10
+"""Steps in a row. Each stretch begins where one device was then, before rounding has grown into another training altogether."""
+
+States = dict[tuple[str, int], Any]
+
+
+def losses(
+    data: Path, mesh: Mesh, steps: int, of_one: States
+) -> tuple[dict[str, list[float]], dict[str, list[str]], States]:
+    """The training loss of the first steps, how devices talk in a step, and the state at each stretch's beginning, by network;
+    PointNet++ alone where weights are split, which compiles sooner. Stretches begin with the states `of_one` device, if given."""
+    out, talk, begins = {}, {}, {}
+    for task in tasks(SETTINGS, load_statistics(data))[mesh.shape["model"] > 1 :]:
+        structure, state = initial_state(task, task.optimiser.seed)
+        where = parameter_sharding(mesh, state)
+        state = place(state, where)
+        step = jax.jit(train_step_of(task, structure, steps), donate_argnums=0, out_shardings=(where, None))
+        batches = train_batches(data, task.batches)
+        found = []
+        program = step.lower(
+            state, place_batch(mesh, next(train_batches(data, task.batches))), task.hyperparameters
+        ).compile()
+        talk[task.name] = sorted(set(COLLECTIVES.findall(program.as_text())))
+        for number in range(steps):
+            if number % STRETCH == 0:
+                begins[task.name, number] = jax.device_get(state)
+                if of_one:
+                    state = place(of_one[task.name, number], where)
+            state, loss = program(state, place_batch(mesh, next(batches)), task.hyperparameters)
+            found.append(loss)
+        out[task.name] = [float(loss) for loss in found]
+    return out, talk, begins
+
+
+def fit_until(data: Path, out: Path, stop_at: int) -> None:
+    """Trains PointNet++; at the batch of number `stop_at` the process is told to end."""
+    real = train.loop.train_batches
+
+    def batches(*arguments, first_step: int = 0):
+        for number, batch in enumerate(real(*arguments, first_step=first_step), first_step):
+            if number == stop_at:
+                os.kill(os.getpid(), signal.SIGTERM)
+            yield batch
+
+    train.loop.train_batches = batches
+    statistics = load_statistics(data)
+    task = tasks(SETTINGS, statistics)[1]
+    try:
+        train.loop.fit(task, data, statistics, out)
+    except Preempted:
+        sys.exit(143)
+
+
+def meshes() -> dict[str, Mesh]:
+    """One device, all of them, and all of them with weights split in two."""
+    return {"1": Mesh([[jax.devices()[0]]], (DATA, MODEL)), "all": device_mesh(), "split": device_mesh(2)}
+
+
+if __name__ == "__main__":
+    asked = json.loads(sys.argv[1])
+    jax.config.update("jax_num_cpu_devices", asked["devices"])
+    assert len(jax.devices()) == asked["devices"]
+    if "steps" in asked:
+        found, of_one = {}, {}
+        for name, mesh in meshes().items():
+            *found[name], begins = losses(Path(asked["data"]), mesh, asked["steps"], of_one)
+            of_one = of_one or begins
+        print(json.dumps(found))
+    else:
+        fit_until(Path(asked["data"]), Path(asked["out"]), asked["stop_at"])

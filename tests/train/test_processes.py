@@ -1,0 +1,115 @@
+"""Several processes train as one does; a lost one ends the others, and the run goes on."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import signal
+import socket
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from tests.train.test_scaling import CPU
+from tests.train.test_training import lines
+
+NETWORKS = ("classifier", "entropy")
+
+
+def start(out: Path, *options: str, processes: int = 1, networks: tuple[str, ...] = NETWORKS) -> list[subprocess.Popen]:
+    """`mevs train` in one process, or in several that find each other on this machine; slowly for these networks."""
+    command = [sys.executable, "-m", "mevs_jax", "train", "--preset", "tiny", "--out", str(out), *options]
+    for network in networks:
+        command += [f"--{network}.optimiser.learning-rate", "1e-4"]
+    if processes == 1:
+        return [subprocess.Popen(command, stderr=subprocess.PIPE, text=True, env=os.environ | CPU)]
+    with socket.socket() as free:
+        free.bind(("localhost", 0))
+        port = free.getsockname()[1]
+    others = {"JAX_COORDINATOR_ADDRESS": f"localhost:{port}", "JAX_NUM_PROCESSES": str(processes)}
+    return [
+        subprocess.Popen(
+            [*command, "--distributed"],
+            stderr=subprocess.PIPE,
+            text=True,
+            env=os.environ | CPU | others | {"JAX_PROCESS_ID": str(number)},
+        )
+        for number in range(processes)
+    ]
+
+
+def ended(process: subprocess.Popen, code: int) -> str:
+    """What a process said, once it has ended with this exit code."""
+    said = process.communicate(timeout=300)[1]
+    assert process.returncode == code, said
+    return said
+
+
+@pytest.fixture
+def run(data, tmp_path):
+    """Makes run directories that hold the data set already."""
+
+    def folder(name: str) -> Path:
+        out = tmp_path / name
+        out.mkdir()
+        (out / "data").symlink_to(data)
+        return out
+
+    return folder
+
+
+@pytest.mark.parametrize("networks", [("entropy",), pytest.param(NETWORKS, marks=pytest.mark.slow)], ids="+".join)
+def test_two_processes_train_as_one_does(networks, run, whole):
+    alone, together = run("alone"), run("together")
+    if "classifier" not in networks:  # both runs have it already, and do not train it again
+        for out in (alone, together):
+            shutil.copytree(whole / "classifier", out / "classifier")
+    ended(*start(alone, networks=networks), 0)
+    first, second = (ended(process, 0) for process in start(together, processes=2, networks=networks))
+    assert "classifier: best epoch" in first
+    assert "epoch" not in second  # one speaks for all
+    for name in networks:
+        for mine, theirs in zip(lines(together / name), lines(alone / name), strict=True):
+            for key in set(mine) - {"seconds"}:
+                assert mine[key] == pytest.approx(theirs[key], rel=1e-5, abs=1e-7), key
+
+
+@pytest.mark.parametrize(
+    "again", [False, pytest.param(True, marks=pytest.mark.slow)], ids=["lost", "lost and told to end"]
+)
+def test_a_lost_process_ends_the_others_and_the_run_goes_on(run, again):
+    out = run("lost")
+    long = ("--classifier.optimiser.epochs", "500", "--classifier.optimiser.patience", "500")
+
+    def wait_for_epoch(epoch: int) -> None:
+        log, until = out / "classifier" / "metrics.jsonl", time.monotonic() + 240
+        while not log.exists() or f'"epoch": {epoch}' not in log.read_text():
+            assert time.monotonic() < until, "no epoch ends"
+            time.sleep(0.2)
+
+    first, second = start(out, *long, processes=2)
+    epoch = 2 if again else 1
+    wait_for_epoch(epoch)
+    second.kill()
+    killed = time.monotonic()
+    said = first.communicate(timeout=60)[1]
+    assert time.monotonic() - killed < 60
+    # Where the loss comes out in a computation we say so; where it comes out in waiting for a checkpoint, JAX does.
+    ours, jax_own = "another process of this run is gone", "This most likely indicates that another task died"
+    assert (first.returncode, ours in said) == (75, True) or (first.returncode, jax_own in said) == (-6, True), said
+    done = lines(out / "classifier")[-1]["epoch"]
+    assert done >= epoch
+    if not again:
+        return
+
+    # Both go on; told to end, they agree on a step, save and leave.
+    both = start(out, *long, processes=2)
+    wait_for_epoch(done + 1)
+    both[0].send_signal(signal.SIGTERM)
+    said = [ended(process, 143) for process in both]
+    assert "resuming after epoch" in said[0]
+    assert all("was asked to end after step" in text for text in said)
+    assert len({text.split("after step ")[1].split()[0] for text in said}) == 1

@@ -1,0 +1,227 @@
+"""Training learns, stops early, and goes on exactly where it was stopped."""
+
+from __future__ import annotations
+
+import json
+import signal
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+import pytest
+from flax import nnx
+
+import train.loop
+from data_pipeline.dataset.statistics import load_statistics
+from data_pipeline.errors import DataError
+from eval.settings import TINY
+from eval.stages import tasks
+from train.checkpoints import Checkpoints
+from train.loop import fit, load_best
+from train.optimiser import OptimiserConfig, descent, learning_rate
+from train.starting_weights import weights_from_network
+from train.tasks.entropy import EntropyTask
+
+SETTINGS = replace(
+    TINY,
+    classifier=replace(
+        TINY.classifier,
+        optimiser=OptimiserConfig(
+            epochs=6, batch_size=16, views_per_object=2, epoch_views=6, learning_rate=3e-3, schedule="cosine"
+        ),
+    ),
+    entropy=replace(
+        TINY.entropy,
+        network=replace(TINY.entropy.network, dropout=0.1),
+        optimiser=OptimiserConfig(epochs=3, batch_size=16, views_per_object=2, epoch_views=6, learning_rate=1e-2),
+    ),
+)
+
+
+def lines(folder: Path) -> list[dict]:
+    return [json.loads(line) for line in (folder / "metrics.jsonl").read_text().splitlines()]
+
+
+@pytest.fixture(scope="module")
+def trained(data, tmp_path_factory) -> Path:
+    """A whole run, never stopped."""
+    folder = tmp_path_factory.mktemp("whole")
+    statistics = load_statistics(data)
+    for task, name in zip(tasks(SETTINGS, statistics), ("classifier", "entropy"), strict=True):
+        fit(task, data, statistics, folder / name)
+    return folder
+
+
+def test_muon_steps_are_as_long_in_all_directions_of_a_matrix(random):
+    """Against the singular value decomposition, and Adam, with Nesterov's momentum, for what is no matrix."""
+    shapes = {"kernel": (3, 3, 8, 32), "matrix": (40, 24), "head": (40, 10), "bias": (24,)}
+    gradients = {name: jnp.asarray(random.normal(size=shape), jnp.float32) for name, shape in shapes.items()}
+    weights = jax.tree.map(jnp.ones_like, gradients)
+    muon, nadam = descent(OptimiserConfig(method="muon")), optax.scale_by_adam(nesterov=True)
+    found, expected = (method.update(gradients, method.init(weights), weights)[0] for method in (muon, nadam))
+    for name in ("head", "bias"):
+        np.testing.assert_allclose(found[name], expected[name], rtol=1e-5)
+    for name, rows in (("kernel", 72), ("matrix", 40)):
+        step, gradient = (np.asarray(tree[name]).reshape(rows, -1) for tree in (found, gradients))
+        left, _, right = np.linalg.svd(gradient, full_matrices=False)
+        along = left.T @ step @ right.T / (0.2 * np.sqrt(rows))
+        assert (np.diag(along) > 0.6).all()  # Newton and Schulz's five steps come near 1, not closer
+        assert (np.diag(along) < 1.3).all()
+        np.testing.assert_allclose(along - np.diag(np.diag(along)), 0, atol=0.02)
+
+
+def test_training_learns(trained):
+    history = lines(trained / "classifier")
+    assert [entry["epoch"] for entry in history] == [1, 2, 3, 4, 5, 6]
+    assert history[-1]["train/loss"] < 0.8 * history[0]["train/loss"]
+    assert history[-1]["train/accuracy"] > 0.2  # chance is 0.1
+    entropy = lines(trained / "entropy")
+    assert entropy[-1]["train/loss"] < 0.7 * entropy[0]["train/loss"]
+    assert list((trained / "classifier" / "tensorboard").iterdir())
+
+
+@pytest.mark.parametrize("name", ["classifier", "entropy"])
+def test_a_stopped_run_ends_as_if_it_had_not_been(name, trained, data, tmp_path, monkeypatch):
+    statistics = load_statistics(data)
+    task = dict(zip(("classifier", "entropy"), tasks(SETTINGS, statistics), strict=True))[name]
+
+    class Stopped(Exception):
+        pass
+
+    real_validate, calls = train.loop.validate, 0
+
+    def stop_in_the_second_epoch(*args):
+        nonlocal calls
+        calls += 1
+        if calls == 2:
+            raise Stopped
+        return real_validate(*args)
+
+    monkeypatch.setattr(train.loop, "validate", stop_in_the_second_epoch)
+    with pytest.raises(Stopped):
+        fit(task, data, statistics, tmp_path)
+    monkeypatch.undo()
+    with (tmp_path / "metrics.jsonl").open("a") as file:
+        file.write('{"step": 99999, "half a line')  # killed while writing
+    summary = fit(task, data, statistics, tmp_path)
+
+    whole = json.loads((trained / name / "summary.json").read_text())
+    for key in ("epoch", "best_epoch", "best_loss", "steps", "best"):
+        assert summary[key] == whole[key], key
+    a, b = nnx.state(load_best(task, tmp_path)), nnx.state(load_best(task, trained / name))
+    for mine, theirs in zip(jax.tree.leaves(a), jax.tree.leaves(b), strict=True):
+        np.testing.assert_array_equal(mine, theirs)
+    timeless = [{key: value for key, value in entry.items() if key != "seconds"} for entry in lines(tmp_path)]
+    assert timeless == [{k: v for k, v in entry.items() if k != "seconds"} for entry in lines(trained / name)]
+
+
+def test_training_goes_on_from_other_weights(trained, data, tmp_path):
+    """The first epoch begins where the other network ended, and the run knows where it began."""
+    statistics = load_statistics(data)
+    task = tasks(SETTINGS, statistics)[0]
+    once = replace(task, optimiser=replace(task.optimiser, epochs=1, learning_rate=1e-6))
+    start = weights_from_network(load_best(task, trained / "classifier"), "the one before")
+    summary = fit(once, data, statistics, tmp_path, start)
+    assert summary["start"] == "the one before"
+    assert json.loads((trained / "classifier" / "summary.json").read_text())["start"] == "random weights"
+    before = json.loads((trained / "classifier" / "summary.json").read_text())
+    assert summary["best"]["loss"] == pytest.approx(before["best"]["loss"], rel=0.2)
+    assert lines(tmp_path)[0]["train/loss"] < 0.8 * lines(trained / "classifier")[0]["train/loss"]
+    with pytest.raises(DataError, match="other settings"):
+        fit(once, data, statistics, tmp_path)
+
+
+def test_a_finished_run_is_not_repeated_nor_mixed(trained, data):
+    statistics = load_statistics(data)
+    task = tasks(SETTINGS, statistics)[0]
+    before = (trained / "classifier" / "metrics.jsonl").stat().st_mtime_ns
+    assert fit(task, data, statistics, trained / "classifier")["epoch"] == 6
+    assert (trained / "classifier" / "metrics.jsonl").stat().st_mtime_ns == before
+    other = replace(task, optimiser=replace(task.optimiser, learning_rate=1e-4))
+    with pytest.raises(DataError, match="other settings"):
+        fit(other, data, statistics, trained / "classifier")
+
+
+def test_training_stops_when_validation_gets_no_better(data, tmp_path, monkeypatch):
+    statistics = load_statistics(data)
+    task = tasks(SETTINGS, statistics)[0]
+    task = replace(task, optimiser=replace(task.optimiser, epochs=9, patience=2, epoch_views=2))
+    losses = iter([1.0, 0.9, 0.95, 0.92, 0.1])
+    monkeypatch.setattr(train.loop, "validate", lambda *_: {"loss": next(losses)})
+    summary = fit(task, data, statistics, tmp_path)
+    assert summary["epoch"] == 4
+    assert summary["best_epoch"] == 2
+    assert summary["stopped_early"]
+
+
+def test_networks_of_another_size_are_described(trained, data):
+    statistics = load_statistics(data)
+    classify, predict = tasks(SETTINGS, statistics)
+    with pytest.raises(DataError, match="trained for 6 views, the data set has 40"):
+        load_best(replace(predict, views=40), trained / "entropy")
+    with pytest.raises(DataError, match="trained for 10 classes, the data set has 4"):
+        load_best(replace(classify, classes=4), trained / "classifier")
+    with pytest.raises(DataError, match="other layers"):
+        load_best(replace(classify, network_config=replace(classify.network_config, width=16)), trained / "classifier")
+    with pytest.raises(DataError, match="no trained classifier in"):
+        load_best(classify, trained / "nothing")
+
+
+def test_schedules():
+    steps = learning_rate(OptimiserConfig(batch_size=32, schedule="steps"), 0)
+    assert float(steps(jnp.int32(0), 1e-3)) == pytest.approx(1e-3)
+    assert float(steps(jnp.int32(20_000 // 32 - 1), 1e-3)) == pytest.approx(1e-3)
+    assert float(steps(jnp.int32(20_000 // 32 + 1), 1e-3)) == pytest.approx(0.7e-3)
+    assert float(steps(jnp.int32(10**6), 1e-3)) == pytest.approx(1e-5)
+    cosine = learning_rate(OptimiserConfig(schedule="cosine"), 1000)
+    assert float(cosine(jnp.int32(1000), 1e-3)) == pytest.approx(0, abs=1e-9)
+    assert float(cosine(jnp.int32(100), 1e-3)) == pytest.approx(1e-3)
+    assert float(cosine(jnp.int32(100), 1e-2)) == pytest.approx(1e-2)
+    assert float(learning_rate(OptimiserConfig(), 10)(jnp.int32(7), 1e-2)) == pytest.approx(1e-2)
+    task = EntropyTask.of(SETTINGS.entropy, 6, 4.0, TINY.dataset.capture)
+    assert float(task.momentum(jnp.int32(0))) == 0.5
+    assert float(task.momentum(jnp.int32(45_000))) == 0.125
+    assert float(task.momentum(jnp.int32(10**6))) == pytest.approx(0.01)
+
+
+def test_a_loss_that_is_no_number_stops_the_run(data, tmp_path):
+    statistics = load_statistics(data)
+    task = tasks(SETTINGS, statistics)[0]
+    task = replace(task, optimiser=replace(task.optimiser, learning_rate=1e30, schedule="constant", epochs=1))
+    with pytest.raises(FloatingPointError, match="no longer finite"):
+        fit(task, data, statistics, tmp_path)
+
+
+@pytest.fixture
+def interruptible() -> Iterator[None]:
+    """Jobs in the background may have been started with interrupts ignored."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, before)
+
+
+@pytest.mark.usefixtures("interruptible")
+def test_an_interrupt_waits_for_the_checkpoint(tmp_path, monkeypatch):
+    """One that falls into Orbax would leave its threads waiting for each other, and the program with them."""
+    state = {"weights": jnp.arange(4.0)}
+    with Checkpoints(tmp_path) as checkpoints:
+        manager = checkpoints._slots["latest"]
+        save = manager.save
+
+        def interrupted(*arguments, **named):
+            signal.raise_signal(signal.SIGINT)
+            return save(*arguments, **named)
+
+        monkeypatch.setattr(manager, "save", interrupted)
+        with pytest.raises(KeyboardInterrupt):
+            checkpoints.save("latest", 1, state, {"epoch": 1})
+        restored = checkpoints.restore("latest", state)
+        assert restored is not None
+        assert restored[1] == {"epoch": 1}
+        np.testing.assert_array_equal(restored[0]["weights"], state["weights"])
+    with pytest.raises(KeyboardInterrupt):
+        signal.raise_signal(signal.SIGINT)
