@@ -42,7 +42,6 @@ from data_pipeline.progress import console, progress_bar
 from mevs_jax.entropy import level_entropy
 from mevs_jax.viewpoints import viewpoint_lattice
 
-
 SOURCE_STATE = "source.json"
 """File name of the state of the source's files in the folder of a data set."""
 

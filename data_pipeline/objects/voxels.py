@@ -7,7 +7,7 @@ import zlib
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import IO, Any
+from typing import Any
 
 import numpy as np
 
@@ -90,8 +90,8 @@ def voxel_archive(path: Path) -> ObjectSource:
     return ObjectSource(shown(path.stem), classes, tuple(entries))
 
 
-def _header(file: IO[bytes], what: str, where: str) -> tuple[tuple[int, ...], bool, np.dtype]:
-    """Returns the shape, Fortran order and type of an array from the head of its file."""
+def _header(file: Any, what: str, where: str) -> tuple[tuple[int, ...], bool, np.dtype]:
+    """Returns the shape, Fortran order and type of an array from the head of its file, which is open."""
     version = np.lib.format.read_magic(file)
     if version == (1, 0):
         shape, fortran, kind = np.lib.format.read_array_header_1_0(file)
