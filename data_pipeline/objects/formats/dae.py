@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import io
+from collections.abc import Iterator
+from typing import Any
 
 import numpy as np
 
 from data_pipeline.errors import DamagedMesh, DataError
 from data_pipeline.objects.formats.polygons import triangulate
 
-MOST_CORNERS = 100_000_000
-"""Largest number of corners of polygons that all copies in a scene may have together."""
+MOST_CORNERS, MOST_COPIES = 50_000_000, 10_000
+"""Largest numbers of corners of polygons and of meshes in a scene, all copies counted. A small file can declare any number."""
 
 
 def parse_dae(content: bytes, where: str) -> tuple[np.ndarray, np.ndarray, str]:
@@ -30,6 +32,17 @@ def parse_dae(content: bytes, where: str) -> tuple[np.ndarray, np.ndarray, str]:
         raise DamagedMesh(f"{where} is not a readable .dae mesh ({reason}); repair it or take it away") from error
 
 
+def _primitives(document: Any) -> Iterator[Any]:
+    """Returns the primitives of the scene, in the world's frame; those of all geometries if there is no scene."""
+    if document.scene is None:
+        for geometry in document.geometries:
+            yield from geometry.primitives
+        return
+    for kind in ("geometry", "controller"):
+        for thing in document.scene.objects(kind):
+            yield from thing.primitives()
+
+
 def _parse(content: bytes, where: str) -> tuple[np.ndarray, np.ndarray, str]:
     import collada
     from collada.common import DaeUnsupportedError
@@ -37,14 +50,11 @@ def _parse(content: bytes, where: str) -> tuple[np.ndarray, np.ndarray, str]:
     if b"<!ENTITY" in content:
         raise DamagedMesh(f"{where} defines XML entities, which are not read; export it again")
     document = collada.Collada(io.BytesIO(content), ignore=[DaeUnsupportedError])
-    if document.scene is None:
-        found = [primitive for geometry in document.geometries for primitive in geometry.primitives]
-    else:
-        bound = [thing for kind in ("geometry", "controller") for thing in document.scene.objects(kind)]
-        found = [primitive for thing in bound for primitive in thing.primitives()]
     parts: list[tuple[np.ndarray, np.ndarray]] = []
     corners = first = 0
-    for primitive in found:
+    for number, primitive in enumerate(_primitives(document)):
+        if number >= MOST_COPIES:
+            raise DamagedMesh(f"{where} unfolds to more than {MOST_COPIES:,} meshes; export a simpler mesh")
         primitive = getattr(primitive, "primitive", primitive)  # of a skin
         if isinstance(primitive, collada.lineset.LineSet | collada.lineset.BoundLineSet):
             continue

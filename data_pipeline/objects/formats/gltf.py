@@ -31,8 +31,9 @@ _HARMLESS = ("KHR_materials_", "KHR_texture_", "EXT_texture_", "MSFT_texture_", 
              "KHR_animation", "KHR_node_", "MSFT_packing", "KHR_techniques_", "ADOBE_materials")  # fmt: skip
 """Beginnings of the names of extensions that leave the geometry as it is."""
 
-MOST_ELEMENTS = 100_000_000
-"""Largest number of elements that an accessor without data, or all instances of meshes together, may have."""
+MOST_ELEMENTS, MOST_ZEROS, MOST_COPIES = 50_000_000, 5_000_000, 100_000
+"""Largest numbers of vertices and triangles of a scene together, of elements of an accessor without data, and of instances of
+one mesh. A small file can declare any number."""
 
 
 def parse_gltf(content: bytes, where: str, sibling: Callable[[str], bytes]) -> tuple[np.ndarray, np.ndarray]:
@@ -122,8 +123,10 @@ class _Reader:
             return self.buffers[index]
         entry = self.item("buffers", index)
         uri = entry.get("uri")
-        if uri is None:
+        if uri is None and index == 0:
             content = self.binary
+        elif uri is None:
+            raise DamagedMesh(f"{self.where} has no data for buffer {index}; export it again")
         elif uri.startswith("data:"):
             head, _, body = uri.partition(",")
             content = base64.b64decode(body) if head.endswith(";base64") else urllib.parse.unquote_to_bytes(body)
@@ -140,8 +143,8 @@ class _Reader:
     def view(self, index: Any) -> tuple[bytes, int]:
         """Returns the bytes of a buffer view and the distance of its elements, 0 if they are packed."""
         entry = self.item("bufferViews", index)
-        for name in entry.get("extensions", {}):
-            if "meshopt" in name:
+        for name in entry.get("extensions", {}):  # if its buffer has data all the same, these are not compressed
+            if "meshopt" in name and "extensions" in self.item("buffers", entry["buffer"]):
                 raise DamagedMesh(
                     f"{self.where} is compressed with {name}, which is not read; unpack it with: gltf-transform copy, or gltfpack"
                 )
@@ -168,12 +171,11 @@ class _Reader:
         """Returns the elements of an accessor (count, width); normalised integers become float64 in [−1, 1]."""
         entry = self.item("accessors", index)
         kind, width, count = _COMPONENTS[entry["componentType"]], _WIDTHS[entry["type"]], entry["count"]
-        if type(count) is not int or not 0 <= count <= MOST_ELEMENTS:
+        if type(count) is not int or not 0 <= count <= (MOST_ELEMENTS if "bufferView" in entry else MOST_ZEROS):
             raise ValueError(f"accessor {index} has {count!r} elements")
         if "bufferView" in entry:
             values = self._array(entry["bufferView"], entry.get("byteOffset", 0), count, kind, width)
         else:
-            self._spend(count)
             values = np.zeros((count, width), kind)
         if sparse := entry.get("sparse"):
             at, new = sparse["indices"], sparse["values"]
@@ -232,10 +234,6 @@ class _Reader:
         faces = getattr(mesh, "faces", None)
         if faces is None:
             raise DamagedMesh(f"{self.where} has a Draco point cloud in place of a mesh; export it again")
-        if len(vertices) != position["count"]:
-            raise DamagedMesh(
-                f"{self.where} declares {position['count']} vertices and its Draco mesh has {len(vertices)}; export it again"
-            )
         return vertices.reshape(-1, 3), np.asarray(faces).reshape(-1)
 
     def matrix(self, node: Any) -> np.ndarray:
@@ -276,7 +274,10 @@ class _Reader:
         if len(counts) != 1:
             raise ValueError("the attributes of instances differ in their number")
         count = counts.pop()
-        self._spend(count)
+        if count > MOST_COPIES:
+            raise DamagedMesh(
+                f"{self.where} has {count:,} copies of a mesh, more than {MOST_COPIES:,}; export a simpler mesh"
+            )
         return _transform(
             given.get("TRANSLATION", np.zeros((count, 3))),
             given.get("ROTATION", np.tile((0.0, 0, 0, 1), (count, 1))),

@@ -10,7 +10,7 @@ from data_pipeline.errors import DamagedMesh
 from data_pipeline.objects.formats.text import columns, text_of
 
 _TRIANGLE = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
-_CORNER = re.compile(r"\bvertex[ \t]+(.*)", re.IGNORECASE)
+_CORNER = re.compile(r"^[ \t]*vertex[ \t]+(.*)", re.IGNORECASE | re.MULTILINE)
 
 
 def parse_stl(content: bytes, where: str) -> tuple[np.ndarray, np.ndarray]:
@@ -48,8 +48,8 @@ def _parse_binary(content: bytes, count: int) -> tuple[np.ndarray, np.ndarray]:
 def _parse_text(content: bytes, where: str) -> tuple[np.ndarray, np.ndarray]:
     text = text_of(content, "an STL", where)
     lowered = text.lower()
-    opened, closed = (len(re.findall(rf"^[ \t]*{word}\b", lowered, re.MULTILINE)) for word in ("solid", "endsolid"))
-    facets, whole = len(re.findall(r"\bfacet\b", lowered)), len(re.findall(r"\bendfacet\b", lowered))
+    words = (r"solid", r"end ?solid", r"facet", r"end ?facet")
+    opened, closed, facets, whole = (len(re.findall(rf"^[ \t]*{word}\b", lowered, re.MULTILINE)) for word in words)
     if closed < opened or whole < facets:
         raise DamagedMesh(
             f"{where} is cut short: {whole} of {facets} facets and {closed} of {opened} solids end; fetch or export it again"

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import zipfile
+from collections import deque
 from typing import Any
 from xml.etree import ElementTree
 
@@ -14,7 +15,10 @@ from data_pipeline.errors import DamagedMesh, DataError
 _CORE = "{http://schemas.microsoft.com/3dmanufacturing/core/2015/02}"
 _PATH = "{http://schemas.microsoft.com/3dmanufacturing/production/2015/06}path"
 
-LARGEST = 1 << 29
+MOST_COPIES = 100_000
+"""Largest number of uses of objects that a file may unfold to."""
+
+LARGEST = 1 << 28
 """Largest unpacked size of the model in bytes."""
 
 MOST_TRIANGLES = 50_000_000
@@ -48,28 +52,31 @@ def _parse(content: bytes, where: str) -> tuple[np.ndarray, np.ndarray]:
     root = ElementTree.fromstring(text)
     objects = {entry.get("id"): entry for entry in root.iter(f"{_CORE}object")}
     parts: list[tuple[np.ndarray, np.ndarray]] = []
-    total = 0
-    todo: list[tuple[Any, np.ndarray, tuple[str, ...]]] = [(item, np.eye(4), ()) for item in root.iter(f"{_CORE}item")]
+    total = unfolded = first = 0
+    todo: deque[tuple[Any, np.ndarray, tuple[str, ...]]] = deque(
+        (item, np.eye(4), ()) for item in root.iter(f"{_CORE}item")
+    )
     read: dict[str, tuple[np.ndarray, np.ndarray]] = {}
     while todo:
-        use, parent, above = todo.pop(0)
+        use, parent, above = todo.popleft()
         if use.get(_PATH):
             raise DamagedMesh(
                 f"{where} keeps parts in other files of its archive, which is not read; export it as .stl"
             )
         name = use.get("objectid")
         total += 1
-        if name in above or len(above) > 50 or total > 100_000:
+        if name in above or len(above) > 50 or total > MOST_COPIES or len(todo) > MOST_COPIES:
             raise DamagedMesh(f"{where} has an object within itself, or too many copies; export it again")
         entry, place = objects[name], parent @ _matrix(use.get("transform"))
         if name not in read:
             mesh = entry.find(f"{_CORE}mesh")
             read[name] = _mesh(mesh) if mesh is not None else (np.zeros((0, 3)), np.zeros((0, 3), np.int64))
         vertices, triangles = read[name]
-        if sum(len(part) for _, part in parts) + len(triangles) > MOST_TRIANGLES:
+        unfolded += len(triangles)
+        if unfolded > MOST_TRIANGLES:
             raise DamagedMesh(f"{where} unfolds to more than {MOST_TRIANGLES:,} triangles; export a simpler mesh")
-        first = sum(len(part) for part, _ in parts)
         parts.append((vertices @ place[:3, :3].T + place[:3, 3], triangles + first))
+        first += len(vertices)
         todo += [(part, place, (*above, name)) for part in entry.iter(f"{_CORE}component")]
     if not parts:
         return np.zeros((0, 3)), np.zeros((0, 3), np.int64)

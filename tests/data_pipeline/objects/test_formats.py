@@ -468,3 +468,38 @@ def test_every_suffix_has_a_reader_and_damage_is_one_sentence():
             with pytest.raises((DamagedMesh, EmptyMesh)) as caught:
                 normalise(*parse_mesh(content, suffix, f"bad{suffix}"), f"bad{suffix}")
             assert "\n" not in str(caught.value)
+
+
+# ------------------------------------------------------------------------------------------------- small files, large meshes
+
+
+def test_small_files_that_unfold_without_end_are_refused(monkeypatch):
+    made = Glb()
+    mesh = made.mesh(made.primitive(BOX[0], triangles_of(BOX[1])))
+    made.document["accessors"].append({"componentType": 5126, "count": 4_000_000, "type": "VEC3"})
+    given = {"TRANSLATION": len(made.document["accessors"]) - 1}
+    made.node(mesh=mesh, extensions={"EXT_mesh_gpu_instancing": {"attributes": given}})
+    with pytest.raises(DamagedMesh, match="4,000,000 copies of a mesh"):
+        parse_mesh(made.bytes(), ".glb", "bomb.glb")
+
+    levels = "".join(
+        f'<node id="l{at}">{f"<instance_node url={chr(34)}#l{at + 1}{chr(34)}/>" * 20}</node>' for at in range(6)
+    )
+    levels += '<node id="l6"><instance_geometry url="#g"/></node>'
+    bomb = dae(*BOX).replace(
+        b"<library_visual_scenes>", f"<library_nodes>{levels}</library_nodes><library_visual_scenes>".encode()
+    )
+    bomb = bomb.replace(b'<instance_geometry url="#g"/></node>\n', b'<instance_node url="#l0"/></node>\n')
+    monkeypatch.setattr("data_pipeline.objects.formats.dae.MOST_COPIES", 500)
+    with pytest.raises(DamagedMesh, match="unfolds to more than 500 meshes"):
+        parse_mesh(bomb, ".dae", "bomb.dae")
+
+
+def test_a_polygon_of_many_corners():
+    count = 20_000
+    angle = np.linspace(0, 2 * np.pi, count, endpoint=False)
+    radius = 1 + 0.5 * (np.arange(count) % 2)
+    star = np.stack([radius * np.cos(angle), radius * np.sin(angle), 0 * angle], axis=1)
+    vertices, triangles = parse_mesh(off(star, [[*range(1, count), 0]]), ".off", "star.off")
+    true = 0.5 * abs(np.sum(star[:, 0] * np.roll(star[:, 1], -1) - star[:, 1] * np.roll(star[:, 0], -1)))
+    assert area(vertices, triangles) == pytest.approx(true)
