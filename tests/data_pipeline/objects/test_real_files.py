@@ -1,0 +1,41 @@
+"""Real meshes by other makers, where they lie beside the checkout, against a second reader."""
+
+from __future__ import annotations
+
+import io
+import json
+import zipfile
+
+import numpy as np
+import pytest
+import trimesh
+
+from data_pipeline.objects.archives import ZipMember
+from data_pipeline.objects.formats import parse_off
+from data_pipeline.objects.mesh import normalise
+from tests.conftest import beside_the_checkout
+from tests.data_pipeline.objects.making import area, extent
+
+
+def test_household_meshes_are_as_trimesh_reads_them():
+    path = beside_the_checkout("data", "household_cc0.zip")
+    with zipfile.ZipFile(path) as archive:
+        names = [name for name in archive.namelist() if name.endswith(".off")]
+        sizes = json.loads(archive.read("sizes.json"))
+        contents = {name: archive.read(name) for name in names}
+    assert len(names) == 39
+    assert sizes
+    for name, content in contents.items():
+        ours = ZipMember(str(path), name).load()
+        theirs = trimesh.load(io.BytesIO(content), file_type="off", process=False)
+        np.testing.assert_allclose(extent(*ours), extent(theirs.vertices, theirs.faces), rtol=1e-12)
+        assert area(*ours) == pytest.approx(theirs.area, rel=1e-9), name
+        normalise(*ours, name)
+
+
+def test_modelnet_meshes_have_the_counts_of_their_headers(real_meshes):
+    for path in sorted(real_meshes.glob("*.off")):
+        content = path.read_bytes()
+        counts = content[:64].removeprefix(b"OFF").split()[:2]
+        vertices, triangles = parse_off(content, path.name)
+        assert [len(vertices), len(triangles)] == [int(count) for count in counts]
