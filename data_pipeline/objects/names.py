@@ -39,6 +39,8 @@ def unread_reason(name: str) -> str | None:
         return f"is a {path.suffix} file, which is not read; convert it to .glb, .obj or .ply"
     if path.suffix in _PACKED and PurePosixPath(path.stem).suffix in (*MESH_SUFFIXES, *UNREAD_SUFFIXES):
         return f"is compressed ({path.suffix}); unpack it"
+    if path.suffix == ".dvc" and PurePosixPath(path.stem).suffix in (*MESH_SUFFIXES, *UNREAD_SUFFIXES):
+        return "stands for a file that is not here; fetch it with: dvc pull"
     return None
 
 

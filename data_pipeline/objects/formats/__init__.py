@@ -54,6 +54,10 @@ _Z_UP_READERS: dict[str, Callable[[bytes, str], tuple[np.ndarray, np.ndarray]]] 
 }
 
 
+_POINTERS = {b"version https://git-lfs.github.com/spec/": "git lfs pull", b"/annex/objects/": "git annex get"}
+"""How files begin that Git LFS and git-annex leave in place of files that were not fetched, and what fetches them."""
+
+
 def _no_sibling(name: str) -> bytes:
     raise DamagedMesh(f"it needs the file {name!r}, which cannot be read here")
 
@@ -74,6 +78,9 @@ def parse_mesh(
         DamagedMesh: if the file is not a readable mesh or is truncated.
     """
     axis = "z"
+    for begin, command in _POINTERS.items():
+        if content.startswith(begin) and len(content) < 1024:
+            raise DamagedMesh(f"{where} only stands for a file that is not here; fetch it with: {command}")
     try:
         if suffix in (".glb", ".gltf"):
             (vertices, triangles), axis = parse_gltf(content, where, sibling), "y"

@@ -10,9 +10,8 @@ from data_pipeline.errors import DamagedMesh
 from data_pipeline.objects.formats.polygons import triangulate
 from data_pipeline.objects.formats.text import COMMENT, columns, integers, text_of
 
-_HEADER = re.compile(
-    r"(?i:ST)?[Cc]?(?P<normals>N|n(?=off))?(?P<homogeneous>4)?(?P<dimensions>n)?(?i:OFF)(?P<rest>.*)", re.DOTALL
-)
+_HEADER = re.compile(r"(?P<kinds>(?:ST|C|N|4|st|c|n(?=off))*)(?P<dimensions>n)?(?i:OFF)(?P<rest>.*)", re.DOTALL)
+"""Kinds: ST texture coordinates, C colours, N normals after the coordinates of a vertex, 4 a fourth, homogeneous coordinate."""
 
 
 def parse_off(content: bytes, where: str) -> tuple[np.ndarray, np.ndarray]:
@@ -35,7 +34,7 @@ def parse_off(content: bytes, where: str) -> tuple[np.ndarray, np.ndarray]:
     header = _HEADER.match(lines[0].strip()) if lines else None
     if header is None:
         raise DamagedMesh(f"{where} is not an OFF mesh: it does not begin with 'OFF'; repair it or take it away")
-    if header["dimensions"] and not header["normals"]:
+    if header["dimensions"]:
         raise DamagedMesh(f"{where} is an nOFF mesh, which may have any number of dimensions; export it as OFF")
     lines[0] = header["rest"]
     counts, body = _counts(lines, where)
@@ -47,7 +46,7 @@ def parse_off(content: bytes, where: str) -> tuple[np.ndarray, np.ndarray]:
             f"{where} is cut short: {whole} of {vertex_count} vertices are there; fetch or export it again"
         )
     try:
-        if header["homogeneous"]:
+        if "4" in header["kinds"]:
             with np.errstate(all="ignore"):
                 points = columns(vertex_lines, 4)
                 vertices = points[:, :3] / points[:, 3:]
@@ -109,9 +108,9 @@ def _parse_binary(content: bytes, where: str) -> tuple[np.ndarray, np.ndarray]:
     header = _HEADER.match(first.split()[0].decode("latin-1"))
     if header is None or header["dimensions"]:
         raise DamagedMesh(f"{where} is not an OFF mesh: it does not begin with 'OFF'; repair it or take it away")
-    name = first.split()[0].upper()
-    width = 4 if header["homogeneous"] else 3
-    stride = width + 3 * bool(header["normals"]) + 4 * (b"C" in name) + 2 * (b"ST" in name)
+    kinds = header["kinds"].upper()
+    width = 4 if "4" in kinds else 3
+    stride = width + 3 * ("N" in kinds) + 4 * ("C" in kinds) + 2 * ("ST" in kinds)
     cut = f"{where} is cut short: its counts are not all there; fetch or export it again"
     if len(body) < 12:
         raise DamagedMesh(cut)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import codecs
 import re
 
 import numpy as np
@@ -22,10 +23,8 @@ def parse_stl(content: bytes, where: str) -> tuple[np.ndarray, np.ndarray]:
     count = int.from_bytes(content[80:84], "little") if len(content) >= 84 else -1
     if count >= 0 and len(content) == 84 + 50 * count:  # also if the text of the header begins with "solid"
         return _parse_binary(content, count)
-    start = content[:1024].lstrip(b"\xef\xbb\xbf \t\r\n\xff\xfe\0")[:5].replace(b"\0", b"").lower()
-    if start[:2] == b"so" and (
-        b"facet" in content[:100_000].replace(b"\0", b"").lower() or b"endsolid" in content.lower()
-    ):
+    begin = content[:512].removeprefix(codecs.BOM_UTF8).lstrip().lower()
+    if begin.startswith(b"solid") and re.search(rb"facet|end ?solid", content, re.IGNORECASE):
         return _parse_text(content, where)
     if count < 0:
         raise DamagedMesh(f"{where} is not a readable .stl mesh (neither text nor binary); repair it or take it away")

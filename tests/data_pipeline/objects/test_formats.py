@@ -55,6 +55,8 @@ def check(
         off(*BOX, "STOFF", " 0.5 0.5"),
         off(*BOX, "STCNOFF", " 0 0 1 1 2 3 255 0.5 0.5"),
         off(*BOX, "COFF", " 255 0 0 255", joined=True),
+        off(*BOX, "NCOFF", " 0 0 1 255 0 0 255"),
+        off(*BOX, "noff", " 0 0 1"),
         off(*BOX, "4OFF", " 1"),
         off(*BOX).replace(b" 6 0\n", b" 6\n"),
         off(*BOX).replace(b"8 6 0\n", b"8\n6\n0\n", 1).replace(b"6\n0\n", b"6 0\n"),
@@ -65,7 +67,8 @@ def check(
         off(*BOX).replace(b"\n", b"\r"),
         off(*BOX).replace(b" 0 1 3 2\n", b" 0 1 3 2 0.5 0.25 1\n"),
     ],
-    ids=["coff", "noff", "cnoff", "stoff", "stcnoff", "joined", "4off", "no-edges", "counts-apart", "bom", "utf8", "latin1",
+    ids=["coff", "noff", "cnoff", "stoff", "stcnoff", "joined", "ncoff", "lower", "4off", "no-edges", "counts-apart",
+         "bom", "utf8", "latin1",
          "utf16", "old-mac", "face-colours"],
 )  # fmt: skip
 def test_variants_of_off(content):
@@ -503,3 +506,16 @@ def test_a_polygon_of_many_corners():
     vertices, triangles = parse_mesh(off(star, [[*range(1, count), 0]]), ".off", "star.off")
     true = 0.5 * abs(np.sum(star[:, 0] * np.roll(star[:, 1], -1) - star[:, 1] * np.roll(star[:, 0], -1)))
     assert area(vertices, triangles) == pytest.approx(true)
+
+
+def test_flat_meshes_and_lines_beside_faces():
+    sheet = np.array([[-1, 0, -1], [1, 0, -1], [1, 0, 1], [-1, 0, 1]], float)
+    for content, suffix in (
+        (off(sheet, [[0, 1, 2, 3]]), ".off"),
+        (obj(sheet, [[0, 1, 2, 3]]) + b"v 9 9 9\nl 1 5\np 5\n", ".obj"),
+    ):
+        mesh = normalise(*parse_mesh(content, suffix, "sign"), "sign")
+        np.testing.assert_allclose(mesh.extent, (2, 0, 2))
+        assert area(mesh.vertices, mesh.faces) == pytest.approx(2)
+    with pytest.raises(EmptyMesh, match="no area"):
+        normalise(*parse_mesh(off(sheet[:3] * (1, 0, 0), [[0, 1, 2]]), ".off", "line"), "line")

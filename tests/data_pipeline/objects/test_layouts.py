@@ -335,3 +335,21 @@ def test_a_scan_is_described_in_one_sentence(tmp_path):
     (tmp_path / "scan.ply").write_bytes(ply(BOX[0], []))
     with pytest.raises(DataError, match=r"scan.ply cannot be used: .* point cloud of 8 points"):
         opened(tmp_path / "scan.ply")
+
+
+def test_files_that_stand_for_files_that_were_not_fetched(tmp_path):
+    pointer = b"version https://git-lfs.github.com/spec/v1\noid sha256:4d7a\nsize 12345\n"
+    files = members(("mug", "rack")) | {
+        "mug/train/a.off": pointer,
+        "mug/train/b.ply": b"/annex/objects/SHA256E-s9--a.ply\n",
+    }
+    source = opened(write(tmp_path / "set", files | {"mug/train/c.obj.dvc": b"outs:"}))
+    by_name = {entry.name: entry for entry in source.entries}
+    for name, command in (("a.off", "git lfs pull"), ("b.ply", "git annex get")):
+        with pytest.raises(
+            DamagedMesh, match=f"{name} only stands for a file that is not here; fetch it with: {command}"
+        ):
+            load_object(by_name[f"mug/train/{name}"])
+    assert source.left_out["train"] == {
+        "mug/train/c.obj.dvc": "stands for a file that is not here; fetch it with: dvc pull"
+    }
