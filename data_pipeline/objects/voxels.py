@@ -22,6 +22,9 @@ FEWEST_VOXELS = 5
 LARGEST_GRIDS = 4 << 30
 """Largest size in bytes of the unpacked grids of a split. They are read in parts and kept as one bit per cell."""
 
+MOST_OBJECTS = 1_000_000
+"""Largest number of objects of a split."""
+
 LARGEST_LABELS = 64 << 20
 """Largest size in bytes of unpacked labels or class names, and of grids in Fortran's order, which are not read in parts."""
 
@@ -153,6 +156,8 @@ def _labels(archive: zipfile.ZipFile, info: zipfile.ZipInfo, where: str) -> np.n
     labels = labels.reshape(-1)
     if not len(labels):
         raise DataError(f"{where}: {what} is empty; a voxel archive needs training and test objects")
+    if len(labels) > MOST_OBJECTS:
+        raise DataError(f"{where}: {what} has {len(labels):,} labels, more than {MOST_OBJECTS:,}; divide the archive")
     if not np.isfinite(labels).all() or (labels != np.floor(labels)).any():
         raise DataError(f"{where}: {what} has labels that are not whole numbers; give whole numbers from 0 on")
     if labels.min() < 0:

@@ -64,6 +64,7 @@ def test_class_names_may_come_along(tmp_path, names):
         ({"y_test": np.array([0, 2**40])}, "the label 1099511627776"),
         ({"y_test": np.array([0, 2**63], np.uint64)}, "the label 9223372036854775808"),
         ({"y_train": np.array([0, 1, 0, 10**6])}, "no training object has the label 2"),
+        ({"y_train": np.zeros(1_000_001, np.uint8)}, "1,000,001 labels, more than 1,000,000"),
         ({"y_train": np.array([0, 1, 0.5, 1])}, "not whole numbers"),
         ({"y_train": np.array([0, 1, np.nan, 1])}, "not whole numbers"),
         ({"y_train": np.array([0, 1j, 0, 1])}, "type complex128"),
