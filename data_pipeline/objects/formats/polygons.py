@@ -5,7 +5,12 @@ from __future__ import annotations
 import mapbox_earcut
 import numpy as np
 
+from data_pipeline.errors import DamagedMesh
 from data_pipeline.objects.checks import check_indices
+
+MOST_WORK = 1_500_000_000
+"""Largest sum of squared numbers of corners of the concave polygons of a file. Ear clipping needs time in proportion to it if a
+polygon crosses itself; this is about five seconds."""
 
 
 def triangulate(vertices: np.ndarray, corners: np.ndarray, counts: np.ndarray, where: str) -> np.ndarray:
@@ -21,7 +26,7 @@ def triangulate(vertices: np.ndarray, corners: np.ndarray, counts: np.ndarray, w
         where: name of the file for error messages.
 
     Raises:
-        DamagedMesh: if a corner names a vertex that does not exist.
+        DamagedMesh: if a corner names a vertex that does not exist, or concave polygons have too many corners.
     """
     corners, counts = np.asarray(corners, np.int64), np.asarray(counts, np.int64)
     if (counts == 3).all():
@@ -31,14 +36,21 @@ def triangulate(vertices: np.ndarray, corners: np.ndarray, counts: np.ndarray, w
     sizes = np.maximum(counts - 2, 0)
     offsets = np.cumsum(sizes) - sizes
     triangles = np.zeros((int(sizes.sum()), 3), np.int64)
-    for size in np.unique(counts[counts >= 3]):
+    work = 0
+    for size in np.unique(counts[counts >= 3]).tolist():
         rows = np.flatnonzero(counts == size)
         polygons = corners[starts[rows, None] + np.arange(size)]
         fans = np.stack(
             [np.broadcast_to(polygons[:, :1], (len(rows), size - 2)), polygons[:, 1:-1], polygons[:, 2:]], -1
         )
         if size > 3:
-            for at in np.flatnonzero(~_fan_is_exact(vertices, fans)):
+            concave = np.flatnonzero(~_fan_is_exact(vertices, fans))
+            work += len(concave) * size**2
+            if work > MOST_WORK:
+                raise DamagedMesh(
+                    f"{where} has concave polygons of up to {size:,} corners, too many to cut; export triangles"
+                )
+            for at in concave:
                 fans[at] = _clipped(vertices, polygons[at], fans[at])
         triangles[offsets[rows, None] + np.arange(size - 2)] = fans
     return triangles

@@ -519,3 +519,9 @@ def test_flat_meshes_and_lines_beside_faces():
         assert area(mesh.vertices, mesh.faces) == pytest.approx(2)
     with pytest.raises(EmptyMesh, match="no area"):
         normalise(*parse_mesh(off(sheet[:3] * (1, 0, 0), [[0, 1, 2]]), ".off", "line"), "line")
+
+
+def test_polygons_that_would_take_minutes_are_refused(monkeypatch):
+    monkeypatch.setattr("data_pipeline.objects.formats.polygons.MOST_WORK", 1000)
+    with pytest.raises(DamagedMesh, match="concave polygons of up to 40 corners, too many to cut"):
+        parse_mesh(off(np.random.default_rng(0).random((40, 3)), [list(range(40))]), ".off", "tangle.off")
