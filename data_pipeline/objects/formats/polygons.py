@@ -8,9 +8,9 @@ import numpy as np
 from data_pipeline.errors import DamagedMesh
 from data_pipeline.objects.checks import check_indices
 
-MOST_WORK = 1_500_000_000
+MOST_WORK = 600_000_000
 """Largest sum of squared numbers of corners of the concave polygons of a file. Ear clipping needs time in proportion to it if a
-polygon crosses itself; this is about five seconds."""
+polygon crosses itself; this is a few seconds."""
 
 
 def triangulate(vertices: np.ndarray, corners: np.ndarray, counts: np.ndarray, where: str) -> np.ndarray:
