@@ -78,7 +78,10 @@ def has_split_folders(found: Sequence[Found]) -> bool:
 def by_split_folders(found: Sequence[Found]) -> list[Found]:
     """Returns the files with class and split where their path has both."""
     places = [_split_at(one.parts) for one in found]
-    if _class_follows([(one.parts, at) for one, at in zip(found, places, strict=True) if at is not None]):
+    meshes = [
+        (one.parts, at) for one, at in zip(found, places, strict=True) if at is not None and one.recipe is not None
+    ]
+    if _class_follows(meshes):
         classes = [
             at + 1 if at is not None and at + 2 < len(one.parts) else None
             for one, at in zip(found, places, strict=True)
@@ -98,14 +101,15 @@ def by_split_folders(found: Sequence[Found]) -> list[Found]:
 def _class_follows(places: list[tuple[tuple[str, ...], int]]) -> bool:
     """Returns whether the folder of the class lies in that of the split, from paths and the places of their splits.
 
-    It does if no path has a folder before its split; or if all paths have a folder after it, the folders of training and test
-    have mostly the same names, as classes have and single objects have not, and there would be one class otherwise or
-    the folders hold several meshes.
+    It does if no path has a folder before its split, and any has one after it. It also does if all paths have a folder after their
+    split, the folders of training and test have mostly the same names, as classes have and single objects have not, and there
+    would be one class otherwise or the folders hold several meshes.
     """
-    if not places or not all(at + 2 < len(parts) for parts, at in places):
-        return False
+    nested = [at + 2 < len(parts) for parts, at in places]
     if not any(at for _, at in places):
-        return True
+        return any(nested)
+    if not all(nested):
+        return False
     inside: dict[str, set[str]] = {"train": set(), "test": set()}
     for parts, at in places:
         inside.setdefault(SPLIT_FOLDERS[parts[at].lower()], set()).add(parts[at + 1])

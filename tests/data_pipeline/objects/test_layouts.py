@@ -118,7 +118,17 @@ def test_the_folder_of_the_split_may_come_first(tmp_path):
     for root in (write(tmp_path / "a", files), tmp_path / "a" / "data"):
         source = opened(root)
         assert source.classes == ("mug", "rack")
+        assert not source.left_out
         assert of_split(source, "test") == ["test/mug/0.off", "test/mug/1.off", "test/rack/0.off", "test/rack/1.off"]
+
+
+def test_files_beside_the_classes_of_a_split_are_named(tmp_path):
+    files = {
+        f"{split}/{name}/{at}.off": off(*BOX) for split in ("train", "test") for name in ("a", "b") for at in range(2)
+    }
+    source = opened(write(tmp_path / "set", files | {"train/stray.off": off(*BOX), "train/notes.fbx": b""}))
+    assert len(source.entries) == 8
+    assert sorted(source.left_out["other"]) == ["train/notes.fbx", "train/stray.off"]
 
 
 def test_folders_of_objects_below_the_split(tmp_path):
