@@ -159,5 +159,5 @@ def list_zip(archive: Path, up: Up = "auto") -> Listing:
     meshes = [one for one in found if one.recipe is not None]
     if meshes and len(hindered) == len(meshes) and len(set(hindered)) == 1:
         raise DataError(f"{where}: every mesh in it, such as {'/'.join(meshes[0].parts)}, {hindered[0]}")
-    notes = (f"{replaced} members of {archive.name} are there twice; the later ones count",) if replaced else ()
+    notes = (f"members replaced by later ones of the same name: {replaced}",) if replaced else ()
     return Listing(tuple(sorted(found, key=lambda one: one.parts)), ignored, notes)

@@ -146,9 +146,7 @@ def _axes(members: list[Found], up: Up) -> tuple[str, ...]:
     if up == "auto" and declared:
         kinds = ", ".join(f"{counts[suffix]} {suffix}" for suffix in AXIS_DECLARED if counts[suffix])
         others = f"; the other {len(members) - declared} were taken as z up" if declared < len(members) else ""
-        return (
-            f"{kinds} files were turned to z up from the axis that their format declares{others} (--dataset.up auto)",
-        )
+        return (f"turned to z up from the axis that their format declares: {kinds}{others} (--dataset.up auto)",)
     return (f"all {len(members)} files were taken as {up} up (--dataset.up {up})",) if up != "auto" else ()
 
 

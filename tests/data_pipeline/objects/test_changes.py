@@ -123,12 +123,12 @@ def test_the_summary_says_which_axis_was_up(tmp_path, capsys):
     statistics = prepare(config, tmp_path / "data")
     assert extents(tmp_path / "data")["mug/train/m.glb"] == [1, 1, 3]
     assert load_statistics(tmp_path / "data") == statistics
-    assert statistics.notes[0].startswith("1 .glb files were turned to z up")
+    assert statistics.notes[0].startswith("turned to z up from the axis that their format declares: 1 .glb;")
     assert statistics.left_out["other"] == {"other/[x].obj": "lies in no folder of a class with train, val or test"}
     report_left_out(statistics)
     said = " ".join(capsys.readouterr().err.split())
     assert "left out: other/[x].obj: lies in no folder" in said
-    assert "1 .glb files were turned to z up" in said
+    assert "declares: 1 .glb; the other 6 were taken as z up" in said
 
 
 def test_an_object_that_no_view_shows_is_left_out_by_name(tmp_path):

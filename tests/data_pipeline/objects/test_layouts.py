@@ -325,8 +325,7 @@ def test_a_class_of_one_format_among_others(tmp_path):
     source = opened(write(tmp_path / "set", files))
     assert source.classes == ("arm", "base", "grip")
     assert source.notes == (
-        "4 .glb files were turned to z up from the axis that their format declares; the other 8 were taken as z up "
-        "(--dataset.up auto)",
+        "turned to z up from the axis that their format declares: 4 .glb; the other 8 were taken as z up (--dataset.up auto)",
     )
     assert opened(tmp_path / "set", up="z").notes == ("all 12 files were taken as z up (--dataset.up z)",)
     (first,) = [entry for entry in opened(tmp_path / "set", up="z").entries if entry.name == "arm/train/1.glb"]

@@ -57,7 +57,7 @@ def test_of_a_member_that_is_there_twice_the_later_counts(tmp_path):
     assert len(source.entries) == 6
     (entry,) = [entry for entry in source.entries if entry.name == "mug/train/mug_0.off"]
     assert load_object(entry).extent[2] == 5
-    assert source.said == ("2 members of set.zip are there twice; the later ones count",)
+    assert source.said == ("members replaced by later ones of the same name: 2",)
 
 
 def changed(content: bytes, *, flags: int | None = None, method: int | None = None) -> bytes:
