@@ -102,8 +102,8 @@ def _class_follows(places: list[tuple[tuple[str, ...], int]]) -> bool:
     """Returns whether the folder of the class lies in that of the split, from paths and the places of their splits.
 
     It does if no path has a folder before its split, and any has one after it. It also does if all paths have a folder after
-    their split, the folders of training and test have mostly the same names, as classes have and single objects have not, and there
-    would be one class otherwise or the folders hold several meshes.
+    their split, the folders of training and test have mostly the same names, as classes have and single objects have not, and
+    there would be one class otherwise or the folders hold several meshes.
     """
     nested = [at + 2 < len(parts) for parts, at in places]
     if not any(at for _, at in places):
