@@ -24,7 +24,8 @@ def parse_dae(content: bytes, where: str) -> tuple[np.ndarray, np.ndarray, str]:
         DamagedMesh: if the file is not a readable COLLADA mesh.
     """
     try:
-        return _parse(content, where)
+        with np.errstate(all="ignore"):  # numbers that are not finite are refused by the normalisation
+            return _parse(content, where)
     except DataError:
         raise
     except Exception as error:  # pycollada raises exceptions of many kinds

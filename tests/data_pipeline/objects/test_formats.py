@@ -273,6 +273,9 @@ def test_ply_triangle_strips(order):
         ((b"property float z", b"property float x"), "a property twice"),
         ((b"property float z", b"property quad z"), "the line 'property quad z'"),
         ((b"4 0 1 3 2", b"-4 0 1 3 2"), "the length -4"),
+        ((b"4 0 1 3 2", b"4 0 1.5 3 2"), "not whole numbers"),
+        ((b"4 0 1 3 2", b"4 0 nan 3 2"), "not whole numbers"),
+        ((b"4 0 1 3 2", b"4 0 1 3 1e30"), "beyond its 8"),
     ],
 )
 def test_damaged_ply_files_are_described(change, message):
