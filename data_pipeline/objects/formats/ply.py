@@ -102,9 +102,12 @@ def _triangles(vertices: np.ndarray, elements: list[_Element], found: dict[str, 
                 f"{where} is not a readable .ply mesh: its element {element.name!r} has no list of vertices; export it again"
             )
         corners: _List = found[element.name][named[0]]
-        if corners.values.dtype.kind == "f" and not (corners.values == np.floor(corners.values)).all():  # nor NaN
-            raise DamagedMesh(f"{where} has a face whose corners are not whole numbers; repair it or take it away")
-        values = corners.values.clip(-1, 2**53).astype(np.int64)
+        values = corners.values
+        if values.dtype.kind == "f":
+            if not (values == np.floor(values)).all():  # nor NaN
+                raise DamagedMesh(f"{where} has a face whose corners are not whole numbers; repair it or take it away")
+            values = values.clip(-1.0, 2.0**53)
+        values = values.astype(np.int64)
         if element.name != "tristrips":
             parts.append(triangulate(vertices, values, corners.counts, where))
             continue
