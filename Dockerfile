@@ -11,6 +11,6 @@ COPY requirements.lock pyproject.toml README.md LICENSE ./
 RUN python -m pip install --no-cache-dir -r requirements.lock
 COPY . .
 RUN python -m pip install --no-cache-dir --no-deps --editable . \
-    && if [ -n "$EXTRA" ]; then python -m pip install --no-cache-dir --constraint requirements.lock ".[$EXTRA]"; fi
+    && if [ -n "$EXTRA" ]; then python -m pip install --no-cache-dir --constraint requirements.lock --editable ".[$EXTRA]"; fi
 ENTRYPOINT ["mevs"]
 CMD ["--help"]

@@ -9,7 +9,6 @@ PYTEST := $(BIN)/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder
 # Packages are installed without bytecode, which each keeps once it was imported, unless told not to: then every start of `mevs`
 # would compile them again, for 12 seconds.
 unexport PYTHONDONTWRITEBYTECODE
-PYTEST := $(BIN)/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder
 
 .PHONY: demo test test-all lint bench wheel clean
 

@@ -11,7 +11,7 @@ from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
 
 from data_pipeline.errors import DataError
 from data_pipeline.files import as_read, read_json, write_json
-from eval.settings import Settings
+from eval.settings import PRESETS, Settings
 
 NAME = "run.json"
 
@@ -40,8 +40,10 @@ def load_run(out: Path) -> RunFile | None:
         return None
     try:
         content = read_json(path)
-        return RunFile(str(content["preset"]), from_plain(Settings, content["settings"], "settings"))
-    except (ValueError, KeyError, TypeError) as error:
+        if content["preset"] not in PRESETS:
+            raise ValueError(f"preset is {content['preset']!r}, not one of {', '.join(PRESETS)}")
+        return RunFile(content["preset"], from_plain(Settings, content["settings"], "settings"))
+    except (OSError, ValueError, KeyError, TypeError) as error:
         raise DataError(
             f"{path} cannot be read ({error}); delete it, and give the options of the run again, or choose another --out"
         ) from error

@@ -179,7 +179,10 @@ def learn_to_choose(settings: Settings, out: Path) -> Path:
     """Trains and evaluates learned fusion and learned view selection; returns the path of the page."""
     config, found = settings.learned, []
     check_learned(config, settings.dataset.capture.views)
-    seeds = [Stages(config, settings.dataset, out, seed, settings.entropy) for seed in range(config.seeds)]
+    seeds = [
+        Stages(config, settings.dataset, out, seed, settings.entropy)
+        for seed in range(config.seed, config.seed + config.seeds)
+    ]
     for stages in seeds:
         train_all(stages)
         found.append(measure(stages))

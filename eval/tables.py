@@ -84,5 +84,8 @@ def save_view_tables(path: Path, tables: ViewTables) -> None:
 
 def load_view_tables(path: Path) -> ViewTables:
     with np.load(path) as stored:
-        arrays = {name: stored[name] for name in ("labels", "logits", "predicted_entropy", "entropy")}
+        predicted = "predicted_entropy" if "predicted_entropy" in stored else "utility"  # its name in version 0.1
+        arrays = {name: stored[name] for name in ("labels", "logits", "entropy")} | {
+            "predicted_entropy": stored[predicted]
+        }
         return ViewTables(names=[str(name) for name in stored["names"]], **arrays, made_by=str(stored["made_by"]))

@@ -162,7 +162,9 @@ def scores_of_object(
 def _folder(out: Path, statistics: DatasetStatistics, config: RenderingConfig) -> Path:
     """The folder of the scores of one data set with these settings."""
     made = (str(value) for name, value in asdict(config).items() if name != "objects")
-    return out / "rendering" / "_".join((statistics.fingerprint, *made))
+    name = "_".join((statistics.fingerprint, *made))
+    older = out / "climbed" / name  # where version 0.1 stored them
+    return older if older.exists() else out / "rendering" / name
 
 
 def chosen_objects(config: RenderingConfig, objects: int) -> np.ndarray:
@@ -205,7 +207,6 @@ def ascend_objects(dataset: DataConfig, statistics: DatasetStatistics, out: Path
             "--rendering.objects and --rendering.faces must be at least 1, --rendering.starts at least 2 and "
             "--rendering.resolution at least 8"
         )
-    require_open3d()
     entries = {entry.name: entry for entry in open_objects(dataset).entries}
     names = objects_of(out / "data", "test", statistics)[0]
     folder, chosen = _folder(out, statistics, config), chosen_objects(config, len(names))
@@ -213,6 +214,8 @@ def ascend_objects(dataset: DataConfig, statistics: DatasetStatistics, out: Path
         if names[at] not in entries:
             raise DataError(f"{dataset.source} has no object {names[at]!r}; pass the --data from which {out} was made")
     jobs = [(int(at), entries[names[at]]) for at in chosen if not npz_of(folder, names[at]).exists()]
+    if jobs:
+        require_open3d()
     given = out / "data", statistics, folder, config
     with progress_bar("objects") as bar:
         line = bar.add_task("Gradient ascent", total=len(chosen), completed=len(chosen) - len(jobs), note="")

@@ -141,7 +141,13 @@ def measure(settings: Settings, folder: ThesisFolder, tables: dict[int, LatticeT
     ran_on = machine()
     thesis = settings.thesis
     counts = thesis.timing_runs, thesis.ascent_runs, thesis.ascent_starts, thesis.ascent_resolution
-    identity = [ran_on, counts, asdict(settings.entropy.network), *([] if why_no_open3d() is None else ["no Open3D"])]
+    identity = [
+        ran_on,
+        counts,
+        asdict(settings.entropy.network),
+        "ascent",
+        *([] if why_no_open3d() is None else ["no Open3D"]),
+    ]
 
     def compute() -> dict[str, Any]:
         console.print(

@@ -63,7 +63,7 @@ COMMANDS = {
         ("evaluation",),
         "stages:evaluate",
     ),
-    "report": Command("write report/index.html", "Options", (), "stages:report"),
+    "report": Command("write report/index.html", "Options", (), "stages:report", writes_run=False),
     "study thesis": Command(
         "every network, table and figure of the thesis, beside its own numbers",
         "ThesisOptions",

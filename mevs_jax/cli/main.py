@@ -39,30 +39,33 @@ def _run(name: str, arguments: list[str]) -> None:
     import json
 
     from data_pipeline.errors import DataError
-    from eval.run_file import NAME, configuration, load_run, save_run
+    from eval.run_file import NAME, configuration, load_run
     from eval.stages import check_output
-    from mevs_jax.cli.parsing import parse
+    from mevs_jax.cli.parsing import keep_settings, parse
 
     call = parse(name, arguments)
     if call.options.print_config:
         print(json.dumps(configuration(call.preset, call.settings), indent=1, default=str))
         return
     command = COMMANDS[name]
-    writes = command.writes_run and not getattr(call.options, "distributed", False)
-    if not getattr(call.options, "distributed", False):
-        check_output(call.out)
-    begins = writes and load_run(call.out) is None
-    typed = [*name.split(), *call.arguments]
+    if getattr(call.options, "distributed", False):
+        command.load()(call)  # which joins the other processes first; one of them keeps the settings
+        return
+    check_output(call.out)
+    begins = command.writes_run and load_run(call.out) is None
     if begins:  # a run that is interrupted continues with the same settings
-        save_run(call.out, call.preset, call.settings, typed)
+        keep_settings(call)
     try:
         command.load()(call)
     except DataError:
-        if begins:
+        if begins and not any((call.out / made).exists() for made in ("data", "classifier", "entropy", "learned")):
             (call.out / NAME).unlink(missing_ok=True)
         raise
-    if writes:
-        save_run(call.out, call.preset, call.settings, typed)
+    except FloatingPointError as error:
+        kept = f"; the settings of this run are in {call.out / NAME}, and options override them" if begins else ""
+        raise FloatingPointError(f"{error}{kept}") from error
+    if command.writes_run:
+        keep_settings(call)
 
 
 def _interrupt(signum: int, frame: object) -> None:
@@ -86,14 +89,15 @@ def _begin_with_large_pages() -> None:
 
 def _say_and_end(error: Exception) -> None:
     """Ends the program for an error that a person can act on; returns for any other."""
+    if isinstance(error, ModuleNotFoundError) and error.name and not _is_ours(error.name):
+        _fail(f"the package {error.name} is not installed; install the study's packages: pip install -e '.[study]'")
     from data_pipeline.errors import DataError
-    from train.devices import is_lost_process
-    from train.preemption import Preempted
 
     if isinstance(error, DataError | FloatingPointError):  # the latter: a loss that is not finite any more
         _fail(str(error))
-    if isinstance(error, ModuleNotFoundError) and error.name and not _is_ours(error.name):
-        _fail(f"the package {error.name} is not installed; install the study's packages: pip install -e '.[study]'")
+    from train.devices import is_lost_process
+    from train.preemption import Preempted
+
     if isinstance(error, Preempted):
         _fail(f"{error} and saved it; the same command goes on from there", 143)
     if is_lost_process(error):
@@ -120,7 +124,13 @@ def main() -> None:
     try:
         _main(sys.argv[1:])
         sys.stdout.flush()
-    except BrokenPipeError:  # whoever read the output has closed it, as `| head` does
+    except BrokenPipeError:
+        try:
+            sys.stdout.flush()
+        except BrokenPipeError:
+            pass  # the reader of the output has closed it, as `| head` does
+        else:
+            raise
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         sys.exit(0)
 

@@ -25,6 +25,7 @@ class Invocation:
         settings: all settings, with the options applied.
         preset: whose defaults they started from.
         out: the run directory.
+        groups: of settings that are the command's own.
         arguments: as typed, after the command.
     """
 
@@ -32,6 +33,7 @@ class Invocation:
     settings: Settings
     preset: str
     out: Path
+    groups: tuple[str, ...]
     arguments: list[str]
 
 
@@ -76,19 +78,36 @@ def parse(name: str, arguments: list[str]) -> Invocation:
         raise DataError(f"unknown preset {preset!r}; it is one of {', '.join(PRESETS)}")
     folder = Path(out or command.out.format(preset=preset or "small"))
     run = load_run(folder)
-    if run is not None and preset in (None, run.preset):
-        preset, base = run.preset, run.settings
-    else:
+    groups = list(command.settings)
+    if run is None:
         preset = preset or "small"
         base = PRESETS[preset]
-    groups = list(command.settings)
+    else:  # another preset is one for this command's own settings, not for a data set that is there already
+        other = groups if preset not in (None, run.preset) else []
+        other = [group for group in other if group != "dataset" or not (folder / "data").exists()]
+        base = replace(run.settings, **{group: getattr(PRESETS[preset or "small"], group) for group in other})
+        preset = (preset if groups else None) or run.preset
     made_before_run_json = run is None and (folder / "classifier" / "config.json").exists()
     if made_before_run_json:  # by version 0.1: its settings have to be given again
         groups += [group for group in ("dataset", "classifier", "entropy") if group not in groups]
     kind = _options_with_settings(command, {group: getattr(base, group) for group in groups})
     arguments = ["--help" if argument == "--help-all" else argument for argument in arguments]
     options: Any = tyro.cli(kind, prog=f"mevs {name}", description=f"{command.title}.", args=arguments)
-    return Invocation(options, settings_of(options, groups, base), preset, folder, arguments)
+    return Invocation(
+        options, settings_of(options, groups, base), preset, folder, tuple(groups), [*name.split(), *arguments]
+    )
+
+
+def keep_settings(call: Invocation) -> None:
+    """Makes the command's own settings those of the run, in its `run.json`; all others stay as they are there by now."""
+    from eval.run_file import load_run, save_run
+
+    run = load_run(call.out)
+    if run is None:
+        save_run(call.out, call.preset, call.settings, call.arguments)
+    else:
+        settings = replace(run.settings, **{group: getattr(call.settings, group) for group in call.groups})
+        save_run(call.out, run.preset, settings, call.arguments)
 
 
 def _options_with_settings(command: Command, groups: dict[str, Any]) -> type:
@@ -109,15 +128,16 @@ def settings_of(options: Any, groups: list[str], base: Settings) -> Settings:
         dataset = replace(dataset, capture=replace(dataset.capture, views=options.views))
     settings = replace(settings, dataset=dataset)
     seed = getattr(options, "seed", None)
-    return settings if seed is None else with_seed(settings, seed)
+    if seed is None:
+        return settings
+    seeded = [group for group in groups if group != "dataset"]
+    return replace(settings, **{group: with_seed(getattr(settings, group), seed) for group in seeded})
 
 
 def with_seed(settings: Any, seed: int) -> Any:
-    """Settings in which every field called `seed` or `data_seed` is this seed, but for the data set's own."""
+    """Settings in which every field called `seed` or `data_seed` is this seed."""
     changed = {}
     for field in dataclasses.fields(settings):
-        if field.name == "dataset":
-            continue
         value = getattr(settings, field.name)
         if field.name in ("seed", "data_seed"):
             changed[field.name] = seed

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from mevs_jax.cli.parsing import Invocation
+from mevs_jax.cli.parsing import Invocation, keep_settings
 
 
 def run(call: Invocation) -> None:
@@ -36,6 +36,9 @@ def train(call: Invocation) -> None:
     if call.options.distributed:
         join_processes()  # before anything is computed
         console.quiet = not is_first()
+        if is_first():
+            stages.check_output(call.out)
+            keep_settings(call)
     start = starting_weights(call.options.pretrained, call.settings.classifier.network)
     stages.train(call.settings, call.out, start, device_mesh(call.options.model_devices))
 

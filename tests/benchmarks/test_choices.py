@@ -52,7 +52,7 @@ def test_what_is_kept_says_what_the_walks_said(tmp_path, monkeypatch, random):
 
 
 def test_shares_that_would_not_be_exact_are_refused():
-    with pytest.raises(ValueError, match="divides none of"):
+    with pytest.raises(ValueError, match="the shares are no multiples of 1/240 or 1/720"):
         choices._packed("random right", np.array([1 / 7]))
 
 

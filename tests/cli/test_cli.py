@@ -20,7 +20,7 @@ from data_pipeline.dataset.statistics import load_statistics
 from eval.learned.page import write_learned_page
 from eval.rendering import policies as rendering_policies
 from eval.settings import TINY
-from eval.stages import ascend_on_objects, learn_to_choose
+from eval.stages import ascend_on_objects, learn_to_choose, report
 from tests.cli.conftest import MEVS, mevs
 from tests.conftest import open3d_or_skip
 
@@ -82,6 +82,7 @@ def test_learning_writes_a_page_and_is_not_repeated(learned, whole, tmp_path):
     made_once = summary.stat().st_mtime_ns
     assert learn_to_choose(settings, out).read_text() == page
     assert summary.stat().st_mtime_ns == made_once
+    assert "Learned fusion and view selection" in report(settings, "tiny", out).read_text()
     said = [
         "6 candidate views",
         "Unknown yaw",
@@ -124,7 +125,6 @@ def test_published_code_and_ascents_fill_their_tables(ascends, whole, tmp_path, 
     assert {"random", "predicted_entropy", "diff_volume", "diff_mesh"} <= set(metrics["climbing"]["policies"])
     page = (out / "report" / "index.html").read_text()
     assert "Choosing by differentiable rendering" in page
-    assert "Learned fusion and view selection" in page
     assert "mevs study published-code" not in page
     before = json.loads((whole / "metrics.json").read_text())
     assert before["compatibility"]["rows"]["text"] == made["rows"]["text"]
@@ -140,7 +140,17 @@ def test_published_code_and_ascents_fill_their_tables(ascends, whole, tmp_path, 
 )
 def test_live_walks_what_the_tables_say(policies, whole, tmp_path, refuses):
     shutil.copytree(whole, tmp_path / "run")
-    arguments = ("live", "--preset", "tiny", "--live.objects", "6", "--out", tmp_path / "run", "--live.policies")
+    arguments = (
+        "check",
+        "live",
+        "--preset",
+        "tiny",
+        "--live.objects",
+        "6",
+        "--out",
+        tmp_path / "run",
+        "--live.policies",
+    )
     result = mevs(*arguments, *policies)
     assert result.returncode == 0, result.stderr
     found = json.loads((tmp_path / "run" / "live.json").read_text())
@@ -163,7 +173,7 @@ def test_many_devices_say_what_one_does(whole, tmp_path, monkeypatch):
     with np.load(out / "tables" / "test.npz") as mine, np.load(whole / "tables" / "test.npz") as theirs:
         for name in ("logits", "predicted_entropy"):
             np.testing.assert_allclose(mine[name], theirs[name], rtol=1e-4, atol=1e-5)
-    result = mevs("live", "--preset", "tiny", "--live.objects", "6", "--out", out, "--live.policies", "random")
+    result = mevs("check", "live", "--preset", "tiny", "--live.objects", "6", "--out", out, "--live.policies", "random")
     assert result.returncode == 0, result.stderr
     agreement = json.loads((out / "live.json").read_text())["random"]
     assert agreement["walks"] == agreement["same"] == 6

@@ -188,9 +188,13 @@ def test_a_run_keeps_its_settings(whole, tmp_path, monkeypatch, capsys):
     assert (run.preset, run.settings) == ("tiny", TINY)
     call = parsing.parse("eval", ["--out", str(whole), "--seed", "3", "--evaluation.draws", "5"])
     assert (call.preset, call.settings.evaluation.draws, call.settings.evaluation.seed) == ("tiny", 5, 3)
-    assert call.settings.classifier.optimiser.seed == call.settings.entropy.optimiser.data_seed == 3
-    assert call.settings.dataset == TINY.dataset
-    assert parsing.parse("eval", ["--out", str(whole), "--preset", "small"]).settings == PRESETS["small"]
+    assert replace(call.settings, evaluation=TINY.evaluation) == TINY  # networks keep theirs
+    seeded = parsing.parse("train", ["--out", str(whole), "--seed", "3"]).settings
+    assert seeded.classifier.optimiser.seed == seeded.entropy.optimiser.data_seed == 3
+    assert seeded.dataset == TINY.dataset
+    assert parsing.parse("report", ["--out", str(whole), "--preset", "small"]).preset == "tiny"
+    other = parsing.parse("eval", ["--out", str(whole), "--preset", "small"]).settings
+    assert other == replace(TINY, evaluation=PRESETS["small"].evaluation)
     monkeypatch.setattr(sys, "argv", ["test", "train", "--out", str(whole), "--print-config"])
     cli.main()
     assert json.loads(capsys.readouterr().out) == {name: kept[name] for name in ("preset", "settings")}
@@ -202,7 +206,7 @@ def test_a_run_keeps_its_settings(whole, tmp_path, monkeypatch, capsys):
             "settings.evaluation.draws is 'many', not of type int",
         ),
         ("choice", {"settings": {"dataset": {"capture": {"backend": "magic"}}}}, "'magic', not one of"),
-        ("missing", {"preset": None}, None),
+        ("preset", {"preset": "foo"}, "preset is 'foo', not one of"),
     ):
         (tmp_path / name).mkdir()
         (tmp_path / name / "run.json").write_text(json.dumps(kept | change))

@@ -1,9 +1,6 @@
-"""Results stored under an identity are computed once for each identity; imports between packages go in one direction."""
+"""Results stored under an identity are computed once for each identity."""
 
 from __future__ import annotations
-
-import ast
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -11,9 +8,6 @@ import pytest
 from data_pipeline.errors import DataError
 from data_pipeline.files import read_json, write_json
 from train.kept import check_config, kept_array, kept_json
-
-ROOT = Path(__file__).parents[1]
-PACKAGES = ("mevs_jax", "data_pipeline", "train", "eval")  # each may import itself and those before it
 
 
 def test_content_is_computed_once_for_each_identity(tmp_path):
@@ -58,15 +52,3 @@ def test_a_folder_of_another_run_is_refused(tmp_path):
     check_config(tmp_path, {"seed": 1}, "a network trained")
     with pytest.raises(DataError, match="holds a network trained with other settings; choose another --out"):
         check_config(tmp_path, {"seed": 2}, "a network trained")
-
-
-@pytest.mark.parametrize("package", PACKAGES)
-def test_imports_go_downward(package):
-    above = PACKAGES[PACKAGES.index(package) + 1 :]
-    for path in (ROOT / package).rglob("*.py"):
-        if "cli" in path.relative_to(ROOT).parts:
-            continue  # the command line imports all packages
-        for node in ast.walk(ast.parse(path.read_text())):
-            names = [alias.name for alias in node.names] if isinstance(node, ast.Import) else []
-            names += [node.module] if isinstance(node, ast.ImportFrom) and node.module else []
-            assert not [name for name in names if name.split(".")[0] in above], path

@@ -27,9 +27,9 @@ def start(out: Path, *options: str, processes: int = 1, networks: tuple[str, ...
     if processes == 1:
         return [subprocess.Popen(command, stderr=subprocess.PIPE, text=True, env=os.environ | CPU)]
     with socket.socket() as free:
-        free.bind(("localhost", 0))
+        free.bind(("127.0.0.1", 0))
         port = free.getsockname()[1]
-    others = {"JAX_COORDINATOR_ADDRESS": f"localhost:{port}", "JAX_NUM_PROCESSES": str(processes)}
+    others = {"JAX_COORDINATOR_ADDRESS": f"127.0.0.1:{port}", "JAX_NUM_PROCESSES": str(processes)}
     return [
         subprocess.Popen(
             [*command, "--distributed"],

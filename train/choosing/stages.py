@@ -56,6 +56,8 @@ class LearnedConfig:
     """training of the policy that learns from walks alone, for comparison"""
     seeds: int = 1
     """number of complete trainings, each with other random weights"""
+    seed: int = 0
+    """seed of the first training; the others count up from it"""
     max_views: int = 8
     """views of a walk"""
     draws: int = 8
