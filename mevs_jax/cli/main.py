@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import gc
 import os
+import select
 import signal
 import sys
 from pathlib import Path
@@ -115,6 +116,13 @@ def _is_ours(module: str) -> bool:
     return module.split(".")[0] in ("mevs_jax", "data_pipeline", "train", "eval")
 
 
+def _output_is_closed() -> bool:
+    """Whether the reader of the standard output has closed it, as `| head` does."""
+    poll = select.poll()
+    poll.register(sys.stdout.fileno(), 0)
+    return any(event & select.POLLERR for _, event in poll.poll(0))
+
+
 def main() -> None:
     """The program `mevs`.
 
@@ -125,11 +133,7 @@ def main() -> None:
         _main(sys.argv[1:])
         sys.stdout.flush()
     except BrokenPipeError:
-        try:
-            sys.stdout.flush()
-        except BrokenPipeError:
-            pass  # the reader of the output has closed it, as `| head` does
-        else:
+        if not _output_is_closed():
             raise
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         sys.exit(0)
