@@ -364,7 +364,7 @@ def _example_walk(inputs: ReportInputs) -> str:
     stacked = tables.stacked()
 
     @jax.jit
-    def walk_along(table: ViewTable, start: int) -> Episode:
+    def walk_along(table: ViewTable, start: int | jax.Array) -> Episode:
         steps = min(4, statistics.views)
         return select_from_table(
             jax.random.key(0), table, Scene(graph, table.entropy), POLICIES["predicted_entropy"], start, max_views=steps
