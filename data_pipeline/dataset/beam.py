@@ -1,7 +1,7 @@
 """Creation of a data set with Apache Beam, for more objects than one machine can capture. The records are the same.
 
 Captures are written to a folder that all workers share; TFDS then reads them from there and writes shards. Both steps are Beam
-pipelines, for any runner. Install Beam with `pip install mevs-jax[beam]`.
+pipelines, for any runner. Install Beam with `pip install -e '.[beam]'`.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ def beam_options(options: str) -> Any:
     try:
         from apache_beam.options.pipeline_options import PipelineOptions
     except ImportError as error:
-        raise DataError("--beam needs Apache Beam; install it with: pip install mevs-jax[beam]") from error
+        raise DataError("--beam needs Apache Beam; install it with: pip install -e '.[beam]'") from error
     return PipelineOptions(shlex.split(options))
 
 

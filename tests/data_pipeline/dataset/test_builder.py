@@ -127,7 +127,7 @@ def test_stored_entropies_are_the_librarys(data):
 
 def test_beam_makes_the_same_records(data, tmp_path):
     """Beam's own local runner, where Beam is installed."""
-    pytest.importorskip("apache_beam", reason="Apache Beam is an optional extra: pip install mevs-jax[beam]")
+    pytest.importorskip("apache_beam", reason="Apache Beam is an optional extra: pip install -e '.[beam]'")
     folder = tmp_path / "data"
     by_beam, alone = prepare(CONFIG, folder, beam="--runner=DirectRunner"), load_statistics(data)
     assert by_beam == alone
