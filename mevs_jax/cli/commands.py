@@ -85,7 +85,7 @@ COMMANDS = {
     ),
     "study published-code": Command(
         "what the thesis's published code changes; evaluate and report again",
-        "PublishedCodeOptions",
+        "WithWeights",
         ("classifier", "evaluation"),
         "studies:published_code",
     ),

@@ -37,6 +37,14 @@ class WithSeed(Options):
 
 
 @dataclass(frozen=True)
+class WithWeights(WithSeed):
+    """Commands that train classifiers."""
+
+    pretrained: Annotated[tuple[Path, ...], _arg("FILE ...")] = ()
+    """ImageNet weights to start classifiers from: torchvision's resnet18 and resnet34, .pth or .safetensors"""
+
+
+@dataclass(frozen=True)
 class WithData(WithSeed):
     """Commands that make a data set."""
 
@@ -63,36 +71,20 @@ class DataOptions(WithViews):
 
 
 @dataclass(frozen=True)
-class RunOptions(WithViews):
+class RunOptions(WithViews, WithWeights):
     """Options of `mevs run`."""
 
-    pretrained: Annotated[tuple[Path, ...], _arg("FILE ...")] = ()
-    """ImageNet weights to start the classifier from: torchvision's .pth or .safetensors"""
-
 
 @dataclass(frozen=True)
-class ThesisOptions(WithData):
+class ThesisOptions(WithData, WithWeights):
     """Options of `mevs study thesis`."""
 
-    pretrained: Annotated[tuple[Path, ...], _arg("FILE ...")] = ()
-    """ImageNet weights to start the classifiers from: torchvision's resnet18 and resnet34"""
-
 
 @dataclass(frozen=True)
-class TrainOptions(WithSeed):
+class TrainOptions(WithWeights):
     """Options of `mevs train`."""
 
-    pretrained: Annotated[tuple[Path, ...], _arg("FILE ...")] = ()
-    """ImageNet weights to start the classifier from: torchvision's .pth or .safetensors"""
     distributed: Annotated[tyro.conf.FlagCreatePairsOff[bool], _arg("")] = False
     """this is one of several processes that train together (docs/scaling.md)"""
     model_devices: Annotated[int, _arg("N", "1")] = 1
     """devices that share one copy of a network's weights; batches are split over the others"""
-
-
-@dataclass(frozen=True)
-class PublishedCodeOptions(WithSeed):
-    """Options of `mevs study published-code`."""
-
-    pretrained: Annotated[tuple[Path, ...], _arg("FILE ...")] = ()
-    """ImageNet weights to start the classifier from: torchvision's .pth or .safetensors"""
