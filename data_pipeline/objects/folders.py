@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import os
 import stat
 from collections import Counter
@@ -40,7 +41,8 @@ def list_folder(root: Path, up: Up = "auto") -> Listing:
         except OSError as error:
             found.append(Found(parts, None, (folder,), linked, f"cannot be read: {error.strerror}"))
             continue
-        buffers = [os.path.join(folder, entry.name) for entry in entries if entry.name.lower().endswith(".bin")]
+        has_gltf = any(entry.name.lower().endswith(".gltf") for entry in entries)
+        buffers = _state_of_buffers(entries) if has_gltf else ""
         for entry in entries:
             place, is_link = (*parts, shown(entry.name)), linked or entry.is_symlink()
             if is_ignored(entry.name):
@@ -59,7 +61,7 @@ def list_folder(root: Path, up: Up = "auto") -> Listing:
                 continue
             suffix = PurePosixPath(entry.name).suffix.lower()
             if suffix in MESH_SUFFIXES and stat.S_ISREG(status.st_mode):
-                mark = stamp_of(status) + (_stamp_of_all(buffers) if suffix == ".gltf" else "")
+                mark = (buffers if suffix == ".gltf" else "") + stamp_of(status)
                 found.append(Found(place, MeshFile(entry.path, mark, up), identity, is_link))
             elif suffix in MESH_SUFFIXES:
                 found.append(Found(place, None, identity, is_link, "is not a regular file"))
@@ -80,12 +82,13 @@ def _add_broken(found: list[Found], entry: os.DirEntry[str], place: tuple[str, .
         found.append(Found(place, None, (entry.path,), True, reason))
 
 
-def _stamp_of_all(paths: list[str]) -> str:
-    """Returns the state of the files in which a glTF file may keep its numbers."""
+def _state_of_buffers(entries: list[os.DirEntry[str]]) -> str:
+    """Returns the state of the files in which the glTF files of a folder may keep their numbers; empty if there are none."""
     found = []
-    for path in paths:
-        try:
-            found.append(stamp_of(os.stat(path)))
-        except OSError:
-            found.append("gone")
-    return "".join(f"+{stamp}" for stamp in found)
+    for entry in entries:
+        if entry.name.lower().endswith(".bin"):
+            try:
+                found.append(f"{os.fsencode(entry.name)!r} {stamp_of(entry.stat())}")
+            except OSError:
+                found.append(f"{os.fsencode(entry.name)!r} gone")
+    return f"{hashlib.sha256(' '.join(found).encode()).hexdigest()[:16]}+" if found else ""

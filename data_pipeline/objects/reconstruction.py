@@ -5,6 +5,7 @@ Quadric decimation, Poisson reconstruction and voxelisation, with Open3D, as the
 
 from __future__ import annotations
 
+import functools
 from typing import Any
 
 import numpy as np
@@ -19,6 +20,7 @@ def _open3d() -> Any:
     return open3d
 
 
+@functools.cache
 def why_no_open3d() -> str | None:
     """Returns why Open3D cannot be loaded here, and what to do, in a clause; None if it can be."""
     try:
