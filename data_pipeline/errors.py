@@ -16,3 +16,13 @@ class DamagedMesh(DataError):
 
 class EmptyMesh(Exception):
     """A valid mesh without a surface. The object is left out of the data set and listed in its summary with this message."""
+
+
+def reason_of(error: Exception) -> str:
+    """Returns the first line of the message of a library's error, or the name of its kind if there is none."""
+    return (str(error).splitlines() or [""])[0] or type(error).__name__
+
+
+def kind_and_reason_of(error: Exception) -> str:
+    """Returns the kind and the first line of the message of a library's error, at most 120 characters."""
+    return f"{type(error).__name__}: {error}".splitlines()[0][:120]

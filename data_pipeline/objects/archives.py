@@ -17,7 +17,7 @@ from pathlib import Path, PurePosixPath
 
 import numpy as np
 
-from data_pipeline.errors import DamagedMesh, DataError
+from data_pipeline.errors import DamagedMesh, DataError, reason_of
 from data_pipeline.objects.formats import MESH_SUFFIXES, Up, parse_mesh
 from data_pipeline.objects.layout import Found, Listing
 from data_pipeline.objects.names import is_ignored, kind_of_ignored, shown, unread_reason
@@ -95,8 +95,9 @@ class ZipMember:
         except DataError:
             raise
         except Exception as error:  # damaged streams raise errors of zipfile, zlib, lzma, struct and others
-            reason = (f"{error}".splitlines() or [""])[0] or type(error).__name__
-            raise DamagedMesh(f"{where} cannot be unpacked ({reason}); download or pack the archive again") from error
+            raise DamagedMesh(
+                f"{where} cannot be unpacked ({reason_of(error)}); download or pack the archive again"
+            ) from error
         if len(content) > LARGEST_MEMBER:
             raise DamagedMesh(f"{where} {_too_large()}")
         return content
@@ -133,8 +134,7 @@ def list_zip(archive: Path, up: Up = "auto") -> Listing:
     try:
         _, members, replaced = _open(str(archive))
     except Exception as error:  # damaged directories raise errors of zipfile, struct and others
-        reason: str = (f"{error}".splitlines() or [""])[0] or type(error).__name__
-        raise DataError(f"{where} is not a readable zip file ({reason}); download it again") from error
+        raise DataError(f"{where} is not a readable zip file ({reason_of(error)}); download it again") from error
     found: list[Found] = []
     ignored: Counter[str] = Counter()
     hindered: list[str] = []

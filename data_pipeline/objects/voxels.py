@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from data_pipeline.errors import DataError, EmptyMesh
+from data_pipeline.errors import DataError, EmptyMesh, reason_of
 from data_pipeline.objects.furniture import CLASSES as FURNITURE_CLASSES
 from data_pipeline.objects.mesh import SOURCE_SPLITS, ObjectEntry, ObjectSource
 from data_pipeline.objects.names import shown
@@ -88,8 +88,7 @@ def voxel_archive(path: Path) -> ObjectSource:
     except DataError:
         raise
     except Exception as error:  # damaged archives raise errors of zipfile, zlib, struct, NumPy and others
-        reason = (str(error).splitlines() or [""])[0] or type(error).__name__
-        raise DataError(f"{where} is not a readable .npz archive ({reason}); download it again") from error
+        raise DataError(f"{where} is not a readable .npz archive ({reason_of(error)}); download it again") from error
     return ObjectSource(shown(path.stem), classes, tuple(entries))
 
 

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from data_pipeline.errors import DamagedMesh, DataError
+from data_pipeline.errors import DamagedMesh, DataError, kind_and_reason_of
 from data_pipeline.objects.formats.polygons import triangulate
 
 MOST_CORNERS, MOST_COPIES = 50_000_000, 10_000
@@ -29,7 +29,7 @@ def parse_dae(content: bytes, where: str) -> tuple[np.ndarray, np.ndarray, str]:
     except DataError:
         raise
     except Exception as error:  # pycollada raises exceptions of many kinds
-        reason = (f"{type(error).__name__}: {error}".splitlines() or [""])[0][:120]
+        reason = kind_and_reason_of(error)
         raise DamagedMesh(f"{where} is not a readable .dae mesh ({reason}); repair it or take it away") from error
 
 

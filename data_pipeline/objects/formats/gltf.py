@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from data_pipeline.errors import DamagedMesh, DataError
+from data_pipeline.errors import DamagedMesh, DataError, kind_and_reason_of
 from data_pipeline.objects.checks import check_indices
 from data_pipeline.objects.formats.polygons import fan_triangles, strip_triangles
 
@@ -63,7 +63,7 @@ def parse_gltf(content: bytes, where: str, sibling: Callable[[str], bytes]) -> t
         MemoryError,
     ) as error:
         # A document of another form than the specification's may fail anywhere.
-        reason = f"{type(error).__name__}: {error}".splitlines()[0][:120]
+        reason = kind_and_reason_of(error)
         raise DamagedMesh(f"{where} is not a readable glTF mesh ({reason}); repair it or take it away") from error
 
 

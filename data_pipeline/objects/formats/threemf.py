@@ -10,7 +10,7 @@ from xml.etree import ElementTree
 
 import numpy as np
 
-from data_pipeline.errors import DamagedMesh, DataError
+from data_pipeline.errors import DamagedMesh, DataError, kind_and_reason_of
 
 _CORE = "{http://schemas.microsoft.com/3dmanufacturing/core/2015/02}"
 _PATH = "{http://schemas.microsoft.com/3dmanufacturing/production/2015/06}path"
@@ -36,7 +36,7 @@ def parse_3mf(content: bytes, where: str) -> tuple[np.ndarray, np.ndarray]:
     except DataError:
         raise
     except Exception as error:  # zip streams and XML fail in many ways
-        reason = (f"{type(error).__name__}: {error}".splitlines() or [""])[0][:120]
+        reason = kind_and_reason_of(error)
         raise DamagedMesh(f"{where} is not a readable .3mf mesh ({reason}); repair it or take it away") from error
 
 

@@ -11,7 +11,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pytest
 
+from data_pipeline.objects.formats import parse_mesh
 from data_pipeline.objects.sources import open_source
 
 Polygons = Sequence[Sequence[int]]
@@ -242,3 +244,16 @@ def area(vertices: np.ndarray, triangles: np.ndarray) -> float:
 def extent(vertices: np.ndarray, triangles: np.ndarray) -> np.ndarray:
     used = vertices[np.unique(triangles)]
     return used.max(axis=0) - used.min(axis=0)
+
+
+BOX_AREA = 2 * (2 + 6 + 3)
+"""Of `box()`."""
+
+
+def check(
+    content: bytes, suffix: str, size=(1, 2, 3), surface: float = BOX_AREA, *, rtol: float = 1e-6, **options
+) -> None:
+    """A file has this extent and surface."""
+    mesh = parse_mesh(content, suffix, f"thing{suffix}", **options)
+    np.testing.assert_allclose(extent(*mesh), size, rtol=rtol, atol=1e-6)
+    assert area(*mesh) == pytest.approx(surface, rel=max(rtol, 1e-6))

@@ -13,9 +13,11 @@ from data_pipeline.errors import DamagedMesh, EmptyMesh
 from data_pipeline.objects.formats import MESH_SUFFIXES, parse_mesh
 from data_pipeline.objects.mesh import normalise
 from tests.data_pipeline.objects.making import (
+    BOX_AREA,
     U_AREA,
     area,
     box,
+    check,
     dae,
     extent,
     obj,
@@ -27,15 +29,6 @@ from tests.data_pipeline.objects.making import (
 )
 
 BOX, U = box(), u_profile()
-BOX_AREA = 2 * (2 + 6 + 3)
-
-
-def check(
-    content: bytes, suffix: str, size=(1, 2, 3), surface: float = BOX_AREA, *, rtol: float = 1e-6, **options
-) -> None:
-    mesh = parse_mesh(content, suffix, f"thing{suffix}", **options)
-    np.testing.assert_allclose(extent(*mesh), size, rtol=rtol, atol=1e-6)
-    assert area(*mesh) == pytest.approx(surface, rel=max(rtol, 1e-6))
 
 
 # -------------------------------------------------------------------------------------------------------------------- OFF
