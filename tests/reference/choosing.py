@@ -73,7 +73,7 @@ def plain_walk(fusion, data, index, scores, start, steps):
 
 
 def telling(objects: int, seed: int) -> Features:
-    """Each class is told apart by one view: at view 0 classes pair up, and which view settles the pair depends on the pair."""
+    """One view identifies each class: at view 0 classes look alike in pairs, and another view separates each pair."""
     random = np.random.default_rng(seed)
     labels = random.integers(0, 4, objects)
     logits = random.normal(0, 0.3, (objects, VIEWS, 4))
