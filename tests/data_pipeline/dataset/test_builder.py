@@ -143,6 +143,6 @@ def test_beam_makes_the_same_records(data, tmp_path):
 
 def test_beam_where_it_is_not_installed(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "apache_beam.options.pipeline_options", None)
-    with pytest.raises(DataError, match=r"pip install mevs-jax\[beam\]"):
+    with pytest.raises(DataError, match=r"pip install -e '\.\[beam\]'"):
         prepare(CONFIG, tmp_path / "data", beam="")
     assert not (tmp_path / "data").exists()
