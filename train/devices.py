@@ -7,6 +7,7 @@ their last axis. The compiler derives the rest.
 from __future__ import annotations
 
 import os
+import socket
 from collections.abc import Callable
 from typing import Any
 
@@ -29,7 +30,7 @@ def join_processes() -> None:
     JAX_COORDINATOR_ADDRESS (host:port of process 0), JAX_NUM_PROCESSES and JAX_PROCESS_ID.
 
     Raises:
-        DataError: if the other processes cannot be found or reached.
+        DataError: if the other processes cannot be found or reached, or cannot reach this one.
     """
     numbers = {}
     try:
@@ -42,6 +43,28 @@ def join_processes() -> None:
             f"--distributed cannot join the other processes ({str(error).splitlines()[0]}); outside Slurm, Open MPI, Kubernetes "
             f"and Cloud TPUs set JAX_COORDINATOR_ADDRESS=host:port, JAX_NUM_PROCESSES and JAX_PROCESS_ID for each"
         ) from error
+    try:
+        jax.devices()
+    except RuntimeError as error:
+        if "gloo" not in str(error) or not (name := unresolved_name()):
+            raise
+        raise DataError(
+            f"--distributed on CPUs needs the name of this machine to have an address, and {name} has none; add a line to "
+            f"/etc/hosts: its address, then {name}"
+        ) from error
+
+
+def unresolved_name() -> str:
+    """Returns the name of this machine if it has no address, else an empty string.
+
+    Processes that train on CPUs find each other by these names (JAX's Gloo collectives).
+    """
+    name = socket.gethostname()
+    try:
+        socket.getaddrinfo(name, None)
+    except OSError:
+        return name
+    return ""
 
 
 def is_first() -> bool:

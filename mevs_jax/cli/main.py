@@ -129,14 +129,19 @@ def main() -> None:
     Exit codes: 0; 2 for input that cannot be used; 130 when interrupted; 143 when asked to end (SIGTERM), with everything
     saved; 75 when another process of the run was lost. After the last three, the same command goes on where it stopped.
     """
+    for stream in ("stdout", "stderr"):
+        if getattr(sys, stream) is None:  # the program was started without it: `>&-`
+            setattr(sys, stream, open(os.devnull, "w"))  # noqa: SIM115  # open until the program ends
     try:
-        _main(sys.argv[1:])
-        sys.stdout.flush()
-    except BrokenPipeError:
+        try:
+            _main(sys.argv[1:])
+        finally:
+            sys.stdout.flush()
+    except BrokenPipeError as error:
         if not _output_is_closed():
             raise
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        sys.exit(0)
+        sys.exit(error.__context__.code if isinstance(error.__context__, SystemExit) else 0)
 
 
 def _main(arguments: list[str]) -> None:

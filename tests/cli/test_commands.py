@@ -226,12 +226,21 @@ def test_a_run_that_cannot_begin_leaves_no_settings(tmp_path, refuses):
 
 @pytest.mark.parametrize("arguments", [["--help"], ["run", "--help-all"]], ids=len)
 def test_a_reader_may_close_the_output(arguments):
-    """As `| head` does: no traceback, no complaint."""
+    """As `| head` does: no traceback, no complaint. The output is buffered, as it is for users."""
     reading, writing = os.pipe()
     os.close(reading)
-    ended = subprocess.run([*MEVS, *arguments], stdout=writing, stderr=subprocess.PIPE, text=True)
+    buffered = os.environ | {"PYTHONUNBUFFERED": ""}
+    ended = subprocess.run([*MEVS, *arguments], stdout=writing, stderr=subprocess.PIPE, text=True, env=buffered)
     os.close(writing)
-    assert ended.stderr == ""
+    assert (ended.returncode, ended.stderr) == (0, "")
+
+
+def test_there_may_be_no_output_at_all():
+    """As with `>&-`."""
+    ended = subprocess.run(
+        ["sh", "-c", f'exec "{sys.executable}" -m mevs_jax --help >&-'], stderr=subprocess.PIPE, text=True
+    )
+    assert (ended.returncode, ended.stderr) == (0, "")
 
 
 def test_the_library_alone_says_that_studies_need_a_checkout(tmp_path):

@@ -64,9 +64,8 @@ def test_steps_on_many_devices_equal_those_on_one(data, devices, steps):
             np.testing.assert_allclose(losses, alone[name], rtol=1e-5, err_msg=f"{name} on {mesh}")
 
 
-@pytest.mark.parametrize(
-    "before", [((2, 7),), pytest.param(((8, 7), (4, 19)), marks=pytest.mark.slow)], ids=["2 to 1", "8 to 4 to 1"]
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("before", [((2, 7),), ((8, 7), (4, 19))], ids=["2 to 1", "8 to 4 to 1"])
 def test_a_run_goes_on_with_fewer_devices(before, data, tmp_path):
     """Some devices, told to end at a batch; then perhaps fewer, told to end; then one: as if one had done it all."""
     whole, moved = tmp_path / "whole", tmp_path / "moved"
@@ -160,24 +159,23 @@ def test_parts_of_a_batch_add_up(data):
     assert {int(leaf) for leaf in network_in_parts[2] if leaf.ndim == 0} == {4}  # batch norm saw four
 
 
-def test_half_precision_keeps_whole_weights(data):
+@pytest.mark.parametrize("network", [0, pytest.param(1, marks=pytest.mark.slow)], ids=["classifier", "entropy"])
+def test_half_precision_keeps_whole_weights(network, data):
     """bfloat16 in the layers: weights and statistics stay float32, and the loss is nearly the same."""
-    batch_of = {}
-    for task in tasks(SETTINGS, load_statistics(data)):
-        found = []
-        for compute in ("float32", "bfloat16"):
-            one = replace(task, optimiser=replace(task.optimiser, compute=compute))
-            batch = batch_of.setdefault(task.name, next(train_batches(data, task.batches)))
-            structure, state = initial_state(one, 0)
-            step = jax.jit(train_step_of(one, structure, 10))
-            state, loss = step(state, batch, one.hyperparameters)
-            found.append(float(loss))
-            floats = [leaf for leaf in jax.tree.leaves(state) if jnp.issubdtype(leaf.dtype, jnp.floating)]
-            assert {leaf.dtype for leaf in floats} == {jnp.dtype("float32")}
-            traced = str(jax.make_jaxpr(step)(state, batch, one.hyperparameters))
-            assert ("bf16" in traced) == (compute == "bfloat16")
-        assert found[1] == pytest.approx(found[0], rel=0.03)
-        assert found[1] != found[0]
+    task, found = tasks(SETTINGS, load_statistics(data))[network], []
+    batch = next(train_batches(data, task.batches))
+    for compute in ("float32", "bfloat16"):
+        one = replace(task, optimiser=replace(task.optimiser, compute=compute))
+        structure, state = initial_state(one, 0)
+        step = jax.jit(train_step_of(one, structure, 10))
+        state, loss = step(state, batch, one.hyperparameters)
+        found.append(float(loss))
+        floats = [leaf for leaf in jax.tree.leaves(state) if jnp.issubdtype(leaf.dtype, jnp.floating)]
+        assert {leaf.dtype for leaf in floats} == {jnp.dtype("float32")}
+        traced = str(jax.make_jaxpr(step)(state, batch, one.hyperparameters))
+        assert ("bf16" in traced) == (compute == "bfloat16")
+    assert found[1] == pytest.approx(found[0], rel=0.03)
+    assert found[1] != found[0]
 
 
 def test_large_weights_are_split_over_the_model_axis():

@@ -23,10 +23,8 @@ from train.choosing.policy import (
 )
 
 
-@pytest.mark.parametrize(
-    "every", [False, pytest.param(True, marks=pytest.mark.slow)], ids=["one learner", "every learner"]
-)
-def test_what_looking_was_worth_is_learned_and_the_study_says_so(every, adding):
+@pytest.mark.slow
+def test_what_looking_was_worth_is_learned_and_the_study_says_so(adding):
     """The further learners ask the same policy otherwise, as tests/mevs_jax/policies/test_learned.py checks step by step."""
     parts = [(adding, telling(160, seed)) for seed in (0, 1)]
     validation, test = telling(120, 2), telling(120, 3)
@@ -45,7 +43,7 @@ def test_what_looking_was_worth_is_learned_and_the_study_says_so(every, adding):
         adding,
         [
             Learner("learned", "view policy", policy),
-            *(others if every else ()),
+            *others,
             Learner("unsure", "another fusion", policy, fusion=replace(adding, temperatures=jnp.full(1, 50.0))),
         ],
         OnLattice(validation),
@@ -77,7 +75,7 @@ def test_what_looking_was_worth_is_learned_and_the_study_says_so(every, adding):
     assert found["gap_closed"]["learned"][1] > 0.4
     assert found["trying_starts"] == 6  # all of them, where there are so few
     assert after["label_oracle"][1] >= after["learned"][1]
-    for name in ("look_ahead", "learned_and_table") if every else ():
+    for name in ("look_ahead", "learned_and_table"):
         assert after[name][2] > after["random"][2] + 0.1
     first = found["policies"]["unsure"]["temperatures"][0] / found["policies"]["learned"]["temperatures"][0]
     assert first == pytest.approx(1 / 50, rel=1e-3)  # of a fusion of its own

@@ -14,7 +14,7 @@ from mevs_jax import cameras_at, fibonacci_sphere
 from mevs_jax.rendering import render_depth
 from tests.conftest import open3d_or_skip
 
-VIEWS = 12
+VIEWS, SEEN = 12, 6
 
 
 def test_distinct_optima_come_first_in_their_order_each_as_its_nearest_candidate(random):
@@ -41,7 +41,7 @@ def test_objects_are_spread_evenly_and_never_twice():
 
 
 def views_of(mesh: Mesh, side: int) -> tuple[np.ndarray, np.ndarray]:
-    cameras = cameras_at(fibonacci_sphere(VIEWS), resolution=side)
+    cameras = cameras_at(fibonacci_sphere(SEEN), resolution=side)
     images = []
     for pose in cameras.pose:
         depth = np.asarray(render_depth(mesh.vertices[mesh.faces], cameras.replace(pose=pose)).depth)
@@ -55,11 +55,11 @@ def test_an_object_gets_a_row_for_every_view_and_what_shows_nothing_is_counted()
     depth, poses = views_of(mesh, 32)
     depth[4] = 0  # as if the object were out of sight
     config = RenderingConfig(starts=2, resolution=16, faces=64)
-    found = scores_of_object(mesh, depth, poses, np.pi / 3, jnp.asarray(fibonacci_sphere(VIEWS)), config)
+    found = scores_of_object(mesh, depth, poses, np.pi / 3, jnp.asarray(fibonacci_sphere(SEEN)), config)
     assert found.pop("without_surface") == 1
     assert set(found) == {rung.policy for rung in ASCENT_RUNGS}
     for name, rows in found.items():
-        assert rows.shape == (VIEWS, VIEWS)
+        assert rows.shape == (SEEN, SEEN)
         assert np.isfinite(rows).all()
         same = (np.argmax(rows, axis=1) == np.argmax(rows[0])).all()
         assert same == name.endswith("_whole")  # the whole object is the same after every view

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import importlib.util
-from functools import cache
+from collections.abc import Callable
+from functools import cache, partial
 from pathlib import Path
 
 import jax
@@ -18,6 +19,17 @@ from tests.reference.weights import made_up_inputs, made_up_weights
 
 GOLDEN = Path(__file__).parents[2] / "reference" / "golden.npz"
 KINDS = ("resnet18", "resnet34", "pointnet2")
+
+
+@partial(nnx.jit, static_argnames="make")
+def made(make: Callable[[], nnx.Module]) -> nnx.Module:
+    """A network with random weights, drawn by one program."""
+    return make()
+
+
+def outputs(network: nnx.Module, inputs: np.ndarray | jax.Array) -> jax.Array:
+    """What a network returns, by one program that is traced anew."""
+    return nnx.jit(lambda network, inputs: network(inputs))(network, inputs)
 
 
 @pytest.mark.parametrize(
@@ -154,10 +166,11 @@ def test_forward_gradients_and_running_statistics_equal_live_pytorch(kind):
 
 
 def test_one_input_equals_a_batch_of_one():
-    network = ResNet(depth=18, width=8, rngs=nnx.Rngs(0))
+    network = made(lambda: ResNet(depth=18, width=8, rngs=nnx.Rngs(0)))
     images = jax.random.normal(jax.random.key(0), (3, 32, 32, 3))
-    np.testing.assert_allclose(network(images[1]), network(images)[1], atol=1e-5)
-    assert network(images[1]).shape == (10,)
+    one = outputs(network, images[1])
+    np.testing.assert_allclose(one, outputs(network, images)[1], atol=1e-5)
+    assert one.shape == (10,)
 
 
 def test_small_maps_as_matrix_product_equal_the_convolution(monkeypatch):
@@ -184,36 +197,38 @@ def test_batch_norm_in_training_updates_with_the_momentum_given():
 
 def test_directions_stand_in_the_place_of_the_normals(random):
     """Zeros there are the network of the thesis; anything else is seen."""
-    network = PointNet2(views=4, rngs=nnx.Rngs(0))
+    network = made(lambda: PointNet2(views=4, rngs=nnx.Rngs(0)))
     cloud = random.normal(0, 0.4, (600, 3)).astype(np.float32)
     directions = random.normal(0, 1, (600, 3)).astype(np.float32)
-    nothing = network(np.concatenate([cloud, np.zeros_like(cloud)], axis=1))
-    found = network(cloud)
+    nothing = outputs(network, np.concatenate([cloud, np.zeros_like(cloud)], axis=1))
+    found, embedded = nnx.jit(lambda network, cloud: (network(cloud), network.embed(cloud)))(network, cloud)
     np.testing.assert_allclose(found, nothing, rtol=1e-5, atol=1e-6)
-    embedded = network.embed(cloud)
     assert embedded.shape == (1024,)
     hidden = embedded
     for weights, bias in network.head.folded():
         hidden = jax.nn.relu(hidden @ weights + bias)
     np.testing.assert_allclose(network.out(hidden), found, rtol=1e-4, atol=1e-6)
-    assert np.abs(np.asarray(network(np.concatenate([cloud, directions], axis=1)) - nothing)).max() > 1e-3
+    seen = outputs(network, np.concatenate([cloud, directions], axis=1))
+    assert np.abs(np.asarray(seen - nothing)).max() > 1e-3
 
 
 @pytest.mark.parametrize("columns", [3, 6])
 def test_pieces_of_a_cloud_equal_the_whole(columns, monkeypatch, random):
     """On a CPU neighbourhoods pass in pieces, elsewhere all at once; in bfloat16 coordinates keep their own precision."""
-    network = PointNet2(views=4, rngs=nnx.Rngs(0))
+    network, halved = (
+        made(lambda dtype=dtype: PointNet2(views=4, dtype=jnp.dtype(dtype), rngs=nnx.Rngs(0)))
+        for dtype in ("float32", "bfloat16")
+    )
     clouds = random.normal(0, 0.4, (3, 700, columns)).astype(np.float32)
-    pieces = network(clouds)
-    rough = PointNet2(views=4, rngs=nnx.Rngs(0), dtype=jnp.dtype("bfloat16"))(clouds)
+    pieces, rough = outputs(network, clouds), outputs(halved, clouds)
     monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
-    np.testing.assert_allclose(network(clouds), pieces, rtol=1e-4, atol=1e-5)
+    np.testing.assert_allclose(outputs(network, clouds), pieces, rtol=1e-4, atol=1e-5)
     assert rough.dtype == jnp.float32
     np.testing.assert_allclose(rough, pieces, atol=0.05 * float(jnp.abs(pieces).max()))
 
 
 def test_dropout_acts_in_training_only():
-    network = PointNet2(views=4, rngs=nnx.Rngs(0))
+    network = made(lambda: PointNet2(views=4, rngs=nnx.Rngs(0)))
     cloud = jax.random.uniform(jax.random.key(0), (2, 600, 3))
     train = nnx.jit(lambda network, cloud, key: network(cloud, train=True, key=key))
     a, b = (train(network, cloud, jax.random.key(k)) for k in (1, 2))
@@ -227,7 +242,7 @@ def test_dropout_acts_in_training_only():
 def test_wrong_state_dicts_are_refused():
     shapes = golden_shapes("resnet18")
     state = made_up_weights(shapes)
-    network = ResNet(depth=18, rngs=nnx.Rngs(0))
+    network = nnx.eval_shape(lambda: ResNet(depth=18, rngs=nnx.Rngs(0)))
     with pytest.raises(ValueError, match=r"no 'fc\.bias'"):
         resnet_from_torch(network, {name: value for name, value in state.items() if name != "fc.bias"})
     with pytest.raises(ValueError, match="lacks"):
@@ -237,6 +252,6 @@ def test_wrong_state_dicts_are_refused():
     with pytest.raises(ValueError, match="18 or 34"):
         ResNet(depth=50, rngs=nnx.Rngs(0))
     with pytest.raises(ValueError, match="3 or 6 columns, got 4"):
-        PointNet2(views=4, rngs=nnx.Rngs(0))(jnp.zeros((600, 4)))
+        outputs(nnx.eval_shape(lambda: PointNet2(views=4, rngs=nnx.Rngs(0))), jnp.zeros((600, 4)))
     with pytest.raises(ValueError, match="at least 2"):
         PointNet2(views=1, rngs=nnx.Rngs(0))

@@ -205,7 +205,7 @@ def volume_of(name: str) -> np.ndarray:
 
 @pytest.mark.parametrize(
     ("values", "thing"),
-    [(of_mesh, lambda name: triangles_of(name)[:128]), (of_volume, volume_of)],
+    [(of_mesh, lambda name: triangles_of(name)[:64]), (of_volume, volume_of)],
     ids=["mesh", "volume"],
 )
 @pytest.mark.usefixtures("fully_compiled")
