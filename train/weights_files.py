@@ -57,7 +57,7 @@ def read_state_dict(path: Path) -> dict[str, np.ndarray]:
         status = path.stat()
         if not stat.S_ISREG(status.st_mode):
             raise DataError(f"{path} cannot be read (it is not a file); name a .pth or .safetensors file")
-        with _File(io.FileIO(path)) as file:
+        with path.open("rb") as file:
             return _read(file, status.st_size, path.suffix == ".safetensors")
     except DataError:
         raise
@@ -66,26 +66,12 @@ def read_state_dict(path: Path) -> dict[str, np.ndarray]:
         raise DataError(f"{path} cannot be read ({reason}); name a .pth or .safetensors file") from error
     except Exception as error:  # damaged files raise errors of zipfile, zlib, struct, safetensors, NumPy and others
         raise DataError(
-            f"{path} is not a file of weights that can be read safely: {shown(reason_of(error))[:400]}; "
+            f"{path} is not a file of weights that can be read safely: {shown(reason_of(error))[:400].rstrip('.')}; "
             f"save the network's state_dict with torch.save or as .safetensors"
         ) from error
 
 
-class _File(io.BufferedReader):
-    """A file whose reads can be bounded, since `zipfile` reads the list of contents of any size at once."""
-
-    bound: int | None = None
-
-    def read(self, size: int | None = -1, /) -> bytes:
-        if self.bound is None:
-            return super().read(size)
-        count = self.bound if size is None or size < 0 else size
-        if count > self.bound:
-            raise ValueError(f"its list of contents is larger than {self.bound >> 20} MB")
-        return super().read(count)
-
-
-def _read(file: _File, size: int, safetensors: bool) -> dict[str, np.ndarray]:
+def _read(file: io.BufferedReader, size: int, safetensors: bool) -> dict[str, np.ndarray]:
     if size > LARGEST_FILE:
         raise ValueError(f"it is larger than {LARGEST_FILE >> 30} GB")
     if safetensors:
@@ -119,10 +105,24 @@ def _checked(name: Any) -> str:
 # -------------------------------------------------------------------------------------------------------------- PyTorch
 
 
-def _zip_state(file: _File, size: int) -> tuple[dict[str, Tensor], dict[str, bytes]]:
-    file.bound = LARGEST_DIRECTORY
-    with zipfile.ZipFile(file) as archive:
-        file.bound = None
+class _BoundedReader(io.BufferedReader):
+    """A file whose reads are bounded until `bound` is None: `zipfile` reads a list of contents of any size at once."""
+
+    bound: int | None = LARGEST_DIRECTORY
+
+    def read(self, size: int | None = -1, /) -> bytes:
+        if self.bound is None:
+            return super().read(size)
+        count = self.bound if size is None or size < 0 else size
+        if count > self.bound:
+            raise ValueError(f"its list of contents is larger than {self.bound >> 20} MB")
+        return super().read(count)
+
+
+def _zip_state(file: io.BufferedReader, size: int) -> tuple[dict[str, Tensor], dict[str, bytes]]:
+    bounded = _BoundedReader(io.FileIO(file.fileno(), closefd=False))
+    with zipfile.ZipFile(bounded) as archive:
+        bounded.bound = None
         members = {info.filename: info for info in archive.infolist()}
         if sum(info.file_size for info in members.values()) > MOST_TIMES * size + _MARGIN:
             raise ValueError(f"it unpacks to more than {MOST_TIMES} times its size")
@@ -142,8 +142,11 @@ def _zip_state(file: _File, size: int) -> tuple[dict[str, Tensor], dict[str, byt
                 raise ValueError(f"it is compressed with method {info.compress_type}, which PyTorch does not write")
             if info.file_size > largest or info.compress_size > size:
                 raise ValueError(f"its {name} is too large")
-            with archive.open(info) as content:
-                return content.read(info.file_size + 1)  # without a size, it would decompress to any
+            with archive.open(info) as packed:
+                content = packed.read(info.file_size + 1)  # without a size, it would decompress to any
+            if len(content) < info.file_size:
+                raise ValueError(f"its {name} ends early")
+            return content
 
         order = member("byteorder", 64).strip() if f"{root}byteorder" in members else b"little"
         if order != b"little":
@@ -153,7 +156,7 @@ def _zip_state(file: _File, size: int) -> tuple[dict[str, Tensor], dict[str, byt
         return tensors, {key: member(f"data/{key}", MOST_TIMES * LARGEST_FILE) for key in used}
 
 
-def _legacy_state(file: _File, size: int) -> tuple[dict[str, Tensor], dict[str, bytes]]:
+def _legacy_state(file: io.BufferedReader, size: int) -> tuple[dict[str, Tensor], dict[str, bytes]]:
     unpickler = WeightsUnpickler(file)
     if unpickler.load() != _LEGACY_MAGIC or unpickler.load() != _LEGACY_VERSION:
         raise ValueError("it does not begin as a file of weights does")
@@ -183,7 +186,7 @@ def _legacy_state(file: _File, size: int) -> tuple[dict[str, Tensor], dict[str, 
 # ---------------------------------------------------------------------------------------------------------- safetensors
 
 
-def _safetensors(file: _File, size: int) -> dict[str, np.ndarray]:
+def _safetensors(file: io.BufferedReader, size: int) -> dict[str, np.ndarray]:
     head = file.read(8)
     length = int.from_bytes(head, "little")
     if length > min(LARGEST_DIRECTORY, size):
