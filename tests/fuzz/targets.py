@@ -19,7 +19,10 @@ from data_pipeline.objects.mesh import normalise
 from data_pipeline.objects.sources import mesh_zip
 from data_pipeline.objects.voxels import voxel_archive
 from tests.data_pipeline.objects import making
+from tests.train import weights_making as weights
+from train.weights_files import read_state_dict
 
+REFERENCE = Path(__file__).parents[1] / "reference"
 CORPUS = Path(__file__).parent / "corpus"
 """Inputs that once went wrong, in a folder for each reader."""
 
@@ -80,6 +83,12 @@ def _read_npz(path: Path) -> None:
             normalise(*entry.recipe.load(), entry.name)
         except EmptyMesh:
             continue
+
+
+def _read_weights(path: Path) -> None:
+    arrays = read_state_dict(path)
+    assert all(name.isprintable() for name in arrays)
+    assert sum(array.nbytes for array in arrays.values()) <= 4 * path.stat().st_size + (1 << 20)
 
 
 def _off() -> list[bytes]:
@@ -164,6 +173,31 @@ def _npz() -> list[bytes]:
     return found
 
 
+def _pth() -> list[bytes]:
+    small = weights.state({"a": weights.tensor(), "b": weights.tensor((1, 2), (2, 1)), "c": weights.tensor(key="1")})
+    numbers = {"0": bytes(8), "1": bytes(8)}
+    hostile = [content for content, _ in weights.HOSTILE_PICKLES.values() if len(content) < 5000]
+    return [
+        *((REFERENCE / f"weights_{kind}.pth").read_bytes() for kind in ("zip", "legacy")),
+        *(weights.legacy(small, numbers) for _ in range(20)),  # as often as hostile ones, which are refused early
+        *(weights.zipped(small, numbers, kind) for kind in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)),
+        *map(weights.legacy, hostile),
+        *(weights.zipped(content) for content in hostile[:4]),
+    ]
+
+
+def _safetensors() -> list[bytes]:
+    entries = {
+        "a": weights.entry("F32", [2, 1], 0, 8),
+        "b": weights.entry("BF16", [3], 8, 14),
+        "c": weights.entry("I64", [], 14, 22),
+        "d": weights.entry("F16", [0, 5], 22, 22),
+        "__metadata__": {"format": "pt"},
+    }
+    unread = {"a": weights.entry("F8_E4M3", [2], 0, 2)}
+    return [weights.safetensors(entries, bytes(22)), weights.safetensors(unread, bytes(2)), weights.safetensors({})]
+
+
 TARGETS = {
     "off": Target(_mesh(".off"), _off),
     "obj": Target(_mesh(".obj"), _obj),
@@ -174,6 +208,8 @@ TARGETS = {
     "3mf": Target(_mesh(".3mf"), lambda: [making.threemf(*BOX), making.threemf(*U, "2 0 0 0 1 0 0 0 1 0 0 0")]),
     "zip": Target(_file(_read_zip, ".zip"), _zip),
     "npz": Target(_file(_read_npz, ".npz"), _npz),
+    "pth": Target(_file(_read_weights, ".pth"), _pth),
+    "safetensors": Target(_file(_read_weights, ".safetensors"), _safetensors),
 }
 
 

@@ -1,15 +1,12 @@
-"""Files of weights: read without PyTorch, exactly, and never trusted."""
+"""Weights of torchvision in the networks of this package."""
 
 from __future__ import annotations
 
-import importlib.util
-import os
-import pickle
-import zipfile
 from pathlib import Path
 
 import jax
 import jax.numpy as jnp
+import ml_dtypes
 import numpy as np
 import pytest
 from flax import nnx
@@ -18,109 +15,10 @@ from safetensors.numpy import save_file
 from data_pipeline.errors import DataError
 from mevs_jax import ResNet
 from tests.mevs_jax.models.test_networks import GOLDEN, golden_shapes
-from tests.reference.weights import made_up_inputs, made_up_weights, small_state
-from train.starting_weights import (
-    _Storage,
-    _Tensor,
-    read_state_dict,
-    resnet_depth,
-    weights_from_network,
-    weights_from_torch,
-)
-
-REFERENCE = Path(__file__).parents[2] / "reference"
-
-
-def check_small(read: dict[str, np.ndarray]) -> None:
-    expected = small_state()
-    assert read.keys() == expected.keys()
-    for name, array in expected.items():
-        assert read[name].shape == array.shape
-        np.testing.assert_array_equal(np.asarray(read[name], np.float64), array, err_msg=name)
-
-
-@pytest.mark.parametrize("kind", ["zip", "legacy"])
-def test_both_formats_of_pytorch_are_read_exactly(kind):
-    read = read_state_dict(REFERENCE / f"weights_{kind}.pth")
-    check_small(read)
-    assert read["half"].dtype == np.float16
-    assert read["count"].dtype == np.int64
-
-
-@pytest.mark.skipif(importlib.util.find_spec("torch") is None, reason="PyTorch is not installed; stored files are read")
-@pytest.mark.parametrize("new", [True, False])
-def test_files_that_pytorch_writes_now_are_read_exactly(tmp_path, new):
-    import torch
-
-    from tests.reference.torch_networks import build, small_tensors
-
-    torch.save(small_tensors(), tmp_path / "small.pth", _use_new_zipfile_serialization=new)
-    check_small(read_state_dict(tmp_path / "small.pth"))
-    network = build("resnet18")
-    wrapped = {"state_dict": {f"module.{name}": value for name, value in network.state_dict().items()}}
-    torch.save(wrapped, tmp_path / "wrapped.pt", _use_new_zipfile_serialization=new)
-    read = read_state_dict(tmp_path / "wrapped.pt")
-    assert resnet_depth(read) == 18
-    for name, value in network.state_dict().items():
-        np.testing.assert_array_equal(read[name], value.numpy())
-
-
-class _Evil:
-    """What a hostile file would hold: unpickled as usual, it makes a folder."""
-
-    def __init__(self, path: Path):
-        self.path = path
-
-    def __reduce__(self):
-        return os.mkdir, (str(self.path),)
-
-
-@pytest.mark.parametrize("kind", ["zip", "legacy", "bare"])
-def test_a_hostile_file_is_refused_and_nothing_runs(tmp_path, kind):
-    marker, path = tmp_path / "was_here", tmp_path / "evil.pth"
-    evil = pickle.dumps({"conv1.weight": _Evil(marker)})
-    if kind == "zip":
-        with zipfile.ZipFile(path, "w") as archive:
-            archive.writestr("archive/data.pkl", evil)
-    elif kind == "legacy":
-        path.write_bytes(pickle.dumps(0x1950A86A20F9469CFC6C) + pickle.dumps(1001) + pickle.dumps({}) + evil)
-    else:
-        path.write_bytes(evil)
-    with pytest.raises(DataError, match=r"evil\.pth is not a file of weights.*mkdir, which no file of weights needs"):
-        read_state_dict(path)
-    assert not marker.exists()
-    pickle.loads(evil)  # the file does what it says it does
-    assert marker.exists()
-
-
-@pytest.mark.parametrize(("size", "stride", "offset"), [((3,), (1,), 0), ((1,), (1,), 2), ((2,), (-1,), 0)])
-def test_a_tensor_beyond_its_storage_is_refused(size, stride, offset):
-    with pytest.raises(ValueError, match="beyond its storage"):
-        _Tensor(_Storage("0", np.float32), offset, size, stride).array({"0": np.zeros(2, np.float32)})
-
-
-@pytest.mark.parametrize(
-    ("name", "content", "message"),
-    [
-        ("empty.pth", b"", "not a file of weights"),
-        ("text.pth", b"<!doctype html>", "not a file of weights"),
-        ("short.pth", (REFERENCE / "weights_legacy.pth").read_bytes()[:-8], "not a file of weights"),
-        ("half.pth", (REFERENCE / "weights_zip.pth").read_bytes()[:400], "not a file of weights"),
-        ("text.safetensors", b"nothing of the kind", "not a file of weights"),
-        ("list.pth", None, "not a state dict"),
-    ],
-)
-def test_unusable_files_are_described(tmp_path, name, content, message):
-    path = tmp_path / name
-    if content is None:
-        with zipfile.ZipFile(path, "w") as archive:
-            archive.writestr("archive/data.pkl", pickle.dumps([1, 2]))
-    else:
-        path.write_bytes(content)
-    with pytest.raises(DataError, match=message):
-        read_state_dict(path)
-    with pytest.raises(DataError, match="cannot be read"):
-        read_state_dict(tmp_path / "missing.pth")
+from tests.reference.weights import made_up_inputs, made_up_weights
+from tests.train.weights_making import entry, safetensors
+from train.starting_weights import weights_from_network, weights_from_torch
+from train.weights_files import read_state_dict
 
 
 @pytest.fixture(scope="module")
@@ -170,6 +68,37 @@ def test_the_file_of_the_right_depth_is_taken(weights, tmp_path):
 def test_a_network_of_another_width_refuses_them(weights):
     with pytest.raises(DataError, match=r"does not fit the classifier: conv1.weight has shape"):
         weights_from_torch((weights,), 18).put(ResNet(depth=18, width=8, rngs=nnx.Rngs(0)))
+
+
+def test_bfloat16_weights_are_used_as_float32(weights, tmp_path):
+    """The same network comes from a bfloat16 file as from its numbers in float32."""
+    state = {name: array.astype(ml_dtypes.bfloat16) for name, array in read_state_dict(weights).items()}
+    header, content = {}, b""
+    for name, array in state.items():
+        header[name] = entry("BF16", array.shape, len(content), len(content) + array.nbytes)
+        content += array.tobytes()
+    half, whole = tmp_path / "half.safetensors", tmp_path / "whole.safetensors"
+    half.write_bytes(safetensors(header, content))
+    save_file({name: array.astype(np.float32) for name, array in state.items()}, whole)
+    networks = [ResNet(depth=18, rngs=nnx.Rngs(0)) for _ in range(2)]
+    for path, network in zip((half, whole), networks, strict=True):
+        weights_from_torch((path,), 18).put(network)
+    leaves = [jax.tree.leaves(nnx.state(network, nnx.Param, nnx.BatchStat)) for network in networks]
+    for one, other in zip(*leaves, strict=True):
+        assert one.dtype == other.dtype
+        np.testing.assert_array_equal(one, other)
+
+
+@pytest.mark.parametrize("value", [np.nan, -np.inf, 1e300])
+def test_weights_that_are_not_finite_are_refused(weights, tmp_path, value):
+    state = {name: np.array(array) for name, array in read_state_dict(weights).items()}
+    state["layer1.0.bn1.weight"] = state["layer1.0.bn1.weight"].astype(np.float64)
+    state["layer1.0.bn1.weight"][3] = value
+    save_file(state, tmp_path / "diverged.safetensors")
+    with pytest.raises(
+        DataError, match=r"diverged.safetensors has weights that are not finite in layer1\.0\.bn1\.weight; "
+    ):
+        weights_from_torch((tmp_path / "diverged.safetensors",), 18)
 
 
 def test_going_on_from_a_network_begins_with_all_of_it():
