@@ -6,11 +6,16 @@ name the last counts, as for programs that unpack.
 
 from __future__ import annotations
 
+import bz2
+import copy
 import functools
+import lzma
 import os
 import posixpath
 import stat
+import struct
 import zipfile
+import zlib
 from collections import Counter
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
@@ -90,8 +95,7 @@ class ZipMember:
                 raise DamagedMesh(f"{where} is not in the archive; pack it again")
             if reason := unreadable(info):
                 raise DamagedMesh(f"{where} {reason}")
-            with opened.open(info) as file:
-                content = file.read(LARGEST_MEMBER + 1)
+            content = _unpacked(opened, info)
         except DataError:
             raise
         except Exception as error:  # damaged streams raise errors of zipfile, zlib, lzma, struct and others
@@ -101,6 +105,36 @@ class ZipMember:
         if len(content) > LARGEST_MEMBER:
             raise DamagedMesh(f"{where} {_too_large()}")
         return content
+
+
+def _unpacked(opened: zipfile.ZipFile, info: zipfile.ZipInfo) -> bytes:
+    """Returns the content of a member, or more than `LARGEST_MEMBER` bytes of it if it is larger."""
+    if info.compress_type in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
+        with opened.open(info) as file:
+            return file.read(LARGEST_MEMBER + 1)
+    # For the other methods `zipfile` unpacks all that a chunk holds, whatever is asked for: 600 bytes can become gigabytes.
+    packed = copy.copy(info)
+    packed.compress_type, packed.file_size = zipfile.ZIP_STORED, info.compress_size
+    packed.CRC = None  # type: ignore[assignment]  # that of the unpacked content, checked below
+    with opened.open(packed) as file:
+        content = file.read()
+    if info.compress_type == zipfile.ZIP_BZIP2:
+        unpacked = bz2.BZ2Decompressor().decompress(content, info.file_size + 1)
+    else:
+        (size,) = struct.unpack("<2xH", content[:4])
+        properties, dictionary = struct.unpack("<BL", content[4:9])
+        method = {
+            "id": lzma.FILTER_LZMA1,
+            "lc": properties % 9,
+            "lp": properties // 9 % 5,
+            "pb": properties // 45,
+            "dict_size": max(min(dictionary, info.file_size), 4096),
+        }
+        decompressor = lzma.LZMADecompressor(lzma.FORMAT_RAW, filters=[method])
+        unpacked = decompressor.decompress(content[4 + size :], info.file_size + 1)
+    if len(unpacked) != info.file_size or zlib.crc32(unpacked) != info.CRC:
+        raise zipfile.BadZipFile("its content is not of the size and checksum that the archive declares")
+    return unpacked
 
 
 def _too_large() -> str:

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import io
+import struct
+import tracemalloc
 import zipfile
 from pathlib import Path
 
@@ -170,3 +172,16 @@ def test_archives_without_splits_take_the_option(tmp_path):
         opened(path)
     splits = [entry.split for entry in opened(path, split="0.8").entries]
     assert (splits.count("train"), splits.count("test")) == (8, 2)
+
+
+@pytest.mark.parametrize("method", [zipfile.ZIP_BZIP2, zipfile.ZIP_LZMA])
+def test_no_method_unpacks_more_than_the_archive_declares(tmp_path, method):
+    """Python's readers of these methods unpack all of a chunk, whatever is asked for."""
+    content = zipped(FILES | {"mug/train/mug_9.off": bytes(64 << 20)}, method)
+    path = archive_of(tmp_path, content.replace(struct.pack("<L", 64 << 20), struct.pack("<L", 8)))
+    (entry,) = (entry for entry in opened(path).entries if "mug_9" in entry.name)
+    tracemalloc.start()
+    with pytest.raises(DamagedMesh, match="not of the size and checksum that the archive declares"):
+        load_object(entry)
+    assert tracemalloc.get_traced_memory()[1] < 8 << 20
+    tracemalloc.stop()

@@ -14,7 +14,7 @@ from safetensors.numpy import save_file
 
 from data_pipeline.errors import DataError
 from mevs_jax import ResNet
-from tests.mevs_jax.models.test_networks import GOLDEN, golden_shapes
+from tests.mevs_jax.models.test_networks import GOLDEN, golden_shapes, made, outputs
 from tests.reference.weights import made_up_inputs, made_up_weights
 from tests.train.weights_making import entry, safetensors
 from train.starting_weights import weights_from_network, weights_from_torch
@@ -32,7 +32,7 @@ def weights(tmp_path_factory) -> Path:
 @pytest.mark.usefixtures("fully_compiled")
 def test_weights_from_a_file_give_pytorchs_outputs(weights):
     """Features are compared, since the head stays new: the stored logits are the file's head on them."""
-    network = ResNet(depth=18, rngs=nnx.Rngs(0))
+    network = made(lambda: ResNet(depth=18, rngs=nnx.Rngs(0)))
     head = np.asarray(network.head.kernel[...])
     weights_from_torch((weights,), 18).put(network)
     np.testing.assert_array_equal(network.head.kernel[...], head)
@@ -46,12 +46,12 @@ def test_weights_from_a_file_give_pytorchs_outputs(weights):
 
 def test_standardised_images_are_what_torchvision_expects(weights):
     """A network that standardises gives on [0, 1] images what one that does not gives on standardised ones."""
-    plain, standard = (ResNet(depth=18, standardise=s, rngs=nnx.Rngs(0)) for s in (False, True))
+    plain, standard = (made(lambda s=s: ResNet(depth=18, standardise=s, rngs=nnx.Rngs(0))) for s in (False, True))
     for network in (plain, standard):
         weights_from_torch((weights,), 18).put(network)
     images = jax.random.uniform(jax.random.key(0), (2, 64, 64, 3))
-    expected = plain((images - jnp.array([0.485, 0.456, 0.406])) / jnp.array([0.229, 0.224, 0.225]))
-    np.testing.assert_allclose(standard(images), expected, atol=1e-5)
+    expected = outputs(plain, (images - jnp.array([0.485, 0.456, 0.406])) / jnp.array([0.229, 0.224, 0.225]))
+    np.testing.assert_allclose(outputs(standard, images), expected, atol=1e-5)
     with pytest.raises(ValueError, match="3 channels only, got 1"):
         ResNet(channels=1, standardise=True, rngs=nnx.Rngs(0))
 
@@ -67,7 +67,7 @@ def test_the_file_of_the_right_depth_is_taken(weights, tmp_path):
 
 def test_a_network_of_another_width_refuses_them(weights):
     with pytest.raises(DataError, match=r"does not fit the classifier: conv1.weight has shape"):
-        weights_from_torch((weights,), 18).put(ResNet(depth=18, width=8, rngs=nnx.Rngs(0)))
+        weights_from_torch((weights,), 18).put(made(lambda: ResNet(depth=18, width=8, rngs=nnx.Rngs(0))))
 
 
 def test_bfloat16_weights_are_used_as_float32(weights, tmp_path):
@@ -80,7 +80,7 @@ def test_bfloat16_weights_are_used_as_float32(weights, tmp_path):
     half, whole = tmp_path / "half.safetensors", tmp_path / "whole.safetensors"
     half.write_bytes(safetensors(header, content))
     save_file({name: array.astype(np.float32) for name, array in state.items()}, whole)
-    networks = [ResNet(depth=18, rngs=nnx.Rngs(0)) for _ in range(2)]
+    networks = [made(lambda: ResNet(depth=18, rngs=nnx.Rngs(0))) for _ in range(2)]
     for path, network in zip((half, whole), networks, strict=True):
         weights_from_torch((path,), 18).put(network)
     leaves = [jax.tree.leaves(nnx.state(network, nnx.Param, nnx.BatchStat)) for network in networks]
@@ -102,8 +102,8 @@ def test_weights_that_are_not_finite_are_refused(weights, tmp_path, value):
 
 
 def test_going_on_from_a_network_begins_with_all_of_it():
-    before, after = (ResNet(depth=18, width=4, rngs=nnx.Rngs(seed)) for seed in (1, 2))
+    before, after = (made(lambda seed=seed: ResNet(depth=18, width=4, rngs=nnx.Rngs(seed))) for seed in (1, 2))
     before.norm.mean[...] = before.norm.mean[...] + 0.3
     weights_from_network(before, "the one before").put(after)
     images = jax.random.uniform(jax.random.key(0), (2, 32, 32, 3))
-    np.testing.assert_array_equal(before(images), after(images))
+    np.testing.assert_array_equal(outputs(before, images), outputs(after, images))
