@@ -28,6 +28,9 @@ from eval.report.policies import (
 )
 from mevs_jax.viewpoints import ViewGraph, local_maxima
 
+_SPLITS = {"train": "training", "val": "validation", "test": "test", "other": "no split"}
+"""Where the source had objects that were left out."""
+
 
 def _data_section(inputs: ReportInputs) -> str:
     statistics = inputs.statistics
@@ -57,7 +60,7 @@ def _data_section(inputs: ReportInputs) -> str:
         f"Entropies are divided by the largest of the training split, {statistics.entropy_max:.2f} bits.</p>"
         + table(["class", "train", "val", "test"], [*rows, ["<b>all</b>", *totals]])
         + f"<p>{statistics.left_out_count} objects were left out "
-        + f"({len(statistics.left_out['train'])} of training, {len(statistics.left_out['test'])} of test).</p>"
+        + f"({', '.join(f'{len(names)} of {_SPLITS[split]}' for split, names in statistics.left_out.items())}).</p>"
         + (
             f"<details><summary>Objects left out, with reasons</summary><ul>{''.join(left_out)}</ul></details>"
             if left_out
