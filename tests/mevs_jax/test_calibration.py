@@ -53,7 +53,7 @@ def test_the_calibration_error_is_the_textbooks(bins):
     assert float(jnp.sum(share * confidence)) == pytest.approx(confidences.mean(), abs=1e-5)
 
 
-@pytest.mark.parametrize("together", [True, False])
+@pytest.mark.parametrize("together", [True, pytest.param(False, marks=pytest.mark.slow)])
 def test_chance_alone_makes_this_much_calibration_error(together):
     """One measurement tells what many worlds measure in which every confidence is kept."""
     random = np.random.default_rng(0)

@@ -73,6 +73,7 @@ def test_members_end_as_separate_runs_do(every, out, tmp_path):
     assert summary["best_loss"] == best.loss
 
 
+@pytest.mark.slow
 def test_a_stopped_sweep_ends_as_if_it_had_not_been(out, tmp_path, monkeypatch):
     statistics, task = load_statistics(out / "data"), task_named("entropy", out)
     task = replace(task, optimiser=replace(task.optimiser, patience=5, epochs=3))

@@ -15,7 +15,7 @@ from eval.learned.stopping import Signal, compare_rules
 from eval.learned.study import fixed_order_scores, novel_classes, seeds_together, study
 from eval.learned.walks import Learner, OnLattice
 from eval.numbers.confidence import stops_at
-from tests.reference.choosing import VIEWS, by_state, telling
+from tests.reference.choosing import VIEWS, by_state, some_policy, telling
 from train.choosing.policy import (
     PolicyConfig,
     train_policy,
@@ -127,3 +127,26 @@ def test_the_fixed_order_begins_with_the_views_that_tell_most(adding):
     scores = fixed_order_scores(adding, telling(200, 5), 3)
     assert sorted(np.argsort(-scores)[:3].tolist()) == [0, 2, 3]
     assert sorted(scores.tolist()) == list(range(1, VIEWS + 1))
+
+
+def test_a_study_walks_all_policies_from_the_same_starts(adding):
+    """With a view policy of arbitrary weights: what holds whatever was learned."""
+    data = telling(40, 3)
+    found, each = study(
+        adding,
+        [Learner("learned", "view policy", some_policy())],
+        OnLattice(telling(40, 2)),
+        OnLattice(data),
+        max_views=2,
+        draws=1,
+        oracle_views=2,
+        costs=False,
+    )
+    assert set(found["policies"]) >= {"random", "learned", "farthest", "fixed_order", "label_oracle"}
+    after = {name: result["after_views"] for name, result in found["policies"].items()}
+    first = {accuracy[0] for accuracy in after.values()}
+    assert max(first) - min(first) < 1e-6  # the start view alone
+    alone = np.asarray(data.features).argmax(-1) == np.asarray(data.labels)[:, None]
+    assert after["random"][0] == pytest.approx(alone.mean(), abs=1e-6)
+    assert after["label_oracle"][1] >= max(after["random"][1], after["learned"][1]) - 1e-6
+    assert set(found["against"]["random"]) == set(each) - {"random", "label_oracle", "belief_oracle"}

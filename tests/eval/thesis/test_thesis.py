@@ -289,6 +289,7 @@ def has_all_tables_and_figures(report: Path) -> None:
             assert (report / "figures" / f"figure_{number:02d}.{kind}").stat().st_size > 1000
 
 
+@pytest.mark.slow
 def test_the_stages_make_everything_and_go_on(results, tmp_path, monkeypatch, capfd):
     """With data sets as the command makes them, but networks that are not trained, and outputs that are made up."""
     settings = PRESETS["tiny"]

@@ -51,7 +51,9 @@ def test_indices_equal_an_obvious_loop(kind, points, k, radius, samples, random)
         np.testing.assert_array_equal(group, numpy_rules.ball_query(cloud, centre, radius, samples))
 
 
-@pytest.mark.parametrize("points", [4096, 3001, 700])
+@pytest.mark.parametrize(
+    "points", [pytest.param(4096, marks=pytest.mark.slow), 3001, pytest.param(700, marks=pytest.mark.slow)]
+)
 def test_indices_at_the_thesis_sizes(points, random):
     cloud = clouds_of("random", random, 1, points)[0]
     chosen = np.asarray(farthest_point_sample(cloud, 512))

@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import optax
+import pytest
 from flax import nnx
 
 from eval.learned.study import random_sets_study
@@ -60,6 +61,7 @@ def trained(train: Features) -> SetFusion:
     return nnx.merge(structure, weights)
 
 
+@pytest.mark.slow
 def test_what_no_view_shows_alone_is_learned_and_reported():
     train, validation, test = (made_up(objects, seed) for seed, objects in enumerate((512, 128, 256)))
     fusion = calibrated(trained(train), validation, jnp.zeros(2))

@@ -25,6 +25,7 @@ from train.choosing.policy import (
 from train.kept import trained_once
 
 
+@pytest.mark.slow
 def test_clouds_are_told_beside_their_views(random):
     policy = moved(ViewPolicy(CLASSES, width=16, heads=2, blocks=1, cloud=7, rngs=nnx.Rngs(1)), 0.1)
     belief = jax.nn.log_softmax(random.normal(size=CLASSES)).astype(np.float32)

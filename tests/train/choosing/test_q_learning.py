@@ -45,6 +45,7 @@ def test_temporal_differences_are_those_of_a_plain_loop(fusion, policy, random):
             assert found[row, step] == pytest.approx(expected, abs=1e-4)
 
 
+@pytest.mark.slow
 def test_q_learning_finds_the_telling_view_too(adding):
     config = QLearningConfig(width=16, heads=2, blocks=1, most_seen=2, walks=4, rounds=2, epochs=6, learning_rate=5e-3)
     network, histories = train_by_q_learning(config, [(adding, telling(160, 0))], (adding, telling(80, 1)))

@@ -78,6 +78,7 @@ def test_changed_objects_are_each_changed_in_a_way_of_their_own_and_the_same_eve
     assert len({tuple(one) for one in changes}) > 1
 
 
+@pytest.mark.slow
 def test_recognisers_of_objects_turned_anyhow_go_on_from_the_others(turned, tmp_path):
     config = replace(TINY.learned, rotation_epochs=1)
     stages = Stages(config, TINY.dataset, tmp_path)
