@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
-from types import SimpleNamespace
 
 import jax
 import jax.numpy as jnp
@@ -144,9 +143,9 @@ def test_chance_is_told_from_learning(chance, stayed):
     assert (chance.warning("classifier", "test") is not None) == stayed
 
 
-def test_a_classifier_at_chance_gets_a_sentence():
-    counts = {"train": {"a": 9, "b": 1}, "val": {"a": 5, "b": 5, "c": 5}, "test": {"a": 8, "b": 2, "c": 0}}
-    statistics = SimpleNamespace(classes=["a", "b", "c"], counts=counts)
+def test_a_classifier_at_chance_gets_a_sentence(data):
+    counts = {"train": {"a": 9, "b": 1, "c": 1}, "val": {"a": 5, "b": 5, "c": 5}, "test": {"a": 8, "b": 2, "c": 0}}
+    statistics = replace(load_statistics(data), classes=["a", "b", "c"], counts=counts)
     said = Chance.of(1 / 3, statistics, ["val"]).warning("classifier", "validation")
     assert said is not None
     assert said.startswith(
