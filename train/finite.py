@@ -54,7 +54,7 @@ def check_results(content: Any, made: str) -> Any:
     """
     if (place := place_not_finite(content)) is not None:
         raise Diverged(
-            f"{made} cannot be computed: {place} is not finite, so the outputs of a network are too large; "
+            f"{made} cannot be computed: {place} is not finite, as happens when a training diverged; "
             f"train the networks with a lower learning rate and another --out"
         )
     return content
