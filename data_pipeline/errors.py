@@ -14,6 +14,13 @@ class DamagedMesh(DataError):
     """
 
 
+class Diverged(ArithmeticError):
+    """Numbers that are infinite or NaN: in a training, a network's outputs, or results computed from them.
+
+    The message is one sentence: which network, where, what is kept, and what to do. The program ends with exit code 3.
+    """
+
+
 class EmptyMesh(Exception):
     """A valid mesh without a surface. The object is left out of the data set and listed in its summary with this message."""
 

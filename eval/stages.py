@@ -17,7 +17,7 @@ import numpy as np
 
 from data_pipeline.dataset.builder import prepare
 from data_pipeline.dataset.statistics import DatasetStatistics, load_statistics, report_left_out
-from data_pipeline.errors import DataError
+from data_pipeline.errors import DataError, Diverged
 from data_pipeline.files import read_json, write_json
 from data_pipeline.progress import console
 from eval.learned.measure import measure, together, train_all
@@ -35,7 +35,9 @@ from eval.walks.ladder import ASCENT_RUNGS
 from eval.walks.live import Agreement, Networks, compare_with_tables
 from mevs_jax.policies.registry import policy_named
 from mevs_jax.viewpoints import ViewGraph
+from train.chance import warn_of_chance
 from train.choosing.stages import Stages, check_learned
+from train.finite import check_results, place_not_finite
 from train.kept import kept, kept_json, made_by
 from train.loop import fit, load_best
 from train.starting_weights import StartingWeights
@@ -82,12 +84,13 @@ def train(
         (predict, "entropy", None),
     ]
     for task, name, weights in planned:
-        summary = fit(task, out / "data", statistics, out / name, weights, mesh)
+        summary = fit(task, out / "data", statistics, out / name, weights, mesh, f"--{name}.optimiser.learning-rate")
         console.print(
             f"{task.name}: best epoch {summary['best_epoch']} of {summary['epoch']}, validation "
             + ", ".join(f"{key} {value:.4f}" for key, value in summary["best"].items())
             + f", {summary['seconds'] / 60:.1f} min"
         )
+        warn_of_chance(task, summary, statistics)
 
 
 def train_sweep(settings: Settings, out: Path, mesh: jax.sharding.Mesh | None = None) -> tuple[Path, list[Member]]:
@@ -109,7 +112,9 @@ def train_by_view(settings: Settings, out: Path, start: StartingWeights | None =
     statistics = load_statistics(out / "data")
     classify, _ = tasks(settings, statistics)
     by_view = replace(classify, optimiser=replace(classify.optimiser, validation_by="view"))
-    fit(by_view, out / "data", statistics, out / BY_VIEW, start)
+    option = "--classifier.optimiser.learning-rate"
+    summary = fit(by_view, out / "data", statistics, out / BY_VIEW, start, rate_option=option)
+    warn_of_chance(by_view, summary, statistics)
 
 
 def _tables(
@@ -125,7 +130,10 @@ def _tables(
         tables = compute_view_tables(out / "data", split, statistics, classify, networks[0], predict, networks[1])
         return replace(tables, made_by=made)
 
-    return kept(path, load_view_tables, save_view_tables, lambda tables: tables.made_by == made, compute)
+    def is_current(tables: ViewTables) -> bool:
+        return tables.made_by == made and tables.is_finite
+
+    return kept(path, load_view_tables, save_view_tables, is_current, compute)
 
 
 def check_evaluation(config: GridConfig) -> None:
@@ -170,9 +178,25 @@ def evaluate(settings: Settings, out: Path) -> dict[str, Any]:
         metrics = run_study(tables, validation, statistics, settings.evaluation, by_view, leak)
         if climbed is not None:
             metrics["climbing"] = ascent_study(tables, statistics, climbed, settings.evaluation)
+        _check_metrics(metrics, tables, out)
         return metrics
 
     return kept_json(out / "metrics.json", identity, compute)
+
+
+def _check_metrics(metrics: dict[str, Any], tables: ViewTables, out: Path) -> None:
+    """Raises `Diverged` if a metric is infinite or NaN, which outputs of networks that are finite, but huge, lead to."""
+    if (place := place_not_finite(metrics)) is None:
+        return
+    largest = {
+        "classifier": float(np.abs(tables.logits).max()),
+        "entropy": float(np.abs(tables.predicted_entropy).max()),
+    }
+    name = max(largest, key=lambda name: largest[name])
+    raise Diverged(
+        f"the metric {place} is not finite, and the outputs of the network in {out / name} reach {largest[name]:.2g}; to train "
+        f"it again, lower --{name}.optimiser.learning-rate, and delete {out / name} or choose another --out"
+    )
 
 
 def learn_to_choose(settings: Settings, out: Path) -> Path:
@@ -187,6 +211,7 @@ def learn_to_choose(settings: Settings, out: Path) -> Path:
         train_all(stages)
         found.append(measure(stages))
     metrics = {"seeds": found, "together": together(seeds, found), "settings": asdict(config)}
+    check_results(metrics, "the metrics of the learned study")
     write_json(out / "learned" / "metrics.json", metrics)
     page = out / "learned" / "index.html"
     write_learned_page(metrics, load_statistics(out / "data"), page)

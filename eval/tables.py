@@ -11,6 +11,7 @@ import numpy as np
 
 from data_pipeline.dataset.builder import open_split
 from data_pipeline.dataset.statistics import DatasetStatistics
+from data_pipeline.errors import Diverged
 from data_pipeline.files import write_npz
 from mevs_jax.selection import ViewTable
 from train.outputs import network_outputs
@@ -38,6 +39,11 @@ class ViewTables:
     entropy: np.ndarray
     made_by: str = ""
 
+    @property
+    def is_finite(self) -> bool:
+        """Whether no number is infinite or NaN."""
+        return all(np.isfinite(array).all() for array in (self.logits, self.predicted_entropy, self.entropy))
+
     def stacked(self) -> ViewTable:
         """Returns one `ViewTable` with a leading axis of objects for `vmap`."""
         logits, predicted_entropy, entropy, labels = map(
@@ -64,8 +70,17 @@ def compute_view_tables(
     predict: EntropyTask,
     predictor: nnx.Module,
 ) -> ViewTables:
-    """Runs both networks on every view of every object of a split."""
+    """Runs both networks on every view of every object of a split.
+
+    Raises:
+        Diverged: if the outputs of a network, or the entropies of an object, are infinite or NaN.
+    """
     names, labels, entropy = objects_of(data, split, statistics)
+    if len(bad := np.flatnonzero(~np.isfinite(entropy).all(axis=1))):
+        raise Diverged(
+            f"the entropies of {len(bad)} {split} objects in {data} are not finite (first: {names[bad[0]]}); delete this folder "
+            f"and make the data set again"
+        )
     logits = network_outputs(data, split, classify, classifier)
     return ViewTables(names, labels, logits, network_outputs(data, split, predict, predictor), entropy)
 

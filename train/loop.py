@@ -10,15 +10,16 @@ from __future__ import annotations
 import json
 import time
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import asdict, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import jax
 import numpy as np
 from flax import nnx
-from jax.sharding import Mesh
+from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
 from data_pipeline.dataset.batches import (
     objects_kept,
@@ -29,11 +30,12 @@ from data_pipeline.dataset.batches import (
     validation_splits,
 )
 from data_pipeline.dataset.statistics import DatasetStatistics
-from data_pipeline.errors import DataError
+from data_pipeline.errors import DataError, Diverged
 from data_pipeline.files import as_read, read_json, write_json, write_text
 from data_pipeline.progress import console, progress_bar
 from train.checkpoints import Checkpoints
 from train.devices import DATA, check_batch, device_mesh, is_first, parameter_sharding, place, place_batch, summed_over
+from train.finite import all_finite, not_finite
 from train.kept import check_config
 from train.optimiser import learning_rate
 from train.preemption import Preempted, Preemption
@@ -156,6 +158,174 @@ def identity_of(task: Task, statistics: DatasetStatistics, start: StartingWeight
     return as_read({"task": asdict(task), "data": statistics.fingerprint, "start": start and start.name})  # type: ignore[call-overload]
 
 
+class _Training:
+    """One training while it runs: its compiled programs, its state and its progress.
+
+    Attributes:
+        state: the state after the last step, spread over the devices.
+        step: number of steps done.
+        progress: what checkpoints hold beside the state: `epoch`, `best_loss`, `best_epoch`, `best` and `seconds`.
+        rate_option: the option that sets the learning rate, for messages.
+    """
+
+    def __init__(
+        self,
+        task: Task,
+        data: Path,
+        statistics: DatasetStatistics,
+        folder: Path,
+        start: StartingWeights | None,
+        mesh: Mesh,
+        rate_option: str,
+    ):
+        self.task, self.config, self.folder, self.mesh, self.rate_option = (
+            task,
+            task.optimiser,
+            folder,
+            mesh,
+            rate_option,
+        )
+        self.epoch_steps = steps_of_an_epoch(task, statistics)
+        self.rate = learning_rate(self.config, self.epoch_steps * self.config.epochs)
+        self.hyper = task.hyperparameters
+        structure, state = initial_state(task, self.config.seed, start)
+        where = parameter_sharding(mesh, state)
+        self.state = place(state, where)
+        # The old state is donated to the step, so that the new one takes its memory and keeps its placement.
+        self._train_step = jax.jit(
+            train_step_of(task, structure, self.epoch_steps), donate_argnums=0, out_shardings=(where, None)
+        )
+        self._evaluate_step = jax.jit(summed_over(mesh, evaluate_step_of(task, structure)))
+        self._all_finite = jax.jit(all_finite, out_shardings=NamedSharding(mesh, PartitionSpec()))
+        self._validation = validation_set(task, data, statistics, mesh.shape[DATA])
+        self._lead = Lead()
+        self.step = 0
+        self.progress: dict[str, Any] = {"epoch": 0, "best_loss": None, "best_epoch": 0, "seconds": 0.0}
+
+    @property
+    def is_finished(self) -> bool:
+        epoch = self.progress["epoch"]
+        return epoch >= self.config.epochs or epoch - self.progress["best_epoch"] >= self.config.patience
+
+    def resume(self, checkpoints: Checkpoints) -> None:
+        """Continues from the latest checkpoint, if there is one.
+
+        Raises:
+            Diverged: if its weights are not finite; versions before 0.2 saved such weights.
+        """
+        if (saved := checkpoints.restore("latest", self.state)) is not None:
+            self.state, self.progress = saved
+            epoch, best = self.progress["epoch"], self.progress["best_loss"]
+            if not self._has_finite_weights():
+                raise Diverged(
+                    f"the checkpoint of the {self.task.name} after epoch {epoch} in {self.folder} has weights that are not "
+                    f"finite; {self._way_out()}"
+                )
+            if best is not None and not np.isfinite(best):  # saved as best by a version before 0.2: any epoch is better
+                self.progress |= {"best_loss": None, "best_epoch": epoch}
+            console.print(f"{self.task.name}: resuming after epoch {epoch}, step {int(self.state.step)}")
+        self.step = int(self.state.step)
+
+    def train_epoch(
+        self, batches: Iterator[dict[str, np.ndarray]], checkpoints: Checkpoints, preemption: Preemption, bar: Callable
+    ) -> dict[str, float]:
+        """Trains to the end of the epoch; returns the mean of every metric over its steps.
+
+        Args:
+            bar: called after every step.
+
+        Raises:
+            Preempted: after SIGTERM, once the state is saved.
+            Diverged: after SIGTERM, if the state cannot be saved because it is not finite.
+        """
+        started, end = time.perf_counter(), (self.progress["epoch"] + 1) * self.epoch_steps
+        while self.step < end:
+            self.state, loss = self._train_step(self.state, place_batch(self.mesh, next(batches)), self.hyper)
+            self.step += 1
+            self._lead.limit(loss)
+            bar()
+            if preemption.after(self.step) and self.step < end:
+                self.progress["seconds"] += time.perf_counter() - started
+                self._check({f"sum of the training {k}": float(total) for k, total in self.state.sums.items()})
+                checkpoints.save("latest", self.step, self.state, self.progress)
+                raise Preempted(f"{self.task.name} was asked to end after step {self.step}")
+        return {name: float(total) / self.epoch_steps for name, total in self.state.sums.items()}
+
+    def finish_epoch(
+        self, started: float, means: dict[str, float], checkpoints: Checkpoints, log: MetricsLog
+    ) -> dict[str, float]:
+        """Validates, saves and logs the state after an epoch; returns the validation metrics.
+
+        Args:
+            started: time at which the epoch began.
+            means: result of `train_epoch`.
+
+        Raises:
+            Diverged: if a metric or a weight is not finite; then nothing is saved.
+        """
+        checked = validate(self._evaluate_step, self.state, self._validation, self.mesh)
+        self._check(
+            {f"training {name}": mean for name, mean in means.items()}
+            | {f"validation {name}": mean for name, mean in checked.items()}
+        )
+        progress = self.progress
+        progress["epoch"] += 1
+        progress["seconds"] += time.perf_counter() - started
+        if progress["best_loss"] is None or checked["loss"] < progress["best_loss"]:
+            progress |= {"best_loss": checked["loss"], "best_epoch": progress["epoch"], "best": checked}
+            checkpoints.save("best", self.step, self.state, progress)
+        rates = {
+            "epoch": progress["epoch"],
+            "learning_rate": float(self.rate(self.state.step, self.hyper.learning_rate)),
+            "seconds": progress["seconds"],
+        }
+        log.write(
+            self.step,
+            rates | {f"train/{k}": v for k, v in means.items()} | {f"val/{k}": v for k, v in checked.items()},
+        )
+        # Saved after the log is written: resuming can remove lines beyond the checkpoint, but cannot restore a missing one.
+        checkpoints.save("latest", self.step, self.state, progress)
+        return checked
+
+    def summary(self, start: StartingWeights | None) -> dict[str, Any]:
+        """Returns what `summary.json` holds of the finished training.
+
+        Raises:
+            Diverged: if no epoch was saved as best, which can only be in a folder of a version before 0.2.
+        """
+        if self.progress["epoch"] and self.progress["best_loss"] is None:
+            raise Diverged(
+                f"no epoch of the {self.task.name} in {self.folder} has a validation loss that is finite; {self._way_out()}"
+            )
+        return self.progress | {
+            "steps": self.step,
+            "start": start.name if start else "random weights",
+            "stopped_early": self.progress["epoch"] < self.config.epochs,
+        }
+
+    def _has_finite_weights(self) -> bool:
+        return bool(self._all_finite((self.state.parameters, self.state.statistics)))
+
+    def _check(self, metrics: dict[str, float]) -> None:
+        """Raises `Diverged` if a metric or a weight is not finite."""
+        bad = not_finite(metrics) or ["weights"] * (not self._has_finite_weights())
+        if not bad:
+            return
+        epoch = self.progress["epoch"]
+        verb = "are" if bad[0] == "weights" else "is"
+        kept = f"the checkpoint after epoch {epoch} is kept in {self.folder}" if epoch else "no epoch was saved"
+        raise Diverged(
+            f"the {self.task.name} diverged in epoch {epoch + 1}, by step {self.step}: its {bad[0]} {verb} not finite; "
+            f"{kept}; {self._way_out()}"
+        )
+
+    def _way_out(self) -> str:
+        return (
+            f"to train again, lower {self.rate_option} ({self.config.learning_rate:g} in this run), and delete {self.folder} "
+            f"or choose another --out"
+        )
+
+
 def fit(
     task: Task,
     data: Path,
@@ -163,6 +333,7 @@ def fit(
     folder: Path,
     start: StartingWeights | None = None,
     mesh: Mesh | None = None,
+    rate_option: str = "the learning rate",
 ) -> dict[str, Any]:
     """Trains a network and returns the run's summary.
 
@@ -175,13 +346,14 @@ def fit(
         folder: where the run is stored.
         start: initial weights; random if None.
         mesh: devices to train on; all if None.
+        rate_option: the option that sets the learning rate, for messages.
 
     Raises:
         DataError: if the folder holds a run with another configuration, or the devices cannot share a batch.
         Preempted: after SIGTERM, once everything is saved.
-        FloatingPointError: if the training loss is no longer finite.
+        Diverged: if after an epoch a training metric, a validation metric or a weight is not finite. The checkpoints are then
+            those of the epochs before.
     """
-    config = task.optimiser
     identity = identity_of(task, statistics, start)
     check_config(folder, identity, "a network trained")
     if (folder / "summary.json").exists():
@@ -190,83 +362,31 @@ def fit(
     check_batch(task, mesh)
     if is_first():
         write_json(folder / "config.json", identity)
-
-    epoch_steps = steps_of_an_epoch(task, statistics)
-    rate, hyper = learning_rate(config, epoch_steps * config.epochs), task.hyperparameters
-
-    structure, state = initial_state(task, config.seed, start)
-    where = parameter_sharding(mesh, state)
-    state = place(state, where)
-    # The old state is donated to the step, so that the new one takes its memory and keeps its placement.
-    train_step = jax.jit(train_step_of(task, structure, epoch_steps), donate_argnums=0, out_shardings=(where, None))
-    evaluate_step = jax.jit(summed_over(mesh, evaluate_step_of(task, structure)))
-    validation = validation_set(task, data, statistics, mesh.shape[DATA])
-    progress: dict[str, Any] = {"epoch": 0, "best_loss": None, "best_epoch": 0, "seconds": 0.0}
-    lead = Lead()
-
+    training, config = _Training(task, data, statistics, folder, start, mesh, rate_option), task.optimiser
     with Checkpoints(folder) as checkpoints, progress_bar("views") as bar, Preemption() as preemption:
-        if (saved := checkpoints.restore("latest", state)) is not None:
-            state, progress = saved
-            console.print(f"{task.name}: resuming after epoch {progress['epoch']}, step {int(state.step)}")
-        step = int(state.step)
-        log = MetricsLog(folder, step)
-        batches = train_batches(data, task.batches, first_step=step)
+        training.resume(checkpoints)
+        log = MetricsLog(folder, training.step)
+        batches = train_batches(data, task.batches, first_step=training.step)
         line = bar.add_task(
             f"Training {task.name}",
-            total=epoch_steps * config.epochs * config.batch_size,
-            completed=step * config.batch_size,
+            total=training.epoch_steps * config.epochs * config.batch_size,
+            completed=training.step * config.batch_size,
             note="",
         )
-        while progress["epoch"] < config.epochs and progress["epoch"] - progress["best_epoch"] < config.patience:
+        advance = partial(bar.advance, line, config.batch_size)
+        while not training.is_finished:
             started = time.perf_counter()
-            epoch_end = (progress["epoch"] + 1) * epoch_steps
-            while step < epoch_end:
-                state, loss = train_step(state, place_batch(mesh, next(batches)), hyper)
-                step += 1
-                lead.limit(loss)
-                bar.advance(line, config.batch_size)
-                if preemption.after(step) and step < epoch_end:
-                    progress["seconds"] += time.perf_counter() - started
-                    checkpoints.save("latest", step, state, progress)
-                    raise Preempted(f"{task.name} was asked to end after step {step}")
-            means = {name: float(total) / epoch_steps for name, total in state.sums.items()}
-            checked = validate(evaluate_step, state, validation, mesh)
-            if not np.isfinite(means["loss"]):
-                raise FloatingPointError(
-                    f"{task.name}: the training loss is no longer finite at step {step}; lower the learning rate"
-                )
-
-            progress["epoch"] += 1
-            progress["seconds"] += time.perf_counter() - started
-            better = progress["best_loss"] is None or checked["loss"] < progress["best_loss"]
-            if better:
-                progress |= {"best_loss": checked["loss"], "best_epoch": progress["epoch"], "best": checked}
-                checkpoints.save("best", step, state, progress)
-            rates = {
-                "epoch": progress["epoch"],
-                "learning_rate": float(rate(state.step, hyper.learning_rate)),
-                "seconds": progress["seconds"],
-            }
-            log.write(
-                step, rates | {f"train/{k}": v for k, v in means.items()} | {f"val/{k}": v for k, v in checked.items()}
-            )
-            # Saved after the log is written: resuming can remove lines beyond the checkpoint, but cannot restore a missing one.
-            checkpoints.save("latest", step, state, progress)
+            means = training.train_epoch(batches, checkpoints, preemption, advance)
+            checked = training.finish_epoch(started, means, checkpoints, log)
             note = ", ".join(f"{name} {value:.4f}" for name, value in checked.items())
             bar.update(line, note=f"val {note}")
             console.print(
-                f"{task.name} epoch {progress['epoch']}/{config.epochs}: train loss {means['loss']:.4f}, val {note}"
+                f"{task.name} epoch {training.progress['epoch']}/{config.epochs}: train loss {means['loss']:.4f}, val {note}"
             )
             if preemption.asked:
-                raise Preempted(f"{task.name} was asked to end after step {step}")
-
+                raise Preempted(f"{task.name} was asked to end after step {training.step}")
     log.close()
-    started_from = start.name if start else "random weights"
-    summary = progress | {
-        "steps": step,
-        "start": started_from,
-        "stopped_early": progress["epoch"] < config.epochs,
-    }
+    summary = training.summary(start)
     if is_first():
         write_json(folder / "summary.json", summary)
     return summary

@@ -16,6 +16,7 @@ from data_pipeline.dataset.batches import evaluation_batches
 from data_pipeline.dataset.builder import open_split
 from data_pipeline.progress import progress_bar
 from train.devices import device_mesh, parameter_sharding, place, place_batch
+from train.finite import check_outputs
 from train.step import Batch, Task
 
 Ask = Callable[[Any, Task, Batch], jax.Array]
@@ -51,6 +52,9 @@ def network_outputs(
         data: folder of the data set.
         ask: computes the output of a batch; by default, what the network returns for the task's inputs.
         chosen: positions of objects in the split, in order; all if None.
+
+    Raises:
+        Diverged: if an output is infinite or NaN.
     """
     structure, state = nnx.split(network)
     mesh = device_mesh()
@@ -68,4 +72,5 @@ def network_outputs(
             out.append(_outputs_of_batch(task, structure, state, place_batch(mesh, batch), ask))
             bar.advance(line, len(chunk))
     found = np.concatenate([np.asarray(part) for part in out])
-    return found.reshape(len(out) * mesh.size, -1, found.shape[-1])[:objects]
+    found = found.reshape(len(out) * mesh.size, -1, found.shape[-1])[:objects]
+    return check_outputs(found, task.name, f"{split} objects")

@@ -21,11 +21,12 @@ from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
 from data_pipeline.dataset.batches import train_batches
 from data_pipeline.dataset.statistics import DatasetStatistics
-from data_pipeline.errors import DataError
+from data_pipeline.errors import DataError, Diverged
 from data_pipeline.files import as_read, read_json, write_json, write_text
 from data_pipeline.progress import console, progress_bar
 from train.checkpoints import Checkpoints
 from train.devices import DATA, device_mesh
+from train.finite import all_finite, not_finite
 from train.kept import check_config
 from train.loop import Lead, identity_of, steps_of_an_epoch, validation_set, weighted_means
 from train.preemption import Preempted, Preemption
@@ -66,7 +67,7 @@ class Member:
     Attributes:
         best: validation metrics of the best epoch.
         epochs: number of epochs trained.
-        diverged: whether its loss became infinite or NaN.
+        diverged: whether a metric or a weight became infinite or NaN; such a member is never the best.
     """
 
     learning_rate: float
@@ -81,7 +82,8 @@ class Member:
 
     @property
     def loss(self) -> float:
-        return self.best["loss"] if self.best else float("inf")
+        """Validation loss of the best epoch, by which members are compared; infinite if it diverged."""
+        return self.best["loss"] if self.best and not self.diverged else float("inf")
 
 
 def draw_members(config: SweepConfig, task: SweepTask) -> list[Member]:
@@ -158,9 +160,9 @@ def sweep(
         mesh: devices to train on; all if None.
 
     Raises:
-        DataError: if the ranges are not valid, the devices cannot share the members equally, the folder holds another sweep, or
-            every member diverged.
+        DataError: if the ranges are not valid, the devices cannot share the members equally, or the folder holds another sweep.
         Preempted: after SIGTERM, at the end of an epoch.
+        Diverged: if every member diverged.
     """
     identity = as_read({"task": asdict(task), "sweep": asdict(config), "data": statistics.fingerprint})
     check_config(folder, identity, "a sweep made")
@@ -199,6 +201,7 @@ def sweep(
 
     train_step = jax.jit(over_members(step_if, "mmsm"), donate_argnums=1)
     evaluate_step = jax.jit(over_members(evaluate_step_of(task, structure), "mmss"))
+    is_finite = jax.jit(over_members(all_finite, "m"))
     keep = jax.jit(
         over_members(lambda better, new, old: jax.tree.map(lambda a, b: jnp.where(better, a, b), new, old), "mmm")
     )
@@ -235,7 +238,8 @@ def sweep(
             means = {name: np.asarray(sums) / epoch_steps for name, sums in state.sums.items()}
             found = [evaluate_step(state.parameters, state.statistics, *batch) for batch in validation]
             progress["epoch"] += 1
-            members, better = _after_epoch(members, training, means, weighted_means(found), progress)
+            finite = np.asarray(is_finite((state.parameters, state.statistics)))
+            members, better = _after_epoch(members, training, means, weighted_means(found), finite, progress)
             best = keep(better, (state.parameters, state.statistics), best)
             progress["seconds"] += time.perf_counter() - started
             checkpoints.save(
@@ -258,9 +262,19 @@ def _after_epoch(
     training: np.ndarray,
     means: dict[str, Any],
     checked: dict[str, Any],
+    finite: np.ndarray,
     progress: dict[str, Any],
 ) -> tuple[list[Member], np.ndarray]:
-    """Returns the members with this epoch's results, and for each whether this is its best epoch so far."""
+    """Returns the members with this epoch's results, and for each whether this is its best epoch so far.
+
+    Args:
+        members: before this epoch.
+        training: whether each member was trained in this epoch.
+        means: training metrics by name, each (members,).
+        checked: validation metrics by name, each (members,).
+        finite: whether all weights of each member are finite.
+        progress: of the sweep; the metrics are added to its histories.
+    """
     after, better = [], np.zeros(len(members), bool)
     for index, member in enumerate(members):
         if training[index]:
@@ -270,7 +284,7 @@ def _after_epoch(
                 {"epoch": progress["epoch"]} | trained | {f"val/{k}": v for k, v in now.items()}
             )
             member = replace(member, epochs=progress["epoch"])
-            if not np.isfinite([now["loss"], trained["train/loss"]]).all():
+            if not_finite(trained | now) or not finite[index]:
                 member = replace(member, diverged=True)
             elif now["loss"] < member.loss:
                 better[index] = True
@@ -291,8 +305,12 @@ def _export(
     """Writes the best member into `network/`, in the form in which `train.loop.fit` stores a run."""
     index = int(np.argmin([member.loss for member in members]))
     member, alone = members[index], task_of(task, members[index])
-    if member.best is None:
-        raise DataError(f"every member of the sweep in {folder} diverged; lower --sweep.learning-rate")
+    if member.best is None or member.diverged:
+        low, high = min(m.learning_rate for m in members), max(m.learning_rate for m in members)
+        raise Diverged(
+            f"every member of the sweep in {folder} diverged, with learning rates from {low:.2g} to {high:.2g}, and no "
+            f"network is kept; to sweep again, lower --sweep.learning-rate, and delete {folder} or choose another --out"
+        )
     out = folder / "network"
     _, state = initial_state(alone, member.seed)
     parameters, rest = jax.tree.map(lambda leaf: jnp.asarray(leaf[index]), best)

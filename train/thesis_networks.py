@@ -8,6 +8,7 @@ from typing import Literal
 
 from data_pipeline.dataset.statistics import DatasetStatistics, load_statistics
 from data_pipeline.files import read_json
+from train.chance import warn_of_chance
 from train.loop import fit, load_best
 from train.optimiser import OptimiserConfig
 from train.starting_weights import StartingWeights, weights_from_network
@@ -152,12 +153,16 @@ def train_thesis(
         statistics = folder.statistics(backbone.views)
         task = backbone_task(backbone, classifier, thesis, statistics)
         start = _weights_before(backbone, folder, classifier, thesis) if backbone.start else first[backbone.name]
-        fit(task, folder.data(backbone.views), statistics, folder.backbone(backbone.name), start)
+        option = f"--thesis.{'fine-tuning' if backbone.start else f'resnet{backbone.depth}'}.learning-rate"
+        trained = folder.backbone(backbone.name)
+        summary = fit(task, folder.data(backbone.views), statistics, trained, start, rate_option=option)
+        warn_of_chance(task, summary, statistics)
     for views in VIEWS:
         statistics = folder.statistics(views)
         for frame in FRAMES:
             predict = entropy_task(frame, entropy, statistics)
-            fit(predict, folder.data(views), statistics, folder.entropy(views, frame))
+            option = "--entropy.optimiser.learning-rate"
+            fit(predict, folder.data(views), statistics, folder.entropy(views, frame), rate_option=option)
 
 
 def _weights_before(

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from data_pipeline.capture.casting import CaptureConfig
-from data_pipeline.errors import DataError
+from data_pipeline.errors import DataError, Diverged
 from data_pipeline.files import read_json
 from data_pipeline.progress import console
 
@@ -100,7 +100,15 @@ class StatisticsCollector:
         self.objects: dict[str, dict[str, tuple[int, np.ndarray, np.ndarray]]] = {split: {} for split in SPLITS}
 
     def add(self, split: str, name: str, example: dict[str, Any]) -> None:
-        """Adds the object `name` with its record `example`."""
+        """Adds the object `name` with its record `example`.
+
+        Raises:
+            Diverged: if an entropy of the object is infinite or NaN.
+        """
+        if not np.isfinite(example["entropy"]).all():
+            raise Diverged(
+                f"the depth entropies of {name} are not finite; leave this object out of the source, or repair its mesh"
+            )
         points = np.count_nonzero(example["depth"], axis=(1, 2))
         self.objects[split][name] = int(example["label"]), example["entropy"], points
 

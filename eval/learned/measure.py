@@ -32,6 +32,7 @@ from mevs_jax.models import Recogniser
 from mevs_jax.models.view_policy import expected_gain
 from mevs_jax.viewpoints import viewpoint_lattice
 from train.choosing.stages import VARIANTS, Stages, lattice_data
+from train.finite import check_results
 from train.kept import kept_json, made_by
 from train.loop import load_best
 
@@ -147,6 +148,7 @@ def _walks(
             others=not ablations,
         )
         arrays = {f"{name} {key}": value for name, policy in each.items() for key, value in vars(policy).items()}
+        check_results(found, f"walks by the recogniser in {stages.recogniser_folder()}")
         write_npz(path.with_suffix(".npz"), **arrays)
         return found
 

@@ -12,7 +12,19 @@ from data_pipeline.dataset.statistics import DatasetStatistics
 from data_pipeline.files import write_text
 from eval.learned.study import BASELINES
 from eval.report import figures
-from eval.report.html import ReportInputs, difference, document, image, percent, rows_by_knowledge, signed, span, table
+from eval.report.html import (
+    ReportInputs,
+    difference,
+    document,
+    image,
+    percent,
+    rows_by_knowledge,
+    signed,
+    span,
+    table,
+    warning,
+)
+from train.chance import Chance
 
 METHOD = "learned"
 """The policy that the page is about."""
@@ -334,7 +346,8 @@ def active_section(inputs: ReportInputs) -> str:
 
 def write_learned_page(metrics: dict[str, Any], statistics: DatasetStatistics, path: Path) -> None:
     """Writes the page, which needs no other file. Numbers are of the first seed unless the page states otherwise."""
-    parts = []
+    single = fmean(next(iter(seed["lattices"].values()))["single_view"] for seed in metrics["seeds"])
+    parts = [warning(Chance.of(single, statistics, ["test"]).warning("recogniser", "test"))]
     for number, (views, found) in enumerate(metrics["seeds"][0]["lattices"].items()):
         titles = {name: policy["title"] for name, policy in found["policies"].items()}
         curves = {name: policy for name, policy in found["policies"].items() if name != "label_oracle"}

@@ -26,6 +26,7 @@ table{border-collapse:collapse;margin:1rem 0;font-variant-numeric:tabular-nums}t
 th{border-bottom:2px solid #d1d5db;font-weight:600}td{border-bottom:1px solid #f3f4f6}
 th:first-child,td:first-child{text-align:left}td[colspan]{padding-top:.9rem}
 .lead{font-size:1.1rem}.note{color:#6b7280;font-size:.9rem}.faint{color:#9ca3af}
+.warning{border-left:4px solid #d97706;background:#fffbeb;padding:.6rem .9rem}
 .figures{display:flex;flex-wrap:wrap;gap:1rem}.figures figure{flex:1 1 45%;margin:0}small{white-space:nowrap}
 figure{margin:1rem 0}figcaption{color:#6b7280;font-size:.85rem}img{max-width:100%;height:auto}
 code{background:#f3f4f6;padding:.1rem .3rem}
@@ -79,6 +80,13 @@ def document(title: str, body: str) -> str:
         f'<!doctype html><html lang="en"><meta charset="utf-8"><meta name="viewport" content="width=device-width">'
         f"<title>{title}</title><style>{STYLE}</style><h1>{title}</h1>{body}</html>\n"
     )
+
+
+def warning(sentence: str | None) -> str:
+    """A visible notice at the top of a page, from a sentence in plain text; empty without one."""
+    if sentence is None:
+        return ""
+    return f'<p class="warning" role="alert"><b>Warning:</b> {html.escape(sentence)}.</p>'
 
 
 def table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:

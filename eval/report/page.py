@@ -15,7 +15,7 @@ from data_pipeline.dataset.builder import open_split
 from data_pipeline.files import write_text
 from eval.learned.page import active_section
 from eval.report import figures
-from eval.report.html import ReportInputs, document, image, percent, table
+from eval.report.html import ReportInputs, document, image, percent, table, warning
 from eval.report.policies import (
     ascent_section,
     compatibility_section,
@@ -27,6 +27,7 @@ from eval.report.policies import (
     movement_section,
 )
 from mevs_jax.viewpoints import ViewGraph, local_maxima
+from train.chance import Chance
 
 _SPLITS = {"train": "training", "val": "validation", "test": "test", "other": "no split"}
 """Where the source had objects that were left out."""
@@ -154,7 +155,14 @@ def read_history(folder: Path) -> list[dict[str, float]]:
     return [json.loads(line) for line in (folder / "metrics.jsonl").read_text().splitlines()]
 
 
+def _chance_notice(inputs: ReportInputs) -> str:
+    """A notice if the classifier's accuracy on single views of test objects is not above chance."""
+    chance = Chance.of(inputs.metrics["single_view"]["accuracy"], inputs.statistics, ["test"])
+    return warning(chance.warning("classifier", "test"))
+
+
 _SECTIONS = (
+    _chance_notice,
     lead,
     ladder_section,
     ascent_section,

@@ -29,7 +29,7 @@ def sweep_table(members: Sequence[Member]) -> str:
     """A Markdown table of the members, best first and diverged ones last."""
     rows = []
     for member in sorted(members, key=lambda member: member.loss):
-        loss = "diverged" if member.best is None else f"{member.loss:.5f}"
+        loss = "diverged" if member.diverged or member.best is None else f"{member.loss:.5f}"
         numbers = [f"{member.learning_rate:.2e}", f"{member.weight_decay:.2e}", f"{member.dropout:.2f}"]
         numbers += [f"{member.augmentation:.2f}", str(member.best_epoch), loss, str(member.epochs)]
         rows.append([str(members.index(member)), *numbers])
@@ -41,7 +41,7 @@ def parallel_coordinates(members: Sequence[Member]) -> Figure:
 
     Members without a finite loss are left out; the title counts them.
     """
-    finite = [member for member in members if member.best is not None]
+    finite = [member for member in members if np.isfinite(member.loss)]
     names = [name for name in _AXES if len({getattr(member, name) for member in finite}) > 1]
     columns, ticks = [], []
     for name in names:
@@ -79,7 +79,7 @@ def parallel_coordinates(members: Sequence[Member]) -> Figure:
 def write_sweep_report(members: Sequence[Member], folder: Path) -> None:
     """Writes `members.md` and `parallel_coordinates.png` beside `members.json`."""
     write_text(folder / "members.md", sweep_table(members))
-    if any(member.best for member in members):
+    if any(np.isfinite(member.loss) for member in members):
         buffer = io.BytesIO()
         parallel_coordinates(members).savefig(buffer, dpi=150)
         write_bytes(folder / "parallel_coordinates.png", buffer.getvalue())

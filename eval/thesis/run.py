@@ -29,6 +29,7 @@ from eval.tables import objects_of
 from eval.thesis.figures import FigureInputs
 from eval.thesis.page import write_thesis_report
 from eval.thesis.results import NO_ACCELERATOR, LatticeTables, all_results, machine
+from train.finite import check_results
 from train.kept import kept_array, kept_json, made_by
 from train.loop import load_best
 from train.outputs import network_outputs
@@ -206,6 +207,7 @@ def evaluate_thesis(settings: Settings, folder: ThesisFolder) -> FigureInputs:
         console.print(f"Walking {len(test[40].labels)} test objects with {len(PIPELINE)} classifiers on two lattices")
         results = all_results(test, validation, statistics, settings.evaluation) | _training(folder, histories)
         results |= {name: measured[name] for name in ("machine", "timing", "memory", "ascent")}
+        check_results(results, f"the results in {folder.out}")
         return results | {"identity": identity, "left_out": {str(v): s.left_out for v, s in statistics.items()}}
 
     results = kept_json(folder.out / "thesis.json", identity, compute)

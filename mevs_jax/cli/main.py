@@ -62,9 +62,6 @@ def _run(name: str, arguments: list[str]) -> None:
         if begins and not any((call.out / made).exists() for made in ("data", "classifier", "entropy", "learned")):
             (call.out / NAME).unlink(missing_ok=True)
         raise
-    except FloatingPointError as error:
-        kept = f"; the settings of this run are in {call.out / NAME}, and options override them" if begins else ""
-        raise FloatingPointError(f"{error}{kept}") from error
     if command.writes_run:
         keep_settings(call)
 
@@ -92,10 +89,12 @@ def _say_and_end(error: Exception) -> None:
     """Ends the program for an error that a person can act on; returns for any other."""
     if isinstance(error, ModuleNotFoundError) and error.name and not _is_ours(error.name):
         _fail(f"the package {error.name} is not installed; install the study's packages: pip install -e '.[study]'")
-    from data_pipeline.errors import DataError
+    from data_pipeline.errors import DataError, Diverged
 
-    if isinstance(error, DataError | FloatingPointError):  # the latter: a loss that is not finite any more
+    if isinstance(error, DataError):
         _fail(str(error))
+    if isinstance(error, Diverged):
+        _fail(str(error), 3)
     from train.devices import is_lost_process
     from train.preemption import Preempted
 
@@ -126,8 +125,9 @@ def _output_is_closed() -> bool:
 def main() -> None:
     """The program `mevs`.
 
-    Exit codes: 0; 2 for input that cannot be used; 130 when interrupted; 143 when asked to end (SIGTERM), with everything
-    saved; 75 when another process of the run was lost. After the last three, the same command goes on where it stopped.
+    Exit codes: 0; 2 for input that cannot be used; 3 when a training diverged, or the outputs of a network are not finite; 130
+    when interrupted; 143 when asked to end (SIGTERM), with everything saved; 75 when another process of the run was lost. After
+    the last three, the same command goes on where it stopped.
     """
     for stream in ("stdout", "stderr"):
         if getattr(sys, stream) is None:  # the program was started without it: `>&-`

@@ -43,8 +43,8 @@ def refuses(at_once):
     return lambda *arguments: refused(at_once(*arguments))
 
 
-def refused(result: subprocess.CompletedProcess) -> str:
-    assert result.returncode == 2, result.stderr
+def refused(result: subprocess.CompletedProcess, code: int = 2) -> str:
+    assert result.returncode == code, result.stderr
     assert "Traceback" not in result.stderr
     message = [line for line in result.stderr.splitlines() if line.startswith("mevs: ")]
     assert len(message) == 1

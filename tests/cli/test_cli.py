@@ -5,6 +5,7 @@ from __future__ import annotations
 import html
 import json
 import os
+import re
 import shutil
 import signal
 import subprocess
@@ -19,7 +20,7 @@ from data_pipeline.dataset.statistics import load_statistics
 from eval.learned.page import write_learned_page
 from eval.settings import TINY
 from eval.stages import ascend_on_objects, learn_to_choose, report
-from tests.cli.conftest import MEVS, mevs
+from tests.cli.conftest import MEVS, mevs, refused
 from tests.conftest import open3d_or_skip
 
 
@@ -44,6 +45,18 @@ def test_the_job_leaves_a_report_and_metrics(whole):
     for rung in metrics["ladder"]:
         assert html.escape(rung["title"]) in page
     assert "0 objects were left out" in page
+    notice, lead = page.index('<p class="warning"'), page.index('<p class="lead">')
+    assert page[notice:lead].count("chance: test accuracy") == 1  # two epochs on 30 objects teach too little
+    assert notice < lead
+
+
+def test_a_run_that_diverges_ends_with_one_sentence(data, tmp_path):
+    """A learning rate at which the loss stays finite, and results from the classifier's outputs do not."""
+    (tmp_path / "data").symlink_to(data)
+    rate = ("--classifier.optimiser.learning-rate", "1e6", "--entropy.optimiser.epochs", "1")
+    ended = refused(mevs("run", "--preset", "tiny", "--out", tmp_path, *rate), code=3)
+    assert re.search(r"not finite.*; to train it again, lower --classifier.optimiser.learning-rate, and delete", ended)
+    assert not (tmp_path / "metrics.json").exists()
 
 
 def test_a_second_run_redoes_nothing(whole, tmp_path):

@@ -15,7 +15,7 @@ from flax import nnx
 
 import train.sweep
 from data_pipeline.dataset.statistics import load_statistics
-from data_pipeline.errors import DataError
+from data_pipeline.errors import DataError, Diverged
 from eval.report.sweep import sweep_table
 from eval.stages import tasks, train_sweep
 from tests.train.scaling_worker import SETTINGS
@@ -107,6 +107,30 @@ def test_a_member_whose_loss_is_no_number_leaves_the_others_alone(out, tmp_path,
     assert "diverged" in sweep_table(members)
     alone = fit(task_of(task, members[0]), out / "data", statistics, tmp_path / "alone")
     assert members[0].loss == pytest.approx(alone["best_loss"], rel=1e-4)
+
+    chosen[0] = chosen[1]
+    for _ in range(2):  # the second time from its checkpoint
+        with pytest.raises(
+            Diverged, match=r"every member .* diverged, with learning rates from 1e.30 to 1e.30, .* delete"
+        ):
+            sweep(task, out / "data", statistics, tmp_path / "none", SWEEP)
+    assert not (tmp_path / "none" / "members.json").exists()
+    assert not (tmp_path / "none" / "network").exists()
+
+
+def test_members_that_diverge_late_are_never_the_best():
+    members = [
+        Member(1e-3, 1e-3, 0.0, 1.0, seed, 1, {"loss": loss}, 1) for seed, loss in enumerate((0.1, 0.2, 0.3, 0.4))
+    ]
+    means = {"loss": np.ones(4), "accuracy": np.array([1, np.nan, 1, 1])}
+    checked = {"loss": np.array([0.01, 0.01, np.inf, 0.35])}
+    progress = {"epoch": 2, "histories": [[] for _ in members]}
+    finite = np.array([False, True, True, True])
+    after, better = train.sweep._after_epoch(members, np.ones(4, bool), means, checked, finite, progress)
+    assert [member.diverged for member in after] == [True, True, True, False]
+    np.testing.assert_array_equal(better, [False, False, False, True])
+    assert min(after, key=lambda member: member.loss) is after[3]
+    assert sweep_table(after).count("diverged") == 3
 
 
 def test_configurations_fill_their_ranges(out):

@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import json
+import math
+import re
+import shutil
 import signal
 from collections.abc import Iterator
 from dataclasses import replace
@@ -17,13 +20,15 @@ from flax import nnx
 
 import train.loop
 from data_pipeline.dataset.statistics import load_statistics
-from data_pipeline.errors import DataError
+from data_pipeline.errors import DataError, Diverged
 from eval.settings import TINY
 from eval.stages import tasks
 from train.checkpoints import Checkpoints
 from train.loop import fit, load_best
 from train.optimiser import OptimiserConfig, descent, learning_rate
+from train.preemption import Preempted
 from train.starting_weights import weights_from_network
+from train.step import abstract_state
 from train.tasks.entropy import EntropyTask
 
 SETTINGS = replace(
@@ -192,8 +197,92 @@ def test_a_loss_that_is_no_number_stops_the_run(data, tmp_path):
     statistics = load_statistics(data)
     task = tasks(SETTINGS, statistics)[0]
     task = replace(task, optimiser=replace(task.optimiser, learning_rate=1e30, schedule="constant", epochs=1))
-    with pytest.raises(FloatingPointError, match="no longer finite"):
+    with pytest.raises(
+        Diverged, match=r"diverged in epoch 1, by step .* not finite; no epoch was saved; to train again, lower"
+    ):
         fit(task, data, statistics, tmp_path)
+    assert not list((tmp_path / "best").iterdir())
+    assert not list((tmp_path / "latest").iterdir())
+
+
+@pytest.mark.parametrize("what", ["validation accuracy", "weights"])
+def test_what_is_not_finite_is_not_saved(what, data, tmp_path, monkeypatch):
+    """Also where the loss is finite; and the way out that the message names works."""
+    statistics = load_statistics(data)
+    task = tasks(SETTINGS, statistics)[0]
+    task = replace(task, optimiser=replace(task.optimiser, epochs=3, epoch_views=2))
+    found = iter([{"loss": 1.0, "accuracy": 0.5}, {"loss": 0.5, "accuracy": 0.5 if what == "weights" else math.nan}])
+    finite = iter([True, what != "weights"])
+    monkeypatch.setattr(train.loop, "validate", lambda *_: next(found))
+    monkeypatch.setattr(train.loop._Training, "_has_finite_weights", lambda _: next(finite))
+    here = re.escape(str(tmp_path))
+    said = (
+        rf"the classifier diverged in epoch 2, by step \d+: its {what} \w+ not finite; the checkpoint after epoch 1 is kept in "
+        rf"{here}; to train again, lower --the.rate \(0.003 in this run\), and delete {here} or choose another --out"
+    )
+    with pytest.raises(Diverged, match=said):
+        fit(task, data, statistics, tmp_path, rate_option="--the.rate")
+    monkeypatch.undo()
+    assert [entry["epoch"] for entry in lines(tmp_path)] == [1]
+    with Checkpoints(tmp_path) as checkpoints:
+        for slot in ("best", "latest"):
+            _, progress = checkpoints.restore(slot, abstract_state(task)[1])
+            assert (progress["epoch"], progress["best_loss"]) == (1, 1.0)
+    lower = replace(task, optimiser=replace(task.optimiser, learning_rate=1e-3, epochs=1))
+    with pytest.raises(DataError, match="other settings"):
+        fit(lower, data, statistics, tmp_path)
+    shutil.rmtree(tmp_path)
+    assert fit(lower, data, statistics, tmp_path)["epoch"] == 1
+
+
+def test_a_best_epoch_of_an_older_version_without_a_loss_is_replaced(data, tmp_path, monkeypatch):
+    statistics = load_statistics(data)
+    task = tasks(SETTINGS, statistics)[0]
+    task = replace(task, optimiser=replace(task.optimiser, epochs=4, epoch_views=2, patience=2))
+    losses = iter([3.0, 2.0, Preempted("stopped")])
+
+    def validated(*_):
+        if isinstance(loss := next(losses), Preempted):
+            raise loss
+        return {"loss": loss}
+
+    monkeypatch.setattr(train.loop, "validate", validated)
+    with pytest.raises(Preempted):
+        fit(task, data, statistics, tmp_path)
+    monkeypatch.undo()
+    shutil.copytree(tmp_path, tmp_path / "weights")
+    with Checkpoints(tmp_path) as checkpoints:
+        state, progress = checkpoints.restore("latest", abstract_state(task)[1])
+        shutil.rmtree(tmp_path / "latest")
+    older = progress | {
+        "best_loss": math.nan,
+        "best_epoch": 1,
+        "best": {"loss": math.nan},
+    }  # it would stop by its patience
+    with Checkpoints(tmp_path) as checkpoints:
+        checkpoints.save("latest", int(state.step), state, older | {"epoch": 2})
+    summary = fit(task, data, statistics, tmp_path)
+    assert summary["best_epoch"] in (3, 4)
+    assert np.isfinite(summary["best_loss"])
+    assert np.isfinite(nnx.state(load_best(task, tmp_path), nnx.Param)["head"]["bias"][...]).all()
+
+    folder = tmp_path / "weights"
+    shutil.rmtree(folder / "latest")
+    nowhere = jax.tree.map(lambda leaf: leaf * np.nan, state.parameters)
+    with Checkpoints(folder) as checkpoints:
+        checkpoints.save("latest", int(state.step), replace(state, parameters=nowhere), older)
+    with pytest.raises(Diverged, match=r"after epoch 2 in .* has weights that are not finite; to train again"):
+        fit(task, data, statistics, folder)
+
+
+def test_an_end_within_an_epoch_saves_nothing_that_is_not_finite(data, tmp_path, monkeypatch):
+    statistics = load_statistics(data)
+    task = tasks(SETTINGS, statistics)[0]
+    task = replace(task, optimiser=replace(task.optimiser, learning_rate=1e30, schedule="constant"))
+    monkeypatch.setattr(train.loop.Preemption, "after", lambda _, step: step == 3)
+    with pytest.raises(Diverged, match="diverged in epoch 1, by step 3"):
+        fit(task, data, statistics, tmp_path)
+    assert not list((tmp_path / "latest").iterdir())
 
 
 @pytest.fixture

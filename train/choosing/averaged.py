@@ -17,6 +17,9 @@ import optax
 from flax import nnx
 from jaxtyping import Array, Float, Int
 
+from data_pipeline.errors import Diverged
+from train.finite import all_finite, not_finite
+
 Data = TypeVar("Data")
 
 
@@ -63,6 +66,8 @@ def fit_averaged(
     parameters: nnx.State,
     data: Data,
     validate: Callable[[nnx.State], dict[str, float]] | None,
+    name: str = "network",
+    rate_option: str = "the learning rate",
 ) -> tuple[nnx.State, list[dict[str, float]]]:
     """Returns the averaged weights of the best epoch, and the losses of every epoch.
 
@@ -73,6 +78,11 @@ def fit_averaged(
         parameters: initial weights.
         data: a tree of arrays with a leading axis of samples.
         validate: averaged weights to losses, the sum of which decides which epoch is best; if None, the last epoch is taken.
+        name: name of the network, for messages.
+        rate_option: the option that sets the learning rate, for messages.
+
+    Raises:
+        Diverged: if after an epoch a loss or an averaged weight is infinite or NaN.
     """
     samples = len(jax.tree.leaves(data)[0])
     batch = min(config.batch_size, samples)
@@ -105,11 +115,17 @@ def fit_averaged(
 
     carry = parameters, optimiser.init(parameters), parameters, jnp.float32(0)
     best, best_loss, history = parameters, float("inf"), []
-    data = jax.tree.map(jnp.asarray, data)
+    data, weights_are_finite = jax.tree.map(jnp.asarray, data), jax.jit(all_finite)
     for number in range(config.epochs):
         carry, loss = epoch(carry, data, jax.random.fold_in(jax.random.key(config.seed), number))
         found = validate(carry[2]) if validate else {}
         history.append({"train": float(loss), **found})
+        bad = [f"loss {which!r} is" for which in not_finite(history[-1])]
+        if bad or not weights_are_finite(carry[2]):
+            raise Diverged(
+                f"the {name} diverged in epoch {number + 1} of {config.epochs}: its {(bad or ['weights are'])[0]} not finite; "
+                f"nothing of it is saved; repeat the command with a lower {rate_option} ({config.learning_rate:g} in this run)"
+            )
         if not validate or sum(found.values()) < best_loss:
             best, best_loss = carry[2], sum(found.values())
     return best, history

@@ -11,12 +11,14 @@ import numpy as np
 from flax import nnx
 from jaxtyping import Array, Bool, Float
 
+from data_pipeline.errors import Diverged
 from mevs_jax.arrays import AnyArray
 from mevs_jax.beliefs import CalibratedFusion
 from mevs_jax.calibration import class_weights, fit_temperature
 from mevs_jax.models.set_fusion import SetFusion, SumFusion
 from train.choosing.chunks import in_chunks
 from train.choosing.features import Features, sets_of_size
+from train.finite import check_outputs
 
 _CALIBRATED = (1, 2, 3, 4, 5, 6, 8, 12, 16, 24, 32, 40)
 """Numbers of views for which a temperature is fitted; temperatures between them are interpolated."""
@@ -35,6 +37,9 @@ def calibrated(
         prior: log-probabilities of the classes in training; it is already subtracted from the single-view logits of `validation`.
         posed: whether the objects' pose is known.
         draws: number of sets of each size for each object.
+
+    Raises:
+        Diverged: if the fusion's beliefs or a temperature are infinite or NaN.
     """
     structure, weights = nnx.split(network)
     objects, views, classes = validation.logits.shape
@@ -46,10 +51,16 @@ def calibrated(
 
     def temperature(size: int) -> float:
         beliefs = beliefs_of_sets(uncalibrated, validation, sets_of_size(objects, views, size, draws))
+        check_outputs(beliefs.swapaxes(0, 1), "recogniser's fusion", "validation objects")  # the fit would hide them
         return float(fitted(beliefs, jnp.tile(validation.labels, draws)))
 
     every = np.exp(np.interp(np.log(np.arange(1, views + 1)), np.log(sizes), np.log([*map(temperature, sizes)])))
+    check_outputs(np.asarray(validation.logits), "recogniser", "validation objects")
     single = fitted(validation.logits, jnp.repeat(validation.labels, views))
+    if not np.isfinite([*every, single]).all():
+        raise Diverged(
+            "a temperature of the recogniser's fusion is not finite; train the recogniser again in another --out"
+        )
     return replace(uncalibrated, temperatures=jnp.asarray(every, jnp.float32), single=single)
 
 

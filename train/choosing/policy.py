@@ -270,7 +270,7 @@ def new_policy(config: PolicyConfig, classes: int, posed: bool = True, cloud: in
 
 
 def _fit(
-    config: PolicyConfig, network: ViewPolicy, train: Choices, validation: Choices | None
+    config: PolicyConfig, network: ViewPolicy, train: Choices, validation: Choices | None, name: str
 ) -> tuple[ViewPolicy, list]:
     """Returns the trained network of the best epoch, or of the last without validation states, and its losses by epoch."""
     structure, parameters = nnx.split(network)
@@ -285,7 +285,8 @@ def _fit(
         return policy_loss(nnx.merge(structure, mean), some, config.differences)
 
     validate = None if validation is None else mean_losses(check, validation, 1024)
-    best, history = fit_averaged(config, loss_of, parameters, train, validate)
+    option = "--learned.policy.learning-rate"
+    best, history = fit_averaged(config, loss_of, parameters, train, validate, name, option)
     return nnx.merge(structure, best), history
 
 
@@ -293,12 +294,17 @@ def train_policy(
     config: PolicyConfig,
     parts: Sequence[Seen],
     validation: Seen | None = None,
+    name: str = "view policy",
 ) -> tuple[ViewPolicy, list[list[dict[str, float]]]]:
     """Returns the policy after all rounds, and the losses by round and epoch.
 
     Args:
         parts: objects to learn from, each part with features and fusion of a recogniser that was trained without it.
         validation: other objects, which decide which epoch is best; if None, the last epoch is taken.
+        name: name of the policy, for messages.
+
+    Raises:
+        Diverged: if a loss or a weight is infinite or NaN.
     """
     fusion, data = parts[0]
     cloud = 0 if data.clouds is None else data.clouds.shape[-1]
@@ -313,7 +319,7 @@ def train_policy(
             gathered_for_check.append(_gather(validation, guide, config, (number, len(parts))))
         train = _balanced(joined(gathered))
         check = _balanced(joined(gathered_for_check)) if gathered_for_check else None
-        policy, history = _fit(config, untrained(), train, check)
+        policy, history = _fit(config, untrained(), train, check, f"{name}, round {number + 1} of {config.rounds},")
         histories.append(history)
         last = ", ".join(f"{name} {value:.4f}" for name, value in history[-1].items())
         console.print(f"Round {number + 1} of {config.rounds}, {len(train.label)} states: {last}")

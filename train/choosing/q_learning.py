@@ -148,6 +148,7 @@ def train_by_q_learning(
     config: QLearningConfig,
     parts: Sequence[Seen],
     validation: Seen | None = None,
+    name: str = "view policy",
 ) -> tuple[ViewPolicy, list[list[dict[str, float]]]]:
     """Returns the network after all rounds, for use with `by="state"`, and the losses by round and epoch.
 
@@ -168,7 +169,8 @@ def train_by_q_learning(
             to = replay if part < len(parts) else replay_for_check
             to.append(transitions_along(fusion, data, walks, config))
         train, check = joined(replay), joined(replay_for_check) if replay_for_check else None
-        weights, history = _fit(config, structure, weights, number > 0, train, check)
+        named = f"{name}, round {number + 1} of {config.rounds},"
+        weights, history = _fit(config, structure, weights, number > 0, train, check, named)
         histories.append(history)
         console.print(f"Round {number + 1} of {config.rounds}, {len(train.order)} walks: {history[-1]}")
     return nnx.merge(structure, weights), histories
@@ -181,11 +183,13 @@ def _fit(
     ahead: bool,
     train: Transitions,
     check: Transitions | None,
+    name: str,
 ) -> tuple[nnx.State, list[dict[str, float]]]:
     """Trains from the target's weights; returns the new weights and the losses by epoch.
 
     Args:
         ahead: whether the next state's value counts; not in the first round, where the target is untrained.
+        name: name of the network, for messages.
     """
     discount = config.discount if ahead else 0.0
 
@@ -199,4 +203,4 @@ def _fit(
         return {"error": loss_of(mean, some)}
 
     validate = None if check is None else mean_losses(error, check, 256)
-    return fit_averaged(config, loss_of, target, train, validate)
+    return fit_averaged(config, loss_of, target, train, validate, name, "--learned.q-learning.learning-rate")

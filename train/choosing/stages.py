@@ -27,11 +27,13 @@ from data_pipeline.progress import console
 from mevs_jax.beliefs import CalibratedFusion
 from mevs_jax.models import Recogniser, ViewPolicy
 from mevs_jax.models.set_fusion import SumFusion
+from train.chance import warn_of_chance
 from train.choosing.calibrated import calibrated
 from train.choosing.features import Features
 from train.choosing.looks import embed, see, see_changed, see_rotated
 from train.choosing.policy import By, PolicyConfig, Seen, new_policy, train_policy
 from train.choosing.q_learning import QLearningConfig, train_by_q_learning
+from train.finite import check_outputs
 from train.kept import kept_array, made_by, trained_once
 from train.loop import fit, load_best
 from train.outputs import Ask, network_outputs
@@ -217,7 +219,13 @@ class Stages:
 
     def train_recogniser(self, fold: int | None = None) -> None:
         """Trains the recogniser, or the one without part `fold`."""
-        fit(self.task(fold), self.turned, self.statistics, self.recogniser_folder(fold), self._start(fold))
+        task, folder, option = (
+            self.task(fold),
+            self.recogniser_folder(fold),
+            "--learned.recogniser.optimiser.learning-rate",
+        )
+        summary = fit(task, self.turned, self.statistics, folder, self._start(fold), rate_option=option)
+        warn_of_chance(task, summary, self.statistics)
 
     def _start(self, fold: int | None) -> StartingWeights | None:
         """Returns the initial weights of a recogniser: those for upright objects, or None for random ones."""
@@ -256,6 +264,7 @@ class Stages:
             made_by(load_statistics(data), folder),
             lambda: network_outputs(data, split, task, load_best(task, folder), ask, chosen).astype(np.float32),
         )
+        check_outputs(seen, task.name, f"objects in the features {name}")
         ends = np.cumsum([seen.shape[-1] - classes - 4, classes, 3])
         features, logits, directions, labels = np.split(seen, ends, axis=-1)
         known = jnp.asarray(labels[:, 0, 0].astype(np.int32))
@@ -306,7 +315,7 @@ class Stages:
             made_by(load_statistics(data), folder),
             lambda: network_outputs(data, split, task, load_best(task, folder), embed).astype(np.float32),
         )
-        return jnp.asarray(found)
+        return jnp.asarray(check_outputs(found, task.name, f"{split} objects"))
 
     def parts(self) -> list[Seen]:
         """Returns the training objects in parts, each with features and fusion of the recogniser trained without it."""
@@ -347,9 +356,9 @@ class Stages:
             parts = [(fusion, data.without(without)) for fusion, data in parts]
             console.print(f"Training the view policy ({name}) on {sum(len(data.labels) for _, data in parts)} objects")
             if isinstance(config, QLearningConfig):
-                policy, histories = train_by_q_learning(config, parts, check)
+                policy, histories = train_by_q_learning(config, parts, check, f"view policy ({name})")
             else:
-                policy, histories = train_policy(config, parts, check)
+                policy, histories = train_policy(config, parts, check, f"view policy ({name})")
             return policy, {"rounds": histories}
 
         made = [self.recogniser_folder()]
