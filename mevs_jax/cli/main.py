@@ -96,6 +96,10 @@ def _say_and_end(error: Exception) -> None:
 
     if isinstance(error, DataError | FloatingPointError):  # the latter: a loss that is not finite any more
         _fail(str(error))
+    from data_pipeline.files import why_not_written
+
+    if (sentence := why_not_written(error)) is not None:
+        _fail(sentence)
     from train.devices import is_lost_process
     from train.preemption import Preempted
 
