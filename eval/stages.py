@@ -18,7 +18,7 @@ import numpy as np
 from data_pipeline.dataset.builder import prepare
 from data_pipeline.dataset.statistics import DatasetStatistics, load_statistics, report_left_out
 from data_pipeline.errors import DataError
-from data_pipeline.files import read_json, write_json
+from data_pipeline.files import keep_json, read_json, write_json
 from data_pipeline.progress import console
 from eval.learned.measure import measure, together, train_all
 from eval.learned.page import write_learned_page
@@ -187,7 +187,7 @@ def learn_to_choose(settings: Settings, out: Path) -> Path:
         train_all(stages)
         found.append(measure(stages))
     metrics = {"seeds": found, "together": together(seeds, found), "settings": asdict(config)}
-    write_json(out / "learned" / "metrics.json", metrics)
+    keep_json(out / "learned" / "metrics.json", metrics)
     page = out / "learned" / "index.html"
     write_learned_page(metrics, load_statistics(out / "data"), page)
     return page

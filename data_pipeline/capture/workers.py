@@ -75,7 +75,7 @@ def capture_entry(entry: ObjectEntry, rig: Rig, folder: Path, backend: str, skip
 def still_to_capture(entries: Sequence[ObjectEntry], folder: Path) -> list[ObjectEntry]:
     """Returns the objects that are neither captured nor left out yet, and makes `folder` if needed."""
     folder.mkdir(parents=True, exist_ok=True)
-    present = {path.name for path in folder.iterdir()}
+    present = {path.name for path in folder.iterdir() if path.stat().st_size}
     paths = (capture_path, _left_out_path)
     return [entry for entry in entries if not any(path(folder, entry).name in present for path in paths)]
 
@@ -83,7 +83,8 @@ def still_to_capture(entries: Sequence[ObjectEntry], folder: Path) -> list[Objec
 def left_out_of(entries: Sequence[ObjectEntry], folder: Path) -> dict[str, str]:
     """Returns the names of the objects left out, with the reasons."""
     paths = {entry.name: _left_out_path(folder, entry) for entry in entries}
-    return {name: path.read_text() for name, path in paths.items() if path.exists()}
+    reasons = {name: path.read_text(errors="replace") for name, path in paths.items() if path.exists()}
+    return {name: reason for name, reason in reasons.items() if reason}  # an empty file is a damaged one
 
 
 _FEW_OBJECTS = 64

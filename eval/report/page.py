@@ -12,7 +12,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from data_pipeline.dataset.builder import open_split
-from data_pipeline.files import write_text
+from data_pipeline.files import damage_in, write_text
+from data_pipeline.progress import console
 from eval.learned.page import active_section
 from eval.report import figures
 from eval.report.html import ReportInputs, document, image, percent, table
@@ -27,6 +28,7 @@ from eval.report.policies import (
     movement_section,
 )
 from mevs_jax.viewpoints import ViewGraph, local_maxima
+from train.loop import read_log
 
 
 def _data_section(inputs: ReportInputs) -> str:
@@ -148,7 +150,14 @@ def _methods_section(inputs: ReportInputs) -> str:
 
 
 def read_history(folder: Path) -> list[dict[str, float]]:
-    return [json.loads(line) for line in (folder / "metrics.jsonl").read_text().splitlines()]
+    """Returns the losses of a training by epoch. Of a damaged file, those lines that can be read, after a sentence."""
+    found = [line for line in read_log(folder / "metrics.jsonl") if {"train/loss", "val/loss"} <= line.keys()]
+    if (damage := damage_in(folder, ["metrics.jsonl"])) is not None or not found:
+        console.print(
+            f"{damage or folder / 'metrics.jsonl'}: the curves of training show the {len(found)} epochs that can be read",
+            markup=False,
+        )
+    return found
 
 
 _SECTIONS = (

@@ -40,6 +40,7 @@ def _run(name: str, arguments: list[str]) -> None:
     import json
 
     from data_pipeline.errors import DataError
+    from data_pipeline.files import CHECKS
     from eval.run_file import NAME, configuration, load_run
     from eval.stages import check_output
     from mevs_jax.cli.parsing import keep_settings, parse
@@ -60,11 +61,12 @@ def _run(name: str, arguments: list[str]) -> None:
         command.load()(call)
     except DataError:
         if begins and not any((call.out / made).exists() for made in ("data", "classifier", "entropy", "learned")):
-            (call.out / NAME).unlink(missing_ok=True)
+            for kept in (NAME, CHECKS):
+                (call.out / kept).unlink(missing_ok=True)
         raise
     except FloatingPointError as error:
-        kept = f"; the settings of this run are in {call.out / NAME}, and options override them" if begins else ""
-        raise FloatingPointError(f"{error}{kept}") from error
+        said = f"; the settings of this run are in {call.out / NAME}, and options override them" if begins else ""
+        raise FloatingPointError(f"{error}{said}") from error
     if command.writes_run:
         keep_settings(call)
 
