@@ -6,13 +6,8 @@ Worker processes import this module, so neither it nor the modules it imports ma
 from __future__ import annotations
 
 import hashlib
-import multiprocessing
-import os
-import signal
-import threading
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from multiprocessing.pool import ThreadPool
 from pathlib import Path
 
 from data_pipeline.capture.casting import Capture, CaptureConfig, Rig, capture, rig_for, save_capture
@@ -21,6 +16,7 @@ from data_pipeline.errors import DamagedMesh, EmptyMesh
 from data_pipeline.files import npz_of, write_text
 from data_pipeline.objects.mesh import Mesh, ObjectEntry
 from data_pipeline.objects.sources import load_object
+from data_pipeline.processes import shared, usable_cpus
 from data_pipeline.progress import progress_bar
 
 
@@ -98,8 +94,6 @@ _settings: tuple[Rig, Path, str, bool] | None = None
 def _start_worker(rig: Rig, folder: Path, backend: str, skip_damaged: bool) -> None:
     global _settings
     _settings = rig, folder, backend, skip_damaged
-    if threading.current_thread() is threading.main_thread():  # a process, not a thread of a pool
-        signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent handles Ctrl-C and ends its workers
 
 
 def _work(entry: ObjectEntry) -> str | None:
@@ -117,9 +111,15 @@ def _captured(
         yield (capture_entry(entry, *settings) for entry in todo)
         return
     # Rasterisation is one program on one device; its threads read meshes and write captures.
-    make_pool = ThreadPool if backend == "rasterise" else multiprocessing.get_context("spawn").Pool
-    with make_pool(workers, _start_worker, settings) as pool:
-        yield pool.imap(_work, todo, chunksize=4)
+    threads = backend == "rasterise"
+    with shared(
+        _work, todo, workers=workers, start=_start_worker, given=settings, name_of=_name_of, threads=threads
+    ) as captured:
+        yield captured
+
+
+def _name_of(entry: ObjectEntry) -> str:
+    return entry.name
 
 
 def say_damaged(damage: str) -> DamagedMesh:
@@ -141,15 +141,16 @@ def capture_all(
 
     Args:
         skip_damaged: leave damaged meshes out, like empty ones.
-        workers: number of processes (threads for the backend `rasterise`). By default one for each CPU, or one for a few
-            objects. One worker that casts rays is this process itself.
+        workers: number of processes (threads for the backend `rasterise`). By default one for each usable CPU, or one for a
+            few objects. One worker that casts rays is this process itself.
 
     Raises:
         DamagedMesh: at the first damaged mesh, unless `skip_damaged`.
+        DataError: if a process dies, for example for lack of memory.
     """
     todo = still_to_capture(entries, folder)
     if todo:
-        workers = workers or (1 if len(todo) <= _FEW_OBJECTS else os.cpu_count() or 1)
+        workers = workers or (1 if len(todo) <= _FEW_OBJECTS else usable_cpus())
         settings = rig_for(config), folder, config.backend, skip_damaged
         with progress_bar("objects") as bar, _captured(todo, min(workers, len(todo)), *settings) as captured:
             task = bar.add_task("Capturing", total=len(entries), completed=len(entries) - len(todo), note="")
