@@ -10,9 +10,14 @@ import os
 import select
 import signal
 import sys
+from contextlib import nullcontext
 from pathlib import Path
+from typing import TYPE_CHECKING
 
-from mevs_jax.cli.commands import COMMANDS, find, help_text
+from mevs_jax.cli.commands import COMMANDS, Command, find, help_text
+
+if TYPE_CHECKING:
+    from mevs_jax.cli.parsing import Invocation
 
 _HELP = ("-h", "--help")
 
@@ -39,11 +44,10 @@ def _require_checkout() -> None:
 def _run(name: str, arguments: list[str]) -> None:
     import json
 
-    from data_pipeline.errors import DataError
-    from data_pipeline.files import CHECKS
-    from eval.run_file import NAME, configuration, load_run
+    from data_pipeline.lock import locked
+    from eval.run_file import configuration
     from eval.stages import check_output
-    from mevs_jax.cli.parsing import keep_settings, parse
+    from mevs_jax.cli.parsing import parse
 
     call = parse(name, arguments)
     if call.options.print_config:
@@ -54,6 +58,17 @@ def _run(name: str, arguments: list[str]) -> None:
         command.load()(call)  # which joins the other processes first; one of them keeps the settings
         return
     check_output(call.out)
+    with locked(call.out, " ".join(["mevs", *call.arguments])) if command.locks else nullcontext():
+        _run_in(call, command)
+
+
+def _run_in(call: Invocation, command: Command) -> None:
+    """Runs a command in its output directory, where its settings are kept."""
+    from data_pipeline.errors import DataError
+    from data_pipeline.files import CHECKS
+    from eval.run_file import NAME, load_run
+    from mevs_jax.cli.parsing import keep_settings
+
     begins = command.writes_run and load_run(call.out) is None
     if begins:  # a run that is interrupted continues with the same settings
         keep_settings(call)
