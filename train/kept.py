@@ -192,6 +192,11 @@ def config_of(folder: Path) -> dict[str, Any]:
     return _of_a_network(folder, "config.json", {"task"})
 
 
+def summary_of(folder: Path) -> dict[str, Any]:
+    """Returns the `summary.json` of a trained network; raises `DataError` if it is damaged."""
+    return _of_a_network(folder, "summary.json", _IN_A_SUMMARY)
+
+
 def _of_a_network(folder: Path, name: str, entries: set[str]) -> dict[str, Any]:
     try:
         content = read_json(folder / name)

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import hashlib
 import html
 import json
 import platform
+from importlib.metadata import version
 from pathlib import Path
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -176,8 +179,34 @@ _SECTIONS = (
 )
 
 
-def write_report(inputs: ReportInputs, path: Path) -> None:
-    """Writes the report as one page that needs no other file."""
+def _mark(described: Any, content: str) -> str:
+    """Returns the last line of a page: hashes of what it was made from, with the versions of the packages, and of itself."""
+    versions = [version(package) for package in ("mevs-jax", "jax", "matplotlib")]
+    made_of = json.dumps([described, versions], sort_keys=True, default=str)
+    hashes = [hashlib.sha256(text.encode()).hexdigest()[:16] for text in (made_of, content)]
+    return f"<!-- made of {hashes[0]}, content {hashes[1]} -->\n"
+
+
+def is_current(path: Path, described: Any) -> bool:
+    """Returns whether a report was made from this, and is as it was written.
+
+    Args:
+        described: what `write_report` was given.
+    """
+    try:
+        content, line = path.read_bytes().decode().rsplit("\n", 2)[:2]
+    except (OSError, ValueError):
+        return False
+    return line + "\n" == _mark(described, content + "\n")
+
+
+def write_report(inputs: ReportInputs, path: Path, described: Any = None) -> None:
+    """Writes the report as one page that needs no other file.
+
+    Args:
+        described: describes all that the page is made from; `is_current` compares it.
+    """
     body = "".join(section(inputs) for section in _SECTIONS)
     title = f"Next-best-view selection: {html.escape(inputs.statistics.source)}"
-    write_text(path, document(title, body))
+    content = document(title, body)
+    write_text(path, content + _mark(described, content))

@@ -117,6 +117,12 @@ def _say_and_end(error: Exception) -> None:
 
     if (sentence := why_not_written(error)) is not None:
         _fail(sentence)
+    if isinstance(error, MemoryError):
+        _fail(f"there is not enough memory ({error}); free some, and the same command goes on where it stopped", 75)
+    if (reason := _why_no_device()) is not None:
+        platforms = os.environ.get("JAX_PLATFORMS")
+        asked = f"JAX_PLATFORMS={platforms} asks for a device" if platforms else "JAX chose a device"
+        _fail(f"{asked} that cannot be used here ({reason}); set JAX_PLATFORMS=cpu, or install what the device needs")
     from train.devices import is_lost_process
     from train.preemption import Preempted
 
@@ -131,6 +137,23 @@ def _say_and_end(error: Exception) -> None:
         )
         sys.stderr.flush()
         os._exit(75)  # JAX's own way out waits for the process that is gone
+
+
+def _why_no_device() -> str | None:
+    """Returns why JAX has no device to compute on; None if it has one, or was not needed."""
+    if "jax" not in sys.modules:
+        return None
+    import jax
+
+    from data_pipeline.errors import reason_of
+
+    try:
+        jax.devices()
+    except AssertionError:  # of JAX itself, where no plugin has this name
+        return "JAX has none of that name"
+    except Exception as error:
+        return reason_of(error)
+    return None
 
 
 def _is_ours(module: str) -> bool:
