@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import argparse
 import os
+import re
 import shutil
 import signal
 import sys
@@ -103,7 +104,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("run", nargs="?", type=Path, help="a finished run of the preset tiny; made first if left out")
     parser.add_argument("--cases", type=int, default=0, help="how many cases, chosen at random; all by default")
-    parser.add_argument("--only", default="", help="cases whose file and kind, as printed, contain this")
+    parser.add_argument("--only", default="", help="a regular expression for cases as they are printed: kind, file")
     parser.add_argument("--seed", type=int, default=0)
     options = parser.parse_args()
     random = np.random.default_rng(options.seed)
@@ -120,7 +121,7 @@ def main() -> None:
         if options.run is None and _forked(whole, work / "log", 900) != 0:
             sys.exit((work / "log").read_text())
         files = sorted(path.relative_to(whole) for path in whole.rglob("*") if path.is_file())
-        cases = [(file, kind) for file in files for kind in KINDS if options.only in f"{kind} {file}"]
+        cases = [(file, kind) for file in files for kind in KINDS if re.search(options.only, f"{kind} {file}")]
         if options.cases and options.cases < len(cases):
             cases = [cases[at] for at in sorted(random.choice(len(cases), options.cases, replace=False))]
         counts: dict[str, Counter[str]] = {kind: Counter() for kind in KINDS}
