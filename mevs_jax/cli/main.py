@@ -171,7 +171,8 @@ def main() -> None:
     """The program `mevs`.
 
     Exit codes: 0; 2 for input that cannot be used; 130 when interrupted; 143 when asked to end (SIGTERM), with everything
-    saved; 75 when another process of the run was lost or memory ran out. After the last three, the same command goes on where it stopped.
+    saved; 75 when another process of the run was lost, or memory ran out. After the last three, the same command goes on
+    where it stopped.
     """
     try:
         _main(sys.argv[1:])
