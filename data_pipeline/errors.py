@@ -2,9 +2,24 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 
 class DataError(ValueError):
     """Data that cannot be used. The message is one sentence: what is wrong, where, and what to do."""
+
+
+class Unreadable(DataError):
+    """A stored file that cannot be read, or is not as it was written.
+
+    Attributes:
+        path: of the file.
+        reason: why it cannot be read.
+    """
+
+    def __init__(self, path: Path, reason: str, way_out: str = "delete it, and the same command makes it again"):
+        super().__init__(f"{path} cannot be read ({reason}); {way_out}")
+        self.path, self.reason = path, reason
 
 
 class DamagedMesh(DataError):

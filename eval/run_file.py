@@ -9,8 +9,8 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
 
-from data_pipeline.errors import DataError
-from data_pipeline.files import as_read, read_json, write_json
+from data_pipeline.errors import DataError, Unreadable
+from data_pipeline.files import CHECKS, as_read, checks_in, keep_json, read_json
 from eval.settings import PRESETS, Settings
 
 NAME = "run.json"
@@ -44,8 +44,10 @@ def load_run(out: Path) -> RunFile | None:
             raise ValueError(f"preset is {content['preset']!r}, not one of {', '.join(PRESETS)}")
         return RunFile(content["preset"], from_plain(Settings, content["settings"], "settings"))
     except (OSError, ValueError, KeyError, TypeError) as error:
+        reason = error.reason if isinstance(error, Unreadable) else error
         raise DataError(
-            f"{path} cannot be read ({error}); delete it, and give the options of the run again, or choose another --out"
+            f"{path} cannot be read ({reason}); delete it, and give the options of the run again, or choose another --out"
+            + (f"; if you edited it, delete {CHECKS} beside it instead" if path.name in checks_in(out) else "")
         ) from error
 
 
@@ -54,7 +56,7 @@ def save_run(out: Path, preset: str, settings: Settings, arguments: list[str]) -
     content, path = as_read(configuration(preset, settings)), out / NAME
     if path.exists() and {name: value for name, value in read_json(path).items() if name in content} == content:
         return
-    write_json(path, content | {"arguments": arguments, "made_with": _made_with()})
+    keep_json(path, content | {"arguments": arguments, "made_with": _made_with()})
 
 
 def configuration(preset: str, settings: Settings) -> dict[str, Any]:

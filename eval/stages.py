@@ -16,16 +16,16 @@ import jax.numpy as jnp
 import numpy as np
 
 from data_pipeline.dataset.builder import prepare
-from data_pipeline.dataset.statistics import DatasetStatistics, load_statistics, report_left_out
-from data_pipeline.errors import DataError, Diverged
-from data_pipeline.files import read_json, write_json
+from data_pipeline.dataset.statistics import SUMMARY, DatasetStatistics, load_statistics, report_left_out
+from data_pipeline.errors import DataError, Diverged, Unreadable
+from data_pipeline.files import check_of_file, keep_json, read_json, write_json
 from data_pipeline.progress import console
 from eval.learned.measure import measure, together, train_all
 from eval.learned.page import write_learned_page
 from eval.numbers.study import reachable_views, run_study
 from eval.rendering.policies import ascend_objects, ascent_study, load_ascent_scores
 from eval.report.html import ReportInputs
-from eval.report.page import read_history, write_report
+from eval.report.page import is_current, read_history, write_report
 from eval.report.sweep import write_sweep_report
 from eval.settings import Settings
 from eval.tables import ViewTables, compute_view_tables, load_view_tables, save_view_tables
@@ -38,7 +38,7 @@ from mevs_jax.viewpoints import ViewGraph
 from train.chance import warn_of_chance
 from train.choosing.stages import Stages, check_learned
 from train.finite import check_results, place_not_finite
-from train.kept import kept, kept_json, made_by
+from train.kept import kept, kept_json, made_by, summary_of
 from train.loop import fit, load_best
 from train.starting_weights import StartingWeights
 from train.step import Task
@@ -169,7 +169,7 @@ def evaluate(settings: Settings, out: Path) -> dict[str, Any]:
             by_view = _tables(settings, out, statistics, "test", BY_VIEW)
             leak = {
                 name: {
-                    "validation": float(read_json(out / name / "summary.json")["best"]["accuracy"]),
+                    "validation": float(summary_of(out / name)["best"]["accuracy"]),
                     "test": float((made.logits.argmax(-1) == made.labels[:, None]).mean()),
                 }
                 for name, made in (("classifier", tables), (BY_VIEW, by_view))
@@ -212,7 +212,7 @@ def learn_to_choose(settings: Settings, out: Path) -> Path:
         found.append(measure(stages))
     metrics = {"seeds": found, "together": together(seeds, found), "settings": asdict(config)}
     check_results(metrics, "the metrics of the learned study")
-    write_json(out / "learned" / "metrics.json", metrics)
+    keep_json(out / "learned" / "metrics.json", metrics)
     page = out / "learned" / "index.html"
     write_learned_page(metrics, load_statistics(out / "data"), page)
     return page
@@ -253,26 +253,39 @@ def check_live(settings: Settings, out: Path) -> dict[str, Agreement]:
 
 
 def report(settings: Settings, preset: str, out: Path) -> Path:
-    """Writes the report and returns its path; a report newer than its metrics is kept."""
+    """Writes the report and returns its path; a page that is as it was written, from the same content, is kept."""
     page, metrics, active = out / "report" / "index.html", out / "metrics.json", out / "learned" / "metrics.json"
     if not metrics.exists():
         raise DataError(f"no metrics in {out}; make them with: mevs eval --out {out}")
-    made_of = [path for path in (metrics, active) if path.exists()]
-    if not page.exists() or page.stat().st_mtime < max(path.stat().st_mtime for path in made_of):
-        statistics = load_statistics(out / "data")
-        networks = {"classifier": out / "classifier", "entropy predictor": out / "entropy"}
-        write_report(
-            ReportInputs(
-                statistics=statistics,
-                metrics=read_json(metrics),
-                tables=load_view_tables(out / "tables" / "test.npz"),
-                data=out / "data",
-                histories={name: read_history(folder) for name, folder in networks.items()},
-                summaries={name: read_json(folder / "summary.json") for name, folder in networks.items()},
-                preset=preset,
-                settings=asdict(settings),
-                learned=read_json(active) if active.exists() else None,
-            ),
-            page,
-        )
+    networks = {"classifier": out / "classifier", "entropy predictor": out / "entropy"}
+    of_networks = [folder / name for folder in networks.values() for name in ("summary.json", "metrics.jsonl")]
+    data, tables = out / "data", out / "tables" / "test.npz"
+    made_of = (metrics, active, data / SUMMARY, tables, *of_networks)
+
+    def described() -> list[Any]:
+        return [preset, asdict(settings), *(path.is_file() and check_of_file(path) for path in made_of)]
+
+    if is_current(page, described()):
+        return page
+    statistics = load_statistics(data)
+    inputs = ReportInputs(
+        statistics=statistics,
+        metrics=_metrics(metrics, f"mevs eval --out {out}"),
+        tables=_tables(settings, out, statistics, "test"),
+        data=data,
+        histories={name: read_history(folder) for name, folder in networks.items()},
+        summaries={name: summary_of(folder) for name, folder in networks.items()},
+        preset=preset,
+        settings=asdict(settings),
+        learned=_metrics(active, f"mevs study learned --out {out}") if active.exists() else None,
+    )
+    write_report(inputs, page, described())  # the tables may have been made again
     return page
+
+
+def _metrics(path: Path, command: str) -> dict[str, Any]:
+    """Returns what a file of metrics holds; raises `DataError`, which names the command that makes it, if it is damaged."""
+    try:
+        return read_json(path)
+    except Unreadable as error:
+        raise Unreadable(path, error.reason, f"make it again with: {command}") from error

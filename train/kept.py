@@ -1,4 +1,4 @@
-"""Results stored on disk under an identity, and computed again when the identity has changed.
+"""Results stored on disk under an identity, and computed again when the identity has changed or the file is damaged.
 
 An identity is whatever the result depends on: settings, the data set, the networks it was computed with.
 """
@@ -15,9 +15,11 @@ import flax.nnx as nnx
 import numpy as np
 
 from data_pipeline.dataset.statistics import DatasetStatistics
-from data_pipeline.errors import DataError
-from data_pipeline.files import as_read, read_json, write_json, write_npz
-from train.checkpoints import Checkpoints
+from data_pipeline.errors import DataError, Unreadable, reason_of
+from data_pipeline.files import as_read, checks_in, keep_json, read_json, was_written, write_npz
+from data_pipeline.progress import console
+from train.checkpoints import Checkpoints, damage_of, drop_damaged
+from train.devices import is_first
 
 Network = TypeVar("Network", bound=nnx.Module)
 Result = TypeVar("Result")
@@ -30,14 +32,33 @@ def kept(
     is_current: Callable[[Result], bool],
     compute: Callable[[], Result],
 ) -> Result:
-    """Returns the result stored in `path`; computes and stores it first if it is missing or not current.
+    """Returns the result stored in `path`; computes and stores it first if it is missing, damaged or not current.
 
     The result is always loaded from the file, so that a first run and a later one return the same.
+
+    Raises:
+        Unreadable: if `path` is a folder.
     """
-    if path.exists() and is_current(stored := load(path)):
-        return stored
+    if path.is_dir():
+        raise Unreadable(path, "it is a folder", "remove it, and the same command goes on")
+    if path.exists():
+        try:
+            stored = load(path)
+            if is_current(stored):
+                return stored
+        except Exception as error:  # the content of a damaged file decides which
+            console.print(f"{path} cannot be read ({why(error)}), so it is made again", markup=False)
     save(path, compute())
     return load(path)
+
+
+def why(error: Exception) -> str:
+    """Returns why a stored file cannot be read, in a few words."""
+    if isinstance(error, Unreadable):
+        return error.reason
+    if isinstance(error, KeyError | TypeError | AttributeError | IndexError):
+        return "its content has another form"
+    return reason_of(error)[:120]
 
 
 def kept_json(path: Path, identity: Any, compute: Callable[[], dict[str, Any]]) -> dict[str, Any]:
@@ -51,7 +72,7 @@ def kept_json(path: Path, identity: Any, compute: Callable[[], dict[str, Any]]) 
     def content() -> dict[str, Any]:
         return compute() | {"identity": identity}
 
-    return kept(path, read_json, write_json, lambda stored: stored["identity"] == identity, content)
+    return kept(path, read_json, keep_json, lambda stored: stored["identity"] == identity, content)
 
 
 def kept_array(path: Path, made: str, compute: Callable[[], np.ndarray]) -> np.ndarray:
@@ -59,7 +80,7 @@ def kept_array(path: Path, made: str, compute: Callable[[], np.ndarray]) -> np.n
 
     def load(path: Path) -> dict[str, np.ndarray]:
         with np.load(path) as stored:
-            return dict(stored)
+            return {name: stored[name] for name in ("array", "made_by")}
 
     def content() -> dict[str, np.ndarray]:
         return {"array": compute(), "made_by": np.array(made)}
@@ -80,27 +101,113 @@ def trained_once(
         train: returns the network and what `summary.json` holds about it.
     """
     path, identity = folder / "summary.json", as_read(identity)
+    current = _is_stored(path, identity)
+    drop_damaged(folder, "so the network is trained again")
     with Checkpoints(folder) as checkpoints:
-        if path.exists() and read_json(path)["identity"] == identity:
-            restored = checkpoints.restore("best", nnx.state(like, nnx.Param))
+        if current:
+            try:
+                restored = checkpoints.restore("best", nnx.state(like, nnx.Param))
+            except Unreadable as error:
+                console.print(f"{error.path} cannot be read ({error.reason}), so it is trained again", markup=False)
+                checkpoints.drop("best")
+                restored = None
             if restored is not None:
                 nnx.update(like, restored[0])
                 return like
         network, summary = train()
         path.unlink(missing_ok=True)  # so that new weights never lie beside the old identity
         checkpoints.save("best", checkpoints.latest_step("best") + 1, nnx.state(network, nnx.Param), {})
-    write_json(path, {"identity": identity, **summary})
+    keep_json(path, {"identity": identity, **summary})
     return network
+
+
+def _is_stored(path: Path, identity: Any) -> bool:
+    """Returns whether a JSON file holds this `"identity"`; False, with a sentence, for a damaged one."""
+    if not path.exists():
+        return False
+    try:
+        return read_json(path)["identity"] == identity
+    except (Unreadable, KeyError, TypeError) as error:
+        console.print(f"{path} cannot be read ({why(error)}), so the network is trained again", markup=False)
+        return False
 
 
 def check_config(folder: Path, identity: dict[str, Any], holds: str) -> None:
     """Raises `DataError` if the `config.json` of a training's folder holds another identity.
 
+    A missing or damaged one is written again if its check proves that it held this identity.
+
     Args:
         holds: what the folder holds, for the message: "a network trained", "a sweep made".
     """
-    if (folder / "config.json").exists() and read_json(folder / "config.json") != identity:
-        raise DataError(f"{folder} holds {holds} with other settings; choose another --out, or delete that folder")
+    path = folder / "config.json"
+    other = DataError(f"{folder} holds {holds} with other settings; choose another --out, or delete that folder")
+    try:
+        if read_json(path) != identity:
+            raise other
+        return
+    except FileNotFoundError:
+        if not any((folder / name).exists() for name in ("latest", "best", "summary.json")):
+            return
+        problem = Unreadable(path, "it is missing", f"delete {folder}, and the same command trains again")
+    except Unreadable as error:
+        problem = Unreadable(path, error.reason, f"delete {folder}, and the same command trains again")
+    if not was_written(path, identity):
+        raise other if path.name in checks_in(folder) else problem
+    if is_first():
+        console.print(f"{path} cannot be read ({problem.reason}), so it is written again", markup=False)
+        keep_json(path, identity)
+
+
+_IN_A_SUMMARY = {"epoch", "best_loss", "best_epoch", "best", "seconds", "steps", "start"}
+
+
+def finished(folder: Path) -> dict[str, Any] | None:
+    """Returns the summary of a finished training, or None if training has to begin or to go on.
+
+    A damaged summary, or one whose weights are damaged, is removed with a sentence: training then goes on from what is sound.
+    """
+    path = folder / "summary.json"
+    if not path.exists():
+        return None
+    damage = damage_of(folder / "best")
+    if damage is None:
+        try:
+            summary = read_json(path)
+            if set(summary) >= _IN_A_SUMMARY:
+                return summary
+            damage = f"{path} cannot be read (its content has another form)"
+        except (Unreadable, TypeError) as error:
+            damage = f"{path} cannot be read ({why(error)})"
+    if path.is_dir():
+        raise Unreadable(path, "it is a folder", "remove it, and the same command goes on")
+    if is_first():
+        console.print(f"{damage}; training goes on from what is sound", markup=False)
+        path.unlink()
+    return None
+
+
+def config_of(folder: Path) -> dict[str, Any]:
+    """Returns the `config.json` of a trained network; raises `DataError` if it is damaged."""
+    return _of_a_network(folder, "config.json", {"task"})
+
+
+def summary_of(folder: Path) -> dict[str, Any]:
+    """Returns the `summary.json` of a trained network; raises `DataError` if it is damaged."""
+    return _of_a_network(folder, "summary.json", _IN_A_SUMMARY)
+
+
+def _of_a_network(folder: Path, name: str, entries: set[str]) -> dict[str, Any]:
+    try:
+        content = read_json(folder / name)
+        if entries <= set(content):
+            return content
+        reason = "its content has another form"
+    except FileNotFoundError:
+        reason = "it is missing"
+    except (Unreadable, TypeError) as error:
+        reason = why(error)
+    raise Unreadable(folder / name, reason, "repeat the command that trained this network, such as mevs train")
 
 
 def made_by(statistics: DatasetStatistics, *networks: Path) -> str:
@@ -120,6 +227,6 @@ def made_by(statistics: DatasetStatistics, *networks: Path) -> str:
             raise DataError(
                 f"the network in {network} is not fully trained; finish it with: mevs train --out {network.parent}"
             )
-        summary = read_json(network / "summary.json")
-        content += [read_json(network / "config.json"), summary["best_epoch"], summary["best"]]
+        summary = _of_a_network(network, "summary.json", {"best_epoch", "best"})
+        content += [config_of(network), summary["best_epoch"], summary["best"]]
     return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()[:16]

@@ -11,6 +11,7 @@ import json
 import time
 from collections import deque
 from collections.abc import Callable, Iterator
+from contextlib import suppress
 from dataclasses import asdict, replace
 from functools import partial
 from pathlib import Path
@@ -31,12 +32,12 @@ from data_pipeline.dataset.batches import (
 )
 from data_pipeline.dataset.statistics import DatasetStatistics
 from data_pipeline.errors import DataError, Diverged
-from data_pipeline.files import as_read, read_json, write_json, write_text
+from data_pipeline.files import as_read, check_of_file, keep_checks, keep_json, write_text
 from data_pipeline.progress import console, progress_bar
-from train.checkpoints import Checkpoints
+from train.checkpoints import Checkpoints, drop_damaged
 from train.devices import DATA, check_batch, device_mesh, is_first, parameter_sharding, place, place_batch, summed_over
 from train.finite import all_finite, not_finite
-from train.kept import check_config
+from train.kept import check_config, config_of, finished
 from train.optimiser import learning_rate
 from train.preemption import Preempted, Preemption
 from train.starting_weights import StartingWeights
@@ -122,6 +123,17 @@ def validate(evaluate_step: Callable, state: TrainState, batches: list, mesh: Me
     return {name: float(mean) for name, mean in weighted_means(found).items()}
 
 
+def read_log(path: Path) -> list[dict[str, float]]:
+    """Returns the readable lines of a `metrics.jsonl`; none if there is no such file."""
+    found = []
+    for line in path.read_text(errors="replace").splitlines() if path.is_file() else []:
+        with suppress(ValueError):
+            content = json.loads(line)
+            if isinstance(content, dict) and "step" in content and "epoch" in content:
+                found.append(content)
+    return found
+
+
 class MetricsLog:
     """Writes metrics as JSON lines and for TensorBoard, from the first process only.
 
@@ -133,9 +145,8 @@ class MetricsLog:
         if not self._writes:
             return
         self._path = folder / "metrics.jsonl"
-        lines = self._path.read_text().splitlines() if self._path.exists() else []
-        kept = [line for line in lines if line.endswith("}") and json.loads(line)["step"] <= step]
-        write_text(self._path, "".join(line + "\n" for line in kept))
+        kept = [line for line in read_log(self._path) if line["step"] <= step]
+        write_text(self._path, "".join(json.dumps(line) + "\n" for line in kept))
         from tensorboardX import SummaryWriter  # imported late: it imports PyTorch if that is installed
 
         self._board = SummaryWriter(str(folder / "tensorboard"), purge_step=step + 1)
@@ -213,7 +224,7 @@ class _Training:
         Raises:
             Diverged: if its weights are not finite; versions before 0.2 saved such weights.
         """
-        if (saved := checkpoints.restore("latest", self.state)) is not None:
+        if (saved := checkpoints.resume(self.state, self.epoch_steps)) is not None:
             self.state, self.progress = saved
             epoch, best = self.progress["epoch"], self.progress["best_loss"]
             if not self._has_finite_weights():
@@ -356,12 +367,13 @@ def fit(
     """
     identity = identity_of(task, statistics, start)
     check_config(folder, identity, "a network trained")
-    if (folder / "summary.json").exists():
-        return read_json(folder / "summary.json")
+    if (made := finished(folder)) is not None:
+        return made
     mesh = mesh or device_mesh()
     check_batch(task, mesh)
     if is_first():
-        write_json(folder / "config.json", identity)
+        keep_json(folder / "config.json", identity)
+    drop_damaged(folder)
     training, config = _Training(task, data, statistics, folder, start, mesh, rate_option), task.optimiser
     with Checkpoints(folder) as checkpoints, progress_bar("views") as bar, Preemption() as preemption:
         training.resume(checkpoints)
@@ -388,7 +400,8 @@ def fit(
     log.close()
     summary = training.summary(start)
     if is_first():
-        write_json(folder / "summary.json", summary)
+        keep_checks(folder, {"metrics.jsonl": check_of_file(folder / "metrics.jsonl")})
+        keep_json(folder / "summary.json", summary)
     return summary
 
 
@@ -400,7 +413,7 @@ def load_best(task: Task, folder: Path) -> nnx.Module:
     """
     if not (folder / "best").is_dir():
         raise DataError(f"no trained {task.name} in {folder}; train one with: mevs train")
-    saved = read_json(folder / "config.json")["task"]
+    saved = config_of(folder)["task"]
     wanted = as_read(asdict(task))  # type: ignore[call-overload]
     for name in ("views", "classes"):
         if name in saved and saved[name] != wanted[name]:

@@ -21,13 +21,13 @@ from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
 from data_pipeline.dataset.batches import train_batches
 from data_pipeline.dataset.statistics import DatasetStatistics
-from data_pipeline.errors import DataError, Diverged
-from data_pipeline.files import as_read, read_json, write_json, write_text
+from data_pipeline.errors import DataError, Diverged, Unreadable
+from data_pipeline.files import as_read, keep_json, read_json, write_text
 from data_pipeline.progress import console, progress_bar
-from train.checkpoints import Checkpoints
+from train.checkpoints import Checkpoints, drop_damaged
 from train.devices import DATA, device_mesh
 from train.finite import all_finite, not_finite
-from train.kept import check_config
+from train.kept import check_config, why
 from train.loop import Lead, identity_of, steps_of_an_epoch, validation_set, weighted_means
 from train.preemption import Preempted, Preemption
 from train.step import Hyperparameters, TrainState, abstract_state, evaluate_step_of, initial_state, train_step_of
@@ -167,14 +167,14 @@ def sweep(
     identity = as_read({"task": asdict(task), "sweep": asdict(config), "data": statistics.fingerprint})
     check_config(folder, identity, "a sweep made")
     members = draw_members(config, task)
-    if (folder / "members.json").exists():
-        return [Member(**member) for member in read_json(folder / "members.json")]
+    if (made := _finished(folder)) is not None:
+        return made
     mesh = mesh or device_mesh()
     if len(members) % mesh.size:
         raise DataError(
             f"--sweep.members {len(members)} cannot be shared equally by {mesh.size} devices; choose a multiple"
         )
-    write_json(folder / "config.json", identity)
+    keep_json(folder / "config.json", identity)
 
     optimiser = task.optimiser
     epoch_steps = steps_of_an_epoch(task, statistics)
@@ -216,6 +216,7 @@ def sweep(
         return not member.diverged and member.epochs - member.best_epoch < optimiser.patience
 
     lead = Lead()
+    drop_damaged(folder, "so the sweep begins again")
     with Checkpoints(folder) as checkpoints, progress_bar("views") as bar, Preemption() as preemption:
         if (saved := checkpoints.restore("latest", (state, best))) is not None:
             (state, best), progress = saved
@@ -253,8 +254,20 @@ def sweep(
             if preemption.after(progress["epoch"]):
                 raise Preempted(f"the sweep was asked to end after epoch {progress['epoch']}")
     _export(task, statistics, folder, members, progress, jax.device_get(best), epoch_steps)
-    write_json(folder / "members.json", [asdict(member) for member in members])
+    keep_json(folder / "members.json", [asdict(member) for member in members])
     return members
+
+
+def _finished(folder: Path) -> list[Member] | None:
+    """Returns the members of a finished sweep; None if it has to go on, or `members.json` is damaged."""
+    path = folder / "members.json"
+    if not path.exists():
+        return None
+    try:
+        return [Member(**member) for member in read_json(path)]
+    except (Unreadable, TypeError) as error:
+        console.print(f"{path} cannot be read ({why(error)}), so it is made again", markup=False)
+        return None
 
 
 def _after_epoch(
@@ -330,5 +343,5 @@ def _export(
         checkpoints.save("best", step, state, summary)
     lines = [entry | {"step": entry["epoch"] * epoch_steps} for entry in progress["histories"][index]]
     write_text(out / "metrics.jsonl", "".join(json.dumps(line) + "\n" for line in lines))
-    write_json(out / "config.json", identity_of(alone, statistics))
-    write_json(out / "summary.json", summary)
+    keep_json(out / "config.json", identity_of(alone, statistics))
+    keep_json(out / "summary.json", summary)

@@ -23,7 +23,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from data_pipeline.errors import DataError
-from data_pipeline.files import write_npz
+from data_pipeline.files import npz_bytes, write_bytes
 from data_pipeline.objects.mesh import Mesh
 
 DEPTH_SCALE = 10_000
@@ -299,9 +299,13 @@ def store_depth(depth: np.ndarray) -> np.ndarray:
 
 
 def save_capture(path: Path, capture: Capture) -> None:
-    """Writes a capture, with fast compression, since most of a view is background."""
+    """Writes a capture, with fast compression, since most of a view is background.
+
+    It is not waited for, since a capture that a power failure damaged is made again.
+    """
     depth, image = (np.frombuffer(zlib.compress(a.tobytes(), 1), np.uint8) for a in (capture.depth, capture.image))
-    write_npz(path, shape=np.array(capture.depth.shape), extent=capture.extent, depth=depth, image=image)
+    content = npz_bytes(shape=np.array(capture.depth.shape), extent=capture.extent, depth=depth, image=image)
+    write_bytes(path, content, durable=False)
 
 
 def load_capture(path: Path) -> Capture:

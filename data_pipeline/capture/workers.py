@@ -6,13 +6,8 @@ Worker processes import this module, so neither it nor the modules it imports ma
 from __future__ import annotations
 
 import hashlib
-import multiprocessing
-import os
-import signal
-import threading
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from multiprocessing.pool import ThreadPool
 from pathlib import Path
 
 from data_pipeline.capture.casting import Capture, CaptureConfig, Rig, capture, rig_for, save_capture
@@ -21,6 +16,7 @@ from data_pipeline.errors import DamagedMesh, EmptyMesh
 from data_pipeline.files import npz_of, write_text
 from data_pipeline.objects.mesh import Mesh, ObjectEntry
 from data_pipeline.objects.sources import load_object
+from data_pipeline.processes import shared, usable_cpus
 from data_pipeline.progress import progress_bar
 
 
@@ -75,7 +71,7 @@ def capture_entry(entry: ObjectEntry, rig: Rig, folder: Path, backend: str, skip
 def still_to_capture(entries: Sequence[ObjectEntry], folder: Path) -> list[ObjectEntry]:
     """Returns the objects that are neither captured nor left out yet, and makes `folder` if needed."""
     folder.mkdir(parents=True, exist_ok=True)
-    present = {path.name for path in folder.iterdir()}
+    present = {path.name for path in folder.iterdir() if path.stat().st_size}
     paths = (capture_path, _left_out_path)
     return [entry for entry in entries if not any(path(folder, entry).name in present for path in paths)]
 
@@ -83,7 +79,8 @@ def still_to_capture(entries: Sequence[ObjectEntry], folder: Path) -> list[Objec
 def left_out_of(entries: Sequence[ObjectEntry], folder: Path) -> dict[str, str]:
     """Returns the names of the objects left out, with the reasons."""
     paths = {entry.name: _left_out_path(folder, entry) for entry in entries}
-    return {name: path.read_text() for name, path in paths.items() if path.exists()}
+    reasons = {name: path.read_text(errors="replace") for name, path in paths.items() if path.exists()}
+    return {name: reason for name, reason in reasons.items() if reason}  # an empty file is a damaged one
 
 
 _FEW_OBJECTS = 64
@@ -97,8 +94,6 @@ _settings: tuple[Rig, Path, str, bool] | None = None
 def _start_worker(rig: Rig, folder: Path, backend: str, skip_damaged: bool) -> None:
     global _settings
     _settings = rig, folder, backend, skip_damaged
-    if threading.current_thread() is threading.main_thread():  # a process, not a thread of a pool
-        signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent handles Ctrl-C and ends its workers
 
 
 def _work(entry: ObjectEntry) -> str | None:
@@ -116,9 +111,15 @@ def _captured(
         yield (capture_entry(entry, *settings) for entry in todo)
         return
     # Rasterisation is one program on one device; its threads read meshes and write captures.
-    make_pool = ThreadPool if backend == "rasterise" else multiprocessing.get_context("spawn").Pool
-    with make_pool(workers, _start_worker, settings) as pool:
-        yield pool.imap(_work, todo, chunksize=4)
+    threads = backend == "rasterise"
+    with shared(
+        _work, todo, workers=workers, start=_start_worker, given=settings, name_of=_name_of, threads=threads
+    ) as captured:
+        yield captured
+
+
+def _name_of(entry: ObjectEntry) -> str:
+    return entry.name
 
 
 def say_damaged(damage: str) -> DamagedMesh:
@@ -140,15 +141,16 @@ def capture_all(
 
     Args:
         skip_damaged: leave damaged meshes out, like empty ones.
-        workers: number of processes (threads for the backend `rasterise`). By default one for each CPU, or one for a few
-            objects. One worker that casts rays is this process itself.
+        workers: number of processes (threads for the backend `rasterise`). By default one for each usable CPU, or one for a
+            few objects. One worker that casts rays is this process itself.
 
     Raises:
         DamagedMesh: at the first damaged mesh, unless `skip_damaged`.
+        DataError: if a process dies, for example for lack of memory.
     """
     todo = still_to_capture(entries, folder)
     if todo:
-        workers = workers or (1 if len(todo) <= _FEW_OBJECTS else os.cpu_count() or 1)
+        workers = workers or (1 if len(todo) <= _FEW_OBJECTS else usable_cpus())
         settings = rig_for(config), folder, config.backend, skip_damaged
         with progress_bar("objects") as bar, _captured(todo, min(workers, len(todo)), *settings) as captured:
             task = bar.add_task("Capturing", total=len(entries), completed=len(entries) - len(todo), note="")

@@ -8,31 +8,40 @@ from __future__ import annotations
 
 import functools
 import io
-import os
 import shutil
 import struct
+import zlib
 from collections.abc import Iterator, Sequence
 from contextlib import redirect_stdout
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
+from zipfile import BadZipFile
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from data_pipeline.capture.casting import Capture, CaptureConfig, Rig, check_camera, load_capture, rig_for
-from data_pipeline.capture.workers import capture_all, capture_path
+from data_pipeline.capture.workers import capture_all, capture_entry, capture_path, say_damaged
 from data_pipeline.dataset.beam import beam_options, capture_by_beam, examples_by_beam
+from data_pipeline.dataset.proof import (
+    SHARDS,
+    SOURCE_STATE,
+    Objects,
+    damage_of_settings,
+    found_in,
+    keep_checks_of_shards,
+    state_before,
+)
 from data_pipeline.dataset.statistics import (
     SPLITS,
     SUMMARY,
     DatasetStatistics,
     StatisticsCollector,
-    load_statistics,
 )
-from data_pipeline.errors import DataError
-from data_pipeline.files import read_json, write_json
+from data_pipeline.errors import DataError, reason_of
+from data_pipeline.files import check_of_file, keep_checks, keep_json
 from data_pipeline.objects.changes import changes_between, source_state
 from data_pipeline.objects.downloads import ARCHIVES, download, download_folder, local
 from data_pipeline.objects.formats import Up
@@ -41,9 +50,6 @@ from data_pipeline.objects.sources import Reading, mesh_zip, open_source
 from data_pipeline.progress import console, progress_bar
 from mevs_jax.entropy import level_entropy
 from mevs_jax.viewpoints import viewpoint_lattice
-
-SOURCE_STATE = "source.json"
-"""File name of the state of the source's files in the folder of a data set."""
 
 
 @dataclass(frozen=True)
@@ -148,9 +154,20 @@ def _spill_without_tensorflow() -> None:
     shuffle._Bucket = Bucket
 
 
-def example_of(entry: ObjectEntry, captures: Path, rig: Rig) -> tuple[str, dict[str, Any]]:
-    """Returns the key and content of an object's record, from its capture in the folder `captures`."""
-    capture = load_capture(capture_path(captures, entry))
+def example_of(entry: ObjectEntry, captures: Path, rig: Rig, backend: str) -> tuple[str, dict[str, Any]]:
+    """Returns the key and content of an object's record, from its capture in the folder `captures`.
+
+    A damaged capture, which a power failure may leave, is made again.
+    """
+    path = capture_path(captures, entry)
+    try:
+        capture = load_capture(path)
+    except (OSError, ValueError, KeyError, EOFError, RuntimeError, BadZipFile, zlib.error) as error:
+        console.print(f"{path} cannot be read ({reason_of(error)}), so it is made again", markup=False)
+        path.unlink(missing_ok=True)
+        if (damage := capture_entry(entry, rig, captures, backend, skip_damaged=False)) is not None:
+            raise say_damaged(damage) from error
+        capture = load_capture(path)
     return entry.name, {
         "name": entry.name,
         "label": entry.label,
@@ -179,7 +196,9 @@ def _builder_class() -> type:
             self._source, self._split, self._data = source, split, config_data
             self._on_object = on_object  # None if Beam makes the examples, in other processes
             rig = rig_for(config_data.capture)
-            self._example_of = functools.partial(example_of, captures=captures.absolute(), rig=rig)
+            self._example_of = functools.partial(
+                example_of, captures=captures.absolute(), rig=rig, backend=config_data.capture.backend
+            )
             super().__init__(file_format="array_record", **rest)
 
         def _info(self):
@@ -296,10 +315,10 @@ def _state(config: DataConfig) -> dict[str, str] | None:
 
 def _say_changes(config: DataConfig, folder: Path) -> None:
     """Prints a sentence if the source has changed since the data set in `folder` was made."""
-    if not (folder / SOURCE_STATE).exists():
+    before = state_before(folder)
+    if before is None or (now := _state(config)) is None:
         return
-    now = _state(config)
-    if now is not None and (changes := changes_between(read_json(folder / SOURCE_STATE), now)):
+    if changes := changes_between(before, now):
         console.print(
             f"{config.source} has changed since its data set was made ({changes}); {folder} keeps the objects as they were: "
             f"delete it, or choose another --out, to capture them again",
@@ -337,6 +356,21 @@ def _reasons(source: ObjectSource, left_out: dict[str, str]) -> dict[str, dict[s
     return reasons
 
 
+def _check_source(config: DataConfig, folder: Path, damage: str) -> None:
+    """Raises DataError if a damaged data set cannot be made again, since its source is gone or has changed."""
+    try:
+        before, now = state_before(folder), _state(config)
+        changes = before is not None and now is not None and changes_between(before, now)
+        open_objects(config)
+    except DataError as error:
+        raise DataError(f"{damage}, and the data set cannot be made again: {error}") from error
+    if changes:
+        raise DataError(
+            f"{damage}, and {config.source} has changed since ({changes}); restore either, or delete {folder} to capture the "
+            f"objects as they are now, or choose another --out"
+        )
+
+
 def prepare(config: DataConfig, folder: Path, beam: str | None = None) -> DatasetStatistics:
     """Creates the data set in `folder`, unless it exists, and returns its statistics.
 
@@ -359,25 +393,22 @@ def prepare(config: DataConfig, folder: Path, beam: str | None = None) -> Datase
         raise DataError(
             f"--dataset.validation-share {config.validation_share:g} is not at least 0 and below 1; choose another"
         )
-    identity = _identity(config)
-    made_with = folder / "config.json"
-    if made_with.exists() and read_json(made_with) != identity:
-        was = read_json(made_with)
-        differs = ", ".join(sorted(key for key in identity if was.get(key) != identity[key]))
-        raise DataError(
-            f"{folder} has a data set made with other settings ({differs}); choose another --out, or delete it"
-        )
-    captures = folder / "captures"
+    identity, captures, made_with = _identity(config), folder / "captures", folder / "config.json"
+    damage = damage_of_settings(folder, identity)
     if (folder / SUMMARY).exists():
-        shutil.rmtree(captures, ignore_errors=True)  # left by a run that was stopped before it removed them
-        _say_changes(config, folder)
-        return load_statistics(folder)
+        found = found_in(folder, damage)
+        if isinstance(found, DatasetStatistics):
+            shutil.rmtree(captures, ignore_errors=True)  # left by a run that was stopped before it removed them
+            _say_changes(config, folder)
+            return found
+        _check_source(config, folder, found)
+        console.print(f"{found}, so the data set is made again from {config.source}", markup=False)
     options = None if beam is None else beam_options(beam)
     source, state = open_objects(config), _state(config)
     for sentence in source.said:
         console.print(f"{config.source}: {sentence}", markup=False)
     folder.mkdir(parents=True, exist_ok=True)
-    write_json(made_with, identity)
+    keep_json(made_with, identity)
     if options is None:
         left_out = capture_all(source.entries, config.capture, captures, skip_damaged=config.skip_damaged)
     else:
@@ -387,12 +418,15 @@ def prepare(config: DataConfig, folder: Path, beam: str | None = None) -> Datase
     )
     _check_classes(config, source, split, left_out)
     reasons = _reasons(source, left_out)
-    shards = folder / "shards"
+    shards = folder / SHARDS
+    (folder / SUMMARY).unlink(missing_ok=True)  # of shards that are damaged
+    keep_checks(folder, {made_with.name: check_of_file(made_with)}, only=True)
     shutil.rmtree(shards, ignore_errors=True)  # incomplete shards of an interrupted run
     statistics = _write_shards(source, split, reasons, config, captures, shards, options)
+    keep_checks_of_shards(folder)
     if state is not None:
-        write_json(folder / SOURCE_STATE, state)
-    write_json(folder / SUMMARY, statistics.content())
+        keep_json(folder / SOURCE_STATE, state)
+    keep_json(folder / SUMMARY, statistics.content())
     shutil.rmtree(captures, ignore_errors=True)
     return statistics
 
@@ -401,11 +435,6 @@ def open_split(folder: Path, split: str) -> Any:
     """Returns a random-access source of the objects of one split: `source[i]` is a dictionary of NumPy arrays.
 
     Raises:
-        DataError: if there are no shards.
+        DataError: if there are no shards, or damaged ones.
     """
-    import tensorflow_datasets as tfds
-
-    found = sorted((folder / "shards").glob("*/*/features.json"))
-    if not found:
-        raise DataError(f"no shards in {folder}; create them with: mevs data --out {os.path.dirname(folder) or '.'}")
-    return tfds.builder_from_directory(str(found[-1].parent)).as_data_source(split=split)
+    return Objects(folder, split)

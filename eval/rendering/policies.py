@@ -8,9 +8,6 @@ object after another, then evaluates and reports again.
 
 from __future__ import annotations
 
-import multiprocessing
-import os
-import signal
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
 from functools import partial
@@ -37,6 +34,7 @@ from data_pipeline.objects.reconstruction import (
     voxelise_cloud,
 )
 from data_pipeline.objects.sources import load_object
+from data_pipeline.processes import shared, usable_cpus
 from data_pipeline.progress import console, progress_bar
 from eval.numbers.comparison import difference, summarise
 from eval.numbers.study import exactly_random, reachable_views
@@ -189,12 +187,15 @@ def _ascend_one(job: _Job, data: Path, statistics: DatasetStatistics, folder: Pa
 def _start_worker(data: Path, statistics: DatasetStatistics, folder: Path, config: RenderingConfig) -> None:
     global _worker
     _worker = partial(_ascend_one, data=data, statistics=statistics, folder=folder, config=config)
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent process handles Ctrl-C and ends its workers
 
 
 def _work(job: _Job) -> None:
     assert _worker is not None
     _worker(job)
+
+
+def _name_of(job: _Job) -> str:
+    return job[1].name
 
 
 def ascend_objects(dataset: DataConfig, statistics: DatasetStatistics, out: Path, config: RenderingConfig) -> None:
@@ -219,14 +220,14 @@ def ascend_objects(dataset: DataConfig, statistics: DatasetStatistics, out: Path
     given = out / "data", statistics, folder, config
     with progress_bar("objects") as bar:
         line = bar.add_task("Gradient ascent", total=len(chosen), completed=len(chosen) - len(jobs), note="")
-        workers = min(len(jobs), os.cpu_count() or 1)
+        workers = min(len(jobs), usable_cpus())
         if jax.default_backend() != "cpu" or workers < 2:
             for job in jobs:
                 _ascend_one(job, *given)
                 bar.advance(line)
             return
-        with multiprocessing.get_context("spawn").Pool(workers, _start_worker, given) as pool:
-            for _ in pool.imap_unordered(_work, jobs):
+        with shared(_work, jobs, workers=workers, start=_start_worker, given=given, name_of=_name_of, chunk=1) as done:
+            for _ in done:
                 bar.advance(line)
 
 

@@ -2,17 +2,21 @@
 
 from __future__ import annotations
 
+import hashlib
 import html
 import json
 import platform
+from importlib.metadata import version
 from pathlib import Path
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from data_pipeline.dataset.builder import open_split
-from data_pipeline.files import write_text
+from data_pipeline.files import damage_in, write_text
+from data_pipeline.progress import console
 from eval.learned.page import active_section
 from eval.report import figures
 from eval.report.html import ReportInputs, document, image, percent, table, warning
@@ -28,6 +32,7 @@ from eval.report.policies import (
 )
 from mevs_jax.viewpoints import ViewGraph, local_maxima
 from train.chance import Chance
+from train.loop import read_log
 
 _SPLITS = {"train": "training", "val": "validation", "test": "test", "other": "no split"}
 """Where the source had objects that were left out."""
@@ -152,7 +157,14 @@ def _methods_section(inputs: ReportInputs) -> str:
 
 
 def read_history(folder: Path) -> list[dict[str, float]]:
-    return [json.loads(line) for line in (folder / "metrics.jsonl").read_text().splitlines()]
+    """Returns the losses of a training by epoch. Of a damaged file, those lines that can be read, after a sentence."""
+    found = [line for line in read_log(folder / "metrics.jsonl") if {"train/loss", "val/loss"} <= line.keys()]
+    if (damage := damage_in(folder, ["metrics.jsonl"])) is not None or not found:
+        console.print(
+            f"{damage or folder / 'metrics.jsonl'}: the curves of training show the {len(found)} epochs that can be read",
+            markup=False,
+        )
+    return found
 
 
 def _chance_notice(inputs: ReportInputs) -> str:
@@ -178,8 +190,34 @@ _SECTIONS = (
 )
 
 
-def write_report(inputs: ReportInputs, path: Path) -> None:
-    """Writes the report as one page that needs no other file."""
+def _mark(described: Any, content: str) -> str:
+    """Returns the last line of a page: hashes of what it was made from, with the versions of the packages, and of itself."""
+    versions = [version(package) for package in ("mevs-jax", "jax", "matplotlib")]
+    made_of = json.dumps([described, versions], sort_keys=True, default=str)
+    hashes = [hashlib.sha256(text.encode()).hexdigest()[:16] for text in (made_of, content)]
+    return f"<!-- made of {hashes[0]}, content {hashes[1]} -->\n"
+
+
+def is_current(path: Path, described: Any) -> bool:
+    """Returns whether a report was made from this, and is as it was written.
+
+    Args:
+        described: what `write_report` was given.
+    """
+    try:
+        content, line = path.read_bytes().decode().rsplit("\n", 2)[:2]
+    except (OSError, ValueError):
+        return False
+    return line + "\n" == _mark(described, content + "\n")
+
+
+def write_report(inputs: ReportInputs, path: Path, described: Any = None) -> None:
+    """Writes the report as one page that needs no other file.
+
+    Args:
+        described: describes all that the page is made from; `is_current` compares it.
+    """
     body = "".join(section(inputs) for section in _SECTIONS)
     title = f"Next-best-view selection: {html.escape(inputs.statistics.source)}"
-    write_text(path, document(title, body))
+    content = document(title, body)
+    write_text(path, content + _mark(described, content))

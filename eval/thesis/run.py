@@ -197,6 +197,11 @@ def evaluate_thesis(settings: Settings, folder: ThesisFolder) -> FigureInputs:
     """Returns all numbers, as written to `thesis.json`, and the other inputs of the report."""
     statistics = {views: folder.statistics(views) for views in VIEWS}
     histories = {name: read_history(network) for name, network in folder.networks().items()}
+    for name, network in folder.networks().items():
+        if not histories[name]:
+            raise DataError(
+                f"{network / 'metrics.jsonl'} is lost; delete {network}, and the same command trains it again"
+            )
     test = {views: lattice_tables(settings, folder, views, "test") for views in VIEWS}
     measured = measure(settings, folder, test)
     made = made_by(statistics[40], *folder.networks().values())

@@ -18,6 +18,7 @@ class Command:
         function: `module:function` that runs it, given an `Invocation`.
         out: default of `--out`, where `{preset}` is the preset.
         writes_run: whether its settings become those of the run, in `run.json`.
+        locks: whether no other job may write into the run directory meanwhile.
     """
 
     title: str
@@ -26,6 +27,7 @@ class Command:
     function: str
     out: str = "runs/{preset}"
     writes_run: bool = True
+    locks: bool = True
 
     def load(self) -> Callable:
         module, name = self.function.split(":")
@@ -102,6 +104,7 @@ COMMANDS = {
         ("dataset", "ascent"),
         "drawings:ascent",
         writes_run=False,
+        locks=False,
     ),
 }
 

@@ -10,9 +10,14 @@ import os
 import select
 import signal
 import sys
+from contextlib import nullcontext
 from pathlib import Path
+from typing import TYPE_CHECKING
 
-from mevs_jax.cli.commands import COMMANDS, find, help_text
+from mevs_jax.cli.commands import COMMANDS, Command, find, help_text
+
+if TYPE_CHECKING:
+    from mevs_jax.cli.parsing import Invocation
 
 _HELP = ("-h", "--help")
 
@@ -39,10 +44,10 @@ def _require_checkout() -> None:
 def _run(name: str, arguments: list[str]) -> None:
     import json
 
-    from data_pipeline.errors import DataError
-    from eval.run_file import NAME, configuration, load_run
+    from data_pipeline.lock import locked
+    from eval.run_file import configuration
     from eval.stages import check_output
-    from mevs_jax.cli.parsing import keep_settings, parse
+    from mevs_jax.cli.parsing import parse
 
     call = parse(name, arguments)
     if call.options.print_config:
@@ -53,6 +58,17 @@ def _run(name: str, arguments: list[str]) -> None:
         command.load()(call)  # which joins the other processes first; one of them keeps the settings
         return
     check_output(call.out)
+    with locked(call.out, " ".join(["mevs", *call.arguments])) if command.locks else nullcontext():
+        _run_in(call, command)
+
+
+def _run_in(call: Invocation, command: Command) -> None:
+    """Runs a command in its output directory, where its settings are kept."""
+    from data_pipeline.errors import DataError
+    from data_pipeline.files import CHECKS
+    from eval.run_file import NAME, load_run
+    from mevs_jax.cli.parsing import keep_settings
+
     begins = command.writes_run and load_run(call.out) is None
     if begins:  # a run that is interrupted continues with the same settings
         keep_settings(call)
@@ -60,7 +76,8 @@ def _run(name: str, arguments: list[str]) -> None:
         command.load()(call)
     except DataError:
         if begins and not any((call.out / made).exists() for made in ("data", "classifier", "entropy", "learned")):
-            (call.out / NAME).unlink(missing_ok=True)
+            for kept in (NAME, CHECKS):
+                (call.out / kept).unlink(missing_ok=True)
         raise
     if command.writes_run:
         keep_settings(call)
@@ -95,6 +112,16 @@ def _say_and_end(error: Exception) -> None:
         _fail(str(error))
     if isinstance(error, Diverged):
         _fail(str(error), 3)
+    from data_pipeline.files import why_not_written
+
+    if (sentence := why_not_written(error)) is not None:
+        _fail(sentence)
+    if isinstance(error, MemoryError):
+        _fail(f"there is not enough memory ({error}); free some, and the same command goes on where it stopped", 75)
+    if (reason := _why_no_device()) is not None:
+        platforms = os.environ.get("JAX_PLATFORMS")
+        asked = f"JAX_PLATFORMS={platforms} asks for a device" if platforms else "JAX chose a device"
+        _fail(f"{asked} that cannot be used here ({reason}); set JAX_PLATFORMS=cpu, or install what the device needs")
     from train.devices import is_lost_process
     from train.preemption import Preempted
 
@@ -109,6 +136,23 @@ def _say_and_end(error: Exception) -> None:
         )
         sys.stderr.flush()
         os._exit(75)  # JAX's own way out waits for the process that is gone
+
+
+def _why_no_device() -> str | None:
+    """Returns why JAX has no device to compute on; None if it has one, or was not needed."""
+    if "jax" not in sys.modules:
+        return None
+    import jax
+
+    from data_pipeline.errors import reason_of
+
+    try:
+        jax.devices()
+    except AssertionError:  # of JAX itself, where no plugin has this name
+        return "JAX has none of that name"
+    except Exception as error:
+        return reason_of(error)
+    return None
 
 
 def _is_ours(module: str) -> bool:
@@ -126,8 +170,8 @@ def main() -> None:
     """The program `mevs`.
 
     Exit codes: 0; 2 for input that cannot be used; 3 when a training diverged, or the outputs of a network are not finite; 130
-    when interrupted; 143 when asked to end (SIGTERM), with everything saved; 75 when another process of the run was lost. After
-    the last three, the same command goes on where it stopped.
+    when interrupted; 143 when asked to end (SIGTERM), with everything saved; 75 when another process of the run was lost, or
+    memory ran out. After the last three, the same command goes on where it stopped.
     """
     for stream in ("stdout", "stderr"):
         if getattr(sys, stream) is None:  # the program was started without it: `>&-`

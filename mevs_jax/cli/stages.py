@@ -28,19 +28,24 @@ def data(call: Invocation) -> None:
 
 def train(call: Invocation) -> None:
     """The networks, with other processes if there are any."""
+    from contextlib import ExitStack
+
+    from data_pipeline.lock import locked
     from data_pipeline.progress import console
     from eval import stages
     from train.devices import device_mesh, is_first, join_processes
     from train.tasks.classifier import starting_weights
 
-    if call.options.distributed:
-        join_processes()  # before anything is computed
-        console.quiet = not is_first()
-        if is_first():
-            stages.check_output(call.out)
-            keep_settings(call)
-    start = starting_weights(call.options.pretrained, call.settings.classifier.network)
-    stages.train(call.settings, call.out, start, device_mesh(call.options.model_devices))
+    with ExitStack() as held:
+        if call.options.distributed:
+            join_processes()  # before anything is computed
+            console.quiet = not is_first()
+            if is_first():
+                stages.check_output(call.out)
+                held.enter_context(locked(call.out, " ".join(["mevs", *call.arguments])))
+                keep_settings(call)
+        start = starting_weights(call.options.pretrained, call.settings.classifier.network)
+        stages.train(call.settings, call.out, start, device_mesh(call.options.model_devices))
 
 
 def sweep(call: Invocation) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import os
 import re
@@ -302,3 +303,35 @@ def test_jobs_begin_again_with_large_pages(monkeypatch):
         assert os.environ["GLIBC_TUNABLES"] == "glibc.malloc.hugetlb=1"
         cli._begin_with_large_pages()
     assert begun == [(sys.executable, [sys.executable, "-m", "mevs_jax", "run", "--views", "10"])] * 2
+
+
+@pytest.mark.parametrize(
+    ("error", "code", "said"),
+    [
+        (OSError(errno.ENOSPC, "No space left on device", "/a/b"), 2, "cannot write /a/b: the disk is full"),
+        (ValueError("Error writing /a: No space left on device"), 2, "the disk is full; free some space"),
+        (MemoryError("cannot allocate"), 75, "there is not enough memory"),
+    ],
+)
+def test_what_the_machine_lacks_is_a_sentence(error, code, said, tmp_path, at_once, monkeypatch):
+    from mevs_jax.cli import stages
+
+    def fails(call):
+        raise error
+
+    monkeypatch.setattr(stages, "data", fails)
+    result = at_once("data", "--preset", "tiny", "--out", tmp_path)
+    assert result.returncode == code
+    assert said in result.stderr
+    assert "Traceback" not in result.stderr
+
+
+def test_a_platform_that_is_not_there_is_a_sentence(tmp_path):
+    result = subprocess.run(
+        [*MEVS, "data", "--preset", "tiny", "--views", "3", "--out", str(tmp_path)],
+        capture_output=True,
+        text=True,
+        timeout=600,
+        env=os.environ | {"JAX_PLATFORMS": "cuda"},
+    )
+    assert "JAX_PLATFORMS=cuda asks for a device that cannot be used here" in refused(result)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from data_pipeline.errors import DataError
-from data_pipeline.files import read_json, write_json
+from data_pipeline.files import CHECKS, keep_json, read_json, write_json
 from train.kept import check_config, kept_array, kept_json
 
 
@@ -52,3 +52,56 @@ def test_a_folder_of_another_run_is_refused(tmp_path):
     check_config(tmp_path, {"seed": 1}, "a network trained")
     with pytest.raises(DataError, match="holds a network trained with other settings; choose another --out"):
         check_config(tmp_path, {"seed": 2}, "a network trained")
+
+
+@pytest.mark.parametrize(
+    "content", [b"", b'{"value": 1', b"[1]", b'{"value": 1}', b"\xff\xfe", b'{"value": 2, "identity": 1}']
+)
+def test_damaged_content_is_computed_again(tmp_path, content, capsys):
+    path = tmp_path / "found.json"
+    kept_json(path, 1, lambda: {"value": 1})
+    path.write_bytes(content)
+    assert kept_json(path, 1, lambda: {"value": 3}) == {"value": 3, "identity": 1}
+    assert f"{path} cannot be read" in capsys.readouterr().err
+    assert kept_json(path, 1, lambda: {"value": 4})["value"] == 3
+
+
+def test_a_file_of_an_older_version_has_no_check_and_is_accepted(tmp_path):
+    write_json(tmp_path / "found.json", {"value": 1, "identity": 1})
+    assert kept_json(tmp_path / "found.json", 1, lambda: {"value": 2})["value"] == 1
+
+
+def test_damaged_arrays_are_computed_again(tmp_path, random):
+    path = tmp_path / "array.npz"
+    whole = kept_array(path, "a", lambda: np.arange(60, dtype=np.float32))
+    content = path.read_bytes()
+    damaged = [b"", content[: len(content) // 2], b"PK", content[:200] + bytes(20) + content[220:]]
+    for at in random.integers(0, 8 * len(content), 20):
+        flipped = bytearray(content)
+        flipped[at // 8] ^= 1 << (at % 8)
+        damaged.append(bytes(flipped))
+    for one in damaged:
+        path.write_bytes(one)
+        np.testing.assert_array_equal(kept_array(path, "a", lambda: np.arange(60, dtype=np.float32)), whole)
+
+
+def test_a_folder_in_place_of_a_file_is_named_before_anything_is_computed(tmp_path):
+    (tmp_path / "found.json").mkdir()
+    with pytest.raises(DataError, match="it is a folder"):
+        kept_json(tmp_path / "found.json", 1, dict)
+
+
+def test_a_damaged_configuration_is_written_again_if_its_check_proves_it(tmp_path):
+    path, identity = tmp_path / "config.json", {"seed": 1}
+    keep_json(path, identity)
+    (tmp_path / "latest").mkdir()
+    for damage in (lambda: path.write_text('{"seed": 2}\n'), path.unlink):
+        damage()
+        check_config(tmp_path, identity, "a network trained")
+        assert read_json(path) == identity
+        damage()
+        with pytest.raises(DataError, match="with other settings"):
+            check_config(tmp_path, {"seed": 2}, "a network trained")
+    (tmp_path / CHECKS).unlink()
+    with pytest.raises(DataError, match="it is missing"):
+        check_config(tmp_path, identity, "a network trained")

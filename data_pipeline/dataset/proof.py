@@ -1,0 +1,172 @@
+"""Proof that a data set is as it was written: its settings, statistics and shards.
+
+ArrayRecord checks every record when it is read. Sizes and CRCs of all files, kept in the data set's `checks.json`, find damage
+before a training begins, so that the shards can be made again.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+from data_pipeline.dataset.statistics import SPLITS, SUMMARY, DatasetStatistics, load_statistics
+from data_pipeline.errors import DataError, Unreadable, reason_of
+from data_pipeline.files import (
+    check_of_file,
+    checks_in,
+    damage_in,
+    files_in,
+    keep_checks,
+    keep_json,
+    read_json,
+    size_of_file,
+    was_written,
+    why_not_written,
+)
+from data_pipeline.progress import console
+
+SHARDS = "shards"
+"""Folder of the shards in the folder of a data set."""
+
+SOURCE_STATE = "source.json"
+"""File name of the state of the source's files in the folder of a data set."""
+
+_LARGE = 4 * 2**30
+"""Of shards with more bytes in all than this, only the sizes are compared: reading them all would take more than seconds."""
+
+
+def keep_checks_of_shards(folder: Path) -> None:
+    """Waits until all shards of a data set are on the disk, and keeps their checks."""
+    found = {}
+    for name in files_in(folder / SHARDS):
+        path = folder / SHARDS / name
+        with path.open("rb") as file:
+            os.fsync(file.fileno())
+        found[f"{SHARDS}/{name}"] = check_of_file(path)
+    keep_checks(folder, found)
+
+
+def _checked(folder: Path) -> list[str]:
+    return [name for name in checks_in(folder) if name.startswith(f"{SHARDS}/")]
+
+
+def folder_of_shards(folder: Path) -> Path | None:
+    """Returns the folder that holds the shards of the data set in `folder`, or None if there is none."""
+    found = sorted((folder / SHARDS).glob("*/*/features.json"))
+    return found[-1].parent if found else None
+
+
+def damage_of_shards(folder: Path) -> str | None:
+    """Returns what is missing or damaged of the shards of the data set in `folder`, or None."""
+    names, where = _checked(folder), folder_of_shards(folder)
+    if where is None:
+        return f"the shards in {folder / SHARDS} are missing"
+    if not names:  # made by an older version
+        lost = next((split for split in SPLITS if not any(where.glob(f"*-{split}.array_record*"))), None)
+        return None if lost is None else f"the shards of {lost} in {where} are missing"
+    if (damage := damage_in(folder, names, size_of_file)) is not None:
+        return damage
+    if sum((folder / name).stat().st_size for name in names) > _LARGE:
+        return None
+    return damage_in(folder, names)
+
+
+def _unusable(folder: Path, damage: str) -> DataError:
+    out = os.path.dirname(folder) or "."
+    return DataError(f"{damage}; delete {folder / SHARDS}, and make it again with: mevs data --out {out}")
+
+
+class Objects:
+    """Random access to the objects of one split: `objects[i]` is a dictionary of NumPy arrays.
+
+    Raises:
+        DataError: when shards that are damaged are opened or read.
+    """
+
+    def __init__(self, folder: Path, split: str):
+        import tensorflow_datasets as tfds
+
+        where = folder_of_shards(folder)
+        if where is None:
+            raise DataError(
+                f"no shards in {folder}; create them with: mevs data --out {os.path.dirname(folder) or '.'}"
+            )
+        if (damage := damage_in(folder, _checked(folder), size_of_file)) is not None:
+            raise _unusable(folder, damage)
+        self._folder = folder
+        try:
+            self._source = tfds.builder_from_directory(str(where)).as_data_source(split=split)
+            self._length = len(self._source)
+        except Exception as error:  # of TFDS, ArrayRecord or Riegeli, each with kinds of its own
+            raise self._damaged(error) from error
+
+    def _damaged(self, error: Exception) -> Exception:
+        if isinstance(error, MemoryError | DataError) or why_not_written(error) is not None:
+            return error
+        return _unusable(self._folder, f"the shards of {self._folder} cannot be read ({reason_of(error)[:120]})")
+
+    def __len__(self) -> int:
+        return self._length
+
+    def __getitem__(self, index: int) -> dict[str, Any]:
+        if not -self._length <= index < self._length:
+            raise IndexError(index)
+        try:
+            return self._source[index]
+        except Exception as error:
+            raise self._damaged(error) from error
+
+    def __iter__(self) -> Iterator[dict[str, Any]]:
+        return (self[index] for index in range(self._length))
+
+
+def state_before(folder: Path) -> dict[str, str] | None:
+    """Returns the state of the source's files when the data set in `folder` was made, or None if it is not known."""
+    try:
+        return read_json(folder / SOURCE_STATE)
+    except FileNotFoundError:
+        return None
+    except Unreadable as error:
+        console.print(
+            f"{error.path} cannot be read ({error.reason}), so changes of the source are not noticed", markup=False
+        )
+        return None
+
+
+def damage_of_settings(folder: Path, identity: dict[str, Any]) -> str | None:
+    """Returns why it is not known with which settings the data set in `folder` was made; None if with these, or there is none.
+
+    Raises:
+        DataError: if it was made with other settings.
+    """
+    path, differs = folder / "config.json", ""
+    try:
+        was = read_json(path)
+        if was == identity:
+            return None
+        if isinstance(was, dict):
+            differs = f" ({', '.join(sorted(key for key in identity if was.get(key) != identity[key]))})"
+    except FileNotFoundError:
+        if not (folder / SUMMARY).exists():
+            return None
+        damage = f"{path} is missing"
+    except Unreadable as error:
+        damage = f"{path} cannot be read ({error.reason})"
+    if not differs and was_written(path, identity):
+        console.print(f"{damage}, so it is written again", markup=False)
+        keep_json(path, identity)
+        return None
+    if not differs and path.name not in checks_in(folder):
+        return damage
+    raise DataError(f"{folder} has a data set made with other settings{differs}; choose another --out, or delete it")
+
+
+def found_in(folder: Path, damage: str | None) -> DatasetStatistics | str:
+    """Returns the statistics of the data set in `folder`, or what of it is damaged (`damage`, if its settings are)."""
+    try:
+        statistics = load_statistics(folder)
+    except Unreadable as error:
+        return f"{error.path} cannot be read ({error.reason})"
+    return damage or damage_of_shards(folder) or statistics

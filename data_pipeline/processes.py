@@ -1,0 +1,138 @@
+"""Work shared by several processes or threads, in order. A process that dies ends the job with the name of what it worked on.
+
+Worker processes import this module, so it may not import JAX.
+"""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+import signal
+import tempfile
+import threading
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import Executor, ProcessPoolExecutor, ThreadPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
+from contextlib import contextmanager
+from functools import partial
+from io import FileIO
+from pathlib import Path
+from typing import Any, TypeVar
+
+from data_pipeline.errors import DataError
+from data_pipeline.progress import console
+
+Job = TypeVar("Job")
+Result = TypeVar("Result")
+
+_note: FileIO | None = None
+"""In a worker process, the file that names what it works on."""
+
+
+def usable_cpus() -> int:
+    """Returns the number of CPUs that this process may use, at least 1."""
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
+
+
+def _end_with_parent() -> None:
+    parent = multiprocessing.parent_process()
+    assert parent is not None
+    parent.join()
+    os._exit(1)
+
+
+def _begin(notes: Path, start: Callable[..., None], given: tuple) -> None:
+    """Starts a worker process."""
+    global _note
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent handles Ctrl-C and ends its workers
+    threading.Thread(target=_end_with_parent, daemon=True).start()  # a parent that is killed cannot
+    _note = FileIO(notes / str(os.getpid()), "w")
+    start(*given)
+
+
+def _noted(work: Callable[[Job], Result], name_of: Callable[[Job], str], job: Job) -> Result:
+    if _note is not None:
+        _note.seek(0)
+        _note.truncate()
+        _note.write(name_of(job).encode("utf-8", "replace"))
+    return work(job)
+
+
+def _death(children: Sequence[Any], notes: Path) -> DataError:
+    """Returns the error about worker processes of which one died."""
+    for child in children:
+        child.join(5)
+    dead = [child for child in children if child.exitcode not in (None, 0, -signal.SIGTERM)]
+    on = [(notes / str(child.pid)).read_text() for child in dead or children if (notes / str(child.pid)).exists()]
+    how = "ended"
+    if dead and dead[0].exitcode < 0:
+        how = f"killed by signal {-dead[0].exitcode}"
+    elif dead:
+        how = f"ended with code {dead[0].exitcode}"
+    if dead and dead[0].exitcode == -signal.SIGKILL:
+        how += ", most likely for lack of memory,"
+    return DataError(
+        f"a worker process was {how} while it worked on {', '.join(filter(None, on)) or 'nothing yet'}; what is done is kept: "
+        f"repeat the command with more memory, on fewer CPUs (taskset -c 0 mevs ...), or leave that object out"
+    )
+
+
+@contextmanager
+def shared(
+    work: Callable[[Job], Result],
+    jobs: Sequence[Job],
+    *,
+    workers: int,
+    start: Callable[..., None],
+    given: tuple,
+    name_of: Callable[[Job], str],
+    threads: bool = False,
+    chunk: int = 4,
+) -> Iterator[Iterator[Result]]:
+    """Yields an iterator over the results of `work` for all jobs, in order.
+
+    Where processes cannot be started, because semaphores cannot be made in `/dev/shm`, this process does the work.
+
+    Args:
+        workers: number of processes or threads.
+        start: called first in each of them, with the arguments `given`.
+        name_of: returns the name of a job, for the message if its process dies.
+        threads: whether to use threads.
+        chunk: number of jobs that a process is given at a time.
+
+    Raises:
+        DataError: if a process dies.
+    """
+    with tempfile.TemporaryDirectory(prefix="mevs-") as folder:
+        notes, children = Path(folder), list[Any]()
+        pool: Executor | None = None
+        try:
+            if threads:
+                pool = ThreadPoolExecutor(workers, initializer=start, initargs=given)
+            else:
+                spawn = multiprocessing.get_context("spawn")
+                pool = ProcessPoolExecutor(workers, spawn, _begin, (notes, start, given))
+        except OSError as error:
+            console.print(
+                f"Worker processes cannot be started ({error.strerror}; is /dev/shm writable?), so one process does the work",
+                markup=False,
+            )
+        if pool is None:
+            start(*given)
+            yield map(work, jobs)
+            return
+        before = set(multiprocessing.active_children())
+        try:
+            results = pool.map(partial(_noted, work, name_of), jobs, chunksize=chunk)
+            children = [child for child in multiprocessing.active_children() if child not in before]
+            yield results
+        except BrokenProcessPool as error:
+            raise _death(children, notes) from error
+        except BaseException:
+            for child in children:
+                child.terminate()
+            raise
+        finally:
+            pool.shutdown(wait=bool(children), cancel_futures=True)

@@ -1,0 +1,86 @@
+"""Work is shared by processes in order; one that dies ends the job with the name of what it worked on."""
+
+from __future__ import annotations
+
+import errno
+import os
+import signal
+import time
+from pathlib import Path
+
+import pytest
+
+from data_pipeline import processes
+from data_pipeline.errors import DataError
+from data_pipeline.processes import shared
+
+_factor = 0
+
+
+def begin(factor: int) -> None:
+    global _factor
+    _factor = factor
+
+
+def times(job: int) -> int:
+    return _factor * job
+
+
+def dies_at_five(job: int) -> int:
+    if job == 5:
+        os.kill(os.getpid(), signal.SIGKILL)
+    return job
+
+
+def sleeps_long(job: int) -> int:
+    if job:
+        time.sleep(600)
+    return job
+
+
+def name_of(job: int) -> str:
+    return f"object {job}"
+
+
+def results(work, jobs, **options) -> list[int]:
+    with shared(work, jobs, workers=2, start=begin, given=(3,), name_of=name_of, **options) as found:
+        return list(found)
+
+
+@pytest.mark.parametrize("threads", [False, True])
+def test_results_are_in_order(threads):
+    assert results(times, range(11), threads=threads) == [3 * job for job in range(11)]
+
+
+def test_a_killed_process_is_named(tmp_path):
+    with pytest.raises(
+        DataError, match=r"killed by signal 9, most likely for lack of memory, while it worked on object 5;"
+    ):
+        results(dies_at_five, range(20), chunk=2)
+
+
+def test_an_interrupt_ends_the_workers_at_once():
+    def interrupted() -> None:
+        with shared(sleeps_long, range(8), workers=2, start=begin, given=(1,), name_of=name_of, chunk=1) as found:
+            assert next(found) == 0
+            raise KeyboardInterrupt
+
+    begun = time.monotonic()
+    with pytest.raises(KeyboardInterrupt):
+        interrupted()
+    assert time.monotonic() - begun < 60
+
+
+def test_one_process_works_where_no_semaphore_can_be_made(monkeypatch, capsys):
+    def refused(*args, **kwargs):
+        raise OSError(errno.EROFS, os.strerror(errno.EROFS))
+
+    monkeypatch.setattr(processes, "ProcessPoolExecutor", refused)
+    assert results(times, range(4)) == [0, 3, 6, 9]
+    assert "one process does the work" in capsys.readouterr().err
+
+
+def test_nothing_is_left_in_the_folder_for_temporary_files(tmp_path, monkeypatch):
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
+    results(times, range(3), threads=True)
+    assert list(Path(tmp_path).iterdir()) == []

@@ -1,0 +1,122 @@
+"""Training goes on from what is sound of a damaged run, and ends as if nothing had been damaged."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from dataclasses import replace
+from pathlib import Path
+
+import jax
+import numpy as np
+import pytest
+from flax import nnx
+
+from data_pipeline.dataset.statistics import load_statistics
+from data_pipeline.errors import DataError
+from data_pipeline.files import CHECKS
+from eval.settings import TINY
+from eval.stages import tasks
+from train.checkpoints import Checkpoints, damage_of
+from train.kept import trained_once
+from train.loop import fit, load_best
+from train.optimiser import OptimiserConfig
+
+
+def task_of(statistics):
+    optimiser = OptimiserConfig(epochs=2, batch_size=16, views_per_object=2, epoch_views=2, learning_rate=1e-2)
+    return replace(tasks(TINY, statistics)[1], optimiser=optimiser)
+
+
+@pytest.fixture(scope="module")
+def trained(data, tmp_path_factory) -> Path:
+    folder = tmp_path_factory.mktemp("trained")
+    statistics = load_statistics(data)
+    fit(task_of(statistics), data, statistics, folder)
+    return folder
+
+
+def largest(slot: Path) -> Path:
+    return max(slot.glob("*/state/**/d/*"), key=lambda path: path.stat().st_size)
+
+
+def flip(path: Path) -> None:
+    content = bytearray(path.read_bytes())
+    content[len(content) // 2] ^= 1
+    path.write_bytes(bytes(content))
+
+
+def remove_checks_and_halve(slot: Path) -> None:
+    """As a save of an older version that is half written."""
+    next(slot.glob(f"*/{CHECKS}")).unlink()
+    path = largest(slot)
+    path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
+
+
+CASES = {
+    "summary": [lambda run: (run / "summary.json").write_text("")],
+    "latest flipped": [lambda run: (run / "summary.json").unlink(), lambda run: flip(largest(run / "latest"))],
+    "best flipped": [lambda run: flip(largest(run / "best"))],
+    "best removed": [lambda run: shutil.rmtree(run / "best")],
+    "both": [lambda run: shutil.rmtree(run / "best"), lambda run: flip(largest(run / "latest"))],
+    "a file for a folder": [lambda run: shutil.rmtree(run / "best"), lambda run: (run / "best").write_text("")],
+    "half and unchecked": [
+        lambda run: (run / "summary.json").unlink(),
+        lambda run: remove_checks_and_halve(run / "latest"),
+    ],
+    "log": [
+        lambda run: (run / "summary.json").write_text("[]"),
+        lambda run: (run / "metrics.jsonl").write_bytes(b"\xff1\n"),
+    ],
+}
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_a_damaged_training_ends_with_the_same_weights(case, trained, data, tmp_path, capsys):
+    run = tmp_path / "run"
+    shutil.copytree(trained, run)
+    for damage in CASES[case]:
+        damage(run)
+    statistics = load_statistics(data)
+    task = task_of(statistics)
+    found, expected = fit(task, data, statistics, run), json.loads((trained / "summary.json").read_text())
+    for key in expected.keys() - {"seconds"}:
+        assert found[key] == expected[key], key
+    mine, theirs = (jax.tree.leaves(nnx.state(load_best(task, folder))) for folder in (run, trained))
+    for a, b in zip(mine, theirs, strict=True):
+        np.testing.assert_array_equal(a, b)
+    assert str(run) in capsys.readouterr().err
+    assert fit(task, data, statistics, run) == found
+
+
+def test_damaged_weights_are_named_where_they_are_only_read(trained, data, tmp_path):
+    run = tmp_path / "run"
+    shutil.copytree(trained, run)
+    assert damage_of(run / "best") is None
+    flip(largest(run / "best"))
+    with pytest.raises(DataError, match=r"best cannot be read \(.* is not as it was written\); repeat the command"):
+        load_best(task_of(load_statistics(data)), run)
+
+
+def test_a_stored_network_is_trained_again_where_it_is_damaged(tmp_path, capsys):
+    def network(seed: int) -> nnx.Linear:
+        return nnx.Linear(64, 64, rngs=nnx.Rngs(seed))
+
+    def stored(seed: int) -> nnx.Linear:
+        return trained_once(tmp_path, {"of": 1}, nnx.eval_shape(lambda: network(0)), lambda: (network(seed), {}))
+
+    first = stored(1)
+    np.testing.assert_array_equal(stored(2).kernel[...], first.kernel[...])
+    flip(largest(tmp_path / "best"))
+    np.testing.assert_array_equal(stored(3).kernel[...], network(3).kernel[...])
+    np.testing.assert_array_equal(stored(4).kernel[...], network(3).kernel[...])
+    remove_checks_and_halve(tmp_path / "best")
+    np.testing.assert_array_equal(stored(5).kernel[...], network(5).kernel[...])
+    (tmp_path / "summary.json").write_text('{"identity"')
+    np.testing.assert_array_equal(stored(6).kernel[...], network(6).kernel[...])
+    assert "trained again" in capsys.readouterr().err
+
+
+def test_a_slot_that_never_held_a_save_is_not_damaged(tmp_path):
+    with Checkpoints(tmp_path) as checkpoints:
+        assert checkpoints.resume({"a": np.zeros(3)}, 1) is None
