@@ -123,6 +123,7 @@ class Checkpoints:
             Unreadable: if the save is damaged, or holds a state of another structure.
         """
         manager = self._slots[slot]
+        manager.wait_until_finished()  # a save may still be under way
         step = manager.latest_step()
         if step is None:
             return None
