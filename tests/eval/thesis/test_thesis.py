@@ -295,7 +295,7 @@ def test_the_stages_make_everything_and_go_on(results, tmp_path, monkeypatch, ca
     settings = PRESETS["tiny"]
     begun, asked = {}, []
 
-    def fit(task, data, statistics, folder, start=None):
+    def fit(task, data, statistics, folder, start=None, rate_option=""):
         assert data == tmp_path / f"views{statistics.views}" / "data"
         begun[folder.name] = start.name if start else "random weights"
         summary = {
