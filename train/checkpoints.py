@@ -22,7 +22,11 @@ from data_pipeline.progress import console
 from train.devices import is_first, is_lost_process
 from train.preemption import interrupts_held
 
-logging.getLogger("absl").setLevel(logging.ERROR)  # Orbax logs every step of every save
+for _name in (
+    "absl",
+    "asyncio",
+):  # Orbax logs every step of every save, and the errors of its threads, which it raises as well
+    logging.getLogger(_name).setLevel(logging.CRITICAL)
 
 
 def _placed(leaf: Any) -> Any:
