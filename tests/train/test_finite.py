@@ -117,10 +117,10 @@ def test_tables_of_numbers_that_are_not_finite_are_not_made(data, monkeypatch, t
 
 
 def test_an_interval_of_a_share():
-    """Against Agresti and Coull's (1998) form of Wilson's interval, solved for its ends."""
+    """Its ends are the probabilities from which the share is 1.96 of their own standard deviations away (Wilson 1927)."""
     for share, count in ((0.0, 3), (0.25, 8), (1 / 3, 30), (0.9, 100), (1.0, 10)):
         for end in wilson_interval(share, count):
-            assert abs(share - end) == pytest.approx(1.959964 * math.sqrt(end * (1 - end) / count), abs=1e-6)
+            assert abs(share - end) == pytest.approx(1.959964 * math.sqrt(end * (1 - end) / count), abs=1e-7)
     assert wilson_interval(0.0, 3)[0] == 0.0
     assert wilson_interval(1.0, 3)[1] == 1.0
 

@@ -289,19 +289,19 @@ def has_all_tables_and_figures(report: Path) -> None:
             assert (report / "figures" / f"figure_{number:02d}.{kind}").stat().st_size > 1000
 
 
-@pytest.mark.slow
 def test_the_stages_make_everything_and_go_on(results, tmp_path, monkeypatch, capfd):
     """With data sets as the command makes them, but networks that are not trained, and outputs that are made up."""
     settings = PRESETS["tiny"]
-    begun, asked = {}, []
+    begun, rates, asked = {}, {}, []
 
     def fit(task, data, statistics, folder, start=None, rate_option=""):
+        rates[folder.name] = rate_option
         assert data == tmp_path / f"views{statistics.views}" / "data"
         begun[folder.name] = start.name if start else "random weights"
         summary = {
             "best_epoch": 2,
             "epoch": 3,
-            "best": {},
+            "best": {"accuracy": 0.9},
             "best_loss": 0.5,
             "start": begun[folder.name],
             "seconds": 1.0,
@@ -331,6 +331,10 @@ def test_the_stages_make_everything_and_go_on(results, tmp_path, monkeypatch, ca
     for name, before in (("image_40", "10 views/object, image"), ("depth_40", "40 views/object, image")):
         assert begun[f"resnet18_{name}"].startswith(f"ResNet-18 ({before}), validation loss 0.5")
     assert len(begun) == 8
+    assert rates["resnet18_image_10"] == "--thesis.resnet18.learning-rate"
+    assert rates["resnet34_depth_40"] == "--thesis.resnet34.learning-rate"
+    assert rates["resnet18_depth_40"] == "--thesis.fine-tuning.learning-rate"
+    assert rates["40_world"] == "--entropy.optimiser.learning-rate"
     assert (
         len(set(asked)) == len(asked) == 2 * 6 + 2 * 4
     )  # every network on both test splits, those walked with on both others
