@@ -53,8 +53,11 @@ def test_the_calibration_error_is_the_textbooks(bins):
     assert float(jnp.sum(share * confidence)) == pytest.approx(confidences.mean(), abs=1e-5)
 
 
-@pytest.mark.parametrize("together", [True, pytest.param(False, marks=pytest.mark.slow)])
-def test_chance_alone_makes_this_much_calibration_error(together):
+@pytest.mark.parametrize(
+    ("together", "worlds", "times"),
+    [(True, 400, 4), *(pytest.param(together, 1000, 10, marks=pytest.mark.slow) for together in (True, False))],
+)
+def test_chance_alone_makes_this_much_calibration_error(together, worlds, times):
     """One measurement tells what many worlds measure in which every confidence is kept."""
     random = np.random.default_rng(0)
     objects, walks = 500, 8
@@ -65,8 +68,8 @@ def test_chance_alone_makes_this_much_calibration_error(together):
         luck = random.uniform(0, 1, (objects, 1 if together else walks))
         return luck < sure
 
-    measured = [numpy_rules.expected_calibration_error(sure.ravel(), world().ravel(), 15) for _ in range(400)]
-    told = np.mean([calibration_error_by_chance(sure, world()) for _ in range(4)], axis=0)
+    measured = [numpy_rules.expected_calibration_error(sure.ravel(), world().ravel(), 15) for _ in range(worlds)]
+    told = np.mean([calibration_error_by_chance(sure, world()) for _ in range(times)], axis=0)
     np.testing.assert_allclose(told, [np.mean(measured), np.quantile(measured, 0.95)], rtol=0.08)
 
 

@@ -9,14 +9,13 @@ import socket
 import subprocess
 import sys
 import time
-from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
 from data_pipeline.dataset.statistics import load_statistics
-from eval.settings import TINY, Settings
 from eval.stages import tasks
+from mevs_jax.cli.parsing import parse
 from tests.train.test_scaling import CPU
 from tests.train.test_training import lines
 from train.devices import unresolved_name
@@ -25,21 +24,15 @@ from train.loop import fit
 NETWORKS = ("classifier", "entropy")
 
 
-def slowly(networks: tuple[str, ...]) -> Settings:
-    """The settings that `start` asks for."""
-    rate = {name: {"learning_rate": 1e-4} for name in networks}
-    return replace(
-        TINY,
-        classifier=replace(TINY.classifier, optimiser=replace(TINY.classifier.optimiser, **rate.get("classifier", {}))),
-        entropy=replace(TINY.entropy, optimiser=replace(TINY.entropy.optimiser, **rate.get("entropy", {}))),
-    )
+def slowly(out: Path, networks: tuple[str, ...]) -> list[str]:
+    """The options of `mevs train` that train these networks slowly."""
+    rates = [f"--{network}.optimiser.learning-rate=1e-4" for network in networks]
+    return ["--preset", "tiny", "--out", str(out), *rates]
 
 
 def start(out: Path, *options: str, processes: int, networks: tuple[str, ...] = NETWORKS) -> list[subprocess.Popen]:
     """`mevs train` in several processes that find each other on this machine; slowly for these networks."""
-    command = [sys.executable, "-m", "mevs_jax", "train", "--preset", "tiny", "--out", str(out), *options]
-    for network in networks:
-        command += [f"--{network}.optimiser.learning-rate", "1e-4"]
+    command = [sys.executable, "-m", "mevs_jax", "train", *slowly(out, networks), *options]
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
         port = free.getsockname()[1]
@@ -86,10 +79,11 @@ def test_two_processes_train_as_one_does(networks, run, whole):
     alone, together = run("alone"), run("together")
     if "classifier" not in networks:  # the run has it already, and does not train it again
         shutil.copytree(whole / "classifier", together / "classifier")
-    tasks_of = tasks(slowly(networks), load_statistics(alone / "data"))
-    for task, name in zip(tasks_of, NETWORKS, strict=True):
+    statistics = load_statistics(alone / "data")
+    settings = parse("train", slowly(alone, networks)).settings
+    for task, name in zip(tasks(settings, statistics), NETWORKS, strict=True):
         if name in networks:
-            fit(task, alone / "data", load_statistics(alone / "data"), alone / name)
+            fit(task, alone / "data", statistics, alone / name)
     first, second = (ended(process, 0) for process in start(together, processes=2, networks=networks))
     assert "classifier: best epoch" in first
     assert "epoch" not in second  # one speaks for all

@@ -21,7 +21,7 @@ def _mattress(random: Random, width: float, length: float, base: float, thicknes
 
 def _bed_size(random: Random) -> tuple[float, float, float, float]:
     """Draws the width (single or double), the length, the height of the mattress's lower side, and its thickness."""
-    width = random.choice([random.uniform(0.85, 1.1), random.uniform(1.35, 1.9)])
+    width = float(random.choice([random.uniform(0.85, 1.1), random.uniform(1.35, 1.9)]))
     return width, random.uniform(1.9, 2.15), random.uniform(0.2, 0.4), random.uniform(0.15, 0.28)
 
 

@@ -18,7 +18,7 @@ def _carcass(random: Random, width: float, depth: float, height: float, feet: fl
 def dresser_wide(random: Random) -> Parts:
     """Rows of two or three drawers."""
     width, depth, height = random.uniform(0.95, 1.7), random.uniform(0.42, 0.58), random.uniform(0.7, 0.95)
-    feet = random.choice([0.0, random.uniform(0.05, 0.2)])
+    feet = float(random.choice([0.0, random.uniform(0.05, 0.2)]))
     rows, columns = int(random.integers(2, 5)), int(random.integers(2, 4))
     parts = _carcass(random, width, depth, height, feet)
     return parts + drawers(random, width * 0.96, height - feet - 0.05, rows, columns, 0, -depth / 2, feet + 0.01)
@@ -27,7 +27,7 @@ def dresser_wide(random: Random) -> Parts:
 def dresser_chest(random: Random) -> Parts:
     """Tall and narrow, with three to six drawers; the smallest have the proportions of a night stand."""
     width, depth, height = random.uniform(0.6, 0.95), random.uniform(0.42, 0.58), random.uniform(0.75, 1.35)
-    feet = random.choice([0.0, random.uniform(0.04, 0.15)])
+    feet = float(random.choice([0.0, random.uniform(0.04, 0.15)]))
     parts = _carcass(random, width, depth, height, feet)
     rows = int(random.integers(3, 7))
     return parts + drawers(random, width * 0.96, height - feet - 0.05, rows, 1, 0, -depth / 2, feet + 0.01)
@@ -47,7 +47,7 @@ def dresser_mirror(random: Random) -> Parts:
 def dresser_doors(random: Random) -> Parts:
     """Doors on one side, drawers on the other."""
     width, depth, height = random.uniform(0.9, 1.6), random.uniform(0.42, 0.58), random.uniform(0.75, 1.0)
-    feet = random.choice([0.0, random.uniform(0.05, 0.2)])
+    feet = float(random.choice([0.0, random.uniform(0.05, 0.2)]))
     parts = _carcass(random, width, depth, height, feet)
     inside, bottom = height - feet - 0.05, feet + 0.01
     share = random.uniform(0.35, 0.6) * width
@@ -60,7 +60,7 @@ def dresser_doors(random: Random) -> Parts:
 
 def _stand_size(random: Random) -> tuple[float, float, float, float]:
     """Draws the width, depth, height and height of the feet of a night stand."""
-    feet = random.choice([0.0, random.uniform(0.04, 0.25)])
+    feet = float(random.choice([0.0, random.uniform(0.04, 0.25)]))
     return random.uniform(0.4, 0.65), random.uniform(0.35, 0.5), random.uniform(0.5, 0.75), feet
 
 

@@ -126,7 +126,7 @@ def _sofa_body(
     width, depth = seats * random.uniform(0.58, 0.75), random.uniform(0.75, 0.95)
     seat, back = random.uniform(0.36, 0.46), random.uniform(0.32, 0.5)
     thick, arm = random.uniform(0.16, 0.24), random.uniform(0.12, 0.22)
-    feet = random.choice([0.0, random.uniform(0.05, 0.14)])
+    feet = float(random.choice([0.0, random.uniform(0.05, 0.14)]))
     parts = [box(width, depth, seat - 0.12 - feet, 0, 0, feet)]
     if feet:
         parts += four_legs(width, depth, feet, 0.05, 0.03)

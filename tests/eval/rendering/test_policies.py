@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import jax.numpy as jnp
 import numpy as np
+import pytest
 
 from data_pipeline.objects.mesh import Mesh, ObjectEntry
 from data_pipeline.objects.recipes import FurniturePiece
@@ -14,7 +15,7 @@ from mevs_jax import cameras_at, fibonacci_sphere
 from mevs_jax.rendering import render_depth
 from tests.conftest import open3d_or_skip
 
-VIEWS, SEEN = 12, 6
+VIEWS = 12
 
 
 def test_distinct_optima_come_first_in_their_order_each_as_its_nearest_candidate(random):
@@ -40,8 +41,8 @@ def test_objects_are_spread_evenly_and_never_twice():
     assert chosen_objects(RenderingConfig(objects=30), 4).tolist() == [0, 1, 2, 3]
 
 
-def views_of(mesh: Mesh, side: int) -> tuple[np.ndarray, np.ndarray]:
-    cameras = cameras_at(fibonacci_sphere(SEEN), resolution=side)
+def views_of(mesh: Mesh, views: int, side: int) -> tuple[np.ndarray, np.ndarray]:
+    cameras = cameras_at(fibonacci_sphere(views), resolution=side)
     images = []
     for pose in cameras.pose:
         depth = np.asarray(render_depth(mesh.vertices[mesh.faces], cameras.replace(pose=pose)).depth)
@@ -49,17 +50,18 @@ def views_of(mesh: Mesh, side: int) -> tuple[np.ndarray, np.ndarray]:
     return np.stack(images), np.asarray(cameras.pose)
 
 
-def test_an_object_gets_a_row_for_every_view_and_what_shows_nothing_is_counted():
+@pytest.mark.parametrize("views", [6, pytest.param(VIEWS, marks=pytest.mark.slow)])
+def test_an_object_gets_a_row_for_every_view_and_what_shows_nothing_is_counted(views):
     open3d_or_skip()
     mesh = load_object(ObjectEntry("chair", 0, "test", FurniturePiece("chair", 3)))
-    depth, poses = views_of(mesh, 32)
+    depth, poses = views_of(mesh, views, 32)
     depth[4] = 0  # as if the object were out of sight
     config = RenderingConfig(starts=2, resolution=16, faces=64)
-    found = scores_of_object(mesh, depth, poses, np.pi / 3, jnp.asarray(fibonacci_sphere(SEEN)), config)
+    found = scores_of_object(mesh, depth, poses, np.pi / 3, jnp.asarray(fibonacci_sphere(views)), config)
     assert found.pop("without_surface") == 1
     assert set(found) == {rung.policy for rung in ASCENT_RUNGS}
     for name, rows in found.items():
-        assert rows.shape == (SEEN, SEEN)
+        assert rows.shape == (views, views)
         assert np.isfinite(rows).all()
         same = (np.argmax(rows, axis=1) == np.argmax(rows[0])).all()
         assert same == name.endswith("_whole")  # the whole object is the same after every view

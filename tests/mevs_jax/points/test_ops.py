@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from jax.sharding import AbstractDevice, AbstractMesh
 
 from mevs_jax import ball_query, farthest_point_sample
 from mevs_jax.points import kernels as point_kernels
@@ -113,10 +114,13 @@ def test_one_gpu_runs_the_kernels_and_nothing_else_does(monkeypatch):
     def both(cloud):
         return farthest_point_sample(cloud, 64), ball_query(cloud, cloud[:32], 0.2, 16)
 
+    h100 = AbstractDevice(device_kind="NVIDIA H100 80GB HBM3", num_cores=None, platform="gpu")
+
     def lowered(points, platform, dtype=np.float32):
-        # A function of its own, since JAX remembers what it traced.
-        traced = jax.jit(lambda cloud: both(cloud)).trace(jax.ShapeDtypeStruct((points, 3), dtype))
-        return traced.lower(lowering_platforms=(platform,)).as_text().count("xla.gpu.triton")
+        # JAX 0.12 asks which GPU it lowers kernels for. A function of its own, since JAX remembers what it traced.
+        with jax.sharding.use_abstract_mesh(AbstractMesh((), (), abstract_device=h100)):
+            traced = jax.jit(lambda cloud: both(cloud)).trace(jax.ShapeDtypeStruct((points, 3), dtype))
+            return traced.lower(lowering_platforms=(platform,)).as_text().count("xla.gpu.triton")
 
     assert lowered(1000, "cuda") == 0
     monkeypatch.setattr(jax, "default_backend", lambda: "gpu")

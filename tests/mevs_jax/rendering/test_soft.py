@@ -205,8 +205,12 @@ def volume_of(name: str) -> np.ndarray:
 
 @pytest.mark.parametrize(
     ("values", "thing"),
-    [(of_mesh, lambda name: triangles_of(name)[:64]), (of_volume, volume_of)],
-    ids=["mesh", "volume"],
+    [
+        (of_mesh, lambda name: triangles_of(name)[:64]),
+        pytest.param(of_mesh, lambda name: triangles_of(name)[:128], marks=pytest.mark.slow),
+        (of_volume, volume_of),
+    ],
+    ids=["mesh", "larger mesh", "volume"],
 )
 @pytest.mark.usefixtures("fully_compiled")
 def test_camera_gradients_are_finite_and_those_of_differences(values, thing):
