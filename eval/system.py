@@ -1,0 +1,233 @@
+"""From a finished run to a trained system: networks, calibration, knowledge and the figures of its evaluation in one folder.
+
+Nothing here uses test objects, except the figures, which are copied from the run's metrics. The policy by default and all
+temperatures come from validation objects. Knowledge (the class × view table, the fixed order) is fitted on the same objects, so
+each half of them walks with the knowledge of the other half.
+"""
+
+from __future__ import annotations
+
+import json
+import platform
+from dataclasses import asdict, dataclass, replace
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from flax import nnx
+from jaxtyping import Array, Float, Int
+
+from data_pipeline.dataset.inputs import view_camera
+from data_pipeline.dataset.statistics import DatasetStatistics, load_statistics
+from data_pipeline.errors import DataError, Unreadable
+from data_pipeline.files import keep_checks, check_of_file
+from data_pipeline.progress import console
+from eval.numbers.comparison import intervals
+from eval.numbers.confidence import logits_along
+from eval.tables import ViewTables
+from eval.walks.grid import run_grid
+from eval.walks.knowledge import learn
+from eval.walks.ladder import Rung
+from mevs_jax.beliefs import running_sum
+from mevs_jax.calibration import fit_temperature
+from mevs_jax.models.shapes import PointNet2Shape, ResNetShape
+from mevs_jax.policies.base import Knowledge
+from mevs_jax.trained import (
+    CloudInput,
+    DataDescription,
+    Description,
+    ImageInput,
+    Network,
+    Parts,
+    TrainedSystem,
+    fit_strangeness,
+    load,
+    save,
+)
+from mevs_jax.trained.description import FORM
+from mevs_jax.viewpoints import ViewGraph
+from train.outputs import network_outputs
+from train.step import Batch, Task
+from train.tasks.classifier import ClassifierTask, ResNetConfig
+from train.tasks.entropy import EntropyTask
+
+USABLE = (
+    "random",
+    "farthest",
+    "predicted_entropy",
+    "predicted_entropy_without_maxima",
+    "remembered_entropy",
+    "fixed_order",
+    "information_gain",
+)
+"""Policies of the ladder that a robot can use: those that know nothing, predictions of networks, or other objects."""
+
+_COUNTED = slice(1, 4)
+"""The numbers of views, 2 to 4, whose accuracy decides which policy is the best."""
+_WITHOUT_YAW = "farthest"
+"""The best policy of a classifier for objects of unknown yaw: all others need the object's frame, except random selection."""
+
+
+@dataclass(frozen=True)
+class OnValidation:
+    """Walks of the usable policies over validation objects.
+
+    Attributes:
+        temperatures: by policy, (steps,) of the sum of logits after 1, 2, … views.
+        after: by policy, (steps,) share of the walks with the right prediction.
+    """
+
+    temperatures: dict[str, np.ndarray]
+    after: dict[str, np.ndarray]
+
+    @property
+    def best(self) -> str:
+        """The policy with the highest mean accuracy after two to four views; of equal ones the first."""
+        return max(self.after, key=lambda name: float(self.after[name][_COUNTED].mean()))
+
+
+@jax.jit
+def _fit(logits: Float[Array, "walks steps classes"], labels: Int[Array, " walks"]) -> Array:
+    return jax.vmap(fit_temperature, (1, None))(jax.vmap(running_sum)(logits), labels)
+
+
+def walk_validation(tables: ViewTables, graph: ViewGraph, max_views: int, seed: int = 0) -> OnValidation:
+    """Walks every validation object from every view by every usable policy, with the knowledge of the other half of the objects."""
+    half = np.argsort(np.random.default_rng(seed).permutation(len(tables.labels))) % 2
+    rungs = tuple(Rung(name, name, "nothing") for name in USABLE)
+    parts: dict[str, list[tuple[np.ndarray, np.ndarray]]] = {name: [] for name in USABLE}
+    for held in range(2):
+        walking, other = (_some(tables, np.flatnonzero((half == held) == inside)) for inside in (True, False))
+        knowledge = learn(jnp.asarray(other.logits), jnp.asarray(other.labels))
+        one_backbone = walking.stacked()
+        found = run_grid(
+            jax.random.key(seed),
+            replace(one_backbone, logits=one_backbone.logits[:, None]),
+            graph,
+            jax.tree.map(lambda leaf: leaf[None], knowledge),
+            rungs,
+            max_views=max_views,
+        )
+        for name in USABLE:
+            views = jnp.asarray(found[name].views)[0, :, :, 0].astype(jnp.int32)
+            logits = logits_along(views, jnp.asarray(walking.logits))
+            starts = logits.shape[1]
+            parts[name].append(
+                (np.asarray(logits).reshape(-1, *logits.shape[2:]), np.repeat(walking.labels, starts))
+            )
+    temperatures, after = {}, {}
+    for name, pieces in parts.items():
+        logits, labels = (np.concatenate(piece) for piece in zip(*pieces, strict=True))
+        temperatures[name] = np.asarray(_fit(jnp.asarray(logits), jnp.asarray(labels)))
+        after[name] = (np.cumsum(logits, axis=1).argmax(-1) == labels[:, None]).mean(axis=0)
+    return OnValidation(temperatures, after)
+
+
+def _some(tables: ViewTables, chosen: np.ndarray) -> ViewTables:
+    names = [tables.names[index] for index in chosen]
+    arrays = (tables.labels, tables.logits, tables.predicted_entropy, tables.entropy)
+    return ViewTables(names, *(array[chosen] for array in arrays))
+
+
+def _features(network: Any, task: Task, batch: Batch) -> jax.Array:
+    return network.features(task.inputs(batch))
+
+
+def resnet_shape(config: ResNetConfig, channels: int) -> ResNetShape:
+    """Returns the shape of an encoder as the tasks make it."""
+    return ResNetShape(config.depth, config.width, channels, config.standardise and channels == 3, config.stem)
+
+
+def pointnet2_shape(task: EntropyTask) -> tuple[PointNet2Shape, CloudInput]:
+    """Returns the shape of an entropy predictor, and its input."""
+    shape = task.network_config
+    directions = shape.directions and shape.frame == "world"
+    return (
+        PointNet2Shape(shape.abstractions, shape.global_layers, shape.head_layers),
+        CloudInput(shape.points, shape.frame, directions),
+    )
+
+
+def made_with() -> dict[str, str]:
+    """Versions of what a system was made with."""
+    packages = ("mevs-jax", "jax", "flax", "numpy")
+    return {"python": platform.python_version(), **{name: version(name) for name in packages}}
+
+
+def data_of(statistics: DatasetStatistics) -> DataDescription:
+    """Describes a data set in a trained system."""
+    objects = {split: statistics.objects_of([split]) for split in statistics.counts}
+    return DataDescription(statistics.source, statistics.fingerprint, objects)
+
+
+def figures_of(metrics: dict[str, Any]) -> dict[str, Any]:
+    """Figures of a run's evaluation that a system carries: accuracy by policy and number of views, with intervals."""
+    policies = {name: of for name, of in metrics["policies"].items() if name in USABLE}
+    return {
+        "objects": metrics["objects"],
+        "single_view": metrics["single_view"]["accuracy"],
+        "after_views": {name: of["after_views"] for name, of in policies.items()},
+    }
+
+
+def classifier_system(
+    data: Path,
+    statistics: DatasetStatistics,
+    classify: ClassifierTask,
+    classifier: nnx.Module,
+    predict: EntropyTask,
+    predictor: nnx.Module,
+    validation: ViewTables,
+    evaluation: dict[str, Any],
+    max_views: int,
+) -> TrainedSystem:
+    """Returns the trained system of a run: classifier, entropy predictor, class × view table.
+
+    Args:
+        data: folder of the data set.
+        validation: view tables of the validation objects by these networks.
+        evaluation: figures to carry.
+        max_views: number of views that temperatures are fitted for.
+    """
+    graph = ViewGraph.from_points(np.array(statistics.viewpoints))
+    max_views = min(max_views, statistics.views)
+    console.print(f"Calibrating {len(USABLE)} policies on {len(validation.labels)} validation objects")
+    walks = walk_validation(validation, graph, max_views)
+    features = network_outputs(data, "val", classify, classifier, ask=_features)
+    labels, classes = validation.labels, len(statistics.classes)
+    knowledge = learn(jnp.asarray(validation.logits), jnp.asarray(labels))
+    single = fit_temperature(
+        jnp.asarray(validation.logits).reshape(-1, classes), jnp.repeat(jnp.asarray(labels), statistics.views)
+    )
+    shape, cloud = pointnet2_shape(predict)
+    channels = classify.network_config.channels
+    description = Description(
+        form=FORM,
+        kind="classifier",
+        classes=tuple(statistics.classes),
+        camera=view_camera(statistics.camera),
+        image=ImageInput(classify.images, channels),
+        encoder=resnet_shape(classify.network_config, channels),
+        best=walks.best,
+        best_unposed=_WITHOUT_YAW,
+        chosen_by="highest mean accuracy after 2 to 4 views on validation objects",
+        data=data_of(statistics),
+        made_with=made_with(),
+        entropy=shape,
+        cloud=cloud,
+        evaluation=evaluation | {"validation_after_views": {name: after.tolist() for name, after in walks.after.items()}},
+    )
+    parts = Parts(
+        encoder=Network.of(classifier),
+        viewpoints=graph.points,
+        neighbours=graph.neighbours,
+        single=single,
+        entropy=Network.of(predictor),
+        knowledge=Knowledge(knowledge.order, knowledge.expected_logits),
+        temperatures={name: jnp.asarray(values) for name, values in walks.temperatures.items()},
+        strangeness=fit_strangeness(features, labels, classes, statistics.views),
+    )
+    return TrainedSystem(description, parts)

@@ -1,0 +1,434 @@
+"""An agent that recognises an object with a depth camera and chooses where the camera goes next.
+
+Frames and units are those of OpenCV and of the world: optical axes x right, y down, z forward; poses `T_world_camera` (camera →
+world), 4×4, metres; depth in metres along the optical axis, 0 or NaN where unknown. NumPy in, NumPy out.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+from numpy.typing import ArrayLike
+
+from mevs_jax.agent import core
+from mevs_jax.agent.candidates import candidates_of
+from mevs_jax.agent.frames import mask_of, pose_towards, rotation_to_world
+from mevs_jax.agent.records import Belief, History, Reason, Step, plain
+from mevs_jax.canonical import canonical_view
+from mevs_jax.sphere import estimate_sphere
+from mevs_jax.policies.base import Policy
+from mevs_jax.trained.parts import Parts, observe
+from mevs_jax.trained.system import TrainedSystem
+
+Reachable = ArrayLike | Callable[[np.ndarray], bool] | None
+"""Which candidates can be reached: a mask, indices, a function of the camera's pose (4, 4), or None for all."""
+
+
+class Agent:
+    """Recognises one object after another: `reset`, then `observe` and `decide` in turn until `Step.done`.
+
+    Args:
+        system: from `mevs_jax.load`.
+        policy: `best`, a name of `system.policies`, or a function `(key, state, scene) -> scores` as in `mevs_jax.POLICIES`.
+        stop: calibrated probability of the most likely class from which on the agent is sure, in (0, 1]; above 1 it never is.
+        max_views: the budget: largest number of views of an object.
+        unknown: an object that is stranger than this share of the known objects is an `unknown object`, in (0, 1]; None: never.
+        gain_per_cost: expected gain that one unit of a candidate's cost is worth, in units of the policy's scores (nats for
+            `information_gain` and learned policies).
+        distance: of the next cameras from the object's centre, in metres; by default that of the training views in radii.
+        max_candidates: largest number of candidates of `decide`.
+        seed: of random policies.
+
+    Raises:
+        ValueError: for an option out of its range, or a policy that needs what an agent does not have.
+    """
+
+    def __init__(
+        self,
+        system: TrainedSystem,
+        policy: str | Policy = "best",
+        *,
+        stop: float = 0.95,
+        max_views: int = 8,
+        unknown: float | None = None,
+        gain_per_cost: float = 0.0,
+        distance: float | None = None,
+        max_candidates: int | None = None,
+        seed: int = 0,
+    ):
+        views = len(system.viewpoints)
+        _check(stop > 0, f"stop must be a probability above 0, got {stop}")
+        _check(
+            int(max_views) == max_views and 1 <= max_views <= 512, f"max_views must be from 1 to 512, got {max_views}"
+        )
+        _check(unknown is None or 0 < unknown <= 1, f"unknown must be in (0, 1] or None, got {unknown}")
+        _check(
+            unknown is None or system.parts.strangeness is not None,
+            "this system cannot tell unknown objects: leave out unknown",
+        )
+        _check(
+            np.isfinite(gain_per_cost) and gain_per_cost >= 0, f"gain_per_cost must be at least 0, got {gain_per_cost}"
+        )
+        _check(distance is None or 0 < distance < np.inf, f"distance must be positive, in metres, got {distance}")
+        if system.description.image.content == "image":
+            raise ValueError("this system reads shaded images, which a depth camera does not give; train one on depth")
+        self.system, self.stop, self.max_views, self.unknown = system, float(stop), int(max_views), unknown
+        self.gain_per_cost, self.distance, self.seed = float(gain_per_cost), distance, int(seed)
+        self.size = max(views, 128 if max_candidates is None else int(max_candidates))
+        self.policy = policy
+        self._key = jax.random.key(seed)
+        self._programs: dict[bool, _Programs] = {}
+        self._lattice = candidates_of(system, None, self.size)
+        self._center: np.ndarray | None = None
+        self._program(True)
+
+    def _program(self, posed: bool) -> _Programs:
+        if posed not in self._programs:
+            self._programs[posed] = _Programs(self.system, self.policy, posed, self.max_views)
+        return self._programs[posed]
+
+    def warm_up(self) -> None:
+        """Compiles everything that the agent computes, so that no later call waits for the compiler.
+
+        With an unknown yaw another program runs, which is compiled too if the policy can be used then.
+        """
+        kept = {name: value for name, value in vars(self).items() if name in _STATE}
+        camera = self.system.description.camera
+        pose = pose_towards(np.array([0.6, 0.0, 0.8]), np.zeros(3), camera.distance, np.array([0.0, 0.0, 1.0]))
+        side = camera.resolution
+        focal = side / 2 / np.tan(np.radians(camera.field_of_view) / 2)
+        middle = (side - 1) / 2
+        K = np.array([[focal, 0, middle], [0, focal, middle], [0, 0, 1]])
+        for yaw_known in (True, False):
+            try:
+                self.reset(center=(0, 0, 0), radius=1.0, yaw_known=yaw_known)
+            except ValueError:
+                continue
+            self.observe(np.full((side, side), camera.distance - 0.5, np.float32), K, pose)
+            self.decide(reachable=[0], cost=np.zeros(len(self.system.viewpoints)))
+        for name in _STATE:
+            if name in kept:
+                setattr(self, name, kept[name])
+            else:
+                vars(self).pop(name, None)
+        self._center = kept.get("_center")
+
+    def reset(
+        self,
+        *,
+        center: ArrayLike,
+        radius: float,
+        up: ArrayLike = (0.0, 0.0, 1.0),
+        yaw: float = 0.0,
+        yaw_known: bool = True,
+    ) -> None:
+        """Begins with a new object.
+
+        Args:
+            center: (3,) of the smallest sphere around its bounding box, in the world, in metres.
+            radius: of this sphere, in metres.
+            up: (3,) the object's upward direction in the world.
+            yaw: angle of the object's front about `up`, in radians, after the smallest rotation from z to `up`.
+            yaw_known: whether `yaw` is known. If not, policies that need the object's own frame cannot be used, and `best` is the
+                system's best without it.
+
+        Raises:
+            ValueError: for an argument out of its range, or a policy that cannot be used without the yaw.
+        """
+        middle = np.asarray(center, float).reshape(-1)
+        _check(
+            middle.shape == (3,) and bool(np.isfinite(middle).all()),
+            f"center must be three finite numbers, got {center}",
+        )
+        _check(0 < float(radius) < np.inf, f"radius must be positive, in metres, got {radius}")
+        _check(bool(np.isfinite(yaw)), f"yaw must be a finite angle in radians, got {yaw}")
+        rotation = rotation_to_world(up, yaw if yaw_known else 0.0)
+        program = self._program(bool(yaw_known))  # refuses a policy first
+        self._center, self._radius, self._rotation, self._posed = middle, float(radius), rotation, bool(yaw_known)
+        self._memory, self._run = program.blank(), program
+        self._turn = np.eye(4, dtype=np.float32)  # from the upright frame of `canonical_view` to the object's
+        self._turn[:3, :3] = rotation.T @ rotation_to_world(up, 0.0)
+        self._belief: Belief | None = None
+        self._failed = np.zeros((0, 3))
+        options = {"center": middle.tolist(), "radius": float(radius), "up": np.asarray(up, float).tolist()}
+        options |= {"yaw": float(yaw), "yaw_known": bool(yaw_known)}
+        policy = self.policy if isinstance(self.policy, str) else getattr(self.policy, "__name__", "a function")
+        mine = {"policy": policy, "stop": self.stop, "max_views": self.max_views, "unknown": self.unknown}
+        self.history = History(self.system.name, {"agent": mine | {"seed": self.seed}, "reset": options})
+
+    def reset_from_points(self, points: ArrayLike, **options: Any) -> None:
+        """Begins with a new object whose centre and radius are estimated from points on its surface.
+
+        Args:
+            points: (points, 3) in the world, in metres, of the object alone.
+            options: `up`, `yaw` and `yaw_known` as of `reset`.
+        """
+        center, radius = estimate_sphere(np.asarray(points, float))
+        self.reset(center=center, radius=float(radius), **options)
+
+    def observe(
+        self,
+        depth: ArrayLike,
+        K: ArrayLike,
+        T_world_camera: ArrayLike,
+        *,
+        mask: ArrayLike | None = None,
+        floor: float | None = None,
+    ) -> Belief:
+        """Adds a view of the object, taken from anywhere, by any depth camera.
+
+        Args:
+            depth: (height, width) metres along the optical axis, 0 or NaN where unknown.
+            K: (3, 3) intrinsics in pixels, centres of pixels at whole numbers.
+            T_world_camera: (4, 4) pose of the camera at the time of the image.
+            mask: (height, width) True for the pixels of the object; without, all that is inside its sphere belongs to it.
+            floor: height of the supporting surface above the centre along `up`, in metres, so usually negative.
+
+        Returns:
+            The belief after this view.
+
+        Raises:
+            ValueError: for an input that cannot be used, or beyond `max_views`.
+        """
+        begun = time.perf_counter()
+        self._check_reset()
+        view = canonical_view(
+            depth,
+            K,
+            T_world_camera,
+            center=self._center,
+            radius=self._radius,
+            up=self._rotation[:, 2],
+            camera=self.system.description.camera,
+            mask=mask,
+            floor=floor,
+        )
+        return self._add(view.depth, self._turn @ view.pose, view.unknown, begun)
+
+    def observe_view(self, depth: Float[np.ndarray, "side side"], pose: Float[np.ndarray, "4 4"]) -> Belief:
+        """Adds a view that the system's own camera has taken, as it is in the data set.
+
+        Args:
+            depth: in radii of the object along the optical axis, 0 where nothing is hit.
+            pose: from the camera to the object's frame, whose unit is the radius.
+        """
+        begun = time.perf_counter()
+        self._check_reset()
+        return self._add(np.asarray(depth, np.float32), np.asarray(pose, np.float32), 0.0, begun)
+
+    def _add(self, depth: np.ndarray, pose: np.ndarray, unseen: float, begun: float) -> Belief:
+        count = self.history.views
+        if count >= self.max_views:
+            raise ValueError(
+                f"the budget of {self.max_views} views is spent; call reset, or make the agent with max_views above it"
+            )
+        self._memory, found = self._run.see(self.system.parts, self._memory, depth, pose)
+        probabilities, strangeness = jax.device_get(found)
+        label = int(probabilities.argmax())
+        belief = Belief(
+            probabilities=probabilities,
+            label=label,
+            name=self.system.classes[label],
+            confidence=float(probabilities[label]),
+            views=count + 1,
+            strangeness=float(strangeness),
+            known=self.unknown is None or not strangeness > self.unknown,
+            unseen=float(unseen),
+            latency_ms=1e3 * (time.perf_counter() - begun),
+        )
+        self.history.depths.append(depth)
+        self.history.poses.append(pose)
+        self.history.events.append({"call": "observe", "belief": plain(belief)})
+        self._belief = belief
+        return belief
+
+    def decide(
+        self,
+        reachable: Reachable = None,
+        *,
+        cost: ArrayLike | None = None,
+        candidates: ArrayLike | None = None,
+    ) -> Step:
+        """Chooses the next view, or ends.
+
+        Args:
+            reachable: which candidates can be reached: a boolean mask, indices, or a function of a pose (4, 4); all by default.
+            cost: of moving to each candidate, in any unit; `gain_per_cost` says what a unit is worth.
+            candidates: (candidates, 4, 4) poses `T_world_camera` to choose from; by default the system's viewpoints, from which
+                the camera looks at the object's centre.
+
+        Returns:
+            The next pose; or, when done, why: `sure`, `budget`, `nothing reachable`, `unknown object`.
+
+        Raises:
+            ValueError: for a mask or costs of another length, or poses that are no poses.
+        """
+        begun = time.perf_counter()
+        self._check_reset()
+        where = self._lattice if candidates is None else self._given(candidates)
+        poses = self.poses if candidates is None else np.asarray(candidates, float)
+        number = len(poses)
+        allowed = (
+            np.array([bool(reachable(pose)) for pose in poses]) if callable(reachable) else mask_of(reachable, number)
+        )
+        costs = np.zeros(number) if cost is None else np.asarray(cost, float).reshape(-1)
+        _check(costs.shape == (number,), f"cost has {costs.size} values; there are {number} candidates")
+        _check(not np.isnan(costs).any(), "cost has values that are NaN")
+        allowed &= np.isfinite(costs)
+        priced = np.where(np.isfinite(costs), self.gain_per_cost * costs, 0.0)
+        reason = self._reason()
+        if not reason:
+            wide = np.zeros((2, self.size), np.float32)
+            wide[0, :number], wide[1, :number] = allowed, priced
+            index, gains = jax.device_get(
+                self._run.choose(
+                    self.system.parts, self._memory, where, self._is_failed(where), wide[0] > 0, wide[1], self._key
+                )
+            )
+            if index < 0:
+                reason = "nothing reachable"
+        elapsed = 1e3 * (time.perf_counter() - begun)
+        if reason:
+            step = Step(None, None, -1, float("nan"), True, reason, elapsed)
+        else:
+            chosen = poses[int(index)]
+            away = chosen[:3, 3] - self._center
+            direction = away / np.linalg.norm(away)
+            step = Step(chosen, direction, int(index), float(gains[index]), False, "", elapsed)
+        self.history.events.append({"call": "decide", "step": plain(step)})
+        return step
+
+    def _reason(self) -> Reason:
+        belief = self._belief
+        if belief is None:
+            return ""
+        sure = belief.confidence >= self.stop
+        spent = belief.views >= self.max_views
+        if not belief.known and (sure or spent):
+            return "unknown object"
+        return "sure" if sure else "budget" if spent else ""
+
+    @property
+    def poses(self) -> Float[np.ndarray, "views 4 4"]:
+        """Poses `T_world_camera` of the system's viewpoints around the object, in metres."""
+        self._check_reset()
+        camera, up = self.system.description.camera, self._rotation[:, 2]
+        distance = camera.distance * self._radius if self.distance is None else self.distance
+        directions = self.system.viewpoints.astype(float) @ self._rotation.T
+        return np.stack([pose_towards(direction, self._center, distance, up) for direction in directions])
+
+    def _given(self, candidates: ArrayLike) -> core.Candidates:
+        poses = np.asarray(candidates, float)
+        _check(
+            poses.ndim == 3 and poses.shape[1:] == (4, 4) and len(poses) > 0 and bool(np.isfinite(poses).all()),
+            f"candidates must be poses (candidates, 4, 4) of finite numbers, got shape {poses.shape}",
+        )
+        away = poses[:, :3, 3] - self._center
+        lengths = np.linalg.norm(away, axis=1)
+        _check(bool((lengths > 1e-9).all()), "a candidate is at the object's centre")
+        return candidates_of(self.system, (away / lengths[:, None]) @ self._rotation, self.size)
+
+    def mark_failed(self, step: Step | ArrayLike) -> None:
+        """Says that a view could not be taken, so that it is not chosen again.
+
+        Args:
+            step: that `decide` returned, or a pose `T_world_camera`.
+        """
+        self._check_reset()
+        pose = step.T_world_camera if isinstance(step, Step) else np.asarray(step, float)
+        if pose is None or np.shape(pose) != (4, 4):
+            raise ValueError("mark_failed needs a step that has a pose, or a pose (4, 4)")
+        away = pose[:3, 3] - self._center
+        self._failed = np.concatenate([self._failed, (away / np.linalg.norm(away) @ self._rotation)[None]])
+        self.history.events.append({"call": "mark_failed", "direction": self._failed[-1].tolist()})
+
+    def _is_failed(self, where: core.Candidates) -> np.ndarray:
+        if not len(self._failed):
+            return np.zeros(self.size, bool)
+        close = np.asarray(where.directions) @ self._failed.T > np.cos(float(where.same))
+        return close.any(axis=1)
+
+    def _check_reset(self) -> None:
+        if self._center is None:
+            raise ValueError("the agent has no object yet: call reset or reset_from_points first")
+
+
+_STATE = ("_center", "_radius", "_rotation", "_turn", "_posed", "_memory", "_run", "_belief", "_failed", "history")
+
+
+def _check(right: bool, message: str) -> None:
+    if not right:
+        raise ValueError(message)
+
+
+class _Programs:
+    """The compiled steps for one policy, and a known or unknown yaw."""
+
+    def __init__(self, system: TrainedSystem, policy: str | Policy, posed: bool, most: int):
+        entropy = system.parts.entropy is not None and posed
+        if entropy and core.why_not(system, policy, posed, False) is None:
+            entropy = False  # the policy does not use predicted entropies
+        if (reason := core.why_not(system, policy, posed, entropy)) is not None:
+            name = policy if isinstance(policy, str) else getattr(policy, "__name__", "given")
+            without = "" if posed else " for an object of unknown yaw"
+            raise ValueError(f"the policy {name} cannot be used here{without}: {reason}")
+        self._system, self._policy, self._posed = system, policy, posed
+        self._entropy, self._most = entropy, most
+        self._temperatures_of = policy if isinstance(policy, str) else "random"
+        if policy == "best":
+            self._temperatures_of = system.description.best if posed else system.description.best_unposed
+        self.see, self.choose = jax.jit(self._see), jax.jit(self._choose)
+
+    def blank(self) -> core.Memory:
+        like = core.example(self._system, self._entropy)
+        return core.blank(self._system.parts, like, self._most)
+
+    def _see(
+        self, parts: Parts, memory: core.Memory, depth: Float[Array, "side side"], pose: Float[Array, "4 4"]
+    ) -> tuple[core.Memory, tuple[Array, Array]]:
+        """The memory after a view; calibrated probabilities and strangeness."""
+        system, description = self._system, self._system.description
+        cloud = description.cloud if self._entropy else None
+        seen = observe(parts, depth, pose, image=description.image, cloud=cloud, camera=description.camera)
+        direction = pose[:3, 3] / jnp.linalg.norm(pose[:3, 3])
+        memory = core.remember(system, parts, memory, seen, direction, self._posed)
+        own = replace(system, parts=parts)
+        probabilities = jnp.exp(own.log_probabilities(memory.belief, memory.count, self._temperatures_of))
+        strangeness = jnp.float32(jnp.nan)
+        if parts.strangeness is not None:
+            present = jnp.arange(self._most) < memory.count
+            assert memory.seen.features is not None
+            strangeness = parts.strangeness.of(memory.seen.features, present)
+        return memory, (probabilities, strangeness)
+
+    def _choose(
+        self,
+        parts: Parts,
+        memory: core.Memory,
+        candidates: core.Candidates,
+        failed: Array,
+        allowed: Array,
+        cost: Array,
+        key: Array,
+    ) -> tuple[Array, Array]:
+        state, scene = core.situation(parts, memory, candidates, failed, allowed, self._posed)
+        policy = self._policy
+        run = self._system.policy(policy, parts, self._posed) if isinstance(policy, str) else policy
+        index, gains = core.choose(key, run, state, scene, cost, len(candidates.directions))
+        first = jnp.argmax(jnp.where(scene.reachable & ~state.attempted, self._first(parts, candidates), -jnp.inf))
+        none = ~jnp.any(scene.reachable & ~state.attempted)
+        return jnp.where(memory.count > 0, index, jnp.where(none, -1, first)), gains
+
+    def _first(self, parts: Parts, candidates: core.Candidates) -> Array:
+        """Scores of the first view, when nothing is known yet: the best fixed order of views where there is one."""
+        slots = jnp.zeros(self._most)
+        if self._posed and parts.knowledge is not None:
+            return jnp.concatenate([candidates.weights @ parts.knowledge.order, slots])
+        return jnp.concatenate([-jnp.abs(candidates.directions[:, 2] - 0.5), slots])

@@ -1,0 +1,87 @@
+"""Candidate views as arrays of a fixed length, from the system's viewpoints or from any poses."""
+
+from __future__ import annotations
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float
+from scipy.spatial import ConvexHull, QhullError
+
+from mevs_jax.agent.core import SAME, Candidates
+from mevs_jax.trained.system import TrainedSystem
+
+_NEAREST = 3
+"""Number of viewpoints that the values of a direction between them are interpolated from."""
+
+
+def candidates_of(system: TrainedSystem, directions: Float[np.ndarray, "candidates 3"] | None, size: int) -> Candidates:
+    """Candidates for the compiled steps.
+
+    Args:
+        system: whose viewpoints are the candidates where no directions are given.
+        directions: unit vectors from the object, in its frame.
+        size: length of the arrays.
+
+    Raises:
+        ValueError: for more candidates than `size`, or none.
+    """
+    own = directions is None
+    points = np.asarray(system.viewpoints if directions is None else directions, np.float64)
+    number = len(points)
+    if not 1 <= number <= size:
+        raise ValueError(
+            f"{number} candidates do not fit the agent's {size}; make it with max_candidates={number} or more"
+        )
+    if own:
+        graph = system.graph
+        neighbours, distances = np.asarray(graph.neighbours), np.asarray(graph.distances)
+    else:
+        distances = np.arccos(np.clip(points @ points.T, -1, 1))
+        np.fill_diagonal(distances, 0)
+        neighbours = _neighbours(points, distances)
+    apart = distances + 10 * np.eye(number)
+    spacing = float(np.median(apart.min(axis=1))) if number > 1 else 1.0
+
+    def padded(array: np.ndarray, axes: int, fill: float = 0) -> np.ndarray:
+        """The array with its first axes filled up to `size`."""
+        return np.pad(array, [(0, size - number)] * axes + [(0, 0)] * (array.ndim - axes), constant_values=fill)
+
+    return Candidates(
+        jnp.asarray(padded(points.astype(np.float32), 1)),
+        jnp.asarray(padded(neighbours, 2)),
+        jnp.asarray(padded(distances.astype(np.float32), 2, np.pi)),
+        jnp.arange(size) < number,
+        jnp.asarray(padded(_weights(points, system.viewpoints), 1)),
+        jnp.float32(max(min(spacing / 2, 0.2), SAME)),
+    )
+
+
+def _neighbours(points: np.ndarray, distances: np.ndarray) -> np.ndarray:
+    """Neighbours on the sphere: edges of the convex hull that are not much longer than the distance to the nearest point.
+
+    Without the last rule, the hull of candidates on a part of the sphere would join views of its opposite borders.
+    """
+    number = len(points)
+    if number <= 4:
+        return ~np.eye(number, dtype=bool)
+    neighbours = np.zeros((number, number), bool)
+    try:
+        for a, b, c in ConvexHull(points).simplices:
+            neighbours[[a, b, c], [b, c, a]] = neighbours[[b, c, a], [a, b, c]] = True
+    except QhullError:  # all in one plane
+        neighbours[:] = ~np.eye(number, dtype=bool)
+    nearest = (distances + 10 * np.eye(number)).min(axis=1)
+    return neighbours & (distances <= 3 * np.maximum(nearest[:, None], nearest[None]))
+
+
+def _weights(points: np.ndarray, viewpoints: np.ndarray) -> Float[np.ndarray, "candidates views"]:
+    """Weights of the viewpoints near each point, by inverse squared distance; one alone if it is the same direction."""
+    views = np.asarray(viewpoints, np.float64)
+    apart = 2 * np.arcsin(np.clip(np.linalg.norm(points[:, None] - views[None], axis=-1) / 2, 0, 1))
+    near = np.argsort(apart, axis=1)[:, : min(_NEAREST, len(views))]
+    of_near = np.take_along_axis(apart, near, axis=1)
+    weight = 1 / np.maximum(of_near, 1e-9) ** 2
+    weight[of_near[:, 0] < SAME] = np.eye(1, near.shape[1])
+    found = np.zeros(apart.shape, np.float32)
+    np.put_along_axis(found, near, (weight / weight.sum(axis=1, keepdims=True)).astype(np.float32), axis=1)
+    return found

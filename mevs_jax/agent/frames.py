@@ -1,0 +1,69 @@
+"""Frames of an object, and candidate poses around it. NumPy in float64, on the host."""
+
+from __future__ import annotations
+
+import numpy as np
+from jaxtyping import Bool, Float
+from numpy.typing import ArrayLike
+
+
+def rotation_to_world(up: ArrayLike, yaw: float) -> Float[np.ndarray, "3 3"]:
+    """Rotation from the object's frame to the world: the smallest one from z to `up`, after one by `yaw` about z.
+
+    Args:
+        up: (3,) the object's upward direction in the world, of any length.
+        yaw: in radians.
+
+    Raises:
+        ValueError: for an upward direction without a length.
+    """
+    axis = np.asarray(up, float).reshape(-1)
+    if axis.shape != (3,) or not np.isfinite(axis).all() or np.linalg.norm(axis) < 1e-9:
+        raise ValueError(f"up must be a direction of three finite numbers, got {np.asarray(up).tolist()}")
+    x, y, z = axis / np.linalg.norm(axis)
+    turn = np.array([[np.cos(yaw), -np.sin(yaw), 0], [np.sin(yaw), np.cos(yaw), 0], [0, 0, 1]])
+    if z < -1 + 1e-12:
+        return np.diag([1.0, -1.0, -1.0]) @ turn
+    cross = np.array([[0, 0, x], [0, 0, y], [-x, -y, 0]])
+    return (np.eye(3) + cross + cross @ cross / (1 + z)) @ turn
+
+
+def pose_towards(
+    direction: Float[np.ndarray, " 3"], center: Float[np.ndarray, " 3"], distance: float, up: Float[np.ndarray, " 3"]
+) -> Float[np.ndarray, "4 4"]:
+    """Pose of a camera that looks at `center` from a direction, with `up` upwards in its image.
+
+    Args:
+        direction: unit vector from the centre to the camera, in the world.
+        distance: of the camera from the centre, in metres.
+        up: upwards, in the world; where the camera looks along it, any direction across it is used.
+    """
+    forward = -direction
+    right = np.cross(forward, up)
+    if np.linalg.norm(right) < 1e-6:
+        right = np.cross(forward, np.eye(3)[np.argmin(np.abs(forward))])
+    right /= np.linalg.norm(right)
+    pose = np.eye(4)
+    pose[:3, :3] = np.stack([right, np.cross(forward, right), forward], axis=1)
+    pose[:3, 3] = center + distance * direction
+    return pose
+
+
+def mask_of(reachable: ArrayLike | None, number: int) -> Bool[np.ndarray, " candidates"]:
+    """A mask of candidates from what a caller gives: None for all, a boolean mask, or indices.
+
+    Raises:
+        ValueError: for a mask of another length, or indices out of range.
+    """
+    if reachable is None:
+        return np.ones(number, bool)
+    given = np.asarray(reachable)
+    if given.dtype == bool:
+        if given.shape != (number,):
+            raise ValueError(f"reachable has shape {given.shape}; there are {number} candidates")
+        return given
+    if given.size and (given.dtype.kind not in "iu" or given.min() < 0 or given.max() >= number):
+        raise ValueError(f"reachable must be a boolean mask of {number} candidates, or indices from 0 to {number - 1}")
+    found = np.zeros(number, bool)
+    found[given.astype(int).reshape(-1)] = True
+    return found

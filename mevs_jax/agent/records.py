@@ -1,0 +1,156 @@
+"""What an agent returns, and the history of its views."""
+
+from __future__ import annotations
+
+import io
+import json
+import os
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
+
+import numpy as np
+from jaxtyping import Float
+
+if TYPE_CHECKING:
+    from mevs_jax.agent.agent import Agent
+
+Reason = Literal["", "sure", "budget", "nothing reachable", "unknown object"]
+"""Why an agent is done; empty while it is not."""
+
+
+@dataclass(frozen=True)
+class Belief:
+    """What an agent knows after a view.
+
+    Attributes:
+        probabilities: (classes,) calibrated, with sum 1.
+        label: index of the most likely class.
+        name: its name.
+        confidence: its probability.
+        views: number of views seen.
+        strangeness: share of the known objects that look less strange after as many views, in [0, 1]; NaN if it is not measured.
+        known: False if the object is stranger than the agent's limit `unknown`.
+        unseen: share of the object's sphere that the latest image does not show, in [0, 1].
+        latency_ms: time that the call took.
+    """
+
+    probabilities: Float[np.ndarray, " classes"]
+    label: int
+    name: str
+    confidence: float
+    views: int
+    strangeness: float
+    known: bool
+    unseen: float
+    latency_ms: float
+
+
+@dataclass(frozen=True)
+class Step:
+    """The next view, or the end.
+
+    Attributes:
+        T_world_camera: (4, 4) pose of the next camera, in metres; None when done.
+        direction: (3,) unit vector from the object to that camera, in the world's frame; None when done.
+        index: of the candidate; −1 when done.
+        expected_gain: expected decrease of the belief's entropy in nats, by the class × view table; NaN without one.
+        done: whether no further view is needed, or none is possible.
+        reason: why it is done.
+        latency_ms: time that the call took.
+    """
+
+    T_world_camera: Float[np.ndarray, "4 4"] | None
+    direction: Float[np.ndarray, " 3"] | None
+    index: int
+    expected_gain: float
+    done: bool
+    reason: Reason
+    latency_ms: float
+
+
+@dataclass
+class History:
+    """All that an agent was given and answered for one object, so that it can be repeated.
+
+    Attributes:
+        system: name of the system.
+        options: of the agent and of `reset`.
+        events: one dictionary for each call, in order: `observe`, `decide` or `mark_failed`, with its result.
+        depths: (views, side, side) the images that the networks received, in radii.
+        poses: (views, 4, 4) their poses in the object's frame.
+    """
+
+    system: str
+    options: dict[str, Any]
+    events: list[dict[str, Any]] = field(default_factory=list)
+    depths: list[np.ndarray] = field(default_factory=list)
+    poses: list[np.ndarray] = field(default_factory=list)
+
+    @property
+    def views(self) -> int:
+        """Number of views seen."""
+        return len(self.depths)
+
+    @property
+    def beliefs(self) -> list[dict[str, Any]]:
+        """The belief after each view, as plain values."""
+        return [event["belief"] for event in self.events if event["call"] == "observe"]
+
+    def save(self, path: str | Path) -> None:
+        """Writes the history into one `.npz` file, which `load_history` reads. Nothing in it is executed when it is read."""
+        path = Path(path)
+        text = json.dumps({"system": self.system, "options": self.options, "events": self.events})
+        side = self.depths[0].shape if self.depths else (0, 0)
+        content = io.BytesIO()
+        np.savez_compressed(
+            content,
+            form=np.array(1),
+            text=np.array(text),
+            depths=np.stack(self.depths) if self.depths else np.zeros((0, *side), np.float32),
+            poses=np.stack(self.poses) if self.poses else np.zeros((0, 4, 4), np.float32),
+        )
+        path.parent.mkdir(parents=True, exist_ok=True)
+        made = path.with_name(f".{path.name}.{os.getpid()}")
+        made.write_bytes(content.getvalue())
+        made.replace(path)
+
+
+def load_history(path: str | Path) -> History:
+    """Reads a history that `History.save` wrote.
+
+    Raises:
+        ValueError: for any other file.
+    """
+    try:
+        with np.load(path, allow_pickle=False) as stored:
+            if int(stored["form"]) != 1:
+                raise ValueError("it is of another version")
+            text = json.loads(str(stored["text"]))
+            history = History(text["system"], dict(text["options"]), list(text["events"]))
+            depths, poses = np.asarray(stored["depths"], np.float32), np.asarray(stored["poses"], np.float32)
+    except FileNotFoundError:
+        raise
+    except Exception as error:  # the content of a damaged file decides which
+        raise ValueError(f"{path} is no history of an agent ({str(error).splitlines()[0][:100]})") from error
+    if depths.ndim != 3 or poses.shape != (len(depths), 4, 4):
+        raise ValueError(f"{path} is no history of an agent (images of shape {depths.shape}, poses {poses.shape})")
+    history.depths, history.poses = list(depths), list(poses)
+    return history
+
+
+def replay(history: History, agent: Agent) -> list[Belief]:
+    """Gives an agent the images of a history again, in the same order; returns its beliefs.
+
+    Args:
+        history: of this agent's system, or of another one with the same camera.
+        agent: which is reset first, as it was for the history.
+    """
+    options = history.options["reset"]
+    agent.reset(**options)
+    return [agent.observe_view(depth, pose) for depth, pose in zip(history.depths, history.poses, strict=True)]
+
+
+def plain(record: Belief | Step) -> dict[str, Any]:
+    """A record as values that JSON can hold."""
+    return {name: value.tolist() if isinstance(value, np.ndarray) else value for name, value in asdict(record).items()}

@@ -1,0 +1,103 @@
+"""`trained.json`: what a trained system is, without its arrays."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any, Literal
+
+from mevs_jax.cameras import ViewCamera
+from mevs_jax.models.shapes import PointNet2Shape, ResNetShape, SetFusionShape, ViewPolicyShape
+
+FORM = 1
+"""Version of the folder's form; a program reads this version alone."""
+
+
+@dataclass(frozen=True)
+class ImageInput:
+    """The images that a classifier or recogniser was trained with.
+
+    Attributes:
+        content: `depth`: (far − depth) / (far − near), where near and far bound the object's sphere, and 0 for background;
+            `depth_and_normals`: this and the unit normal in the camera's frame; `image`: grey levels, which a depth camera
+            does not give.
+        channels: of the image; depth is repeated in all channels, except for `depth_and_normals`, which has 4.
+    """
+
+    content: Literal["depth", "depth_and_normals", "image"]
+    channels: int
+
+
+@dataclass(frozen=True)
+class CloudInput:
+    """The partial clouds that an entropy predictor was trained with. Their unit is the object's radius.
+
+    Attributes:
+        points: number of points, drawn from the pixels that show the object.
+        frame: `world`, the object's frame; or `camera`, with the origin moved along the optical axis to the object's centre.
+        directions: whether each point has the unit vector towards the camera beside it, so a cloud has 6 columns; 3 if not.
+    """
+
+    points: int
+    frame: Literal["world", "camera"]
+    directions: bool
+
+    @property
+    def columns(self) -> int:
+        """Number of columns of a cloud."""
+        return 6 if self.directions else 3
+
+
+@dataclass(frozen=True)
+class DataDescription:
+    """The data set of a system.
+
+    Attributes:
+        source: its name.
+        fingerprint: hash of its statistics.
+        objects: number of objects by split.
+    """
+
+    source: str
+    fingerprint: str
+    objects: dict[str, int]
+
+
+@dataclass(frozen=True)
+class Description:
+    """All that `trained.json` holds besides the file of weights.
+
+    Attributes:
+        form: version of the folder's form.
+        kind: `classifier`: logits of single views are added; `recogniser`: a network fuses the features of all views.
+        classes: names of the classes, by label.
+        camera: of the views that the networks were trained with.
+        image: input of the classifier or recogniser.
+        encoder: its shape.
+        fusion: shape of the set fusion, for a recogniser.
+        entropy: shape of the entropy predictor, if there is one.
+        cloud: input of the entropy predictor.
+        view_policies: shapes of the networks that score views, by name of the policy.
+        best: name of the policy that is used by default where the object's yaw is known.
+        best_unposed: the same for an unknown yaw.
+        chosen_by: how `best` was chosen.
+        data: the data set that the networks were trained and calibrated on.
+        made_with: versions of packages.
+        evaluation: figures of its own evaluation, on test objects.
+    """
+
+    form: int
+    kind: Literal["classifier", "recogniser"]
+    classes: tuple[str, ...]
+    camera: ViewCamera
+    image: ImageInput
+    encoder: ResNetShape
+    best: str
+    best_unposed: str
+    chosen_by: str
+    data: DataDescription
+    made_with: dict[str, str]
+    fusion: SetFusionShape | None = None
+    entropy: PointNet2Shape | None = None
+    cloud: CloudInput | None = None
+    view_policies: dict[str, ViewPolicyShape] = field(default_factory=dict)
+    evaluation: dict[str, Any] = field(default_factory=dict)

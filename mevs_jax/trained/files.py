@@ -1,0 +1,381 @@
+"""A trained system in one folder: `trained.json`, `weights.safetensors` and a model card, `README.md`.
+
+Nothing in a folder is executed, and nothing is allocated before the shapes in the file agree with those of the networks that
+`trained.json` describes.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import re
+import shutil
+import tempfile
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import flax.traverse_util
+import jax
+import jax.numpy as jnp
+import numpy as np
+from flax import nnx
+
+from mevs_jax.beliefs import CalibratedFusion
+from mevs_jax.plain import from_plain
+from mevs_jax.policies.base import Knowledge
+from mevs_jax.policies.registry import POLICIES
+from mevs_jax.trained.card import model_card
+from mevs_jax.trained.description import FORM, Description
+from mevs_jax.trained.parts import Network, Parts
+from mevs_jax.trained.strangeness import LEVELS, Strangeness
+from mevs_jax.trained.system import TrainedSystem
+
+DESCRIPTION, WEIGHTS, CARD = "trained.json", "weights.safetensors", "README.md"
+SHIPPED = Path(__file__).parents[1] / "systems"
+"""Folder of the systems that come with the package, by name."""
+LARGEST = 2**31
+"""Largest size of a file of weights in bytes."""
+LARGEST_DESCRIPTION = 2**24
+_HUB_ID = re.compile(r"[A-Za-z0-9][\w.-]{0,95}/[A-Za-z0-9][\w.-]{0,95}")
+
+
+class UnreadableSystem(ValueError):
+    """A folder that is no trained system of this version, or a damaged one."""
+
+
+def load(path: str | Path) -> TrainedSystem:
+    """Returns a trained system.
+
+    Args:
+        path: a folder that `mevs run`, `mevs study learned` or `mevs export` wrote; a run's folder; the name of a system that
+            comes with the package, as `furniture10`; or `owner/name` of a model on the Hugging Face hub.
+
+    Raises:
+        FileNotFoundError: if there is no such folder or name.
+        UnreadableSystem: for a folder that is damaged or was written by another version.
+        ImportError: for a name on the hub, without the package huggingface_hub.
+    """
+    folder = _folder_of(path)
+    try:
+        return _read(folder, str(path))
+    except UnreadableSystem:
+        raise
+    except OSError as error:
+        reason = error.strerror or str(error).splitlines()[0]
+        raise UnreadableSystem(
+            f"{error.filename or folder} cannot be read ({reason}); export the system again"
+        ) from error
+
+
+def _folder_of(path: str | Path) -> Path:
+    folder = Path(path)
+    for place in (folder, folder / "system", folder / "learned" / "system"):
+        if (place / DESCRIPTION).exists():
+            return place
+    if (folder / "run.json").exists():
+        raise FileNotFoundError(
+            f"the run in {folder} has no trained system yet; finish it with: mevs run --out {folder}"
+        )
+    if folder.exists():
+        raise FileNotFoundError(f"{folder} has no {DESCRIPTION}: it is no trained system; write one with mevs export")
+    if (SHIPPED / str(path) / DESCRIPTION).exists() and "/" not in str(path):
+        return SHIPPED / str(path)
+    if isinstance(path, str) and _HUB_ID.fullmatch(path):
+        return _from_hub(path)
+    shipped = ", ".join(sorted(found.name for found in SHIPPED.glob("*/"))) if SHIPPED.is_dir() else "none"
+    raise FileNotFoundError(
+        f"there is no folder {path}, and no system of this name; those that come with the package: {shipped}"
+    )
+
+
+def from_pretrained(name: str, revision: str | None = None) -> TrainedSystem:
+    """Returns a trained system from the Hugging Face hub, downloaded once into its cache.
+
+    Args:
+        name: `owner/name`.
+        revision: branch, tag or commit.
+
+    Raises:
+        ImportError: without the package huggingface_hub.
+        FileNotFoundError: if it cannot be downloaded.
+        UnreadableSystem: as of `load`.
+    """
+    return _read(_from_hub(name, revision), name)
+
+
+def _from_hub(name: str, revision: str | None = None) -> Path:
+    try:
+        from huggingface_hub import snapshot_download
+    except ImportError as error:
+        raise ImportError(
+            f"there is no folder {name}; to get it from the Hugging Face hub, install huggingface_hub: pip install mevs-jax[hub]"
+        ) from error
+    try:
+        return Path(snapshot_download(name, revision=revision, allow_patterns=[DESCRIPTION, WEIGHTS, CARD]))
+    except Exception as error:  # of the hub, of its client and of the network: many kinds, one meaning
+        reason = (str(error).strip() or type(error).__name__).splitlines()[0][:200]
+        raise FileNotFoundError(f"{name} cannot be had from the Hugging Face hub ({reason})") from error
+
+
+def save(system: TrainedSystem, folder: str | Path, *, half: bool = False) -> None:
+    """Writes a trained system into a folder; an existing one is replaced as a whole.
+
+    Args:
+        system: the system.
+        folder: where to; a folder that holds anything but a trained system is refused.
+        half: whether networks are stored in float16, which halves the file. They compute in float32 all the same.
+
+    Raises:
+        FileExistsError: for a folder that holds something else.
+    """
+    from safetensors.numpy import save as as_safetensors
+
+    folder = Path(folder)
+    if folder.exists() and not folder.is_dir():
+        raise FileExistsError(f"{folder} is a file; choose another folder")
+    if folder.is_dir() and set(os.listdir(folder)) - {DESCRIPTION, WEIGHTS, CARD, "checks.json"}:
+        raise FileExistsError(f"{folder} holds other files; choose another folder, or empty it first")
+    arrays = {name: np.asarray(array) for name, array in _arrays_of(system.parts).items()}
+    if half:
+        arrays = {name: _halved(name, array) for name, array in arrays.items()}
+    weights = as_safetensors({name: np.array(array, order="C") for name, array in arrays.items()})
+    content = json.loads(json.dumps(asdict(system.description)))
+    content["weights"] = {"sha256": hashlib.sha256(weights).hexdigest(), "bytes": len(weights)}
+    content["sha256"] = _hash_of(content)
+    folder.parent.mkdir(parents=True, exist_ok=True)
+    made = Path(tempfile.mkdtemp(prefix=f".{folder.name}.", dir=folder.parent))
+    try:
+        made.chmod(0o755)
+        _write(made / WEIGHTS, weights)
+        _write(made / CARD, model_card(system.description, len(weights)).encode())
+        _write(made / DESCRIPTION, json.dumps(content, indent=1, ensure_ascii=False).encode())
+        if folder.is_dir():
+            shutil.rmtree(folder)
+        made.rename(folder)
+    finally:
+        shutil.rmtree(made, ignore_errors=True)
+
+
+def _write(path: Path, content: bytes) -> None:
+    with path.open("wb") as file:
+        file.write(content)
+        file.flush()
+        os.fsync(file.fileno())
+
+
+def _halved(name: str, array: np.ndarray) -> np.ndarray:
+    """Weights of networks in float16, unless they would overflow; everything else is kept as it is."""
+    networks = name.split(".")[0] in ("encoder", "entropy", "fusion", "view_policies")
+    if not networks or array.dtype != np.float32 or array.ndim < 2 or np.abs(array).max(initial=0) > 60_000:
+        return array
+    return array.astype(np.float16)
+
+
+def _hash_of(content: dict[str, Any]) -> str:
+    kept = {name: value for name, value in content.items() if name != "sha256"}
+    return hashlib.sha256(json.dumps(kept, sort_keys=True).encode()).hexdigest()
+
+
+def _arrays_of(parts: Parts) -> dict[str, Any]:
+    """All arrays by names joined with dots; those of a network by their place in it."""
+    found: dict[str, Any] = {"viewpoints": parts.viewpoints, "neighbours": parts.neighbours, "single": parts.single}
+    networks = {"encoder": parts.encoder, "entropy": parts.entropy}
+    networks |= {f"view_policies.{name}": network for name, network in parts.view_policies.items()}
+    for name, network in networks.items():
+        if network is not None:
+            found |= _flat(name, network.weights)
+    if parts.fusion:
+        found |= _flat("fusion.weights", parts.fusion["posed"].weights)
+        found["fusion.prior"] = parts.fusion["posed"].prior
+        found |= {f"fusion.temperatures.{name}": fusion.temperatures for name, fusion in parts.fusion.items()}
+    if parts.knowledge is not None:
+        found |= {
+            "knowledge.order": parts.knowledge.order,
+            "knowledge.expected_logits": parts.knowledge.expected_logits,
+        }
+    found |= {f"temperatures.{name}": values for name, values in parts.temperatures.items()}
+    if parts.strangeness is not None:
+        known = parts.strangeness
+        found |= {
+            "strangeness.whitening": known.whitening,
+            "strangeness.means": known.means,
+            "strangeness.quantiles": known.quantiles,
+        }
+    return found
+
+
+def _flat(name: str, weights: nnx.State) -> dict[str, Any]:
+    flat = flax.traverse_util.flatten_dict(nnx.to_pure_dict(weights))
+    return {".".join(map(str, (name, *place))): value for place, value in flat.items()}
+
+
+def _read(folder: Path, name: str) -> TrainedSystem:
+    path = folder / DESCRIPTION
+    bad = f"{path} cannot be read"
+    if path.stat().st_size > LARGEST_DESCRIPTION:
+        raise UnreadableSystem(f"{bad}: it is larger than {LARGEST_DESCRIPTION >> 20} MB; export the system again")
+    try:
+        content = json.loads(path.read_bytes().decode())
+    except (ValueError, RecursionError) as error:
+        raise UnreadableSystem(f"{bad}: it is no JSON file; export the system again") from error
+    if not isinstance(content, dict):
+        raise UnreadableSystem(f"{bad}: it holds no object; export the system again")
+    if content.get("form") != FORM:
+        form = f"{content.get('form')!r:.20}"
+        raise UnreadableSystem(f"{bad}: its form is {form}, this version reads {FORM}; export the system again")
+    if content.get("sha256") != _hash_of(content):
+        raise UnreadableSystem(f"{bad}: it was changed or damaged, since its hash differs; export the system again")
+    of_weights = content.pop("weights", None)
+    del content["sha256"]
+    try:
+        description = from_plain(Description, content, DESCRIPTION)
+        check(description)
+        arrays = _read_arrays(folder / WEIGHTS, of_weights)
+        parts = _parts_of(description, arrays)
+    except UnreadableSystem:
+        raise
+    except (ValueError, TypeError, KeyError, AttributeError, OverflowError, ZeroDivisionError, IndexError) as error:
+        reason = (str(error).strip() or type(error).__name__).splitlines()[0][:300]
+        raise UnreadableSystem(f"{folder} is no sound trained system ({reason}); export the system again") from error
+    return TrainedSystem(description, parts, name)
+
+
+def check(description: Description) -> None:
+    """Raises `ValueError` if a description contradicts itself."""
+    camera, classes = description.camera, description.classes
+    if not 1 <= camera.resolution <= 4096 or not 0 < camera.field_of_view < 180 or not 1 < camera.distance < 1e3:
+        raise ValueError("the camera is impossible")
+    if len(classes) < 2 or len(set(classes)) < len(classes):
+        raise ValueError("there are fewer than two classes, or two of one name")
+    if description.image.content == "depth_and_normals" and description.image.channels != 4:
+        raise ValueError("depth and normals have 4 channels")
+    if description.encoder.channels != description.image.channels:
+        raise ValueError("encoder and image differ in their channels")
+    if (description.entropy is None) != (description.cloud is None):
+        raise ValueError("an entropy predictor and its cloud belong together")
+    if description.cloud is not None and not 1 <= description.cloud.points <= 2**20:
+        raise ValueError("the number of points of a cloud is impossible")
+    if (description.kind == "recogniser") != (description.fusion is not None):
+        raise ValueError("a recogniser, and nothing else, has a fusion")
+    for name in (description.best, description.best_unposed):
+        if name not in POLICIES and name not in description.view_policies:
+            raise ValueError(f"it has no policy {name!r:.40}")
+
+
+def _read_arrays(path: Path, expected: Any) -> dict[str, np.ndarray]:
+    from safetensors import SafetensorError
+    from safetensors.numpy import load as from_safetensors
+
+    if not isinstance(expected, dict) or set(expected) != {"sha256", "bytes"}:
+        raise ValueError(f"{DESCRIPTION} does not say what {WEIGHTS} holds")
+    if not path.is_file():
+        raise UnreadableSystem(f"{path} is missing; export the system again")
+    size = path.stat().st_size
+    if size != expected["bytes"] or size > LARGEST:
+        raise UnreadableSystem(f"{path} has {size} bytes instead of {expected['bytes']!r:.20}; export the system again")
+    content = path.read_bytes()
+    if hashlib.sha256(content).hexdigest() != expected["sha256"]:
+        raise UnreadableSystem(f"{path} is damaged, since its hash differs; export the system again")
+    try:
+        return from_safetensors(content)
+    except (SafetensorError, ValueError, TypeError, KeyError, OverflowError) as error:
+        raise UnreadableSystem(f"{path} is no safetensors file; export the system again") from error
+
+
+class _Arrays:
+    """Takes arrays by name, of the shapes that they must have; `finish` names those that are left."""
+
+    def __init__(self, arrays: dict[str, np.ndarray]):
+        self.arrays, self.left = arrays, set(arrays)
+
+    def take(self, name: str, shape: tuple[int | None, ...], dtype: Any = np.float32) -> jax.Array:
+        """The array of a name; None in `shape` allows any extent from 1 on."""
+        if name not in self.arrays:
+            raise ValueError(f"{WEIGHTS} lacks {name}")
+        array = self.arrays[name]
+        fits = array.ndim == len(shape) and all(
+            got >= 1 if want is None else got == want for got, want in zip(array.shape, shape, strict=True)
+        )
+        if not fits:
+            raise ValueError(f"{name} in {WEIGHTS} has shape {array.shape}, not {shape}")
+        if np.issubdtype(dtype, np.floating) and not np.isfinite(array).all():
+            raise ValueError(f"{name} in {WEIGHTS} has numbers that are not finite")
+        self.left.discard(name)
+        return jnp.asarray(array.astype(dtype))
+
+    def network(self, name: str, make: Any) -> Network:
+        """A network with its weights; `make` is a function of `nnx.Rngs`, which is not computed."""
+        module = nnx.eval_shape(lambda: make(nnx.Rngs(0)))
+        structure, shapes = nnx.split(module)
+        flat = flax.traverse_util.flatten_dict(nnx.to_pure_dict(shapes))
+        filled = {
+            place: self.take(".".join(map(str, (name, *place))), like.shape, np.dtype(like.dtype))
+            for place, like in flat.items()
+        }
+        nnx.replace_by_pure_dict(shapes, flax.traverse_util.unflatten_dict(filled))
+        return Network(structure, shapes)
+
+    def finish(self) -> None:
+        """Raises `ValueError` if arrays are left."""
+        if self.left:
+            raise ValueError(f"{WEIGHTS} has {min(self.left)!r:.60}, which {DESCRIPTION} does not speak of")
+
+
+def _parts_of(description: Description, arrays: dict[str, np.ndarray]) -> Parts:
+    take = _Arrays(arrays)
+    classes = len(description.classes)
+    viewpoints = take.take("viewpoints", (None, 3))
+    views = len(viewpoints)
+    if views < 2 or float(jnp.abs(jnp.linalg.norm(viewpoints, axis=1) - 1).max()) > 1e-3:
+        raise ValueError("viewpoints are not at least two unit vectors")
+    features = 8 * description.encoder.width
+    fusion = {}
+    if (shape := description.fusion) is not None:
+        network = take.network("fusion.weights", lambda rngs: shape.network(features, classes, rngs))
+        prior, single = take.take("fusion.prior", (classes,)), take.take("single", ())
+        for name in ("posed", "unposed"):
+            temperatures = _positive(take.take(f"fusion.temperatures.{name}", (None,)))
+            fusion[name] = CalibratedFusion(
+                network.structure, network.weights, prior, temperatures, single, name == "posed"
+            )
+    entropy, knowledge, strangeness = None, None, None
+    if (of_entropy := description.entropy) is not None:
+        entropy = take.network("entropy", lambda rngs: of_entropy.network(views, rngs))
+    if "knowledge.order" in arrays:
+        table = take.take("knowledge.expected_logits", (classes, views, classes))
+        knowledge = Knowledge(take.take("knowledge.order", (views,)), table)
+    if "strangeness.means" in arrays:
+        rank = arrays["strangeness.means"].shape[-1]
+        strangeness = Strangeness(
+            take.take("strangeness.whitening", (features, rank)),
+            take.take("strangeness.means", (classes, rank)),
+            take.take("strangeness.quantiles", (None, LEVELS)),
+        )
+    names = sorted(name for name in arrays if name.startswith("temperatures."))
+    if "temperatures.random" not in names:
+        raise ValueError(f"{WEIGHTS} lacks temperatures.random")
+    parts = Parts(
+        encoder=take.network("encoder", lambda rngs: description.encoder.network(classes, rngs)),
+        viewpoints=viewpoints,
+        neighbours=take.take("neighbours", (views, views), bool),
+        single=_positive(take.take("single", ())),
+        entropy=entropy,
+        fusion=fusion,
+        view_policies={
+            name: take.network(f"view_policies.{name}", lambda rngs, of=of: of.network(classes, rngs))
+            for name, of in description.view_policies.items()
+        },
+        knowledge=knowledge,
+        temperatures={name.partition(".")[2]: _positive(take.take(name, (None,))) for name in names},
+        strangeness=strangeness,
+    )
+    take.finish()
+    return parts
+
+
+def _positive(temperatures: jax.Array) -> jax.Array:
+    if not bool(jnp.all(temperatures > 0)):
+        raise ValueError("a temperature is not positive")
+    return temperatures

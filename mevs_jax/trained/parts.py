@@ -1,0 +1,119 @@
+"""The arrays of a trained system, and what its networks compute from one view."""
+
+from __future__ import annotations
+
+from functools import lru_cache
+
+import flax.struct
+import jax.numpy as jnp
+import numpy as np
+from flax import nnx
+from jaxtyping import Array, Float
+
+from mevs_jax.beliefs import CalibratedFusion
+from mevs_jax.cameras import ViewCamera
+from mevs_jax.inputs import depth_and_normals, depth_image, view_cloud
+from mevs_jax.policies.base import Knowledge, Observation
+from mevs_jax.trained.description import CloudInput, ImageInput
+from mevs_jax.trained.strangeness import Strangeness
+
+
+@flax.struct.dataclass
+class Network:
+    """A network as an array tree: its structure is static, so that it can be an argument of compiled functions."""
+
+    structure: nnx.GraphDef = flax.struct.field(pytree_node=False)
+    weights: nnx.State
+
+    @classmethod
+    def of(cls, module: nnx.Module) -> Network:
+        """Splits a module."""
+        return cls(*nnx.split(module))
+
+    @property
+    def module(self) -> nnx.Module:
+        """The module."""
+        return nnx.merge(self.structure, self.weights)
+
+
+@flax.struct.dataclass
+class Parts:
+    """Everything of a trained system that is made of arrays.
+
+    Attributes:
+        encoder: ResNet, from an image to features and logits.
+        viewpoints: (views, 3) unit vectors from the object to the candidate cameras.
+        neighbours: (views, views) True for neighbours on the view graph.
+        entropy: PointNet++, from a cloud to the entropies of all views.
+        fusion: of a recogniser, for a known and for an unknown yaw: `posed` and `unposed`.
+        single: temperature of the logits of a single view.
+        view_policies: networks that score views, by name of the policy.
+        knowledge: statistics over validation objects, for policies that use them.
+        temperatures: by name of the policy, (views,): temperature of the belief after 1, 2, … views of its walks.
+        strangeness: compares features with those of known objects.
+    """
+
+    encoder: Network
+    viewpoints: Float[Array, "views 3"]
+    neighbours: Array
+    single: Float[Array, ""]
+    entropy: Network | None = None
+    fusion: dict[str, CalibratedFusion] = flax.struct.field(default_factory=dict)
+    view_policies: dict[str, Network] = flax.struct.field(default_factory=dict)
+    knowledge: Knowledge | None = None
+    temperatures: dict[str, Array] = flax.struct.field(default_factory=dict)
+    strangeness: Strangeness | None = None
+
+
+@lru_cache(maxsize=8)
+def _priorities(pixels: int) -> Array:
+    """A fixed random order of the pixels of an image."""
+    return np.argsort(np.random.default_rng(0).permutation(pixels)).astype(np.int32)
+
+
+def sample_pixels(depth: Float[Array, "side side"], points: int) -> Array:
+    """Flat indices (points,) of pixels that hit the object, in a fixed random order, repeated if there are too few.
+
+    All indices are 0 for an image in which nothing is hit.
+    """
+    flat = depth.reshape(-1)
+    order = jnp.argsort(jnp.where(flat > 0, _priorities(flat.shape[0]), flat.shape[0]))
+    return order[jnp.arange(points) % jnp.maximum(jnp.sum(flat > 0), 1)].astype(jnp.int32)
+
+
+def image_of(
+    depth: Float[Array, "side side"], image: ImageInput, camera: ViewCamera
+) -> Float[Array, "side side channels"]:
+    """The input of the encoder for a depth image in radii, 0 where nothing is hit."""
+    if image.content == "depth_and_normals":
+        return depth_and_normals(depth, camera)
+    return depth_image(depth, camera, image.channels)
+
+
+def observe(
+    parts: Parts,
+    depth: Float[Array, "side side"],
+    pose: Float[Array, "4 4"],
+    *,
+    image: ImageInput,
+    cloud: CloudInput | None,
+    camera: ViewCamera,
+) -> Observation:
+    """What the networks compute from one view.
+
+    Args:
+        parts: of the system.
+        depth: along the optical axis, in radii of the object; 0 where nothing is hit.
+        pose: from the camera to the object's frame, whose unit is the radius.
+        image: input of the encoder.
+        cloud: input of the entropy predictor; None if its predictions are not needed.
+        camera: of the view.
+    """
+    encoder = parts.encoder.module
+    features = encoder.features(image_of(depth, image, camera))
+    entropies = None
+    if cloud is not None and parts.entropy is not None:
+        pixels = sample_pixels(depth, cloud.points)
+        seen = view_cloud(pixels, depth.reshape(-1)[pixels], pose, camera, cloud.frame, cloud.directions)
+        entropies = parts.entropy.module(seen)
+    return Observation(encoder.head(features), entropies, features)

@@ -1,0 +1,158 @@
+"""A trained system: networks, calibration and knowledge, with what is needed to use them on any object."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from functools import cached_property, partial
+from typing import TYPE_CHECKING, Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from mevs_jax.arrays import AnyArray
+from mevs_jax.policies.base import Observation, Policy
+from mevs_jax.policies.learned import learned
+from mevs_jax.policies.registry import POLICIES, policy_named
+from mevs_jax.selection import Fuse, by_attention, sum_of_logits
+from mevs_jax.trained.description import Description
+from mevs_jax.trained.parts import Parts, observe
+from mevs_jax.viewpoints import ViewGraph
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from mevs_jax.agent import Agent
+
+
+@dataclass(frozen=True)
+class TrainedSystem:
+    """Networks that recognise objects and choose views, as `mevs_jax.load` returns them.
+
+    Attributes:
+        description: all that is not an array; the content of `trained.json`.
+        parts: all arrays.
+        name: where it was loaded from.
+    """
+
+    description: Description
+    parts: Parts = field(repr=False)
+    name: str = ""
+
+    @property
+    def classes(self) -> tuple[str, ...]:
+        """Names of the classes, by label."""
+        return self.description.classes
+
+    @property
+    def viewpoints(self) -> Float[np.ndarray, "views 3"]:
+        """Unit vectors from the object to the candidate cameras, in the object's frame."""
+        return np.asarray(self.parts.viewpoints)
+
+    @property
+    def evaluation(self) -> dict[str, Any]:
+        """Figures of the system's own evaluation on test objects."""
+        return self.description.evaluation
+
+    @cached_property
+    def graph(self) -> ViewGraph:
+        """The candidate views with their neighbours."""
+        points = self.parts.viewpoints
+        distances = np.arccos(np.clip(np.asarray(points, float) @ np.asarray(points, float).T, -1, 1))
+        np.fill_diagonal(distances, 0)
+        return ViewGraph(points, self.parts.neighbours, jnp.asarray(distances, jnp.float32))
+
+    @property
+    def policies(self) -> tuple[str, ...]:
+        """Names of the policies that can be used with this system, for objects of known yaw."""
+        return tuple(name for name in (*POLICIES, *self.parts.view_policies) if self._has_inputs_of(name))
+
+    def _has_inputs_of(self, name: str) -> bool:
+        from mevs_jax.agent.core import can_run  # the agent knows what a policy is given
+
+        return can_run(self, name, posed=True)
+
+    @property
+    def temperatures(self) -> dict[str, np.ndarray]:
+        """By policy: temperature of the belief after 1, 2, … views; the last one holds for more views."""
+        return {name: np.asarray(values) for name, values in self.parts.temperatures.items()}
+
+    def fuse(self, parts: Parts, posed: bool = True) -> Fuse:
+        """Returns the fusion that computes the belief from the views seen.
+
+        Args:
+            parts: those of this system, as they are within a compiled function.
+            posed: whether the object's yaw is known.
+        """
+        if not parts.fusion:
+            return sum_of_logits
+        return by_attention(parts.fusion["posed" if posed else "unposed"])
+
+    def policy(self, name: str, parts: Parts | None = None, posed: bool = True) -> Policy:
+        """Returns a policy by its name: one of this system's networks, or a registered policy.
+
+        Args:
+            name: `best` for the one that `description.best` names.
+            parts: those of this system, as they are within a compiled function.
+            posed: whether the object's yaw is known.
+
+        Raises:
+            ValueError: for an unknown name.
+        """
+        parts = self.parts if parts is None else parts
+        if name == "best":
+            name = self.description.best if posed else self.description.best_unposed
+        if name in parts.view_policies:
+            by = "table" if name.endswith("and_table") else "belief"
+            return learned(parts.view_policies[name].module, parts.single, by=by)  # type: ignore[arg-type]
+        if name not in POLICIES:
+            known = ", ".join(("best", *parts.view_policies, *POLICIES))
+            raise ValueError(f"unknown policy {name!r}; it is one of {known}")
+        return policy_named(name)
+
+    @cached_property
+    def _observe(self) -> Any:
+        description = self.description
+        given = {"image": description.image, "cloud": description.cloud, "camera": description.camera}
+        return jax.jit(partial(observe, **given))  # type: ignore[arg-type]
+
+    def observe(self, depth: Float[AnyArray, "side side"], pose: Float[AnyArray, "4 4"]) -> Observation:
+        """What the networks compute from one view, taken by the camera `description.camera`.
+
+        `mevs_jax.canonical_view` makes such a view from that of any depth camera.
+
+        Args:
+            depth: along the optical axis, in radii of the object; 0 where nothing is hit.
+            pose: from the camera to the object's frame: origin at its centre, z up, unit the radius.
+
+        Raises:
+            ValueError: for a depth image of another size.
+        """
+        side = self.description.camera.resolution
+        if np.shape(depth) != (side, side):
+            raise ValueError(
+                f"this system needs depth images of {side}×{side} pixels, got {'×'.join(map(str, np.shape(depth)))}; make one "
+                f"from any camera's image with mevs_jax.canonical_view"
+            )
+        return self._observe(self.parts, jnp.asarray(depth, jnp.float32), jnp.asarray(pose, jnp.float32))
+
+    def log_probabilities(
+        self, belief: Float[Array, "*batch classes"], count: int | Array, policy: str = "random"
+    ) -> Float[Array, "*batch classes"]:
+        """Calibrated log-probabilities of the classes, from the belief after `count` views of a policy's walk."""
+        temperatures = self.parts.temperatures.get(policy, self.parts.temperatures["random"])
+        at = jnp.clip(jnp.asarray(count), 1, len(temperatures)) - 1
+        return jax.nn.log_softmax(belief / temperatures[at], axis=-1)
+
+    def agent(self, policy: str | Policy = "best", **options: Any) -> Agent:
+        """Returns an agent that recognises objects with a depth camera; see `mevs_jax.Agent` for the options."""
+        from mevs_jax.agent import Agent
+
+        return Agent(self, policy, **options)
+
+    def save(self, folder: str | Path) -> None:
+        """Writes the system into a folder, which `mevs_jax.load` reads; see `mevs_jax.trained.files.save`."""
+        from mevs_jax.trained.files import save
+
+        save(self, folder)
