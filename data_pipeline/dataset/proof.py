@@ -6,10 +6,11 @@ before a training begins, so that the shards can be made again.
 
 from __future__ import annotations
 
+import operator
 import os
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
+from typing import Any, SupportsIndex
 
 from data_pipeline.dataset.statistics import SPLITS, SUMMARY, DatasetStatistics, load_statistics
 from data_pipeline.errors import DataError, Unreadable, reason_of
@@ -110,7 +111,8 @@ class Objects:
     def __len__(self) -> int:
         return self._length
 
-    def __getitem__(self, index: int) -> dict[str, Any]:
+    def __getitem__(self, index: SupportsIndex) -> dict[str, Any]:
+        index = operator.index(index)
         if not -self._length <= index < self._length:
             raise IndexError(index)
         try:

@@ -306,9 +306,12 @@ def test_the_stages_make_everything_and_go_on(results, tmp_path, monkeypatch, ca
             "start": begun[folder.name],
             "seconds": 1.0,
         }
-        write_json(folder / "config.json", {"name": task.name})
+        write_json(folder / "config.json", {"task": task.name})
         write_json(folder / "summary.json", summary)
-        lines = [json.dumps({"epoch": epoch, "train/loss": 1 / epoch, "val/loss": 1.2 / epoch}) for epoch in (1, 2, 3)]
+        lines = [
+            json.dumps({"step": epoch, "epoch": epoch, "train/loss": 1 / epoch, "val/loss": 1.2 / epoch})
+            for epoch in (1, 2, 3)
+        ]
         (folder / "metrics.jsonl").write_text("\n".join(lines) + "\n")
         return summary
 
