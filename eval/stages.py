@@ -28,6 +28,7 @@ from eval.report.html import ReportInputs
 from eval.report.page import is_current, read_history, write_report
 from eval.report.sweep import write_sweep_report
 from eval.settings import Settings
+from eval.system import classifier_system, figures_of, identity_of, save_system, stored_system
 from eval.tables import ViewTables, compute_view_tables, load_view_tables, save_view_tables
 from eval.walks.grid import FIRST_MV, GridConfig
 from eval.walks.knowledge import learn
@@ -197,6 +198,40 @@ def _check_metrics(metrics: dict[str, Any], tables: ViewTables, out: Path) -> No
         f"the metric {place} is not finite, and the outputs of the network in {out / name} reach {largest[name]:.2g}; to train "
         f"it again, lower --{name}.optimiser.learning-rate, and delete {out / name} or choose another --out"
     )
+
+
+def make_system(settings: Settings, out: Path) -> Path:
+    """Writes the trained system of the run into `system/`, unless it is there already; returns the folder.
+
+    Raises:
+        DataError: if the run is not finished.
+    """
+    folder, statistics = out / "system", load_statistics(out / "data")
+    if not (out / "metrics.json").exists():
+        raise DataError(f"no metrics in {out}; make them with: mevs eval --out {out}")
+    metrics = _metrics(out / "metrics.json", f"mevs eval --out {out}")
+    made = made_by(statistics, out / "classifier", out / "entropy")
+    evaluation = figures_of(metrics)
+    identity = identity_of(made, evaluation, settings.evaluation.max_views)
+    if stored_system(folder, identity):
+        return folder
+    classify, predict = tasks(settings, statistics)
+    networks = load_best(classify, out / "classifier"), load_best(predict, out / "entropy")
+    validation = _tables(settings, out, statistics, "val")
+    system = classifier_system(
+        out / "data",
+        statistics,
+        classify,
+        networks[0],
+        predict,
+        networks[1],
+        validation,
+        evaluation,
+        settings.evaluation.max_views,
+        identity,
+    )
+    save_system(system, folder)
+    return folder
 
 
 def learn_to_choose(settings: Settings, out: Path) -> Path:

@@ -7,9 +7,10 @@ each half of them walks with the knowledge of the other half.
 
 from __future__ import annotations
 
+import hashlib
 import json
 import platform
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -21,11 +22,10 @@ from flax import nnx
 from jaxtyping import Array, Float, Int
 
 from data_pipeline.dataset.inputs import view_camera
-from data_pipeline.dataset.statistics import DatasetStatistics, load_statistics
-from data_pipeline.errors import DataError, Unreadable
-from data_pipeline.files import keep_checks, check_of_file
+from data_pipeline.dataset.statistics import DatasetStatistics
+from data_pipeline.errors import DataError
+from data_pipeline.files import as_read
 from data_pipeline.progress import console
-from eval.numbers.comparison import intervals
 from eval.numbers.confidence import logits_along
 from eval.tables import ViewTables
 from eval.walks.grid import run_grid
@@ -43,9 +43,10 @@ from mevs_jax.trained import (
     Network,
     Parts,
     TrainedSystem,
+    UnreadableSystem,
     fit_strangeness,
-    load,
     save,
+    verify,
 )
 from mevs_jax.trained.description import FORM
 from mevs_jax.viewpoints import ViewGraph
@@ -69,6 +70,21 @@ _COUNTED = slice(1, 4)
 """The numbers of views, 2 to 4, whose accuracy decides which policy is the best."""
 _WITHOUT_YAW = "farthest"
 """The best policy of a classifier for objects of unknown yaw: all others need the object's frame, except random selection."""
+
+
+_STRANGE_OBJECTS = 400
+"""Number of validation objects, at most, whose features say what known objects look like."""
+
+
+def stored_system(folder: Path, made_by: str) -> bool:
+    """Whether a folder holds the sound trained system that `made_by` identifies; says so if it holds a damaged one."""
+    try:
+        return verify(folder).made_by == made_by
+    except FileNotFoundError:
+        return False
+    except UnreadableSystem as error:
+        console.print(f"{str(error).split(';')[0]}, so it is made again", markup=False)
+        return False
 
 
 @dataclass(frozen=True)
@@ -95,7 +111,7 @@ def _fit(logits: Float[Array, "walks steps classes"], labels: Int[Array, " walks
 
 
 def walk_validation(tables: ViewTables, graph: ViewGraph, max_views: int, seed: int = 0) -> OnValidation:
-    """Walks every validation object from every view by every usable policy, with the knowledge of the other half of the objects."""
+    """Walks every validation object from every view by every usable policy, with knowledge of the other half of them."""
     half = np.argsort(np.random.default_rng(seed).permutation(len(tables.labels))) % 2
     rungs = tuple(Rung(name, name, "nothing") for name in USABLE)
     parts: dict[str, list[tuple[np.ndarray, np.ndarray]]] = {name: [] for name in USABLE}
@@ -115,9 +131,7 @@ def walk_validation(tables: ViewTables, graph: ViewGraph, max_views: int, seed: 
             views = jnp.asarray(found[name].views)[0, :, :, 0].astype(jnp.int32)
             logits = logits_along(views, jnp.asarray(walking.logits))
             starts = logits.shape[1]
-            parts[name].append(
-                (np.asarray(logits).reshape(-1, *logits.shape[2:]), np.repeat(walking.labels, starts))
-            )
+            parts[name].append((np.asarray(logits).reshape(-1, *logits.shape[2:]), np.repeat(walking.labels, starts)))
     temperatures, after = {}, {}
     for name, pieces in parts.items():
         logits, labels = (np.concatenate(piece) for piece in zip(*pieces, strict=True))
@@ -157,6 +171,23 @@ def made_with() -> dict[str, str]:
     return {"python": platform.python_version(), **{name: version(name) for name in packages}}
 
 
+def identity_of(*content: Any) -> str:
+    """Returns a hash of what a system is made from."""
+    return hashlib.sha256(json.dumps(as_read(content), sort_keys=True).encode()).hexdigest()[:16]
+
+
+def save_system(system: TrainedSystem, folder: Path) -> None:
+    """Writes a system.
+
+    Raises:
+        DataError: if the folder holds something else.
+    """
+    try:
+        save(system, folder)
+    except FileExistsError as error:
+        raise DataError(str(error)) from error
+
+
 def data_of(statistics: DatasetStatistics) -> DataDescription:
     """Describes a data set in a trained system."""
     objects = {split: statistics.objects_of([split]) for split in statistics.counts}
@@ -183,6 +214,7 @@ def classifier_system(
     validation: ViewTables,
     evaluation: dict[str, Any],
     max_views: int,
+    made_by: str,
 ) -> TrainedSystem:
     """Returns the trained system of a run: classifier, entropy predictor, class × view table.
 
@@ -191,13 +223,15 @@ def classifier_system(
         validation: view tables of the validation objects by these networks.
         evaluation: figures to carry.
         max_views: number of views that temperatures are fitted for.
+        made_by: identifies what the system is made from.
     """
     graph = ViewGraph.from_points(np.array(statistics.viewpoints))
     max_views = min(max_views, statistics.views)
     console.print(f"Calibrating {len(USABLE)} policies on {len(validation.labels)} validation objects")
     walks = walk_validation(validation, graph, max_views)
-    features = network_outputs(data, "val", classify, classifier, ask=_features)
     labels, classes = validation.labels, len(statistics.classes)
+    some = np.unique(np.linspace(0, len(labels) - 1, _STRANGE_OBJECTS).astype(int))
+    features = network_outputs(data, "val", classify, classifier, ask=_features, chosen=some)
     knowledge = learn(jnp.asarray(validation.logits), jnp.asarray(labels))
     single = fit_temperature(
         jnp.asarray(validation.logits).reshape(-1, classes), jnp.repeat(jnp.asarray(labels), statistics.views)
@@ -215,10 +249,12 @@ def classifier_system(
         best_unposed=_WITHOUT_YAW,
         chosen_by="highest mean accuracy after 2 to 4 views on validation objects",
         data=data_of(statistics),
+        made_by=made_by,
         made_with=made_with(),
         entropy=shape,
         cloud=cloud,
-        evaluation=evaluation | {"validation_after_views": {name: after.tolist() for name, after in walks.after.items()}},
+        evaluation=evaluation
+        | {"validation_after_views": {name: after.tolist() for name, after in walks.after.items()}},
     )
     parts = Parts(
         encoder=Network.of(classifier),
@@ -228,6 +264,6 @@ def classifier_system(
         entropy=Network.of(predictor),
         knowledge=Knowledge(knowledge.order, knowledge.expected_logits),
         temperatures={name: jnp.asarray(values) for name, values in walks.temperatures.items()},
-        strangeness=fit_strangeness(features, labels, classes, statistics.views),
+        strangeness=fit_strangeness(features, labels[some], classes, statistics.views),
     )
     return TrainedSystem(description, parts)

@@ -11,6 +11,12 @@ from typing import Any
 __version__ = "0.2.0.dev0"
 
 _MODULES = {
+    "agent": (
+        "Agent",
+        "Belief",
+        "Step",
+        "look",
+    ),
     "beliefs": (
         "CalibratedFusion",
         "confidence",
@@ -89,6 +95,12 @@ _MODULES = {
         "by_attention",
         "select_from_table",
         "select_views",
+    ),
+    "trained": (
+        "TrainedSystem",
+        "UnreadableSystem",
+        "from_pretrained",
+        "load",
     ),
     "viewpoints": (
         "ViewGraph",

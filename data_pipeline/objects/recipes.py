@@ -9,7 +9,7 @@ from pathlib import Path, PurePosixPath
 import numpy as np
 
 from data_pipeline.errors import DamagedMesh
-from data_pipeline.objects.formats import Up, parse_mesh
+from data_pipeline.objects.formats import MESH_SUFFIXES, Up, parse_mesh
 from data_pipeline.objects.furniture import furniture
 from data_pipeline.objects.names import shown
 
@@ -51,6 +51,24 @@ class MeshFile:
     def _sibling(self, name: str) -> bytes:
         where = f"{shown(self.path)} needs {shown(name)!r}, which"
         return _content(os.path.join(os.path.dirname(self.path), within(name, where)), where)
+
+
+def read_mesh(path: str | Path, up: Up = "auto") -> tuple[np.ndarray, np.ndarray]:
+    """Returns the vertices (n, 3), z up, and triangles (m, 3) of a mesh file.
+
+    Args:
+        path: a file of one of the formats of `data_pipeline.objects.formats`.
+        up: which axis of the file is up.
+
+    Raises:
+        DataError: if it is not a mesh that can be read.
+    """
+    if Path(path).suffix.lower() not in MESH_SUFFIXES:
+        known = ", ".join(MESH_SUFFIXES)
+        raise DamagedMesh(
+            f"{shown(str(path))} has no suffix of a mesh that is read here ({known}); convert it to one of them"
+        )
+    return MeshFile(str(path), up=up).load()
 
 
 def _content(path: str, where: str) -> bytes:

@@ -22,8 +22,8 @@ from mevs_jax.agent.candidates import candidates_of
 from mevs_jax.agent.frames import mask_of, pose_towards, rotation_to_world
 from mevs_jax.agent.records import Belief, History, Reason, Step, plain
 from mevs_jax.canonical import canonical_view
-from mevs_jax.sphere import estimate_sphere
 from mevs_jax.policies.base import Policy
+from mevs_jax.sphere import estimate_sphere
 from mevs_jax.trained.parts import Parts, observe
 from mevs_jax.trained.system import TrainedSystem
 

@@ -19,6 +19,8 @@ class Command:
         out: default of `--out`, where `{preset}` is the preset.
         writes_run: whether its settings become those of the run, in `run.json`.
         locks: whether no other job may write into the run directory meanwhile.
+        tool: whether it is a tool, which takes its options alone: it has no run directory, preset or settings.
+        needs_study: whether it needs the packages of the study, so a checkout of the project.
     """
 
     title: str
@@ -28,6 +30,8 @@ class Command:
     out: str = "runs/{preset}"
     writes_run: bool = True
     locks: bool = True
+    tool: bool = False
+    needs_study: bool = True
 
     def load(self) -> Callable:
         module, name = self.function.split(":")
@@ -64,6 +68,22 @@ COMMANDS = {
         "WithSeed",
         ("evaluation",),
         "stages:evaluate",
+    ),
+    "look": Command(
+        "recognise one object by chosen views, with a trained system",
+        "LookOptions",
+        (),
+        "tools:look",
+        tool=True,
+        needs_study=False,
+    ),
+    "export": Command(
+        "write the trained system of a run into a folder of its own",
+        "ExportOptions",
+        (),
+        "tools:export",
+        tool=True,
+        needs_study=False,
     ),
     "report": Command("write report/index.html", "Options", (), "stages:report", writes_run=False),
     "study thesis": Command(
@@ -132,6 +152,9 @@ measures how much choosing the next view helps.
 stages of a run:
 {stages}
 
+trained systems:
+{tools}
+
 studies, checks, drawings:
 {others}
 
@@ -153,18 +176,19 @@ common options:
   mevs run --data modelnet10 --out runs/modelnet10
   mevs study thesis --data modelnet10 --archive ModelNet10.zip
   mevs train --out runs/modelnet10 --classifier.optimiser.epochs 20
+  mevs look --mesh chair.obj
 """
 
 
 def help_text() -> str:
     """What `mevs --help` prints."""
 
-    def lines(grouped: bool) -> str:
-        shown = {name: command for name, command in COMMANDS.items() if (" " in name) == grouped}
+    def lines(grouped: bool, tools: bool = False) -> str:
+        shown = {name: of for name, of in COMMANDS.items() if (" " in name) == grouped and of.tool == tools}
         width = max(map(len, shown)) + 2
         return "\n".join(f"  {name:<{width}}{command.title}" for name, command in shown.items())
 
-    return HELP.format(stages=lines(False), others=lines(True))
+    return HELP.format(stages=lines(False), tools=lines(False, True), others=lines(True))
 
 
 def find(arguments: Sequence[str]) -> tuple[str, list[str], str | None]:

@@ -29,21 +29,33 @@ def _fail(message: str, code: int = 2) -> None:
 
 def _require_checkout() -> None:
     """Ends with a sentence where only the library is installed: the wheel has no studies."""
-    import mevs_jax
-
-    root = Path(mevs_jax.__file__).resolve().parents[1]
-    if not all((root / package / "__init__.py").is_file() for package in ("data_pipeline", "train", "eval")):
+    if not has_checkout():
         _fail(
             "the installed package holds the library alone; studies run from a checkout of the project: clone it, run "
             "`make demo` there, and then use .venv/bin/mevs"
         )
+
+
+def has_checkout() -> bool:
+    """Whether the packages of the study are beside this one; if so, they can be imported from then on."""
+    import mevs_jax
+
+    root = Path(mevs_jax.__file__).resolve().parents[1]
+    if not all((root / package / "__init__.py").is_file() for package in ("data_pipeline", "train", "eval")):
+        return False
     if str(root) not in sys.path:
         sys.path.insert(0, str(root))
+    return True
 
 
 def _run(name: str, arguments: list[str]) -> None:
     import json
 
+    if COMMANDS[name].tool:
+        from mevs_jax.cli.parsing import tool_options
+
+        COMMANDS[name].load()(tool_options(name, arguments))
+        return
     from data_pipeline.lock import locked
     from eval.run_file import configuration
     from eval.stages import check_output
@@ -106,6 +118,12 @@ def _say_and_end(error: Exception) -> None:
     """Ends the program for an error that a person can act on; returns for any other."""
     if isinstance(error, ModuleNotFoundError) and error.name and not _is_ours(error.name):
         _fail(f"the package {error.name} is not installed; install the study's packages: pip install -e '.[study]'")
+    from mevs_jax.cli.failure import Unusable
+
+    if isinstance(error, Unusable):
+        _fail(str(error))
+    if not has_checkout():
+        return
     from data_pipeline.errors import DataError, Diverged
 
     if isinstance(error, DataError):
@@ -212,7 +230,8 @@ def _main(arguments: list[str]) -> None:
     _begin_with_large_pages()
     if note:
         print(f"mevs: {note}", file=sys.stderr)
-    _require_checkout()
+    if COMMANDS[name].needs_study:
+        _require_checkout()
     os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "2")
     # Tracing leaves many small objects that live: looking through them as often as Python does takes a twentieth of a short job.
     gc.set_threshold(100_000, 50, 100)

@@ -88,3 +88,52 @@ class TrainOptions(WithWeights):
     """this is one of several processes that train together (docs/scaling.md)"""
     model_devices: Annotated[int, _arg("N", "1")] = 1
     """devices that share one copy of a network's weights; batches are split over the others"""
+
+
+@dataclass(frozen=True)
+class LookOptions:
+    """Options of `mevs look`."""
+
+    system: Annotated[str, _arg("PATH|NAME", "furniture10, which comes with the package")] = "furniture10"
+    """the trained system: a folder, a run, a name that comes with the package, or owner/name on the Hugging Face hub"""
+    mesh: Annotated[Path | None, _arg("FILE")] = None
+    """a mesh to recognise: .off, .obj, .stl, .ply, .glb, .gltf, .dae or .3mf; it is rendered from the views that are chosen"""
+    depth: Annotated[Path | None, _arg("FILE")] = None
+    """recorded depth images to choose from, in an .npz: depth (n, h, w) in metres, K, T_world_camera (n, 4, 4), and center with
+    radius, or mask; optionally up and floor"""
+    first: Annotated[int | None, _arg("VIEW", "chosen; 0 for recorded images")] = None
+    """the first view"""
+    policy: Annotated[str, _arg("NAME", "best, the one that won on validation objects")] = "best"
+    """the policy that chooses views"""
+    stop: Annotated[float, _arg("P", "0.95")] = 0.95
+    """calibrated probability of the class at which to stop; above 1 never"""
+    max_views: Annotated[int, _arg("N", "8")] = 8
+    """largest number of views"""
+    unknown: Annotated[float | None, _arg("Q", "no such answer")] = None
+    """answer "unknown object" for an object that is stranger than this share of the known ones, as 0.99"""
+    yaw_unknown: Annotated[tyro.conf.FlagCreatePairsOff[bool], _arg("")] = False
+    """the object's rotation about the upward axis is unknown; only for recorded images"""
+    up: Annotated[Literal["auto", "z", "y"], _arg("auto|z|y", "auto: y for glTF, as declared for DAE, else z")] = "auto"
+    """the upward axis of the mesh"""
+    json: Annotated[tyro.conf.FlagCreatePairsOff[bool], _arg("")] = False
+    """print the walk as JSON"""
+    draw: Annotated[Path | None, _arg("FILE")] = None
+    """draw the walk into this image, .png or .svg"""
+    save: Annotated[Path | None, _arg("FILE")] = None
+    """save the walk's history, which can be repeated, into this .npz"""
+
+
+@dataclass(frozen=True)
+class ExportOptions:
+    """Options of `mevs export`."""
+
+    to: Annotated[Path, _arg("FOLDER")]
+    """where to write"""
+    out: Annotated[Path | None, _arg("DIR")] = None
+    """folder of a run, whose trained system is made first if it is not there"""
+    system: Annotated[str | None, _arg("PATH|NAME")] = None
+    """or a trained system, as for mevs look"""
+    half: Annotated[tyro.conf.FlagCreatePairsOff[bool], _arg("")] = False
+    """store the networks in float16, which halves the folder"""
+    stablehlo: Annotated[tyro.conf.FlagCreatePairsOff[bool], _arg("")] = False
+    """also write the compiled programs for CPU, CUDA and TPU, which need JAX and NumPy alone"""

@@ -37,6 +37,17 @@ class Invocation:
     arguments: list[str]
 
 
+def tool_options(name: str, arguments: list[str]) -> Any:
+    """The options of a tool, which has no settings.
+
+    Raises:
+        SystemExit: for options that tyro refuses, after its message.
+    """
+    return tyro.cli(
+        _class_of(COMMANDS[name]), prog=f"mevs {name}", description=f"{COMMANDS[name].title}.", args=arguments
+    )
+
+
 def show_options(name: str) -> None:
     """Prints the options of a command, without its settings, and exits."""
     command = COMMANDS[name]
@@ -46,7 +57,7 @@ def show_options(name: str) -> None:
     tyro.cli(_class_of(command), prog=f"mevs {name}", description=about, args=["--help"])
 
 
-def _class_of(command: Command) -> type[option_classes.Options]:
+def _class_of(command: Command) -> Any:
     return getattr(option_classes, command.options)
 
 

@@ -14,6 +14,7 @@ def run(call: Invocation) -> None:
     stages.make_data(call.settings, call.out)
     stages.train(call.settings, call.out, start)
     evaluate(call)
+    print(f"Trained system: {stages.make_system(call.settings, call.out).absolute()}")
     report(call)
 
 

@@ -81,6 +81,7 @@ class Description:
         best_unposed: the same for an unknown yaw.
         chosen_by: how `best` was chosen.
         data: the data set that the networks were trained and calibrated on.
+        made_by: hash of what the system was made from: data set, networks, evaluation.
         made_with: versions of packages.
         evaluation: figures of its own evaluation, on test objects.
     """
@@ -95,6 +96,7 @@ class Description:
     best_unposed: str
     chosen_by: str
     data: DataDescription
+    made_by: str
     made_with: dict[str, str]
     fusion: SetFusionShape | None = None
     entropy: PointNet2Shape | None = None

@@ -12,6 +12,8 @@ import os
 import re
 import shutil
 import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -119,13 +121,14 @@ def _from_hub(name: str, revision: str | None = None) -> Path:
         raise FileNotFoundError(f"{name} cannot be had from the Hugging Face hub ({reason})") from error
 
 
-def save(system: TrainedSystem, folder: str | Path, *, half: bool = False) -> None:
+def save(system: TrainedSystem, folder: str | Path, *, half: bool = False, stablehlo: bool = False) -> None:
     """Writes a trained system into a folder; an existing one is replaced as a whole.
 
     Args:
         system: the system.
         folder: where to; a folder that holds anything but a trained system is refused.
         half: whether networks are stored in float16, which halves the file. They compute in float32 all the same.
+        stablehlo: whether the compiled programs of `mevs_jax.export` are written too.
 
     Raises:
         FileExistsError: for a folder that holds something else.
@@ -211,7 +214,40 @@ def _flat(name: str, weights: nnx.State) -> dict[str, Any]:
     return {".".join(map(str, (name, *place))): value for place, value in flat.items()}
 
 
+def verify(folder: str | Path) -> Description:
+    """Returns the description of the system in a folder, whose weights are as they were written; quicker than `load`.
+
+    Raises:
+        FileNotFoundError: if there is none.
+        UnreadableSystem: if it is damaged, or of another version.
+    """
+    folder = Path(folder)
+    description, of_weights = _read_description(folder)
+    _read_weights(folder / WEIGHTS, of_weights)
+    return description
+
+
 def _read(folder: Path, name: str) -> TrainedSystem:
+    description, of_weights = _read_description(folder)
+    content = _read_weights(folder / WEIGHTS, of_weights)
+    with _sound(folder):
+        return TrainedSystem(description, _parts_of(description, _arrays_in(content, folder / WEIGHTS)), name)
+
+
+@contextmanager
+def _sound(folder: Path) -> Iterator[None]:
+    """Turns the errors of content of another form into `UnreadableSystem`."""
+    try:
+        yield
+    except UnreadableSystem:
+        raise
+    except (ValueError, TypeError, LookupError, AttributeError, ArithmeticError, RecursionError, MemoryError) as error:
+        reason = (str(error).strip() or type(error).__name__).splitlines()[0][:300]
+        raise UnreadableSystem(f"{folder} is no sound trained system ({reason}); export the system again") from error
+
+
+def _read_description(folder: Path) -> tuple[Description, Any]:
+    """The checked description, and what it says about the file of weights."""
     path = folder / DESCRIPTION
     bad = f"{path} cannot be read"
     if path.stat().st_size > LARGEST_DESCRIPTION:
@@ -229,17 +265,10 @@ def _read(folder: Path, name: str) -> TrainedSystem:
         raise UnreadableSystem(f"{bad}: it was changed or damaged, since its hash differs; export the system again")
     of_weights = content.pop("weights", None)
     del content["sha256"]
-    try:
+    with _sound(folder):
         description = from_plain(Description, content, DESCRIPTION)
         check(description)
-        arrays = _read_arrays(folder / WEIGHTS, of_weights)
-        parts = _parts_of(description, arrays)
-    except UnreadableSystem:
-        raise
-    except (ValueError, TypeError, KeyError, AttributeError, OverflowError, ZeroDivisionError, IndexError) as error:
-        reason = (str(error).strip() or type(error).__name__).splitlines()[0][:300]
-        raise UnreadableSystem(f"{folder} is no sound trained system ({reason}); export the system again") from error
-    return TrainedSystem(description, parts, name)
+    return description, of_weights
 
 
 def check(description: Description) -> None:
@@ -264,12 +293,12 @@ def check(description: Description) -> None:
             raise ValueError(f"it has no policy {name!r:.40}")
 
 
-def _read_arrays(path: Path, expected: Any) -> dict[str, np.ndarray]:
-    from safetensors import SafetensorError
-    from safetensors.numpy import load as from_safetensors
-
+def _read_weights(path: Path, expected: Any) -> bytes:
+    """The content of the file of weights, which is as it was written."""
     if not isinstance(expected, dict) or set(expected) != {"sha256", "bytes"}:
-        raise ValueError(f"{DESCRIPTION} does not say what {WEIGHTS} holds")
+        raise UnreadableSystem(
+            f"{path.parent / DESCRIPTION} does not say what {WEIGHTS} holds; export the system again"
+        )
     if not path.is_file():
         raise UnreadableSystem(f"{path} is missing; export the system again")
     size = path.stat().st_size
@@ -278,9 +307,16 @@ def _read_arrays(path: Path, expected: Any) -> dict[str, np.ndarray]:
     content = path.read_bytes()
     if hashlib.sha256(content).hexdigest() != expected["sha256"]:
         raise UnreadableSystem(f"{path} is damaged, since its hash differs; export the system again")
+    return content
+
+
+def _arrays_in(content: bytes, path: Path) -> dict[str, np.ndarray]:
+    from safetensors import SafetensorError
+    from safetensors.numpy import load as from_safetensors
+
     try:
         return from_safetensors(content)
-    except (SafetensorError, ValueError, TypeError, KeyError, OverflowError) as error:
+    except (SafetensorError, ValueError, TypeError, LookupError, ArithmeticError) as error:
         raise UnreadableSystem(f"{path} is no safetensors file; export the system again") from error
 
 

@@ -1,0 +1,229 @@
+"""An object recognised from beginning to end: a mesh, rendered where the agent wants to see it, or recorded depth images."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import partial
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int
+
+from mevs_jax.agent.agent import Agent
+from mevs_jax.agent.records import Belief, History, Reason
+from mevs_jax.cameras import ViewCamera, look_at_origin
+from mevs_jax.rendering.depth import pad_triangles, render_depth
+from mevs_jax.sphere import estimate_sphere
+from mevs_jax.trained.system import TrainedSystem
+
+MOST_FRAMES = 512
+
+
+@dataclass(frozen=True)
+class Walk:
+    """How an object was recognised.
+
+    Attributes:
+        views: indices of the views seen, in order, of the system's viewpoints or of the recorded frames.
+        beliefs: after each of them.
+        reason: why it ended: `sure`, `budget`, `nothing reachable` or `unknown object`.
+        history: everything, so that it can be saved and repeated.
+    """
+
+    views: tuple[int, ...]
+    beliefs: tuple[Belief, ...]
+    reason: Reason
+    history: History
+
+    @property
+    def name(self) -> str:
+        """The answer: name of the most likely class, or `unknown object`."""
+        return "unknown object" if self.reason == "unknown object" else self.beliefs[-1].name
+
+    @property
+    def confidence(self) -> float:
+        """Calibrated probability of the most likely class at the end."""
+        return self.beliefs[-1].confidence
+
+    def __str__(self) -> str:
+        lines = [
+            f"view {view:3d}: {belief.name} {100 * belief.confidence:.1f} %"
+            for view, belief in zip(self.views, self.beliefs, strict=True)
+        ]
+        count = f"{len(self.views)} view{'s' * (len(self.views) > 1)}"
+        lines.append(f"{self.name}, {100 * self.confidence:.1f} % confident after {count} ({self.reason})")
+        return "\n".join(lines)
+
+
+def look(
+    system: TrainedSystem,
+    vertices: Float[np.ndarray, "vertices 3"],
+    faces: Int[np.ndarray, "faces 3"],
+    *,
+    first: int | None = None,
+    **options: Any,
+) -> Walk:
+    """Recognises a mesh: renders it from the views that the agent chooses.
+
+    Args:
+        system: from `mevs_jax.load`.
+        vertices: corners, z up, in any unit; centre and size are taken from the mesh.
+        faces: (faces, 3) indices of corners.
+        first: index of the first view; by default the agent chooses it.
+        options: of `mevs_jax.Agent`.
+
+    Raises:
+        ValueError: for a mesh without faces or with coordinates that are not finite, or an option out of its range.
+    """
+    agent = system.agent(**options)
+    views = len(system.viewpoints)
+    if first is not None and not 0 <= first < views:
+        raise ValueError(f"first must be a view from 0 to {views - 1}, got {first}")
+    triangles = pad_triangles(unit_triangles(vertices, faces))
+    camera = system.description.camera
+    agent.reset(center=(0.0, 0.0, 0.0), radius=1.0)
+    seen, beliefs = [], []
+    index = agent.decide().index if first is None else first
+    while True:
+        pose = np.asarray(look_at_origin(jnp.asarray(system.viewpoints[index]) * camera.distance))
+        depth = np.asarray(_depth(jnp.asarray(triangles), jnp.asarray(pose), camera))
+        seen.append(index)
+        beliefs.append(agent.observe_view(depth, pose))
+        step = agent.decide()
+        if step.done:
+            return Walk(tuple(seen), tuple(beliefs), step.reason, agent.history)
+        index = step.index
+
+
+@partial(jax.jit, static_argnames="camera")
+def _depth(triangles: Array, pose: Array, camera: ViewCamera) -> Array:
+    depth = render_depth(triangles, camera.at(pose)).depth
+    return jnp.where(jnp.isfinite(depth), depth, 0.0)
+
+
+def unit_triangles(
+    vertices: Float[np.ndarray, "vertices 3"], faces: Int[np.ndarray, "faces 3"]
+) -> Float[np.ndarray, "faces 3 3"]:
+    """Triangles of a mesh, centred on its bounding box and scaled into the unit sphere, as the data sets are.
+
+    Raises:
+        ValueError: for a mesh without faces, with indices out of range, with corners that are not finite, or without a size.
+    """
+    vertices, faces = np.asarray(vertices, np.float64), np.asarray(faces)
+    if vertices.ndim != 2 or vertices.shape[1] != 3 or faces.ndim != 2 or faces.shape[1] != 3 or not len(faces):
+        raise ValueError(
+            f"a mesh needs vertices (n, 3) and triangles (m, 3), at least one, got shapes {vertices.shape} and {faces.shape}"
+        )
+    if faces.dtype.kind not in "iu" or faces.min() < 0 or faces.max() >= len(vertices):
+        raise ValueError(f"the triangles must be indices of the {len(vertices)} vertices")
+    corners = vertices[faces]
+    if not np.isfinite(corners).all():
+        raise ValueError("the mesh has coordinates that are not finite")
+    low, high = corners.min(axis=(0, 1)), corners.max(axis=(0, 1))
+    corners = corners - (low + high) / 2
+    radius = np.linalg.norm(corners, axis=-1).max()
+    if not 0 < radius < np.inf:
+        raise ValueError("the mesh is a single point")
+    return (corners / radius).astype(np.float32)
+
+
+@dataclass(frozen=True)
+class Frames:
+    """Recorded depth images of one object that stands still.
+
+    Attributes:
+        depth: (frames, height, width) metres.
+        K: (frames, 3, 3) intrinsics.
+        T_world_camera: (frames, 4, 4) poses.
+        center, radius: of the object's sphere, in metres.
+        up: its upward direction in the world.
+        mask: (frames, height, width) True at the object's pixels, or None.
+        floor: height of the supporting surface above the centre, or None.
+    """
+
+    depth: Float[np.ndarray, "frames height width"]
+    K: Float[np.ndarray, "frames 3 3"]
+    T_world_camera: Float[np.ndarray, "frames 4 4"]
+    center: Float[np.ndarray, " 3"]
+    radius: float
+    up: Float[np.ndarray, " 3"]
+    mask: np.ndarray | None = None
+    floor: float | None = None
+
+    @classmethod
+    def of(cls, stored: dict[str, np.ndarray]) -> Frames:
+        """Frames from arrays by name: `depth`, `K`, `T_world_camera`, and optionally `center`, `radius`, `up`, `mask`, `floor`.
+
+        `K` may be one matrix for all frames. Without `center` and `radius`, they are estimated from the pixels in `mask`.
+
+        Raises:
+            ValueError: for missing arrays, or arrays of other shapes.
+        """
+        for name in ("depth", "K", "T_world_camera"):
+            if name not in stored:
+                raise ValueError(f"there is no array {name!r}; it holds {', '.join(stored) or 'nothing'}")
+        depth, poses = stored["depth"], np.asarray(stored["T_world_camera"], float)
+        if depth.ndim != 3 or not 1 <= len(depth) <= MOST_FRAMES:
+            raise ValueError(
+                f"depth must be (frames, height, width) with 1 to {MOST_FRAMES} frames, got shape {depth.shape}"
+            )
+        number = len(depth)
+        if poses.shape != (number, 4, 4):
+            raise ValueError(f"T_world_camera must be ({number}, 4, 4), got shape {poses.shape}")
+        K = np.asarray(stored["K"], float)
+        if K.shape not in ((3, 3), (number, 3, 3)):
+            raise ValueError(f"K must be (3, 3) or ({number}, 3, 3), got shape {K.shape}")
+        K = np.broadcast_to(K, (number, 3, 3))
+        mask = np.asarray(stored["mask"], bool) if "mask" in stored else None
+        if mask is not None and mask.shape != depth.shape:
+            raise ValueError(f"mask must have the shape of depth, {depth.shape}, got {mask.shape}")
+        if "center" in stored and "radius" in stored:
+            center, radius = np.asarray(stored["center"], float).reshape(-1), float(np.asarray(stored["radius"]))
+        elif mask is not None:
+            center, radius = estimate_sphere(_points(depth, K, poses, mask))
+        else:
+            raise ValueError(
+                "center and radius of the object are needed, or a mask of its pixels to estimate them from"
+            )
+        up = np.asarray(stored.get("up", (0.0, 0.0, 1.0)), float).reshape(-1)
+        floor = float(np.asarray(stored["floor"])) if "floor" in stored else None
+        return cls(depth, K, poses, center, float(radius), up, mask, floor)
+
+
+def _points(depth: np.ndarray, K: np.ndarray, poses: np.ndarray, mask: np.ndarray) -> Float[np.ndarray, "points 3"]:
+    """The points at the pixels of a mask, of all frames, in the world."""
+    found = []
+    for image, intrinsics, pose, own in zip(depth, K, poses, mask, strict=True):
+        rows, columns = np.nonzero(own & (image > 0) & np.isfinite(image))
+        rays = np.stack([columns, rows, np.ones(len(rows))], axis=1) @ np.linalg.inv(intrinsics).T
+        found.append((rays * image[rows, columns, None]) @ pose[:3, :3].T + pose[:3, 3])
+    return np.concatenate(found)
+
+
+def look_at_frames(agent: Agent, frames: Frames, *, first: int = 0, yaw: float | None = 0.0) -> Walk:
+    """Recognises an object from recorded images, of which the agent chooses the next.
+
+    Args:
+        agent: with at least as many `max_candidates` as there are frames.
+        frames: the recorded images.
+        first: the first frame.
+        yaw: of the object, as of `Agent.reset`; None if it is unknown.
+    """
+    number = len(frames.depth)
+    if not 0 <= first < number:
+        raise ValueError(f"first must be a frame from 0 to {number - 1}, got {first}")
+    agent.reset(center=frames.center, radius=frames.radius, up=frames.up, yaw=yaw or 0.0, yaw_known=yaw is not None)
+    left, index = np.ones(number, bool), first
+    seen, beliefs = [], []
+    while True:
+        mask = None if frames.mask is None else frames.mask[index]
+        pose = frames.T_world_camera[index]
+        seen.append(index)
+        left[index] = False
+        beliefs.append(agent.observe(frames.depth[index], frames.K[index], pose, mask=mask, floor=frames.floor))
+        step = agent.decide(left, candidates=frames.T_world_camera)
+        if step.done:
+            return Walk(tuple(seen), tuple(beliefs), step.reason, agent.history)
+        index = step.index

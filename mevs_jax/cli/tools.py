@@ -1,0 +1,138 @@
+"""Tools for trained systems: `mevs look`, `mevs export`. They need the library alone, except to read meshes and runs."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from mevs_jax.cli.failure import Unusable
+
+if TYPE_CHECKING:
+    from mevs_jax.agent import Walk
+    from mevs_jax.cli.options import ExportOptions, LookOptions
+    from mevs_jax.trained import TrainedSystem
+
+
+def look(options: LookOptions) -> None:
+    """Recognises one object, and prints how."""
+    if (options.mesh is None) == (options.depth is None):
+        raise Unusable("mevs look needs an object: --mesh FILE or --depth FILE, one of them")
+    if options.yaw_unknown and options.mesh is not None:
+        raise Unusable("--yaw-unknown is for recorded images; a mesh is taken as it stands")
+    source = options.mesh or options.depth
+    assert source is not None
+    mesh = read_mesh(options.mesh, options.up) if options.mesh is not None else None
+    stored = read_arrays(options.depth) if options.depth is not None else None
+    system = load_system(options.system)
+    given = {name: getattr(options, name) for name in ("policy", "stop", "max_views", "unknown")}
+    try:
+        if mesh is not None:
+            from mevs_jax.agent import look as look_at_mesh
+
+            walk = look_at_mesh(system, *mesh, first=options.first, **given)
+        else:
+            walk = _look_at_frames(system, stored, options, given)
+    except ValueError as error:
+        raise Unusable(f"{source}: {error}") from error
+    if options.save is not None:
+        walk.history.save(options.save)
+    if options.draw is not None:
+        from mevs_jax.agent.drawing import draw_walk
+
+        if options.draw.suffix.lower() not in (".png", ".svg", ".pdf"):
+            raise Unusable(f"{options.draw} is no .png, .svg or .pdf; name the image by one of these")
+        draw_walk(walk, system, options.draw, source.name)
+    print(json.dumps(as_json(walk, source.name)) if options.json else f"{source.name}\n{walk}")
+
+
+def _look_at_frames(system: TrainedSystem, stored: Any, options: LookOptions, given: dict[str, Any]) -> Walk:
+    from mevs_jax.agent import Frames, look_at_frames
+
+    frames = Frames.of(stored)
+    given["max_views"] = min(given["max_views"], len(frames.depth))
+    agent = system.agent(**given, max_candidates=max(128, len(frames.depth)))
+    return look_at_frames(agent, frames, first=options.first or 0, yaw=None if options.yaw_unknown else 0.0)
+
+
+def as_json(walk: Walk, name: str) -> dict[str, Any]:
+    """A walk as values that JSON can hold."""
+    return {
+        "object": name,
+        "answer": walk.name,
+        "confidence": walk.confidence,
+        "reason": walk.reason,
+        "views": list(walk.views),
+        "beliefs": walk.history.beliefs,
+    }
+
+
+def read_mesh(path: Path, up: str) -> tuple[np.ndarray, np.ndarray]:
+    """Vertices and triangles of a mesh file, by the study's readers."""
+    from mevs_jax.cli.main import has_checkout
+
+    if not has_checkout():
+        raise Unusable("meshes are read by a checkout of the project, not by the package alone; give --depth instead")
+    from data_pipeline.objects.recipes import read_mesh
+
+    return read_mesh(path, up)  # type: ignore[arg-type]
+
+
+def read_arrays(path: Path) -> dict[str, np.ndarray]:
+    """The arrays of an .npz file; nothing in it is executed."""
+    try:
+        with np.load(path, allow_pickle=False) as stored:
+            if not hasattr(stored, "files"):
+                raise ValueError("it is a single array")
+            return {name: stored[name] for name in stored.files}
+    except FileNotFoundError as error:
+        raise Unusable(f"there is no file {path}") from error
+    except Exception as error:  # the content of a damaged file decides which
+        reason = (str(error).strip() or type(error).__name__).splitlines()[0][:120]
+        raise Unusable(f"{path} is no .npz of arrays that can be read ({reason})") from error
+
+
+def load_system(name: str) -> TrainedSystem:
+    """A trained system by its path or name."""
+    import mevs_jax
+
+    try:
+        return mevs_jax.load(name)
+    except (ValueError, OSError, ImportError) as error:
+        raise Unusable(str(error)) from error
+
+
+def export(options: ExportOptions) -> None:
+    """Writes the trained system of a run, or any other, into a folder."""
+    from mevs_jax.trained import save
+
+    if (options.out is None) == (options.system is None):
+        raise Unusable("mevs export needs a run or a system: --out DIR or --system PATH, one of them")
+    if options.out is not None:
+        system = _system_of_run(options.out)
+    else:
+        assert options.system is not None
+        system = load_system(options.system)
+    try:
+        save(system, options.to, half=options.half, stablehlo=options.stablehlo)
+    except FileExistsError as error:
+        raise Unusable(str(error)) from error
+    size = sum(path.stat().st_size for path in options.to.iterdir())
+    print(f"Trained system: {options.to.absolute()} ({size / 1e6:.1f} MB)")
+
+
+def _system_of_run(out: Path) -> TrainedSystem:
+    from mevs_jax.cli.main import has_checkout
+
+    if (out / "run.json").exists() and has_checkout():
+        from data_pipeline.lock import locked
+        from eval import stages
+        from eval.run_file import load_run
+
+        run = load_run(out)
+        assert run is not None
+        with locked(out, "mevs export"):
+            stages.make_system(run.settings, out)
+    return load_system(str(out))
