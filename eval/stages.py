@@ -22,6 +22,7 @@ from data_pipeline.files import check_of_file, keep_json, read_json, write_json
 from data_pipeline.progress import console
 from eval.learned.measure import measure, together, train_all
 from eval.learned.page import write_learned_page
+from eval.learned.system import make_learned_system
 from eval.numbers.study import reachable_views, run_study
 from eval.rendering.policies import ascend_objects, ascent_study, load_ascent_scores
 from eval.report.html import ReportInputs
@@ -248,6 +249,7 @@ def learn_to_choose(settings: Settings, out: Path) -> Path:
     metrics = {"seeds": found, "together": together(seeds, found), "settings": asdict(config)}
     check_results(metrics, "the metrics of the learned study")
     keep_json(out / "learned" / "metrics.json", metrics)
+    make_learned_system(seeds[0], found[0])
     page = out / "learned" / "index.html"
     write_learned_page(metrics, load_statistics(out / "data"), page)
     return page

@@ -84,14 +84,14 @@ class Agent:
         self.size = max(views, 128 if max_candidates is None else int(max_candidates))
         self.policy = policy
         self._key = jax.random.key(seed)
-        self._programs: dict[bool, _Programs] = {}
+        self._programs: dict[bool, Programs] = {}
         self._lattice = candidates_of(system, None, self.size)
         self._center: np.ndarray | None = None
         self._program(True)
 
-    def _program(self, posed: bool) -> _Programs:
+    def _program(self, posed: bool) -> Programs:
         if posed not in self._programs:
-            self._programs[posed] = _Programs(self.system, self.policy, posed, self.max_views)
+            self._programs[posed] = Programs(self.system, self.policy, posed, self.max_views)
         return self._programs[posed]
 
     def warm_up(self) -> None:
@@ -368,7 +368,7 @@ def _check(right: bool, message: str) -> None:
         raise ValueError(message)
 
 
-class _Programs:
+class Programs:
     """The compiled steps for one policy, and a known or unknown yaw."""
 
     def __init__(self, system: TrainedSystem, policy: str | Policy, posed: bool, most: int):
@@ -384,13 +384,13 @@ class _Programs:
         self._temperatures_of = policy if isinstance(policy, str) else "random"
         if policy == "best":
             self._temperatures_of = system.description.best if posed else system.description.best_unposed
-        self.see, self.choose = jax.jit(self._see), jax.jit(self._choose)
+        self.see, self.choose = jax.jit(self.see_view), jax.jit(self.choose_next)
 
     def blank(self) -> core.Memory:
         like = core.example(self._system, self._entropy)
         return core.blank(self._system.parts, like, self._most)
 
-    def _see(
+    def see_view(
         self, parts: Parts, memory: core.Memory, depth: Float[Array, "side side"], pose: Float[Array, "4 4"]
     ) -> tuple[core.Memory, tuple[Array, Array]]:
         """The memory after a view; calibrated probabilities and strangeness."""
@@ -408,7 +408,7 @@ class _Programs:
             strangeness = parts.strangeness.of(memory.seen.features, present)
         return memory, (probabilities, strangeness)
 
-    def _choose(
+    def choose_next(
         self,
         parts: Parts,
         memory: core.Memory,

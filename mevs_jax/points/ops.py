@@ -13,6 +13,9 @@ programs. All return the same indices, since all compare the same distances (`me
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
+from contextvars import ContextVar
 from functools import partial
 
 import jax
@@ -24,9 +27,23 @@ from mevs_jax.points import kernels as point_kernels
 from mevs_jax.points.bits import WORD, bits_until, set_bits
 from mevs_jax.points.distances import square, squared_distance
 
+_PORTABLE: ContextVar[bool] = ContextVar("portable", default=False)
+
+
+@contextmanager
+def portable() -> Iterator[None]:
+    """Within it, what is traced uses array operations alone, which run on every platform, and no kernels."""
+    token = _PORTABLE.set(True)
+    try:
+        yield
+    finally:
+        _PORTABLE.reset(token)
+
 
 def _on_one_gpu(points: Array) -> bool:
     """Whether a kernel may be used: the compiler cannot split a kernel over several devices."""
+    if _PORTABLE.get():
+        return False
     return jax.default_backend() == "gpu" and jax.device_count() == 1 and points.dtype == jnp.float32
 
 

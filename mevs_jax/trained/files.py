@@ -34,7 +34,7 @@ from mevs_jax.trained.parts import Network, Parts
 from mevs_jax.trained.strangeness import LEVELS, Strangeness
 from mevs_jax.trained.system import TrainedSystem
 
-DESCRIPTION, WEIGHTS, CARD = "trained.json", "weights.safetensors", "README.md"
+DESCRIPTION, WEIGHTS, CARD, PROGRAMS = "trained.json", "weights.safetensors", "README.md", "stablehlo"
 SHIPPED = Path(__file__).parents[1] / "systems"
 """Folder of the systems that come with the package, by name."""
 LARGEST = 2**31
@@ -138,7 +138,7 @@ def save(system: TrainedSystem, folder: str | Path, *, half: bool = False, stabl
     folder = Path(folder)
     if folder.exists() and not folder.is_dir():
         raise FileExistsError(f"{folder} is a file; choose another folder")
-    if folder.is_dir() and set(os.listdir(folder)) - {DESCRIPTION, WEIGHTS, CARD, "checks.json"}:
+    if folder.is_dir() and set(os.listdir(folder)) - {DESCRIPTION, WEIGHTS, CARD, PROGRAMS}:
         raise FileExistsError(f"{folder} holds other files; choose another folder, or empty it first")
     arrays = {name: np.asarray(array) for name, array in _arrays_of(system.parts).items()}
     if half:
@@ -152,6 +152,10 @@ def save(system: TrainedSystem, folder: str | Path, *, half: bool = False, stabl
     try:
         made.chmod(0o755)
         _write(made / WEIGHTS, weights)
+        if stablehlo:
+            from mevs_jax.export import export
+
+            export(system, made / PROGRAMS)
         _write(made / CARD, model_card(system.description, len(weights)).encode())
         _write(made / DESCRIPTION, json.dumps(content, indent=1, ensure_ascii=False).encode())
         if folder.is_dir():

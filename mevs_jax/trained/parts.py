@@ -8,7 +8,7 @@ import flax.struct
 import jax.numpy as jnp
 import numpy as np
 from flax import nnx
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
 from mevs_jax.beliefs import CalibratedFusion
 from mevs_jax.cameras import ViewCamera
@@ -66,12 +66,12 @@ class Parts:
 
 
 @lru_cache(maxsize=8)
-def _priorities(pixels: int) -> Array:
+def _priorities(pixels: int) -> Int[np.ndarray, " pixels"]:
     """A fixed random order of the pixels of an image."""
     return np.argsort(np.random.default_rng(0).permutation(pixels)).astype(np.int32)
 
 
-def sample_pixels(depth: Float[Array, "side side"], points: int) -> Array:
+def sample_pixels(depth: Float[Array, "side side"], points: int) -> Int[Array, " {points}"]:
     """Flat indices (points,) of pixels that hit the object, in a fixed random order, repeated if there are too few.
 
     All indices are 0 for an image in which nothing is hit.
@@ -116,4 +116,7 @@ def observe(
         pixels = sample_pixels(depth, cloud.points)
         seen = view_cloud(pixels, depth.reshape(-1)[pixels], pose, camera, cloud.frame, cloud.directions)
         entropies = parts.entropy.module(seen)
-    return Observation(encoder.head(features), entropies, features)
+    logits = encoder.head(features)
+    if parts.fusion:
+        logits = logits - parts.fusion["posed"].prior  # all classes are equally likely before the first view
+    return Observation(logits, entropies, features)

@@ -26,6 +26,10 @@ if TYPE_CHECKING:
     from mevs_jax.agent import Agent
 
 
+_AND_TABLE = "learned_and_table"
+"""The policy that averages the gains by the network `learned` and by the class × view table."""
+
+
 @dataclass(frozen=True)
 class TrainedSystem:
     """Networks that recognise objects and choose views, as `mevs_jax.load` returns them.
@@ -66,7 +70,8 @@ class TrainedSystem:
     @property
     def policies(self) -> tuple[str, ...]:
         """Names of the policies that can be used with this system, for objects of known yaw."""
-        return tuple(name for name in (*POLICIES, *self.parts.view_policies) if self._has_inputs_of(name))
+        own = [*self.parts.view_policies, *[_AND_TABLE] * ("learned" in self.parts.view_policies)]
+        return tuple(name for name in (*POLICIES, *own) if self._has_inputs_of(name))
 
     def _has_inputs_of(self, name: str) -> bool:
         from mevs_jax.agent.core import can_run  # the agent knows what a policy is given
@@ -104,8 +109,9 @@ class TrainedSystem:
         if name == "best":
             name = self.description.best if posed else self.description.best_unposed
         if name in parts.view_policies:
-            by = "table" if name.endswith("and_table") else "belief"
-            return learned(parts.view_policies[name].module, parts.single, by=by)  # type: ignore[arg-type]
+            return learned(parts.view_policies[name].module, parts.single)  # type: ignore[arg-type]
+        if name == _AND_TABLE and "learned" in parts.view_policies:
+            return learned(parts.view_policies["learned"].module, parts.single, by="table")  # type: ignore[arg-type]
         if name not in POLICIES:
             known = ", ".join(("best", *parts.view_policies, *POLICIES))
             raise ValueError(f"unknown policy {name!r}; it is one of {known}")

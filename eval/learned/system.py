@@ -1,0 +1,123 @@
+"""From a finished learned study to a trained system: recogniser, fusion and view policies of the first seed."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+
+from data_pipeline.dataset.inputs import view_camera
+from data_pipeline.dataset.statistics import load_statistics
+from eval.learned.study import learn
+from eval.system import data_of, identity_of, made_with, resnet_shape, save_system, stored_system
+from mevs_jax.models import Recogniser, ViewPolicy
+from mevs_jax.models.shapes import SetFusionShape, ViewPolicyShape
+from mevs_jax.trained import Description, ImageInput, Network, Parts, TrainedSystem, fit_strangeness
+from mevs_jax.trained.description import FORM
+from mevs_jax.viewpoints import ViewGraph
+from train.choosing.stages import Stages, lattice_data
+from train.kept import made_by
+from train.loop import load_best
+
+POLICIES = {"learned": True, "learned_unposed": False}
+"""The view policies of a system, and whether they know the object's pose."""
+
+
+def figures_of(found: dict[str, Any], views: int) -> dict[str, Any]:
+    """Figures of the study that a system carries, of one seed: accuracy by policy and number of views."""
+    usable = ("random", "farthest", "fixed_order", "information_gain", "learned", "learned_and_table")
+    of_lattice = found["lattices"][str(views)]
+    policies = {name: of for name, of in of_lattice["policies"].items() if name in usable}
+    figures = {
+        "objects": of_lattice["objects"],
+        "single_view": of_lattice["single_view"],
+        "after_views": {name: of["after_views"] for name, of in policies.items()},
+        "interval": {name: of["interval"] for name, of in policies.items()},
+    }
+    unposed = found.get("unposed", {}).get(str(views))
+    if unposed is not None:
+        figures["unknown_yaw"] = {
+            "after_views": {name: of["after_views"] for name, of in unposed["policies"].items() if name in usable}
+        }
+    return figures
+
+
+def make_learned_system(stages: Stages, found: dict[str, Any]) -> Path:
+    """Writes the trained system of a seed into `learned/system/`, unless it is there already; returns the folder.
+
+    Args:
+        stages: of the first seed, with everything trained.
+        found: its metrics.
+    """
+    views, folder = stages.dataset.capture.views, stages.out / "learned" / "system"
+    figures = figures_of(found, views)
+    networks = [stages.policy_folder(name) for name in POLICIES]
+    made = identity_of(
+        made_by(stages.statistics, stages.recogniser_folder()),
+        [(network / "summary.json").read_text() for network in networks],
+        figures,
+    )
+    if not stored_system(folder, made):
+        save_system(learned_system(stages, found, figures, made), folder)
+    return folder
+
+
+def learned_system(stages: Stages, found: dict[str, Any], figures: dict[str, Any], made: str) -> TrainedSystem:
+    """Returns the trained system of a seed.
+
+    Args:
+        stages: with everything trained.
+        found: its metrics, with temperatures of every policy's walks.
+        figures: to carry.
+        made: identifies what the system is made from.
+    """
+    views, config = stages.dataset.capture.views, stages.config
+    data = lattice_data(stages.dataset, stages.out, views)
+    recogniser = load_best(stages.task(), stages.recogniser_folder())
+    assert isinstance(recogniser, Recogniser)
+    validation = stages.features(f"lattice_{views}_val", data, "val")
+    graph = ViewGraph.from_points(np.array(load_statistics(data).viewpoints))
+    fusions = {"posed": stages.fusion(), "unposed": stages.fusion(posed=False)}
+    policies = {name: stages.policy(name) for name in POLICIES}
+    walks = found["lattices"][str(views)]["policies"]
+    temperatures = {name: of["temperatures"] for name, of in walks.items() if name in figures["after_views"]}
+    if "unposed" in found:
+        temperatures["learned_unposed"] = found["unposed"][str(views)]["policies"]["learned"]["temperatures"]
+    shape = config.recogniser.fusion
+    description = Description(
+        form=FORM,
+        kind="recogniser",
+        classes=tuple(stages.statistics.classes),
+        camera=view_camera(stages.statistics.camera),
+        image=ImageInput("depth_and_normals", 4),
+        encoder=resnet_shape(config.recogniser.network, 4),
+        best="learned",
+        best_unposed="learned_unposed",
+        chosen_by="the method of the learned study, not chosen by a comparison",
+        data=data_of(stages.statistics),
+        made_by=made,
+        made_with=made_with(),
+        fusion=SetFusionShape(shape.width, shape.heads, shape.blocks),
+        view_policies={name: _shape_of(policy, config.policy) for name, policy in policies.items()},
+        evaluation=figures,
+    )
+    parts = Parts(
+        encoder=Network.of(recogniser.encoder),
+        viewpoints=graph.points,
+        neighbours=graph.neighbours,
+        single=fusions["posed"].single,
+        fusion=fusions,
+        view_policies={name: Network.of(policy) for name, policy in policies.items()},
+        knowledge=learn(fusions["posed"], validation, min(config.max_views, views)),
+        temperatures={name: jnp.asarray(values, jnp.float32) for name, values in temperatures.items()},
+        strangeness=fit_strangeness(
+            np.asarray(validation.features), np.asarray(validation.labels), len(stages.statistics.classes), views
+        ),
+    )
+    return TrainedSystem(description, parts)
+
+
+def _shape_of(policy: ViewPolicy, config: Any) -> ViewPolicyShape:
+    return ViewPolicyShape(config.width, config.heads, config.blocks, policy.posed, policy.utility, policy.floor)
