@@ -27,12 +27,17 @@ _MODULES = {
     ),
     "cameras": (
         "Camera",
+        "ViewCamera",
         "cameras_at",
         "look_at_origin",
         "orbit",
         "partial_cloud",
         "pixel_directions",
         "unproject",
+    ),
+    "canonical": (
+        "CanonicalView",
+        "canonical_view",
     ),
     "decisions": (
         "Decision",
@@ -90,6 +95,7 @@ _MODULES = {
         "select_from_table",
         "select_views",
     ),
+    "sphere": ("estimate_sphere",),
     "viewpoints": (
         "ViewGraph",
         "fibonacci_sphere",
