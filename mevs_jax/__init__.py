@@ -33,6 +33,7 @@ _MODULES = {
     ),
     "cameras": (
         "Camera",
+        "ViewCamera",
         "cameras_at",
         "look_at_origin",
         "orbit",
@@ -40,6 +41,11 @@ _MODULES = {
         "pixel_directions",
         "unproject",
     ),
+    "canonical": (
+        "CanonicalView",
+        "canonical_view",
+    ),
+    "compiled": ("keep_compiled",),
     "decisions": (
         "Decision",
         "NextView",
@@ -96,6 +102,7 @@ _MODULES = {
         "select_from_table",
         "select_views",
     ),
+    "sphere": ("estimate_sphere",),
     "trained": (
         "TrainedSystem",
         "UnreadableSystem",

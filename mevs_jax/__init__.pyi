@@ -201,3 +201,15 @@ from mevs_jax.viewpoints import (
 
 __version__: str
 __all__: list[str]
+from mevs_jax.cameras import (
+    ViewCamera as ViewCamera,
+)
+from mevs_jax.canonical import (
+    CanonicalView as CanonicalView,
+)
+from mevs_jax.canonical import (
+    canonical_view as canonical_view,
+)
+from mevs_jax.sphere import (
+    estimate_sphere as estimate_sphere,
+)

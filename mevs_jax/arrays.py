@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import jax
 import numpy as np
 
 AnyArray = jax.Array | np.ndarray
+AnyVector = jax.Array | np.ndarray | Sequence[float]

@@ -11,6 +11,7 @@ object is never cut off. The thesis's captures were made with a viewer whose fie
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 
 import flax.struct
 import jax
@@ -38,6 +39,35 @@ class Camera:
     def focal_length(self) -> float:
         """The focal length in pixels."""
         return self.resolution / 2 / math.tan(self.field_of_view / 2)
+
+
+@dataclass(frozen=True)
+class ViewCamera:
+    """The camera of a data set, which looks at the object's centre from a fixed distance, in any direction.
+
+    Attributes:
+        resolution: pixels per side of the image.
+        field_of_view: horizontal and vertical, in degrees.
+        distance: from the object's centre, in radii of the object.
+
+    Raises:
+        ValueError: for a number out of its range, such as a camera inside the object's sphere.
+    """
+
+    resolution: int = 224
+    field_of_view: float = 60.0
+    distance: float = 2.0
+
+    def __post_init__(self) -> None:
+        if self.resolution < 1 or not 0 < self.field_of_view < 180 or not self.distance > 1:
+            raise ValueError(
+                "a camera has at least 1 pixel, a field of view between 0 and 180 degrees and a distance above 1 radius, "
+                f"got {self}"
+            )
+
+    def at(self, pose: Float[AnyArray, "*batch 4 4"], resolution: int | None = None) -> Camera:
+        """Returns the pinhole camera at `pose`, with another resolution where one is given."""
+        return Camera(jnp.asarray(pose), math.radians(self.field_of_view), resolution or self.resolution)
 
 
 def look_at_origin(position: Float[AnyArray, 3]) -> Float[Array, "4 4"]:

@@ -29,11 +29,12 @@ def test_inputs_are_what_the_stored_view_shows(data):
     np.testing.assert_allclose(cloud, np.asarray(whole)[pixels], atol=1e-5)
     assert np.linalg.norm(cloud, axis=1).max() <= 1.01
     pose = example["pose"][0]
-    for frame, eye in (("world", pose[:3, 3]), ("camera", np.zeros(3))):
+    for frame, eye in (("world", pose[:3, 3]), ("camera", np.array([0, 0, -camera.distance]))):
         both = np.asarray(
             cloud_input(jnp.asarray(pixels), jnp.asarray(depth), jnp.asarray(pose), camera, frame, directions=True)
         )
         way = eye - both[:, :3]
         np.testing.assert_allclose(both[:, 3:], way / np.linalg.norm(way, axis=1, keepdims=True), atol=1e-5)
-    nothing = cloud_input(jnp.zeros(2, int), jnp.zeros(2, int), jnp.asarray(pose), camera, "world", directions=True)
-    np.testing.assert_allclose(nothing[:, 3:], 0, atol=1e-6)
+        zeros = jnp.zeros(2, int)
+        nothing = cloud_input(zeros, zeros, jnp.asarray(pose), camera, frame, directions=True)
+        np.testing.assert_allclose(nothing[:, 3:], 0, atol=1e-6)
