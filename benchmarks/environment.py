@@ -1,8 +1,8 @@
 """Steps a second of `ActiveRecognition`, beside environments of ap_gym and Gymnasium: `python benchmarks/environment.py`.
 
-All environments run many episodes at once with actions that were drawn beforehand; predictions are the beliefs, or were drawn too. A step
-of one episode counts as one step. Calls take turns, and times are medians. Peers that are not installed are left out
-(`pip install -e '.[gym]'`). The table is written to `benchmarks/results/environment.md`.
+All environments run many episodes at once. A step of one episode counts as one step. The pure environment draws its actions in
+the compiled loop; vector environments are given actions that were drawn beforehand. Calls take turns, and rates are medians.
+Peers that are not installed (`pip install -e '.[gym]'`) are left out. The table is kept in `benchmarks/results/environment.md`.
 
 The peers compute other observations: a glimpse of an image (CircleSquare, which needs no download), and a pole's four numbers.
 """

@@ -1,9 +1,10 @@
 """PPO in the environment `ActiveRecognition`, beside other policies: `python examples/gymnasium_ppo.py [RUN]`.
 
-RUN is a directory in which `mevs run` has been run (default: runs/demo). Policy networks learn by PPO (Schulman et al. 2017) on the
-validation objects, which the classifier was not trained on. Their mean is evaluated on the test objects from every start view.
-The whole training is one compiled function of (config, key), as in purejaxrl (Lu et al. 2022), so several networks are one `vmap`.
-All episodes have the same length, so a rollout is whole episodes. `mevs_jax.gymnasium` has the same environment for Gymnasium.
+RUN is a directory in which `mevs run` has been run (default: runs/demo). Policy networks learn by PPO (Schulman et al. 2017) on
+the validation objects, which the classifier was not trained on; the policy is their mean. It is evaluated on the test objects
+from every start view. A whole training is one compiled function of (config, key), as in purejaxrl (Lu et al. 2022), so several
+networks are one `vmap`. All episodes have the same length, so a rollout is whole episodes. `mevs_jax.gymnasium` has the same
+environment for programs written for Gymnasium.
 
 All policies share the classifier and the fusion (sum of logits), so they differ only in the views that they choose. The
 prediction of PPO's agent is the belief divided by a temperature for each number of views, which is fitted on the validation
@@ -180,8 +181,8 @@ def train(config: Config, key: jax.Array, tables: ViewTable, graph: ViewGraph, t
 
         def descend(carry: tuple[Any, Any], rows: jax.Array) -> tuple[Any, None]:
             weights, optimised = carry
-            batch = jax.tree.map(lambda leaf: leaf[rows], flat)
-            gradient = jax.grad(lambda weights: loss_of(agent(weights), *batch, config))(weights)
+            steps, advantages, returns = jax.tree.map(lambda leaf: leaf[rows], flat)
+            gradient = jax.grad(lambda weights: loss_of(agent(weights), steps, advantages, returns, config))(weights)
             change, optimised = optimiser.update(gradient, optimised, weights)
             return (optax.apply_updates(weights, change), optimised), None
 
@@ -193,7 +194,7 @@ def train(config: Config, key: jax.Array, tables: ViewTable, graph: ViewGraph, t
         best = jax.tree.map(lambda new, old: jnp.where(found > highest, new, old), weights, best)
         return (weights, optimised, best, jnp.maximum(found, highest)), None
 
-    start = weights, optimiser.init(weights), weights, -jnp.inf
+    start = weights, optimiser.init(weights), weights, jnp.array(-jnp.inf)
     return nnx.merge(structure, jax.lax.scan(update, start, jax.random.split(of_updates, config.updates))[0][2])
 
 

@@ -263,8 +263,8 @@ class ActiveRecognition:
 
     def loss(self, prediction: Float[Array, " classes"], label: Int[Array, ""]) -> Float[Array, ""]:
         """Cross-entropy of the logits `prediction` with the true class, at least 0; see the class for its unit."""
-        # As log Σ exp(prediction − prediction[label]), which needs no log-probability of the other classes.
-        cross_entropy = jax.nn.logsumexp(prediction - prediction[label])
+        shifted = prediction - jnp.max(prediction)
+        cross_entropy = jax.nn.logsumexp(shifted) - shifted[label]
         return cross_entropy / jnp.log(float(self.classes)) if self.normalised else cross_entropy
 
     def observe(self, state: EnvironmentState) -> EnvironmentObservation:

@@ -21,7 +21,10 @@ EXAMPLES = Path(__file__).resolve().parents[1] / "examples"
     ],
 )
 def test_an_example_runs(name, said, whole, tmp_path):
-    arguments = {"own_encoder": [str(tmp_path)], "gymnasium_ppo": "--updates 2 --episodes 16 --networks 2".split()}
+    arguments = {
+        "own_encoder": [str(tmp_path)],
+        "gymnasium_ppo": ["--updates", "2", "--episodes", "16", "--networks", "2"],
+    }
     command = [sys.executable, str(EXAMPLES / f"{name}.py"), str(whole), *arguments.get(name, [])]
     ended = subprocess.run(command, capture_output=True, text=True, timeout=600)
     assert ended.returncode == 0, ended.stderr

@@ -213,6 +213,18 @@ def test_an_episode_of_one_view_is_one_prediction():
     np.testing.assert_allclose(reward, -1, rtol=1e-6)  # a uniform prediction costs 1
 
 
+def test_the_loss_of_logits_that_are_large_or_infinite():
+    environment = environment_of(normalised=False)
+    label = jnp.int32(1)
+    for prediction, loss in (
+        ([0, 1e4, 0, 0], 0),
+        ([1e4, 0, 0, 0], 1e4),
+        ([-np.inf, 0, -np.inf, -np.inf], 0),
+        ([0, -np.inf, -np.inf, 0], np.inf),
+    ):
+        np.testing.assert_allclose(environment.loss(jnp.array(prediction, jnp.float32), label), loss)
+
+
 def test_autoreset_begins_another_episode_in_the_step_that_ends_one():
     environment = environment_of(max_views=2)
     state, observation = reset(environment, jax.random.key(0), 1, 2)
