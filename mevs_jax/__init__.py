@@ -57,6 +57,11 @@ _MODULES = {
         "quantise_depth",
         "shannon_entropy",
     ),
+    "environment": (
+        "ActiveRecognition",
+        "EnvironmentObservation",
+        "EnvironmentState",
+    ),
     "metrics": (
         "accuracy",
         "bootstrap_interval",

@@ -72,6 +72,15 @@ from mevs_jax.entropy import (
 from mevs_jax.entropy import (
     shannon_entropy as shannon_entropy,
 )
+from mevs_jax.environment import (
+    ActiveRecognition as ActiveRecognition,
+)
+from mevs_jax.environment import (
+    EnvironmentObservation as EnvironmentObservation,
+)
+from mevs_jax.environment import (
+    EnvironmentState as EnvironmentState,
+)
 from mevs_jax.metrics import (
     accuracy as accuracy,
 )

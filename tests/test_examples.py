@@ -16,11 +16,16 @@ EXAMPLES = Path(__file__).resolve().parents[1] / "examples"
     [
         ("own_policy", "opposite: "),
         ("load_and_ask", "view 0: "),
+        ("gymnasium_ppo", "| PPO − random | +0.0 "),
         pytest.param("own_encoder", "validation accuracy", marks=pytest.mark.slow),
     ],
 )
 def test_an_example_runs(name, said, whole, tmp_path):
-    command = [sys.executable, str(EXAMPLES / f"{name}.py"), str(whole), *[str(tmp_path)] * (name == "own_encoder")]
+    arguments = {
+        "own_encoder": [str(tmp_path)],
+        "gymnasium_ppo": ["--updates", "2", "--episodes", "16", "--networks", "2"],
+    }
+    command = [sys.executable, str(EXAMPLES / f"{name}.py"), str(whole), *arguments.get(name, [])]
     ended = subprocess.run(command, capture_output=True, text=True, timeout=600)
     assert ended.returncode == 0, ended.stderr
     assert said in ended.stdout
@@ -28,4 +33,9 @@ def test_an_example_runs(name, said, whole, tmp_path):
 
 
 def test_all_examples_are_run():
-    assert {path.stem for path in EXAMPLES.glob("*.py")} == {"own_policy", "own_encoder", "load_and_ask"}
+    assert {path.stem for path in EXAMPLES.glob("*.py")} == {
+        "own_policy",
+        "own_encoder",
+        "load_and_ask",
+        "gymnasium_ppo",
+    }
