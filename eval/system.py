@@ -129,9 +129,8 @@ def walk_validation(tables: ViewTables, graph: ViewGraph, max_views: int, seed: 
         )
         for name in USABLE:
             views = jnp.asarray(found[name].views)[0, :, :, 0].astype(jnp.int32)
-            logits = logits_along(views, jnp.asarray(walking.logits))
-            starts = logits.shape[1]
-            parts[name].append((np.asarray(logits).reshape(-1, *logits.shape[2:]), np.repeat(walking.labels, starts)))
+            along = np.asarray(logits_along(views, jnp.asarray(walking.logits)))
+            parts[name].append((along.reshape(-1, *along.shape[2:]), np.repeat(walking.labels, along.shape[1])))
     temperatures, after = {}, {}
     for name, pieces in parts.items():
         logits, labels = (np.concatenate(piece) for piece in zip(*pieces, strict=True))

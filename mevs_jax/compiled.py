@@ -14,8 +14,8 @@ LARGEST = 512 * 2**20
 def keep_compiled(folder: str | Path | None = None) -> Path:
     """Keeps what JAX compiles from now on in a folder, and uses what it holds; returns the folder.
 
-    Changes JAX's settings for the whole process (its persistent compilation cache). Programs of other versions of JAX, or for other
-    devices, are told apart.
+    Changes JAX's settings for the whole process (its persistent compilation cache). Programs of other versions of JAX, or for
+    other devices, are told apart.
 
     Args:
         folder: by default `mevs_jax/compiled` in the user's cache, `$XDG_CACHE_HOME` or `~/.cache`.

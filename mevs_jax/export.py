@@ -20,8 +20,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from mevs_jax.agent.agent import Programs
 from mevs_jax.agent.candidates import candidates_of
+from mevs_jax.agent.programs import Programs
 from mevs_jax.points.ops import portable
 from mevs_jax.trained.parts import image_of
 from mevs_jax.trained.system import TrainedSystem
@@ -114,8 +114,8 @@ def _recognise(system: TrainedSystem) -> _Program:
     def recognise(depth: Array) -> dict[str, Array]:
         images = jax.vmap(lambda one: image_of(one, description.image, description.camera))(depth)
         encoder = parts.encoder.module
-        features = encoder.features(images)  # type: ignore[attr-defined]
-        logits = encoder.head(features) / parts.single  # type: ignore[attr-defined]
+        features = encoder.features(images)
+        logits = encoder.head(features) / parts.single
         return {"features": features, "probabilities": jax.nn.softmax(logits, axis=-1)}
 
     about = {
@@ -139,7 +139,7 @@ def _entropies(system: TrainedSystem) -> _Program:
     (b,) = jax.export.symbolic_shape("b")
 
     def entropies(clouds: Array) -> dict[str, Array]:
-        return {"entropies": network.module(clouds)}  # type: ignore[operator]
+        return {"entropies": network.module(clouds)}
 
     columns = "x, y, z" + (" and the unit vector to the camera" if cloud.directions else "")
     frame = (

@@ -7,28 +7,51 @@ world), 4×4, metres; depth in metres along the optical axis, 0 or NaN where unk
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
-from dataclasses import replace
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
-from numpy.typing import ArrayLike
+from jaxtyping import Float
 
 from mevs_jax.agent import core
 from mevs_jax.agent.candidates import candidates_of
 from mevs_jax.agent.frames import mask_of, pose_towards, rotation_to_world
+from mevs_jax.agent.programs import Programs
 from mevs_jax.agent.records import Belief, History, Reason, Step, plain
+from mevs_jax.arrays import AnyArray, AnyVector
 from mevs_jax.canonical import canonical_view
 from mevs_jax.policies.base import Policy
 from mevs_jax.sphere import estimate_sphere
-from mevs_jax.trained.parts import Parts, observe
 from mevs_jax.trained.system import TrainedSystem
 
-Reachable = ArrayLike | Callable[[np.ndarray], bool] | None
+Reachable = AnyArray | Sequence[int] | Callable[[np.ndarray], bool] | None
 """Which candidates can be reached: a mask, indices, a function of the camera's pose (4, 4), or None for all."""
+
+
+@dataclass
+class _Object:
+    """What an agent knows about the present object.
+
+    Attributes:
+        center, radius: of its sphere, in metres.
+        rotation: (3, 3) from its frame to the world.
+        turn: (4, 4) from the upright frame of `canonical_view` to its own, which differ by the yaw.
+        programs: compiled for its policy.
+        memory: of its views.
+        belief: the latest one.
+        failed: (failed, 3) directions, in its frame, from which no view could be taken.
+    """
+
+    center: np.ndarray
+    radius: float
+    rotation: np.ndarray
+    turn: np.ndarray
+    programs: Programs
+    memory: core.Memory
+    belief: Belief | None
+    failed: np.ndarray
 
 
 class Agent:
@@ -86,7 +109,8 @@ class Agent:
         self._key = jax.random.key(seed)
         self._programs: dict[bool, Programs] = {}
         self._lattice = candidates_of(system, None, self.size)
-        self._center: np.ndarray | None = None
+        self._object: _Object | None = None
+        self.history = History(system.name, {})
         self._program(True)
 
     def _program(self, posed: bool) -> Programs:
@@ -99,7 +123,7 @@ class Agent:
 
         With an unknown yaw another program runs, which is compiled too if the policy can be used then.
         """
-        kept = {name: value for name, value in vars(self).items() if name in _STATE}
+        kept = self._object, self.history
         camera = self.system.description.camera
         pose = pose_towards(np.array([0.6, 0.0, 0.8]), np.zeros(3), camera.distance, np.array([0.0, 0.0, 1.0]))
         side = camera.resolution
@@ -113,19 +137,14 @@ class Agent:
                 continue
             self.observe(np.full((side, side), camera.distance - 0.5, np.float32), K, pose)
             self.decide(reachable=[0], cost=np.zeros(len(self.system.viewpoints)))
-        for name in _STATE:
-            if name in kept:
-                setattr(self, name, kept[name])
-            else:
-                vars(self).pop(name, None)
-        self._center = kept.get("_center")
+        self._object, self.history = kept
 
     def reset(
         self,
         *,
-        center: ArrayLike,
+        center: AnyVector,
         radius: float,
-        up: ArrayLike = (0.0, 0.0, 1.0),
+        up: AnyVector = (0.0, 0.0, 1.0),
         yaw: float = 0.0,
         yaw_known: bool = True,
     ) -> None:
@@ -145,25 +164,22 @@ class Agent:
         middle = np.asarray(center, float).reshape(-1)
         _check(
             middle.shape == (3,) and bool(np.isfinite(middle).all()),
-            f"center must be three finite numbers, got {center}",
+            f"center must be three finite numbers, got {np.asarray(center).tolist()}",
         )
         _check(0 < float(radius) < np.inf, f"radius must be positive, in metres, got {radius}")
         _check(bool(np.isfinite(yaw)), f"yaw must be a finite angle in radians, got {yaw}")
         rotation = rotation_to_world(up, yaw if yaw_known else 0.0)
         program = self._program(bool(yaw_known))  # refuses a policy first
-        self._center, self._radius, self._rotation, self._posed = middle, float(radius), rotation, bool(yaw_known)
-        self._memory, self._run = program.blank(), program
-        self._turn = np.eye(4, dtype=np.float32)  # from the upright frame of `canonical_view` to the object's
-        self._turn[:3, :3] = rotation.T @ rotation_to_world(up, 0.0)
-        self._belief: Belief | None = None
-        self._failed = np.zeros((0, 3))
+        turn = np.eye(4, dtype=np.float32)
+        turn[:3, :3] = rotation.T @ rotation_to_world(up, 0.0)
+        self._object = _Object(middle, float(radius), rotation, turn, program, program.blank(), None, np.zeros((0, 3)))
         options = {"center": middle.tolist(), "radius": float(radius), "up": np.asarray(up, float).tolist()}
         options |= {"yaw": float(yaw), "yaw_known": bool(yaw_known)}
         policy = self.policy if isinstance(self.policy, str) else getattr(self.policy, "__name__", "a function")
         mine = {"policy": policy, "stop": self.stop, "max_views": self.max_views, "unknown": self.unknown}
         self.history = History(self.system.name, {"agent": mine | {"seed": self.seed}, "reset": options})
 
-    def reset_from_points(self, points: ArrayLike, **options: Any) -> None:
+    def reset_from_points(self, points: AnyArray, **options: Any) -> None:
         """Begins with a new object whose centre and radius are estimated from points on its surface.
 
         Args:
@@ -175,11 +191,11 @@ class Agent:
 
     def observe(
         self,
-        depth: ArrayLike,
-        K: ArrayLike,
-        T_world_camera: ArrayLike,
+        depth: AnyArray,
+        K: AnyArray,
+        T_world_camera: AnyArray,
         *,
-        mask: ArrayLike | None = None,
+        mask: AnyArray | None = None,
         floor: float | None = None,
     ) -> Belief:
         """Adds a view of the object, taken from anywhere, by any depth camera.
@@ -198,19 +214,19 @@ class Agent:
             ValueError: for an input that cannot be used, or beyond `max_views`.
         """
         begun = time.perf_counter()
-        self._check_reset()
+        of = self._current
         view = canonical_view(
             depth,
             K,
             T_world_camera,
-            center=self._center,
-            radius=self._radius,
-            up=self._rotation[:, 2],
+            center=of.center,
+            radius=of.radius,
+            up=of.rotation[:, 2],
             camera=self.system.description.camera,
             mask=mask,
             floor=floor,
         )
-        return self._add(view.depth, self._turn @ view.pose, view.unknown, begun)
+        return self._add(view.depth, of.turn @ view.pose, view.unknown, begun)
 
     def observe_view(self, depth: Float[np.ndarray, "side side"], pose: Float[np.ndarray, "4 4"]) -> Belief:
         """Adds a view that the system's own camera has taken, as it is in the data set.
@@ -220,16 +236,15 @@ class Agent:
             pose: from the camera to the object's frame, whose unit is the radius.
         """
         begun = time.perf_counter()
-        self._check_reset()
         return self._add(np.asarray(depth, np.float32), np.asarray(pose, np.float32), 0.0, begun)
 
     def _add(self, depth: np.ndarray, pose: np.ndarray, unseen: float, begun: float) -> Belief:
-        count = self.history.views
+        of, count = self._current, self.history.views
         if count >= self.max_views:
             raise ValueError(
                 f"the budget of {self.max_views} views is spent; call reset, or make the agent with max_views above it"
             )
-        self._memory, found = self._run.see(self.system.parts, self._memory, depth, pose)
+        of.memory, found = of.programs.see(self.system.parts, of.memory, depth, pose)
         probabilities, strangeness = jax.device_get(found)
         label = int(probabilities.argmax())
         belief = Belief(
@@ -246,15 +261,15 @@ class Agent:
         self.history.depths.append(depth)
         self.history.poses.append(pose)
         self.history.events.append({"call": "observe", "belief": plain(belief)})
-        self._belief = belief
+        of.belief = belief
         return belief
 
     def decide(
         self,
         reachable: Reachable = None,
         *,
-        cost: ArrayLike | None = None,
-        candidates: ArrayLike | None = None,
+        cost: AnyVector | None = None,
+        candidates: AnyArray | None = None,
     ) -> Step:
         """Chooses the next view, or ends.
 
@@ -270,8 +285,7 @@ class Agent:
         Raises:
             ValueError: for a mask or costs of another length, or poses that are no poses.
         """
-        begun = time.perf_counter()
-        self._check_reset()
+        begun, of = time.perf_counter(), self._current
         where = self._lattice if candidates is None else self._given(candidates)
         poses = self.poses if candidates is None else np.asarray(candidates, float)
         number = len(poses)
@@ -288,8 +302,8 @@ class Agent:
             wide = np.zeros((2, self.size), np.float32)
             wide[0, :number], wide[1, :number] = allowed, priced
             index, gains = jax.device_get(
-                self._run.choose(
-                    self.system.parts, self._memory, where, self._is_failed(where), wide[0] > 0, wide[1], self._key
+                of.programs.choose(
+                    self.system.parts, of.memory, where, self._is_failed(where), wide[0] > 0, wide[1], self._key
                 )
             )
             if index < 0:
@@ -299,14 +313,14 @@ class Agent:
             step = Step(None, None, -1, float("nan"), True, reason, elapsed)
         else:
             chosen = poses[int(index)]
-            away = chosen[:3, 3] - self._center
+            away = chosen[:3, 3] - of.center
             direction = away / np.linalg.norm(away)
             step = Step(chosen, direction, int(index), float(gains[index]), False, "", elapsed)
         self.history.events.append({"call": "decide", "step": plain(step)})
         return step
 
     def _reason(self) -> Reason:
-        belief = self._belief
+        belief = self._current.belief
         if belief is None:
             return ""
         sure = belief.confidence >= self.stop
@@ -318,117 +332,51 @@ class Agent:
     @property
     def poses(self) -> Float[np.ndarray, "views 4 4"]:
         """Poses `T_world_camera` of the system's viewpoints around the object, in metres."""
-        self._check_reset()
-        camera, up = self.system.description.camera, self._rotation[:, 2]
-        distance = camera.distance * self._radius if self.distance is None else self.distance
-        directions = self.system.viewpoints.astype(float) @ self._rotation.T
-        return np.stack([pose_towards(direction, self._center, distance, up) for direction in directions])
+        of, camera = self._current, self.system.description.camera
+        distance = camera.distance * of.radius if self.distance is None else self.distance
+        directions = self.system.viewpoints.astype(float) @ of.rotation.T
+        return np.stack([pose_towards(one, of.center, distance, of.rotation[:, 2]) for one in directions])
 
-    def _given(self, candidates: ArrayLike) -> core.Candidates:
+    def _given(self, candidates: AnyArray) -> core.Candidates:
         poses = np.asarray(candidates, float)
         _check(
             poses.ndim == 3 and poses.shape[1:] == (4, 4) and len(poses) > 0 and bool(np.isfinite(poses).all()),
             f"candidates must be poses (candidates, 4, 4) of finite numbers, got shape {poses.shape}",
         )
-        away = poses[:, :3, 3] - self._center
+        of = self._current
+        away = poses[:, :3, 3] - of.center
         lengths = np.linalg.norm(away, axis=1)
         _check(bool((lengths > 1e-9).all()), "a candidate is at the object's centre")
-        return candidates_of(self.system, (away / lengths[:, None]) @ self._rotation, self.size)
+        return candidates_of(self.system, (away / lengths[:, None]) @ of.rotation, self.size)
 
-    def mark_failed(self, step: Step | ArrayLike) -> None:
+    def mark_failed(self, step: Step | AnyArray) -> None:
         """Says that a view could not be taken, so that it is not chosen again.
 
         Args:
             step: that `decide` returned, or a pose `T_world_camera`.
         """
-        self._check_reset()
+        of = self._current
         pose = step.T_world_camera if isinstance(step, Step) else np.asarray(step, float)
         if pose is None or np.shape(pose) != (4, 4):
             raise ValueError("mark_failed needs a step that has a pose, or a pose (4, 4)")
-        away = pose[:3, 3] - self._center
-        self._failed = np.concatenate([self._failed, (away / np.linalg.norm(away) @ self._rotation)[None]])
-        self.history.events.append({"call": "mark_failed", "direction": self._failed[-1].tolist()})
+        away = pose[:3, 3] - of.center
+        of.failed = np.concatenate([of.failed, (away / np.linalg.norm(away) @ of.rotation)[None]])
+        self.history.events.append({"call": "mark_failed", "direction": of.failed[-1].tolist()})
 
     def _is_failed(self, where: core.Candidates) -> np.ndarray:
-        if not len(self._failed):
+        failed = self._current.failed
+        if not len(failed):
             return np.zeros(self.size, bool)
-        close = np.asarray(where.directions) @ self._failed.T > np.cos(float(where.same))
+        close = np.asarray(where.directions) @ failed.T > np.cos(float(where.same))
         return close.any(axis=1)
 
-    def _check_reset(self) -> None:
-        if self._center is None:
+    @property
+    def _current(self) -> _Object:
+        if self._object is None:
             raise ValueError("the agent has no object yet: call reset or reset_from_points first")
-
-
-_STATE = ("_center", "_radius", "_rotation", "_turn", "_posed", "_memory", "_run", "_belief", "_failed", "history")
+        return self._object
 
 
 def _check(right: bool, message: str) -> None:
     if not right:
         raise ValueError(message)
-
-
-class Programs:
-    """The compiled steps for one policy, and a known or unknown yaw."""
-
-    def __init__(self, system: TrainedSystem, policy: str | Policy, posed: bool, most: int):
-        entropy = system.parts.entropy is not None and posed
-        if entropy and core.why_not(system, policy, posed, False) is None:
-            entropy = False  # the policy does not use predicted entropies
-        if (reason := core.why_not(system, policy, posed, entropy)) is not None:
-            name = policy if isinstance(policy, str) else getattr(policy, "__name__", "given")
-            without = "" if posed else " for an object of unknown yaw"
-            raise ValueError(f"the policy {name} cannot be used here{without}: {reason}")
-        self._system, self._policy, self._posed = system, policy, posed
-        self._entropy, self._most = entropy, most
-        self._temperatures_of = policy if isinstance(policy, str) else "random"
-        if policy == "best":
-            self._temperatures_of = system.description.best if posed else system.description.best_unposed
-        self.see, self.choose = jax.jit(self.see_view), jax.jit(self.choose_next)
-
-    def blank(self) -> core.Memory:
-        like = core.example(self._system, self._entropy)
-        return core.blank(self._system.parts, like, self._most)
-
-    def see_view(
-        self, parts: Parts, memory: core.Memory, depth: Float[Array, "side side"], pose: Float[Array, "4 4"]
-    ) -> tuple[core.Memory, tuple[Array, Array]]:
-        """The memory after a view; calibrated probabilities and strangeness."""
-        system, description = self._system, self._system.description
-        cloud = description.cloud if self._entropy else None
-        seen = observe(parts, depth, pose, image=description.image, cloud=cloud, camera=description.camera)
-        direction = pose[:3, 3] / jnp.linalg.norm(pose[:3, 3])
-        memory = core.remember(system, parts, memory, seen, direction, self._posed)
-        own = replace(system, parts=parts)
-        probabilities = jnp.exp(own.log_probabilities(memory.belief, memory.count, self._temperatures_of))
-        strangeness = jnp.float32(jnp.nan)
-        if parts.strangeness is not None:
-            present = jnp.arange(self._most) < memory.count
-            assert memory.seen.features is not None
-            strangeness = parts.strangeness.of(memory.seen.features, present)
-        return memory, (probabilities, strangeness)
-
-    def choose_next(
-        self,
-        parts: Parts,
-        memory: core.Memory,
-        candidates: core.Candidates,
-        failed: Array,
-        allowed: Array,
-        cost: Array,
-        key: Array,
-    ) -> tuple[Array, Array]:
-        state, scene = core.situation(parts, memory, candidates, failed, allowed, self._posed)
-        policy = self._policy
-        run = self._system.policy(policy, parts, self._posed) if isinstance(policy, str) else policy
-        index, gains = core.choose(key, run, state, scene, cost, len(candidates.directions))
-        first = jnp.argmax(jnp.where(scene.reachable & ~state.attempted, self._first(parts, candidates), -jnp.inf))
-        none = ~jnp.any(scene.reachable & ~state.attempted)
-        return jnp.where(memory.count > 0, index, jnp.where(none, -1, first)), gains
-
-    def _first(self, parts: Parts, candidates: core.Candidates) -> Array:
-        """Scores of the first view, when nothing is known yet: the best fixed order of views where there is one."""
-        slots = jnp.zeros(self._most)
-        if self._posed and parts.knowledge is not None:
-            return jnp.concatenate([candidates.weights @ parts.knowledge.order, slots])
-        return jnp.concatenate([-jnp.abs(candidates.directions[:, 2] - 0.5), slots])

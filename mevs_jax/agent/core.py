@@ -71,7 +71,7 @@ def angles(a: Float[Array, "n 3"], b: Float[Array, "m 3"]) -> Float[Array, "n m"
     return 2 * jnp.arcsin(jnp.clip(apart / 2, 0, 1))
 
 
-def blank(parts: Parts, like: Observation, most: int) -> Memory:
+def blank(like: Observation, most: int) -> Memory:
     """The memory before the first view.
 
     Args:
@@ -163,6 +163,12 @@ def situation(
     return state, Scene(ViewGraph(points, neighbours, distances), knowledge=knowledge, reachable=reachable)
 
 
+def left(state: SelectionState, scene: Scene) -> Bool[Array, " views"]:
+    """The views that may still be chosen."""
+    assert scene.reachable is not None
+    return scene.reachable & ~state.attempted
+
+
 def choose(
     key: Array,
     policy: Policy,
@@ -182,20 +188,16 @@ def choose(
     gains = jnp.full(number, jnp.nan)
     if scene.knowledge is not None:
         gains = information_gain(key, state, scene)[:number]
-    assert scene.reachable is not None
-    left = scene.reachable & ~state.attempted
-    best = best_view(jnp.where(left, jnp.minimum(scores, jnp.finfo(scores.dtype).max), -jnp.inf), left)
-    return jnp.where(jnp.any(left), best, -1), gains
+    remaining = left(state, scene)
+    best = best_view(jnp.where(remaining, jnp.minimum(scores, jnp.finfo(scores.dtype).max), -jnp.inf), remaining)
+    return jnp.where(jnp.any(remaining), best, -1), gains
 
 
 def example(system: TrainedSystem, with_entropy: bool) -> Observation:
-    """The shapes of an observation."""
-    description, parts = system.description, system.parts
-    classes, features = len(description.classes), 8 * description.encoder.width
-    entropies = jax.ShapeDtypeStruct((len(parts.viewpoints),), jnp.float32) if with_entropy else None
-    return Observation(
-        jax.ShapeDtypeStruct((classes,), jnp.float32), entropies, jax.ShapeDtypeStruct((features,), jnp.float32)
-    )  # type: ignore[arg-type]
+    """An observation of zeros."""
+    classes, features = len(system.classes), 8 * system.description.encoder.width
+    entropies = jnp.zeros(len(system.parts.viewpoints)) if with_entropy else None
+    return Observation(jnp.zeros(classes), entropies, jnp.zeros(features))
 
 
 def why_not(system: TrainedSystem, policy: str | Policy, posed: bool, with_entropy: bool) -> str | None:
@@ -203,7 +205,7 @@ def why_not(system: TrainedSystem, policy: str | Policy, posed: bool, with_entro
     views, most = len(system.parts.viewpoints), 2
 
     def trial(parts: Parts) -> Any:
-        memory = blank(parts, jax.tree.map(lambda leaf: jnp.zeros(leaf.shape), example(system, with_entropy)), most)
+        memory = blank(example(system, with_entropy), most)
         candidates = Candidates(
             parts.viewpoints,
             parts.neighbours,

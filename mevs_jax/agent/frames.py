@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 from jaxtyping import Bool, Float
-from numpy.typing import ArrayLike
+
+from mevs_jax.arrays import AnyArray, AnyVector
 
 
-def rotation_to_world(up: ArrayLike, yaw: float) -> Float[np.ndarray, "3 3"]:
+def rotation_to_world(up: AnyVector, yaw: float) -> Float[np.ndarray, "3 3"]:
     """Rotation from the object's frame to the world: the smallest one from z to `up`, after one by `yaw` about z.
 
     Args:
@@ -49,7 +52,7 @@ def pose_towards(
     return pose
 
 
-def mask_of(reachable: ArrayLike | None, number: int) -> Bool[np.ndarray, " candidates"]:
+def mask_of(reachable: AnyArray | Sequence[int] | None, number: int) -> Bool[np.ndarray, " candidates"]:
     """A mask of candidates from what a caller gives: None for all, a boolean mask, or indices.
 
     Raises:

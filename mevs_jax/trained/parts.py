@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from functools import lru_cache
+from typing import Any
 
 import flax.struct
 import jax.numpy as jnp
@@ -31,7 +32,7 @@ class Network:
         return cls(*nnx.split(module))
 
     @property
-    def module(self) -> nnx.Module:
+    def module(self) -> Any:
         """The module."""
         return nnx.merge(self.structure, self.weights)
 

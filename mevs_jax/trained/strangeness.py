@@ -7,6 +7,8 @@ is the mean of theirs. It is compared with the distances of validation objects a
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import flax.struct
 import jax.numpy as jnp
 import numpy as np
@@ -90,7 +92,7 @@ def fit_strangeness(
     along = np.take_along_axis(np.broadcast_to(distances, walks.shape), walks[..., :most], axis=-1)
     means = np.cumsum(along, axis=-1) / np.arange(1, along.shape[-1] + 1)
     levels = np.quantile(means.reshape(-1, means.shape[-1]), np.linspace(0, 1, LEVELS), axis=0).T
-    return _fit(features, labels, classes).replace(quantiles=jnp.asarray(levels, jnp.float32))
+    return replace(_fit(features, labels, classes), quantiles=jnp.asarray(levels, jnp.float32))
 
 
 def _fit(features: np.ndarray, labels: np.ndarray, classes: int, shrinkage: float = 0.05) -> Strangeness:

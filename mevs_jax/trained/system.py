@@ -109,9 +109,9 @@ class TrainedSystem:
         if name == "best":
             name = self.description.best if posed else self.description.best_unposed
         if name in parts.view_policies:
-            return learned(parts.view_policies[name].module, parts.single)  # type: ignore[arg-type]
+            return learned(parts.view_policies[name].module, parts.single)
         if name == _AND_TABLE and "learned" in parts.view_policies:
-            return learned(parts.view_policies["learned"].module, parts.single, by="table")  # type: ignore[arg-type]
+            return learned(parts.view_policies["learned"].module, parts.single, by="table")
         if name not in POLICIES:
             known = ", ".join(("best", *parts.view_policies, *POLICIES))
             raise ValueError(f"unknown policy {name!r}; it is one of {known}")

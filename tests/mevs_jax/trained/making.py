@@ -69,7 +69,9 @@ def system(kind: str = "classifier", seed: int = 0) -> TrainedSystem:
         structure, weights = nnx.split(of.fusion.network(features, classes, rngs))
         prior = jnp.log(jnp.asarray([0.1, 0.2, 0.3, 0.4]))
         fusion = {
-            name: CalibratedFusion(structure, weights, prior, jnp.linspace(1, 1.5, 5), jnp.float32(1.2), name == "posed")
+            name: CalibratedFusion(
+                structure, weights, prior, jnp.linspace(1, 1.5, 5), jnp.float32(1.2), name == "posed"
+            )
             for name in ("posed", "unposed")
         }
         for name, shape in of.view_policies.items():

@@ -1,0 +1,80 @@
+"""The compiled programs of an agent, for one policy."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from mevs_jax.agent import core
+from mevs_jax.policies.base import Policy
+from mevs_jax.trained.parts import Parts, observe
+from mevs_jax.trained.system import TrainedSystem
+
+
+class Programs:
+    """The compiled steps for one policy, and a known or unknown yaw."""
+
+    def __init__(self, system: TrainedSystem, policy: str | Policy, posed: bool, most: int):
+        entropy = system.parts.entropy is not None and posed
+        if entropy and core.why_not(system, policy, posed, False) is None:
+            entropy = False  # the policy does not use predicted entropies
+        if (reason := core.why_not(system, policy, posed, entropy)) is not None:
+            name = policy if isinstance(policy, str) else getattr(policy, "__name__", "given")
+            without = "" if posed else " for an object of unknown yaw"
+            raise ValueError(f"the policy {name} cannot be used here{without}: {reason}")
+        self._system, self._policy, self._posed = system, policy, posed
+        self._entropy, self._most = entropy, most
+        self._temperatures_of = policy if isinstance(policy, str) else "random"
+        if policy == "best":
+            self._temperatures_of = system.description.best if posed else system.description.best_unposed
+        self.see, self.choose = jax.jit(self.see_view), jax.jit(self.choose_next)
+
+    def blank(self) -> core.Memory:
+        like = core.example(self._system, self._entropy)
+        return core.blank(like, self._most)
+
+    def see_view(
+        self, parts: Parts, memory: core.Memory, depth: Float[Array, "side side"], pose: Float[Array, "4 4"]
+    ) -> tuple[core.Memory, tuple[Array, Array]]:
+        """The memory after a view; calibrated probabilities and strangeness."""
+        system, description = self._system, self._system.description
+        cloud = description.cloud if self._entropy else None
+        seen = observe(parts, depth, pose, image=description.image, cloud=cloud, camera=description.camera)
+        direction = pose[:3, 3] / jnp.linalg.norm(pose[:3, 3])
+        memory = core.remember(system, parts, memory, seen, direction, self._posed)
+        own = replace(system, parts=parts)
+        probabilities = jnp.exp(own.log_probabilities(memory.belief, memory.count, self._temperatures_of))
+        strangeness = jnp.float32(jnp.nan)
+        if parts.strangeness is not None:
+            present = jnp.arange(self._most) < memory.count
+            assert memory.seen.features is not None
+            strangeness = parts.strangeness.of(memory.seen.features, present)
+        return memory, (probabilities, strangeness)
+
+    def choose_next(
+        self,
+        parts: Parts,
+        memory: core.Memory,
+        candidates: core.Candidates,
+        failed: Array,
+        allowed: Array,
+        cost: Array,
+        key: Array,
+    ) -> tuple[Array, Array]:
+        state, scene = core.situation(parts, memory, candidates, failed, allowed, self._posed)
+        policy = self._policy
+        run = self._system.policy(policy, parts, self._posed) if isinstance(policy, str) else policy
+        index, gains = core.choose(key, run, state, scene, cost, len(candidates.directions))
+        left = core.left(state, scene)
+        first = jnp.argmax(jnp.where(left, self._first(parts, candidates), -jnp.inf))
+        return jnp.where(memory.count > 0, index, jnp.where(jnp.any(left), first, -1)), gains
+
+    def _first(self, parts: Parts, candidates: core.Candidates) -> Array:
+        """Scores of the first view, when nothing is known yet: the best fixed order of views where there is one."""
+        slots = jnp.zeros(self._most)
+        if self._posed and parts.knowledge is not None:
+            return jnp.concatenate([candidates.weights @ parts.knowledge.order, slots])
+        return jnp.concatenate([-jnp.abs(candidates.directions[:, 2] - 0.5), slots])
