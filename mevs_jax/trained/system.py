@@ -71,6 +71,7 @@ class TrainedSystem:
     def policies(self) -> tuple[str, ...]:
         """Names of the policies that can be used with this system, for objects of known yaw."""
         own = [*self.parts.view_policies, *[_AND_TABLE] * ("learned" in self.parts.view_policies)]
+        own = [name for name in own if name not in (shapes := self.description.view_policies) or shapes[name].posed]
         return tuple(name for name in (*POLICIES, *own) if self._has_inputs_of(name))
 
     def _has_inputs_of(self, name: str) -> bool:

@@ -1,0 +1,349 @@
+"""An agent walks as the selection loop does on tables, takes any candidates, and says what it cannot use."""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import mevs_jax
+from mevs_jax.agent import Agent, load_history, replay
+from mevs_jax.agent.candidates import candidates_of
+from mevs_jax.agent.frames import pose_towards, rotation_to_world
+from mevs_jax.beliefs import running_sum
+from mevs_jax.selection import ViewTable, by_attention, select_from_table
+from tests.mevs_jax.trained import making
+
+K = np.array([[16 / np.tan(np.pi / 6), 0, 15.5], [0, 16 / np.tan(np.pi / 6), 15.5], [0, 0, 1]])
+
+
+@pytest.fixture(scope="module")
+def classifier():
+    return making.system("classifier")
+
+
+@pytest.fixture(scope="module")
+def recogniser():
+    return making.system("recogniser")
+
+
+def pose_at(direction) -> np.ndarray:
+    return np.asarray(mevs_jax.look_at_origin(jnp.asarray(direction, jnp.float32) * 2), float)
+
+
+def views_of(system, **ball):
+    """Depth images and poses of all viewpoints."""
+    return [(making.depth_of_ball(point, **ball), pose_at(point)) for point in system.viewpoints]
+
+
+def table_of(system, views) -> ViewTable:
+    seen = [system.observe(depth, pose) for depth, pose in views]
+    entropies = None if seen[0].predicted_entropy is None else jnp.stack([one.predicted_entropy for one in seen])
+    features = jnp.stack([one.features for one in seen])
+    return ViewTable(jnp.stack([one.logits for one in seen]), entropies, None, jnp.int32(0), features=features)
+
+
+CENTER, RADIUS = np.array([0.5, -0.2, 0.8]), 0.3
+
+
+def walk(agent, views, first, **reset):
+    """Views and probabilities of a walk in metres, around an object away from the origin."""
+    agent.reset(center=CENTER, radius=RADIUS, **reset)
+    rotation = rotation_to_world(reset.get("up", (0, 0, 1)), reset.get("yaw", 0.0))
+    seen, found, index = [], [], first
+    while True:
+        depth, pose = views[index]
+        placed = np.eye(4)
+        placed[:3, :3], placed[:3, 3] = rotation @ pose[:3, :3], CENTER + RADIUS * rotation @ pose[:3, 3]
+        metres = np.where(depth > 0, RADIUS * depth, np.inf).astype(np.float32)
+        found.append(agent.observe(metres, K, placed).probabilities)
+        seen.append(index)
+        step = agent.decide()
+        if step.done:
+            return seen, np.stack(found), step.reason
+        index = step.index
+
+
+@pytest.mark.parametrize(
+    ("kind", "policy"),
+    [
+        ("classifier", "information_gain"),
+        ("classifier", "predicted_entropy"),
+        ("classifier", "remembered_entropy"),
+        ("classifier", "random"),
+        ("classifier", "farthest"),
+        ("classifier", "fixed_order"),
+        ("recogniser", "learned"),
+        ("recogniser", "learned_and_table"),
+    ],
+)
+@pytest.mark.parametrize("placed", [{}, {"up": (0.3, -1.0, 0.2), "yaw": 0.7}], ids=["upright", "lying"])
+def test_walks_are_those_of_the_selection_loop_on_tables(request, kind, policy, placed):
+    system = request.getfixturevalue(kind)
+    views = views_of(system)
+    table, graph = table_of(system, views), system.graph
+    fuse = by_attention(system.parts.fusion["posed"]) if kind == "recogniser" else mevs_jax.sum_of_logits
+    run = system.policy(policy)
+    agent = Agent(system, policy, stop=2, max_views=6)
+    for first in (0, 7):
+        scene = table.scene(graph, system.parts.knowledge)
+        episode = select_from_table(jax.random.key(0), table, scene, run, first, max_views=6, fuse=fuse)
+        seen, probabilities, reason = walk(agent, views, first, **placed)
+        assert seen == list(map(int, episode.views))
+        assert reason == "budget"
+        if kind == "classifier":
+            beliefs = running_sum(table.logits[jnp.asarray(seen)])
+            expected = [
+                jnp.exp(system.log_probabilities(belief, count + 1, policy)) for count, belief in enumerate(beliefs)
+            ]
+            np.testing.assert_allclose(probabilities, np.stack(expected), atol=1e-4)
+        else:
+            np.testing.assert_allclose(probabilities.argmax(-1), episode.predictions)
+
+
+def test_it_stops_when_it_is_sure(classifier):
+    views = views_of(classifier)
+    seen, probabilities, reason = walk(Agent(classifier, "farthest", stop=0.3, max_views=6), views, 0)
+    assert reason == "sure"
+    assert (probabilities[:-1].max(axis=1) < 0.3).all()
+    assert probabilities[-1].max() >= 0.3
+    seen, _, reason = walk(Agent(classifier, "farthest", stop=2, max_views=3), views, 0)
+    assert (len(seen), reason) == (3, "budget")
+
+
+def test_the_first_view_is_that_of_the_fixed_order(classifier):
+    agent = Agent(classifier)
+    agent.reset(center=CENTER, radius=RADIUS)
+    step = agent.decide()
+    assert step.index == int(np.argmax(classifier.parts.knowledge.order))
+    expected = pose_towards(classifier.viewpoints[step.index].astype(float), CENTER, 2 * RADIUS, np.array([0, 0, 1.0]))
+    np.testing.assert_allclose(step.T_world_camera, expected, atol=1e-6)
+    np.testing.assert_allclose(step.direction, classifier.viewpoints[step.index], atol=1e-6)
+    only = agent.decide(reachable=[4]).index
+    assert only == 4
+
+
+def test_what_cannot_be_reached_or_failed_is_not_chosen(classifier):
+    views = views_of(classifier)
+    agent = Agent(classifier, "information_gain", stop=2)
+    agent.reset(center=CENTER, radius=RADIUS)
+    agent.observe_view(*views[0])
+    best = agent.decide()
+    agent.mark_failed(best)
+    second = agent.decide()
+    assert second.index not in (0, best.index)
+    above = np.flatnonzero(2 * RADIUS * classifier.viewpoints[:, 2] > 0.15)
+    assert agent.decide(reachable=lambda pose: pose[2, 3] > CENTER[2] + 0.15).index in above
+    step = agent.decide(reachable=[0, best.index])
+    assert (step.done, step.reason, step.index, step.T_world_camera) == (True, "nothing reachable", -1, None)
+    mask = np.zeros(making.VIEWS, bool)
+    assert agent.decide(reachable=mask).reason == "nothing reachable"
+
+
+def test_costs_change_the_choice(classifier):
+    views = views_of(classifier)
+    agent = Agent(classifier, "information_gain", stop=2, gain_per_cost=1.0)
+    agent.reset(center=CENTER, radius=RADIUS)
+    agent.observe_view(*views[0])
+    free = agent.decide()
+    cost = np.zeros(making.VIEWS)
+    cost[free.index] = 100.0
+    assert agent.decide(cost=cost).index != free.index
+    cost[:] = np.inf
+    cost[3] = 5.0
+    assert agent.decide(cost=cost).index == 3
+    assert np.isfinite(free.expected_gain)
+
+
+def test_candidates_may_be_any_poses(classifier):
+    views = views_of(classifier)
+    agent = Agent(classifier, "information_gain", stop=2)
+    agent.reset(center=CENTER, radius=RADIUS)
+    agent.observe_view(*views[2])
+    by_index = agent.decide().index
+    poses = agent.poses
+    order = np.random.default_rng(0).permutation(making.VIEWS)
+    assert order[agent.decide(candidates=poses[order]).index] == by_index  # the same poses, in another order
+    random = np.random.default_rng(1)
+    free = random.normal(size=(30, 3))
+    free[:, 2] = np.abs(free[:, 2])
+    free /= np.linalg.norm(free, axis=1, keepdims=True)
+    around = np.stack([pose_towards(one, CENTER, 0.9, np.array([0, 0, 1.0])) for one in free])
+    step = agent.decide(candidates=around)
+    np.testing.assert_array_equal(step.T_world_camera, around[step.index])
+    assert agent.decide(candidates=around[:1]).index == 0
+    near = pose_towards(views[2][1][:3, 3] / 2 + np.array([0.01, 0, 0]), CENTER, 0.9, np.array([0, 0, 1.0]))
+    assert agent.decide(candidates=near[None]).reason == "nothing reachable"  # it was seen from there
+    with pytest.raises(ValueError, match="make it with max_candidates=200"):
+        agent.decide(candidates=np.repeat(around[:1], 200, axis=0))
+
+
+def test_views_may_be_between_the_viewpoints(classifier):
+    direction = classifier.viewpoints[0] + 0.6 * classifier.viewpoints[1]
+    direction /= np.linalg.norm(direction)
+    for policy in ("information_gain", "farthest", "predicted_entropy"):
+        agent = Agent(classifier, policy, stop=2)
+        agent.reset(center=CENTER, radius=RADIUS)
+        agent.observe_view(making.depth_of_ball(direction), pose_at(direction))
+        index = agent.decide().index
+        if policy == "farthest":
+            assert index == int(np.argmin(classifier.viewpoints @ direction))
+
+
+def test_values_between_viewpoints_are_interpolated(classifier):
+    points = np.stack([classifier.viewpoints[3], (classifier.viewpoints[3] + classifier.viewpoints[4]) / 2])
+    points /= np.linalg.norm(points, axis=1, keepdims=True)
+    weights = np.asarray(candidates_of(classifier, points, 5).weights)
+    np.testing.assert_array_equal(weights[0], np.eye(making.VIEWS)[3])
+    np.testing.assert_allclose(weights[:2].sum(axis=1), 1, rtol=1e-6)
+    np.testing.assert_allclose(weights[1, 3], weights[1, 4], rtol=1e-4)
+    assert not weights[2:].any()
+
+
+def test_the_yaw_may_be_unknown(recogniser, classifier):
+    views = views_of(recogniser)
+    known, unknown = (Agent(recogniser, stop=2, max_views=4) for _ in range(2))
+    turned = {"yaw": 1.1}
+    first = walk(unknown, views, 0, yaw_known=False)
+    np.testing.assert_allclose(first[1], walk(unknown, views, 0, yaw_known=False, up=(0, 0, 2))[1], atol=1e-5)
+    assert walk(known, views, 0, **turned)[0] == walk(known, views, 0)[0]
+    agent = Agent(classifier, "information_gain")
+    with pytest.raises(
+        ValueError, match=r"cannot be used here for an object of unknown yaw: this policy needs Scene\.knowledge"
+    ):
+        agent.reset(center=CENTER, radius=RADIUS, yaw_known=False)
+    agent = Agent(classifier, stop=2)
+    agent.reset(center=CENTER, radius=RADIUS, yaw_known=False)
+    agent.observe_view(*views_of(classifier)[0])
+    assert agent.decide().index == int(np.argmin(classifier.viewpoints @ classifier.viewpoints[0]))  # farthest
+
+
+def test_strange_objects_are_unknown(classifier):
+    views = views_of(classifier)
+    agent = Agent(classifier, stop=2, max_views=2, unknown=0.9)
+    agent.reset(center=CENTER, radius=RADIUS)
+    beliefs = [agent.observe_view(*views[index]) for index in (0, 5)]
+    assert all(belief.strangeness > 0.9 and not belief.known for belief in beliefs)  # its features were random numbers
+    assert agent.decide().reason == "unknown object"
+    assert Agent(classifier, stop=2, max_views=1).unknown is None
+
+
+def test_nothing_is_compiled_after_the_warm_up(recogniser):
+    agent = Agent(recogniser, stop=2, max_views=5)
+    agent.warm_up()
+    views, events = views_of(recogniser), []
+
+    def listen(event, *_, **__):
+        if "compile" in event:
+            events.append(event)
+
+    jax.monitoring.register_event_duration_secs_listener(listen)
+    try:
+        for yaw_known in (True, False):
+            agent.reset(center=CENTER, radius=RADIUS, yaw_known=yaw_known)
+            for index in (0, 3):
+                depth, pose = views[index]
+                placed = pose.copy()
+                placed[:3, 3] = CENTER + RADIUS * pose[:3, 3]
+                for rows in (32, 48):  # images of other sizes
+                    image = np.zeros((rows, 40), np.float32)
+                    image[:32, :32] = RADIUS * depth
+                    agent.observe(image, K, placed)
+                agent.decide()
+                agent.decide(reachable=[1, 2], cost=np.ones(making.VIEWS))
+                agent.decide(candidates=agent.poses[:7])
+        assert events == []
+    finally:
+        jax.monitoring.unregister_event_duration_listener(listen)
+
+
+def test_a_history_is_saved_and_repeated(classifier, tmp_path):
+    views = views_of(classifier)
+    agent = Agent(classifier, "information_gain", stop=2, max_views=4)
+    _, probabilities, _ = walk(agent, views, 3, up=(0, 1, 0), yaw=0.4)
+    agent.history.save(tmp_path / "walk.npz")
+    history = load_history(tmp_path / "walk.npz")
+    assert [event["call"] for event in history.events] == ["observe", "decide"] * 4
+    assert history.options["reset"]["yaw"] == 0.4
+    again = replay(history, Agent(classifier, "information_gain", stop=2, max_views=4))
+    np.testing.assert_allclose([belief.probabilities for belief in again], probabilities, atol=1e-6)
+    (tmp_path / "other.npz").write_bytes(b"nothing")
+    with pytest.raises(ValueError, match="is no history of an agent"):
+        load_history(tmp_path / "other.npz")
+
+
+def test_a_policy_of_ones_own(classifier):
+    def lowest(key, state, scene):
+        return -scene.graph.points[:, 2]
+
+    agent = Agent(classifier, lowest, stop=2)
+    agent.reset(center=CENTER, radius=RADIUS)
+    agent.observe_view(*views_of(classifier)[0])
+    assert agent.decide().index == int(np.argmin(classifier.viewpoints[:, 2]))
+
+    def wrong(key, state, scene):
+        return jnp.zeros(1)
+
+    with pytest.raises(ValueError, match=r"policy wrong cannot be used here: it returns scores of shape \(1,\)"):
+        Agent(classifier, wrong)
+
+
+REFUSED = {
+    "stop must be a probability": {"stop": 0.0},
+    "max_views must be from 1": {"max_views": 0},
+    r"unknown must be in \(0, 1\]": {"unknown": 1.5},
+    "gain_per_cost must be at least 0": {"gain_per_cost": -1.0},
+    "distance must be positive": {"distance": 0.0},
+    "unknown policy 'luck'": {"policy": "luck"},
+    r"policy label_oracle cannot be used here: this policy needs Scene\.": {"policy": "label_oracle"},
+}
+
+
+@pytest.mark.parametrize("message", REFUSED)
+def test_options_that_cannot_be_are_refused(classifier, message):
+    with pytest.raises(ValueError, match=message):
+        classifier.agent(**REFUSED[message])
+
+
+def test_calls_that_cannot_be_are_refused(classifier):
+    agent = Agent(classifier, max_views=1, stop=2)
+    depth, pose = views_of(classifier)[0]
+    for call in (agent.decide, lambda: agent.observe_view(depth, pose), lambda: agent.poses):
+        with pytest.raises(ValueError, match="call reset or reset_from_points first"):
+            call()
+    for message, options in {
+        "center must be three finite numbers": {"center": (0, 0), "radius": 1},
+        "radius must be positive": {"center": (0, 0, 0), "radius": -1},
+        "up must be a direction": {"center": (0, 0, 0), "radius": 1, "up": (0, 0, 0)},
+        "yaw must be a finite angle": {"center": (0, 0, 0), "radius": 1, "yaw": np.nan},
+    }.items():
+        with pytest.raises(ValueError, match=message):
+            agent.reset(**options)
+    agent.reset(center=CENTER, radius=RADIUS)
+    for message, options in {
+        r"reachable has shape \(3,\); there are 12 candidates": {"reachable": np.ones(3, bool)},
+        "or indices from 0 to 11": {"reachable": [12]},
+        "cost has 2 values; there are 12 candidates": {"cost": [1, 2]},
+        "cost has values that are NaN": {"cost": [np.nan] * 12},
+        r"candidates must be poses \(candidates, 4, 4\)": {"candidates": np.eye(4)},
+        "a candidate is at the object's centre": {
+            "candidates": pose_towards(np.eye(3)[0], CENTER, 0.0, np.eye(3)[2])[None]
+        },
+    }.items():
+        with pytest.raises(ValueError, match=message):
+            agent.decide(**options)
+    agent.observe_view(depth, pose)
+    with pytest.raises(ValueError, match="the budget of 1 views is spent"):
+        agent.observe_view(depth, pose)
+    with pytest.raises(ValueError, match="needs depth images of 32×32 pixels, got 8×8"):
+        classifier.observe(np.zeros((8, 8)), pose)
+
+
+def test_the_smallest_rotation_takes_z_to_up():
+    for up in ((0, 0, 1), (0, 0, -3), (1, 2, 3), (0, -1, 0)):
+        rotation = rotation_to_world(up, 0.0)
+        np.testing.assert_allclose(rotation @ rotation.T, np.eye(3), atol=1e-12)
+        np.testing.assert_allclose(np.linalg.det(rotation), 1)
+        np.testing.assert_allclose(rotation[:, 2], np.asarray(up) / np.linalg.norm(up), atol=1e-12)
+    np.testing.assert_allclose(rotation_to_world((0, 0, 1), np.pi / 2)[:, 0], [0, 1, 0], atol=1e-12)
