@@ -1,44 +1,20 @@
-"""A trained run, asked about one object of its data set: `python examples/load_and_ask.py [RUN]`.
+"""A trained system, asked about a mesh: `python examples/load_and_ask.py [MESH] [SYSTEM]`.
 
-It looks at the object from one view, and prints what the classifier says and which view the policy by expected information gain
-would take next, until it is confident. RUN is a directory in which `mevs run` has been run (default: runs/demo).
+MESH is a file (default: a piece of the built-in furniture). SYSTEM is the folder of a run or of an exported system, or a name
+(default: furniture10, which comes with the package).
 """
 
 from __future__ import annotations
 
 import sys
-from pathlib import Path
 
-import jax
-import jax.numpy as jnp
-import numpy as np
+import mevs_jax
+from data_pipeline.objects.furniture import furniture
+from data_pipeline.objects.recipes import read_mesh
 
-from data_pipeline.dataset.statistics import load_statistics
-from eval.tables import load_view_tables
-from eval.walks.knowledge import learn
-from mevs_jax import POLICIES, ViewGraph, select_from_table
+piece = furniture("chair", 900)  # which no system was trained on
+mesh = read_mesh(sys.argv[1]) if len(sys.argv) > 1 else (piece.vertices, piece.faces)
 
-
-def main(run: Path, position: int = 0, start: int = 0) -> None:
-    statistics = load_statistics(run / "data")
-    graph = ViewGraph.from_points(np.array(statistics.viewpoints))
-    test, validation = (load_view_tables(run / "tables" / f"{split}.npz") for split in ("test", "val"))
-    knowledge = learn(jnp.asarray(validation.logits), jnp.asarray(validation.labels))
-    table = jax.tree.map(lambda leaf: leaf[position], test.stacked())
-    walk = select_from_table(
-        jax.random.key(0),
-        table,
-        table.scene(graph, knowledge),
-        POLICIES["information_gain"],
-        start,
-        threshold=0.95,
-        max_views=min(5, statistics.views),
-    )
-    print(f"{test.names[position]}, seen from view {start} first:")
-    for view, label, confidence in zip(walk.views, walk.predictions, walk.confidences, strict=True):
-        if view >= 0:
-            print(f"  view {view}: {statistics.classes[label]}, {100 * confidence:.0f} % confident")
-
-
-if __name__ == "__main__":
-    main(Path(sys.argv[1] if len(sys.argv) > 1 else "runs/demo"))
+system = mevs_jax.load(sys.argv[2] if len(sys.argv) > 2 else "furniture10")
+walk = mevs_jax.look(system, *mesh, stop=0.99)
+print(walk)  # the class and its probability after each view, and why it ended

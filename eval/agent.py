@@ -1,0 +1,244 @@
+"""How well a run's trained system does what its agent promises, on test objects: `mevs check agent`.
+
+Walks: an agent visits the views that the selection loop visits on view tables, and has the same beliefs. Stopping: those who stop
+at a calibrated probability are wrong at most as often as it says. Time: from a 640×480 image to the next pose.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int
+
+from data_pipeline.dataset.builder import open_split
+from data_pipeline.dataset.inputs import metric_depth
+from data_pipeline.progress import progress_bar
+from eval.numbers.comparison import intervals
+from eval.numbers.confidence import stops_at
+from eval.tables import ViewTables
+from mevs_jax.agent import Agent
+from mevs_jax.beliefs import running_sum
+from mevs_jax.selection import ViewTable, by_attention, select_from_table, sum_of_logits
+from mevs_jax.trained import TrainedSystem
+
+STOPS = (0.9, 0.95, 0.99)
+_CENTER, _RADIUS = np.array([0.4, -0.3, 0.7]), 0.25
+
+
+@dataclass(frozen=True)
+class AgentConfig:
+    """The check of an agent."""
+
+    objects: int = 200
+    """number of test objects that agents walk around"""
+    max_views: int = 8
+    """views of each walk"""
+
+
+@dataclass(frozen=True)
+class WalkAgreement:
+    """Walks of an agent beside those of the selection loop on tables.
+
+    Attributes:
+        walks: number of walks.
+        same: how many visit the same views.
+        largest_difference: of the probabilities, along the walks that are the same.
+    """
+
+    walks: int
+    same: int
+    largest_difference: float
+
+
+def own_intrinsics(side: int, field_of_view: float) -> Float[np.ndarray, "3 3"]:
+    """Intrinsics of the data set's camera, whose pixel centres are at whole numbers here.
+
+    Args:
+        side: pixels per side of the image.
+        field_of_view: in degrees.
+    """
+    focal = side / 2 / np.tan(np.radians(field_of_view) / 2)
+    return np.array([[focal, 0, (side - 1) / 2], [0, focal, (side - 1) / 2], [0, 0, 1]])
+
+
+def placed(pose: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, "4 4"]:
+    """A pose of the data set in metres, around an object away from the origin."""
+    found = np.array(pose, float)
+    found[:3, 3] = found[:3, 3] * _RADIUS + _CENTER
+    return found
+
+
+def walk_of(
+    agent: Agent, depth: Float[np.ndarray, "views side side"], poses: np.ndarray, first: int
+) -> tuple[list[int], np.ndarray]:
+    """Views, and probabilities after each, of an agent's walk around an object whose views are known.
+
+    Args:
+        agent: that never stops early.
+        depth: of every view in radii, 0 where nothing is hit.
+        poses: of every view.
+        first: the first view.
+    """
+    camera = agent.system.description.camera
+    K = own_intrinsics(camera.resolution, camera.field_of_view)
+    agent.reset(center=_CENTER, radius=_RADIUS)
+    views, found, view = [], [], first
+    while True:
+        metres = np.where(depth[view] > 0, depth[view] * _RADIUS, np.inf).astype(np.float32)
+        views.append(view)
+        found.append(agent.observe(metres, K, placed(poses[view])).probabilities)
+        step = agent.decide()
+        if step.done:
+            return views, np.stack(found)
+        view = step.index
+
+
+def table_of(system: TrainedSystem, depth: Float[np.ndarray, "views side side"], poses: np.ndarray) -> ViewTable:
+    """What the system's networks compute from every view of one object."""
+    seen = [system.observe(depth[view], poses[view]) for view in range(len(depth))]
+    stacked = jax.tree.map(lambda *leaves: jnp.stack(leaves), *seen)
+    return ViewTable(stacked.logits, stacked.predicted_entropy, None, jnp.int32(0), features=stacked.features)
+
+
+def compare_walks(
+    system: TrainedSystem, data: Path, config: AgentConfig, policies: Sequence[str]
+) -> dict[str, WalkAgreement]:
+    """Walks test objects by an agent and on tables, object i from view i modulo the number of views."""
+    source = open_split(data, "test")
+    objects = min(config.objects, len(source))
+    max_views = min(config.max_views, len(system.viewpoints))
+    agents = {name: system.agent(name, stop=2.0, max_views=max_views) for name in policies}
+    fuse = by_attention(system.parts.fusion["posed"]) if system.parts.fusion else sum_of_logits
+    scene_of = partial(ViewTable.scene, graph=system.graph, knowledge=system.parts.knowledge)
+
+    @partial(jax.jit, static_argnames="name")
+    def by_table(table: ViewTable, first: Int[Array, ""], name: str) -> Int[Array, " steps"]:
+        run = system.policy(name)
+        key = jax.random.key(0)
+        return select_from_table(key, table, scene_of(table), run, first, max_views=max_views, fuse=fuse).views
+
+    found: dict[str, list[tuple[bool, float]]] = {name: [] for name in policies}
+    with progress_bar("objects") as bar:
+        line = bar.add_task("Walking with an agent", total=objects, note="")
+        for index in np.linspace(0, len(source) - 1, objects).astype(int):
+            example = source[index]
+            depth, poses = np.asarray(metric_depth(example["depth"])), example["pose"]
+            table, first = table_of(system, depth, poses), int(index) % len(poses)
+            for name, agent in agents.items():
+                views, probabilities = walk_of(agent, depth, poses, first)
+                same = views == np.asarray(by_table(table, jnp.int32(first), name)).tolist()
+                expected = probabilities_along(system, table, views, name)
+                found[name].append((same, float(np.abs(probabilities - expected).max())))
+            bar.advance(line)
+    return {
+        name: WalkAgreement(
+            len(rows), sum(same for same, _ in rows), max((gap for same, gap in rows if same), default=0.0)
+        )
+        for name, rows in found.items()
+    }
+
+
+def probabilities_along(system: TrainedSystem, table: ViewTable, views: Sequence[int], policy: str) -> np.ndarray:
+    """Calibrated probabilities after each view of a walk on a table."""
+    order = jnp.asarray(views)
+    if system.parts.fusion:
+        assert table.features is not None
+        fusion, points = system.parts.fusion["posed"], system.parts.viewpoints[order]
+        present = jnp.tril(jnp.ones((len(views), len(views)), bool))
+        beliefs = jnp.stack([fusion(table.features[order], points, seen) for seen in present])
+    else:
+        beliefs = running_sum(table.logits[order])
+    steps = [system.log_probabilities(belief, count, policy) for count, belief in enumerate(beliefs, 1)]
+    return np.exp(np.stack([np.asarray(step) for step in steps]))
+
+
+def stopping(
+    system: TrainedSystem, tables: ViewTables, policy: str, max_views: int, stops: Sequence[float] = STOPS
+) -> list[dict[str, Any]]:
+    """How often the walks that stop at a calibrated probability are wrong, over all test objects and start views.
+
+    Only for systems that add logits, whose beliefs follow from view tables.
+
+    Returns:
+        For each probability: the promised and the measured error with its 95 % interval over objects, the share of walks that
+        stopped, their mean number of views, and the accuracy of all walks.
+    """
+    run, graph = system.policy(policy), system.graph
+    max_views = min(max_views, len(system.viewpoints))
+
+    @jax.jit
+    def walks(table: ViewTable) -> tuple[Array, Array]:
+        def from_view(first: Array) -> tuple[Array, Array]:
+            scene = table.scene(graph, system.parts.knowledge)
+            views = select_from_table(jax.random.key(0), table, scene, run, first, max_views=max_views).views
+            beliefs = running_sum(table.logits[views])
+            counts = jnp.arange(1, max_views + 1)
+            steps = jax.vmap(lambda belief, count: system.log_probabilities(belief, count, policy))(beliefs, counts)
+            return jnp.exp(jnp.max(steps, axis=-1)), jnp.argmax(steps, axis=-1) == table.label
+
+        return jax.vmap(from_view)(jnp.arange(len(graph.points)))
+
+    confidence, right = map(np.asarray, jax.lax.map(walks, tables.stacked(), batch_size=16))
+    rows = []
+    for stop in stops:
+        sure = confidence >= stop
+        stopped, at = sure.any(axis=-1), stops_at(sure)
+        answer = np.take_along_axis(right, at[..., None], axis=-1)[..., 0]
+        wrong = (stopped & ~answer).mean(axis=1)
+        share = stopped.mean(axis=1)
+        error = float(wrong.sum() / max(share.sum(), 1e-9))
+        rows.append(
+            {
+                "stop": stop,
+                "promised_error": 1 - stop,
+                "error": error,
+                "excess": intervals(wrong - (1 - stop) * share),
+                "stopped": float(stopped.mean()),
+                "views": float((at + 1).mean()),
+                "accuracy": float(answer.mean()),
+            }
+        )
+    return rows
+
+
+def latency(system: TrainedSystem, data: Path, calls: int = 200, policy: str = "best") -> dict[str, float]:
+    """Time in ms from a 640×480 depth image to the next pose: 50th and 99th percentile, and the number of compilations."""
+    agent = system.agent(policy, stop=2.0, max_views=8)
+    agent.warm_up()
+    example = open_split(data, "test")[0]
+    depth, poses = np.asarray(metric_depth(example["depth"])), example["pose"]
+    camera = system.description.camera
+    side = camera.resolution
+    K = own_intrinsics(side, camera.field_of_view)
+    scale = 480 / side
+    wide = np.array([[scale, 0, (640 - 480) / 2 + (scale - 1) / 2], [0, scale, (scale - 1) / 2], [0, 0, 1]]) @ K
+    index = (np.arange(480) / scale).astype(int)
+    frames = np.full((len(depth), 480, 640), np.inf, np.float32)
+    frames[:, :, 80:560] = np.where(depth > 0, depth * _RADIUS, np.inf)[:, index][:, :, index]
+    compiled: list[str] = []
+
+    def listen(event: str, *_: Any, **__: Any) -> None:
+        if "backend_compile" in event:
+            compiled.append(event)
+
+    jax.monitoring.register_event_duration_secs_listener(listen)
+    times = []
+    for call in range(calls):
+        if call % 8 == 0:
+            agent.reset(center=_CENTER, radius=_RADIUS)
+        view = (7 * call) % len(depth)
+        begun = time.perf_counter()
+        agent.observe(frames[view], wide, placed(poses[view]))
+        agent.decide()
+        times.append(1e3 * (time.perf_counter() - begun))
+    jax.monitoring.unregister_event_duration_listener(listen)
+    p50, p99 = np.percentile(times, (50, 99))
+    return {"p50": float(p50), "p99": float(p99), "compilations": float(len(compiled))}

@@ -1,0 +1,52 @@
+"""A depth camera that goes where the agent sends it: `python examples/depth_camera.py [SYSTEM]`.
+
+The camera is simulated (640×480, with an off-centre principal point), above a chair that stands somewhere in a room. Everything
+between `system = …` and the loop's end is what a robot's program needs. SYSTEM is the folder of a run or of an exported system, or a
+name (default: furniture10, which comes with the package).
+"""
+
+from __future__ import annotations
+
+import sys
+
+import numpy as np
+
+import mevs_jax
+from data_pipeline.capture.casting import default_caster
+from data_pipeline.objects.furniture import furniture
+from data_pipeline.objects.mesh import Mesh, normalise
+
+CENTER, RADIUS = np.array([0.5, 0.1, 0.8]), 0.45  # of the chair, in metres, in the world
+K = np.array([[525.0, 0.0, 325.0], [0.0, 520.0, 236.0], [0.0, 0.0, 1.0]])
+
+
+def depth_camera():
+    """A function from poses `T_world_camera` to depth images in metres, 0 where nothing is seen."""
+    piece = furniture("chair", 900)
+    mesh = normalise(piece.vertices, piece.faces, "chair")
+    cast = default_caster()(Mesh((mesh.vertices * RADIUS + CENTER).astype(np.float32), mesh.faces, mesh.extent))
+    rows, columns = np.mgrid[:480, :640]
+    rays = np.stack([columns, rows, np.ones_like(rows)], axis=-1).reshape(-1, 3) @ np.linalg.inv(K).T
+
+    def take(T_world_camera: np.ndarray) -> np.ndarray:
+        directions = (rays @ T_world_camera[:3, :3].T).astype(np.float32)
+        origins = np.broadcast_to(T_world_camera[:3, 3].astype(np.float32), directions.shape)
+        depth, _ = cast(origins, directions)
+        return np.where(np.isfinite(depth), depth, 0).reshape(480, 640).astype(np.float32)
+
+    return take
+
+
+take = depth_camera()
+
+system = mevs_jax.load(sys.argv[1] if len(sys.argv) > 1 else "furniture10")
+agent = system.agent(stop=0.99)
+agent.warm_up()
+agent.reset(center=CENTER, radius=RADIUS)
+step = agent.decide()
+while not step.done:
+    depth = take(step.T_world_camera)  # the robot moves its camera there
+    belief = agent.observe(depth, K, step.T_world_camera)
+    print(f"{belief.name}, {100 * belief.confidence:.1f} % ({belief.latency_ms:.0f} ms)")
+    step = agent.decide(reachable=lambda pose: pose[2, 3] > 0.6)  # above the floor
+print(f"{belief.name} after {belief.views} views: {step.reason}")
