@@ -44,6 +44,11 @@ class Shot:
     center: np.ndarray
     radius: float
 
+    @property
+    def eye(self) -> np.ndarray:
+        """(3,) float32, the camera's position in radii from the object's centre."""
+        return ((self.T_world_camera[:3, 3] - self.center) / self.radius).astype(np.float32)
+
     def contains(self, points: np.ndarray) -> bool:
         """Whether world points (n, 3) are all in front of the camera and inside its image."""
         seen = (points - self.T_world_camera[:3, 3]) @ self.T_world_camera[:3, :3] @ self.K.T
@@ -96,8 +101,7 @@ def cast_shot(cast: Cast, shot: Shot) -> np.ndarray:
     column, row = np.meshgrid(np.arange(shot.width), np.arange(shot.height))
     pixels = np.stack([column, row, np.ones_like(row)], axis=-1).reshape(-1, 3)
     rays = (pixels @ np.linalg.inv(shot.K).T @ shot.T_world_camera[:3, :3].T).astype(np.float32)
-    eye = ((shot.T_world_camera[:3, 3] - shot.center) / shot.radius).astype(np.float32)
-    found = _cast(cast, eye, rays).reshape(shot.height, shot.width)
+    found = _cast(cast, shot.eye, rays).reshape(shot.height, shot.width)
     return np.where(np.isfinite(found), found * np.float32(shot.radius), np.float32(0))
 
 
@@ -122,22 +126,30 @@ class Agreement:
         overlap: intersection over union of the masks.
         error: median error of depth in radii, where both show the object; NaN where they have no pixel in common.
         unknown: share of the sphere's pixels that the source does not determine.
-        milliseconds: time of the conversion.
+        visible: share of the object's pixels in the truth whose surface the source sees: the largest overlap that is possible
+            without guessing what is hidden.
     """
 
     overlap: float
     error: float
     unknown: float
-    milliseconds: float
+    visible: float
 
 
-def agreement(view: CanonicalView, truth: np.ndarray, milliseconds: float = math.nan) -> Agreement:
+def agreement(view: CanonicalView, truth: np.ndarray, visible: float = 1.0) -> Agreement:
     """Compares a canonical view with the image of the data set's camera from its direction (`cast_canonical`)."""
     ours, theirs = view.depth > 0, truth > 0
     both = ours & theirs
     overlap = both.sum() / max(1, (ours | theirs).sum())
     error = float(np.median(np.abs(view.depth - truth)[both])) if both.any() else math.nan
-    return Agreement(float(overlap), error, view.unknown, milliseconds)
+    return Agreement(float(overlap), error, view.unknown, visible)
+
+
+def visible_share(cast: Cast, shot: Shot, truth: np.ndarray, view: CanonicalView, camera: ViewCamera) -> float:
+    """Returns the share of the object's pixels in the truth whose surface the source sees; 1 if there are none."""
+    points = view.pose[:3, 3] + np.asarray(pixel_directions(camera.at(view.pose))) * truth[..., None]
+    ways = (points[truth > 0] - shot.eye).astype(np.float32)
+    return float((_cast(cast, shot.eye, ways) > 1 - 0.01).mean()) if len(ways) else 1.0
 
 
 def agreements(
@@ -166,7 +178,6 @@ def agreements(
             depth = cast_shot(cast, shot)
             if not depth.any():
                 continue  # an object so thin that no pixel hits it
-            start = time.perf_counter()
             view = canonical_view(
                 depth,
                 shot.K,
@@ -176,12 +187,13 @@ def agreements(
                 camera=camera,
                 mask=depth > 0,
             )
-            taken = 1000 * (time.perf_counter() - start)
-            yield agreement(view, cast_canonical(cast, view.direction, camera), taken)
+            truth = cast_canonical(cast, view.direction, camera)
+            yield agreement(view, truth, visible_share(cast, shot, truth, view, camera))
 
 
 def summary(found: Sequence[Agreement]) -> dict[str, float]:
-    """Returns the median and 5th percentile of the overlap, the median of the error, and the median share that is unknown."""
+    """Returns the median and 5th percentile of the overlap and of the share that is visible, and the medians of the error and
+    of the share that is unknown."""
     overlap = np.array([one.overlap for one in found])
     return {
         "views": len(found),
@@ -189,4 +201,32 @@ def summary(found: Sequence[Agreement]) -> dict[str, float]:
         "overlap_low": float(np.quantile(overlap, 0.05)),
         "error_median": float(np.nanmedian([one.error for one in found])),
         "unknown_median": float(np.median([one.unknown for one in found])),
+        "visible_median": float(np.median([one.visible for one in found])),
+        "visible_low": float(np.quantile([one.visible for one in found], 0.05)),
     }
+
+
+def milliseconds(
+    mesh: Mesh, size: tuple[int, int], camera: ViewCamera, *, distance: float = 2.0, calls: int = 200, seed: int = 0
+) -> np.ndarray:
+    """Returns the times (calls,) of one conversion in milliseconds, after a warm-up.
+
+    Args:
+        mesh: the object.
+        size: width and height of the source image.
+        camera: the data set's camera.
+        distance: of the source's camera, in radii.
+        calls: how often the same image is converted.
+        seed: of the source's camera.
+    """
+    shot = random_shot(np.random.default_rng(seed), distance, size)
+    depth = cast_shot(default_caster()(mesh), shot)
+    taken = np.empty(calls)
+    for number in range(-3, calls):
+        start = time.perf_counter()
+        canonical_view(
+            depth, shot.K, shot.T_world_camera, center=shot.center, radius=shot.radius, camera=camera, mask=depth > 0
+        )
+        if number >= 0:
+            taken[number] = 1000 * (time.perf_counter() - start)
+    return taken

@@ -200,7 +200,7 @@ def test_a_sphere_that_is_partly_outside_the_image_says_so():
 
 def test_images_of_all_sizes_share_one_program():
     camera = ViewCamera(resolution=33)
-    programs = (canonical_module._render, canonical_module._inverse_depth)
+    programs = [getattr(canonical_module, name) for name in ("_render", "_inverse_depth", "_without_small_holes")]
     mesh, random = default_caster()(chair()), np.random.default_rng(0)
     convert(cast_shot(mesh, data_set_shot()), data_set_shot(), camera=camera)
     before = [program._cache_size() for program in programs]
