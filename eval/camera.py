@@ -152,6 +152,64 @@ def visible_share(cast: Cast, shot: Shot, truth: np.ndarray, view: CanonicalView
     return float((_cast(cast, shot.eye, ways) > 1 - 0.01).mean()) if len(ways) else 1.0
 
 
+@dataclass(frozen=True)
+class Pair:
+    """What one random camera took of a mesh, and the truth.
+
+    Attributes:
+        shot: the camera.
+        view: made from its image.
+        truth: (resolution, resolution) image of the data set's camera from the same direction, in radii.
+        cast: casts rays at the mesh.
+    """
+
+    shot: Shot
+    view: CanonicalView
+    truth: np.ndarray
+    cast: Cast
+
+    def agreement(self, camera: ViewCamera) -> Agreement:
+        """Compares both."""
+        return agreement(self.view, self.truth, visible_share(self.cast, self.shot, self.truth, self.view, camera))
+
+
+def pairs(
+    mesh: Mesh,
+    distance: float,
+    *,
+    shots: int = 20,
+    camera: ViewCamera = CAMERA,
+    size: tuple[int, int] | None = None,
+    seed: Sequence[int] = (0, 0),
+) -> Iterator[Pair]:
+    """Takes a mesh with random cameras (`random_shot`) and with that of the data set.
+
+    Args:
+        mesh: the object.
+        distance: of the cameras, in radii.
+        shots: number of cameras; one that does not see an object, since it is too thin, yields nothing.
+        camera: the data set's camera.
+        size: width and height of the cameras' images; by default any of `SIZES`.
+        seed: of the cameras.
+    """
+    cast, random = default_caster()(mesh), np.random.default_rng(seed)
+    for _ in range(shots):
+        shot = random_shot(random, distance, size)
+        depth = cast_shot(cast, shot)
+        if not depth.any():
+            continue
+        view = canonical_view(
+            depth,
+            shot.K,
+            shot.T_world_camera,
+            center=shot.center,
+            radius=shot.radius,
+            camera=camera,
+            mask=depth > 0,
+        )
+        yield Pair(shot, view, cast_canonical(cast, view.direction, camera), cast)
+
+
 def agreements(
     meshes: Iterable[Mesh],
     distance: float,
@@ -161,34 +219,10 @@ def agreements(
     size: tuple[int, int] | None = None,
     seed: int = 0,
 ) -> Iterator[Agreement]:
-    """Compares canonical views of random cameras (`random_shot`) with the truth.
-
-    Args:
-        meshes: the objects.
-        distance: of the cameras, in radii.
-        shots: number of cameras for each object.
-        camera: the data set's camera.
-        size: width and height of the cameras' images; by default any of `SIZES`.
-        seed: of the cameras.
-    """
+    """Compares canonical views of random cameras with the truth; arguments as of `pairs`."""
     for number, mesh in enumerate(meshes):
-        cast, random = default_caster()(mesh), np.random.default_rng((seed, number))
-        for _ in range(shots):
-            shot = random_shot(random, distance, size)
-            depth = cast_shot(cast, shot)
-            if not depth.any():
-                continue  # an object so thin that no pixel hits it
-            view = canonical_view(
-                depth,
-                shot.K,
-                shot.T_world_camera,
-                center=shot.center,
-                radius=shot.radius,
-                camera=camera,
-                mask=depth > 0,
-            )
-            truth = cast_canonical(cast, view.direction, camera)
-            yield agreement(view, truth, visible_share(cast, shot, truth, view, camera))
+        for pair in pairs(mesh, distance, shots=shots, camera=camera, size=size, seed=(seed, number)):
+            yield pair.agreement(camera)
 
 
 def summary(found: Sequence[Agreement]) -> dict[str, float]:

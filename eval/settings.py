@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 from data_pipeline.capture.casting import CaptureConfig
 from data_pipeline.dataset.augment import CloudAugmentation, ViewAugmentation
 from data_pipeline.dataset.builder import DataConfig
+from eval.agent import AgentConfig
 from eval.rendering.ascent import AscentConfig
 from eval.rendering.policies import RenderingConfig
 from eval.walks.grid import GridConfig
@@ -32,6 +33,7 @@ class Settings:
     entropy: EntropyConfig = EntropyConfig()
     evaluation: GridConfig = GridConfig()
     live: LiveConfig = LiveConfig()
+    agent: AgentConfig = AgentConfig()
     thesis: ThesisConfig = ThesisConfig()
     sweep: SweepConfig = SweepConfig()
     ascent: AscentConfig = AscentConfig()
@@ -157,6 +159,7 @@ TINY = Settings(
     ),
     evaluation=GridConfig(draws=2),
     live=LiveConfig(objects=10, at_once=8, max_views=4),
+    agent=AgentConfig(objects=3, max_views=4, shots=2, distances=(2.0,), calls=10),
     thesis=ThesisConfig(
         _TINY_OPTIMISER,
         _TINY_OPTIMISER,

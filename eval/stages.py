@@ -15,11 +15,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from data_pipeline.dataset.builder import prepare
+from data_pipeline.dataset.builder import open_objects, prepare
 from data_pipeline.dataset.statistics import SUMMARY, DatasetStatistics, load_statistics, report_left_out
 from data_pipeline.errors import DataError, Diverged, Unreadable
 from data_pipeline.files import check_of_file, keep_json, read_json, write_json
+from data_pipeline.objects.sources import load_object
 from data_pipeline.progress import console
+from eval.agent import compare_walks, latency, recognised, stopping
 from eval.learned.measure import measure, together, train_all
 from eval.learned.page import write_learned_page
 from eval.learned.system import make_learned_system
@@ -29,13 +31,14 @@ from eval.report.html import ReportInputs
 from eval.report.page import is_current, read_history, write_report
 from eval.report.sweep import write_sweep_report
 from eval.settings import Settings
-from eval.system import classifier_system, figures_of, identity_of, save_system, stored_system
+from eval.system import USABLE, classifier_system, figures_of, identity_of, save_system, stored_system
 from eval.tables import ViewTables, compute_view_tables, load_view_tables, save_view_tables
 from eval.walks.grid import FIRST_MV, GridConfig
 from eval.walks.knowledge import learn
 from eval.walks.ladder import ASCENT_RUNGS
 from eval.walks.live import Agreement, Networks, compare_with_tables
 from mevs_jax.policies.registry import policy_named
+from mevs_jax.trained import load as load_system
 from mevs_jax.viewpoints import ViewGraph
 from train.chance import warn_of_chance
 from train.choosing.stages import Stages, check_learned
@@ -286,6 +289,32 @@ def check_live(settings: Settings, out: Path) -> dict[str, Agreement]:
         config=settings.live,
     )
     write_json(out / "live.json", {policy: asdict(agreement) for policy, agreement in found.items()})
+    return found
+
+
+def check_agent(settings: Settings, out: Path) -> dict[str, Any]:
+    """Measures what an agent with the run's system promises, on test objects; writes `agent.json`."""
+    folder, config = make_system(settings, out), settings.agent
+    if min(config.objects, config.shots, config.calls, config.max_views) < 1:
+        raise DataError("--agent.objects, --agent.max-views, --agent.shots and --agent.calls must be at least 1")
+    system, statistics = load_system(folder), load_statistics(out / "data")
+    tables = _tables(settings, out, statistics, "test")
+    entries = {entry.name: entry for entry in open_objects(settings.dataset).entries}
+    chosen = np.unique(np.linspace(0, len(tables.names) - 1, config.objects).astype(int))
+    if missing := [tables.names[index] for index in chosen if tables.names[index] not in entries]:
+        raise DataError(
+            f"{settings.dataset.source} has no object {missing[0]!r}; pass the --data from which {out} was made"
+        )
+    meshes = [(load_object(entries[tables.names[index]]), int(tables.labels[index])) for index in chosen]
+    policies = [name for name in USABLE if name in system.policies]
+    found = {
+        "walks": {name: asdict(walks) for name, walks in compare_walks(system, out / "data", config, policies).items()},
+        "stopping": {name: stopping(system, tables, name, config.max_views) for name in policies},
+        "camera": recognised(system, meshes, config),
+        "latency_ms": latency(system, out / "data", config.calls),
+        "settings": asdict(config),
+    }
+    write_json(out / "agent.json", found)
     return found
 
 

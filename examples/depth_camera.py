@@ -1,8 +1,8 @@
 """A depth camera that goes where the agent sends it: `python examples/depth_camera.py [SYSTEM]`.
 
-The camera is simulated (640×480, with an off-centre principal point), above a chair that stands somewhere in a room. Everything
-between `system = …` and the loop's end is what a robot's program needs. SYSTEM is the folder of a run or of an exported system, or a
-name (default: furniture10, which comes with the package).
+The camera is simulated (640×480, with an off-centre principal point), and a chair stands somewhere in a room. From
+`system = …` on, it is what a robot's program needs. SYSTEM is the folder of a run or of an exported system, or a name
+(default: furniture10, which comes with the package).
 """
 
 from __future__ import annotations

@@ -118,6 +118,13 @@ COMMANDS = {
         "checks:live",
         writes_run=False,
     ),
+    "check agent": Command(
+        "what an agent promises, on test objects: walks, stopping, any camera, time",
+        "WithViews",
+        ("dataset", "agent"),
+        "checks:agent",
+        writes_run=False,
+    ),
     "draw ascent": Command(
         "ascend to the best view of one object by a renderer's gradient; draw it",
         "WithViews",
