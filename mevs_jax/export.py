@@ -166,7 +166,9 @@ def _decide(system: TrainedSystem, policy: str, max_views: int) -> _Program:
     def decide(memory: Any, depth: Array, pose: Array, reachable: Array, cost: Array, seed: Array) -> dict[str, Any]:
         structure = jax.tree.structure(programs.blank())
         unpacked = jax.tree.unflatten(structure, [memory[name] for name in sorted(memory)])
-        unpacked, (probabilities, strangeness) = programs.see_view(system.parts, unpacked, depth, pose)
+        unpacked, (probabilities, strangeness) = programs.see_view(
+            system.parts, unpacked, depth, pose, programs.temperatures(system.parts)
+        )
         key = jax.random.key(seed)
         failed = jnp.zeros(views, bool)
         following, gains = programs.choose_next(system.parts, unpacked, lattice, failed, reachable, cost, key)

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from mevs_jax.agent import core
@@ -30,23 +31,43 @@ class Programs:
         self._temperatures_of = policy if isinstance(policy, str) else "random"
         if policy == "best":
             self._temperatures_of = system.description.best if posed else system.description.best_unposed
-        self.see, self.choose = jax.jit(self.see_view), jax.jit(self.choose_next)
+        self.choose = jax.jit(self.choose_next)
+        # Compiled once for all policies of a system that need the same.
+        shared = system.__dict__.setdefault("programs", {})
+        self._see = shared.setdefault((entropy, posed, most), jax.jit(self.see_view))
+
+    def see(self, parts: Parts, memory: core.Memory, depth: np.ndarray, pose: np.ndarray) -> Any:
+        """`see_view`, compiled, with the temperatures of the policy."""
+        return self._see(parts, memory, depth, pose, self.temperatures(parts))
+
+    def temperatures(self, parts: Parts) -> Float[Array, " counts"]:
+        """The temperatures of the policy's walks; those of random ones for a policy without its own."""
+        return parts.temperatures.get(self._temperatures_of, parts.temperatures["random"])
 
     def blank(self) -> core.Memory:
         like = core.example(self._system, self._entropy)
         return core.blank(like, self._most)
 
     def see_view(
-        self, parts: Parts, memory: core.Memory, depth: Float[Array, "side side"], pose: Float[Array, "4 4"]
+        self,
+        parts: Parts,
+        memory: core.Memory,
+        depth: Float[Array, "side side"],
+        pose: Float[Array, "4 4"],
+        temperatures: Float[Array, " counts"],
     ) -> tuple[core.Memory, tuple[Array, Array]]:
-        """The memory after a view; calibrated probabilities and strangeness."""
+        """The memory after a view; calibrated probabilities and strangeness.
+
+        Args:
+            temperatures: of the belief after 1, 2, … views; the last one holds for more.
+        """
         system, description = self._system, self._system.description
         cloud = description.cloud if self._entropy else None
         seen = observe(parts, depth, pose, image=description.image, cloud=cloud, camera=description.camera)
         direction = pose[:3, 3] / jnp.linalg.norm(pose[:3, 3])
         memory = core.remember(system, parts, memory, seen, direction, self._posed)
-        own = replace(system, parts=parts)
-        probabilities = jnp.exp(own.log_probabilities(memory.belief, memory.count, self._temperatures_of))
+        at = jnp.clip(memory.count, 1, len(temperatures)) - 1
+        probabilities = jax.nn.softmax(memory.belief / temperatures[at])
         strangeness = jnp.float32(jnp.nan)
         if parts.strangeness is not None:
             present = jnp.arange(self._most) < memory.count

@@ -39,5 +39,6 @@ def agent(call: Invocation) -> None:
         )
     time = found["latency_ms"]
     print(
-        f"640×480 image to next pose: {time['p50']:.1f} ms (99th percentile {time['p99']:.1f}), {time['compilations']:.0f} compilations"
+        f"640×480 image to next pose: {time['p50']:.1f} ms (99th percentile {time['p99']:.1f}), "
+        f"{time['compilations']:.0f} compilations"
     )
