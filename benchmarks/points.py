@@ -325,7 +325,7 @@ def decisions(clouds: np.ndarray, calls: int = 200) -> list[dict[str, float]]:
     """Time from clouds to the next of 40 views: single clouds by size, as on a robot, and 256 clouds of 4,096 points."""
     graph = ViewGraph.from_points(fibonacci_sphere(40))
     network = PointNet2(views=40, rngs=nnx.Rngs(0))
-    choose = NextView(network, graph)
+    choose = NextView(network, graph, columns=3)
     structure, state = nnx.split(network)
     found = []
     for size, batch in [(size, 1) for size in choose.sizes] + [(POINTS, 256)]:

@@ -21,6 +21,9 @@ from mevs_jax.models import PointNet2
 from mevs_jax.policies.base import maxima_first
 from mevs_jax.viewpoints import ViewGraph
 
+_FARTHEST = 1.1
+"""Largest distance of a point from the object's centre, in radii; above 1 since depth is measured with errors."""
+
 
 @dataclass(frozen=True)
 class Decision:
@@ -41,18 +44,23 @@ class NextView:
     Args:
         network: predicts the entropy of every view of `graph`.
         graph: the candidate views.
+        columns: of the clouds that the network was trained with: 3, or 6 with the unit vector to the camera beside each point.
         sizes: that clouds are padded to, increasing. Larger clouds are reduced to the last size by random sampling.
 
     Raises:
         ValueError: for a network with another number of views than `graph`, or sizes that do not increase.
     """
 
-    def __init__(self, network: PointNet2, graph: ViewGraph, *, sizes: Sequence[int] = (512, 1024, 2048, 4096)):
+    def __init__(
+        self, network: PointNet2, graph: ViewGraph, *, columns: int, sizes: Sequence[int] = (512, 1024, 2048, 4096)
+    ):
         if network.views != len(graph.points):
             raise ValueError(f"the network predicts {network.views} views, the graph has {len(graph.points)}")
         if not sizes or any(b <= a for a, b in zip((0, *sizes), sizes, strict=False)):
             raise ValueError(f"sizes must increase from at least 1, got {tuple(sizes)}")
-        self.sizes, self.views = tuple(sizes), network.views
+        if columns not in (3, 6):
+            raise ValueError(f"a network reads clouds of 3 or 6 columns, not {columns}")
+        self.sizes, self.views, self.columns = tuple(sizes), network.views, columns
         structure, self._state = nnx.split(network)
 
         def decide(state: nnx.State, clouds: Array, available: Array) -> tuple[Array, Array]:
@@ -68,12 +76,14 @@ class NextView:
         """Chooses the best available local maximum of the predicted entropies, or the best available view if there is none.
 
         Args:
-            cloud: (points, 3) or (points, 6) as for `PointNet2`, in any order. The points are shuffled, in the same way in every
-                call, as in training, since a ball query depends on their order.
+            cloud: (points, columns) in any order, in the frame and unit of the training clouds: the object's sphere is the unit
+                sphere. The points are shuffled, in the same way in every call, as in training, since a ball query depends on
+                their order.
             available: True for the views that may be chosen, for example those not yet attempted; all views by default.
 
         Raises:
-            ValueError: for a cloud without points or with numbers that are not finite, or if no view is available.
+            ValueError: for a cloud of other columns, outside the unit sphere, without points or with numbers that are not
+                finite, or if no view is available.
         """
         return self.of_many([cloud], None if available is None else np.asarray(available)[None])[0]
 
@@ -108,10 +118,10 @@ class NextView:
         views, entropies = map(np.asarray, self._decide(self._state, padded[batch], available[batch]))
         return [Decision(int(views[i]), entropies[i]) for i in range(len(clouds))]
 
-    def warm_up(self, columns: int = 3) -> None:
-        """Compiles the programs for one cloud of every size, with 3 or 6 columns, so that no decision waits for the compiler."""
+    def warm_up(self) -> None:
+        """Compiles the programs for one cloud of every size, so that no decision waits for the compiler."""
         for size in self.sizes:
-            self(np.ones((size, columns), np.float32))
+            self(np.full((size, self.columns), 0.1, np.float32))
 
     def fill(
         self, cloud: Float[np.ndarray, "points columns"], size: int | None = None
@@ -123,12 +133,18 @@ class NextView:
             size: number of points of the result; by default the smallest of `sizes` that holds the cloud, else the largest.
 
         Raises:
-            ValueError: for a cloud without points or with numbers that are not finite.
+            ValueError: for a cloud of other columns, outside the unit sphere, without points or with numbers that are not
+                finite.
         """
         cloud = np.asarray(cloud, np.float32)
-        if cloud.ndim != 2 or len(cloud) == 0 or not np.isfinite(cloud).all():
+        if cloud.ndim != 2 or cloud.shape[1] != self.columns or len(cloud) == 0 or not np.isfinite(cloud).all():
             raise ValueError(
-                f"a decision needs a cloud (points, 3 or 6) of finite numbers with at least one point, got shape {cloud.shape}"
+                f"this network reads clouds (points, {self.columns}) of finite numbers with at least one point, got shape "
+                f"{cloud.shape}"
+            )
+        if (farthest := float(np.linalg.norm(cloud[:, :3], axis=1).max())) > _FARTHEST:
+            raise ValueError(
+                f"the cloud reaches {farthest:.2f} from the origin; subtract the object's centre and divide by its radius"
             )
         size = size or self._size(len(cloud))
         order = np.random.default_rng(0).permutation(len(cloud))[:size]
