@@ -223,7 +223,6 @@ def make_system(settings: Settings, out: Path) -> Path:
     networks = load_best(classify, out / "classifier"), load_best(predict, out / "entropy")
     validation = _tables(settings, out, statistics, "val")
     system = classifier_system(
-        out / "data",
         statistics,
         classify,
         networks[0],

@@ -50,8 +50,6 @@ from mevs_jax.trained import (
 )
 from mevs_jax.trained.description import FORM
 from mevs_jax.viewpoints import ViewGraph
-from train.outputs import network_outputs
-from train.step import Batch, Task
 from train.tasks.classifier import ClassifierTask, ResNetConfig
 from train.tasks.entropy import EntropyTask
 
@@ -70,10 +68,6 @@ _COUNTED = slice(1, 4)
 """The numbers of views, 2 to 4, whose accuracy decides which policy is the best."""
 _WITHOUT_YAW = "farthest"
 """The best policy of a classifier for objects of unknown yaw: all others need the object's frame, except random selection."""
-
-
-_STRANGE_OBJECTS = 400
-"""Number of validation objects, at most, whose features say what known objects look like."""
 
 
 def stored_system(folder: Path, made_by: str) -> bool:
@@ -145,10 +139,6 @@ def _some(tables: ViewTables, chosen: np.ndarray) -> ViewTables:
     return ViewTables(names, *(array[chosen] for array in arrays))
 
 
-def _features(network: Any, task: Task, batch: Batch) -> jax.Array:
-    return network.features(task.inputs(batch))
-
-
 def resnet_shape(config: ResNetConfig, channels: int) -> ResNetShape:
     """Returns the shape of an encoder as the tasks make it."""
     return ResNetShape(config.depth, config.width, channels, config.standardise and channels == 3, config.stem)
@@ -204,7 +194,6 @@ def figures_of(metrics: dict[str, Any]) -> dict[str, Any]:
 
 
 def classifier_system(
-    data: Path,
     statistics: DatasetStatistics,
     classify: ClassifierTask,
     classifier: nnx.Module,
@@ -218,7 +207,7 @@ def classifier_system(
     """Returns the trained system of a run: classifier, entropy predictor, class × view table.
 
     Args:
-        data: folder of the data set.
+        statistics: of the data set.
         validation: view tables of the validation objects by these networks.
         evaluation: figures to carry.
         max_views: number of views that temperatures are fitted for.
@@ -229,8 +218,6 @@ def classifier_system(
     console.print(f"Calibrating {len(USABLE)} policies on {len(validation.labels)} validation objects")
     walks = walk_validation(validation, graph, max_views)
     labels, classes = validation.labels, len(statistics.classes)
-    some = np.unique(np.linspace(0, len(labels) - 1, _STRANGE_OBJECTS).astype(int))
-    features = network_outputs(data, "val", classify, classifier, ask=_features, chosen=some)
     knowledge = learn(jnp.asarray(validation.logits), jnp.asarray(labels))
     single = fit_temperature(
         jnp.asarray(validation.logits).reshape(-1, classes), jnp.repeat(jnp.asarray(labels), statistics.views)
@@ -263,6 +250,6 @@ def classifier_system(
         entropy=Network.of(predictor),
         knowledge=Knowledge(knowledge.order, knowledge.expected_logits),
         temperatures={name: jnp.asarray(values) for name, values in walks.temperatures.items()},
-        strangeness=fit_strangeness(features, labels[some], classes, statistics.views),
+        strangeness=fit_strangeness(validation.logits, statistics.views),
     )
     return TrainedSystem(description, parts)

@@ -112,9 +112,7 @@ def learned_system(stages: Stages, found: dict[str, Any], figures: dict[str, Any
         view_policies={name: Network.of(policy) for name, policy in policies.items()},
         knowledge=learn(fusions["posed"], validation, min(config.max_views, views)),
         temperatures={name: jnp.asarray(values, jnp.float32) for name, values in temperatures.items()},
-        strangeness=fit_strangeness(
-            np.asarray(validation.features), np.asarray(validation.labels), len(stages.statistics.classes), views
-        ),
+        strangeness=fit_strangeness(validation.logits, views),
     )
     return TrainedSystem(description, parts)
 

@@ -9,7 +9,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Float, Int, Shaped
 
 from mevs_jax.agent.agent import Agent
 from mevs_jax.agent.records import Belief, History, Reason
@@ -143,7 +143,7 @@ class Frames:
         floor: height of the supporting surface above the centre, or None.
     """
 
-    depth: Float[np.ndarray, "frames height width"]
+    depth: Shaped[np.ndarray, "frames height width"]
     K: Float[np.ndarray, "frames 3 3"]
     T_world_camera: Float[np.ndarray, "frames 4 4"]
     center: Float[np.ndarray, " 3"]

@@ -71,8 +71,7 @@ class Programs:
         strangeness = jnp.float32(jnp.nan)
         if parts.strangeness is not None:
             present = jnp.arange(self._most) < memory.count
-            assert memory.seen.features is not None
-            strangeness = parts.strangeness.of(memory.seen.features, present)
+            strangeness = parts.strangeness.of(memory.seen.logits, present)
         return memory, (probabilities, strangeness)
 
     def choose_next(

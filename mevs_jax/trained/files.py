@@ -204,12 +204,7 @@ def _arrays_of(parts: Parts) -> dict[str, Any]:
         }
     found |= {f"temperatures.{name}": values for name, values in parts.temperatures.items()}
     if parts.strangeness is not None:
-        known = parts.strangeness
-        found |= {
-            "strangeness.whitening": known.whitening,
-            "strangeness.means": known.means,
-            "strangeness.quantiles": known.quantiles,
-        }
+        found["strangeness.quantiles"] = parts.strangeness.quantiles
     return found
 
 
@@ -386,13 +381,8 @@ def _parts_of(description: Description, arrays: dict[str, np.ndarray]) -> Parts:
     if "knowledge.order" in arrays:
         table = take.take("knowledge.expected_logits", (classes, views, classes))
         knowledge = Knowledge(take.take("knowledge.order", (views,)), table)
-    if "strangeness.means" in arrays:
-        rank = arrays["strangeness.means"].shape[-1]
-        strangeness = Strangeness(
-            take.take("strangeness.whitening", (features, rank)),
-            take.take("strangeness.means", (classes, rank)),
-            take.take("strangeness.quantiles", (None, LEVELS)),
-        )
+    if "strangeness.quantiles" in arrays:
+        strangeness = Strangeness(take.take("strangeness.quantiles", (None, LEVELS)))
     names = sorted(name for name in arrays if name.startswith("temperatures."))
     if "temperatures.random" not in names:
         raise ValueError(f"{WEIGHTS} lacks temperatures.random")

@@ -51,7 +51,7 @@ class Parts:
         view_policies: networks that score views, by name of the policy.
         knowledge: statistics over validation objects, for policies that use them.
         temperatures: by name of the policy, (views,): temperature of the belief after 1, 2, … views of its walks.
-        strangeness: compares features with those of known objects.
+        strangeness: compares logits with those of known objects.
     """
 
     encoder: Network

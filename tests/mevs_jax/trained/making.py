@@ -80,7 +80,7 @@ def system(kind: str = "classifier", seed: int = 0) -> TrainedSystem:
             policies[name] = Network.of(policy)
             temperatures[name] = jnp.ones(6)
     table = random.normal(size=(classes, VIEWS, classes)) + 2 * np.eye(classes)[:, None]
-    strange = fit_strangeness(9 + random.normal(size=(30, VIEWS, features)), np.arange(30) % classes, classes, VIEWS)
+    strange = fit_strangeness(9 + random.normal(size=(30, VIEWS, classes)), VIEWS)
     parts = Parts(
         encoder=Network.of(encoder),
         viewpoints=graph.points,
