@@ -40,13 +40,13 @@ def depth_camera():
 take = depth_camera()
 
 system = mevs_jax.load(sys.argv[1] if len(sys.argv) > 1 else "furniture10")
-agent = system.agent(stop=0.99)
+agent = system.agent(stop=0.999)
 agent.warm_up()
 agent.reset(center=CENTER, radius=RADIUS)
 step = agent.decide()
-while not step.done:
-    depth = take(step.T_world_camera)  # the robot moves its camera there
-    belief = agent.observe(depth, K, step.T_world_camera)
+while (pose := step.T_world_camera) is not None:
+    depth = take(pose)  # the robot moves its camera there
+    belief = agent.observe(depth, K, pose)
     print(f"{belief.name}, {100 * belief.confidence:.1f} % ({belief.latency_ms:.0f} ms)")
     step = agent.decide(reachable=lambda pose: pose[2, 3] > 0.6)  # above the floor
 print(f"{belief.name} after {belief.views} views: {step.reason}")
