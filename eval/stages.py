@@ -33,6 +33,7 @@ from eval.walks.grid import FIRST_MV, GridConfig
 from eval.walks.knowledge import learn
 from eval.walks.ladder import ASCENT_RUNGS
 from eval.walks.live import Agreement, Networks, compare_with_tables
+from eval.walks.own_policies import OwnPolicy, load_policies, own_rungs
 from mevs_jax.policies.registry import policy_named
 from mevs_jax.viewpoints import ViewGraph
 from train.chance import warn_of_chance
@@ -142,18 +143,32 @@ def check_evaluation(config: GridConfig) -> None:
         raise DataError("--evaluation.max-views must be at least 2 and --evaluation.draws at least 1")
 
 
+def policies_of(settings: Settings, statistics: DatasetStatistics) -> tuple[OwnPolicy, ...]:
+    """Returns the policies of `--policy`, checked on this data set before anything is trained or evaluated.
+
+    Raises:
+        DataError: if one cannot be used.
+    """
+    own = load_policies(settings.policies)
+    own_rungs(own, ViewGraph.from_points(np.array(statistics.viewpoints)), len(statistics.classes), 1)
+    return own
+
+
 def evaluate(settings: Settings, out: Path) -> dict[str, Any]:
     """Returns the metrics of the test split, as written to `metrics.json`."""
     statistics = load_statistics(out / "data")
+    own = policies_of(settings, statistics)
     by_view_made = None
     if (out / BY_VIEW / "summary.json").exists():
         by_view_made = made_by(statistics, out / BY_VIEW, out / "entropy")
-    identity = {
+    identity: dict[str, Any] = {
         "evaluation": asdict(settings.evaluation),
         "made_by": made_by(statistics, out / "classifier", out / "entropy"),
         "by_view": by_view_made,
         "climbed": None,
     }
+    if own:
+        identity["policies"] = [policy.identity for policy in own]
     climbed = load_ascent_scores(out, statistics, settings.rendering)
     if climbed is not None:
         identity["climbed"] = asdict(settings.rendering)
@@ -175,7 +190,7 @@ def evaluate(settings: Settings, out: Path) -> dict[str, Any]:
                 for name, made in (("classifier", tables), (BY_VIEW, by_view))
             }
         validation = _tables(settings, out, statistics, "val")
-        metrics = run_study(tables, validation, statistics, settings.evaluation, by_view, leak)
+        metrics = run_study(tables, validation, statistics, settings.evaluation, by_view, leak, own)
         if climbed is not None:
             metrics["climbing"] = ascent_study(tables, statistics, climbed, settings.evaluation)
         _check_metrics(metrics, tables, out)
@@ -236,6 +251,12 @@ def check_live(settings: Settings, out: Path) -> dict[str, Agreement]:
                 f"{policy} needs the tables of mevs study rendering, which live walks do not have; leave it out"
             )
     statistics = load_statistics(out / "data")
+    own = own_rungs(
+        load_policies(settings.policies),
+        ViewGraph.from_points(np.array(statistics.viewpoints)),
+        len(statistics.classes),
+        1,
+    )
     classify, predict = tasks(settings, statistics)
     networks = Networks(classify, load_best(classify, out / "classifier"), predict, load_best(predict, out / "entropy"))
     validation = _tables(settings, out, statistics, "val")
@@ -247,6 +268,7 @@ def check_live(settings: Settings, out: Path) -> dict[str, Agreement]:
         learn(jnp.asarray(validation.logits), jnp.asarray(validation.labels)),
         ViewGraph.from_points(np.array(statistics.viewpoints)),
         config=settings.live,
+        own=own,
     )
     write_json(out / "live.json", {policy: asdict(agreement) for policy, agreement in found.items()})
     return found

@@ -61,7 +61,7 @@ COMMANDS = {
     ),
     "eval": Command(
         "run every policy on every test object from every start view",
-        "WithSeed",
+        "EvalOptions",
         ("evaluation",),
         "stages:evaluate",
     ),
@@ -93,7 +93,7 @@ COMMANDS = {
     ),
     "check live": Command(
         "walk with the networks in the loop; compare with the view tables",
-        "Options",
+        "WithPolicies",
         ("live",),
         "checks:live",
         writes_run=False,

@@ -37,6 +37,20 @@ class WithSeed(Options):
 
 
 @dataclass(frozen=True)
+class WithPolicies(Options):
+    """Commands that run policies."""
+
+    policy: Annotated[tyro.conf.UseAppendAction[tuple[str, ...]], _arg("MODULE:FUNCTION", "those of the run")] = ()
+    """a policy of your own, evaluated like all others: module:function or path/to/file.py:function; once for each policy;
+    `none` leaves those of the run out (docs/policies.md)"""
+
+
+@dataclass(frozen=True)
+class EvalOptions(WithSeed, WithPolicies):
+    """Options of `mevs eval`."""
+
+
+@dataclass(frozen=True)
 class WithWeights(WithSeed):
     """Commands that train classifiers."""
 
@@ -71,7 +85,7 @@ class DataOptions(WithViews):
 
 
 @dataclass(frozen=True)
-class RunOptions(WithViews, WithWeights):
+class RunOptions(WithViews, WithWeights, WithPolicies):
     """Options of `mevs run`."""
 
 

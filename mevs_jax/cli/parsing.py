@@ -107,6 +107,8 @@ def keep_settings(call: Invocation) -> None:
         save_run(call.out, call.preset, call.settings, call.arguments)
     else:
         settings = replace(run.settings, **{group: getattr(call.settings, group) for group in call.groups})
+        if hasattr(call.options, "policy"):
+            settings = replace(settings, policies=call.settings.policies)
         save_run(call.out, run.preset, settings, call.arguments)
 
 
@@ -126,12 +128,20 @@ def settings_of(options: Any, groups: list[str], base: Settings) -> Settings:
         dataset = replace(dataset, archive=options.archive)
     if getattr(options, "views", None) is not None:
         dataset = replace(dataset, capture=replace(dataset.capture, views=options.views))
-    settings = replace(settings, dataset=dataset)
+    settings = replace(settings, dataset=dataset, policies=_policies(options, base))
     seed = getattr(options, "seed", None)
     if seed is None:
         return settings
     seeded = [group for group in groups if group != "dataset"]
     return replace(settings, **{group: with_seed(getattr(settings, group), seed) for group in seeded})
+
+
+def _policies(options: Any, base: Settings) -> tuple[str, ...]:
+    """The policies of `--policy`: those that are given, or those of the run; `none` is for no policy."""
+    from train.own_code import absolute
+
+    given = getattr(options, "policy", ())
+    return tuple(absolute(one) for one in given if one != "none") if given else base.policies
 
 
 def with_seed(settings: Any, seed: int) -> Any:

@@ -8,10 +8,12 @@ from mevs_jax.cli.parsing import Invocation, keep_settings
 def run(call: Invocation) -> None:
     """All stages, one after the other."""
     from eval import stages
+    from eval.walks.own_policies import load_policies
     from train.tasks.classifier import starting_weights
 
     start = starting_weights(call.options.pretrained, call.settings.classifier.network)
-    stages.make_data(call.settings, call.out)
+    load_policies(call.settings.policies)  # so that an error in one is found before anything else is done
+    stages.policies_of(call.settings, stages.make_data(call.settings, call.out))
     stages.train(call.settings, call.out, start)
     evaluate(call)
     report(call)
@@ -69,9 +71,10 @@ def evaluate(call: Invocation) -> None:
     accuracy = metrics["single_view"]["accuracy"]
     print(f"Single views: {100 * accuracy:.1f} % of {metrics['objects']} test objects right")
     titles = {rung["policy"]: rung["title"] for rung in metrics["ladder"]}
+    own = [rung["policy"] for rung in metrics["ladder"] if "own" in rung]
     after_two = ", ".join(
         f"{titles[name]} {100 * metrics['policies'][name]['after_views'][1]:.1f} %"
-        for name in ("random", "predicted_entropy", "oracle_entropy", "information_gain")
+        for name in ("random", "predicted_entropy", "oracle_entropy", "information_gain", *own)
     )
     print(f"After two views: {after_two}")
     print(f"Metrics: {call.out / 'metrics.json'}")
