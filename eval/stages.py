@@ -1,7 +1,7 @@
 """The stages of a run: data → networks → tables and metrics → report. Each stage skips completed work.
 
-A run directory holds `data/`, `classifier/`, `entropy/`, `tables/`, `metrics.json` and `report/index.html`. It also holds
-`classifier_by_view/` if the validation of the published code is compared.
+A run directory holds `data/`, `classifier/`, `entropy/`, `tables/`, `metrics.json`, `metrics.csv` and `report/index.html`. It
+also holds `classifier_by_view/` if the validation of the published code is compared.
 """
 
 from __future__ import annotations
@@ -22,6 +22,7 @@ from data_pipeline.files import check_of_file, keep_json, read_json, write_json
 from data_pipeline.progress import console
 from eval.learned.measure import measure, together, train_all
 from eval.learned.page import write_learned_page
+from eval.numbers.policies import csv_of
 from eval.numbers.study import reachable_views, run_study
 from eval.rendering.policies import ascend_objects, ascent_study, load_ascent_scores
 from eval.report.html import ReportInputs
@@ -39,7 +40,7 @@ from mevs_jax.viewpoints import ViewGraph
 from train.chance import warn_of_chance
 from train.choosing.stages import Stages, check_learned
 from train.finite import check_results, place_not_finite
-from train.kept import kept, kept_json, made_by, summary_of
+from train.kept import keep_beside, kept, kept_json, made_by, summary_of
 from train.loop import fit, load_best
 from train.starting_weights import StartingWeights
 from train.step import Task
@@ -155,7 +156,7 @@ def policies_of(settings: Settings, statistics: DatasetStatistics) -> tuple[OwnP
 
 
 def evaluate(settings: Settings, out: Path) -> dict[str, Any]:
-    """Returns the metrics of the test split, as written to `metrics.json`."""
+    """Returns the metrics of the test split, as written to `metrics.json`; `metrics.csv` has those by number of views."""
     statistics = load_statistics(out / "data")
     own = policies_of(settings, statistics)
     by_view_made = None
@@ -196,7 +197,9 @@ def evaluate(settings: Settings, out: Path) -> dict[str, Any]:
         _check_metrics(metrics, tables, out)
         return metrics
 
-    return kept_json(out / "metrics.json", identity, compute)
+    metrics = kept_json(out / "metrics.json", identity, compute)
+    keep_beside(out / "metrics.csv", csv_of(metrics))
+    return metrics
 
 
 def _check_metrics(metrics: dict[str, Any], tables: ViewTables, out: Path) -> None:

@@ -16,7 +16,18 @@ import numpy as np
 
 from data_pipeline.dataset.statistics import DatasetStatistics
 from data_pipeline.errors import DataError, Unreadable, reason_of
-from data_pipeline.files import as_read, checks_in, keep_json, read_json, was_written, write_npz
+from data_pipeline.files import (
+    as_read,
+    check_of,
+    checks_in,
+    damage_in,
+    keep_checks,
+    keep_json,
+    read_json,
+    was_written,
+    write_bytes,
+    write_npz,
+)
 from data_pipeline.progress import console
 from train.checkpoints import Checkpoints, damage_of, drop_damaged
 from train.devices import is_first
@@ -73,6 +84,23 @@ def kept_json(path: Path, identity: Any, compute: Callable[[], dict[str, Any]]) 
         return compute() | {"identity": identity}
 
     return kept(path, read_json, keep_json, lambda stored: stored["identity"] == identity, content)
+
+
+def keep_beside(path: Path, content: bytes) -> None:
+    """Writes a file whose content follows from another file, unless it holds this content already.
+
+    Raises:
+        Unreadable: if `path` is a folder.
+    """
+    if path.is_dir():
+        raise Unreadable(path, "it is a folder", "remove it, and the same command goes on")
+    if path.exists():
+        if damage_in(path.parent, [path.name]) is not None:
+            console.print(f"{path} is not as it was written, so it is made again", markup=False)
+        elif path.read_bytes() == content:
+            return
+    keep_checks(path.parent, {path.name: check_of(content)})
+    write_bytes(path, content)
 
 
 def kept_array(path: Path, made: str, compute: Callable[[], np.ndarray]) -> np.ndarray:

@@ -156,9 +156,10 @@ def reachable_views(viewpoints: np.ndarray, lowest_elevation: float) -> np.ndarr
     return reachable
 
 
-def _walk(
+def walk_tables(
     tables: ViewTables, rungs: tuple[Rung, ...], graph: ViewGraph, knowledge: Knowledge, config: GridConfig, **rest: Any
 ) -> dict[str, Results]:
+    """Results of some policies on all objects of a split, by name; `rest` are further arguments of `run_grid`."""
     one_backbone = tables.stacked()
     stacked = replace(one_backbone, logits=one_backbone.logits[:, None])
     knowledge = jax.tree.map(lambda leaf: leaf[None], knowledge)
@@ -216,14 +217,14 @@ def run_study(
     further = own_rungs(own, graph, len(statistics.classes), config.draws)
     rungs = ladder(config.draws, further)
     console.print(f"Walking {len(tables.labels)} test objects from {can_reach.sum()} views by {len(rungs)} policies")
-    results = _walk(tables, (*rungs, SCRAMBLED), graph, knowledge, config, reachable=reachable)
+    results = walk_tables(tables, (*rungs, SCRAMBLED), graph, knowledge, config, reachable=reachable)
     results[BASELINE], exact = exactly_random(results[BASELINE], jnp.asarray(tables.logits)[:, None], labels, can_reach)
     shown = {rung.policy: results[rung.policy] for rung in rungs}
 
     check_own(own, further, results, tables, graph, knowledge, reachable, config)
 
     fitting = tuple(replace(rung, draws=1) for rung in rungs if rung.policy in CONFIDENCE_OF)
-    validation_walks = _walk(validation, fitting, graph, knowledge, config, reachable=reachable)
+    validation_walks = walk_tables(validation, fitting, graph, knowledge, config, reachable=reachable)
 
     def starts_of(result: Results) -> np.ndarray:
         """The stored walks from reachable views, (objects, starts, steps)."""
@@ -246,7 +247,7 @@ def run_study(
     }
     moving = tuple(rung for rung in rungs if rung.policy in MOVING)
     for cost in MOVEMENT_COSTS:
-        with_cost = _walk(
+        with_cost = walk_tables(
             tables, moving, graph, knowledge, config, reachable=reachable, movement_cost=jnp.float32(cost)
         )
         for name, result in with_cost.items():
@@ -256,7 +257,7 @@ def run_study(
     if by_view is not None:
         wanted = ("random", "random_with_repetition", "predicted_entropy")
         switched = (*(rung for rung in rungs if rung.policy in wanted), SCRAMBLED)
-        other = _walk(by_view, switched, graph, knowledge, config, reachable=reachable)
+        other = walk_tables(by_view, switched, graph, knowledge, config, reachable=reachable)
         other[BASELINE], _ = exactly_random(other[BASELINE], jnp.asarray(by_view.logits)[:, None], labels, can_reach)
 
     sources = {policy.entry.name: {"own": policy.code.identity if policy.code else {}} for policy in own}

@@ -58,8 +58,11 @@ def test_a_policy_enters_the_evaluation_and_the_report(whole, tmp_path, file, at
     assert f"<code>mine.py:opposite</code> (source {identity['source']})" in html
     # The run keeps it, in every working directory; an edited file is evaluated again.
     monkeypatch.chdir("/")
-    kept = (out / "metrics.json").stat().st_mtime_ns
+    kept, table = (out / "metrics.json").stat().st_mtime_ns, (out / "metrics.csv").read_text()
+    assert "\nmy_opposite,my <opposite> view,nothing,2," in table
+    (out / "metrics.csv").write_text(table[:-5])
     ended(at_once("eval", "--out", out))
+    assert (out / "metrics.csv").read_text() == table
     assert (out / "metrics.json").stat().st_mtime_ns == kept
     file.write_text(POLICY.replace("return -scene", "return scene"))
     ended(at_once("eval", "--out", out))
