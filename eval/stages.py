@@ -28,6 +28,7 @@ from eval.rendering.policies import ascend_objects, ascent_study, load_ascent_sc
 from eval.report.html import ReportInputs
 from eval.report.page import is_current, read_history, write_report
 from eval.report.sweep import write_sweep_report
+from eval.run_file import plain
 from eval.settings import Settings
 from eval.tables import ViewTables, compute_view_tables, load_view_tables, save_view_tables
 from eval.walks.grid import FIRST_MV, GridConfig
@@ -288,7 +289,7 @@ def report(settings: Settings, preset: str, out: Path) -> Path:
     made_of = (metrics, active, data / SUMMARY, tables, *of_networks)
 
     def described() -> list[Any]:
-        return [preset, asdict(settings), *(path.is_file() and check_of_file(path) for path in made_of)]
+        return [preset, plain(settings), *(path.is_file() and check_of_file(path) for path in made_of)]
 
     if is_current(page, described()):
         return page
@@ -301,7 +302,7 @@ def report(settings: Settings, preset: str, out: Path) -> Path:
         histories={name: read_history(folder) for name, folder in networks.items()},
         summaries={name: summary_of(folder) for name, folder in networks.items()},
         preset=preset,
-        settings=asdict(settings),
+        settings=plain(settings),
         learned=_metrics(active, f"mevs study learned --out {out}") if active.exists() else None,
     )
     write_report(inputs, page, described())  # the tables may have been made again

@@ -15,6 +15,7 @@ import flax.nnx as nnx
 import numpy as np
 
 from data_pipeline.dataset.statistics import DatasetStatistics
+from data_pipeline.differences import differences, in_words
 from data_pipeline.errors import DataError, Unreadable, reason_of
 from data_pipeline.files import (
     as_read,
@@ -171,8 +172,9 @@ def check_config(folder: Path, identity: dict[str, Any], holds: str) -> None:
     path = folder / "config.json"
     other = DataError(f"{folder} holds {holds} with other settings; choose another --out, or delete that folder")
     try:
-        if read_json(path) != identity:
-            raise other
+        was = read_json(path)
+        if was != identity:
+            raise _other(folder, holds, was, identity)
         return
     except FileNotFoundError:
         if not any((folder / name).exists() for name in ("latest", "best", "summary.json")):
@@ -185,6 +187,20 @@ def check_config(folder: Path, identity: dict[str, Any], holds: str) -> None:
     if is_first():
         console.print(f"{path} cannot be read ({problem.reason}), so it is written again", markup=False)
         keep_json(path, identity)
+
+
+def _other(folder: Path, holds: str, was: Any, identity: dict[str, Any]) -> DataError:
+    """The refusal of a folder that holds something else, which names what differs."""
+    found = differences(was, identity)
+    if list(found) == ["task.network_config.source"]:
+        config = identity["task"]["network_config"]
+        return DataError(
+            f"{folder} holds {holds} with {config['module']}:{config['name']} as it was before it was edited; restore that file, "
+            f"choose another --out, or delete that folder"
+        )
+    return DataError(
+        f"{folder} holds {holds} with other settings ({in_words(found)}); choose another --out, or delete that folder"
+    )
 
 
 _IN_A_SUMMARY = {"epoch", "best_loss", "best_epoch", "best", "seconds", "steps", "start"}

@@ -127,8 +127,8 @@ class PolicyStudy:
         Args:
             by: `views` for a row for each policy and number of views, without stopping, as in `metrics.csv`: policy, title,
                 knows, views, accuracy, accuracy_low, accuracy_high, difference, low, high, travelled (radians). `threshold` for a
-                row for each policy, limit on views and confidence threshold: policy, title, knows, max_views, threshold, accuracy,
-                views_used, difference, low, high.
+                row for each policy, limit on views and confidence threshold: policy, title, knows, max_views, threshold,
+                accuracy, views_used, difference, low, high.
         """
         rows = self.rows(by)
         try:

@@ -122,9 +122,18 @@ def _entropy_section(inputs: ReportInputs) -> str:
 
 
 def _training_section(inputs: ReportInputs) -> str:
+    def called(name: str, summary: dict[str, Any]) -> str:
+        encoder = summary.get("encoder")
+        if encoder is None:
+            return html.escape(name)
+        return (
+            f"{html.escape(name)}: <code>{html.escape(encoder['module'])}:{html.escape(encoder['name'])}</code> "
+            f"(source {html.escape(encoder['source'])})"
+        )
+
     rows = [
         [
-            html.escape(name),
+            called(name, s),
             str(s["best_epoch"]),
             str(s["epoch"]),
             f"{s['best_loss']:.4f}",

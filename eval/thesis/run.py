@@ -227,6 +227,8 @@ def reproduce(settings: Settings, preset: str, out: Path, pretrained: tuple[Path
     """
     if settings.evaluation.lowest_elevation > -90:
         raise DataError("mevs study thesis walks from every view; leave out --evaluation.lowest-elevation")
+    if settings.classifier.encoder:
+        raise DataError("mevs study thesis trains the thesis's own classifiers; leave out --classifier.encoder")
     check_evaluation(settings.evaluation)
     thesis = settings.thesis
     if thesis.ascent_runs < 1 or thesis.ascent_starts < 2 or thesis.ascent_resolution < 8:

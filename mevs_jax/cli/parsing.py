@@ -93,9 +93,23 @@ def parse(name: str, arguments: list[str]) -> Invocation:
     kind = _options_with_settings(command, {group: getattr(base, group) for group in groups})
     arguments = ["--help" if argument == "--help-all" else argument for argument in arguments]
     options: Any = tyro.cli(kind, prog=f"mevs {name}", description=f"{command.title}.", args=arguments)
-    return Invocation(
-        options, settings_of(options, groups, base), preset, folder, tuple(groups), [*name.split(), *arguments]
-    )
+    settings = settings_of(options, groups, base)
+    if settings.classifier.encoder:
+        _check_no_resnet(arguments, settings.classifier.encoder)
+    return Invocation(options, settings, preset, folder, tuple(groups), [*name.split(), *arguments])
+
+
+def _check_no_resnet(arguments: list[str], encoder: str) -> None:
+    """Raises `DataError` for settings of a ResNet beside an encoder of the user's, which has none of them but channels."""
+    from data_pipeline.errors import DataError
+
+    prefix = "--classifier.network."
+    for argument in arguments:
+        name = argument.split("=")[0].replace("_", "-")
+        if name.startswith(prefix) and name != f"{prefix}channels":
+            raise DataError(
+                f"{name} is a setting of the ResNet, and the classifier is {encoder}; leave one of them out"
+            )
 
 
 def keep_settings(call: Invocation) -> None:
@@ -120,6 +134,8 @@ def _options_with_settings(command: Command, groups: dict[str, Any]) -> type:
 
 def settings_of(options: Any, groups: list[str], base: Settings) -> Settings:
     """All settings: these groups as given, the others as they were; short options override."""
+    from train.own_code import absolute
+
     settings = replace(base, **{group: getattr(options, group) for group in groups})
     dataset = settings.dataset
     if getattr(options, "data", None) is not None:
@@ -129,6 +145,8 @@ def settings_of(options: Any, groups: list[str], base: Settings) -> Settings:
     if getattr(options, "views", None) is not None:
         dataset = replace(dataset, capture=replace(dataset.capture, views=options.views))
     settings = replace(settings, dataset=dataset, policies=_policies(options, base))
+    encoder = absolute(getattr(options, "encoder", None) or settings.classifier.encoder)
+    settings = replace(settings, classifier=replace(settings.classifier, encoder=encoder))
     seed = getattr(options, "seed", None)
     if seed is None:
         return settings

@@ -9,10 +9,14 @@ def run(call: Invocation) -> None:
     """All stages, one after the other."""
     from eval import stages
     from eval.walks.own_policies import load_policies
+    from train.own_code import load_own
     from train.tasks.classifier import starting_weights
 
-    start = starting_weights(call.options.pretrained, call.settings.classifier.network)
-    load_policies(call.settings.policies)  # so that an error in one is found before anything else is done
+    classifier = call.settings.classifier
+    start = starting_weights(call.options.pretrained, classifier.network, classifier.encoder)
+    load_policies(call.settings.policies)  # so that an error in what users bring is found before anything else is done
+    if classifier.encoder:
+        load_own(classifier.encoder, "--encoder")
     stages.policies_of(call.settings, stages.make_data(call.settings, call.out))
     stages.train(call.settings, call.out, start)
     evaluate(call)
@@ -38,6 +42,7 @@ def train(call: Invocation) -> None:
     from train.devices import device_mesh, is_first, join_processes
     from train.tasks.classifier import starting_weights
 
+    classifier = call.settings.classifier
     with ExitStack() as held:
         if call.options.distributed:
             join_processes()  # before anything is computed
@@ -46,7 +51,7 @@ def train(call: Invocation) -> None:
                 stages.check_output(call.out)
                 held.enter_context(locked(call.out, " ".join(["mevs", *call.arguments])))
                 keep_settings(call)
-        start = starting_weights(call.options.pretrained, call.settings.classifier.network)
+        start = starting_weights(call.options.pretrained, classifier.network, classifier.encoder)
         stages.train(call.settings, call.out, start, device_mesh(call.options.model_devices))
 
 

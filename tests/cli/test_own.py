@@ -1,4 +1,4 @@
-"""What users bring of their own, by command: policies."""
+"""What users bring of their own, by command: policies and encoders."""
 
 from __future__ import annotations
 
@@ -96,3 +96,71 @@ def test_a_policy_is_walked_live(whole, tmp_path, file):
     found = json.loads((out / "live.json").read_text())
     assert set(found) == {"random", "drawn"}
     assert all(agreement["walks"] == agreement["same"] for agreement in found.values())
+
+
+ENCODER = """
+import jax.numpy as jnp
+from flax import nnx
+
+class Net(nnx.Module):
+    def __init__(self, classes, channels, rngs):
+        self.head = nnx.Linear(64 * channels, classes, rngs=rngs)
+
+    def __call__(self, images, train=False):
+        return self.head(images[:, ::4, ::4].reshape(len(images), -1))
+
+def net(classes, channels, resolution, rngs):
+    return Net(classes, channels, rngs)
+"""
+
+
+def test_an_encoder_is_the_classifier_of_a_run(data, whole, tmp_path, at_once, refuses, monkeypatch):
+    """Every file of the run names it, and none a ResNet."""
+    monkeypatch.chdir(tmp_path)
+    path, out = tmp_path / "nets.py", tmp_path / "run"
+    path.write_text(ENCODER)
+    out.mkdir()
+    shutil.copytree(data, out / "data")
+    shutil.copytree(whole / "entropy", out / "entropy")
+    brief = ("--classifier.optimiser.epochs", "1")
+    train = ("train", "--out", out, "--preset", "tiny")
+    assert "--classifier.network.depth is a setting of the ResNet" in refuses(
+        *train, "--encoder", "nets.py:net", "--classifier.network.depth", "18"
+    )
+    (tmp_path / "resnet.pth").write_bytes(b"")
+    assert "--pretrained weights are those of a ResNet" in refuses(
+        *train, "--encoder", "nets.py:net", "--pretrained", "resnet.pth"
+    )
+    assert "returns float32[2, 3] for 2 images" in refuses(*train, "--encoder", three_classes(tmp_path))
+    assert not (out / "classifier").exists()
+    ended(at_once(*train, *brief, "--encoder", "nets.py:net"))
+    run, config, summary = (
+        json.loads((out / name).read_text())
+        for name in ("run.json", "classifier/config.json", "classifier/summary.json")
+    )
+    assert run["encoder"] == config["task"]["network_config"] == summary["encoder"]
+    assert (summary["encoder"]["module"], summary["encoder"]["name"]) == ("nets.py", "net")
+    assert run["settings"]["classifier"]["network"] == {"channels": 1}
+    assert run["settings"]["classifier"]["encoder"] == f"{path}:net"
+    monkeypatch.chdir("/")
+    ended(at_once("eval", "--out", out))
+    ended(at_once("report", "--out", out))
+    page = (out / "report" / "index.html").read_text()
+    assert f"classifier: <code>nets.py:net</code> (source {summary['encoder']['source']})" in page
+    assert "ResNet" not in page
+    # Edited, it is another network: the run goes on with the numbers of the one that was trained, and trains no other.
+    path.write_text(ENCODER.replace("::4, ::4", "1::4, ::4"))
+    ended(at_once("eval", "--out", out))
+    assert json.loads((out / "run.json").read_text())["encoder"] == run["encoder"]
+    assert "nets.py:net as it was before it was edited; restore that file" in refuses("train", "--out", out)
+    shutil.rmtree(out / "tables")
+    (out / "metrics.json").unlink()
+    assert "other layers than the settings describe (source" in refuses("eval", "--out", out)
+    path.unlink()
+    assert "nets.py cannot be read" in refuses("eval", "--out", out)
+
+
+def three_classes(folder):
+    path = folder / "three.py"
+    path.write_text(ENCODER.replace("Net(classes", "Net(3"))
+    return f"{path}:net"
