@@ -37,7 +37,6 @@ from eval.walks.ladder import ASCENT_RUNGS
 from eval.walks.live import Agreement, Networks, compare_with_tables
 from eval.walks.own_policies import OwnPolicy, load_policies, own_rungs
 from mevs_jax.policies.registry import policy_named
-from mevs_jax.viewpoints import ViewGraph
 from train.chance import warn_of_chance
 from train.choosing.stages import Stages, check_learned
 from train.finite import check_results, place_not_finite
@@ -152,7 +151,7 @@ def policies_of(settings: Settings, statistics: DatasetStatistics) -> tuple[OwnP
         DataError: if one cannot be used.
     """
     own = load_policies(settings.policies)
-    own_rungs(own, ViewGraph.from_points(np.array(statistics.viewpoints)), len(statistics.classes), 1)
+    own_rungs(own, statistics.graph, len(statistics.classes), 1)
     return own
 
 
@@ -257,7 +256,7 @@ def check_live(settings: Settings, out: Path) -> dict[str, Agreement]:
     statistics = load_statistics(out / "data")
     own = own_rungs(
         load_policies(settings.policies),
-        ViewGraph.from_points(np.array(statistics.viewpoints)),
+        statistics.graph,
         len(statistics.classes),
         1,
     )
@@ -270,7 +269,7 @@ def check_live(settings: Settings, out: Path) -> dict[str, Agreement]:
         networks,
         _tables(settings, out, statistics, "test"),
         learn(jnp.asarray(validation.logits), jnp.asarray(validation.labels)),
-        ViewGraph.from_points(np.array(statistics.viewpoints)),
+        statistics.graph,
         config=settings.live,
         own=own,
     )

@@ -11,17 +11,16 @@ from pathlib import Path
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 
 from data_pipeline.dataset.statistics import load_statistics
 from eval.tables import load_view_tables
 from eval.walks.knowledge import learn
-from mevs_jax import POLICIES, ViewGraph, select_from_table
+from mevs_jax import POLICIES, select_from_table
 
 
 def main(run: Path, position: int = 0, start: int = 0) -> None:
     statistics = load_statistics(run / "data")
-    graph = ViewGraph.from_points(np.array(statistics.viewpoints))
+    graph = statistics.graph
     test, validation = (load_view_tables(run / "tables" / f"{split}.npz") for split in ("test", "val"))
     knowledge = learn(jnp.asarray(validation.logits), jnp.asarray(validation.labels))
     table = jax.tree.map(lambda leaf: leaf[position], test.stacked())

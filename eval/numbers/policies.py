@@ -74,7 +74,7 @@ class EvaluationInputs:
                     f"{path} was made with other networks than {run} has; make it again: mevs eval --out {run}"
                 )
             found.append(tables)
-        graph = ViewGraph.from_points(np.array(statistics.viewpoints))
+        graph = statistics.graph
         return cls(found[0], found[1], graph, GridConfig() if kept is None else kept.settings.evaluation)
 
 

@@ -209,7 +209,7 @@ def run_study(
     viewpoints = np.array(statistics.viewpoints)
     can_reach = reachable_views(viewpoints, config.lowest_elevation)
     config = replace(config, max_views=min(config.max_views, int(can_reach.sum())))
-    graph = ViewGraph.from_points(viewpoints)
+    graph = statistics.graph
     reachable = None if can_reach.all() else jnp.asarray(can_reach)
     knowledge = learn(jnp.asarray(validation.logits), jnp.asarray(validation.labels))
     labels = jnp.asarray(tables.labels)

@@ -16,7 +16,6 @@ from eval.report.html import ReportInputs, difference, image, percent, rows_by_k
 from mevs_jax.policies.base import Scene
 from mevs_jax.policies.registry import POLICIES
 from mevs_jax.selection import Episode, ViewTable, select_from_table
-from mevs_jax.viewpoints import ViewGraph
 
 
 def _verdict(difference: float, interval: Sequence[float]) -> str:
@@ -384,7 +383,7 @@ def grid_section(inputs: ReportInputs) -> str:
 def _example_walk(inputs: ReportInputs) -> str:
     """A walk of the predicted-entropy policy that starts with a wrong prediction and ends with the right one, if there is one."""
     tables, statistics = inputs.tables, inputs.statistics
-    graph = ViewGraph.from_points(np.array(statistics.viewpoints))
+    graph = statistics.graph
     stacked = tables.stacked()
 
     @jax.jit

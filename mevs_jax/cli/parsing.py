@@ -13,6 +13,7 @@ from mevs_jax.cli import options as option_classes
 from mevs_jax.cli.commands import COMMANDS, Command
 
 if TYPE_CHECKING:
+    from data_pipeline.capture.casting import CaptureConfig
     from eval.settings import Settings
 
 
@@ -94,6 +95,12 @@ def parse(name: str, arguments: list[str]) -> Invocation:
     arguments = ["--help" if argument == "--help-all" else argument for argument in arguments]
     options: Any = tyro.cli(kind, prog=f"mevs {name}", description=f"{command.title}.", args=arguments)
     settings = settings_of(options, groups, base)
+    views = _given(arguments, "--dataset.capture.views")
+    if views is not None and views != str(settings.dataset.capture.views):
+        raise DataError(
+            f"{settings.dataset.capture.lattice} has {settings.dataset.capture.views} viewpoints, and --dataset.capture.views is "
+            f"{views}; leave one of them out"
+        )
     if settings.classifier.encoder:
         _check_no_resnet(arguments, settings.classifier.encoder)
     return Invocation(options, settings, preset, folder, tuple(groups), [*name.split(), *arguments])
@@ -134,6 +141,7 @@ def _options_with_settings(command: Command, groups: dict[str, Any]) -> type:
 
 def settings_of(options: Any, groups: list[str], base: Settings) -> Settings:
     """All settings: these groups as given, the others as they were; short options override."""
+    from data_pipeline.capture.viewpoints import is_file
     from train.own_code import absolute
 
     settings = replace(base, **{group: getattr(options, group) for group in groups})
@@ -144,6 +152,9 @@ def settings_of(options: Any, groups: list[str], base: Settings) -> Settings:
         dataset = replace(dataset, archive=options.archive)
     if getattr(options, "views", None) is not None:
         dataset = replace(dataset, capture=replace(dataset.capture, views=options.views))
+    capture = dataset.capture
+    if is_file(capture.lattice) and capture.lattice != base.dataset.capture.lattice:
+        dataset = replace(dataset, capture=_with_own_viewpoints(capture, options, base))
     settings = replace(settings, dataset=dataset, policies=_policies(options, base))
     encoder = absolute(getattr(options, "encoder", None) or settings.classifier.encoder)
     settings = replace(settings, classifier=replace(settings.classifier, encoder=encoder))
@@ -152,6 +163,22 @@ def settings_of(options: Any, groups: list[str], base: Settings) -> Settings:
         return settings
     seeded = [group for group in groups if group != "dataset"]
     return replace(settings, **{group: with_seed(getattr(settings, group), seed) for group in seeded})
+
+
+def _with_own_viewpoints(capture: CaptureConfig, options: Any, base: Settings) -> CaptureConfig:
+    """The capture with as many views as the file of its viewpoints has.
+
+    Raises:
+        DataError: if the file cannot be used, or `--views` is another number.
+    """
+    from data_pipeline.capture.viewpoints import FILE, absolute_lattice, read_viewpoints, viewpoints_of
+
+    capture = replace(capture, lattice=absolute_lattice(capture.lattice))
+    if getattr(options, "views", None) is None and capture.views == base.dataset.capture.views:
+        views = len(read_viewpoints(Path(capture.lattice.removeprefix(FILE))).points)
+        return replace(capture, views=views)
+    viewpoints_of(capture)
+    return capture
 
 
 def _policies(options: Any, base: Settings) -> tuple[str, ...]:

@@ -1,4 +1,4 @@
-"""What users bring of their own, by command: policies and encoders."""
+"""What users bring of their own, by command: policies, encoders, viewpoints."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import shutil
 
 import pytest
 
-from mevs_jax import POLICIES
+from mevs_jax import POLICIES, ViewGraph, fibonacci_sphere
 from tests.cli.conftest import mevs
 
 POLICY = """
@@ -164,3 +164,37 @@ def three_classes(folder):
     path = folder / "three.py"
     path.write_text(ENCODER.replace("Net(classes", "Net(3"))
     return f"{path}:net"
+
+
+def test_viewpoints_of_a_file_are_those_of_the_whole_run(whole, tmp_path, at_once, refuses, monkeypatch):
+    """Every graph that the evaluation and the report use has the neighbours of the file."""
+    monkeypatch.chdir(tmp_path)
+    out, points = tmp_path / "run", fibonacci_sphere(6).tolist()
+    ring = [[i, (i + 1) % 6] for i in range(6)]
+    (tmp_path / "six.json").write_text(json.dumps({"viewpoints": points, "adjacency": ring}))
+    few = ("--dataset.train-per-class", "2", "--dataset.test-per-class", "1", "--dataset.capture.backend", "rasterise")
+    make = ("data", "--out", out, "--preset", "tiny", *few, "--dataset.capture.lattice", "file:six.json")
+    for option in ("--views", "--dataset.capture.views"):
+        assert "six.json has 6 viewpoints, and --" in refuses(*make, option, "7")
+    assert "four.json cannot be read" in refuses(*make[:-1], "file:four.json")
+    ended(at_once(*make))
+    run = json.loads((out / "run.json").read_text())["settings"]["dataset"]["capture"]
+    assert (run["views"], run["lattice"]) == (6, f"file:{tmp_path / 'six.json'}")
+    for name in ("classifier", "entropy"):
+        shutil.copytree(whole / name, out / name)
+    graphs = []
+    from_points = ViewGraph.from_points.__func__
+
+    def recorded(cls, points, neighbours=None):
+        graphs.append(neighbours)
+        return from_points(cls, points, neighbours)
+
+    monkeypatch.setattr(ViewGraph, "from_points", classmethod(recorded))
+    monkeypatch.chdir("/")
+    (tmp_path / "six.json").unlink()  # a data set that is made does not need it
+    ended(at_once("eval", "--out", out))
+    ended(at_once("report", "--out", out))
+    assert len(graphs) >= 4
+    assert all(neighbours == sorted([min(pair), max(pair)] for pair in ring) for neighbours in graphs)
+    page = (out / "report" / "index.html").read_text()
+    assert "directions from a file, 6 pairs of neighbours, content " in page
