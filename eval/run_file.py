@@ -87,9 +87,13 @@ def _encoder(out: Path, reference: str) -> dict[str, Any]:
     return load_own(reference, "--encoder").identity
 
 
-def _made_with() -> dict[str, str]:
+def _made_with() -> dict[str, Any]:
+    import jax  # late, since parsing options does not need it
+
     packages = ("mevs-jax", "jax", "flax", "optax", "numpy")
-    return {"python": platform.python_version(), **{name: version(name) for name in packages}}
+    device = jax.devices()[0]
+    devices = {"platform": device.platform, "kind": device.device_kind, "count": jax.device_count()}
+    return {"python": platform.python_version(), **{name: version(name) for name in packages}, "devices": devices}
 
 
 def from_plain(kind: Any, content: Any, where: str) -> Any:

@@ -15,11 +15,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from data_pipeline.dataset.builder import prepare
+from data_pipeline.dataset.builder import check_same_data, prepare
 from data_pipeline.dataset.statistics import SUMMARY, DatasetStatistics, load_statistics, report_left_out
 from data_pipeline.errors import DataError, Diverged, Unreadable
 from data_pipeline.files import check_of_file, keep_json, read_json, write_json
 from data_pipeline.progress import console
+from eval.consistency import check_classifier, check_evaluated_with, check_made_with
 from eval.learned.measure import measure, together, train_all
 from eval.learned.page import write_learned_page
 from eval.numbers.policies import csv_of
@@ -112,6 +113,7 @@ BY_VIEW = "classifier_by_view"
 def train_by_view(settings: Settings, out: Path, start: StartingWeights | None = None) -> None:
     """Trains the classifier again for the compatibility table, validated by view as in the thesis's published code."""
     statistics = load_statistics(out / "data")
+    check_classifier(settings, out)
     classify, _ = tasks(settings, statistics)
     by_view = replace(classify, optimiser=replace(classify.optimiser, validation_by="view"))
     option = "--classifier.optimiser.learning-rate"
@@ -158,6 +160,7 @@ def policies_of(settings: Settings, statistics: DatasetStatistics) -> tuple[OwnP
 def evaluate(settings: Settings, out: Path) -> dict[str, Any]:
     """Returns the metrics of the test split, as written to `metrics.json`; `metrics.csv` has those by number of views."""
     statistics = load_statistics(out / "data")
+    check_made_with(settings, out)
     own = policies_of(settings, statistics)
     by_view_made = None
     if (out / BY_VIEW / "summary.json").exists():
@@ -221,6 +224,7 @@ def learn_to_choose(settings: Settings, out: Path) -> Path:
     """Trains and evaluates learned fusion and learned view selection; returns the path of the page."""
     config, found = settings.learned, []
     check_learned(config, settings.dataset.capture.views)
+    check_same_data(settings.dataset, out / "data")
     seeds = [
         Stages(config, settings.dataset, out, seed, settings.entropy)
         for seed in range(config.seed, config.seed + config.seeds)
@@ -239,6 +243,7 @@ def learn_to_choose(settings: Settings, out: Path) -> Path:
 def ascend_on_objects(settings: Settings, out: Path) -> None:
     """Computes the choices of differentiable rendering for many test objects; `evaluate` then compares them."""
     statistics = load_statistics(out / "data")
+    check_same_data(settings.dataset, out / "data")
     ascend_objects(settings.dataset, statistics, out, settings.rendering)
 
 
@@ -254,6 +259,7 @@ def check_live(settings: Settings, out: Path) -> dict[str, Agreement]:
                 f"{policy} needs the tables of mevs study rendering, which live walks do not have; leave it out"
             )
     statistics = load_statistics(out / "data")
+    check_made_with(settings, out)
     own = own_rungs(
         load_policies(settings.policies),
         statistics.graph,
@@ -282,6 +288,9 @@ def report(settings: Settings, preset: str, out: Path) -> Path:
     page, metrics, active = out / "report" / "index.html", out / "metrics.json", out / "learned" / "metrics.json"
     if not metrics.exists():
         raise DataError(f"no metrics in {out}; make them with: mevs eval --out {out}")
+    check_made_with(settings, out)
+    found = _metrics(metrics, f"mevs eval --out {out}")
+    check_evaluated_with(settings, found, out)
     networks = {"classifier": out / "classifier", "entropy predictor": out / "entropy"}
     of_networks = [folder / name for folder in networks.values() for name in ("summary.json", "metrics.jsonl")]
     data, tables = out / "data", out / "tables" / "test.npz"
@@ -295,7 +304,7 @@ def report(settings: Settings, preset: str, out: Path) -> Path:
     statistics = load_statistics(data)
     inputs = ReportInputs(
         statistics=statistics,
-        metrics=_metrics(metrics, f"mevs eval --out {out}"),
+        metrics=found,
         tables=_tables(settings, out, statistics, "test"),
         data=data,
         histories={name: read_history(folder) for name, folder in networks.items()},

@@ -45,6 +45,12 @@ def absolute(reference: str) -> str:
     return f"{Path(place).expanduser().absolute()}:{name}" if colon and place.endswith(".py") else reference
 
 
+def named(reference: str) -> tuple[str, str]:
+    """Returns the module, or the name of the file, and the function that a reference names, as in `OwnCode.identity`."""
+    place, _, name = reference.rpartition(":")
+    return (Path(place).name if place.endswith(".py") else place), name
+
+
 def load_own(reference: str, option: str) -> OwnCode:
     """Loads a function from `module:function` or `path/to/file.py:function`.
 
@@ -76,8 +82,7 @@ def load_own(reference: str, option: str) -> OwnCode:
     content = content or _source_of(module, reference, option)
     if (defined := _file_of(function)) not in (None, _file_of(module)):
         content += Path(str(defined)).read_bytes()
-    shown = Path(place).name if place.endswith(".py") else place
-    return OwnCode(reference, shown, name, hashlib.sha256(content).hexdigest()[:16], function)
+    return OwnCode(reference, *named(reference), hashlib.sha256(content).hexdigest()[:16], function)
 
 
 def _from_file(path: Path, reference: str, option: str) -> tuple[ModuleType, bytes]:

@@ -42,8 +42,9 @@ from data_pipeline.dataset.statistics import (
     StatisticsCollector,
     load_statistics,
 )
-from data_pipeline.errors import DataError, reason_of
-from data_pipeline.files import check_of_file, keep_checks, keep_json
+from data_pipeline.differences import differences, in_words
+from data_pipeline.errors import DataError, Unreadable, reason_of
+from data_pipeline.files import as_read, check_of_file, keep_checks, keep_json, read_json
 from data_pipeline.objects.changes import changes_between, source_state
 from data_pipeline.objects.downloads import ARCHIVES, download, download_folder, local
 from data_pipeline.objects.formats import Up
@@ -316,6 +317,27 @@ def _identity(config: DataConfig, folder: Path | None = None) -> dict[str, Any]:
         made = load_statistics(folder).capture
     identity, default = asdict(replace(config, capture=identified(config.capture, made))), asdict(DataConfig())
     return {key: value for key, value in identity.items() if key not in ("up", "split") or value != default[key]}
+
+
+def made_with_other_settings(config: DataConfig, folder: Path) -> dict[str, tuple[Any, Any]]:
+    """Returns the settings of the data set in `folder` that differ from `config`, by name: as it was made, and as in `config`.
+
+    There are none if there is no data set, or its settings cannot be read. Settings that only one of them has are left out.
+    """
+    try:
+        was = read_json(folder / "config.json")
+    except (FileNotFoundError, Unreadable):
+        return {}
+    return differences(was, as_read(_identity(config, folder)), "dataset", shared=True)
+
+
+def check_same_data(config: DataConfig, folder: Path) -> None:
+    """Raises `DataError` if the data set in `folder` was made with other settings; names what differs."""
+    if found := made_with_other_settings(config, folder):
+        raise DataError(
+            f"{folder} has a data set made with other settings ({in_words(found)}); leave these options out, or "
+            f"choose another --out"
+        )
 
 
 def _state(config: DataConfig) -> dict[str, str] | None:

@@ -18,6 +18,7 @@ class Command:
         function: `module:function` that runs it, given an `Invocation`.
         out: default of `--out`, where `{preset}` is the preset.
         writes_run: whether its settings become those of the run, in `run.json`.
+        tries: groups of settings that it only tries: where a network was trained, they do not become those of the run.
         locks: whether no other job may write into the run directory meanwhile.
     """
 
@@ -28,6 +29,7 @@ class Command:
     out: str = "runs/{preset}"
     writes_run: bool = True
     locks: bool = True
+    tries: tuple[str, ...] = ()
 
     def load(self) -> Callable:
         module, name = self.function.split(":")
@@ -58,6 +60,7 @@ COMMANDS = {
         "WithSeed",
         ("sweep", "classifier", "entropy"),
         "stages:sweep",
+        tries=("classifier", "entropy"),
     ),
     "eval": Command(
         "run every policy on every test object from every start view",
