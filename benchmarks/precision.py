@@ -30,7 +30,7 @@ from eval.report.markdown import markdown_table
 from eval.settings import PRESETS
 from eval.stages import tasks
 from eval.tables import objects_of
-from mevs_jax import ViewGraph, bootstrap_interval, maxima_first
+from mevs_jax import bootstrap_interval, maxima_first
 from mevs_jax.models.batch_norm import BatchNorm
 from train.loop import load_best
 from train.outputs import network_outputs
@@ -74,7 +74,7 @@ def main() -> None:
     run = Path(sys.argv[1])
     statistics = load_statistics(run / "data")
     classify, predict = tasks(PRESETS["small"], statistics)
-    graph = ViewGraph.from_points(np.array(statistics.viewpoints))
+    graph = statistics.graph
     _, labels, entropy = objects_of(run / "data", "test", statistics)
     variance = np.square(entropy - entropy.mean()).mean()
 

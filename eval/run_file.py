@@ -54,6 +54,8 @@ def load_run(out: Path) -> RunFile | None:
 def save_run(out: Path, preset: str, settings: Settings, arguments: list[str]) -> None:
     """Writes `run.json`; a file that holds the same settings already is left as it is."""
     content, path = as_read(configuration(preset, settings)), out / NAME
+    if settings.classifier.encoder:
+        content["encoder"] = _encoder(out, settings.classifier.encoder)
     if path.exists() and {name: value for name, value in read_json(path).items() if name in content} == content:
         return
     keep_json(path, content | {"arguments": arguments, "made_with": _made_with()})
@@ -61,12 +63,37 @@ def save_run(out: Path, preset: str, settings: Settings, arguments: list[str]) -
 
 def configuration(preset: str, settings: Settings) -> dict[str, Any]:
     """The resolved configuration, as `run.json` has it and `--print-config` prints it."""
-    return {"preset": preset, "settings": asdict(settings)}
+    return {"preset": preset, "settings": plain(settings)}
 
 
-def _made_with() -> dict[str, str]:
+def plain(settings: Settings) -> dict[str, Any]:
+    """All settings as nested dictionaries. With an encoder of the user's, those of the ResNet that it replaces are left out."""
+    content = asdict(settings)
+    if settings.classifier.encoder:
+        content["classifier"]["network"] = {"channels": settings.classifier.network.channels}
+    return content
+
+
+def _encoder(out: Path, reference: str) -> dict[str, Any]:
+    """What identifies the user's encoder: as the classifier was trained with it, or as it is now."""
+    try:
+        trained = read_json(out / "classifier" / "config.json")["task"]["network_config"]
+    except (OSError, Unreadable, KeyError, TypeError):
+        trained = {}
+    if {"module", "name", "source"} <= set(trained):
+        return trained
+    from train.own_code import load_own
+
+    return load_own(reference, "--encoder").identity
+
+
+def _made_with() -> dict[str, Any]:
+    import jax  # late, since parsing options does not need it
+
     packages = ("mevs-jax", "jax", "flax", "optax", "numpy")
-    return {"python": platform.python_version(), **{name: version(name) for name in packages}}
+    device = jax.devices()[0]
+    devices = {"platform": device.platform, "kind": device.device_kind, "count": jax.device_count()}
+    return {"python": platform.python_version(), **{name: version(name) for name in packages}, "devices": devices}
 
 
 def from_plain(kind: Any, content: Any, where: str) -> Any:

@@ -39,6 +39,8 @@ class Settings:
     ascent: AscentConfig = AscentConfig()
     rendering: RenderingConfig = RenderingConfig()
     learned: LearnedConfig = LearnedConfig()
+    policies: tuple[str, ...] = ()
+    """further policies to evaluate, as module:function or path/to/file.py:function (`--policy`)"""
 
 
 THESIS = Settings()

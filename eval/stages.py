@@ -1,7 +1,7 @@
 """The stages of a run: data → networks → tables and metrics → report. Each stage skips completed work.
 
-A run directory holds `data/`, `classifier/`, `entropy/`, `tables/`, `metrics.json` and `report/index.html`. It also holds
-`classifier_by_view/` if the validation of the published code is compared.
+A run directory holds `data/`, `classifier/`, `entropy/`, `tables/`, `metrics.json`, `metrics.csv` and `report/index.html`. It
+also holds `classifier_by_view/` if the validation of the published code is compared.
 """
 
 from __future__ import annotations
@@ -15,21 +15,24 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from data_pipeline.dataset.builder import open_objects, prepare
+from data_pipeline.dataset.builder import check_same_data, open_objects, prepare
 from data_pipeline.dataset.statistics import SUMMARY, DatasetStatistics, load_statistics, report_left_out
 from data_pipeline.errors import DataError, Diverged, Unreadable
 from data_pipeline.files import check_of_file, keep_json, read_json, write_json
 from data_pipeline.objects.sources import load_object
 from data_pipeline.progress import console
 from eval.agent import compare_walks, latency, recognised, stopping
+from eval.consistency import check_classifier, check_evaluated_with, check_made_with
 from eval.learned.measure import measure, together, train_all
 from eval.learned.page import write_learned_page
 from eval.learned.system import make_learned_system
+from eval.numbers.policies import csv_of
 from eval.numbers.study import reachable_views, run_study
 from eval.rendering.policies import ascend_objects, ascent_study, load_ascent_scores
 from eval.report.html import ReportInputs
 from eval.report.page import is_current, read_history, write_report
 from eval.report.sweep import write_sweep_report
+from eval.run_file import plain
 from eval.settings import Settings
 from eval.system import USABLE, classifier_system, figures_of, identity_of, save_system, stored_system
 from eval.tables import ViewTables, compute_view_tables, load_view_tables, save_view_tables
@@ -37,13 +40,13 @@ from eval.walks.grid import FIRST_MV, GridConfig
 from eval.walks.knowledge import learn
 from eval.walks.ladder import ASCENT_RUNGS
 from eval.walks.live import Agreement, Networks, compare_with_tables
+from eval.walks.own_policies import OwnPolicy, load_policies, own_rungs
 from mevs_jax.policies.registry import policy_named
 from mevs_jax.trained import load as load_system
-from mevs_jax.viewpoints import ViewGraph
 from train.chance import warn_of_chance
 from train.choosing.stages import Stages, check_learned
 from train.finite import check_results, place_not_finite
-from train.kept import kept, kept_json, made_by, summary_of
+from train.kept import keep_beside, kept, kept_json, made_by, summary_of
 from train.loop import fit, load_best
 from train.starting_weights import StartingWeights
 from train.step import Task
@@ -115,6 +118,7 @@ BY_VIEW = "classifier_by_view"
 def train_by_view(settings: Settings, out: Path, start: StartingWeights | None = None) -> None:
     """Trains the classifier again for the compatibility table, validated by view as in the thesis's published code."""
     statistics = load_statistics(out / "data")
+    check_classifier(settings, out)
     classify, _ = tasks(settings, statistics)
     by_view = replace(classify, optimiser=replace(classify.optimiser, validation_by="view"))
     option = "--classifier.optimiser.learning-rate"
@@ -147,18 +151,33 @@ def check_evaluation(config: GridConfig) -> None:
         raise DataError("--evaluation.max-views must be at least 2 and --evaluation.draws at least 1")
 
 
+def policies_of(settings: Settings, statistics: DatasetStatistics) -> tuple[OwnPolicy, ...]:
+    """Returns the policies of `--policy`, checked on this data set before anything is trained or evaluated.
+
+    Raises:
+        DataError: if one cannot be used.
+    """
+    own = load_policies(settings.policies)
+    own_rungs(own, statistics.graph, len(statistics.classes), 1)
+    return own
+
+
 def evaluate(settings: Settings, out: Path) -> dict[str, Any]:
-    """Returns the metrics of the test split, as written to `metrics.json`."""
+    """Returns the metrics of the test split, as written to `metrics.json`; `metrics.csv` has those by number of views."""
     statistics = load_statistics(out / "data")
+    check_made_with(settings, out)
+    own = policies_of(settings, statistics)
     by_view_made = None
     if (out / BY_VIEW / "summary.json").exists():
         by_view_made = made_by(statistics, out / BY_VIEW, out / "entropy")
-    identity = {
+    identity: dict[str, Any] = {
         "evaluation": asdict(settings.evaluation),
         "made_by": made_by(statistics, out / "classifier", out / "entropy"),
         "by_view": by_view_made,
         "climbed": None,
     }
+    if own:
+        identity["policies"] = [policy.identity for policy in own]
     climbed = load_ascent_scores(out, statistics, settings.rendering)
     if climbed is not None:
         identity["climbed"] = asdict(settings.rendering)
@@ -180,13 +199,15 @@ def evaluate(settings: Settings, out: Path) -> dict[str, Any]:
                 for name, made in (("classifier", tables), (BY_VIEW, by_view))
             }
         validation = _tables(settings, out, statistics, "val")
-        metrics = run_study(tables, validation, statistics, settings.evaluation, by_view, leak)
+        metrics = run_study(tables, validation, statistics, settings.evaluation, by_view, leak, own)
         if climbed is not None:
             metrics["climbing"] = ascent_study(tables, statistics, climbed, settings.evaluation)
         _check_metrics(metrics, tables, out)
         return metrics
 
-    return kept_json(out / "metrics.json", identity, compute)
+    metrics = kept_json(out / "metrics.json", identity, compute)
+    keep_beside(out / "metrics.csv", csv_of(metrics))
+    return metrics
 
 
 def _check_metrics(metrics: dict[str, Any], tables: ViewTables, out: Path) -> None:
@@ -241,6 +262,7 @@ def learn_to_choose(settings: Settings, out: Path) -> Path:
     """Trains and evaluates learned fusion and learned view selection; returns the path of the page."""
     config, found = settings.learned, []
     check_learned(config, settings.dataset.capture.views)
+    check_same_data(settings.dataset, out / "data")
     seeds = [
         Stages(config, settings.dataset, out, seed, settings.entropy)
         for seed in range(config.seed, config.seed + config.seeds)
@@ -260,6 +282,7 @@ def learn_to_choose(settings: Settings, out: Path) -> Path:
 def ascend_on_objects(settings: Settings, out: Path) -> None:
     """Computes the choices of differentiable rendering for many test objects; `evaluate` then compares them."""
     statistics = load_statistics(out / "data")
+    check_same_data(settings.dataset, out / "data")
     ascend_objects(settings.dataset, statistics, out, settings.rendering)
 
 
@@ -275,6 +298,13 @@ def check_live(settings: Settings, out: Path) -> dict[str, Agreement]:
                 f"{policy} needs the tables of mevs study rendering, which live walks do not have; leave it out"
             )
     statistics = load_statistics(out / "data")
+    check_made_with(settings, out)
+    own = own_rungs(
+        load_policies(settings.policies),
+        statistics.graph,
+        len(statistics.classes),
+        1,
+    )
     classify, predict = tasks(settings, statistics)
     networks = Networks(classify, load_best(classify, out / "classifier"), predict, load_best(predict, out / "entropy"))
     validation = _tables(settings, out, statistics, "val")
@@ -284,8 +314,9 @@ def check_live(settings: Settings, out: Path) -> dict[str, Agreement]:
         networks,
         _tables(settings, out, statistics, "test"),
         learn(jnp.asarray(validation.logits), jnp.asarray(validation.labels)),
-        ViewGraph.from_points(np.array(statistics.viewpoints)),
+        statistics.graph,
         config=settings.live,
+        own=own,
     )
     write_json(out / "live.json", {policy: asdict(agreement) for policy, agreement in found.items()})
     return found
@@ -322,26 +353,29 @@ def report(settings: Settings, preset: str, out: Path) -> Path:
     page, metrics, active = out / "report" / "index.html", out / "metrics.json", out / "learned" / "metrics.json"
     if not metrics.exists():
         raise DataError(f"no metrics in {out}; make them with: mevs eval --out {out}")
+    check_made_with(settings, out)
+    found = _metrics(metrics, f"mevs eval --out {out}")
+    check_evaluated_with(settings, found, out)
     networks = {"classifier": out / "classifier", "entropy predictor": out / "entropy"}
     of_networks = [folder / name for folder in networks.values() for name in ("summary.json", "metrics.jsonl")]
     data, tables = out / "data", out / "tables" / "test.npz"
     made_of = (metrics, active, data / SUMMARY, tables, *of_networks)
 
     def described() -> list[Any]:
-        return [preset, asdict(settings), *(path.is_file() and check_of_file(path) for path in made_of)]
+        return [preset, plain(settings), *(path.is_file() and check_of_file(path) for path in made_of)]
 
     if is_current(page, described()):
         return page
     statistics = load_statistics(data)
     inputs = ReportInputs(
         statistics=statistics,
-        metrics=_metrics(metrics, f"mevs eval --out {out}"),
+        metrics=found,
         tables=_tables(settings, out, statistics, "test"),
         data=data,
         histories={name: read_history(folder) for name, folder in networks.items()},
         summaries={name: summary_of(folder) for name, folder in networks.items()},
         preset=preset,
-        settings=asdict(settings),
+        settings=plain(settings),
         learned=_metrics(active, f"mevs study learned --out {out}") if active.exists() else None,
     )
     write_report(inputs, page, described())  # the tables may have been made again

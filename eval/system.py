@@ -213,7 +213,7 @@ def classifier_system(
         max_views: number of views that temperatures are fitted for.
         made_by: identifies what the system is made from.
     """
-    graph = ViewGraph.from_points(np.array(statistics.viewpoints))
+    graph = statistics.graph
     max_views = min(max_views, statistics.views)
     console.print(f"Calibrating {len(USABLE)} policies on {len(validation.labels)} validation objects")
     walks = walk_validation(validation, graph, max_views)

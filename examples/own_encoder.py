@@ -1,13 +1,13 @@
-"""An encoder of one's own, trained as the classifier: `python examples/own_encoder.py [RUN] [FOLDER]`.
+"""A network of one's own, trained as the classifier: `python examples/own_encoder.py [RUN] [FOLDER]`.
 
-Training needs a `Task`: a network, its inputs, its loss. Here it is the classifier's, with another network. RUN is a directory
-with a data set (`mevs data`; default: runs/demo); the network is written to FOLDER (default: RUN/own_encoder).
+The function `encoder` is all that `mevs run --encoder examples/own_encoder.py:encoder` needs. Here it is trained from Python: RUN
+is a directory with a data set (`mevs data`; default: runs/demo); the network is written to FOLDER (default: RUN/own_encoder).
 """
 
 from __future__ import annotations
 
 import sys
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 
@@ -25,8 +25,8 @@ from train.tasks.classifier import ClassifierTask
 class Encoder(nnx.Module):
     """Three strided convolutions, and the mean over what is left of the image."""
 
-    def __init__(self, classes: int, rngs: nnx.Rngs):
-        widths = (1, 16, 32, 64)
+    def __init__(self, classes: int, channels: int, rngs: nnx.Rngs):
+        widths = (channels, 16, 32, 64)
         self.convolutions = nnx.List(
             nnx.Conv(before, after, (3, 3), strides=2, rngs=rngs) for before, after in pairwise(widths)
         )
@@ -39,22 +39,17 @@ class Encoder(nnx.Module):
         return self.head(jnp.mean(images, axis=(1, 2)))
 
 
-@dataclass(frozen=True)
-class OwnTask(ClassifierTask):
-    """The classifier's task with another network; `name` is part of what identifies the trained network."""
-
-    name: str = "classifier with an encoder of one's own"
-
-    def network(self, rngs: nnx.Rngs) -> Encoder:  # type: ignore[override]
-        return Encoder(self.classes, rngs)
+def encoder(classes: int, channels: int, resolution: int, rngs: nnx.Rngs) -> Encoder:
+    del resolution  # the mean makes it good for any
+    return Encoder(classes, channels, rngs)
 
 
 def main(run: Path, folder: Path) -> None:
-    statistics = load_statistics(run / "data")
-    kept = load_run(run)
+    statistics, kept = load_statistics(run / "data"), load_run(run)
     config = (SMALL if kept is None else kept.settings).classifier
-    config = replace(config, network=replace(config.network, channels=1))
-    summary = fit(OwnTask.of(config, len(statistics.classes), statistics.camera), run / "data", statistics, folder)
+    config = replace(config, encoder=f"{__file__}:encoder")
+    task = ClassifierTask.of(config, len(statistics.classes), statistics.camera)
+    summary = fit(task, run / "data", statistics, folder)
     print(f"best epoch {summary['best_epoch']}: validation accuracy {100 * summary['best']['accuracy']:.1f} %")
 
 

@@ -7,8 +7,9 @@ Platonic solids (RotationNet, view-GCN) or rings (MORE). A nested lattice allows
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from itertools import product
-from typing import Literal
+from typing import Literal, get_args
 
 import flax.struct
 import jax.numpy as jnp
@@ -125,7 +126,7 @@ def nested_lattice(n: int) -> Float[np.ndarray, "{n} 3"]:
     return dense[chosen]
 
 
-def viewpoint_lattice(n: int, lattice: Lattice = "golden_angle") -> Float[np.ndarray, "{n} 3"]:
+def viewpoint_lattice(n: int, lattice: Lattice | str = "golden_angle") -> Float[np.ndarray, "{n} 3"]:
     """`n` viewpoints of a lattice as unit vectors.
 
     Raises:
@@ -139,6 +140,8 @@ def viewpoint_lattice(n: int, lattice: Lattice = "golden_angle") -> Float[np.nda
         return ring_lattice(n)
     if lattice == "nested":
         return nested_lattice(n)
+    if lattice not in get_args(Lattice):
+        raise ValueError(f"unknown lattice {lattice!r}: it is one of {', '.join(get_args(Lattice))}")
     return fibonacci_sphere(n, lattice)
 
 
@@ -157,17 +160,20 @@ class ViewGraph:
     distances: Float[Array, "*batch views views"]
 
     @classmethod
-    def from_points(cls, points: AnyArray) -> ViewGraph:
-        """The spherical Delaunay graph, whose edges are the 3n − 6 edges of the convex hull (thesis §4.1).
+    def from_points(cls, points: AnyArray, neighbours: Sequence[Sequence[int]] | None = None) -> ViewGraph:
+        """The graph of viewpoints with the given neighbours, or the spherical Delaunay graph.
 
-        Two or three points are all neighbours of each other. If the hull has flat faces with more than three corners (as a cube
-        does), the diagonals that triangulate them are edges too.
+        The edges of the Delaunay graph are the 3n − 6 edges of the convex hull (thesis §4.1). Two or three points are all
+        neighbours of each other. If the hull has flat faces with more than three corners (as a cube does), the diagonals that
+        triangulate them are edges too.
 
         Args:
             points: (views, 3) unit vectors.
+            neighbours: pairs of neighbouring views, in any order; the Delaunay graph if None.
 
         Raises:
-            ValueError: for fewer than 2 points, points off the unit sphere, duplicates, or four or more points in one plane.
+            ValueError: for fewer than 2 points, points off the unit sphere, duplicates, pairs of views that do not exist or of a
+                view and itself, or, without `neighbours`, four or more points in one plane.
         """
         array = np.asarray(points, float)
         if array.ndim != 2 or array.shape[1] != 3 or len(array) < 2:
@@ -179,17 +185,22 @@ class ViewGraph:
         count = len(array)
         if np.min(distances + 10 * np.eye(count)) < 1e-4:
             raise ValueError("two viewpoints coincide: remove one of them")
-        neighbours = np.zeros((count, count), bool)
-        if count <= 3:
-            neighbours[:] = ~np.eye(count, dtype=bool)
+        near = np.zeros((count, count), bool)
+        if neighbours is not None:
+            for a, b in neighbours:
+                if a == b or not (0 <= a < count and 0 <= b < count):
+                    raise ValueError(f"views {a} and {b} cannot be neighbours: the {count} views are 0 to {count - 1}")
+                near[[a, b], [b, a]] = True
+        elif count <= 3:
+            near[:] = ~np.eye(count, dtype=bool)
         else:
             if np.linalg.matrix_rank(array - array.mean(axis=0), tol=1e-6) < 3:
                 raise ValueError("four or more viewpoints in one plane have no view graph")
             for a, b, c in ConvexHull(array).simplices:
-                neighbours[[a, b, c], [b, c, a]] = neighbours[[b, c, a], [a, b, c]] = True
+                near[[a, b, c], [b, c, a]] = near[[b, c, a], [a, b, c]] = True
         return cls(
             points=jnp.asarray(array, jnp.float32),
-            neighbours=jnp.asarray(neighbours),
+            neighbours=jnp.asarray(near),
             distances=jnp.asarray(distances, jnp.float32),
         )
 

@@ -123,6 +123,9 @@ def place(tree: Any, sharding: Any) -> Any:
     """Distributes arrays that every process holds completely; `sharding` is a tree like `tree`."""
 
     def put(leaf: jax.Array, where: NamedSharding) -> jax.Array:
+        if jax.dtypes.issubdtype(leaf.dtype, jax.dtypes.prng_key):  # of a network that draws its own dropout
+            data = put(jax.random.key_data(leaf), NamedSharding(where.mesh, PartitionSpec()))
+            return jax.random.wrap_key_data(data, impl=jax.random.key_impl(leaf))
         whole = np.asarray(leaf)
         return jax.make_array_from_callback(whole.shape, where, lambda index: whole[index])
 

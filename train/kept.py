@@ -15,8 +15,20 @@ import flax.nnx as nnx
 import numpy as np
 
 from data_pipeline.dataset.statistics import DatasetStatistics
+from data_pipeline.differences import differences, in_words
 from data_pipeline.errors import DataError, Unreadable, reason_of
-from data_pipeline.files import as_read, checks_in, keep_json, read_json, was_written, write_npz
+from data_pipeline.files import (
+    as_read,
+    check_of,
+    checks_in,
+    damage_in,
+    keep_checks,
+    keep_json,
+    read_json,
+    was_written,
+    write_bytes,
+    write_npz,
+)
 from data_pipeline.progress import console
 from train.checkpoints import Checkpoints, damage_of, drop_damaged
 from train.devices import is_first
@@ -73,6 +85,23 @@ def kept_json(path: Path, identity: Any, compute: Callable[[], dict[str, Any]]) 
         return compute() | {"identity": identity}
 
     return kept(path, read_json, keep_json, lambda stored: stored["identity"] == identity, content)
+
+
+def keep_beside(path: Path, content: bytes) -> None:
+    """Writes a file whose content follows from another file, unless it holds this content already.
+
+    Raises:
+        Unreadable: if `path` is a folder.
+    """
+    if path.is_dir():
+        raise Unreadable(path, "it is a folder", "remove it, and the same command goes on")
+    if path.exists():
+        if damage_in(path.parent, [path.name]) is not None:
+            console.print(f"{path} is not as it was written, so it is made again", markup=False)
+        elif path.read_bytes() == content:
+            return
+    keep_checks(path.parent, {path.name: check_of(content)})
+    write_bytes(path, content)
 
 
 def kept_array(path: Path, made: str, compute: Callable[[], np.ndarray]) -> np.ndarray:
@@ -143,8 +172,9 @@ def check_config(folder: Path, identity: dict[str, Any], holds: str) -> None:
     path = folder / "config.json"
     other = DataError(f"{folder} holds {holds} with other settings; choose another --out, or delete that folder")
     try:
-        if read_json(path) != identity:
-            raise other
+        was = read_json(path)
+        if was != identity:
+            raise _other(folder, holds, was, identity)
         return
     except FileNotFoundError:
         if not any((folder / name).exists() for name in ("latest", "best", "summary.json")):
@@ -157,6 +187,20 @@ def check_config(folder: Path, identity: dict[str, Any], holds: str) -> None:
     if is_first():
         console.print(f"{path} cannot be read ({problem.reason}), so it is written again", markup=False)
         keep_json(path, identity)
+
+
+def _other(folder: Path, holds: str, was: Any, identity: dict[str, Any]) -> DataError:
+    """The refusal of a folder that holds something else, which names what differs."""
+    found = differences(was, identity)
+    if list(found) == ["task.network_config.source"]:
+        config = identity["task"]["network_config"]
+        return DataError(
+            f"{folder} holds {holds} with {config['module']}:{config['name']} as it was before it was edited; restore that file, "
+            f"choose another --out, or delete that folder"
+        )
+    return DataError(
+        f"{folder} holds {holds} with other settings ({in_words(found)}); choose another --out, or delete that folder"
+    )
 
 
 _IN_A_SUMMARY = {"epoch", "best_loss", "best_epoch", "best", "seconds", "steps", "start"}

@@ -31,6 +31,7 @@ from data_pipeline.dataset.batches import (
     validation_splits,
 )
 from data_pipeline.dataset.statistics import DatasetStatistics
+from data_pipeline.differences import differences, in_words
 from data_pipeline.errors import DataError, Diverged
 from data_pipeline.files import as_read, check_of_file, keep_checks, keep_json, write_text
 from data_pipeline.progress import console, progress_bar
@@ -312,6 +313,7 @@ class _Training:
             "steps": self.step,
             "start": start.name if start else "random weights",
             "stopped_early": self.progress["epoch"] < self.config.epochs,
+            **({"encoder": encoder} if (encoder := getattr(self.task, "encoder", None)) else {}),
         }
 
     def _has_finite_weights(self) -> bool:
@@ -421,10 +423,11 @@ def load_best(task: Task, folder: Path) -> nnx.Module:
                 f"the {task.name} in {folder} was trained for {saved[name]} {name}, the data set has {wanted[name]}; "
                 f"train a new one with another --out, or evaluate this one on its own data set"
             )
-    layers = [{**config["network_config"], "dropout": None} for config in (saved, wanted)]
-    if layers[0] != layers[1]:
+    was, now = ({**config["network_config"], "dropout": None} for config in (saved, wanted))
+    if found := differences(was, now):
         raise DataError(
-            f"the {task.name} in {folder} has other layers than the settings describe; use the settings it was trained with"
+            f"the {task.name} in {folder} has other layers than the settings describe ({in_words(found)}); use the settings "
+            f"it was trained with"
         )
     optimiser = replace(task.optimiser, method=saved["optimiser"]["method"])  # the checkpoint holds its moments too
     structure, like = abstract_state(replace(task, optimiser=optimiser))  # type: ignore[type-var]

@@ -44,19 +44,10 @@ class CaptureConfig:
 
     views: int = 40
     """number of candidate viewpoints, at least 2"""
-    lattice: Literal[
-        "golden_angle",
-        "equation8",
-        "nested",
-        "rings",
-        "tetrahedron",
-        "octahedron",
-        "cube",
-        "icosahedron",
-        "dodecahedron",
-    ] = "golden_angle"
+    lattice: str = "golden_angle"
     """their arrangement: the Fibonacci lattice of the thesis's published code (golden_angle) or of its eq. (8) (equation8),
-    nested (the 10 views are among the 40), five rings, or the corners of a Platonic solid"""
+    nested (the 10 views are among the 40), five rings, or the corners of a Platonic solid (tetrahedron, octahedron, cube,
+    icosahedron, dodecahedron); or your own: file:PATH, directions as JSON or CSV (docs/own.md)"""
     turned: bool = False
     """rotate the lattice at random for each object, so that training sees a different set of directions with every object"""
     resolution: int = 224
@@ -155,17 +146,17 @@ def rig_for(config: CaptureConfig) -> Rig:
     """Returns the cameras that `config` describes.
 
     Raises:
-        DataError: if a number of `config` is out of its range.
+        DataError: if a number of `config` is out of its range, or a file of viewpoints cannot be used.
         ValueError: if the lattice cannot have this number of views.
     """
     check_camera(config)
     import jax
 
+    from data_pipeline.capture.viewpoints import viewpoints_of  # which needs this module
     from mevs_jax.cameras import cameras_at, pixel_directions
-    from mevs_jax.viewpoints import viewpoint_lattice
 
     cameras = cameras_at(
-        viewpoint_lattice(config.views, config.lattice).astype(np.float32),
+        viewpoints_of(config).points.astype(np.float32),
         distance=config.distance,
         resolution=config.resolution,
         field_of_view=np.deg2rad(config.field_of_view),

@@ -23,6 +23,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from data_pipeline.capture.casting import Capture, CaptureConfig, Rig, check_camera, load_capture, rig_for
+from data_pipeline.capture.viewpoints import FILE, identified, is_file, viewpoints_of
 from data_pipeline.capture.workers import capture_all, capture_entry, capture_path, say_damaged
 from data_pipeline.dataset.beam import beam_options, capture_by_beam, examples_by_beam
 from data_pipeline.dataset.proof import (
@@ -39,9 +40,11 @@ from data_pipeline.dataset.statistics import (
     SUMMARY,
     DatasetStatistics,
     StatisticsCollector,
+    load_statistics,
 )
-from data_pipeline.errors import DataError, reason_of
-from data_pipeline.files import check_of_file, keep_checks, keep_json
+from data_pipeline.differences import differences, in_words
+from data_pipeline.errors import DataError, Unreadable, reason_of
+from data_pipeline.files import as_read, check_of_file, keep_checks, keep_json, read_json
 from data_pipeline.objects.changes import changes_between, source_state
 from data_pipeline.objects.downloads import ARCHIVES, download, download_folder, local
 from data_pipeline.objects.formats import Up
@@ -49,7 +52,7 @@ from data_pipeline.objects.mesh import SOURCE_SPLITS, ObjectEntry, ObjectSource
 from data_pipeline.objects.sources import Reading, mesh_zip, open_source
 from data_pipeline.progress import console, progress_bar
 from mevs_jax.entropy import level_entropy
-from mevs_jax.viewpoints import viewpoint_lattice
+from mevs_jax.viewpoints import ViewGraph
 
 
 @dataclass(frozen=True)
@@ -258,12 +261,14 @@ def _write_shards(
         name: {c: sum(entry.label == i for entry in members) for i, c in enumerate(source.classes)}
         for name, members in split.items()
     }
+    viewpoints = viewpoints_of(config.capture)
     return statistics.finish(
         classes=list(source.classes),
         counts=counts,
         left_out=left_out,
-        viewpoints=viewpoint_lattice(config.capture.views, config.capture.lattice).tolist(),
-        capture=asdict(config.capture),
+        viewpoints=viewpoints.points.tolist(),
+        neighbours=None if viewpoints.neighbours is None else [list(pair) for pair in viewpoints.neighbours],
+        capture=asdict(identified(config.capture)),
         source=source.name,
         notes=source.notes,
     )
@@ -301,10 +306,38 @@ def open_objects(config: DataConfig) -> ObjectSource:
     return replace(source, name=official.name)
 
 
-def _identity(config: DataConfig) -> dict[str, Any]:
-    """Returns the settings that identify a data set. Later settings are left out at their defaults, as in older data sets."""
-    identity, default = asdict(config), asdict(DataConfig())
+def _identity(config: DataConfig, folder: Path | None = None) -> dict[str, Any]:
+    """Returns the settings that identify a data set. Later settings are left out at their defaults, as in older data sets.
+
+    Args:
+        folder: of the data set, which does not need its file of viewpoints any more once it is finished.
+    """
+    made = None
+    if is_file(config.capture.lattice) and folder is not None and (folder / SUMMARY).exists():
+        made = load_statistics(folder).capture
+    identity, default = asdict(replace(config, capture=identified(config.capture, made))), asdict(DataConfig())
     return {key: value for key, value in identity.items() if key not in ("up", "split") or value != default[key]}
+
+
+def made_with_other_settings(config: DataConfig, folder: Path) -> dict[str, tuple[Any, Any]]:
+    """Returns the settings of the data set in `folder` that differ from `config`, by name: as it was made, and as in `config`.
+
+    There are none if there is no data set, or its settings cannot be read. Settings that only one of them has are left out.
+    """
+    try:
+        was = read_json(folder / "config.json")
+    except (FileNotFoundError, Unreadable):
+        return {}
+    return differences(was, as_read(_identity(config, folder)), "dataset", shared=True)
+
+
+def check_same_data(config: DataConfig, folder: Path) -> None:
+    """Raises `DataError` if the data set in `folder` was made with other settings; names what differs."""
+    if found := made_with_other_settings(config, folder):
+        raise DataError(
+            f"{folder} has a data set made with other settings ({in_words(found)}); leave these options out, or "
+            f"choose another --out"
+        )
 
 
 def _state(config: DataConfig) -> dict[str, str] | None:
@@ -371,6 +404,23 @@ def _check_source(config: DataConfig, folder: Path, damage: str) -> None:
         )
 
 
+def _check_viewpoints(capture: CaptureConfig, finished: bool) -> None:
+    """Raises `DataError` if there are no such viewpoints, or no graph of their neighbours."""
+    if is_file(capture.lattice):
+        if finished:  # they are in its summary
+            return
+        found = viewpoints_of(capture)
+        try:
+            ViewGraph.from_points(found.points, found.neighbours)
+        except ValueError as error:
+            raise DataError(f"{error}: give the neighbours in {capture.lattice.removeprefix(FILE)}") from error
+        return
+    try:
+        viewpoints_of(capture)
+    except ValueError as error:
+        raise DataError(f"{error}; choose another --views or --dataset.capture.lattice") from error
+
+
 def prepare(config: DataConfig, folder: Path, beam: str | None = None) -> DatasetStatistics:
     """Creates the data set in `folder`, unless it exists, and returns its statistics.
 
@@ -385,15 +435,12 @@ def prepare(config: DataConfig, folder: Path, beam: str | None = None) -> Datase
     if config.capture.views < 2:
         raise DataError(f"--views {config.capture.views} is too few: choosing a next view needs at least 2 viewpoints")
     check_camera(config.capture)
-    try:
-        viewpoint_lattice(config.capture.views, config.capture.lattice)
-    except ValueError as error:
-        raise DataError(f"{error}; choose another --views or --dataset.capture.lattice") from error
+    _check_viewpoints(config.capture, (folder / SUMMARY).exists())
     if not 0 <= config.validation_share < 1:
         raise DataError(
             f"--dataset.validation-share {config.validation_share:g} is not at least 0 and below 1; choose another"
         )
-    identity, captures, made_with = _identity(config), folder / "captures", folder / "config.json"
+    identity, captures, made_with = _identity(config, folder), folder / "captures", folder / "config.json"
     damage = damage_of_settings(folder, identity)
     if (folder / SUMMARY).exists():
         found = found_in(folder, damage)

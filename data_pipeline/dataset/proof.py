@@ -13,8 +13,10 @@ from pathlib import Path
 from typing import Any, SupportsIndex
 
 from data_pipeline.dataset.statistics import SPLITS, SUMMARY, DatasetStatistics, load_statistics
+from data_pipeline.differences import differences, in_words
 from data_pipeline.errors import DataError, Unreadable, reason_of
 from data_pipeline.files import (
+    as_read,
     check_of_file,
     checks_in,
     damage_in,
@@ -149,7 +151,7 @@ def damage_of_settings(folder: Path, identity: dict[str, Any]) -> str | None:
         if was == identity:
             return None
         if isinstance(was, dict):
-            differs = f" ({', '.join(sorted(key for key in identity if was.get(key) != identity[key]))})"
+            differs = f" ({in_words(differences(was, as_read(identity)))})"
     except FileNotFoundError:
         if not (folder / SUMMARY).exists():
             return None

@@ -16,6 +16,7 @@ from data_pipeline.capture.casting import CaptureConfig
 from data_pipeline.errors import DataError, Diverged
 from data_pipeline.files import read_json
 from data_pipeline.progress import console
+from mevs_jax.viewpoints import ViewGraph
 
 SPLITS = ("train", "val", "test")
 SUMMARY = "summary.json"
@@ -38,6 +39,7 @@ class DatasetStatistics:
         points_mean, points_std: mean and standard deviation of the number of points visible in a view.
         points_by_class: by class, the 5th, 25th, 50th, 75th and 95th percentiles of that number.
         viewpoints: (views, 3) unit vectors.
+        neighbours: pairs of neighbouring views, of viewpoints from a file that has them; else None, and not stored.
         capture: the `CaptureConfig`, as a dictionary.
         source: name of the source of objects.
         notes: sentences on how the files were read, such as which axis was up. Not stored where there are none.
@@ -59,6 +61,7 @@ class DatasetStatistics:
     capture: dict[str, Any]
     source: str
     notes: tuple[str, ...] = ()
+    neighbours: list[list[int]] | None = None
 
     @property
     def views(self) -> int:
@@ -79,12 +82,19 @@ class DatasetStatistics:
         content = asdict(self)
         if not self.notes:
             del content["notes"]
+        if self.neighbours is None:
+            del content["neighbours"]
         return content
 
     @property
     def left_out_count(self) -> int:
         """Number of objects left out."""
         return sum(map(len, self.left_out.values()))
+
+    @property
+    def graph(self) -> ViewGraph:
+        """The candidate views and their neighbours: those of the file that the viewpoints are from, or the Delaunay graph."""
+        return ViewGraph.from_points(np.array(self.viewpoints), self.neighbours)
 
     @property
     def camera(self) -> CaptureConfig:

@@ -30,7 +30,6 @@ from eval.tables import load_view_tables
 from eval.thesis.results import machine
 from mevs_jax.models import Recogniser
 from mevs_jax.models.view_policy import expected_gain
-from mevs_jax.viewpoints import viewpoint_lattice
 from train.choosing.stages import VARIANTS, Stages, lattice_data
 from train.finite import check_results
 from train.kept import kept_json, made_by
@@ -124,7 +123,7 @@ def _walks(
         features = stages.features(f"{views}_{split}", data, split)
         if "cloud" in names:
             features = replace(features, clouds=stages.clouds(data, split))
-        return OnLattice(features, *_entropies(stages.out, data, split))
+        return OnLattice(features, *_entropies(stages.out, data, split), load_statistics(data).neighbours)
 
     def walk() -> dict[str, Any]:
         validation, test = map(objects_of, ("val", "test"))
@@ -194,7 +193,14 @@ def _novel(stages: Stages) -> dict[str, Any]:
         test = stages.features(f"lattice_{views}_test", data, "test")
         console.print(f"Walking test objects of {2 * len(pairs)} classes that a policy was trained without")
         return novel_classes(
-            stages.fusion(), policies, stages.policy(), test, stages.config.max_views, stages.config.draws, stages.seed
+            stages.fusion(),
+            policies,
+            stages.policy(),
+            test,
+            stages.config.max_views,
+            stages.config.draws,
+            stages.seed,
+            load_statistics(data).neighbours,
         )
 
     return kept_json(stages.folder / "walks_novel.json", identity, walk)
@@ -213,7 +219,7 @@ def _decision_times(stages: Stages, calls: int = 200) -> dict[str, Any]:
     assert isinstance(recogniser, Recogniser)
     structure, weights = nnx.split((recogniser, stages.policy()))
     fusion, classes = stages.fusion(), len(stages.statistics.classes)
-    candidates = jnp.asarray(viewpoint_lattice(camera.views, camera.lattice), jnp.float32)
+    candidates = jnp.asarray(stages.statistics.viewpoints, jnp.float32)
     seen, present = candidates[:most], jnp.arange(most) < most - 1
 
     @jax.jit

@@ -176,7 +176,9 @@ def moving(
     distances = np.asarray(graph_of(directions[0]).distances)
     for cost in MOVEMENT_COSTS:
         given = policy_parameters(learner, fusion), jnp.float32(cost)
-        views = walk_all(key, contender, given, fusion, test.table(True), directions, knowledge, max_views)
+        views = walk_all(
+            key, contender, given, fusion, test.table(True), directions, knowledge, max_views, test.neighbours
+        )
         steps = distances[views[:, :, :-1], views[:, :, 1:]]
         travelled = np.concatenate([np.zeros_like(steps[..., :1]), np.cumsum(steps, axis=-1)], axis=-1)
         right = (

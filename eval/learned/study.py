@@ -267,6 +267,7 @@ def study(
                 data.features.directions,
                 knowledge,
                 contender.max_views or max_views,
+                data.neighbours,
             )
             walks.append(views)
             beliefs.append(beliefs_of(own, data.features, views))
@@ -346,12 +347,14 @@ def novel_classes(
     max_views: int,
     draws: int,
     seed: int = 0,
+    neighbours: list[list[int]] | None = None,
 ) -> dict[str, Any]:
     """Results of policies on classes that they were trained without, with random selection and a fully trained policy.
 
     Args:
         policies: pairs of the classes that a policy was trained without, and the policy.
         whole: the policy that was trained on all classes.
+        neighbours: as for `walk_all`.
     """
     after: dict[str, list[np.ndarray]] = {"random": [], "trained_without": [], "trained_with": []}
     rows = []
@@ -362,7 +365,7 @@ def novel_classes(
         walkers += [(walker(one), policy_parameters(one, fusion)) for one in learners]
         for contender, given in walkers:
             table, key = OnLattice(some).table(contender.believes), jax.random.key(seed)
-            views = walk_all(key, contender, given, fusion, table, some.directions, None, max_views)
+            views = walk_all(key, contender, given, fusion, table, some.directions, None, max_views, neighbours)
             right = beliefs_of(fusion, some, views).argmax(axis=-1) == np.asarray(some.labels)[:, None, None]
             after[contender.name].append(right.mean(axis=1).T)
         row = {"classes": list(classes), "objects": len(some.labels)}

@@ -78,7 +78,7 @@ def learned_system(stages: Stages, found: dict[str, Any], figures: dict[str, Any
     recogniser = load_best(stages.task(), stages.recogniser_folder())
     assert isinstance(recogniser, Recogniser)
     validation = stages.features(f"lattice_{views}_val", data, "val")
-    graph = ViewGraph.from_points(np.array(load_statistics(data).viewpoints))
+    graph = load_statistics(data).graph
     fusions = {"posed": stages.fusion(), "unposed": stages.fusion(posed=False)}
     policies = {name: stages.policy(name) for name in POLICIES}
     walks = found["lattices"][str(views)]["policies"]

@@ -36,11 +36,13 @@ class OnLattice:
         features: of every view.
         predicted_entropy: (objects, views, views) predicted normalised entropies, if known; row i after seeing view i.
         entropy: (objects, views) true normalised entropies, if known.
+        neighbours: pairs of neighbouring views, if the viewpoints have neighbours of their own (`ViewGraph.from_points`).
     """
 
     features: Features
     predicted_entropy: np.ndarray | None = None
     entropy: np.ndarray | None = None
+    neighbours: list[list[int]] | None = None
 
     def table(self, with_features: bool) -> ViewTable:
         predicted_entropy, entropy = (
@@ -151,13 +153,15 @@ def walk_all(
     directions: Float[AnyArray, "objects views 3"],
     knowledge: Knowledge | None,
     max_views: int,
+    neighbours: list[list[int]] | None = None,
 ) -> Int[np.ndarray, "objects walks steps"]:
     """The views of walks, `contender.draws` from each of its start views.
 
     Args:
         directions: unit vectors to the views; the angles between views must be the same for all objects.
+        neighbours: pairs of neighbouring views; those of the Delaunay graph if None.
     """
-    graph = ViewGraph.from_points(np.asarray(directions[0], np.float64))
+    graph = ViewGraph.from_points(np.asarray(directions[0], np.float64), neighbours)
     keys = jax.vmap(jax.random.fold_in, (None, 0))(key, jnp.arange(len(tables.label)))
     rest = contender, parameters, fusion, graph, knowledge, max_views
     at_once = max(1, _WALKS_AT_ONCE * contender.every // (len(graph.points) * contender.draws))

@@ -19,6 +19,7 @@ from eval.walks.exact import expected_random
 from eval.walks.grid import FIRST_MV, THRESHOLDS, GridConfig, Results, run_grid
 from eval.walks.knowledge import learn
 from eval.walks.ladder import SCRAMBLED, Rung, ladder
+from eval.walks.own_policies import OwnPolicy, check_scores, own_rungs
 from mevs_jax.metrics import accuracy, class_accuracy, confusion_matrix
 from mevs_jax.policies.base import Knowledge
 from mevs_jax.viewpoints import ViewGraph
@@ -155,13 +156,31 @@ def reachable_views(viewpoints: np.ndarray, lowest_elevation: float) -> np.ndarr
     return reachable
 
 
-def _walk(
+def walk_tables(
     tables: ViewTables, rungs: tuple[Rung, ...], graph: ViewGraph, knowledge: Knowledge, config: GridConfig, **rest: Any
 ) -> dict[str, Results]:
+    """Results of some policies on all objects of a split, by name; `rest` are further arguments of `run_grid`."""
     one_backbone = tables.stacked()
     stacked = replace(one_backbone, logits=one_backbone.logits[:, None])
     knowledge = jax.tree.map(lambda leaf: leaf[None], knowledge)
     return run_grid(jax.random.key(config.seed), stacked, graph, knowledge, rungs, max_views=config.max_views, **rest)
+
+
+def check_own(
+    own: tuple[OwnPolicy, ...],
+    rungs: tuple[Rung, ...],
+    results: dict[str, Results],
+    tables: ViewTables,
+    graph: ViewGraph,
+    knowledge: Knowledge,
+    reachable: jax.Array | None,
+    config: GridConfig,
+) -> None:
+    """Raises `DataError` if scores of a user's policy mean nothing (`check_scores`); `rungs` are the policies as evaluated."""
+    for policy, rung in zip(own, rungs, strict=True):
+        walks = np.asarray(results[rung.policy].views)[0, :, :, 0]
+        key, stacked = jax.random.key(config.seed), tables.stacked()
+        check_scores(policy, rung, key, stacked, walks, graph, knowledge, reachable)
 
 
 def run_study(
@@ -171,6 +190,7 @@ def run_study(
     config: GridConfig,
     by_view: ViewTables | None = None,
     leak: dict[str, dict[str, float]] | None = None,
+    own: tuple[OwnPolicy, ...] = (),
 ) -> dict[str, Any]:
     """All metrics of the test split.
 
@@ -181,23 +201,30 @@ def run_study(
         config: settings of the evaluation.
         by_view: view tables of the test objects by the classifier validated by view, for the compatibility table.
         leak: accuracy on single views, `validation` and `test`, of both classifiers.
+        own: further policies, evaluated like those of the ladder.
+
+    Raises:
+        DataError: if a further policy cannot be used.
     """
     viewpoints = np.array(statistics.viewpoints)
     can_reach = reachable_views(viewpoints, config.lowest_elevation)
     config = replace(config, max_views=min(config.max_views, int(can_reach.sum())))
-    graph = ViewGraph.from_points(viewpoints)
+    graph = statistics.graph
     reachable = None if can_reach.all() else jnp.asarray(can_reach)
     knowledge = learn(jnp.asarray(validation.logits), jnp.asarray(validation.labels))
     labels = jnp.asarray(tables.labels)
 
-    rungs = ladder(config.draws)
+    further = own_rungs(own, graph, len(statistics.classes), config.draws)
+    rungs = ladder(config.draws, further)
     console.print(f"Walking {len(tables.labels)} test objects from {can_reach.sum()} views by {len(rungs)} policies")
-    results = _walk(tables, (*rungs, SCRAMBLED), graph, knowledge, config, reachable=reachable)
+    results = walk_tables(tables, (*rungs, SCRAMBLED), graph, knowledge, config, reachable=reachable)
     results[BASELINE], exact = exactly_random(results[BASELINE], jnp.asarray(tables.logits)[:, None], labels, can_reach)
     shown = {rung.policy: results[rung.policy] for rung in rungs}
 
+    check_own(own, further, results, tables, graph, knowledge, reachable, config)
+
     fitting = tuple(replace(rung, draws=1) for rung in rungs if rung.policy in CONFIDENCE_OF)
-    validation_walks = _walk(validation, fitting, graph, knowledge, config, reachable=reachable)
+    validation_walks = walk_tables(validation, fitting, graph, knowledge, config, reachable=reachable)
 
     def starts_of(result: Results) -> np.ndarray:
         """The stored walks from reachable views, (objects, starts, steps)."""
@@ -220,7 +247,7 @@ def run_study(
     }
     moving = tuple(rung for rung in rungs if rung.policy in MOVING)
     for cost in MOVEMENT_COSTS:
-        with_cost = _walk(
+        with_cost = walk_tables(
             tables, moving, graph, knowledge, config, reachable=reachable, movement_cost=jnp.float32(cost)
         )
         for name, result in with_cost.items():
@@ -230,9 +257,10 @@ def run_study(
     if by_view is not None:
         wanted = ("random", "random_with_repetition", "predicted_entropy")
         switched = (*(rung for rung in rungs if rung.policy in wanted), SCRAMBLED)
-        other = _walk(by_view, switched, graph, knowledge, config, reachable=reachable)
+        other = walk_tables(by_view, switched, graph, knowledge, config, reachable=reachable)
         other[BASELINE], _ = exactly_random(other[BASELINE], jnp.asarray(by_view.logits)[:, None], labels, can_reach)
 
+    sources = {policy.entry.name: {"own": policy.code.identity if policy.code else {}} for policy in own}
     mv = min(HEADLINE_MV, config.max_views)
     column = THRESHOLDS.index(HEADLINE_CT)
     return {
@@ -249,7 +277,10 @@ def run_study(
         "headline": {"threshold": HEADLINE_CT, "max_views": mv},
         "single_view": single_view(tables, len(statistics.classes)),
         "entropy": entropy_errors(tables, statistics),
-        "ladder": [{"policy": rung.policy, "title": rung.title, "knows": rung.knows} for rung in rungs],
+        "ladder": [
+            {"policy": rung.policy, "title": rung.title, "knows": rung.knows} | sources.get(rung.policy, {})
+            for rung in rungs
+        ],
         "policies": {
             name: summarise(result, tables.labels)
             | {

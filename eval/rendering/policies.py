@@ -44,7 +44,6 @@ from eval.walks.grid import GridConfig, run_grid
 from eval.walks.ladder import ASCENT_RUNGS, KNOWS, Rung, ladder
 from mevs_jax.cameras import Camera, partial_cloud
 from mevs_jax.rendering import corners_of_cells, distinct_optima
-from mevs_jax.viewpoints import ViewGraph
 
 COMPARED = ("random", "farthest", "predicted_entropy", "oracle_entropy")
 """The policies that are evaluated on the same objects for comparison."""
@@ -278,7 +277,7 @@ def ascent_study(
     found = run_grid(
         jax.random.key(config.seed),
         table,
-        ViewGraph.from_points(viewpoints),
+        statistics.graph,
         None,
         rungs,
         max_views=min(config.max_views, int(can_reach.sum())),

@@ -30,6 +30,7 @@ KNOWS_COLOURS = {
     "networks": "#2563eb",
     "others": "#dc2626",
     "learned": "#059669",
+    "rendering": "#7c3aed",
     "truth": "#d97706",
 }
 
@@ -47,10 +48,20 @@ plt.rcParams.update(
 )
 
 
-def accuracy_after_views(policies: dict[str, dict[str, Any]], titles: dict[str, str], all_views: float) -> Figure:
-    """Accuracy after each number of views, over all start views, with 95 % bands over objects."""
+_OWN_COLOURS = ("#db2777", "#65a30d", "#0891b2", "#92400e")
+
+
+def _colours(own: Sequence[str]) -> dict[str, str]:
+    """Colours of the policies drawn as lines: those of `COLOURS`, and the users' own."""
+    return COLOURS | dict(zip(own, itertools.cycle(_OWN_COLOURS), strict=False))
+
+
+def accuracy_after_views(
+    policies: dict[str, dict[str, Any]], titles: dict[str, str], all_views: float, own: Sequence[str] = ()
+) -> Figure:
+    """Accuracy after each number of views, over all start views, with 95 % bands over objects; `own` are drawn as well."""
     figure, axis = plt.subplots(figsize=(7.2, 4.2), layout="constrained")
-    for name, colour in COLOURS.items():
+    for name, colour in _colours(own).items():
         values = 100 * np.array(policies[name]["after_views"])
         low, high = 100 * np.array(policies[name]["after_views_interval"]).T
         steps = np.arange(1, len(values) + 1)
@@ -109,11 +120,14 @@ def ladder_gains(
 
 
 def accuracy_by_distance(
-    policies: dict[str, dict[str, Any]], titles: dict[str, str], movement: dict[str, list[dict[str, Any]]]
+    policies: dict[str, dict[str, Any]],
+    titles: dict[str, str],
+    movement: dict[str, list[dict[str, Any]]],
+    own: Sequence[str] = (),
 ) -> Figure:
     """Accuracy against the distance that the camera travelled; the fainter lines have a movement cost."""
     figure, axis = plt.subplots(figsize=(7.2, 4.2), layout="constrained")
-    for name, colour in COLOURS.items():
+    for name, colour in _colours(own).items():
         if name == "belief_oracle":
             continue
         distance, values = np.degrees(policies[name]["travelled"]), 100 * np.array(policies[name]["after_views"])

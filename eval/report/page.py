@@ -14,6 +14,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from data_pipeline.capture.viewpoints import FILE, is_file
 from data_pipeline.dataset.builder import open_split
 from data_pipeline.files import damage_in, write_text
 from data_pipeline.progress import console
@@ -30,7 +31,7 @@ from eval.report.policies import (
     lead,
     movement_section,
 )
-from mevs_jax.viewpoints import ViewGraph, local_maxima
+from mevs_jax.viewpoints import local_maxima
 from train.chance import Chance
 from train.loop import read_log
 
@@ -46,6 +47,11 @@ def _data_section(inputs: ReportInputs) -> str:
     ]
     totals = [f"<b>{sum(statistics.counts[split].values())}</b>" for split in ("train", "val", "test")]
     camera = statistics.camera
+    lattice = f"lattice <code>{html.escape(camera.lattice)}</code>"
+    if is_file(camera.lattice):
+        pairs = statistics.neighbours
+        near = "" if pairs is None else f", {len(pairs)} pairs of neighbours"
+        lattice = f"directions from a file{near}, content {html.escape(camera.lattice.removeprefix(FILE))}"
     source = open_split(inputs.data, "test")
     chosen: dict[int, int] = {}
     for index, label in enumerate(inputs.tables.labels):
@@ -58,8 +64,8 @@ def _data_section(inputs: ReportInputs) -> str:
         for name, why in by_name.items()
     ]
     return (
-        f"<h2>Data</h2><p>{html.escape(statistics.source)}: {statistics.views} views of each object (lattice "
-        f"<code>{camera.lattice}</code>), {camera.resolution}×{camera.resolution} pixels, "
+        f"<h2>Data</h2><p>{html.escape(statistics.source)}: {statistics.views} views of each object ({lattice}), "
+        f"{camera.resolution}×{camera.resolution} pixels, "
         f"{camera.field_of_view:g}° field of view from {camera.distance:g} radii away. "
         f"Points seen per view: {statistics.points_mean:,.0f} ± "
         f"{statistics.points_std:,.0f}. "
@@ -88,7 +94,7 @@ def _data_section(inputs: ReportInputs) -> str:
 
 def _entropy_section(inputs: ReportInputs) -> str:
     entropy, statistics, tables = inputs.metrics["entropy"], inputs.statistics, inputs.tables
-    graph = ViewGraph.from_points(np.array(statistics.viewpoints))
+    graph = statistics.graph
     errors = np.square(tables.predicted_entropy - tables.entropy[:, None, :]).mean(axis=(1, 2))
     example = int(np.argsort(errors)[len(errors) // 2])
     true, predicted = tables.entropy[example], tables.predicted_entropy[example, 0]
@@ -122,9 +128,18 @@ def _entropy_section(inputs: ReportInputs) -> str:
 
 
 def _training_section(inputs: ReportInputs) -> str:
+    def called(name: str, summary: dict[str, Any]) -> str:
+        encoder = summary.get("encoder")
+        if encoder is None:
+            return html.escape(name)
+        return (
+            f"{html.escape(name)}: <code>{html.escape(encoder['module'])}:{html.escape(encoder['name'])}</code> "
+            f"(source {html.escape(encoder['source'])})"
+        )
+
     rows = [
         [
-            html.escape(name),
+            called(name, s),
             str(s["best_epoch"]),
             str(s["epoch"]),
             f"{s['best_loss']:.4f}",

@@ -16,7 +16,6 @@ from eval.report.html import ReportInputs, difference, image, percent, rows_by_k
 from mevs_jax.policies.base import Scene
 from mevs_jax.policies.registry import POLICIES
 from mevs_jax.selection import Episode, ViewTable, select_from_table
-from mevs_jax.viewpoints import ViewGraph
 
 
 def _verdict(difference: float, interval: Sequence[float]) -> str:
@@ -29,6 +28,22 @@ def _verdict(difference: float, interval: Sequence[float]) -> str:
 
 def _titles(metrics: dict[str, Any]) -> dict[str, str]:
     return {rung["policy"]: rung["title"].lstrip("— ") for rung in metrics["ladder"]}
+
+
+def _own(metrics: dict[str, Any]) -> list[dict[str, Any]]:
+    """The policies of the user."""
+    return [rung for rung in metrics["ladder"] if "own" in rung]
+
+
+def _sources(metrics: dict[str, Any]) -> str:
+    """A note that names where the user's policies come from; empty without any."""
+    named = [
+        f"“{html.escape(rung['title'])}” is <code>{html.escape(rung['own']['module'])}:{html.escape(rung['own']['name'])}"
+        f"</code> (source {rung['own']['source']})"
+        for rung in _own(metrics)
+        if rung["own"]
+    ]
+    return f"<p class='note'>Policies of one's own: {'; '.join(named)}.</p>" if named else ""
 
 
 def _steps(metrics: dict[str, Any], wanted: Sequence[int]) -> list[int]:
@@ -113,14 +128,20 @@ def ladder_section(inputs: ReportInputs) -> str:
         + ". The label oracles are optimistic, because they also find views that are right by chance. With the best pair of "
         f"views for the known label, accuracy is {percent(metrics['best_pair']['accuracy'])} % "
         f"[{span(metrics['best_pair']['interval'])}].</p>"
+        + _sources(metrics)
         + image(
             figures.ladder_gains(against, metrics["ladder"], _steps(metrics, (2, 4)), ("label_oracle", "pair_oracle")),
-            "Hollow markers: not distinguishable from random. Colours by what a policy uses: grey nothing, blue predicted "
-            "entropies, red views of other objects, orange the truth. The label oracles are left out; they would lie far to "
-            "the right.",
+            "Hollow markers: not distinguishable from random. Colours by what a policy uses: grey nothing, blue outputs "
+            "of the networks, red views of other objects, orange the truth. The label oracles are left out; they would lie far "
+            "to the right.",
         )
         + image(
-            figures.accuracy_after_views(policies, _titles(metrics), metrics["single_view"]["all_views"]),
+            figures.accuracy_after_views(
+                policies,
+                _titles(metrics),
+                metrics["single_view"]["all_views"],
+                [rung["policy"] for rung in _own(metrics)],
+            ),
             "Bands: 95 % intervals over objects.",
         )
         + "<details><summary>Accuracy (%) after each number of views, with 95 % intervals</summary>"
@@ -185,7 +206,9 @@ def movement_section(inputs: ReportInputs) -> str:
         "<h2>Accuracy by distance travelled</h2><p>Policies with a movement cost choose the view with the largest "
         "score − cost × great-circle distance (in radians).</p>"
         + image(
-            figures.accuracy_by_distance(metrics["policies"], titles, metrics["movement"]),
+            figures.accuracy_by_distance(
+                metrics["policies"], titles, metrics["movement"], [rung["policy"] for rung in _own(metrics)]
+            ),
             "Markers: after 1, 2, 3, … views. Thin lines: the same policy with the movement cost printed at its end.",
         )
         + f"<details><summary>After {last[0]} views, by movement cost</summary>"
@@ -360,7 +383,7 @@ def grid_section(inputs: ReportInputs) -> str:
 def _example_walk(inputs: ReportInputs) -> str:
     """A walk of the predicted-entropy policy that starts with a wrong prediction and ends with the right one, if there is one."""
     tables, statistics = inputs.tables, inputs.statistics
-    graph = ViewGraph.from_points(np.array(statistics.viewpoints))
+    graph = statistics.graph
     stacked = tables.stacked()
 
     @jax.jit

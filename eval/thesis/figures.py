@@ -45,7 +45,7 @@ class FigureInputs:
     example: int
 
     def graph(self, views: int) -> ViewGraph:
-        return ViewGraph.from_points(np.array(self.statistics[views].viewpoints))
+        return self.statistics[views].graph
 
 
 @dataclass(frozen=True)

@@ -171,7 +171,7 @@ def pipeline(
     test: LatticeTables, validation: LatticeTables, statistics: DatasetStatistics, config: GridConfig
 ) -> dict[str, Any]:
     """The thesis's multi-view grid on one lattice: Tables 7–8 and 10–15, and the confusion matrices of Fig. 23."""
-    graph = ViewGraph.from_points(np.array(statistics.viewpoints))
+    graph = statistics.graph
     rungs = (*(rung for rung in ladder(config.draws) if rung.policy in POLICIES), SCRAMBLED)
     found = walk(test, graph, config, "world", rungs)
     camera = walk(test, graph, config, "camera", tuple(r for r in rungs if r.knows == "networks"))

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 from flax import nnx
 
+from data_pipeline.capture.viewpoints import is_file
 from data_pipeline.dataset.builder import open_objects, prepare
 from data_pipeline.dataset.statistics import report_left_out
 from data_pipeline.errors import DataError
@@ -227,6 +228,10 @@ def reproduce(settings: Settings, preset: str, out: Path, pretrained: tuple[Path
     """
     if settings.evaluation.lowest_elevation > -90:
         raise DataError("mevs study thesis walks from every view; leave out --evaluation.lowest-elevation")
+    if settings.classifier.encoder:
+        raise DataError("mevs study thesis trains the thesis's own classifiers; leave out --classifier.encoder")
+    if is_file(settings.dataset.capture.lattice):
+        raise DataError("mevs study thesis has lattices of 10 and 40 views; leave out --dataset.capture.lattice file:…")
     check_evaluation(settings.evaluation)
     thesis = settings.thesis
     if thesis.ascent_runs < 1 or thesis.ascent_starts < 2 or thesis.ascent_resolution < 8:

@@ -24,7 +24,6 @@ from eval.walks.ladder import Rung
 from eval.walks.over_objects import over_objects
 from mevs_jax.metrics import is_right
 from mevs_jax.policies.base import Knowledge, with_movement
-from mevs_jax.policies.registry import POLICIES
 from mevs_jax.selection import ViewTable, select_from_table
 from mevs_jax.viewpoints import ViewGraph
 
@@ -138,7 +137,7 @@ def run_grid(
     start_weight /= jnp.sum(start_weight)
 
     def evaluate(rung: Rung, keys: Array, tables: ViewTable) -> Results:
-        policy = POLICIES[rung.policy]
+        policy = rung.scores
         if movement_cost is not None:
             policy = with_movement(policy, movement_cost)
 

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
 
-Knows = Literal["nothing", "networks", "others", "learned", "rendering", "truth"]
+from mevs_jax.policies.base import Policy
+from mevs_jax.policies.registry import POLICIES, Knows, policy_entry
 
 KNOWS: dict[Knows, str] = {
     "nothing": "no information about the object",
-    "networks": "entropies predicted from the views seen",
+    "networks": "outputs of the networks for the views seen",
     "others": "statistics of other (validation) objects",
     "learned": "a network trained on gains of views that were measured on validation objects",
     "rendering": "renderings of a surface or volume reconstructed from the latest view",
@@ -23,44 +23,63 @@ class Rung:
     """One policy as it is evaluated.
 
     Attributes:
-        policy: its name in `mevs_jax.POLICIES`.
+        policy: its name in `mevs_jax.POLICIES`, or that of `function`.
         title: its name in the report.
         knows: the information that it uses, a key of `KNOWS`.
         draws: walks that are averaged for each object and start view; 1 for a deterministic policy.
+        function: the policy, if it is not registered.
     """
 
     policy: str
     title: str
     knows: Knows
     draws: int = 1
+    function: Policy | None = None
+
+    @classmethod
+    def of(cls, name: str, draws: int = 1) -> Rung:
+        """Returns the rung of a registered policy."""
+        entry = policy_entry(name)
+        return cls(name, entry.title, entry.knows, draws)
+
+    @property
+    def scores(self) -> Policy:
+        """The policy."""
+        return self.function or POLICIES[self.policy]
 
 
-SCRAMBLED = Rung("scrambled_entropy", "sorted in place", "networks")
+SCRAMBLED = Rung.of("scrambled_entropy")
 """The thesis's policy as its published code implements it. It is not part of `ladder`; the compatibility table shows it."""
 
-ASCENT_RUNGS = (
-    Rung("diff_volume", "ascent on a volume", "rendering"),
-    Rung("diff_mesh", "ascent on a surface", "rendering"),
-    Rung("diff_volume_whole", "ascent on the whole volume", "truth"),
-    Rung("diff_mesh_whole", "ascent on the whole mesh", "truth"),
-)
+ASCENT_RUNGS = tuple(map(Rung.of, ("diff_volume", "diff_mesh", "diff_volume_whole", "diff_mesh_whole")))
 """The policies by differentiable rendering. They have a table of their own, on fewer objects."""
 
+_DETERMINISTIC = (
+    "farthest",
+    "predicted_entropy",
+    "predicted_entropy_without_maxima",
+    "remembered_entropy",
+    "fixed_order",
+    "information_gain",
+    "lowest_entropy",
+    "oracle_entropy",
+    "belief_oracle",
+    "label_oracle",
+    "pair_oracle",
+)
 
-def ladder(draws: int) -> tuple[Rung, ...]:
-    """Returns all policies; random ones walk `draws` times from each start view. The first is the baseline of the others."""
-    return (
-        Rung("random", "random", "nothing", draws),
-        Rung("random_with_repetition", "random, with repetition", "nothing", draws),
-        Rung("farthest", "farthest from those seen", "nothing"),
-        Rung("predicted_entropy", "PointNet++ entropy (thesis)", "networks"),
-        Rung("predicted_entropy_without_maxima", "— without local maxima", "networks"),
-        Rung("remembered_entropy", "— mean over all clouds seen", "networks"),
-        Rung("fixed_order", "best fixed order", "others"),
-        Rung("information_gain", "expected information gain", "others"),
-        Rung("lowest_entropy", "lowest entropy (control)", "truth"),
-        Rung("oracle_entropy", "entropy oracle (thesis)", "truth"),
-        Rung("belief_oracle", "label-free oracle", "truth"),
-        Rung("label_oracle", "greedy label oracle", "truth"),
-        Rung("pair_oracle", "best pair by label", "truth"),
+
+def ladder(draws: int, own: tuple[Rung, ...] = ()) -> tuple[Rung, ...]:
+    """Returns all policies; random ones walk `draws` times from each start view. The first is the baseline of the others.
+
+    Args:
+        draws: walks of a random policy from each start view of an object.
+        own: further policies, which follow those that use the same information.
+    """
+    official = (
+        Rung.of("random", draws),
+        Rung.of("random_with_repetition", draws),
+        *map(Rung.of, _DETERMINISTIC),
     )
+    order = [*KNOWS]
+    return tuple(sorted((*official, *own), key=lambda rung: order.index(rung.knows)))

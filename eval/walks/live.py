@@ -22,8 +22,9 @@ from jaxtyping import Array, Int, Integer
 from data_pipeline.dataset.batches import evaluation_batches
 from data_pipeline.progress import progress_bar
 from eval.tables import ViewTables
+from eval.walks.ladder import ASCENT_RUNGS, Rung
 from eval.walks.over_objects import over_objects
-from mevs_jax.policies.base import Knowledge, Observation, Scene
+from mevs_jax.policies.base import Knowledge, Observation, Policy, Scene
 from mevs_jax.policies.registry import POLICIES
 from mevs_jax.selection import Episode, ViewTable, select_from_table, select_views
 from mevs_jax.viewpoints import ViewGraph
@@ -77,17 +78,19 @@ class LiveWalker:
         scenes: Scene,
         starts: Int[Array, " objects"],
         *,
-        policy: str,
+        policy: str | Policy,
         max_views: int,
         threshold: float | None = None,
     ) -> Episode:
         """Returns the episodes of several objects; `keys`, `captures`, `starts` and all of `scenes` have an axis of objects.
 
         Args:
-            policy: a name in `POLICIES`.
+            policy: a name in `POLICIES`, or a policy.
             max_views: limit on views (MV).
             threshold: confidence threshold (CT); None to continue to `max_views`.
         """
+        if isinstance(policy, str):
+            policy = POLICIES[policy]
         return self._walk(self._states, keys, captures, scenes, starts, policy, max_views, threshold)
 
     @partial(jax.jit, static_argnums=(0, 6, 7, 8))
@@ -106,7 +109,7 @@ class LiveWalker:
                 cloud = {name: captures.clouds[name][view][None] for name in _CLOUD}
                 return Observation(classifier(classify.inputs(image))[0], predictor(predict.inputs(cloud))[0])
 
-            return select_views(key, observe, scene, POLICIES[policy], start, threshold=threshold, max_views=max_views)
+            return select_views(key, observe, scene, policy, start, threshold=threshold, max_views=max_views)
 
         return over_objects(jax.vmap(of_object), (keys, captures, scenes, starts))
 
@@ -122,7 +125,7 @@ class LiveConfig:
     max_views: int = 9
     """views of each object"""
     policies: tuple[str, ...] = ()
-    """names of policies; all if empty"""
+    """names of policies; if empty, all but those by rendering"""
 
 
 @dataclass(frozen=True)
@@ -143,19 +146,26 @@ def compare_with_tables(
     graph: ViewGraph,
     *,
     config: LiveConfig,
+    own: tuple[Rung, ...] = (),
 ) -> dict[str, Agreement]:
-    """Walks the first objects of a split in both modes with the same keys, object i from view i modulo the number of views."""
-    policies = config.policies or tuple(POLICIES)
+    """Walks the first objects of a split in both modes with the same keys, object i from view i modulo the number of views.
+
+    Args:
+        own: further policies, which are not registered.
+    """
+    without_tables = {rung.policy for rung in ASCENT_RUNGS}  # which live walks have not
+    names = dict.fromkeys(config.policies or (name for name in POLICIES if name not in without_tables))
+    policies = {name: POLICIES[name] for name in names} | {rung.policy: rung.scores for rung in own}
     walker = LiveWalker(networks, graph)
     views, stacked = graph.points.shape[0], tables.stacked()
     objects, max_views = min(config.objects, len(tables.labels)), min(config.max_views, views)
     at_once = min(config.at_once, objects)
 
     @partial(jax.jit, static_argnames="policy")
-    def by_table(keys: Array, tables: ViewTable, starts: Array, policy: str) -> Episode:
+    def by_table(keys: Array, tables: ViewTable, starts: Array, policy: Policy) -> Episode:
         def one(key: Array, table: ViewTable, start: Array) -> Episode:
             scene = table.scene(graph, knowledge)
-            return select_from_table(key, table, scene, POLICIES[policy], start, max_views=max_views)
+            return select_from_table(key, table, scene, policy, start, max_views=max_views)
 
         return jax.vmap(one)(keys, tables, starts)
 
@@ -179,12 +189,12 @@ def compare_with_tables(
             keys = jax.vmap(partial(jax.random.fold_in, jax.random.key(0)))(jnp.asarray(index))
             starts = jnp.asarray(index % views, jnp.int32)
             scenes = jax.vmap(lambda table: table.scene(graph, knowledge))(part)
-            for policy in policies:
+            for name, policy in policies.items():
                 live = walker.walk(keys, captures, scenes, starts, policy=policy, max_views=max_views)
                 stored = by_table(keys, part, starts, policy)
                 same = np.all(np.asarray(live.views) == np.asarray(stored.views), axis=1)
                 apart = np.abs(np.asarray(live.confidences) - np.asarray(stored.confidences)).max(axis=1)
-                walks[policy].append((same[: len(chunk)], apart[: len(chunk)]))
+                walks[name].append((same[: len(chunk)], apart[: len(chunk)]))
             bar.advance(line, len(chunk))
     return {policy: _agreement(parts) for policy, parts in walks.items()}
 

@@ -18,6 +18,7 @@ class Command:
         function: `module:function` that runs it, given an `Invocation`.
         out: default of `--out`, where `{preset}` is the preset.
         writes_run: whether its settings become those of the run, in `run.json`.
+        tries: groups of settings that it only tries: where a network was trained, they do not become those of the run.
         locks: whether no other job may write into the run directory meanwhile.
         tool: whether it is a tool, which takes its options alone: it has no run directory, preset or settings.
         needs_study: whether it needs the packages of the study, so a checkout of the project.
@@ -32,6 +33,7 @@ class Command:
     locks: bool = True
     tool: bool = False
     needs_study: bool = True
+    tries: tuple[str, ...] = ()
 
     def load(self) -> Callable:
         module, name = self.function.split(":")
@@ -62,10 +64,11 @@ COMMANDS = {
         "WithSeed",
         ("sweep", "classifier", "entropy"),
         "stages:sweep",
+        tries=("classifier", "entropy"),
     ),
     "eval": Command(
         "run every policy on every test object from every start view",
-        "WithSeed",
+        "EvalOptions",
         ("evaluation",),
         "stages:evaluate",
     ),
@@ -113,7 +116,7 @@ COMMANDS = {
     ),
     "check live": Command(
         "walk with the networks in the loop; compare with the view tables",
-        "Options",
+        "WithPolicies",
         ("live",),
         "checks:live",
         writes_run=False,

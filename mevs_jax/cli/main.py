@@ -81,14 +81,17 @@ def _run_in(call: Invocation, command: Command) -> None:
     from eval.run_file import NAME, load_run
     from mevs_jax.cli.parsing import keep_settings
 
-    begins = command.writes_run and load_run(call.out) is None
+    def is_made() -> bool:
+        return any((call.out / made).exists() for made in ("data", "classifier", "entropy", "learned"))
+
+    begins, continued = command.writes_run and load_run(call.out) is None, is_made()
     if begins:  # a run that is interrupted continues with the same settings
         keep_settings(call)
     try:
         command.load()(call)
     except DataError:
-        if begins and not any((call.out / made).exists() for made in ("data", "classifier", "entropy", "learned")):
-            for kept in (NAME, CHECKS):
+        if begins and (continued or not is_made()):  # settings that were refused do not become those of the run
+            for kept in (NAME, *([CHECKS] if not continued else [])):
                 (call.out / kept).unlink(missing_ok=True)
         raise
     if command.writes_run:

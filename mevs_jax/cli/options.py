@@ -37,11 +37,33 @@ class WithSeed(Options):
 
 
 @dataclass(frozen=True)
+class WithPolicies(Options):
+    """Commands that run policies."""
+
+    policy: Annotated[tyro.conf.UseAppendAction[tuple[str, ...]], _arg("MODULE:FUNCTION", "those of the run")] = ()
+    """a policy of your own, evaluated like all others: module:function or path/to/file.py:function; once for each policy;
+    `none` leaves those of the run out (docs/own.md)"""
+
+
+@dataclass(frozen=True)
+class EvalOptions(WithSeed, WithPolicies):
+    """Options of `mevs eval`."""
+
+
+@dataclass(frozen=True)
 class WithWeights(WithSeed):
     """Commands that train classifiers."""
 
     pretrained: Annotated[tuple[Path, ...], _arg("FILE ...")] = ()
     """ImageNet weights to start classifiers from: torchvision's resnet18 and resnet34, .pth or .safetensors"""
+
+
+@dataclass(frozen=True)
+class WithEncoder(Options):
+    """Commands that train the classifier of a run."""
+
+    encoder: Annotated[str | None, _arg("MODULE:FUNCTION", "a ResNet")] = None
+    """train a network of your own as the classifier: module:function or path/to/file.py:function (docs/own.md)"""
 
 
 @dataclass(frozen=True)
@@ -71,7 +93,7 @@ class DataOptions(WithViews):
 
 
 @dataclass(frozen=True)
-class RunOptions(WithViews, WithWeights):
+class RunOptions(WithViews, WithWeights, WithEncoder, WithPolicies):
     """Options of `mevs run`."""
 
 
@@ -81,7 +103,7 @@ class ThesisOptions(WithData, WithWeights):
 
 
 @dataclass(frozen=True)
-class TrainOptions(WithWeights):
+class TrainOptions(WithWeights, WithEncoder):
     """Options of `mevs train`."""
 
     distributed: Annotated[tyro.conf.FlagCreatePairsOff[bool], _arg("")] = False

@@ -13,6 +13,7 @@ from mevs_jax.cli import options as option_classes
 from mevs_jax.cli.commands import COMMANDS, Command
 
 if TYPE_CHECKING:
+    from data_pipeline.capture.casting import CaptureConfig
     from eval.settings import Settings
 
 
@@ -21,6 +22,7 @@ class Invocation:
     """One call of a command.
 
     Attributes:
+        name: of the command.
         options: of the command, one of `mevs_jax.cli.options`.
         settings: all settings, with the options applied.
         preset: whose defaults they started from.
@@ -29,6 +31,7 @@ class Invocation:
         arguments: as typed, after the command.
     """
 
+    name: str
     options: Any
     settings: Settings
     preset: str
@@ -76,7 +79,7 @@ def parse(name: str, arguments: list[str]) -> Invocation:
     """What a command is called with. Settings start from the run's own `run.json`, or else from the preset.
 
     Raises:
-        DataError: for an unknown preset, or a `run.json` that cannot be read.
+        DataError: for an unknown preset, a `run.json` that cannot be read, or options that contradict what the run was made with.
         SystemExit: for options that tyro refuses, after its message.
     """
     from data_pipeline.errors import DataError
@@ -97,16 +100,84 @@ def parse(name: str, arguments: list[str]) -> Invocation:
         other = groups if preset not in (None, run.preset) else []
         other = [group for group in other if group != "dataset" or not (folder / "data").exists()]
         base = replace(run.settings, **{group: getattr(PRESETS[preset or "small"], group) for group in other})
-        preset = (preset if groups else None) or run.preset
+        if preset not in (None, run.preset) and not groups:
+            raise DataError(
+                f"{folder} was made with --preset {run.preset}, not {preset}, which mevs {name} does not change; leave it out"
+            )
+        preset = preset or run.preset
     made_before_run_json = run is None and (folder / "classifier" / "config.json").exists()
     if made_before_run_json:  # by version 0.1: its settings have to be given again
         groups += [group for group in ("dataset", "classifier", "entropy") if group not in groups]
-    kind = _options_with_settings(command, {group: getattr(base, group) for group in groups})
+    others = _other_groups(groups, arguments) if run is not None else []
+    shorts = _short_options(command, arguments) if run is not None or made_before_run_json else []
+    kind = _options_with_settings(command, {group: getattr(base, group) for group in (*groups, *others)}, shorts)
     arguments = ["--help" if argument == "--help-all" else argument for argument in arguments]
     options: Any = tyro.cli(kind, prog=f"mevs {name}", description=f"{command.title}.", args=arguments)
-    return Invocation(
-        options, settings_of(options, groups, base), preset, folder, tuple(groups), [*name.split(), *arguments]
-    )
+    settings = settings_of(options, groups, base)
+    given = replace(settings, **{group: getattr(options, group) for group in others})
+    _check_unchanged(base, given, groups, f"mevs {name}", folder)
+    _check_views(arguments, settings.dataset.capture)
+    if settings.classifier.encoder:
+        _check_no_resnet(arguments, settings.classifier.encoder)
+    return Invocation(name, options, settings, preset, folder, tuple(groups), [*name.split(), *arguments])
+
+
+def _other_groups(groups: list[str], arguments: list[str]) -> list[str]:
+    """The groups of settings that arguments name and that are not the command's own."""
+    from eval.settings import Settings
+
+    found = (field.name for field in dataclasses.fields(Settings) if field.name not in groups)
+    return [group for group in found if any(argument.startswith(f"--{group}.") for argument in arguments)]
+
+
+_SHORT = ("data", "archive", "views", "encoder")
+"""Options that stand for a setting."""
+
+
+def _short_options(command: Command, arguments: list[str]) -> list[str]:
+    """The short options among the arguments that the command does not have."""
+    own = {field.name for field in dataclasses.fields(_class_of(command))}
+    given = {argument.split("=")[0] for argument in arguments}
+    return [name for name in _SHORT if f"--{name}" in given and name not in own]
+
+
+def _check_unchanged(base: Settings, settings: Settings, groups: list[str], command: str, folder: Path) -> None:
+    """Raises `DataError` if options change settings that a command does not use: they are those that the run was made with."""
+    from data_pipeline.differences import differences, in_words
+    from data_pipeline.errors import DataError
+
+    own = {*groups, "policies"}
+    was, now = ({n: v for n, v in dataclasses.asdict(all_of).items() if n not in own} for all_of in (base, settings))
+    if found := differences(was, now):
+        raise DataError(
+            f"{folder} was made with other settings ({in_words(found)}), which {command} does not change; leave these options "
+            f"out, or make another run with another --out"
+        )
+
+
+def _check_views(arguments: list[str], capture: CaptureConfig) -> None:
+    """Raises `DataError` if `--dataset.capture.views` is not the number of viewpoints in a file."""
+    from data_pipeline.capture.viewpoints import is_file
+    from data_pipeline.errors import DataError
+
+    views = _given(arguments, "--dataset.capture.views") or ""
+    if is_file(capture.lattice) and views.isdecimal() and int(views) != capture.views:
+        raise DataError(
+            f"{capture.lattice} has {capture.views} viewpoints, and --dataset.capture.views is {views}; leave one of them out"
+        )
+
+
+def _check_no_resnet(arguments: list[str], encoder: str) -> None:
+    """Raises `DataError` for settings of a ResNet beside an encoder of the user's, which has none of them but channels."""
+    from data_pipeline.errors import DataError
+
+    prefix = "--classifier.network."
+    for argument in arguments:
+        name = argument.split("=")[0].replace("_", "-")
+        if name.startswith(prefix) and name != f"{prefix}channels":
+            raise DataError(
+                f"{name} is a setting of the ResNet, and the classifier is {encoder}; leave one of them out"
+            )
 
 
 def keep_settings(call: Invocation) -> None:
@@ -117,18 +188,26 @@ def keep_settings(call: Invocation) -> None:
     if run is None:
         save_run(call.out, call.preset, call.settings, call.arguments)
     else:
-        settings = replace(run.settings, **{group: getattr(call.settings, group) for group in call.groups})
+        tried = [group for group in COMMANDS[call.name].tries if (call.out / group / "config.json").exists()]
+        groups = [group for group in call.groups if group not in tried]
+        settings = replace(run.settings, **{group: getattr(call.settings, group) for group in groups})
+        if hasattr(call.options, "policy"):
+            settings = replace(settings, policies=call.settings.policies)
         save_run(call.out, run.preset, settings, call.arguments)
 
 
-def _options_with_settings(command: Command, groups: dict[str, Any]) -> type:
-    """The command's options with groups of settings, and their defaults, beside them."""
-    fields = [(group, type(value), dataclasses.field(default=value)) for group, value in groups.items()]
+def _options_with_settings(command: Command, groups: dict[str, Any], shorts: list[str]) -> type:
+    """The command's options with groups of settings, and their defaults, beside them, and with short options of others."""
+    fields: list = [(group, type(value), dataclasses.field(default=value)) for group, value in groups.items()]
+    fields += [(name, int | None if name == "views" else str | None, None) for name in shorts]
     return dataclasses.make_dataclass(command.options, fields, bases=(_class_of(command),), frozen=True)
 
 
 def settings_of(options: Any, groups: list[str], base: Settings) -> Settings:
     """All settings: these groups as given, the others as they were; short options override."""
+    from data_pipeline.capture.viewpoints import is_file
+    from train.own_code import absolute
+
     settings = replace(base, **{group: getattr(options, group) for group in groups})
     dataset = settings.dataset
     if getattr(options, "data", None) is not None:
@@ -137,12 +216,41 @@ def settings_of(options: Any, groups: list[str], base: Settings) -> Settings:
         dataset = replace(dataset, archive=options.archive)
     if getattr(options, "views", None) is not None:
         dataset = replace(dataset, capture=replace(dataset.capture, views=options.views))
-    settings = replace(settings, dataset=dataset)
+    capture = dataset.capture
+    if is_file(capture.lattice) and capture.lattice != base.dataset.capture.lattice:
+        dataset = replace(dataset, capture=_with_own_viewpoints(capture, options, base))
+    settings = replace(settings, dataset=dataset, policies=_policies(options, base))
+    encoder = absolute(getattr(options, "encoder", None) or settings.classifier.encoder)
+    settings = replace(settings, classifier=replace(settings.classifier, encoder=encoder))
     seed = getattr(options, "seed", None)
     if seed is None:
         return settings
     seeded = [group for group in groups if group != "dataset"]
     return replace(settings, **{group: with_seed(getattr(settings, group), seed) for group in seeded})
+
+
+def _with_own_viewpoints(capture: CaptureConfig, options: Any, base: Settings) -> CaptureConfig:
+    """The capture with as many views as the file of its viewpoints has.
+
+    Raises:
+        DataError: if the file cannot be used, or `--views` is another number.
+    """
+    from data_pipeline.capture.viewpoints import FILE, absolute_lattice, read_viewpoints, viewpoints_of
+
+    capture = replace(capture, lattice=absolute_lattice(capture.lattice))
+    if getattr(options, "views", None) is None and capture.views == base.dataset.capture.views:
+        views = len(read_viewpoints(Path(capture.lattice.removeprefix(FILE))).points)
+        return replace(capture, views=views)
+    viewpoints_of(capture)
+    return capture
+
+
+def _policies(options: Any, base: Settings) -> tuple[str, ...]:
+    """The policies of `--policy`: those that are given, or those of the run; `none` is for no policy."""
+    from train.own_code import absolute
+
+    given = getattr(options, "policy", ())
+    return tuple(absolute(one) for one in given if one != "none") if given else base.policies
 
 
 def with_seed(settings: Any, seed: int) -> Any:

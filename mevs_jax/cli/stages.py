@@ -8,10 +8,16 @@ from mevs_jax.cli.parsing import Invocation, keep_settings
 def run(call: Invocation) -> None:
     """All stages, one after the other."""
     from eval import stages
+    from eval.walks.own_policies import load_policies
+    from train.own_code import load_own
     from train.tasks.classifier import starting_weights
 
-    start = starting_weights(call.options.pretrained, call.settings.classifier.network)
-    stages.make_data(call.settings, call.out)
+    classifier = call.settings.classifier
+    start = starting_weights(call.options.pretrained, classifier.network, classifier.encoder)
+    load_policies(call.settings.policies)  # so that an error in what users bring is found before anything else is done
+    if classifier.encoder:
+        load_own(classifier.encoder, "--encoder")
+    stages.policies_of(call.settings, stages.make_data(call.settings, call.out))
     stages.train(call.settings, call.out, start)
     evaluate(call)
     print(f"Trained system: {stages.make_system(call.settings, call.out).absolute()}")
@@ -37,6 +43,7 @@ def train(call: Invocation) -> None:
     from train.devices import device_mesh, is_first, join_processes
     from train.tasks.classifier import starting_weights
 
+    classifier = call.settings.classifier
     with ExitStack() as held:
         if call.options.distributed:
             join_processes()  # before anything is computed
@@ -45,7 +52,7 @@ def train(call: Invocation) -> None:
                 stages.check_output(call.out)
                 held.enter_context(locked(call.out, " ".join(["mevs", *call.arguments])))
                 keep_settings(call)
-        start = starting_weights(call.options.pretrained, call.settings.classifier.network)
+        start = starting_weights(call.options.pretrained, classifier.network, classifier.encoder)
         stages.train(call.settings, call.out, start, device_mesh(call.options.model_devices))
 
 
@@ -70,9 +77,10 @@ def evaluate(call: Invocation) -> None:
     accuracy = metrics["single_view"]["accuracy"]
     print(f"Single views: {100 * accuracy:.1f} % of {metrics['objects']} test objects right")
     titles = {rung["policy"]: rung["title"] for rung in metrics["ladder"]}
+    own = [rung["policy"] for rung in metrics["ladder"] if "own" in rung]
     after_two = ", ".join(
         f"{titles[name]} {100 * metrics['policies'][name]['after_views'][1]:.1f} %"
-        for name in ("random", "predicted_entropy", "oracle_entropy", "information_gain")
+        for name in ("random", "predicted_entropy", "oracle_entropy", "information_gain", *own)
     )
     print(f"After two views: {after_two}")
     print(f"Metrics: {call.out / 'metrics.json'}")

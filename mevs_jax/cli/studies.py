@@ -35,7 +35,8 @@ def published_code(call: Invocation) -> None:
     from eval import stages
     from train.tasks.classifier import starting_weights
 
-    start = starting_weights(call.options.pretrained, call.settings.classifier.network)
+    classifier = call.settings.classifier
+    start = starting_weights(call.options.pretrained, classifier.network, classifier.encoder)
     stages.train_by_view(call.settings, call.out, start)
     evaluate(call)
     report(call)

@@ -186,6 +186,7 @@ def test_a_run_keeps_its_settings(whole, tmp_path, monkeypatch, capsys):
     assert (kept["preset"], kept["settings"]["dataset"]["capture"]["views"]) == ("tiny", 6)
     assert kept["arguments"][:3] == ["run", "--preset", "tiny"]
     assert {"python", "jax", "mevs-jax"} <= set(kept["made_with"])
+    assert kept["made_with"]["devices"] == {"platform": "cpu", "kind": "cpu", "count": 1}
     run = load_run(whole)
     assert (run.preset, run.settings) == ("tiny", TINY)
     call = parsing.parse("eval", ["--out", str(whole), "--seed", "3", "--evaluation.draws", "5"])
@@ -194,7 +195,8 @@ def test_a_run_keeps_its_settings(whole, tmp_path, monkeypatch, capsys):
     seeded = parsing.parse("train", ["--out", str(whole), "--seed", "3"]).settings
     assert seeded.classifier.optimiser.seed == seeded.entropy.optimiser.data_seed == 3
     assert seeded.dataset == TINY.dataset
-    assert parsing.parse("report", ["--out", str(whole), "--preset", "small"]).preset == "tiny"
+    with pytest.raises(DataError, match="was made with --preset tiny, not small, which mevs report does not change"):
+        parsing.parse("report", ["--out", str(whole), "--preset", "small"])
     other = parsing.parse("eval", ["--out", str(whole), "--preset", "small"]).settings
     assert other == replace(TINY, evaluation=PRESETS["small"].evaluation)
     monkeypatch.setattr(sys, "argv", ["test", "train", "--out", str(whole), "--print-config"])

@@ -24,7 +24,7 @@ from mevs_jax import (
     select_views,
     with_movement,
 )
-from mevs_jax.policies import policy_named, register_policy
+from mevs_jax.policies import policy_entry, policy_named, register_policy
 from tests.reference import numpy_rules, policies
 
 THRESHOLDS = (0.5, 0.6, 0.7, 0.8, 0.9, 0.95, 0.99)
@@ -341,14 +341,22 @@ def test_nothing_is_compiled_twice():
 def test_policies_are_registered_by_call_or_decorator_and_no_name_twice():
     try:
 
-        @register_policy("decorated")
+        @register_policy("decorated", title="a title", knows="truth")
         def decorated(key, state, scene):
             return jnp.zeros(10)
 
         assert register_policy("called", decorated) is decorated
         assert list(POLICIES)[-2:] == ["decorated", "called"]
+        entries = [policy_entry(name) for name in ("decorated", "called", "predicted_entropy")]
+        assert [(entry.title, entry.knows) for entry in entries] == [
+            ("a title", "truth"),
+            ("called", "networks"),
+            ("PointNet++ entropy (thesis)", "networks"),
+        ]
+        with pytest.raises(ValueError, match="knows 'all', which is none of nothing, networks"):
+            register_policy("other", decorated, knows="all")
         assert policy_named("decorated") is policy_named("called") is decorated
-        for register in (lambda: register_policy("called", decorated), lambda: register_policy("random")):
+        for register in (lambda: register_policy("called", decorated), lambda: register_policy("random")(decorated)):
             with pytest.raises(ValueError, match="is taken"):
                 register()
     finally:

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from data_pipeline.errors import DataError
+from data_pipeline.errors import DataError, Unreadable
 from data_pipeline.files import CHECKS, keep_json, read_json, write_json
-from train.kept import check_config, kept_array, kept_json
+from train.kept import check_config, keep_beside, kept_array, kept_json
 
 
 def test_content_is_computed_once_for_each_identity(tmp_path):
@@ -50,7 +50,7 @@ def test_a_folder_of_another_run_is_refused(tmp_path):
     check_config(tmp_path, {"seed": 1}, "a network trained")
     write_json(tmp_path / "config.json", {"seed": 1})
     check_config(tmp_path, {"seed": 1}, "a network trained")
-    with pytest.raises(DataError, match="holds a network trained with other settings; choose another --out"):
+    with pytest.raises(DataError, match=r"holds a network trained with other settings \(.*\); choose another --out"):
         check_config(tmp_path, {"seed": 2}, "a network trained")
 
 
@@ -105,3 +105,22 @@ def test_a_damaged_configuration_is_written_again_if_its_check_proves_it(tmp_pat
     (tmp_path / CHECKS).unlink()
     with pytest.raises(DataError, match="it is missing"):
         check_config(tmp_path, identity, "a network trained")
+
+
+def test_a_file_that_follows_from_another_is_kept(tmp_path, capsys):
+    path = tmp_path / "table.csv"
+    keep_beside(path, b"a,b\n")
+    made = path.stat().st_mtime_ns
+    keep_beside(path, b"a,b\n")
+    assert path.stat().st_mtime_ns == made
+    for damage in (lambda: path.write_bytes(b"a"), path.unlink, lambda: (tmp_path / CHECKS).unlink()):
+        damage()
+        keep_beside(path, b"a,b\n")
+        assert path.read_bytes() == b"a,b\n"
+    assert capsys.readouterr().err.count("is not as it was written, so it is made again") == 1
+    keep_beside(path, b"c\n")  # of other content
+    assert path.read_bytes() == b"c\n"
+    path.unlink()
+    path.mkdir()
+    with pytest.raises(Unreadable, match="it is a folder"):
+        keep_beside(path, b"c\n")

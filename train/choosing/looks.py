@@ -9,11 +9,12 @@ from functools import cache, partial
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array
 
 from data_pipeline.dataset.augment import object_changes, views_after
+from data_pipeline.errors import DataError
 from mevs_jax.models import PointNet2, Recogniser
-from mevs_jax.viewpoints import viewpoint_lattice
 from train.outputs import Ask
 from train.step import Batch, Task
 from train.tasks.entropy import EntropyTask
@@ -42,20 +43,36 @@ def _see_changed_by(changes: Array, network: Recogniser, task: RecogniserTask, b
     return _see_images(network, images.reshape(-1, *images.shape[2:]), directions.reshape(-1, 3), batch)
 
 
-def see_rotated(network: Recogniser, task: Task, batch: Batch) -> jax.Array:
-    """Returns `see` of objects turned so that their cameras are in the directions of the lattice again.
+@cache
+def see_rotated(viewpoints: tuple[tuple[float, ...], ...]) -> Ask:
+    """Returns a `see` for objects turned so that their cameras are in the directions of the lattice again.
 
     For data sets made with `turned`, where the lattice around each object is turned by a random rotation. Those rotations are
     uniform over all rotations, and so are the ones applied here.
+
+    Args:
+        viewpoints: unit vectors of the lattice.
+
+    Raises:
+        DataError: if they lie in one plane with the origin, from which no rotation can be told.
     """
-    assert isinstance(task, RecogniserTask)
-    lattice = jnp.asarray(viewpoint_lattice(task.camera.views, task.camera.lattice), jnp.float32)
+    if np.linalg.matrix_rank(np.array(viewpoints), tol=1e-6) < 3:
+        raise DataError(
+            "the viewpoints lie in one plane with the object's centre, from which no rotation of an object can be told; set "
+            "--learned.rotation-epochs 0"
+        )
 
-    def turn_back(directions: Array) -> Array:
-        return jnp.linalg.solve(directions.T @ directions, directions.T @ lattice).T
+    def see(network: Recogniser, task: Task, batch: Batch) -> jax.Array:
+        assert isinstance(task, RecogniserTask)
+        lattice = jnp.asarray(viewpoints, jnp.float32)
 
-    turns = jax.vmap(turn_back)(views_by_object(task.directions(batch), task.camera.views))
-    return _see_changed_by(turns, network, task, batch)
+        def turn_back(directions: Array) -> Array:
+            return jnp.linalg.solve(directions.T @ directions, directions.T @ lattice).T
+
+        turns = jax.vmap(turn_back)(views_by_object(task.directions(batch), task.camera.views))
+        return _see_changed_by(turns, network, task, batch)
+
+    return see
 
 
 @cache

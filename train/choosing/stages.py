@@ -19,6 +19,7 @@ import numpy as np
 from flax import nnx
 from jaxtyping import Array, Float
 
+from data_pipeline.capture.viewpoints import is_file
 from data_pipeline.dataset.batches import fold_of
 from data_pipeline.dataset.builder import DataConfig, open_split, prepare
 from data_pipeline.dataset.statistics import DatasetStatistics, load_statistics
@@ -67,7 +68,8 @@ class LearnedConfig:
     fitting_starts: int = 1
     """n: temperatures are fitted on walks from every n-th start view"""
     lattices: tuple[int, ...] = (10,)
-    """further numbers of candidate views to test on, which are not trained on"""
+    """further numbers of candidate views to test on, which are not trained on; of the same lattice, or of golden_angle if the
+    run's viewpoints are from a file"""
     ablations: tuple[str, ...] = ()
     """variants of the policy to compare with, for the first seed: as_it_is, look_ahead, probability, random_states, unchanged,
     crossed, known, summed, cloud (needs PointNet++, trained by `mevs train`), q_learning"""
@@ -258,7 +260,8 @@ class Stages:
             ask: computes the features of a batch; by default `see`, or `see_rotated` for turned objects.
         """
         task, folder, classes = self.task(fold), self.recogniser_folder(fold), len(self.statistics.classes)
-        ask = ask or (see if self.upright is None else see_rotated)
+        if ask is None:
+            ask = see if self.upright is None else see_rotated(tuple(map(tuple, self.statistics.viewpoints)))
         seen = kept_array(
             self.folder / "features" / f"{name}.npz",
             made_by(load_statistics(data), folder),
@@ -378,7 +381,10 @@ class Stages:
 
 def lattice_data(dataset: DataConfig, out: Path, views: int) -> Path:
     """Returns the folder of the data set with `views` candidate views, made first if it does not exist."""
-    own = dataset.capture.views == views
-    folder = out / "data" if own else out / "learned" / f"lattice_{views}"
-    prepare(replace(dataset, capture=replace(dataset.capture, views=views)), folder)
+    if dataset.capture.views == views:
+        prepare(dataset, out / "data")
+        return out / "data"
+    lattice = "golden_angle" if is_file(dataset.capture.lattice) else dataset.capture.lattice
+    folder = out / "learned" / f"lattice_{views}"
+    prepare(replace(dataset, capture=replace(dataset.capture, views=views, lattice=lattice)), folder)
     return folder

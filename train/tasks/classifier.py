@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import jax
 import jax.numpy as jnp
@@ -39,7 +39,7 @@ class ResNetConfig:
     """the first layer: ResNet's convolution, or patches of 4×4 pixels, a third faster on a CPU"""
 
 
-def starting_weights(files: tuple[Path, ...], network: ResNetConfig) -> StartingWeights | None:
+def starting_weights(files: tuple[Path, ...], network: ResNetConfig, encoder: str = "") -> StartingWeights | None:
     """Returns the initial weights of a classifier from the file that holds its depth, or None without files.
 
     Raises:
@@ -47,6 +47,10 @@ def starting_weights(files: tuple[Path, ...], network: ResNetConfig) -> Starting
     """
     if not files:
         return None
+    if encoder:
+        raise DataError(
+            f"--pretrained weights are those of a ResNet, not of --encoder {encoder}; leave one of them out"
+        )
     if (network.width, network.channels) != (64, 3):
         raise DataError(
             f"--pretrained weights fit a ResNet of width 64 with 3 input channels, this one has width {network.width} and "
@@ -60,6 +64,8 @@ class ClassifierConfig:
     """Settings of the classifier and its training."""
 
     network: ResNetConfig = ResNetConfig()
+    encoder: str = ""
+    """a network of your own instead of the ResNet: module:function or path/to/file.py:function (docs/own.md)"""
     images: Literal["depth", "image"] = "depth"
     """its input: depth, or the shaded image"""
     augmentation: ImageAugmentation = ImageAugmentation()
@@ -80,6 +86,10 @@ class ClassifierTask:
 
     @classmethod
     def of(cls, config: ClassifierConfig, classes: int, camera: CaptureConfig) -> ClassifierTask:
+        if config.encoder:
+            from train.tasks.own_encoder import OwnEncoderTask  # which needs this module
+
+            return OwnEncoderTask.of_encoder(config, classes, camera)
         return cls(config.network, classes, config.images, camera, config.augmentation, config.optimiser)
 
     @property
@@ -120,7 +130,7 @@ class ClassifierTask:
         return jax.vmap(convert)(batch[self.images])
 
     def loss(
-        self, network: ResNet, batch: Batch, key: jax.Array, samples: jax.Array, hyper: Hyperparameters
+        self, network: Any, batch: Batch, key: jax.Array, samples: jax.Array, hyper: Hyperparameters
     ) -> tuple[jax.Array, Metrics]:
         del samples
         images = self.inputs(batch)
@@ -132,7 +142,7 @@ class ClassifierTask:
         loss = jnp.mean(optax.softmax_cross_entropy_with_integer_labels(logits, batch["label"]))
         return loss, {"loss": loss, "accuracy": jnp.mean(jnp.argmax(logits, -1) == batch["label"])}
 
-    def evaluate(self, network: ResNet, batch: Batch) -> Metrics:
+    def evaluate(self, network: Any, batch: Batch) -> Metrics:
         logits = network(self.inputs(batch))
         return {
             "loss": optax.softmax_cross_entropy_with_integer_labels(logits, batch["label"]),

@@ -80,7 +80,7 @@ def test_a_data_set_is_not_made_twice_nor_mixed(data):
     assert prepare(CONFIG, data) == load_statistics(data)
     assert before == {path: path.stat().st_mtime_ns for path in data.rglob("*") if path.is_file()}
     assert not (data / "captures").exists()
-    with pytest.raises(DataError, match=r"other settings \(seed\)"):
+    with pytest.raises(DataError, match=r"other settings \(seed 0, not "):
         prepare(replace(CONFIG, seed=9), data)
 
 

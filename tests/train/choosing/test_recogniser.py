@@ -41,7 +41,9 @@ def test_objects_turned_anyhow_are_seen_from_the_lattice_itself(turned):
     together = {name: np.concatenate([batch[name] for batch in batches]) for name in batches[0]}
     lattice = viewpoint_lattice(task.camera.views, task.camera.lattice)
     see, after = nnx.jit(Recogniser.see), jax.jit(partial(views_after, camera=task.camera))
-    turned_back = nnx.jit(partial(see_rotated, task=task))(network, batch=together)
+    turned_back = nnx.jit(partial(see_rotated(tuple(map(tuple, statistics.viewpoints))), task=task))(
+        network, batch=together
+    )
     for index, found in enumerate(np.split(np.asarray(turned_back), 2)):
         np.testing.assert_allclose(found[:, features + 10 : -1], lattice, atol=1e-4)
         np.testing.assert_array_equal(found[:, -1], batches[index]["label"])
