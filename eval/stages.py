@@ -229,8 +229,10 @@ def make_system(settings: Settings, out: Path) -> Path:
     """Writes the trained system of the run into `system/`, unless it is there already; returns the folder.
 
     Raises:
-        DataError: if the run is not finished.
+        DataError: if the run is not finished, or its classifier is an encoder of the user's own.
     """
+    if encoder := settings.classifier.encoder:
+        raise DataError(f"a trained system holds networks of this project, and the classifier of {out} is {encoder}")
     folder, statistics = out / "system", load_statistics(out / "data")
     if not (out / "metrics.json").exists():
         raise DataError(f"no metrics in {out}; make them with: mevs eval --out {out}")
@@ -339,7 +341,10 @@ def check_agent(settings: Settings, out: Path) -> dict[str, Any]:
     policies = [name for name in USABLE if name in system.policies]
     found = {
         "walks": {name: asdict(walks) for name, walks in compare_walks(system, out / "data", config, policies).items()},
-        "stopping": {name: stopping(system, tables, name, config.max_views) for name in policies},
+        "stopping": {
+            name: stopping(system, tables, name, config.max_views)
+            for name in dict.fromkeys((system.description.best, "random"))
+        },
         "camera": recognised(system, meshes, config),
         "latency_ms": latency(system, out / "data", config.calls),
         "settings": asdict(config),

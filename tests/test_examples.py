@@ -15,17 +15,19 @@ EXAMPLES = Path(__file__).resolve().parents[1] / "examples"
     ("name", "said"),
     [
         ("own_policy", "opposite: "),
-        ("load_and_ask", "view 0: "),
+        ("load_and_ask", "confident after "),
+        ("depth_camera", " views: sure"),
         ("gymnasium_ppo", "| PPO − random | +0.0 "),
         pytest.param("own_encoder", "validation accuracy", marks=pytest.mark.slow),
     ],
 )
 def test_an_example_runs(name, said, whole, tmp_path):
     arguments = {
-        "own_encoder": [str(tmp_path)],
-        "gymnasium_ppo": ["--updates", "2", "--episodes", "16", "--networks", "2"],
+        "own_policy": [str(whole)],
+        "own_encoder": [str(whole), str(tmp_path)],
+        "gymnasium_ppo": [str(whole), "--updates", "2", "--episodes", "16", "--networks", "2"],
     }
-    command = [sys.executable, str(EXAMPLES / f"{name}.py"), str(whole), *arguments.get(name, [])]
+    command = [sys.executable, str(EXAMPLES / f"{name}.py"), *arguments.get(name, [])]
     ended = subprocess.run(command, capture_output=True, text=True, timeout=600)
     assert ended.returncode == 0, ended.stderr
     assert said in ended.stdout
@@ -37,5 +39,6 @@ def test_all_examples_are_run():
         "own_policy",
         "own_encoder",
         "load_and_ask",
+        "depth_camera",
         "gymnasium_ppo",
     }

@@ -6,7 +6,6 @@ from pathlib import Path
 from typing import Any
 
 import jax.numpy as jnp
-import numpy as np
 
 from data_pipeline.dataset.inputs import view_camera
 from data_pipeline.dataset.statistics import load_statistics
@@ -16,7 +15,6 @@ from mevs_jax.models import Recogniser, ViewPolicy
 from mevs_jax.models.shapes import SetFusionShape, ViewPolicyShape
 from mevs_jax.trained import Description, ImageInput, Network, Parts, TrainedSystem, fit_strangeness
 from mevs_jax.trained.description import FORM
-from mevs_jax.viewpoints import ViewGraph
 from train.choosing.stages import Stages, lattice_data
 from train.kept import made_by
 from train.loop import load_best

@@ -26,7 +26,7 @@ def agent(call: Invocation) -> None:
             f"{policy}: {walks['same']} of {walks['walks']} walks are those on view tables (probabilities within "
             f"{walks['largest_difference']:.1e})"
         )
-        for row in found["stopping"][policy]:
+        for row in found["stopping"].get(policy, []):
             print(
                 f"  stops at {row['stop']:g}: wrong {100 * row['error']:.2f} % (promised {100 * row['promised_error']:g} %), "
                 f"{100 * row['stopped']:.0f} % of walks stop, {row['views']:.1f} views"

@@ -20,7 +20,8 @@ def run(call: Invocation) -> None:
     stages.policies_of(call.settings, stages.make_data(call.settings, call.out))
     stages.train(call.settings, call.out, start)
     evaluate(call)
-    print(f"Trained system: {stages.make_system(call.settings, call.out).absolute()}")
+    if not call.settings.classifier.encoder:  # of which no trained system can be made
+        print(f"Trained system: {stages.make_system(call.settings, call.out).absolute()}")
     report(call)
 
 
