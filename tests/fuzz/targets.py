@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import json
 import tempfile
 import zipfile
 from collections.abc import Callable
@@ -18,7 +19,10 @@ from data_pipeline.objects.formats import parse_mesh
 from data_pipeline.objects.mesh import normalise
 from data_pipeline.objects.sources import mesh_zip
 from data_pipeline.objects.voxels import voxel_archive
+from mevs_jax.trained import UnreadableSystem, load, save
+from mevs_jax.trained.files import DESCRIPTION, WEIGHTS, _hash_of
 from tests.data_pipeline.objects import making
+from tests.mevs_jax.trained import making as systems
 from tests.train import weights_making as weights
 from train.weights_files import read_state_dict
 
@@ -89,6 +93,40 @@ def _read_weights(path: Path) -> None:
     arrays = read_state_dict(path)
     assert all(name.isprintable() for name in arrays)
     assert sum(array.nbytes for array in arrays.values()) <= 4 * path.stat().st_size + (1 << 20)
+
+
+@cache
+def _system() -> tuple[bytes, bytes]:
+    """The description and the weights of a small trained system."""
+    with tempfile.TemporaryDirectory() as folder:
+        save(systems.system(), Path(folder) / "system")
+        return tuple((Path(folder) / "system" / name).read_bytes() for name in (DESCRIPTION, WEIGHTS))  # type: ignore[return-value]
+
+
+def _read_system(content: bytes) -> None:
+    """Reads a description beside sound weights, with a hash that fits it if it is JSON."""
+    try:
+        described = json.loads(content)
+        described["sha256"] = _hash_of(described)
+        content = json.dumps(described).encode()
+    except (ValueError, TypeError, AttributeError, RecursionError):
+        pass
+    with tempfile.TemporaryDirectory() as folder:
+        (Path(folder) / DESCRIPTION).write_bytes(content)
+        (Path(folder) / WEIGHTS).write_bytes(_system()[1])
+        try:
+            load(folder)
+        except UnreadableSystem as reason:
+            _is_one_line(reason)
+
+
+def _systems() -> list[bytes]:
+    description = json.loads(_system()[0])
+    found = [_system()[0]]
+    for name, value in description.items():
+        for other in (None, -1, 2**70, 1e308, "text", [], {}, [value], {"a": value}):
+            found.append(json.dumps(description | {name: other}).encode())
+    return found
 
 
 def _off() -> list[bytes]:
@@ -166,9 +204,9 @@ def _npz() -> list[bytes]:
     grids[:, 1:5, 2:4, 1:4] = 1
     arrays = {"X_train": grids, "y_train": np.array([0, 1]), "X_test": grids[:1], "y_test": np.array([1])}
     found = []
-    for save, more in ((np.savez, {}), (np.savez_compressed, {}), (np.savez, {"classes": np.array(["mug", "rack"])})):
+    for write, more in ((np.savez, {}), (np.savez_compressed, {}), (np.savez, {"classes": np.array(["mug", "rack"])})):
         buffer = io.BytesIO()
-        save(buffer, **arrays, **more)
+        write(buffer, **arrays, **more)
         found.append(buffer.getvalue())
     return found
 
@@ -210,6 +248,7 @@ TARGETS = {
     "npz": Target(_file(_read_npz, ".npz"), _npz),
     "pth": Target(_file(_read_weights, ".pth"), _pth),
     "safetensors": Target(_file(_read_weights, ".safetensors"), _safetensors),
+    "system": Target(_read_system, _systems),
 }
 
 
