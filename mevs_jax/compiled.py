@@ -17,9 +17,16 @@ def keep_compiled(folder: str | Path | None = None) -> Path:
     Changes JAX's settings for the whole process (its persistent compilation cache). Programs of other versions of JAX, or for
     other devices, are told apart.
 
+    A folder that JAX already uses, by `JAX_COMPILATION_CACHE_DIR` for example, is kept.
+
     Args:
         folder: by default `mevs_jax/compiled` in the user's cache, `$XDG_CACHE_HOME` or `~/.cache`.
+
+    Raises:
+        OSError: if the folder cannot be made.
     """
+    if folder is None and jax.config.jax_compilation_cache_dir:
+        return Path(jax.config.jax_compilation_cache_dir)
     if folder is None:
         folder = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "mevs_jax" / "compiled"
     folder = Path(folder)

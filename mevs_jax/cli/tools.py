@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import json
+from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from mevs_jax.cli.failure import Unusable
+from mevs_jax.compiled import keep_compiled
 
 if TYPE_CHECKING:
     from mevs_jax.agent import Walk
@@ -26,6 +28,8 @@ def look(options: LookOptions) -> None:
     assert source is not None
     mesh = read_mesh(options.mesh, options.up) if options.mesh is not None else None
     stored = read_arrays(options.depth) if options.depth is not None else None
+    with suppress(OSError):  # without a place to keep programs in, they are compiled again
+        keep_compiled()
     system = load_system(options.system)
     given = {name: getattr(options, name) for name in ("policy", "stop", "max_views", "unknown")}
     try:
