@@ -91,6 +91,13 @@ def window_of(
     return Window(samples, marks, *f32)
 
 
+def check_source(depth: AnyArray, K: AnyArray, T_world_camera: AnyArray, mask: AnyArray | None) -> None:
+    """Raises `ValueError` unless depth image, intrinsics, pose and mask are such as `window_of` takes."""
+    _checked_images(depth, mask)
+    _checked_intrinsics(K)
+    _checked_pose(T_world_camera)
+
+
 def why_empty(window: Window) -> str:
     """Returns a sentence that says why a window shows nothing of the object."""
     expected = float(np.linalg.norm(window.eye) * window.radius)

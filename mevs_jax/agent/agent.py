@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import jax
@@ -17,14 +17,18 @@ from jaxtyping import Float
 
 from mevs_jax.agent import core
 from mevs_jax.agent.candidates import candidates_of
-from mevs_jax.agent.frames import mask_of, pose_towards, rotation_to_world
+from mevs_jax.agent.frames import mask_of, points_of, pose_towards, rotation_to_world
 from mevs_jax.agent.programs import Programs
 from mevs_jax.agent.records import Belief, History, Reason, Step, plain
 from mevs_jax.arrays import AnyArray, AnyVector
-from mevs_jax.canonical import canonical_view
+from mevs_jax.canonical import CanonicalView, canonical_view
 from mevs_jax.policies.base import Policy
+from mevs_jax.source_view import check_source
 from mevs_jax.sphere import estimate_sphere
 from mevs_jax.trained.system import TrainedSystem
+
+_REACH = 1.3
+"""Points up to this many radii from the estimated centre belong to the object, since an estimate from one side is too small."""
 
 Reachable = AnyArray | Sequence[int] | Callable[[np.ndarray], bool] | None
 """Which candidates can be reached: a mask, indices, a function of the camera's pose (4, 4), or None for all."""
@@ -42,6 +46,8 @@ class _Object:
         memory: of its views.
         belief: the latest one.
         failed: (failed, 3) directions, in its frame, from which no view could be taken.
+        points: (points, 3) of its surface in the world, if its sphere is estimated from them; None if it is known.
+        frames: the images from which they are, as they were given to `observe`.
     """
 
     center: np.ndarray
@@ -52,6 +58,8 @@ class _Object:
     memory: core.Memory
     belief: Belief | None
     failed: np.ndarray
+    points: np.ndarray | None = None
+    frames: list[tuple[Any, ...]] = field(default_factory=list)
 
 
 class Agent:
@@ -180,14 +188,18 @@ class Agent:
         self.history = History(self.system.name, {"agent": mine | {"seed": self.seed}, "reset": options})
 
     def reset_from_points(self, points: AnyArray, **options: Any) -> None:
-        """Begins with a new object whose centre and radius are estimated from points on its surface.
+        """Begins with a new object whose centre and radius are estimated from points on its surface, and from all views to come.
+
+        When a view changes the estimate by more than 1 % of the radius, all views so far are converted again.
 
         Args:
             points: (points, 3) in the world, in metres, of the object alone.
             options: `up`, `yaw` and `yaw_known` as of `reset`.
         """
-        center, radius = estimate_sphere(np.asarray(points, float))
-        self.reset(center=center, radius=float(radius), **options)
+        cloud = np.asarray(points, float)
+        center, radius = estimate_sphere(cloud, up=options.get("up", (0.0, 0.0, 1.0)))
+        self.reset(center=center, radius=radius, **options)
+        self._current.points = cloud
 
     def observe(
         self,
@@ -213,20 +225,41 @@ class Agent:
         Raises:
             ValueError: for an input that cannot be used, or beyond `max_views`.
         """
-        begun = time.perf_counter()
-        of = self._current
-        view = canonical_view(
-            depth,
-            K,
-            T_world_camera,
-            center=of.center,
-            radius=of.radius,
-            up=of.rotation[:, 2],
-            camera=self.system.description.camera,
-            mask=mask,
-            floor=floor,
-        )
+        begun, of = time.perf_counter(), self._current
+        frame = (depth, K, T_world_camera, mask, floor)
+        if of.points is not None:
+            check_source(depth, K, T_world_camera, mask)
+            self._refine(of, frame)
+        view = self._converted(*frame)
         return self._add(view.depth, of.turn @ view.pose, view.unknown, begun)
+
+    def _converted(
+        self, depth: AnyArray, K: AnyArray, pose: AnyArray, mask: AnyArray | None, floor: float | None
+    ) -> CanonicalView:
+        """The image of the data set's camera from the direction of an image."""
+        of = self._current
+        up, camera = of.rotation[:, 2], self.system.description.camera
+        sphere = {"center": of.center, "radius": of.radius}
+        return canonical_view(depth, K, pose, **sphere, up=up, camera=camera, mask=mask, floor=floor)  # type: ignore[arg-type]
+
+    def _refine(self, of: _Object, frame: tuple[Any, ...]) -> None:
+        """Estimates the sphere again with the points of a new image, and converts the views so far again if it changed."""
+        depth, K, pose, mask, floor = frame
+        found, up = points_of(depth, K, pose, mask), of.rotation[:, 2]
+        near = np.linalg.norm(found - of.center, axis=1) < _REACH * of.radius
+        if floor is not None:
+            near &= (found - of.center) @ up > floor
+        assert of.points is not None
+        of.points = np.concatenate([of.points, found[near][:: max(1, int(near.sum()) // 5000)]])
+        of.frames.append(frame)
+        center, radius = estimate_sphere(of.points, up=up)
+        if np.linalg.norm(center - of.center) + abs(radius - of.radius) < 0.01 * of.radius:
+            return
+        of.center, of.radius, of.memory = center, radius, of.programs.blank()
+        for index, earlier in enumerate(of.frames[:-1]):
+            view = self._converted(*earlier)
+            self.history.depths[index], self.history.poses[index] = view.depth, of.turn @ view.pose
+            of.memory, _ = of.programs.see(self.system.parts, of.memory, view.depth, self.history.poses[index])
 
     def observe_view(self, depth: Float[np.ndarray, "side side"], pose: Float[np.ndarray, "4 4"]) -> Belief:
         """Adds a view that the system's own camera has taken, as it is in the data set.
@@ -295,6 +328,11 @@ class Agent:
         costs = np.zeros(number) if cost is None else np.asarray(cost, float).reshape(-1)
         _check(costs.shape == (number,), f"cost has {costs.size} values; there are {number} candidates")
         _check(not np.isnan(costs).any(), "cost has values that are NaN")
+        finite = costs[np.isfinite(costs)]
+        worth = self.gain_per_cost > 0 or not len(finite) or bool(np.ptp(finite) == 0)
+        _check(
+            worth, "costs differ, but gain_per_cost is 0; make the agent with the gain that one unit of cost is worth"
+        )
         allowed &= np.isfinite(costs)
         priced = np.where(np.isfinite(costs), self.gain_per_cost * costs, 0.0)
         reason = self._reason()

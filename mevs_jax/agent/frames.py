@@ -52,6 +52,24 @@ def pose_towards(
     return pose
 
 
+def points_of(
+    depth: AnyArray, K: AnyArray, T_world_camera: AnyArray, mask: AnyArray | None = None
+) -> Float[np.ndarray, "points 3"]:
+    """The points that a depth image shows, in the world, in metres.
+
+    Args:
+        depth: (height, width) metres along the optical axis, 0, NaN or infinite where unknown.
+        K: (3, 3) intrinsics, centres of pixels at whole numbers.
+        T_world_camera: (4, 4) pose.
+        mask: (height, width) True for the pixels that are wanted; all by default.
+    """
+    image, pose = np.asarray(depth), np.asarray(T_world_camera, float)
+    wanted = (image > 0) & np.isfinite(image)
+    rows, columns = np.nonzero(wanted if mask is None else wanted & np.asarray(mask, bool))
+    rays = np.stack([columns, rows, np.ones(len(rows))], axis=1) @ np.linalg.inv(np.asarray(K, float)).T
+    return (rays * image[rows, columns, None]) @ pose[:3, :3].T + pose[:3, 3]
+
+
 def mask_of(reachable: AnyArray | Sequence[int] | None, number: int) -> Bool[np.ndarray, " candidates"]:
     """A mask of candidates from what a caller gives: None for all, a boolean mask, or indices.
 

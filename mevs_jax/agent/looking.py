@@ -12,6 +12,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int, Shaped
 
 from mevs_jax.agent.agent import Agent
+from mevs_jax.agent.frames import points_of
 from mevs_jax.agent.records import Belief, History, Reason
 from mevs_jax.cameras import ViewCamera, look_at_origin
 from mevs_jax.rendering.depth import pad_triangles, render_depth
@@ -182,7 +183,8 @@ class Frames:
         if "center" in stored and "radius" in stored:
             center, radius = np.asarray(stored["center"], float).reshape(-1), float(np.asarray(stored["radius"]))
         elif mask is not None:
-            center, radius = estimate_sphere(_points(depth, K, poses, mask))
+            found = [points_of(*one) for one in zip(depth, K, poses, mask, strict=True)]
+            center, radius = estimate_sphere(np.concatenate(found), up=stored.get("up", (0.0, 0.0, 1.0)))
         else:
             raise ValueError(
                 "center and radius of the object are needed, or a mask of its pixels to estimate them from"
@@ -190,16 +192,6 @@ class Frames:
         up = np.asarray(stored.get("up", (0.0, 0.0, 1.0)), float).reshape(-1)
         floor = float(np.asarray(stored["floor"])) if "floor" in stored else None
         return cls(depth, K, poses, center, float(radius), up, mask, floor)
-
-
-def _points(depth: np.ndarray, K: np.ndarray, poses: np.ndarray, mask: np.ndarray) -> Float[np.ndarray, "points 3"]:
-    """The points at the pixels of a mask, of all frames, in the world."""
-    found = []
-    for image, intrinsics, pose, own in zip(depth, K, poses, mask, strict=True):
-        rows, columns = np.nonzero(own & (image > 0) & np.isfinite(image))
-        rays = np.stack([columns, rows, np.ones(len(rows))], axis=1) @ np.linalg.inv(intrinsics).T
-        found.append((rays * image[rows, columns, None]) @ pose[:3, :3].T + pose[:3, 3])
-    return np.concatenate(found)
 
 
 def look_at_frames(agent: Agent, frames: Frames, *, first: int = 0, yaw: float | None = 0.0) -> Walk:

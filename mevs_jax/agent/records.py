@@ -152,5 +152,11 @@ def replay(history: History, agent: Agent) -> list[Belief]:
 
 
 def plain(record: Belief | Step) -> dict[str, Any]:
-    """A record as values that JSON can hold."""
-    return {name: value.tolist() if isinstance(value, np.ndarray) else value for name, value in asdict(record).items()}
+    """A record as values that JSON can hold; None for numbers that are not finite."""
+
+    def of(value: Any) -> Any:
+        if isinstance(value, np.ndarray):
+            return value.tolist()
+        return None if isinstance(value, float) and not np.isfinite(value) else value
+
+    return {name: of(value) for name, value in asdict(record).items()}

@@ -10,7 +10,7 @@ import pytest
 import mevs_jax
 from mevs_jax.agent import Agent, load_history, replay
 from mevs_jax.agent.candidates import candidates_of
-from mevs_jax.agent.frames import pose_towards, rotation_to_world
+from mevs_jax.agent.frames import points_of, pose_towards, rotation_to_world
 from mevs_jax.beliefs import running_sum
 from mevs_jax.selection import ViewTable, by_attention, select_from_table
 from tests.mevs_jax.trained import making
@@ -154,6 +154,30 @@ def test_costs_change_the_choice(classifier):
     cost[3] = 5.0
     assert agent.decide(cost=cost).index == 3
     assert np.isfinite(free.expected_gain)
+
+
+def test_an_unknown_sphere_is_estimated_and_refined(classifier):
+    """Of a ball whose first view shows half: the belief at the end is that of the ball's own sphere."""
+    directions = classifier.viewpoints[[2, 6, 9, 11]]
+    ball, radius = CENTER + np.array([0.05, 0.02, -0.01]), 0.2
+    shots = []
+    for direction in directions:
+        pose = pose_towards(direction.astype(float), CENTER, 0.9, np.array([0, 0, 1.0]))
+        depth = making.depth_of_ball(direction, centre=(ball - CENTER) / 0.45, radius=radius / 0.45, notch=False) * 0.45
+        shots.append((depth, K, pose))
+    known, unknown = (Agent(classifier, stop=2, max_views=4) for _ in range(2))
+    known.reset(center=ball, radius=radius)
+    unknown.reset_from_points(points_of(*shots[0]))
+    first = np.linalg.norm(unknown._current.center - ball)
+    for shot in shots:
+        expected, belief = known.observe(*shot), unknown.observe(*shot)
+    assert first > 0.05
+    assert np.linalg.norm(unknown._current.center - ball) < 0.1 * first + 0.01
+    np.testing.assert_allclose(unknown._current.radius, radius, rtol=0.05)
+    np.testing.assert_allclose(belief.probabilities, expected.probabilities, atol=0.1)
+    assert belief.views == unknown.history.views == 4
+    again = replay(unknown.history, Agent(classifier, stop=2, max_views=4))
+    np.testing.assert_allclose(again[-1].probabilities, belief.probabilities, atol=1e-5)
 
 
 def test_candidates_may_be_any_poses(classifier):
@@ -326,6 +350,7 @@ def test_calls_that_cannot_be_are_refused(classifier):
         "or indices from 0 to 11": {"reachable": [12]},
         "cost has 2 values; there are 12 candidates": {"cost": [1, 2]},
         "cost has values that are NaN": {"cost": [np.nan] * 12},
+        "costs differ, but gain_per_cost is 0": {"cost": range(12)},
         r"candidates must be poses \(candidates, 4, 4\)": {"candidates": np.eye(4)},
         "a candidate is at the object's centre": {
             "candidates": pose_towards(np.eye(3)[0], CENTER, 0.0, np.eye(3)[2])[None]

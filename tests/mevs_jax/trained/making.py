@@ -96,7 +96,9 @@ def system(kind: str = "classifier", seed: int = 0) -> TrainedSystem:
     return TrainedSystem(of, parts, "made up")
 
 
-def depth_of_ball(direction: np.ndarray, side: int = 32, centre=(0.1, -0.2, 0.15), radius: float = 0.6) -> np.ndarray:
+def depth_of_ball(
+    direction: np.ndarray, side: int = 32, centre=(0.1, -0.2, 0.15), radius: float = 0.6, notch: bool = True
+) -> np.ndarray:
     """Depth image of a ball in the unit sphere, by the camera of the system, and with a notch so that views differ."""
     from mevs_jax.cameras import ViewCamera as Camera
     from mevs_jax.cameras import look_at_origin, pixel_directions
@@ -108,4 +110,4 @@ def depth_of_ball(direction: np.ndarray, side: int = 32, centre=(0.1, -0.2, 0.15
     root = b**2 - a * c
     depth = np.where(root > 0, (-b - np.sqrt(np.maximum(root, 0))) / a, 0)
     hit = pose[:3, 3] + rays * depth[..., None]
-    return np.where((root > 0) & (hit[..., 0] < 0.4), depth, 0).astype(np.float32)
+    return np.where((root > 0) & ((hit[..., 0] < 0.4) | (not notch)), depth, 0).astype(np.float32)
