@@ -22,7 +22,15 @@ EntropyVariant = Literal["thesis", "foreground"]
 
 
 def quantise_depth(depth: Float[AnyArray, "*shape"]) -> Int[Array, "*shape"]:
-    """Metric depth as in the thesis's 16-bit images: ⌊10,000 d⌋, at most 65,535; 0 where nothing is hit (depth 0 or +inf)."""
+    """Metric depth as in the thesis's 16-bit images: ⌊10,000 d⌋, at most 65,535; 0 where nothing is hit (depth 0 or +inf).
+
+    Raises:
+        ValueError: for depth in integers, which is stored depth and not metric.
+    """
+    if not jnp.issubdtype(jnp.asarray(depth).dtype, jnp.floating):
+        raise ValueError(
+            f"depth must be metric, in floating point, got {jnp.asarray(depth).dtype}: divide stored depth by {DEPTH_SCALE:,}"
+        )
     return jnp.floor(jnp.clip(jnp.where(jnp.isfinite(depth), depth, 0.0) * DEPTH_SCALE, 0, 65535)).astype(jnp.int32)
 
 
@@ -60,6 +68,6 @@ def depth_entropy(depth: Float[AnyArray, "height width"], variant: EntropyVarian
         variant: `thesis` counts the background as a level, `foreground` ignores it.
 
     Raises:
-        ValueError: for an unknown variant.
+        ValueError: for an unknown variant, or depth in integers.
     """
     return level_entropy(depth_levels(depth), variant)

@@ -19,9 +19,14 @@ def confusion_matrix(
     classes: int,
     weights: Float[AnyArray, " n"] | None = None,
 ) -> Float[Array, "{classes} {classes}"]:
-    """Total weight of the answers by (true class, predicted class); every answer has weight 1 unless `weights` is given."""
+    """Total weight of the answers by (true class, predicted class); every answer has weight 1 unless `weights` is given.
+
+    Labels and predictions outside 0..classes−1, such as the −1 of an `Episode` beyond its end, are not counted.
+    """
     weights = jnp.ones(labels.shape) if weights is None else weights
-    return jnp.zeros((classes, classes)).at[labels, predictions].add(weights)
+    # Of JAX's indices, negative ones count from the end; those that are too large are dropped.
+    labels, predictions = (jnp.where(jnp.asarray(i) < 0, classes, i) for i in (labels, predictions))
+    return jnp.zeros((classes, classes)).at[labels, predictions].add(weights, mode="drop")
 
 
 def accuracy(confusion: Float[AnyArray, "classes classes"]) -> Float[Array, ""]:

@@ -79,13 +79,17 @@ class Episode:
     count: Int[Array, "*batch"]
 
 
-def best_view(scores: Float[Array, " views"], allowed: Bool[Array, " views"]) -> Int[Array, ""]:
+def best_view(
+    scores: Float[Array, " views"], allowed: Bool[Array, " views"], reachable: Bool[Array, " views"] | None = None
+) -> Int[Array, ""]:
     """Index of the allowed view with the highest score, the lowest index among equals; −inf and NaN come last.
 
-    A view with a score of +inf is chosen even if it is not allowed. `random_with_repetition` uses this to repeat views.
+    A view with a score of +inf is chosen even if it is not allowed, because it was seen before, unless it is not `reachable`.
+    `random_with_repetition` uses this to repeat views.
     """
     scores = jnp.where(jnp.isnan(scores), -jnp.inf, scores)
-    allowed = allowed | (scores == jnp.inf)
+    ordered = scores == jnp.inf
+    allowed = allowed | (ordered if reachable is None else ordered & reachable)
     best = jnp.max(jnp.where(allowed, scores, -jnp.inf))
     return jnp.argmax(allowed & (scores == best)).astype(jnp.int32)
 
@@ -164,7 +168,7 @@ def select_views(
 
     def step(carry: tuple[SelectionState, Episode]) -> tuple[SelectionState, Episode]:
         state, episode = carry
-        latest = observe(state.view)
+        latest = observed(state.view)
         state = replace(
             state,
             count=state.count + 1,
@@ -173,21 +177,26 @@ def select_views(
             views=_put(state.views, state.count, state.view),
             seen=jax.tree.map(lambda history, now: _put(history, state.count, now), state.seen, latest),
         )
-        belief = fuse(state, scene)
+        belief = fuse(state, scene).astype(jnp.float32)
         state = replace(state, belief=belief)
         episode = Episode(
             views=state.views,
             predictions=_put(episode.predictions, state.count - 1, jnp.argmax(belief).astype(jnp.int32)),
-            confidences=_put(episode.confidences, state.count - 1, confidence(belief)),
+            confidences=_put(episode.confidences, state.count - 1, confidence(belief).astype(jnp.float32)),
             count=state.count,
         )
         scores = policy(jax.random.fold_in(key, state.count), state, scene)
-        return replace(state, view=best_view(scores, candidates(state, scene))), episode
+        return replace(state, view=best_view(scores, candidates(state, scene), scene.reachable)), episode
+
+    def observed(view: Int[Array, ""]) -> Observation:
+        """The observation of a view with logits in float32, in which the loop computes whatever the networks compute in."""
+        found = observe(view)
+        return replace(found, logits=found.logits.astype(jnp.float32))
 
     structures = []  # receives the tree structure of an observation when `observe` is traced
 
     def leaves_of(view: Int[Array, ""]) -> list[Array]:
-        leaves, structure = jax.tree.flatten(observe(view))
+        leaves, structure = jax.tree.flatten(observed(view))
         structures.append(structure)
         return leaves
 
@@ -203,7 +212,7 @@ def select_views(
         views=unset,
         seen=jax.tree.map(lambda leaf: jnp.zeros((max_views, *leaf.shape), leaf.dtype), blank),
     )
-    episode = Episode(unset, unset, jnp.zeros(max_views), jnp.int32(0))
+    episode = Episode(unset, unset, jnp.zeros(max_views, jnp.float32), jnp.int32(0))
     return jax.lax.while_loop(unsure, step, (state, episode))[1]
 
 

@@ -165,7 +165,8 @@ class ViewGraph:
 
         The edges of the Delaunay graph are the 3n − 6 edges of the convex hull (thesis §4.1). Two or three points are all
         neighbours of each other. If the hull has flat faces with more than three corners (as a cube does), the diagonals that
-        triangulate them are edges too.
+        triangulate them are edges too. Of six or more viewpoints on one side of the object, such as a hemisphere, the faces of
+        the hull that close it below are left out, so that opposite views are no neighbours.
 
         Args:
             points: (views, 3) unit vectors.
@@ -196,7 +197,11 @@ class ViewGraph:
         else:
             if np.linalg.matrix_rank(array - array.mean(axis=0), tol=1e-6) < 3:
                 raise ValueError("four or more viewpoints in one plane have no view graph")
-            for a, b, c in ConvexHull(array).simplices:
+            hull = ConvexHull(array)
+            # A face's distance from the origin is the cosine of the angle from its centre to its corners. Viewpoints all around
+            # an object have no face beyond 75°, unless they are very few.
+            widest = np.inf if count < 6 else -0.25
+            for a, b, c in hull.simplices[hull.equations[:, 3] < widest]:
                 near[[a, b, c], [b, c, a]] = near[[b, c, a], [a, b, c]] = True
         return cls(
             points=jnp.asarray(array, jnp.float32),

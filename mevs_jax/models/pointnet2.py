@@ -21,6 +21,7 @@ from jaxtyping import Array, Float, Int
 
 from mevs_jax.arrays import AnyArray
 from mevs_jax.models.batch_norm import BatchNorm
+from mevs_jax.models.calling import TrainedByCall
 from mevs_jax.models.product import product
 from mevs_jax.points.ops import ball_query, farthest_point_sample
 
@@ -179,7 +180,7 @@ def _pieces(level: Abstraction) -> int:
     return next(count for count in range(fewest, level.centres + 1) if level.centres % count == 0)
 
 
-class PointNet2(nnx.Module):
+class PointNet2(TrainedByCall):
     """PointNet++ SSG regressor with one output per candidate view.
 
     Args:
@@ -239,11 +240,13 @@ class PointNet2(nnx.Module):
             dropout: rate that replaces the network's own, in [0, 1).
 
         Raises:
-            ValueError: for clouds of other than 3 or 6 columns, or training without a key.
+            ValueError: for clouds of other than 3 or 6 columns or without points, or training without a key.
         """
         points = jnp.asarray(points)
         if points.shape[-1] not in (3, 6):
             raise ValueError(f"PointNet2 needs clouds of 3 or 6 columns, got {points.shape[-1]}")
+        if not points.shape[-2]:
+            raise ValueError("PointNet2 needs clouds of at least one point, got none")
         batch, dtype = points.shape[:-2], self.dtype or points.dtype
         clouds = points.reshape(-1, *points.shape[-2:])
         if not train:

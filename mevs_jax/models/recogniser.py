@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 import jax.numpy as jnp
-from flax import nnx
 from jaxtyping import Array, Bool, Float
 
 from mevs_jax.arrays import AnyArray
+from mevs_jax.models.calling import TrainedByCall
 from mevs_jax.models.resnet import ResNet
 from mevs_jax.models.set_fusion import SetFusion
 
 
-class Recogniser(nnx.Module):
+class Recogniser(TrainedByCall):
     """An encoder and a fusion network.
 
     Trained together, the encoder learns features that complement those of other views.

@@ -16,6 +16,7 @@ from jaxtyping import Array, Float
 
 from mevs_jax.arrays import AnyArray
 from mevs_jax.models.batch_norm import BatchNorm
+from mevs_jax.models.calling import TrainedByCall
 
 _BLOCKS = {10: (1, 1, 1, 1), 18: (2, 2, 2, 2), 34: (3, 4, 6, 3)}
 _IMAGENET_MEAN, _IMAGENET_STD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
@@ -141,7 +142,7 @@ class PatchStem(nnx.Module):
         return patches.reshape(batch, height // 4, width // 4, -1) @ self.layer.kernel[...].astype(x.dtype)
 
 
-class ResNet(nnx.Module):
+class ResNet(TrainedByCall):
     """ResNet of basic blocks.
 
     Args:
@@ -202,8 +203,16 @@ class ResNet(nnx.Module):
         train: bool = False,
         momentum: float | Array = 0.1,
     ) -> Float[Array, "*batch features"]:
-        """The feature vector before the last layer, of length `8 * width`."""
+        """The feature vector before the last layer, of length `8 * width`.
+
+        Raises:
+            ValueError: for images of integers.
+        """
         images = jnp.asarray(images)
+        if not jnp.issubdtype(images.dtype, jnp.floating):
+            raise ValueError(
+                f"ResNet needs floating-point images in [0, 1], got {images.dtype}: divide 8-bit images by 255"
+            )
         batch = images.shape[:-3]
         x = images.reshape(-1, *images.shape[-3:])
         if self.standardise:

@@ -34,19 +34,26 @@ class _Block(nnx.Module):
         return x + _dropout(keys[1], self.dropout, hidden)
 
 
+def has_azimuth(directions: Float[AnyArray, "*batch views 3"]) -> Bool[Array, "*batch views"]:
+    """Whether each direction is not vertical, so that it tells which way is forward."""
+    return jnp.linalg.norm(jnp.asarray(directions)[..., :2], axis=-1) > 1e-6
+
+
 def relative_to_first(
     directions: Float[AnyArray, "*batch views 3"], present: Bool[AnyArray, "*batch views"]
 ) -> tuple[Float[Array, "*batch views 3"], Float[Array, "*batch 3 3"]]:
-    """Rotates directions about the vertical axis so that the first present one has azimuth 0.
+    """Rotates directions about the vertical axis so that the first present one that is not vertical has azimuth 0.
 
-    The result does not depend on the object's rotation about the vertical axis, so it can be used where that is unknown. If the
-    first present direction is vertical, or none is present, nothing is rotated.
+    The result does not depend on the object's rotation about the vertical axis, so it can be used where that is unknown. If no
+    present direction has an azimuth, nothing is rotated.
 
     Returns:
         The rotated directions, and the rotation matrix.
     """
     directions, present = jnp.asarray(directions), jnp.asarray(present)
-    first = jnp.take_along_axis(directions, jnp.argmax(present, axis=-1)[..., None, None], axis=-2)[..., 0, :2]
+    told = present & has_azimuth(directions)
+    first = jnp.take_along_axis(directions, jnp.argmax(told, axis=-1)[..., None, None], axis=-2)[..., 0, :2]
+    first = jnp.where(jnp.any(told, axis=-1)[..., None], first, 0.0)
     length = jnp.linalg.norm(first, axis=-1, keepdims=True)
     x, y = jnp.moveaxis(jnp.where(length > 1e-6, first / jnp.maximum(length, 1e-6), jnp.array([1.0, 0.0])), -1, 0)
     zero, one = jnp.zeros_like(x), jnp.ones_like(x)
@@ -61,8 +68,8 @@ class SetFusion(nnx.Module):
     the logits are computed from this token. As in Set Transformer (Lee et al. 2019) and ViewFormer (Sun et al. 2023), with
     viewing directions, which the latter leaves out.
 
-    The object's pose may be unknown. Directions are then relative to the first view (`relative_to_first`), so of the order of
-    views only the choice of the first matters.
+    The object's pose may be unknown. Directions are then relative to the first view that is not vertical (`relative_to_first`),
+    so of the order of views only the choice of that one matters.
 
     Args:
         features: length of a view's feature vector.

@@ -16,7 +16,7 @@ from flax import nnx
 from jaxtyping import Array, Bool, Float
 
 from mevs_jax.arrays import AnyArray
-from mevs_jax.models.set_fusion import relative_to_first
+from mevs_jax.models.set_fusion import has_azimuth, relative_to_first
 
 Utility = Literal["probability", "log"]
 """The utility of a belief: the probability of the true class, or its logarithm."""
@@ -49,6 +49,12 @@ def direction_features(directions: Float[AnyArray, "*batch 3"]) -> Float[Array, 
             for k in range(j, 3):
                 found.append(directions[..., i] * directions[..., j] * directions[..., k])
     return jnp.stack(found, axis=-1)
+
+
+def _without_azimuth(directions: Float[Array, "*batch candidates 3"]) -> Float[Array, "*batch candidates 3"]:
+    """Each direction turned about the vertical axis to azimuth 0: all that is known of it where no view tells what is forward."""
+    level = jnp.linalg.norm(directions[..., :2], axis=-1)
+    return jnp.stack([level, jnp.zeros_like(level), directions[..., 2]], axis=-1)
 
 
 class _CrossBlock(nnx.Module):
@@ -137,8 +143,10 @@ class ViewPolicy(nnx.Module):
             raise ValueError("this view policy needs the embeddings of partial clouds, which are not given")
         belief, views, present = jnp.asarray(belief), jnp.asarray(views), jnp.asarray(present)
         if not self.posed:
+            forward = jnp.any(present & has_azimuth(directions), axis=-1)
             directions, rotation = relative_to_first(directions, present)
             candidates = jnp.asarray(candidates) @ jnp.swapaxes(rotation, -1, -2)
+            candidates = jnp.where(forward[..., None, None], candidates, _without_azimuth(candidates))
         seen = present[..., None]
         least = -12.0  # log-probabilities below this (6 in a million) make no difference
         tokens = self.view(jnp.where(seen, jnp.maximum(views, least), 0.0))

@@ -60,13 +60,12 @@ def farthest_point_sample(points: Float[AnyArray, "points 3"], k: int) -> Int[Ar
         (k,) int32 indices.
 
     Raises:
-        ValueError: for `k` below 1, or a cloud without points.
+        ValueError: for `k` below 1, a cloud without points, or an array of other than one cloud.
     """
     if k < 1:
         raise ValueError(f"farthest_point_sample needs k >= 1, got {k}")
+    _check_cloud("farthest_point_sample", points)
     count = points.shape[0]
-    if count < 1:
-        raise ValueError("farthest_point_sample needs at least one point")
     points = jax.lax.stop_gradient(jnp.asarray(points))
     if _on_one_gpu(points) and count <= point_kernels.LARGEST_CLOUD:
         return jax.lax.platform_dependent(
@@ -75,6 +74,14 @@ def farthest_point_sample(points: Float[AnyArray, "points 3"], k: int) -> Int[Ar
             default=partial(_farthest_of_array, k=k),
         )
     return _farthest_of_array(points, k)
+
+
+def _check_cloud(name: str, points: AnyArray) -> None:
+    """Raises `ValueError` unless `points` are those of one cloud, at least one."""
+    if points.ndim != 2 or points.shape[1] != 3:
+        raise ValueError(f"{name} takes one cloud (points, 3), got shape {points.shape}: use jax.vmap for several")
+    if not len(points):
+        raise ValueError(f"{name} needs at least one point")
 
 
 def _farthest_of_array(points: Float[Array, "points 3"], k: int) -> Int[Array, " {k}"]:
@@ -124,14 +131,19 @@ def ball_query(
         k: number of indices per centre, at least 1. Empty slots repeat the first hit; a centre without hits gets point 0.
 
     Returns:
-        (centres, k) int32 indices.
+        (centres, k) int32 indices. A point with a coordinate that is not finite is no hit.
 
     Raises:
-        ValueError: for `k` below 1.
+        ValueError: for `k` below 1, a cloud without points, or arrays of other than one cloud.
     """
     if k < 1:
         raise ValueError(f"ball_query needs k >= 1, got {k}")
+    _check_cloud("ball_query", points)
+    _check_cloud("ball_query", centres)
     points, centres = (jax.lax.stop_gradient(jnp.asarray(array)) for array in (points, centres))
+    # A point that is not finite is no neighbour of any centre, and a centre that is not finite has none.
+    points = jnp.where(jnp.isfinite(points), points, jnp.inf)
+    centres = jnp.where(jnp.isfinite(centres), centres, -jnp.inf)
     squared_radius = square(jnp.asarray(radius, points.dtype))
     arguments = (points, centres, squared_radius)
     if _on_one_gpu(points):

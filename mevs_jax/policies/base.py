@@ -116,6 +116,16 @@ def candidates(state: SelectionState, scene: Scene) -> Bool[Array, " views"]:
     return ~state.attempted if scene.reachable is None else ~state.attempted & scene.reachable
 
 
+def neighbours_in_reach(state: SelectionState, scene: Scene) -> Bool[Array, "views views"]:
+    """Returns the neighbours of each view among those that the camera can reach or has seen.
+
+    A view is a local maximum if it exceeds these: a higher neighbour that cannot be reached does not count.
+    """
+    if scene.reachable is None:
+        return scene.graph.neighbours
+    return scene.graph.neighbours & (scene.reachable | state.attempted)
+
+
 def maxima_first(
     weights: Float[Array, " views"], allowed: Bool[Array, " views"], neighbours: Bool[Array, "views views"]
 ) -> Float[Array, " views"]:

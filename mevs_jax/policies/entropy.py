@@ -5,7 +5,7 @@ from __future__ import annotations
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from mevs_jax.policies.base import Scene, SelectionState, candidates, maxima_first, required
+from mevs_jax.policies.base import Scene, SelectionState, candidates, maxima_first, neighbours_in_reach, required
 
 
 def predicted_entropy(key: Array, state: SelectionState, scene: Scene) -> Float[Array, " views"]:
@@ -14,7 +14,7 @@ def predicted_entropy(key: Array, state: SelectionState, scene: Scene) -> Float[
     return maxima_first(
         required(state.latest.predicted_entropy, "Observation.predicted_entropy"),
         candidates(state, scene),
-        scene.graph.neighbours,
+        neighbours_in_reach(state, scene),
     )
 
 
@@ -30,4 +30,4 @@ def remembered_entropy(key: Array, state: SelectionState, scene: Scene) -> Float
     mean = jnp.sum(required(state.seen.predicted_entropy, "Observation.predicted_entropy"), axis=0) / jnp.maximum(
         state.count, 1
     )  # zeros beyond `count`
-    return maxima_first(mean, candidates(state, scene), scene.graph.neighbours)
+    return maxima_first(mean, candidates(state, scene), neighbours_in_reach(state, scene))

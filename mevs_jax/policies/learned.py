@@ -17,6 +17,8 @@ def learned(
 ) -> Policy:
     """Returns the policy that scores a view by the gain in utility that `network` expects from it.
 
+    The belief may be unnormalised, as a sum of logits is, but the network was trained on calibrated beliefs.
+
     Args:
         network: trained by `train.choosing.policy`.
         temperature: of the logits of single views.
@@ -28,16 +30,22 @@ def learned(
     def scores(key: Array, state: SelectionState, scene: Scene) -> Float[Array, " views"]:
         del key
         points, present = scene.graph.points, jnp.arange(len(state.views)) < state.count
-        views = jax.nn.log_softmax(state.seen.logits / temperature, axis=-1)
-        gain, gain_if = network(state.belief, views, points[state.views], present, points, state.seen.cloud)
+        views, belief = jax.nn.log_softmax(state.seen.logits / temperature, axis=-1), _normalised(state.belief)
+        gain, gain_if = network(belief, views, points[state.views], present, points, state.seen.cloud)
         if by == "state":
             return gain
         if by == "table":
             knowledge = required(scene.knowledge, "Scene.knowledge")
-            gain_if = (gain_if + _gain_by_table(network, state.belief, knowledge)) / 2
-        return expected_gain(state.belief, gain_if)
+            gain_if = (gain_if + _gain_by_table(network, belief, knowledge)) / 2
+        return expected_gain(belief, gain_if)
 
     return scores
+
+
+def _normalised(belief: Float[Array, " classes"]) -> Float[Array, " classes"]:
+    """Log-probabilities of the belief, as the networks were trained on; a normalised belief stays as it is, to the bit."""
+    is_normalised = jnp.abs(jax.nn.logsumexp(belief)) < 1e-5
+    return jnp.where(is_normalised, belief, jax.nn.log_softmax(belief))
 
 
 _TABLE_WEIGHT = 0.5
@@ -72,26 +80,26 @@ def looking_ahead(
         expected = jax.nn.log_softmax(required(scene.knowledge, "Scene.knowledge").expected_logits, axis=-1)
         points, slots = scene.graph.points, jnp.arange(len(state.views))
         views = jax.nn.log_softmax(state.seen.logits / temperature, axis=-1)
-        allowed = candidates(state, scene)
+        allowed, believed = candidates(state, scene), _normalised(state.belief)
 
         def gains(belief: Array, views: Array, order: Array, count: Array) -> Float[Array, " views"]:
             gain_if = network(belief, views, points[order], slots < count, points, state.seen.cloud)[1]
             return expected_gain(belief, gain_if)
 
-        now = gains(state.belief, views, state.views, state.count)
+        now = gains(believed, views, state.views, state.count)
         best = jax.lax.top_k(jnp.where(allowed, now, -jnp.inf), min(shortlist, len(points)))[1]
-        likeliest = jax.lax.top_k(state.belief, min(classes, len(state.belief)))[1]
+        likeliest = jax.lax.top_k(believed, min(classes, len(believed)))[1]
 
         def afterwards(view: Array, label: Array) -> Float[Array, ""]:
             shown = expected[label, view]
-            belief = jax.nn.log_softmax(state.belief + shown)
+            belief = jax.nn.log_softmax(believed + shown)
             found = gains(
                 belief, views.at[state.count].set(shown), state.views.at[state.count].set(view), state.count + 1
             )
             return jnp.max(jnp.where(allowed & (jnp.arange(len(points)) != view), found, -jnp.inf))
 
         then = jax.vmap(jax.vmap(afterwards, (None, 0)), (0, None))(best, likeliest)
-        then = then @ jax.nn.softmax(state.belief[likeliest])
+        then = then @ jax.nn.softmax(believed[likeliest])
         return jnp.full(len(points), -jnp.inf).at[best].set(now[best] + jnp.where(jnp.isfinite(then), then, 0.0))
 
     return scores

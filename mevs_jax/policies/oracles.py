@@ -9,13 +9,22 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from mevs_jax.beliefs import CalibratedFusion
-from mevs_jax.policies.base import Policy, Scene, SelectionState, candidates, maxima_first, required
+from mevs_jax.policies.base import (
+    Policy,
+    Scene,
+    SelectionState,
+    candidates,
+    maxima_first,
+    neighbours_in_reach,
+    required,
+)
 
 
 def oracle_entropy(key: Array, state: SelectionState, scene: Scene) -> Float[Array, " views"]:
     """The thesis's rule on the true entropies: the limit of a perfect entropy predictor."""
     del key
-    return maxima_first(required(scene.entropy, "Scene.entropy"), candidates(state, scene), scene.graph.neighbours)
+    entropy = required(scene.entropy, "Scene.entropy")
+    return maxima_first(entropy, candidates(state, scene), neighbours_in_reach(state, scene))
 
 
 def lowest_entropy(key: Array, state: SelectionState, scene: Scene) -> Float[Array, " views"]:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import inspect
+
 import numpy as np
 import pytest
 from skimage.measure import shannon_entropy as skimage_entropy
@@ -55,3 +57,11 @@ def test_extremes():
 
 def test_capture_stores_depth_as_the_entropy_reads_it():
     assert capture.DEPTH_SCALE == DEPTH_SCALE
+
+
+def test_stored_depth_is_refused():
+    """Integers are stored depth, whose entropy as metric depth would be that of a saturated image."""
+    stored = np.full((4, 4), 20_000, np.uint16)
+    said = r"depth must be metric, in floating point, got uint16: divide stored depth by 10,000"
+    with pytest.raises(ValueError, match=said):
+        inspect.unwrap(quantise_depth)(stored)  # without the check of types in tests; the other functions call it

@@ -33,3 +33,13 @@ def test_the_bootstrap_interval_covers_as_it_says(random):
         low, high = interval(jax.random.key(trial), random.normal(1.0, 2.0, 80).astype(np.float32))
         hits += low <= 1.0 <= high
     assert 176 <= hits <= 200
+
+
+def test_answers_that_were_not_given_are_not_counted():
+    """Beyond the end of a walk, the prediction is −1: neither the last class nor right."""
+    labels, predictions = np.array([2, 2, 0, -1, 1]), np.array([-1, 2, 0, 2, 3])
+    expected = np.zeros((3, 3))
+    expected[2, 2] = expected[0, 0] = 1
+    np.testing.assert_array_equal(confusion_matrix(labels, predictions, 3), expected)
+    weighted = confusion_matrix(labels, predictions, 3, np.array([5.0, 2.0, 3.0, 7.0, 1.0]))
+    np.testing.assert_array_equal(weighted, expected * [[3], [1], [2]])

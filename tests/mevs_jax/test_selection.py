@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import inspect
+from dataclasses import replace
 from functools import partial
 from types import SimpleNamespace
 
@@ -354,7 +356,7 @@ def test_policies_are_registered_by_call_or_decorator_and_no_name_twice():
             ("PointNet++ entropy (thesis)", "networks"),
         ]
         with pytest.raises(ValueError, match="knows 'all', which is none of nothing, networks"):
-            register_policy("other", decorated, knows="all")
+            inspect.unwrap(register_policy)("other", decorated, knows="all")
         assert policy_named("decorated") is policy_named("called") is decorated
         for register in (lambda: register_policy("called", decorated), lambda: register_policy("random")(decorated)):
             with pytest.raises(ValueError, match="is taken"):
@@ -363,3 +365,64 @@ def test_policies_are_registered_by_call_or_decorator_and_no_name_twice():
         POLICIES.pop("decorated", None), POLICIES.pop("called", None)
     with pytest.raises(ValueError, match=r"unknown policy 'called'; it is one of random, .*pair_oracle"):
         policy_named("called")
+
+
+@pytest.mark.parametrize("dtype", [jnp.bfloat16, jnp.float16, jnp.float32, jnp.float64])
+def test_logits_of_any_precision_are_walked(dtype):
+    """The loop computes in float32, also where JAX has 64 bits switched on."""
+    table = jax.tree.map(lambda leaf: leaf[0], random_tables(10, 4, 4, seed=3))
+    graph = ViewGraph.from_points(fibonacci_sphere(10))
+
+    def walk(table):
+        scene = table.scene(graph)
+        return select_from_table(
+            jax.random.key(0), table, scene, POLICIES["label_oracle"], 2, threshold=0.99, max_views=5
+        )
+
+    with jax.enable_x64(dtype == jnp.float64):
+        rounded = replace(table, logits=table.logits.astype(dtype))
+        found = walk(rounded)
+        expected = walk(replace(table, logits=rounded.logits.astype(jnp.float32)))
+    assert found.confidences.dtype == jnp.float32
+    assert found.views.tolist() == expected.views.tolist()
+    np.testing.assert_array_equal(found.confidences, expected.confidences)
+
+
+def test_an_order_does_not_reach_a_view_out_of_reach():
+    """A score of +inf takes a view a second time, but not one that the camera cannot go to."""
+    graph = ViewGraph.from_points(fibonacci_sphere(10))
+    table = jax.tree.map(lambda leaf: leaf[0], random_tables(10, 4, 4, seed=3))
+    reachable = jnp.arange(10) != 7
+
+    def orders(key, state, scene):
+        return jnp.where(jnp.arange(10) == 7, jnp.inf, jnp.where(jnp.arange(10) == 4, jnp.inf, 0.0))
+
+    scene = table.scene(graph, reachable=reachable)
+    assert select_from_table(jax.random.key(0), table, scene, orders, 0, max_views=4).views.tolist() == [0, 4, 4, 4]
+    everywhere = table.scene(graph)
+    views = select_from_table(jax.random.key(0), table, everywhere, orders, 0, max_views=4).views
+    assert views.tolist() == [0, 4, 4, 4]  # the lowest index among equals
+    no_order = table.scene(graph, reachable=jnp.arange(10) < 4)
+    walked = select_from_table(jax.random.key(0), table, no_order, orders, 0, max_views=4).views
+    assert sorted(walked.tolist()) == [0, 1, 2, 3]
+
+
+@pytest.mark.parametrize("policy", ["predicted_entropy", "remembered_entropy", "oracle_entropy"])
+def test_a_neighbour_out_of_reach_does_not_keep_a_view_from_being_a_maximum(policy):
+    graph = ViewGraph.from_points(fibonacci_sphere(10))
+    neighbours = np.asarray(graph.neighbours)
+    top = 4
+    beside = int(np.flatnonzero(neighbours[top])[0])
+    away = [view for view in range(10) if view not in (top, beside) and not neighbours[beside, view]]
+    second = next(view for view in away if not neighbours[top, view])
+    entropy = np.full(10, 0.1, np.float32) + np.arange(10, dtype=np.float32) / 1000
+    entropy[[top, beside, second]] = 0.9, 0.8, 0.5  # `beside` is a maximum only where `top` is out of reach
+    start = next(view for view in range(10) if view not in (top, beside, second))
+    table = ViewTable(jnp.zeros((10, 3)), jnp.tile(entropy, (10, 1)), jnp.asarray(entropy), jnp.int32(0))
+
+    def second_view(reachable):
+        scene = table.scene(graph, reachable=reachable)
+        return int(select_from_table(jax.random.key(0), table, scene, POLICIES[policy], start, max_views=2).views[1])
+
+    assert second_view(None) == top
+    assert second_view(jnp.arange(10) != top) == beside

@@ -210,3 +210,38 @@ def test_equal_neighbours_exclude_each_other():
         local_maxima(np.array([2.0, 2.0, 1.0], np.float32), neighbours), [False, False, False]
     )
     np.testing.assert_array_equal(local_maxima(np.array([2.0, 1.0, 2.0], np.float32), neighbours), [True, False, True])
+
+
+@pytest.mark.parametrize("lowest", [-0.1, 0.0, 0.3])
+def test_opposite_views_of_a_hemisphere_are_no_neighbours(lowest):
+    """The hull of viewpoints on one side is closed by faces that are none of the sphere."""
+    points = fibonacci_sphere(80, "equation8")
+    points = points[points[:, 2] > lowest]
+    graph = ViewGraph.from_points(points)
+    apart = np.asarray(graph.distances)[np.asarray(graph.neighbours)]
+    whole = ViewGraph.from_points(fibonacci_sphere(80, "equation8"))
+    widest = np.asarray(whole.distances)[np.asarray(whole.neighbours)].max()
+    assert apart.max() < 2.5 * widest
+    assert np.asarray(graph.neighbours).any(axis=1).all()
+    np.testing.assert_array_equal(graph.neighbours, np.asarray(graph.neighbours).T)
+
+
+def test_a_ring_on_the_equator_below_a_cap_keeps_its_own_edges():
+    angle = np.arange(8) * np.pi / 4
+    ring = np.stack([np.cos(angle), np.sin(angle), np.zeros(8)], axis=1)
+    graph = ViewGraph.from_points(np.concatenate([ring, [[0, 0, 1]]]))
+    expected = {(i, 8) for i in range(8)} | {(i, i + 1) for i in range(7)} | {(0, 7)}
+    assert edges_of(graph) == expected
+
+
+@pytest.mark.parametrize("variant", ["golden_angle", "equation8", "nested"])
+@pytest.mark.parametrize("count", [4, 5, 6, 7, 9, 13, 40])
+def test_viewpoints_all_around_have_all_edges_of_their_hull(variant, count):
+    """Also so few that faces of the hull are as far around as the origin."""
+    assert len(edges_of(ViewGraph.from_points(viewpoint_lattice(count, variant)))) == 3 * count - 6
+
+
+@pytest.mark.parametrize("pair", [(0, 0), (0, 5), (-1, 2)])
+def test_neighbours_that_do_not_exist_are_refused(pair):
+    with pytest.raises(ValueError, match="cannot be neighbours: the 5 views are 0 to 4"):
+        ViewGraph.from_points(fibonacci_sphere(5), [pair])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib.util
+import inspect
 from collections.abc import Callable
 from functools import cache, partial
 from pathlib import Path
@@ -14,7 +15,7 @@ import pytest
 from flax import nnx
 
 from mevs_jax import PointNet2, ResNet, count_parameters, pointnet2_from_torch, resnet_from_torch
-from mevs_jax.models import BatchNorm
+from mevs_jax.models import Abstraction, BatchNorm
 from tests.reference.weights import made_up_inputs, made_up_weights
 
 GOLDEN = Path(__file__).parents[2] / "reference" / "golden.npz"
@@ -255,3 +256,44 @@ def test_wrong_state_dicts_are_refused():
         outputs(nnx.eval_shape(lambda: PointNet2(views=4, rngs=nnx.Rngs(0))), jnp.zeros((600, 4)))
     with pytest.raises(ValueError, match="at least 2"):
         PointNet2(views=1, rngs=nnx.Rngs(0))
+
+
+def test_images_of_integers_are_refused():
+    """They would cast the weights to integers, and all logits would be 0."""
+    network = ResNet(depth=10, classes=3, channels=1, width=8, rngs=nnx.Rngs(0))
+    with pytest.raises(ValueError, match=r"needs floating-point images in .* got uint8: divide 8-bit images by 255"):
+        inspect.unwrap(ResNet.features)(network, np.zeros((32, 32, 1), np.uint8))
+
+
+def small_pointnet(views: int) -> PointNet2:
+    levels = Abstraction(8, 0.5, 4, (8,)), Abstraction(4, 1.0, 4, (8,))
+    return PointNet2(views=views, abstractions=levels, global_layers=(8,), head_layers=(8,), rngs=nnx.Rngs(0))
+
+
+def test_clouds_without_points_are_refused():
+    with pytest.raises(ValueError, match="at least one point, got none"):
+        small_pointnet(6)(np.zeros((2, 0, 3), np.float32))
+
+
+@pytest.mark.parametrize(
+    ("network", "inputs"),
+    [
+        (
+            lambda: ResNet(depth=10, classes=3, channels=1, width=8, rngs=nnx.Rngs(0)),
+            np.ones((4, 16, 16, 1), np.float32),
+        ),
+        (lambda: small_pointnet(6), np.ones((4, 20, 3), np.float32)),
+    ],
+)
+def test_training_is_told_with_each_call(network, inputs):
+    """Flax's modes would change nothing in silence; and statistics cannot be updated within a vmap."""
+    network = network()
+    before = network(inputs)
+    with pytest.raises(ValueError, match="has no training mode: call it with train=True"):
+        network.train()
+    network.eval()
+    np.testing.assert_array_equal(network(inputs), before)
+    rest = {"key": jax.random.key(0)} if not isinstance(network, ResNet) else {}
+    with pytest.raises(ValueError, match="give the network the whole batch in one call"):
+        jax.vmap(lambda one: network(one[None], train=True, **rest))(inputs)
+    network(inputs, train=True, **rest)

@@ -133,3 +133,17 @@ def test_the_sum_in_its_place_adds_logits_and_counts_the_prior_once(seen):
     padded = np.where(present[:, None], features, np.nan)
     found = SumFusion(head, prior)(padded, directions, present, posed=False)
     np.testing.assert_allclose(found, logits[present].sum(axis=0) + prior, atol=1e-5)
+
+
+def test_a_vertical_first_view_does_not_tell_which_way_an_object_faces():
+    """The first view with an azimuth does, whichever views come before it."""
+    directions = np.array([[0, 0, 1], [0, 0, -1], [0, 0.6, 0.8], [0.8, 0, -0.6]], np.float32)
+    turn = np.array([[0.6, -0.8, 0], [0.8, 0.6, 0], [0, 0, 1]], np.float32)
+    for present in ([True, True, True, True], [True, False, False, True], [False, True, True, False]):
+        present = np.array(present)
+        found, rotation = relative_to_first(directions, present)
+        turned, _ = relative_to_first(directions @ turn.T, present)
+        np.testing.assert_allclose(found, turned, atol=1e-6)
+        first = np.flatnonzero(present & np.array([False, False, True, True]))[0]
+        assert abs(float(found[first, 1])) < 1e-6 < float(found[first, 0])
+        np.testing.assert_allclose(directions @ np.asarray(rotation).T, found, atol=1e-6)

@@ -84,3 +84,23 @@ def test_the_expected_gain_in_log_probability_is_the_expected_information(random
     expected = entropy(prior) - np.sum(joint.sum(axis=0) * entropy(after))
     found = expected_gain(np.log(prior).astype(np.float32), gain_if[None].astype(np.float32))
     np.testing.assert_allclose(found, [expected], rtol=1e-4)
+
+
+@pytest.mark.parametrize(
+    "seen", [[True, False, False], [True, True, False], [False, False, False], [True, False, True]]
+)
+def test_without_a_pose_and_an_azimuth_only_elevations_count(random, seen):
+    """From straight above and below, nothing tells which way the object faces, and no candidate may."""
+    policy = moved(ViewPolicy(CLASSES, width=16, heads=2, blocks=2, posed=False, rngs=nnx.Rngs(1)), 0.1)
+    belief = jax.nn.log_softmax(random.normal(size=CLASSES)).astype(np.float32)
+    views = jax.nn.log_softmax(random.normal(size=(3, CLASSES)), axis=-1)
+    directions = np.array([[0, 0, 1], [0, 0, -1], [0.6, 0, 0.8]], np.float32)
+    points, present = fibonacci_sphere(VIEWS).astype(np.float32), np.array(seen)
+    turn = np.array([[0.6, -0.8, 0], [0.8, 0.6, 0], [0, 0, 1]], np.float32)
+    gain, gain_if = asked(policy, belief, views, directions, present, points)
+    turned = asked(policy, belief, views, directions @ turn.T, present, points @ turn.T)
+    np.testing.assert_allclose(gain, turned[0], atol=1e-5)
+    np.testing.assert_allclose(gain_if, turned[1], atol=1e-5)
+    around = np.array([[0.8, 0, 0.6], [0, 0.8, 0.6], [-0.8, 0, 0.6]], np.float32)
+    told = np.ptp(np.asarray(asked(policy, belief, views, directions, present, around)[0])) > 1e-4
+    assert told == seen[2]  # candidates of one elevation differ only where a view tells what is forward

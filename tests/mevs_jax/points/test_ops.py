@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import inspect
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -130,3 +132,36 @@ def test_one_gpu_runs_the_kernels_and_nothing_else_does(monkeypatch):
     assert lowered(1000, "cpu") == 0
     monkeypatch.setattr(jax, "device_count", lambda: 8)
     assert lowered(1000, "cuda") == 0
+
+
+def test_points_that_are_not_finite_are_no_neighbours():
+    """They are left out, as by the plain rule; a centre that is not finite has no neighbours."""
+    cloud = np.random.default_rng(7).normal(0, 0.2, (70, 3)).astype(np.float32)
+    cloud[[3, 40], 1], cloud[[5, 41], 2], cloud[50] = np.nan, np.inf, -np.inf
+    centres = np.concatenate([cloud[:8], np.full((1, 3), np.nan, np.float32)])
+    found = np.asarray(ball_query(cloud, centres, 0.4, 12))
+    with np.errstate(invalid="ignore"):
+        np.testing.assert_array_equal(found, numpy_rules.ball_query(cloud, centres, 0.4, 12))
+    finite = np.isfinite(cloud).all(axis=1)
+    assert finite[found[np.isfinite(centres).all(axis=1)]].all()
+    with pytest.raises(AssertionError):
+        np.testing.assert_array_equal(found[3], found[0])
+    np.testing.assert_array_equal(found[[3, 5, 8]], 0)
+
+
+@pytest.mark.parametrize(
+    ("points", "said"),
+    [
+        (
+            np.zeros((2, 5, 3), np.float32),
+            r"takes one cloud \(points, 3\), got shape \(2, 5, 3\): use jax.vmap for several",
+        ),
+        (np.zeros((5, 6), np.float32), r"takes one cloud \(points, 3\), got shape \(5, 6\)"),
+        (np.zeros((0, 3), np.float32), "needs at least one point"),
+    ],
+)
+def test_what_is_no_cloud_is_described(points, said):
+    sample, query = map(inspect.unwrap, (farthest_point_sample, ball_query))  # without the check of shapes in tests
+    for call in (lambda: sample(points, 2), lambda: query(points, points, 0.1, 2)):
+        with pytest.raises(ValueError, match=said):
+            call()

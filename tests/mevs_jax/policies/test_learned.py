@@ -130,3 +130,28 @@ def test_a_learned_fusion_says_what_it_lacks(fusion):
         select_from_table(jax.random.key(0), table, scene, fused_oracle(fusion), 0, max_views=2)
     with pytest.raises(ValueError, match=r"needs Observation\.predicted_entropy"):
         select_from_table(jax.random.key(0), table, scene, POLICIES["predicted_entropy"], 0, max_views=2)
+
+
+@pytest.mark.parametrize("make", [learned, looking_ahead])
+def test_a_belief_that_is_not_normalised_means_the_same(make, policy):
+    """A sum of logits, by the default fusion, and its log-probabilities lead to the same walks."""
+    data, index = some_features(3, seed=6), 1
+    graph = graph_of(data.directions[index])
+    table = ViewTable(5 * data.logits[index], None, None, data.labels[index])
+    expected = jnp.asarray(np.random.default_rng(8).normal(0, 2, (CLASSES, VIEWS, CLASSES)), jnp.float32)
+    scene = table.scene(graph, Knowledge(jnp.zeros(VIEWS), expected))
+
+    def log_probabilities(state, scene):
+        return jax.nn.log_softmax(state.belief + state.latest.logits)
+
+    @jax.jit
+    def walk(start):
+        choose = make(policy, 1.0)
+        return [
+            select_from_table(jax.random.key(0), table, scene, choose, start, max_views=4, **fused).views
+            for fused in ({}, {"fuse": log_probabilities})
+        ]
+
+    for start in range(VIEWS):
+        summed, normalised = walk(start)
+        assert summed.tolist() == normalised.tolist()
