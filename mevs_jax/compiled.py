@@ -25,8 +25,8 @@ def keep_compiled(folder: str | Path | None = None) -> Path:
     Raises:
         OSError: if the folder cannot be made.
     """
-    if folder is None and jax.config.jax_compilation_cache_dir:
-        return Path(jax.config.jax_compilation_cache_dir)
+    if folder is None and (used := getattr(jax.config, "jax_compilation_cache_dir", None)):
+        return Path(used)
     if folder is None:
         folder = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "mevs_jax" / "compiled"
     folder = Path(folder)
