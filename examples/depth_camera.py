@@ -1,6 +1,6 @@
 """A depth camera that goes where the agent sends it: `python examples/depth_camera.py [SYSTEM]`.
 
-The camera is simulated (640×480, with an off-centre principal point), and a chair stands somewhere in a room. From
+The camera is simulated (640×480, with an off-centre principal point), and a desk stands somewhere in a room. From
 `system = …` on, it is what a robot's program needs. SYSTEM is the folder of a run or of an exported system, or a name
 (default: furniture10, which comes with the package).
 """
@@ -16,14 +16,14 @@ from data_pipeline.capture.casting import default_caster
 from data_pipeline.objects.furniture import furniture
 from data_pipeline.objects.mesh import Mesh, normalise
 
-CENTER, RADIUS = np.array([0.5, 0.1, 0.8]), 0.45  # of the chair, in metres, in the world
+CENTER, RADIUS = np.array([0.5, 0.1, 0.8]), 0.45  # of the desk, in metres, in the world
 K = np.array([[525.0, 0.0, 325.0], [0.0, 520.0, 236.0], [0.0, 0.0, 1.0]])
 
 
 def depth_camera():
     """A function from poses `T_world_camera` to depth images in metres, 0 where nothing is seen."""
-    piece = furniture("chair", 900)
-    mesh = normalise(piece.vertices, piece.faces, "chair")
+    piece = furniture("desk", 900)
+    mesh = normalise(piece.vertices, piece.faces, "desk")
     cast = default_caster()(Mesh((mesh.vertices * RADIUS + CENTER).astype(np.float32), mesh.faces, mesh.extent))
     rows, columns = np.mgrid[:480, :640]
     rays = np.stack([columns, rows, np.ones_like(rows)], axis=-1).reshape(-1, 3) @ np.linalg.inv(K).T
@@ -40,7 +40,7 @@ def depth_camera():
 take = depth_camera()
 
 system = mevs_jax.load(sys.argv[1] if len(sys.argv) > 1 else "furniture10")
-agent = system.agent(stop=0.999)
+agent = system.agent(stop=0.95)
 agent.warm_up()
 agent.reset(center=CENTER, radius=RADIUS)
 step = agent.decide()

@@ -20,6 +20,7 @@ def model_card(description: Description, size: int) -> str:
     """
     camera, data = description.camera, description.data
     objects = ", ".join(f"{count} {split}" for split, count in data.objects.items())
+    channels = f"{description.image.channels} channel{'s' * (description.image.channels > 1)}"
     lines = [
         "---",
         "library_name: mevs_jax",
@@ -39,7 +40,7 @@ def model_card(description: Description, size: int) -> str:
         f"* Data: {data.source} ({objects} objects; fingerprint {data.fingerprint}).",
         f"* Camera: {camera.resolution}×{camera.resolution} pixels, field of view {camera.field_of_view:g}°, "
         f"{camera.distance:g} radii from the object's centre, z up in the image.",
-        f"* Image: {_INPUTS[description.image.content]}; {description.image.channels} channels.",
+        f"* Image: {_INPUTS[description.image.content]}; {channels}.",
         f"* Kind: {_kind(description)}.",
         f"* Policy by default: `{description.best}` ({description.chosen_by}); with unknown yaw `{description.best_unposed}`.",
         f"* Weights: {size / 1e6:.1f} MB. Made with "
