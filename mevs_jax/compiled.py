@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import os
+from contextlib import suppress
 from pathlib import Path
 
 import jax
 
 LARGEST = 512 * 2**20
-"""Largest size of the kept programs in bytes; the ones used longest ago go first."""
+"""Size in bytes above which the oldest programs in the folder are removed."""
 
 
 def keep_compiled(folder: str | Path | None = None) -> Path:
@@ -31,8 +32,23 @@ def keep_compiled(folder: str | Path | None = None) -> Path:
         folder = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "mevs_jax" / "compiled"
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
+    _prune(folder)
     jax.config.update("jax_compilation_cache_dir", str(folder))
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
     jax.config.update("jax_persistent_cache_min_entry_size_bytes", -1)
-    jax.config.update("jax_compilation_cache_max_size", LARGEST)
     return folder
+
+
+def _prune(folder: Path, largest: int = LARGEST) -> None:
+    """Removes the oldest files until the rest is small enough. (JAX's own limit needs a further package.)"""
+    found = []
+    for path in folder.iterdir():
+        with suppress(OSError):  # another process may have removed it
+            found.append((path.stat().st_mtime, path.stat().st_size, path))
+    size = sum(of for _, of, _ in found)
+    for _, of, path in sorted(found):
+        if size <= largest:
+            return
+        with suppress(OSError):
+            path.unlink()
+        size -= of

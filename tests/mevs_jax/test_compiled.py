@@ -6,6 +6,8 @@ import os
 import subprocess
 import sys
 
+from mevs_jax.compiled import _prune
+
 PROGRAM = """
 import jax, jax.numpy as jnp
 from mevs_jax import keep_compiled
@@ -25,3 +27,11 @@ def test_programs_are_kept_in_the_users_cache(tmp_path):
     other = given | {"JAX_COMPILATION_CACHE_DIR": str(tmp_path / "own")}
     ended = subprocess.run([sys.executable, "-c", PROGRAM], capture_output=True, text=True, env=other, timeout=300)
     assert ended.stdout.strip() == str(tmp_path / "own")
+
+
+def test_the_oldest_programs_go_first(tmp_path):
+    for age, name in enumerate("abcd"):
+        (tmp_path / name).write_bytes(bytes(100))
+        os.utime(tmp_path / name, (1000 - age, 1000 - age))
+    _prune(tmp_path, 250)
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["a", "b"]
