@@ -1,4 +1,4 @@
-"""Whether settings are those that a run was made with: later stages refuse others, so that no report says what was not done."""
+"""Comparison of settings with those that a run was made with. Later stages refuse settings that differ."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from data_pipeline.dataset.builder import made_with_other_settings
+from data_pipeline.dataset.config import made_with_other_settings
 from data_pipeline.differences import differences, in_words
 from data_pipeline.errors import DataError
 from data_pipeline.files import as_read

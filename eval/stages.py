@@ -15,7 +15,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from data_pipeline.dataset.builder import check_same_data, open_objects, prepare
+from data_pipeline.dataset.builder import open_objects, prepare
+from data_pipeline.dataset.config import check_same_data
 from data_pipeline.dataset.statistics import SUMMARY, DatasetStatistics, load_statistics, report_left_out
 from data_pipeline.errors import DataError, Diverged, Unreadable
 from data_pipeline.files import check_of_file, keep_json, read_json, write_json

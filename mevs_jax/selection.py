@@ -189,7 +189,7 @@ def select_views(
         return replace(state, view=best_view(scores, candidates(state, scene), scene.reachable)), episode
 
     def observed(view: Int[Array, ""]) -> Observation:
-        """The observation of a view with logits in float32, in which the loop computes whatever the networks compute in."""
+        """The observation of a view, with logits in float32."""
         found = observe(view)
         return replace(found, logits=found.logits.astype(jnp.float32))
 

@@ -1,4 +1,4 @@
-"""Functions that users bring, as `module:function` or `path/to/file.py:function`: loading, and what identifies them."""
+"""Functions of users, given as `module:function` or `path/to/file.py:function`: loading, and what identifies them."""
 
 from __future__ import annotations
 

@@ -13,7 +13,7 @@ import struct
 import zlib
 from collections.abc import Iterator, Sequence
 from contextlib import redirect_stdout
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 from zipfile import BadZipFile
@@ -23,9 +23,11 @@ import jax.numpy as jnp
 import numpy as np
 
 from data_pipeline.capture.casting import Capture, CaptureConfig, Rig, check_camera, load_capture, rig_for
-from data_pipeline.capture.viewpoints import FILE, identified, is_file, viewpoints_of
+from data_pipeline.capture.viewpoints import identified, viewpoints_of
 from data_pipeline.capture.workers import capture_all, capture_entry, capture_path, say_damaged
 from data_pipeline.dataset.beam import beam_options, capture_by_beam, examples_by_beam
+from data_pipeline.dataset.config import DataConfig as DataConfig
+from data_pipeline.dataset.config import check_viewpoints, identity_of
 from data_pipeline.dataset.proof import (
     SHARDS,
     SOURCE_STATE,
@@ -40,46 +42,15 @@ from data_pipeline.dataset.statistics import (
     SUMMARY,
     DatasetStatistics,
     StatisticsCollector,
-    load_statistics,
 )
-from data_pipeline.differences import differences, in_words
-from data_pipeline.errors import DataError, Unreadable, reason_of
-from data_pipeline.files import as_read, check_of_file, keep_checks, keep_json, read_json
+from data_pipeline.errors import DataError, reason_of
+from data_pipeline.files import check_of_file, keep_checks, keep_json
 from data_pipeline.objects.changes import changes_between, source_state
 from data_pipeline.objects.downloads import ARCHIVES, download, download_folder, local
-from data_pipeline.objects.formats import Up
 from data_pipeline.objects.mesh import SOURCE_SPLITS, ObjectEntry, ObjectSource
 from data_pipeline.objects.sources import Reading, mesh_zip, open_source
 from data_pipeline.progress import console, progress_bar
 from mevs_jax.entropy import level_entropy
-from mevs_jax.viewpoints import ViewGraph
-
-
-@dataclass(frozen=True)
-class DataConfig:
-    """Which objects the data set contains, and how they are captured."""
-
-    source: str = "furniture10"
-    """furniture10, modelnet10 or modelnet40 (downloaded), a folder of <class>/{train,test}/ meshes, a zip of the same
-    layout, or an .npz of voxel grids"""
-    archive: str = ""
-    """local ModelNet10.zip or ModelNet40.zip to use instead of the download"""
-    train_per_class: int = 60
-    """training objects per class, for furniture10 (including those for validation)"""
-    test_per_class: int = 20
-    """test objects per class, for furniture10"""
-    validation_share: float = 0.2
-    """share of the training objects of each class that is used for validation"""
-    seed: int = 0
-    """seed of the split into training and validation"""
-    skip_damaged: bool = False
-    """leave damaged files out instead of stopping at the first one"""
-    up: Up = "auto"
-    """which axis of mesh files is up: the one that the format declares (glTF, COLLADA), else z (auto), or always z or y"""
-    split: str = ""
-    """for a folder or zip without train and test folders: the share of training objects of each class, such as 0.8, or a .json
-    or .csv list of splits"""
-    capture: CaptureConfig = CaptureConfig()
 
 
 def split_objects(entries: Sequence[ObjectEntry], validation_share: float, seed: int) -> dict[str, list[ObjectEntry]]:
@@ -306,40 +277,6 @@ def open_objects(config: DataConfig) -> ObjectSource:
     return replace(source, name=official.name)
 
 
-def _identity(config: DataConfig, folder: Path | None = None) -> dict[str, Any]:
-    """Returns the settings that identify a data set. Later settings are left out at their defaults, as in older data sets.
-
-    Args:
-        folder: of the data set, which does not need its file of viewpoints any more once it is finished.
-    """
-    made = None
-    if is_file(config.capture.lattice) and folder is not None and (folder / SUMMARY).exists():
-        made = load_statistics(folder).capture
-    identity, default = asdict(replace(config, capture=identified(config.capture, made))), asdict(DataConfig())
-    return {key: value for key, value in identity.items() if key not in ("up", "split") or value != default[key]}
-
-
-def made_with_other_settings(config: DataConfig, folder: Path) -> dict[str, tuple[Any, Any]]:
-    """Returns the settings of the data set in `folder` that differ from `config`, by name: as it was made, and as in `config`.
-
-    There are none if there is no data set, or its settings cannot be read. Settings that only one of them has are left out.
-    """
-    try:
-        was = read_json(folder / "config.json")
-    except (FileNotFoundError, Unreadable):
-        return {}
-    return differences(was, as_read(_identity(config, folder)), "dataset", shared=True)
-
-
-def check_same_data(config: DataConfig, folder: Path) -> None:
-    """Raises `DataError` if the data set in `folder` was made with other settings; names what differs."""
-    if found := made_with_other_settings(config, folder):
-        raise DataError(
-            f"{folder} has a data set made with other settings ({in_words(found)}); leave these options out, or "
-            f"choose another --out"
-        )
-
-
 def _state(config: DataConfig) -> dict[str, str] | None:
     """Returns the state of the source's files, or None if it has none or they are an official archive's."""
     data = config.archive if config.source in ARCHIVES else config.source
@@ -404,23 +341,6 @@ def _check_source(config: DataConfig, folder: Path, damage: str) -> None:
         )
 
 
-def _check_viewpoints(capture: CaptureConfig, finished: bool) -> None:
-    """Raises `DataError` if there are no such viewpoints, or no graph of their neighbours."""
-    if is_file(capture.lattice):
-        if finished:  # they are in its summary
-            return
-        found = viewpoints_of(capture)
-        try:
-            ViewGraph.from_points(found.points, found.neighbours)
-        except ValueError as error:
-            raise DataError(f"{error}: give the neighbours in {capture.lattice.removeprefix(FILE)}") from error
-        return
-    try:
-        viewpoints_of(capture)
-    except ValueError as error:
-        raise DataError(f"{error}; choose another --views or --dataset.capture.lattice") from error
-
-
 def prepare(config: DataConfig, folder: Path, beam: str | None = None) -> DatasetStatistics:
     """Creates the data set in `folder`, unless it exists, and returns its statistics.
 
@@ -435,12 +355,12 @@ def prepare(config: DataConfig, folder: Path, beam: str | None = None) -> Datase
     if config.capture.views < 2:
         raise DataError(f"--views {config.capture.views} is too few: choosing a next view needs at least 2 viewpoints")
     check_camera(config.capture)
-    _check_viewpoints(config.capture, (folder / SUMMARY).exists())
+    check_viewpoints(config.capture, (folder / SUMMARY).exists())
     if not 0 <= config.validation_share < 1:
         raise DataError(
             f"--dataset.validation-share {config.validation_share:g} is not at least 0 and below 1; choose another"
         )
-    identity, captures, made_with = _identity(config, folder), folder / "captures", folder / "config.json"
+    identity, captures, made_with = identity_of(config, folder), folder / "captures", folder / "config.json"
     damage = damage_of_settings(folder, identity)
     if (folder / SUMMARY).exists():
         found = found_in(folder, damage)

@@ -1,4 +1,4 @@
-"""Policies that users bring: how they are loaded, what they are given, and how their scores are checked.
+"""Policies of users: how they are loaded, what they are given, and how their scores are checked.
 
 A policy is evaluated like those of the ladder. It is given what it declares to know (`register_policy(knows=...)`): one that
 does not declare the truth cannot read it.

@@ -178,6 +178,8 @@ common options:
   --archive FILE          ModelNet10.zip or ModelNet40.zip, where it has been downloaded already
   --views N               candidate viewpoints around an object (default 40)
   --pretrained FILE ...   ImageNet weights for the classifiers: torchvision's .pth or .safetensors
+  --policy FILE.py:NAME   a policy of your own, evaluated like all others (docs/own.md)
+  --encoder FILE.py:NAME  a network of your own as the classifier
   --seed N                seed of everything that is random (default 0)
   --print-config          print the resolved configuration as JSON, and stop
 

@@ -14,7 +14,7 @@ def run(call: Invocation) -> None:
 
     classifier = call.settings.classifier
     start = starting_weights(call.options.pretrained, classifier.network, classifier.encoder)
-    load_policies(call.settings.policies)  # so that an error in what users bring is found before anything else is done
+    load_policies(call.settings.policies)  # so that an error in a policy is found before anything is computed
     if classifier.encoder:
         load_own(classifier.encoder, "--encoder")
     stages.policies_of(call.settings, stages.make_data(call.settings, call.out))

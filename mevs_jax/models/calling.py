@@ -1,4 +1,4 @@
-"""Networks that are told with each call whether it is one of training, not by a mode that they are put into."""
+"""Networks whose calls take an argument `train`, instead of a mode that is set on the network."""
 
 from __future__ import annotations
 

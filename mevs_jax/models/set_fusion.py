@@ -35,7 +35,7 @@ class _Block(nnx.Module):
 
 
 def has_azimuth(directions: Float[AnyArray, "*batch views 3"]) -> Bool[Array, "*batch views"]:
-    """Whether each direction is not vertical, so that it tells which way is forward."""
+    """Whether each direction is not vertical, so that its azimuth is defined."""
     return jnp.linalg.norm(jnp.asarray(directions)[..., :2], axis=-1) > 1e-6
 
 
@@ -51,9 +51,9 @@ def relative_to_first(
         The rotated directions, and the rotation matrix.
     """
     directions, present = jnp.asarray(directions), jnp.asarray(present)
-    told = present & has_azimuth(directions)
-    first = jnp.take_along_axis(directions, jnp.argmax(told, axis=-1)[..., None, None], axis=-2)[..., 0, :2]
-    first = jnp.where(jnp.any(told, axis=-1)[..., None], first, 0.0)
+    usable = present & has_azimuth(directions)
+    first = jnp.take_along_axis(directions, jnp.argmax(usable, axis=-1)[..., None, None], axis=-2)[..., 0, :2]
+    first = jnp.where(jnp.any(usable, axis=-1)[..., None], first, 0.0)
     length = jnp.linalg.norm(first, axis=-1, keepdims=True)
     x, y = jnp.moveaxis(jnp.where(length > 1e-6, first / jnp.maximum(length, 1e-6), jnp.array([1.0, 0.0])), -1, 0)
     zero, one = jnp.zeros_like(x), jnp.ones_like(x)

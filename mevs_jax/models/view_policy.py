@@ -52,7 +52,7 @@ def direction_features(directions: Float[AnyArray, "*batch 3"]) -> Float[Array, 
 
 
 def _without_azimuth(directions: Float[Array, "*batch candidates 3"]) -> Float[Array, "*batch candidates 3"]:
-    """Each direction turned about the vertical axis to azimuth 0: all that is known of it where no view tells what is forward."""
+    """Each direction turned about the vertical axis to azimuth 0, so that only its elevation is left."""
     level = jnp.linalg.norm(directions[..., :2], axis=-1)
     return jnp.stack([level, jnp.zeros_like(level), directions[..., 2]], axis=-1)
 
@@ -143,10 +143,11 @@ class ViewPolicy(nnx.Module):
             raise ValueError("this view policy needs the embeddings of partial clouds, which are not given")
         belief, views, present = jnp.asarray(belief), jnp.asarray(views), jnp.asarray(present)
         if not self.posed:
-            forward = jnp.any(present & has_azimuth(directions), axis=-1)
+            # If all views seen are vertical, the azimuth of a candidate relative to the object is unknown.
+            has_forward = jnp.any(present & has_azimuth(directions), axis=-1)
             directions, rotation = relative_to_first(directions, present)
             candidates = jnp.asarray(candidates) @ jnp.swapaxes(rotation, -1, -2)
-            candidates = jnp.where(forward[..., None, None], candidates, _without_azimuth(candidates))
+            candidates = jnp.where(has_forward[..., None, None], candidates, _without_azimuth(candidates))
         seen = present[..., None]
         least = -12.0  # log-probabilities below this (6 in a million) make no difference
         tokens = self.view(jnp.where(seen, jnp.maximum(views, least), 0.0))

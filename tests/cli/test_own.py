@@ -1,4 +1,4 @@
-"""What users bring of their own, by command: policies, encoders, viewpoints."""
+"""A user's own code and files, by command: policies, encoders, viewpoints."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Functions that users bring by `module:function` or by file."""
+"""Functions of users by `module:function` or by file."""
 
 from __future__ import annotations
 

@@ -54,11 +54,11 @@ def see_rotated(viewpoints: tuple[tuple[float, ...], ...]) -> Ask:
         viewpoints: unit vectors of the lattice.
 
     Raises:
-        DataError: if they lie in one plane with the origin, from which no rotation can be told.
+        DataError: if they lie in one plane with the origin, which does not determine a rotation.
     """
     if np.linalg.matrix_rank(np.array(viewpoints), tol=1e-6) < 3:
         raise DataError(
-            "the viewpoints lie in one plane with the object's centre, from which no rotation of an object can be told; set "
+            "the viewpoints lie in one plane with the object's centre, which does not determine the rotation of an object; set "
             "--learned.rotation-epochs 0"
         )
 

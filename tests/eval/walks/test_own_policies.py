@@ -1,4 +1,4 @@
-"""Policies that users bring: what they are given, how many walks they take, and which of them are refused."""
+"""Policies of users: what they are given, how many walks they take, and which of them are refused."""
 
 from __future__ import annotations
 

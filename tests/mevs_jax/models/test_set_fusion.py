@@ -136,7 +136,7 @@ def test_the_sum_in_its_place_adds_logits_and_counts_the_prior_once(seen):
 
 
 def test_a_vertical_first_view_does_not_tell_which_way_an_object_faces():
-    """The first view with an azimuth does, whichever views come before it."""
+    """The first view with an azimuth does, also if vertical views come before it."""
     directions = np.array([[0, 0, 1], [0, 0, -1], [0, 0.6, 0.8], [0.8, 0, -0.6]], np.float32)
     turn = np.array([[0.6, -0.8, 0], [0.8, 0.6, 0], [0, 0, 1]], np.float32)
     for present in ([True, True, True, True], [True, False, False, True], [False, True, True, False]):

@@ -90,7 +90,7 @@ def test_the_expected_gain_in_log_probability_is_the_expected_information(random
     "seen", [[True, False, False], [True, True, False], [False, False, False], [True, False, True]]
 )
 def test_without_a_pose_and_an_azimuth_only_elevations_count(random, seen):
-    """From straight above and below, nothing tells which way the object faces, and no candidate may."""
+    """Views from straight above and below do not determine the yaw, so the candidates' azimuths must not matter."""
     policy = moved(ViewPolicy(CLASSES, width=16, heads=2, blocks=2, posed=False, rngs=nnx.Rngs(1)), 0.1)
     belief = jax.nn.log_softmax(random.normal(size=CLASSES)).astype(np.float32)
     views = jax.nn.log_softmax(random.normal(size=(3, CLASSES)), axis=-1)
@@ -102,5 +102,5 @@ def test_without_a_pose_and_an_azimuth_only_elevations_count(random, seen):
     np.testing.assert_allclose(gain, turned[0], atol=1e-5)
     np.testing.assert_allclose(gain_if, turned[1], atol=1e-5)
     around = np.array([[0.8, 0, 0.6], [0, 0.8, 0.6], [-0.8, 0, 0.6]], np.float32)
-    told = np.ptp(np.asarray(asked(policy, belief, views, directions, present, around)[0])) > 1e-4
-    assert told == seen[2]  # candidates of one elevation differ only where a view tells what is forward
+    differ = np.ptp(np.asarray(asked(policy, belief, views, directions, present, around)[0])) > 1e-4
+    assert differ == seen[2]  # candidates of one elevation differ only if some view seen is not vertical
