@@ -17,7 +17,7 @@ EXAMPLES = Path(__file__).resolve().parents[1] / "examples"
         ("own_policy", "opposite: "),
         ("load_and_ask", "confident after "),
         ("depth_camera", " views: sure"),
-        ("gymnasium_ppo", "| PPO − random | +0.0 "),
+        pytest.param("gymnasium_ppo", "| PPO − random | +0.0 ", marks=pytest.mark.slow),
         pytest.param("own_encoder", "validation accuracy", marks=pytest.mark.slow),
     ],
 )

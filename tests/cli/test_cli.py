@@ -50,6 +50,7 @@ def test_the_job_leaves_a_report_and_metrics(whole):
     assert notice < lead
 
 
+@pytest.mark.slow
 def test_a_run_that_diverges_ends_with_one_sentence(data, tmp_path):
     """A learning rate at which the loss stays finite, and results from the classifier's outputs do not."""
     (tmp_path / "data").symlink_to(data)
@@ -234,6 +235,7 @@ def has_trained_an_epoch(out: Path) -> bool:
     return log.exists() and log.stat().st_size > 0
 
 
+@pytest.mark.slow
 def test_an_interrupted_training_ends_as_one_that_was_not(whole, tmp_path):
     """Interrupted after an epoch; the slow test below compares whole jobs."""
     shutil.copytree(whole / "data", tmp_path / "data")

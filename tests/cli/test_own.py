@@ -35,6 +35,7 @@ def metrics_of(out):
     return json.loads((out / "metrics.json").read_text())
 
 
+@pytest.mark.slow
 def test_a_policy_enters_the_evaluation_and_the_report(whole, tmp_path, file, at_once, monkeypatch):
     out = tmp_path / "run"
     shutil.copytree(whole, out)
@@ -166,6 +167,7 @@ def three_classes(folder):
     return f"{path}:net"
 
 
+@pytest.mark.slow
 def test_viewpoints_of_a_file_are_those_of_the_whole_run(whole, tmp_path, at_once, refuses, monkeypatch):
     """Every graph that the evaluation and the report use has the neighbours of the file."""
     monkeypatch.chdir(tmp_path)

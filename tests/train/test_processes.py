@@ -74,7 +74,8 @@ def run(data, tmp_path):
     return folder
 
 
-@pytest.mark.parametrize("networks", [("entropy",), pytest.param(NETWORKS, marks=pytest.mark.slow)], ids="+".join)
+@pytest.mark.slow
+@pytest.mark.parametrize("networks", [("entropy",), NETWORKS], ids="+".join)
 def test_two_processes_train_as_one_does(networks, run, whole):
     alone, together = run("alone"), run("together")
     if "classifier" not in networks:  # the run has it already, and does not train it again

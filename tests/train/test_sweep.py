@@ -97,6 +97,7 @@ def test_a_stopped_sweep_ends_as_if_it_had_not_been(out, tmp_path, monkeypatch):
         sweep(task, out / "data", statistics, tmp_path / "stopped", replace(SWEEP, members=2))
 
 
+@pytest.mark.slow
 def test_a_member_whose_loss_is_no_number_leaves_the_others_alone(out, tmp_path, monkeypatch):
     statistics, task = load_statistics(out / "data"), task_named("classifier", out)
     task = replace(task, optimiser=replace(task.optimiser, schedule="constant", epochs=1))

@@ -206,7 +206,7 @@ def volume_of(name: str) -> np.ndarray:
 @pytest.mark.parametrize(
     ("values", "thing"),
     [
-        (of_mesh, lambda name: triangles_of(name)[:64]),
+        (of_mesh, lambda name: triangles_of(name)[:24]),
         pytest.param(of_mesh, lambda name: triangles_of(name)[:128], marks=pytest.mark.slow),
         (of_volume, volume_of),
     ],
