@@ -1,8 +1,9 @@
-"""Kills jobs at random moments and starts them in pairs: `python -m tests.damage.kills [--kills 60] [--pairs 20]`.
+"""Kills jobs at random moments and starts them in pairs: `python -m tests.damage.kills [--kills 48] [--workers 12]`.
 
 After each kill the same command runs again. After a few kills it is left alone, and should end with the metrics of a run that was
 never interrupted. No job may print a traceback or leave a process behind. A kill is a signal to the job, or SIGKILL to one of its
-capture workers. Of two jobs that start in one directory, one should finish and the other end with one sentence, or wait.
+capture workers, for which the job captures more objects than the preset has. Of two jobs that start in one directory, one should
+finish and the other end with one sentence, or wait.
 """
 
 from __future__ import annotations
@@ -21,18 +22,20 @@ import numpy as np
 
 LIMIT = 300.0
 """Seconds after which a job counts as one that hangs."""
-KINDS = {"SIGKILL": (-9,), "SIGTERM": (-15, 143), "SIGINT": (130,), "worker": (2,)}
-"""The exit codes that a job may have after each kill."""
+KINDS = {"SIGKILL": (-9,), "SIGTERM": (-15, 143), "SIGINT": (130, -2)}
+"""The exit codes that a job may have after each signal. While Python itself ends, after all is done, SIGINT gives -2."""
 OUTCOMES = ("same", "DIFFERENT", "CODE", "TRACEBACK", "HANG", "REMAINS")
+RUN = ("run", "--preset", "tiny")
+DATA = ("data", "--preset", "tiny", "--dataset.train-per-class", "12", "--dataset.test-per-class", "2")
 
 
 class Job:
-    """A run of the preset tiny in a process group of its own; its output is in `log`."""
+    """A command in a process group of its own; its output is in `log`."""
 
-    def __init__(self, out: Path, log: Path) -> None:
+    def __init__(self, out: Path, log: Path, arguments: tuple[str, ...] = RUN) -> None:
         self.log = log
         with log.open("w") as file:
-            command = [sys.executable, "-m", "mevs_jax", "run", "--preset", "tiny", "--out", str(out)]
+            command = [sys.executable, "-m", "mevs_jax", *arguments, "--out", str(out)]
             self.process = subprocess.Popen(command, stdout=file, stderr=file, start_new_session=True)
 
     def code(self) -> int | None:
@@ -69,25 +72,27 @@ class Job:
 
 
 def _kill(job: Job, kind: str, moment: float) -> bool:
-    """Kills a job after `moment` seconds, or one of its workers. Returns whether it was still running."""
-    begun, fraction = time.monotonic(), moment % 1
-    if kind != "worker":
-        while time.monotonic() - begun < moment and job.process.poll() is None:
-            time.sleep(0.005)
-        if job.process.poll() is not None:
-            return False
-        job.process.send_signal(getattr(signal, kind))
-        return True
-    while job.process.poll() is None:
-        if found := job.workers():
-            time.sleep(2 * fraction)
-            try:
-                os.kill(found[int(fraction * 100) % len(found)], signal.SIGKILL)
-                return True
-            except ProcessLookupError:
-                return False
+    """Sends a signal to a job after `moment` seconds. Returns whether it was still running."""
+    begun = time.monotonic()
+    while time.monotonic() - begun < moment and job.process.poll() is None:
+        time.sleep(0.005)
+    if job.process.poll() is not None:
+        return False
+    job.process.send_signal(getattr(signal, kind))
+    return True
+
+
+def _kill_worker(job: Job, moment: float, random: np.random.Generator) -> bool:
+    """Kills a capture worker of a job, `moment` seconds after the first one starts. Returns whether one was running."""
+    while job.process.poll() is None and not job.workers():
         time.sleep(0.02)
-    return False
+    time.sleep(moment)
+    try:
+        if found := job.workers():
+            os.kill(int(random.choice(found)), signal.SIGKILL)
+        return bool(found)
+    except ProcessLookupError:
+        return False
 
 
 def _is_whole(out: Path, whole: Path) -> bool:
@@ -107,7 +112,7 @@ def killed(
     for at in range(kills + 1):
         job, moment, kind = Job(run, work / f"{at}.log"), random.uniform(0, left), ""
         if at < kills:
-            kind = str(random.choice(list(KINDS) if not (run / "data" / "summary.json").exists() else list(KINDS)[:-1]))
+            kind = str(random.choice(list(KINDS)))
             hit, left = _kill(job, kind, moment), max(left - 0.6 * moment, 0.3 * length)
             kind = kind if hit else ""
         code, text = job.code(), job.text()
@@ -122,6 +127,26 @@ def killed(
         if code == 0:
             break
     return ("same" if _is_whole(run, whole) else "DIFFERENT"), hits, last
+
+
+def bereaved(work: Path, captured: Path, moment: float, random: np.random.Generator) -> tuple[str, list[str], str]:
+    """Returns as `killed` does, for a job that captures objects and loses a worker after `moment` seconds."""
+    first = Job(work / "run", work / "first.log", DATA)
+    kinds = ["worker"] if _kill_worker(first, moment, random) else []
+    code, again = first.code(), Job(work / "run", work / "again.log", DATA)
+    last = f"at {moment:.2f} s: {code} {first.text().splitlines()[-1:]}"
+    codes = code, again.code()
+    if None in codes:
+        return "HANG", kinds, last
+    if any("Traceback" in job.text() for job in (first, again)):
+        return "TRACEBACK", kinds, f"{first.text()}\n{again.text()}"
+    if codes not in ((0, 0), (2, 0) if kinds else (0, 0)):
+        return "CODE", kinds, f"{codes} {last}"
+    if first.remains() or again.remains():
+        return "REMAINS", kinds, last
+    shards = sorted(path.relative_to(captured) for path in captured.rglob("*.array_record*"))
+    equal = shards and all((work / "run" / path).read_bytes() == (captured / path).read_bytes() for path in shards)
+    return ("same" if equal and not list(work.rglob("*.partial*")) else "DIFFERENT"), kinds, last
 
 
 def paired(work: Path, whole: Path, stagger: float) -> tuple[str, str]:
@@ -145,8 +170,9 @@ def paired(work: Path, whole: Path, stagger: float) -> tuple[str, str]:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("run", nargs="?", type=Path, help="a finished run of the preset tiny; made first if left out")
-    parser.add_argument("--kills", type=int, default=60)
+    parser.add_argument("--kills", type=int, default=48)
     parser.add_argument("--in-a-row", type=int, default=3, help="kills of a run before it is left alone")
+    parser.add_argument("--workers", type=int, default=12, help="kills of a capture worker")
     parser.add_argument("--pairs", type=int, default=20)
     parser.add_argument("--seed", type=int, default=0)
     options = parser.parse_args()
@@ -163,14 +189,19 @@ def main() -> None:
             sys.exit(timing.text())
         length = time.monotonic() - begun
         print(f"a run takes {length:.1f} s", flush=True)
+        captured = Path(folder) / "captured"
+        if options.workers and (job := Job(captured, Path(folder) / "log", DATA)).code() != 0:
+            sys.exit(job.text())
         done = at = 0
-        while done < options.kills or at < options.pairs:
+        while done < options.kills or at < options.pairs + options.workers:
             work = Path(folder) / str(at)
             work.mkdir()
             if at < options.pairs:
                 kinds, moment = ["pair"], random.uniform(0, 3)
                 found, said = paired(work, whole, moment)
                 said = f"{moment:.2f} s apart: {said}"
+            elif at < options.pairs + options.workers:
+                found, kinds, said = bereaved(work, captured, random.uniform(0, 5), random)
             else:
                 found, kinds, said = killed(work, whole, min(options.in_a_row, options.kills - done), length, random)
                 done += len(kinds)
@@ -178,7 +209,7 @@ def main() -> None:
             counts.update((kind, found) for kind in kinds)
             print(f"{found:9} {' '.join(kinds)} {said}", flush=True)
     print(f"\n{'':9}" + "".join(f"{name:>11}" for name in OUTCOMES))
-    for kind in ("pair", *KINDS):
+    for kind in ("pair", "worker", *KINDS):
         print(f"{kind:9}" + "".join(f"{counts[kind, name]:>11}" for name in OUTCOMES))
     sys.exit(int(any(name != "same" for _, name in counts)))
 
