@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import multiprocessing
 import os
+import pickle
 import signal
 import tempfile
 import threading
@@ -43,12 +44,21 @@ def _end_with_parent() -> None:
     os._exit(1)
 
 
-def _begin(notes: Path, start: Callable[..., None], given: tuple) -> None:
+_GIVEN = "given"
+"""File of the folder of notes that holds what a worker process is started with.
+
+Python writes the arguments of a new process into a pipe before the process reads them. More than the pipe holds (64 KB on Linux)
+would block this process for ever if the new one dies first.
+"""
+
+
+def _begin(notes: Path) -> None:
     """Starts a worker process."""
     global _note
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent handles Ctrl-C and ends its workers
     threading.Thread(target=_end_with_parent, daemon=True).start()  # a parent that is killed cannot
     _note = FileIO(notes / str(os.getpid()), "w")
+    start, given = pickle.loads((notes / _GIVEN).read_bytes())
     start(*given)
 
 
@@ -79,6 +89,17 @@ def _death(children: Sequence[Any], notes: Path) -> DataError:
     )
 
 
+def _is_broken(pool: Executor) -> bool:
+    """Returns whether a process of the pool died. While others are started, this also raises errors about closed handles."""
+    try:
+        pool.submit(int)
+    except BrokenProcessPool:
+        return True
+    except RuntimeError:  # it is shut down
+        return False
+    return False
+
+
 @contextmanager
 def shared(
     work: Callable[[Job], Result],
@@ -93,7 +114,8 @@ def shared(
 ) -> Iterator[Iterator[Result]]:
     """Yields an iterator over the results of `work` for all jobs, in order.
 
-    Where processes cannot be started, because semaphores cannot be made in `/dev/shm`, this process does the work.
+    Where processes cannot be started, because semaphores cannot be made in `/dev/shm` or the folder for temporary files is full,
+    this process does the work.
 
     Args:
         workers: number of processes or threads.
@@ -105,7 +127,7 @@ def shared(
     Raises:
         DataError: if a process dies.
     """
-    with tempfile.TemporaryDirectory(prefix="mevs-") as folder:
+    with tempfile.TemporaryDirectory(prefix="mevs-", ignore_cleanup_errors=True) as folder:
         notes, children = Path(folder), list[Any]()
         pool: Executor | None = None
         try:
@@ -113,10 +135,12 @@ def shared(
                 pool = ThreadPoolExecutor(workers, initializer=start, initargs=given)
             else:
                 spawn = multiprocessing.get_context("spawn")
-                pool = ProcessPoolExecutor(workers, spawn, _begin, (notes, start, given))
+                (notes / _GIVEN).write_bytes(pickle.dumps((start, given)))
+                pool = ProcessPoolExecutor(workers, spawn, _begin, (notes,))
         except OSError as error:
+            where = f"are /dev/shm and {folder} writable?"
             console.print(
-                f"Worker processes cannot be started ({error.strerror}; is /dev/shm writable?), so one process does the work",
+                f"Worker processes cannot be started ({error.strerror}; {where}), so one process does the work",
                 markup=False,
             )
         if pool is None:
@@ -128,9 +152,9 @@ def shared(
             results = pool.map(partial(_noted, work, name_of), jobs, chunksize=chunk)
             children = [child for child in multiprocessing.active_children() if child not in before]
             yield results
-        except BrokenProcessPool as error:
-            raise _death(children, notes) from error
-        except BaseException:
+        except BaseException as error:
+            if isinstance(error, Exception) and _is_broken(pool):
+                raise _death(children, notes) from error
             for child in children:
                 child.terminate()
             raise

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import multiprocessing.spawn
 import os
 import signal
 import time
@@ -57,6 +58,20 @@ def test_a_killed_process_is_named(tmp_path):
         DataError, match=r"killed by signal 9, most likely for lack of memory, while it worked on object 5;"
     ):
         results(dies_at_five, range(20), chunk=2)
+
+
+@pytest.mark.parametrize("size", [1, 10_000_000])
+def test_a_process_that_dies_while_it_starts_ends_the_job(size, monkeypatch, tmp_path):
+    """A process that dies before it reads its arguments, which may be larger than a pipe, blocked the job for ever."""
+    dies = tmp_path / "python"
+    dies.write_text("#!/bin/sh\nkill -9 $$\n")
+    dies.chmod(0o755)
+    monkeypatch.setattr(multiprocessing.spawn, "_python_exe", os.fsencode(dies))
+    with (
+        pytest.raises(DataError, match=r"a worker process was .* while it worked on nothing yet"),
+        shared(times, range(20), workers=2, start=begin, given=(bytes(size),), name_of=name_of) as found,
+    ):
+        list(found)
 
 
 def test_an_interrupt_ends_the_workers_at_once():
