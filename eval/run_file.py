@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 import platform
-import types
-from dataclasses import asdict, dataclass, fields, is_dataclass
+from dataclasses import asdict, dataclass
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
+from typing import Any
 
 from data_pipeline.errors import DataError, Unreadable
 from data_pipeline.files import CHECKS, as_read, checks_in, keep_json, read_json
 from eval.settings import PRESETS, Settings
+from mevs_jax.plain import from_plain
 
 NAME = "run.json"
 
@@ -94,43 +94,3 @@ def _made_with() -> dict[str, Any]:
     device = jax.devices()[0]
     devices = {"platform": device.platform, "kind": device.device_kind, "count": jax.device_count()}
     return {"python": platform.python_version(), **{name: version(name) for name in packages}, "devices": devices}
-
-
-def from_plain(kind: Any, content: Any, where: str) -> Any:
-    """A value of a type made of dataclasses, tuples and plain values, from what JSON keeps of it.
-
-    Raises:
-        TypeError, ValueError: for content of another form; the message names the place.
-    """
-    origin, arguments = get_origin(kind), get_args(kind)
-    if isinstance(kind, type) and is_dataclass(kind):
-        if not isinstance(content, dict):
-            raise TypeError(f"{where} is no object")
-        hints = get_type_hints(kind)
-        known = {field.name for field in fields(kind)}
-        if unknown := set(content) - known:
-            raise ValueError(f"{where} has no setting {min(unknown)!r}")
-        found = {name: from_plain(hints[name], value, f"{where}.{name}") for name, value in content.items()}
-        return kind(**found)
-    if origin is tuple:
-        if not isinstance(content, list):
-            raise TypeError(f"{where} is no list")
-        kinds = [arguments[0]] * len(content) if arguments[1:] == (...,) else list(arguments)
-        values = zip(kinds, content, strict=True)
-        return tuple(from_plain(one, item, f"{where}[{i}]") for i, (one, item) in enumerate(values))
-    if origin in (Union, types.UnionType):
-        if content is None and type(None) in arguments:
-            return None
-        (one,) = [argument for argument in arguments if argument is not type(None)]
-        return from_plain(one, content, where)
-    if origin is Literal:
-        if content not in arguments:
-            raise ValueError(f"{where} is {content!r}, not one of {', '.join(map(str, arguments))}")
-        return content
-    if kind is Path:
-        return Path(content)
-    if kind is float and type(content) is int:
-        return float(content)
-    if kind is not Any and type(content) is not kind:
-        raise TypeError(f"{where} is {content!r}, not of type {kind.__name__}")
-    return content
