@@ -99,7 +99,7 @@ def walk_of(
     """
     camera = agent.system.description.camera
     K = own_intrinsics(camera.resolution, camera.field_of_view)
-    agent.reset(center=_CENTER, radius=_RADIUS)
+    agent.reset(center=_CENTER, radius=_RADIUS, yaw=0.0)
     views, found, view = [], [], first
     while True:
         metres = np.where(depth[view] > 0, depth[view] * _RADIUS, np.inf).astype(np.float32)
@@ -288,7 +288,7 @@ def latency(system: TrainedSystem, data: Path, calls: int = 200, policy: str = "
     times = []
     for call in range(calls):
         if call % 8 == 0:
-            agent.reset(center=_CENTER, radius=_RADIUS)
+            agent.reset(center=_CENTER, radius=_RADIUS, yaw=0.0)
         view = (7 * call) % len(depth)
         begun = time.perf_counter()
         agent.observe(frames[view], wide, placed(poses[view]))

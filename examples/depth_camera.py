@@ -42,7 +42,7 @@ take = depth_camera()
 system = mevs_jax.load(sys.argv[1] if len(sys.argv) > 1 else "furniture10")
 agent = system.agent(stop=0.95)
 agent.warm_up()
-agent.reset(center=CENTER, radius=RADIUS)
+agent.reset(center=CENTER, radius=RADIUS, yaw=0.0)  # it faces as the training objects do; None if unknown
 step = agent.decide()
 while (pose := step.T_world_camera) is not None:
     depth = take(pose)  # the robot moves its camera there

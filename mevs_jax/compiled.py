@@ -40,9 +40,9 @@ def keep_compiled(folder: str | Path | None = None) -> Path:
 
 
 def _prune(folder: Path, largest: int = LARGEST) -> None:
-    """Removes the oldest files until the rest is small enough. (JAX's own limit needs a further package.)"""
+    """Removes the oldest of JAX's files until the rest is small enough. (JAX's own limit needs a further package.)"""
     found = []
-    for path in folder.iterdir():
+    for path in folder.glob("*-cache"):
         with suppress(OSError):  # another process may have removed it
             found.append((path.stat().st_mtime, path.stat().st_size, path))
     size = sum(of for _, of, _ in found)

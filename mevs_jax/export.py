@@ -23,7 +23,7 @@ from jaxtyping import Array
 from mevs_jax.agent.candidates import candidates_of
 from mevs_jax.agent.programs import Programs
 from mevs_jax.points.ops import portable
-from mevs_jax.trained.parts import image_of
+from mevs_jax.trained.parts import image_of, logits_of
 from mevs_jax.trained.system import TrainedSystem
 
 PLATFORMS = ("cpu", "cuda", "tpu")
@@ -115,7 +115,7 @@ def _recognise(system: TrainedSystem) -> _Program:
         images = jax.vmap(lambda one: image_of(one, description.image, description.camera))(depth)
         encoder = parts.encoder.module
         features = encoder.features(images)
-        logits = encoder.head(features) / parts.single
+        logits = logits_of(parts, encoder, features) / parts.single
         return {"features": features, "probabilities": jax.nn.softmax(logits, axis=-1)}
 
     about = {
@@ -194,7 +194,7 @@ def _decide(system: TrainedSystem, policy: str, max_views: int) -> _Program:
         "inputs": [
             {
                 "name": "memory",
-                "about": "zeros before the first view, then the memory that the last call returned",
+                "about": f"zeros before the first view, then what the last call returned; at most {max_views} views, no more",
                 "arrays": [_described(name, leaf.shape, str(leaf.dtype), "") for name, leaf in memory.items()],
             },
             _described("depth", [side, side], "float32", "radii along the optical axis; 0 where nothing is hit"),

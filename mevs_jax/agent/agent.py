@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
 from typing import Any
 
 import jax
@@ -17,49 +16,17 @@ from jaxtyping import Float
 
 from mevs_jax.agent import core
 from mevs_jax.agent.candidates import candidates_of
-from mevs_jax.agent.frames import mask_of, points_of, pose_towards, rotation_to_world
+from mevs_jax.agent.frames import mask_of, pose_towards, rotation_to_world
+from mevs_jax.agent.present import Present, sphere_of
 from mevs_jax.agent.programs import Programs
 from mevs_jax.agent.records import Belief, History, Reason, Step, plain
 from mevs_jax.arrays import AnyArray, AnyVector
-from mevs_jax.canonical import CanonicalView, canonical_view
 from mevs_jax.policies.base import Policy
 from mevs_jax.source_view import check_source
-from mevs_jax.sphere import estimate_sphere
 from mevs_jax.trained.system import TrainedSystem
-
-_REACH = 1.3
-"""Points up to this many radii from the estimated centre belong to the object, since an estimate from one side is too small."""
 
 Reachable = AnyArray | Sequence[int] | Callable[[np.ndarray], bool] | None
 """Which candidates can be reached: a mask, indices, a function of the camera's pose (4, 4), or None for all."""
-
-
-@dataclass
-class _Object:
-    """What an agent knows about the present object.
-
-    Attributes:
-        center, radius: of its sphere, in metres.
-        rotation: (3, 3) from its frame to the world.
-        turn: (4, 4) from the upright frame of `canonical_view` to its own, which differ by the yaw.
-        programs: compiled for its policy.
-        memory: of its views.
-        belief: the latest one.
-        failed: (failed, 3) directions, in its frame, from which no view could be taken.
-        points: (points, 3) of its surface in the world, if its sphere is estimated from them; None if it is known.
-        frames: the images from which they are, as they were given to `observe`.
-    """
-
-    center: np.ndarray
-    radius: float
-    rotation: np.ndarray
-    turn: np.ndarray
-    programs: Programs
-    memory: core.Memory
-    belief: Belief | None
-    failed: np.ndarray
-    points: np.ndarray | None = None
-    frames: list[tuple[Any, ...]] = field(default_factory=list)
 
 
 class Agent:
@@ -110,14 +77,16 @@ class Agent:
         _check(distance is None or 0 < distance < np.inf, f"distance must be positive, in metres, got {distance}")
         if system.description.image.content == "image":
             raise ValueError("this system reads shaded images, which a depth camera does not give; train one on depth")
-        self.system, self.stop, self.max_views, self.unknown = system, float(stop), int(max_views), unknown
-        self.gain_per_cost, self.distance, self.seed = float(gain_per_cost), distance, int(seed)
+        self.system, self.stop, self.max_views = system, float(stop), int(max_views)
+        self.unknown = None if unknown is None else float(unknown)
+        self.distance = None if distance is None else float(distance)
+        self.gain_per_cost, self.seed = float(gain_per_cost), int(seed)
         self.size = max(views, 128 if max_candidates is None else int(max_candidates))
         self.policy = policy
         self._key = jax.random.key(seed)
         self._programs: dict[bool, Programs] = {}
         self._lattice = candidates_of(system, None, self.size)
-        self._object: _Object | None = None
+        self._object: Present | None = None
         self.history = History(system.name, {})
         self._program(True)
 
@@ -131,21 +100,23 @@ class Agent:
 
         With an unknown yaw another program runs, which is compiled too if the policy can be used then.
         """
-        kept = self._object, self.history
         camera = self.system.description.camera
         pose = pose_towards(np.array([0.6, 0.0, 0.8]), np.zeros(3), camera.distance, np.array([0.0, 0.0, 1.0]))
         side = camera.resolution
         focal = side / 2 / np.tan(np.radians(camera.field_of_view) / 2)
         middle = (side - 1) / 2
         K = np.array([[focal, 0, middle], [0, focal, middle], [0, 0, 1]])
-        for yaw_known in (True, False):
-            try:
-                self.reset(center=(0, 0, 0), radius=1.0, yaw_known=yaw_known)
-            except ValueError:
-                continue
-            self.observe(np.full((side, side), camera.distance - 0.5, np.float32), K, pose)
-            self.decide(reachable=[0], cost=np.zeros(len(self.system.viewpoints)))
-        self._object, self.history = kept
+        kept = self._object, self.history
+        try:
+            for yaw in (0.0, None):
+                try:
+                    self.reset(center=(0, 0, 0), radius=1.0, yaw=yaw)
+                except ValueError:
+                    continue
+                self.decide(reachable=[0])  # before the first view, since afterwards it may be sure
+                self.observe(np.full((side, side), camera.distance - 0.5, np.float32), K, pose)
+        finally:
+            self._object, self.history = kept
 
     def reset(
         self,
@@ -153,18 +124,17 @@ class Agent:
         center: AnyVector,
         radius: float,
         up: AnyVector = (0.0, 0.0, 1.0),
-        yaw: float = 0.0,
-        yaw_known: bool = True,
+        yaw: float | None = None,
     ) -> None:
         """Begins with a new object.
 
         Args:
-            center: (3,) of the smallest sphere around its bounding box, in the world, in metres.
-            radius: of this sphere, in metres.
+            center: (3,) of its bounding box, in the world, in metres.
+            radius: distance of its furthest point from there, in metres.
             up: (3,) the object's upward direction in the world.
-            yaw: angle of the object's front about `up`, in radians, after the smallest rotation from z to `up`.
-            yaw_known: whether `yaw` is known. If not, policies that need the object's own frame cannot be used, and `best` is the
-                system's best without it.
+            yaw: how far the object is turned about `up` against the objects of the data set, in radians, after the smallest
+                rotation from z to `up`; None if this is unknown. Then policies that need the object's own frame cannot be used,
+                and `best` is the system's best without it.
 
         Raises:
             ValueError: for an argument out of its range, or a policy that cannot be used without the yaw.
@@ -175,29 +145,32 @@ class Agent:
             f"center must be three finite numbers, got {np.asarray(center).tolist()}",
         )
         _check(0 < float(radius) < np.inf, f"radius must be positive, in metres, got {radius}")
-        _check(bool(np.isfinite(yaw)), f"yaw must be a finite angle in radians, got {yaw}")
-        rotation = rotation_to_world(up, yaw if yaw_known else 0.0)
-        program = self._program(bool(yaw_known))  # refuses a policy first
+        _check(yaw is None or bool(np.isfinite(yaw)), f"yaw must be a finite angle in radians, or None, got {yaw}")
+        rotation = rotation_to_world(up, yaw or 0.0)
+        program = self._program(yaw is not None)  # refuses a policy first
         turn = np.eye(4, dtype=np.float32)
         turn[:3, :3] = rotation.T @ rotation_to_world(up, 0.0)
-        self._object = _Object(middle, float(radius), rotation, turn, program, program.blank(), None, np.zeros((0, 3)))
+        self._object = Present(middle, float(radius), rotation, turn, program, program.blank(), None, np.zeros((0, 3)))
         options = {"center": middle.tolist(), "radius": float(radius), "up": np.asarray(up, float).tolist()}
-        options |= {"yaw": float(yaw), "yaw_known": bool(yaw_known)}
+        options |= {"yaw": None if yaw is None else float(yaw)}
         policy = self.policy if isinstance(self.policy, str) else getattr(self.policy, "__name__", "a function")
         mine = {"policy": policy, "stop": self.stop, "max_views": self.max_views, "unknown": self.unknown}
-        self.history = History(self.system.name, {"agent": mine | {"seed": self.seed}, "reset": options})
+        mine |= {"gain_per_cost": self.gain_per_cost, "distance": self.distance, "seed": self.seed}
+        self.history = History(self.system.name, {"agent": mine, "reset": options})
 
     def reset_from_points(self, points: AnyArray, **options: Any) -> None:
         """Begins with a new object whose centre and radius are estimated from points on its surface, and from all views to come.
 
-        When a view changes the estimate by more than 1 % of the radius, all views so far are converted again.
+        Each view then needs a `mask` or a `floor`, to tell the object from what is beside it. When a view changes the estimate by
+        more than 1 % of the radius, all views so far are converted again.
 
         Args:
             points: (points, 3) in the world, in metres, of the object alone.
-            options: `up`, `yaw` and `yaw_known` as of `reset`.
+            options: `up` and `yaw` as of `reset`.
         """
-        cloud = np.asarray(points, float)
-        center, radius = estimate_sphere(cloud, up=options.get("up", (0.0, 0.0, 1.0)))
+        cloud = np.array(points, float)
+        rotation = rotation_to_world(options.get("up", (0.0, 0.0, 1.0)), options.get("yaw") or 0.0)
+        center, radius = sphere_of(cloud, rotation)
         self.reset(center=center, radius=radius, **options)
         self._current.points = cloud
 
@@ -217,7 +190,7 @@ class Agent:
             K: (3, 3) intrinsics in pixels, centres of pixels at whole numbers.
             T_world_camera: (4, 4) pose of the camera at the time of the image.
             mask: (height, width) True for the pixels of the object; without, all that is inside its sphere belongs to it.
-            floor: height of the supporting surface above the centre along `up`, in metres, so usually negative.
+            floor: height of the supporting surface in the world along `up`, in metres; what is below is not the object.
 
         Returns:
             The belief after this view.
@@ -226,40 +199,29 @@ class Agent:
             ValueError: for an input that cannot be used, or beyond `max_views`.
         """
         begun, of = time.perf_counter(), self._current
+        self._check_budget()
         frame = (depth, K, T_world_camera, mask, floor)
-        if of.points is not None:
+        if of.points is None:
+            view = of.converted(self.system, frame)
+        else:
             check_source(depth, K, T_world_camera, mask)
-            self._refine(of, frame)
-        view = self._converted(*frame)
+            if mask is None and floor is None:
+                raise ValueError(
+                    "an object of unknown size needs a mask of its pixels or a floor, to be told from the rest"
+                )
+            of, view = of.refined(self.system, frame, self.history)
+            self._object = of
         return self._add(view.depth, of.turn @ view.pose, view.unknown, begun)
 
-    def _converted(
-        self, depth: AnyArray, K: AnyArray, pose: AnyArray, mask: AnyArray | None, floor: float | None
-    ) -> CanonicalView:
-        """The image of the data set's camera from the direction of an image."""
-        of = self._current
-        up, camera = of.rotation[:, 2], self.system.description.camera
-        sphere = {"center": of.center, "radius": of.radius}
-        return canonical_view(depth, K, pose, **sphere, up=up, camera=camera, mask=mask, floor=floor)  # type: ignore[arg-type]
+    @property
+    def center(self) -> Float[np.ndarray, " 3"]:
+        """Centre of the present object in the world, in metres, as it is given or estimated by now."""
+        return self._current.center.copy()
 
-    def _refine(self, of: _Object, frame: tuple[Any, ...]) -> None:
-        """Estimates the sphere again with the points of a new image, and converts the views so far again if it changed."""
-        depth, K, pose, mask, floor = frame
-        found, up = points_of(depth, K, pose, mask), of.rotation[:, 2]
-        near = np.linalg.norm(found - of.center, axis=1) < _REACH * of.radius
-        if floor is not None:
-            near &= (found - of.center) @ up > floor
-        assert of.points is not None
-        of.points = np.concatenate([of.points, found[near][:: max(1, int(near.sum()) // 5000)]])
-        of.frames.append(frame)
-        center, radius = estimate_sphere(of.points, up=up)
-        if np.linalg.norm(center - of.center) + abs(radius - of.radius) < 0.01 * of.radius:
-            return
-        of.center, of.radius, of.memory = center, radius, of.programs.blank()
-        for index, earlier in enumerate(of.frames[:-1]):
-            view = self._converted(*earlier)
-            self.history.depths[index], self.history.poses[index] = view.depth, of.turn @ view.pose
-            of.memory, _ = of.programs.see(self.system.parts, of.memory, view.depth, self.history.poses[index])
+    @property
+    def radius(self) -> float:
+        """Radius of the present object in metres, as it is given or estimated by now."""
+        return self._current.radius
 
     def observe_view(self, depth: Float[np.ndarray, "side side"], pose: Float[np.ndarray, "4 4"]) -> Belief:
         """Adds a view that the system's own camera has taken, as it is in the data set.
@@ -268,15 +230,29 @@ class Agent:
             depth: in radii of the object along the optical axis, 0 where nothing is hit.
             pose: from the camera to the object's frame, whose unit is the radius.
         """
-        begun = time.perf_counter()
-        return self._add(np.asarray(depth, np.float32), np.asarray(pose, np.float32), 0.0, begun)
+        begun, side = time.perf_counter(), self.system.description.camera.resolution
+        self._check_budget()
+        image, placed = np.array(depth, np.float32), np.array(pose, np.float32)
+        _check(
+            image.shape == (side, side) and placed.shape == (4, 4),
+            f"this system's camera takes images ({side}, {side}) at poses (4, 4), got {image.shape} and {placed.shape}",
+        )
+        _check(
+            bool(np.isfinite(placed).all()) and bool(placed[:3, 3].any()),
+            "pose is not finite, or at the object's centre",
+        )
+        _check(self._current.points is None, "an object of unknown size is seen by observe alone, in metres")
+        return self._add(image, placed, 0.0, begun)
+
+    def _check_budget(self) -> None:
+        _check(
+            self._object is None or self.history.views < self.max_views,
+            f"the budget of {self.max_views} views is spent; call reset, or make the agent with max_views above it",
+        )
+        self._current  # noqa: B018  # refuses if there is no object
 
     def _add(self, depth: np.ndarray, pose: np.ndarray, unseen: float, begun: float) -> Belief:
         of, count = self._current, self.history.views
-        if count >= self.max_views:
-            raise ValueError(
-                f"the budget of {self.max_views} views is spent; call reset, or make the agent with max_views above it"
-            )
         of.memory, found = of.programs.see(self.system.parts, of.memory, depth, pose)
         probabilities, strangeness = jax.device_get(found)
         label = int(probabilities.argmax())
@@ -333,7 +309,7 @@ class Agent:
         _check(
             worth, "costs differ, but gain_per_cost is 0; make the agent with the gain that one unit of cost is worth"
         )
-        allowed &= np.isfinite(costs)
+        allowed = allowed & np.isfinite(costs)
         priced = np.where(np.isfinite(costs), self.gain_per_cost * costs, 0.0)
         reason = self._reason()
         if not reason:
@@ -409,7 +385,7 @@ class Agent:
         return close.any(axis=1)
 
     @property
-    def _current(self) -> _Object:
+    def _current(self) -> Present:
         if self._object is None:
             raise ValueError("the agent has no object yet: call reset or reset_from_points first")
         return self._object

@@ -84,7 +84,7 @@ def look(
         raise ValueError(f"first must be a view from 0 to {views - 1}, got {first}")
     triangles = pad_triangles(unit_triangles(vertices, faces))
     camera = system.description.camera
-    agent.reset(center=(0.0, 0.0, 0.0), radius=1.0)
+    agent.reset(center=(0.0, 0.0, 0.0), radius=1.0, yaw=0.0)
     seen, beliefs = [], []
     index = agent.decide().index if first is None else first
     while True:
@@ -141,7 +141,8 @@ class Frames:
         center, radius: of the object's sphere, in metres.
         up: its upward direction in the world.
         mask: (frames, height, width) True at the object's pixels, or None.
-        floor: height of the supporting surface above the centre, or None.
+        floor: height of the supporting surface in the world along `up`, or None.
+        yaw: of the object, as of `Agent.reset`; None if it is unknown.
     """
 
     depth: Shaped[np.ndarray, "frames height width"]
@@ -152,10 +153,11 @@ class Frames:
     up: Float[np.ndarray, " 3"]
     mask: np.ndarray | None = None
     floor: float | None = None
+    yaw: float | None = None
 
     @classmethod
     def of(cls, stored: dict[str, np.ndarray]) -> Frames:
-        """Frames from arrays by name: `depth`, `K`, `T_world_camera`, and optionally `center`, `radius`, `up`, `mask`, `floor`.
+        """Frames from arrays by name: depth, K, T_world_camera; optionally center, radius, up, yaw, mask, floor.
 
         `K` may be one matrix for all frames. Without `center` and `radius`, they are estimated from the pixels in `mask`.
 
@@ -181,7 +183,7 @@ class Frames:
         if mask is not None and mask.shape != depth.shape:
             raise ValueError(f"mask must have the shape of depth, {depth.shape}, got {mask.shape}")
         if "center" in stored and "radius" in stored:
-            center, radius = np.asarray(stored["center"], float).reshape(-1), float(np.asarray(stored["radius"]))
+            center, radius = np.asarray(stored["center"], float).reshape(-1), _number(stored, "radius")
         elif mask is not None:
             found = [points_of(*one) for one in zip(depth, K, poses, mask, strict=True)]
             center, radius = estimate_sphere(np.concatenate(found), up=stored.get("up", (0.0, 0.0, 1.0)))
@@ -190,23 +192,28 @@ class Frames:
                 "center and radius of the object are needed, or a mask of its pixels to estimate them from"
             )
         up = np.asarray(stored.get("up", (0.0, 0.0, 1.0)), float).reshape(-1)
-        floor = float(np.asarray(stored["floor"])) if "floor" in stored else None
-        return cls(depth, K, poses, center, float(radius), up, mask, floor)
+        floor, yaw = (_number(stored, name) if name in stored else None for name in ("floor", "yaw"))
+        return cls(depth, K, poses, center, float(radius), up, mask, floor, yaw)
 
 
-def look_at_frames(agent: Agent, frames: Frames, *, first: int = 0, yaw: float | None = 0.0) -> Walk:
+def _number(stored: dict[str, np.ndarray], name: str) -> float:
+    if np.size(stored[name]) != 1:
+        raise ValueError(f"{name} must be one number, got shape {np.shape(stored[name])}")
+    return float(np.reshape(stored[name], ()))
+
+
+def look_at_frames(agent: Agent, frames: Frames, *, first: int = 0) -> Walk:
     """Recognises an object from recorded images, of which the agent chooses the next.
 
     Args:
         agent: with at least as many `max_candidates` as there are frames.
         frames: the recorded images.
         first: the first frame.
-        yaw: of the object, as of `Agent.reset`; None if it is unknown.
     """
     number = len(frames.depth)
     if not 0 <= first < number:
         raise ValueError(f"first must be a frame from 0 to {number - 1}, got {first}")
-    agent.reset(center=frames.center, radius=frames.radius, up=frames.up, yaw=yaw or 0.0, yaw_known=yaw is not None)
+    agent.reset(center=frames.center, radius=frames.radius, up=frames.up, yaw=frames.yaw)
     left, index = np.ones(number, bool), first
     seen, beliefs = [], []
     while True:

@@ -30,7 +30,9 @@ class Programs:
         self._entropy, self._most = entropy, most
         self._temperatures_of = policy if isinstance(policy, str) else "random"
         if policy == "best":
-            self._temperatures_of = system.description.best if posed else system.description.best_unposed
+            self._temperatures_of = system.description.best
+        if not posed and (policy == "best" or system.parts.fusion):  # whose fusion is another one then
+            self._temperatures_of = system.description.best_unposed
         self.choose = jax.jit(self.choose_next)
         # Compiled once for all policies of a system that need the same.
         shared = system.__dict__.setdefault("programs", {})
@@ -89,12 +91,14 @@ class Programs:
         run = self._system.policy(policy, parts, self._posed) if isinstance(policy, str) else policy
         index, gains = core.choose(key, run, state, scene, cost, len(candidates.directions))
         left = core.left(state, scene)
-        first = jnp.argmax(jnp.where(left, self._first(parts, candidates), -jnp.inf))
+        scores = self._first(parts, candidates) - jnp.concatenate([cost, jnp.zeros(self._most)])
+        first = jnp.argmax(jnp.where(left, scores, -jnp.inf))
         return jnp.where(memory.count > 0, index, jnp.where(jnp.any(left), first, -1)), gains
 
     def _first(self, parts: Parts, candidates: core.Candidates) -> Array:
-        """Scores of the first view, when nothing is known yet: the best fixed order of views where there is one."""
+        """Scores of the first view, from 0 to 1: the best fixed order of views where there is one, else views from above."""
         slots = jnp.zeros(self._most)
         if self._posed and parts.knowledge is not None:
-            return jnp.concatenate([candidates.weights @ parts.knowledge.order, slots])
-        return jnp.concatenate([-jnp.abs(candidates.directions[:, 2] - 0.5), slots])
+            order = candidates.weights @ parts.knowledge.order
+            return jnp.concatenate([order / jnp.max(parts.knowledge.order), slots])
+        return jnp.concatenate([1 - jnp.abs(candidates.directions[:, 2] - 0.5), slots])

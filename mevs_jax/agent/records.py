@@ -71,7 +71,7 @@ class Step:
 
 @dataclass
 class History:
-    """All that an agent was given and answered for one object, so that it can be repeated.
+    """The images that an agent received for one object, and all that it answered, so that its beliefs can be computed again.
 
     Attributes:
         system: name of the system.
@@ -145,9 +145,13 @@ def replay(history: History, agent: Agent) -> list[Belief]:
     Args:
         history: of this agent's system, or of another one with the same camera.
         agent: which is reset first, as it was for the history.
+
+    Raises:
+        ValueError: for a history without an object, or images of another size than the agent's.
     """
-    options = history.options["reset"]
-    agent.reset(**options)
+    if "reset" not in history.options:
+        raise ValueError("the history has no object: its agent was not reset")
+    agent.reset(**history.options["reset"])
     return [agent.observe_view(depth, pose) for depth, pose in zip(history.depths, history.poses, strict=True)]
 
 

@@ -126,6 +126,8 @@ def _say_and_end(error: Exception) -> None:
     if isinstance(error, Unusable):
         _fail(str(error))
     if not has_checkout():
+        if isinstance(error, OSError | MemoryError):
+            _fail(f"{getattr(error, 'filename', None) or 'the command'}: {getattr(error, 'strerror', None) or error}")
         return
     from data_pipeline.errors import DataError, Diverged
 
@@ -246,7 +248,7 @@ def _main(arguments: list[str]) -> None:
     except KeyboardInterrupt:
         if hasattr(signal, "setitimer"):
             signal.setitimer(signal.ITIMER_REAL, 0)
-        _fail("interrupted; the same command goes on where it stopped", 130)
+        _fail("interrupted" if COMMANDS[name].tool else "interrupted; the same command goes on where it stopped", 130)
     except Exception as error:
         _say_and_end(error)
         raise

@@ -122,10 +122,10 @@ class LookOptions:
     """a mesh to recognise: .off, .obj, .stl, .ply, .glb, .gltf, .dae or .3mf; it is rendered from the views that are chosen"""
     depth: Annotated[Path | None, _arg("FILE")] = None
     """recorded depth images to choose from, in an .npz: depth (n, h, w) in metres, K, T_world_camera (n, 4, 4), and center with
-    radius, or mask; optionally up and floor"""
+    radius, or mask; optionally up, yaw (else unknown) and floor"""
     first: Annotated[int | None, _arg("VIEW", "chosen; 0 for recorded images")] = None
     """the first view"""
-    policy: Annotated[str, _arg("NAME", "best, the one that won on validation objects")] = "best"
+    policy: Annotated[str, _arg("NAME", "best, which the system names")] = "best"
     """the policy that chooses views"""
     stop: Annotated[float, _arg("P", "0.95")] = 0.95
     """calibrated probability of the class at which to stop; above 1 never"""
@@ -133,8 +133,6 @@ class LookOptions:
     """largest number of views"""
     unknown: Annotated[float | None, _arg("Q", "no such answer")] = None
     """answer "unknown object" for an object that is stranger than this share of the known ones, as 0.99"""
-    yaw_unknown: Annotated[tyro.conf.FlagCreatePairsOff[bool], _arg("")] = False
-    """the object's rotation about the upward axis is unknown; only for recorded images"""
     up: Annotated[Literal["auto", "z", "y"], _arg("auto|z|y", "auto: y for glTF, as declared for DAE, else z")] = "auto"
     """the upward axis of the mesh"""
     json: Annotated[tyro.conf.FlagCreatePairsOff[bool], _arg("")] = False

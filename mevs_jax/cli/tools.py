@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib.util
 import json
 from contextlib import suppress
 from pathlib import Path
@@ -22,8 +23,8 @@ def look(options: LookOptions) -> None:
     """Recognises one object, and prints how."""
     if (options.mesh is None) == (options.depth is None):
         raise Unusable("mevs look needs an object: --mesh FILE or --depth FILE, one of them")
-    if options.yaw_unknown and options.mesh is not None:
-        raise Unusable("--yaw-unknown is for recorded images; a mesh is taken as it stands")
+    if options.draw is not None:
+        check_drawing(options.draw)
     source = options.mesh or options.depth
     assert source is not None
     mesh = read_mesh(options.mesh, options.up) if options.mesh is not None else None
@@ -41,15 +42,26 @@ def look(options: LookOptions) -> None:
             walk = _look_at_frames(system, stored, options, given)
     except ValueError as error:
         raise Unusable(f"{source}: {error}") from error
-    if options.save is not None:
-        walk.history.save(options.save)
-    if options.draw is not None:
-        from mevs_jax.agent.drawing import draw_walk
-
-        if options.draw.suffix.lower() not in (".png", ".svg", ".pdf"):
-            raise Unusable(f"{options.draw} is no .png, .svg or .pdf; name the image by one of these")
-        draw_walk(walk, system, options.draw, source.name)
     print(json.dumps(as_json(walk, source.name)) if options.json else f"{source.name}\n{walk}")
+    try:
+        if options.save is not None:
+            walk.history.save(options.save)
+        if options.draw is not None:
+            from mevs_jax.agent.drawing import draw_walk
+
+            draw_walk(walk, system, options.draw, source.name)
+    except OSError as error:
+        raise Unusable(
+            f"cannot write {error.filename or 'the results'} ({error.strerror}); choose another file"
+        ) from error
+
+
+def check_drawing(path: Path) -> None:
+    """Raises `Unusable` if a picture cannot be drawn into a file of this name."""
+    if path.suffix.lower() not in (".png", ".svg", ".pdf"):
+        raise Unusable(f"{path} is no .png, .svg or .pdf; name the image by one of these")
+    if importlib.util.find_spec("matplotlib") is None:
+        raise Unusable("drawing a walk needs matplotlib: pip install matplotlib")
 
 
 def _look_at_frames(system: TrainedSystem, stored: Any, options: LookOptions, given: dict[str, Any]) -> Walk:
@@ -58,7 +70,7 @@ def _look_at_frames(system: TrainedSystem, stored: Any, options: LookOptions, gi
     frames = Frames.of(stored)
     given["max_views"] = min(given["max_views"], len(frames.depth))
     agent = system.agent(**given, max_candidates=max(128, len(frames.depth)))
-    return look_at_frames(agent, frames, first=options.first or 0, yaw=None if options.yaw_unknown else 0.0)
+    return look_at_frames(agent, frames, first=options.first or 0)
 
 
 def as_json(walk: Walk, name: str) -> dict[str, Any]:
@@ -121,16 +133,18 @@ def export(options: ExportOptions) -> None:
         system = load_system(options.system)
     try:
         save(system, options.to, half=options.half, stablehlo=options.stablehlo)
-    except FileExistsError as error:
+    except (FileExistsError, ImportError) as error:
         raise Unusable(str(error)) from error
-    size = sum(path.stat().st_size for path in options.to.iterdir())
+    except OSError as error:
+        raise Unusable(f"cannot write {options.to} ({error.strerror}); choose another folder") from error
+    size = sum(path.stat().st_size for path in options.to.rglob("*") if path.is_file())
     print(f"Trained system: {options.to.absolute()} ({size / 1e6:.1f} MB)")
 
 
 def _system_of_run(out: Path) -> TrainedSystem:
     from mevs_jax.cli.main import has_checkout
 
-    if (out / "run.json").exists() and has_checkout():
+    if (out / "metrics.json").exists() and (out / "run.json").exists() and has_checkout():
         from data_pipeline.lock import locked
         from eval import stages
         from eval.run_file import load_run

@@ -84,7 +84,7 @@ def _folder_of(path: str | Path) -> Path:
         raise FileNotFoundError(f"{folder} has no {DESCRIPTION}: it is no trained system; write one with mevs export")
     if (SHIPPED / str(path) / DESCRIPTION).exists() and "/" not in str(path):
         return SHIPPED / str(path)
-    if isinstance(path, str) and _HUB_ID.fullmatch(path):
+    if isinstance(path, str) and _HUB_ID.fullmatch(path) and not folder.parent.exists():
         return _from_hub(path)
     shipped = ", ".join(sorted(found.name for found in SHIPPED.glob("*/"))) if SHIPPED.is_dir() else "none"
     raise FileNotFoundError(
@@ -118,7 +118,9 @@ def _from_hub(name: str, revision: str | None = None) -> Path:
         return Path(snapshot_download(name, revision=revision, allow_patterns=[DESCRIPTION, WEIGHTS, CARD]))
     except Exception as error:  # of the hub, of its client and of the network: many kinds, one meaning
         reason = (str(error).strip() or type(error).__name__).splitlines()[0][:200]
-        raise FileNotFoundError(f"{name} cannot be had from the Hugging Face hub ({reason})") from error
+        raise FileNotFoundError(
+            f"there is no folder {name}, and the Hugging Face hub did not give a model of this name ({reason})"
+        ) from error
 
 
 def save(system: TrainedSystem, folder: str | Path, *, half: bool = False, stablehlo: bool = False) -> None:
@@ -242,7 +244,9 @@ def _sound(folder: Path) -> Iterator[None]:
         raise
     except (ValueError, TypeError, LookupError, AttributeError, ArithmeticError, RecursionError, MemoryError) as error:
         reason = (str(error).strip() or type(error).__name__).splitlines()[0][:300]
-        raise UnreadableSystem(f"{folder} is no sound trained system ({reason}); export the system again") from error
+        raise UnreadableSystem(
+            f"{folder} is not a trained system that can be read ({reason}); export the system again"
+        ) from error
 
 
 def _read_description(folder: Path) -> tuple[Description, Any]:
@@ -355,7 +359,7 @@ class _Arrays:
     def finish(self) -> None:
         """Raises `ValueError` if arrays are left."""
         if self.left:
-            raise ValueError(f"{WEIGHTS} has {min(self.left)!r:.60}, which {DESCRIPTION} does not speak of")
+            raise ValueError(f"{WEIGHTS} has {min(self.left)!r:.60}, which {DESCRIPTION} does not describe")
 
 
 def _parts_of(description: Description, arrays: dict[str, np.ndarray]) -> Parts:

@@ -91,6 +91,12 @@ def image_of(
     return depth_image(depth, camera, image.channels)
 
 
+def logits_of(parts: Parts, encoder: Any, features: Float[Array, "*batch features"]) -> Float[Array, "*batch classes"]:
+    """The logits of single views; all classes are equally likely before the first view."""
+    logits = encoder.head(features)
+    return logits - parts.fusion["posed"].prior if parts.fusion else logits
+
+
 def observe(
     parts: Parts,
     depth: Float[Array, "side side"],
@@ -117,7 +123,4 @@ def observe(
         pixels = sample_pixels(depth, cloud.points)
         seen = view_cloud(pixels, depth.reshape(-1)[pixels], pose, camera, cloud.frame, cloud.directions)
         entropies = parts.entropy.module(seen)
-    logits = encoder.head(features)
-    if parts.fusion:
-        logits = logits - parts.fusion["posed"].prior  # all classes are equally likely before the first view
-    return Observation(logits, entropies, features)
+    return Observation(logits_of(parts, encoder, features), entropies, features)

@@ -104,11 +104,14 @@ class TrainedSystem:
             posed: whether the object's yaw is known.
 
         Raises:
-            ValueError: for an unknown name.
+            ValueError: for an unknown name, or a network that needs the object's yaw where it is unknown.
         """
         parts = self.parts if parts is None else parts
         if name == "best":
             name = self.description.best if posed else self.description.best_unposed
+        needs = "learned" if name == _AND_TABLE else name
+        if not posed and needs in parts.view_policies and self.description.view_policies[needs].posed:
+            raise ValueError("its network needs the object's yaw")
         if name in parts.view_policies:
             return learned(parts.view_policies[name].module, parts.single)
         if name == _AND_TABLE and "learned" in parts.view_policies:

@@ -93,6 +93,7 @@ def test_what_cannot_be_looked_at_is_one_sentence(system, chair, frames, refuses
     assert "convert it to one of them" in refuses("look", "--system", system, "--mesh", "chair.blend")
     (tmp_path / "empty.off").write_text("OFF\n0 0 0\n")
     assert "empty.off" in refuses("look", "--system", system, "--mesh", tmp_path / "empty.off")
+    assert "is no .png, .svg or .pdf" in refuses("look", "--system", system, "--mesh", chair, "--draw", "walk.doc")
     assert "no file" in refuses("look", "--system", system, "--depth", tmp_path / "none.npz")
     (tmp_path / "text.npz").write_text("text")
     assert "is no .npz of arrays" in refuses("look", "--system", system, "--depth", tmp_path / "text.npz")
@@ -102,6 +103,7 @@ def test_what_cannot_be_looked_at_is_one_sentence(system, chair, frames, refuses
         ({"depth": np.zeros((6, 8))}, "depth must be (frames, height, width)"),
         ({"T_world_camera": np.zeros((5, 4, 4))}, "T_world_camera must be (6, 4, 4)"),
         ({"K": np.zeros(3)}, "K must be (3, 3)"),
+        ({"radius": np.ones(2)}, "radius must be one number"),
         ({"depth": np.ones((6, 32, 32), np.uint16)}, "metres"),
     ):
         stored = {name: value for name, value in (frames[1] | change).items() if value is not None}

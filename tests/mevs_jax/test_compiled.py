@@ -30,8 +30,8 @@ def test_programs_are_kept_in_the_users_cache(tmp_path):
 
 
 def test_the_oldest_programs_go_first(tmp_path):
-    for age, name in enumerate("abcd"):
+    for age, name in enumerate(("a-cache", "b-cache", "c-cache", "d-cache", "notes.txt")):
         (tmp_path / name).write_bytes(bytes(100))
         os.utime(tmp_path / name, (1000 - age, 1000 - age))
     _prune(tmp_path, 250)
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["a", "b"]
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["a-cache", "b-cache", "notes.txt"]

@@ -49,8 +49,9 @@ CENTER, RADIUS = np.array([0.5, -0.2, 0.8]), 0.3
 
 def walk(agent, views, first, **reset):
     """Views and probabilities of a walk in metres, around an object away from the origin."""
+    reset = {"yaw": 0.0} | reset
     agent.reset(center=CENTER, radius=RADIUS, **reset)
-    rotation = rotation_to_world(reset.get("up", (0, 0, 1)), reset.get("yaw", 0.0))
+    rotation = rotation_to_world(reset.get("up", (0, 0, 1)), reset["yaw"] or 0.0)
     seen, found, index = [], [], first
     while True:
         depth, pose = views[index]
@@ -116,7 +117,7 @@ def test_it_stops_when_it_is_sure(classifier):
 
 def test_the_first_view_is_that_of_the_fixed_order(classifier):
     agent = Agent(classifier)
-    agent.reset(center=CENTER, radius=RADIUS)
+    agent.reset(center=CENTER, radius=RADIUS, yaw=0.0)
     step = agent.decide()
     assert step.index == int(np.argmax(classifier.parts.knowledge.order))
     expected = pose_towards(classifier.viewpoints[step.index].astype(float), CENTER, 2 * RADIUS, np.array([0, 0, 1.0]))
@@ -124,12 +125,15 @@ def test_the_first_view_is_that_of_the_fixed_order(classifier):
     np.testing.assert_allclose(step.direction, classifier.viewpoints[step.index], atol=1e-6)
     only = agent.decide(reachable=[4]).index
     assert only == 4
+    agent = Agent(classifier, gain_per_cost=1.0)
+    agent.reset(center=CENTER, radius=RADIUS, yaw=0.0)
+    assert agent.decide(cost=np.where(np.arange(making.VIEWS) == step.index, 9.0, 0.0)).index != step.index
 
 
 def test_what_cannot_be_reached_or_failed_is_not_chosen(classifier):
     views = views_of(classifier)
     agent = Agent(classifier, "information_gain", stop=2)
-    agent.reset(center=CENTER, radius=RADIUS)
+    agent.reset(center=CENTER, radius=RADIUS, yaw=0.0)
     agent.observe_view(*views[0])
     best = agent.decide()
     agent.mark_failed(best)
@@ -141,12 +145,17 @@ def test_what_cannot_be_reached_or_failed_is_not_chosen(classifier):
     assert (step.done, step.reason, step.index, step.T_world_camera) == (True, "nothing reachable", -1, None)
     mask = np.zeros(making.VIEWS, bool)
     assert agent.decide(reachable=mask).reason == "nothing reachable"
+    mask = jnp.ones(making.VIEWS, bool)
+    assert agent.decide(reachable=mask).index == second.index
+    mine = np.ones(making.VIEWS, bool)
+    agent.decide(reachable=mine, cost=np.where(np.arange(making.VIEWS) == 3, np.inf, 0.0))
+    assert mine.all()
 
 
 def test_costs_change_the_choice(classifier):
     views = views_of(classifier)
     agent = Agent(classifier, "information_gain", stop=2, gain_per_cost=1.0)
-    agent.reset(center=CENTER, radius=RADIUS)
+    agent.reset(center=CENTER, radius=RADIUS, yaw=0.0)
     agent.observe_view(*views[0])
     free = agent.decide()
     cost = np.zeros(making.VIEWS)
@@ -166,26 +175,37 @@ def test_an_unknown_sphere_is_estimated_and_refined(classifier):
     for direction in directions:
         pose = pose_towards(direction.astype(float), CENTER, 0.9, np.array([0, 0, 1.0]))
         depth = making.depth_of_ball(direction, centre=(ball - CENTER) / 0.45, radius=radius / 0.45, notch=False) * 0.45
-        shots.append((depth, K, pose))
-    known, unknown = (Agent(classifier, stop=2, max_views=4) for _ in range(2))
-    known.reset(center=ball, radius=radius)
-    unknown.reset_from_points(points_of(*shots[0]))
-    first = np.linalg.norm(unknown._current.center - ball)
-    for shot in shots:
-        expected, belief = known.observe(*shot), unknown.observe(*shot)
+        shots.append((depth, pose))
+    known, unknown = (Agent(classifier, stop=2, max_views=5) for _ in range(2))
+    known.reset(center=ball, radius=radius, yaw=0.0)
+    unknown.reset_from_points(points_of(shots[0][0], K, shots[0][1]), yaw=0.0)
+    first = np.linalg.norm(unknown.center - ball)
+    buffer = np.zeros_like(shots[0][0])  # which a driver fills again and again
+    for depth, pose in shots:
+        expected = known.observe(depth, K, pose)
+        buffer[:] = depth
+        belief = unknown.observe(buffer, K, pose, mask=buffer > 0)
+        before = unknown.center, unknown.radius
+        with pytest.raises(ValueError, match="needs a mask of its pixels or a floor"):
+            unknown.observe(depth, K, pose)
+        with pytest.raises(ValueError, match="is seen by observe alone"):
+            unknown.observe_view(depth, pose)
+        with pytest.raises(ValueError, match="no measured pixel|no pixel shows"):
+            unknown.observe(np.zeros_like(depth), K, pose, mask=depth > 0)
+        np.testing.assert_array_equal(unknown.center, before[0])
     assert first > 0.05
-    assert np.linalg.norm(unknown._current.center - ball) < 0.1 * first + 0.01
-    np.testing.assert_allclose(unknown._current.radius, radius, rtol=0.05)
+    assert np.linalg.norm(unknown.center - ball) < 0.1 * first + 0.01
+    np.testing.assert_allclose(unknown.radius, radius, rtol=0.05)
     np.testing.assert_allclose(belief.probabilities, expected.probabilities, atol=0.1)
     assert belief.views == unknown.history.views == 4
-    again = replay(unknown.history, Agent(classifier, stop=2, max_views=4))
+    again = replay(unknown.history, Agent(classifier, stop=2, max_views=5))
     np.testing.assert_allclose(again[-1].probabilities, belief.probabilities, atol=1e-5)
 
 
 def test_candidates_may_be_any_poses(classifier):
     views = views_of(classifier)
     agent = Agent(classifier, "information_gain", stop=2)
-    agent.reset(center=CENTER, radius=RADIUS)
+    agent.reset(center=CENTER, radius=RADIUS, yaw=0.0)
     agent.observe_view(*views[2])
     by_index = agent.decide().index
     poses = agent.poses
@@ -210,7 +230,7 @@ def test_views_may_be_between_the_viewpoints(classifier):
     direction /= np.linalg.norm(direction)
     for policy in ("information_gain", "farthest", "predicted_entropy"):
         agent = Agent(classifier, policy, stop=2)
-        agent.reset(center=CENTER, radius=RADIUS)
+        agent.reset(center=CENTER, radius=RADIUS, yaw=0.0)
         agent.observe_view(making.depth_of_ball(direction), pose_at(direction))
         index = agent.decide().index
         if policy == "farthest":
@@ -231,16 +251,16 @@ def test_the_yaw_may_be_unknown(recogniser, classifier):
     views = views_of(recogniser)
     known, unknown = (Agent(recogniser, stop=2, max_views=4) for _ in range(2))
     turned = {"yaw": 1.1}
-    first = walk(unknown, views, 0, yaw_known=False)
-    np.testing.assert_allclose(first[1], walk(unknown, views, 0, yaw_known=False, up=(0, 0, 2))[1], atol=1e-5)
+    first = walk(unknown, views, 0, yaw=None)
+    np.testing.assert_allclose(first[1], walk(unknown, views, 0, yaw=None, up=(0, 0, 2))[1], atol=1e-5)
     assert walk(known, views, 0, **turned)[0] == walk(known, views, 0)[0]
     agent = Agent(classifier, "information_gain")
     with pytest.raises(
         ValueError, match=r"cannot be used here for an object of unknown yaw: this policy needs Scene\.knowledge"
     ):
-        agent.reset(center=CENTER, radius=RADIUS, yaw_known=False)
+        agent.reset(center=CENTER, radius=RADIUS, yaw=None)
     agent = Agent(classifier, stop=2)
-    agent.reset(center=CENTER, radius=RADIUS, yaw_known=False)
+    agent.reset(center=CENTER, radius=RADIUS, yaw=None)
     agent.observe_view(*views_of(classifier)[0])
     assert agent.decide().index == int(np.argmin(classifier.viewpoints @ classifier.viewpoints[0]))  # farthest
 
@@ -248,7 +268,7 @@ def test_the_yaw_may_be_unknown(recogniser, classifier):
 def test_strange_objects_are_unknown(classifier):
     views = views_of(classifier)
     agent = Agent(classifier, stop=2, max_views=2, unknown=0.9)
-    agent.reset(center=CENTER, radius=RADIUS)
+    agent.reset(center=CENTER, radius=RADIUS, yaw=0.0)
     beliefs = [agent.observe_view(*views[index]) for index in (0, 5)]
     assert all(belief.strangeness > 0.9 and not belief.known for belief in beliefs)  # its features were random numbers
     assert agent.decide().reason == "unknown object"
@@ -256,8 +276,9 @@ def test_strange_objects_are_unknown(classifier):
 
 
 def test_nothing_is_compiled_after_the_warm_up(recogniser):
-    agent = Agent(recogniser, stop=2, max_views=5)
+    agent = Agent(recogniser, stop=0.01, max_views=5)  # sure of the first view, also while it warms up
     agent.warm_up()
+    agent.stop = 2
     views, events = views_of(recogniser), []
 
     def listen(event, *_, **__):
@@ -266,8 +287,8 @@ def test_nothing_is_compiled_after_the_warm_up(recogniser):
 
     jax.monitoring.register_event_duration_secs_listener(listen)
     try:
-        for yaw_known in (True, False):
-            agent.reset(center=CENTER, radius=RADIUS, yaw_known=yaw_known)
+        for yaw in (0.0, None):
+            agent.reset(center=CENTER, radius=RADIUS, yaw=yaw)
             for index in (0, 3):
                 depth, pose = views[index]
                 placed = pose.copy()
@@ -304,7 +325,7 @@ def test_a_policy_of_ones_own(classifier):
         return -scene.graph.points[:, 2]
 
     agent = Agent(classifier, lowest, stop=2)
-    agent.reset(center=CENTER, radius=RADIUS)
+    agent.reset(center=CENTER, radius=RADIUS, yaw=0.0)
     agent.observe_view(*views_of(classifier)[0])
     assert agent.decide().index == int(np.argmin(classifier.viewpoints[:, 2]))
 
@@ -346,7 +367,7 @@ def test_calls_that_cannot_be_are_refused(classifier):
     }.items():
         with pytest.raises(ValueError, match=message):
             agent.reset(**options)
-    agent.reset(center=CENTER, radius=RADIUS)
+    agent.reset(center=CENTER, radius=RADIUS, yaw=0.0)
     for message, options in {
         r"reachable has shape \(3,\); there are 12 candidates": {"reachable": np.ones(3, bool)},
         "or indices from 0 to 11": {"reachable": [12]},
@@ -365,6 +386,13 @@ def test_calls_that_cannot_be_are_refused(classifier):
         agent.observe_view(depth, pose)
     with pytest.raises(ValueError, match="needs depth images of 32×32 pixels, got 8×8"):
         classifier.observe(np.zeros((8, 8)), pose)
+    agent.reset(center=CENTER, radius=RADIUS)
+    for message, given in {
+        r"takes images \(32, 32\) at poses \(4, 4\), got \(8, 8\)": (np.zeros((8, 8)), pose),
+        "pose is not finite, or at the object's centre": (depth, np.eye(4)),
+    }.items():
+        with pytest.raises(ValueError, match=message):
+            agent.observe_view(*given)
 
 
 def test_the_smallest_rotation_takes_z_to_up():

@@ -182,7 +182,7 @@ def test_weights_of_another_form_are_refused(written, tmp_path):
         "not finite": {"viewpoints": arrays["viewpoints"] * np.float32(np.nan)},
         "not positive": {"single": np.zeros((), np.float32)},
         "has shape": {"encoder.head.bias": np.zeros(3, np.float32)},
-        "does not speak of": {"spare": np.zeros(3, np.float32)},
+        "does not describe": {"spare": np.zeros(3, np.float32)},
     }
     for message, change in changes.items():
         restamped(copy, as_bytes(arrays | change))

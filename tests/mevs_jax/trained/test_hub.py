@@ -108,5 +108,5 @@ def test_a_system_is_loaded_from_the_hub(hub):
     assert read.name == NAME
     assert not any("pickle.bin" in path and "resolve" in path for path in asked)
     assert mevs_jax.from_pretrained(NAME, revision="main").classes == made.classes
-    with pytest.raises(FileNotFoundError, match="cannot be had from the Hugging Face hub"):
+    with pytest.raises(FileNotFoundError, match="the Hugging Face hub did not give a model of this name"):
         mevs_jax.load("somebody/else")

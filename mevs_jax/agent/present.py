@@ -1,0 +1,97 @@
+"""The object that an agent recognises at present: its sphere, frame and memory."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+
+from mevs_jax.agent import core
+from mevs_jax.agent.frames import points_of
+from mevs_jax.agent.programs import Programs
+from mevs_jax.agent.records import Belief, History
+from mevs_jax.canonical import CanonicalView, canonical_view
+from mevs_jax.sphere import estimate_sphere
+from mevs_jax.trained.system import TrainedSystem
+
+_REACH = 1.3
+"""Points up to this many radii from the estimated centre belong to the object, since an estimate from one side is too small."""
+
+Frame = tuple[Any, ...]
+"""An image as it is given to `Agent.observe`: depth, intrinsics, pose, mask or None, floor or None."""
+
+
+@dataclass
+class Present:
+    """What an agent knows about the present object.
+
+    Attributes:
+        center, radius: of its sphere, in metres.
+        rotation: (3, 3) from its frame to the world.
+        turn: (4, 4) from the upright frame of `canonical_view` to its own, which differ by the yaw.
+        programs: compiled for its policy.
+        memory: of its views.
+        belief: the latest one.
+        failed: (failed, 3) directions, in its frame, from which no view could be taken.
+        points: (points, 3) of its surface in the world, if its sphere is estimated from them; None if it is known.
+        frames: the images from which they are, as they were given to `observe`.
+    """
+
+    center: np.ndarray
+    radius: float
+    rotation: np.ndarray
+    turn: np.ndarray
+    programs: Programs
+    memory: core.Memory
+    belief: Belief | None
+    failed: np.ndarray
+    points: np.ndarray | None = None
+    frames: list[Frame] = field(default_factory=list)
+
+    def converted(self, system: TrainedSystem, frame: Frame) -> CanonicalView:
+        """The image of the data set's camera from the direction of an image."""
+        depth, K, pose, mask, floor = frame
+        up = self.rotation[:, 2]
+        return canonical_view(
+            depth,
+            K,
+            pose,
+            center=self.center,
+            radius=self.radius,
+            up=up,
+            camera=system.description.camera,
+            mask=mask,
+            floor=None if floor is None else float(floor) - float(self.center @ up),
+        )
+
+    def refined(self, system: TrainedSystem, frame: Frame, history: History) -> tuple[Present, CanonicalView]:
+        """The object with its sphere estimated again, by the points of a new image too, and the new view.
+
+        If the sphere changes, the views so far are converted again, also in the history. Nothing is changed if a view cannot be
+        converted.
+        """
+        frame = tuple(None if part is None else np.array(part) for part in frame)  # the caller may use its arrays again
+        depth, K, pose, mask, floor = frame
+        found, up = points_of(depth, K, pose, mask), self.rotation[:, 2]
+        near = np.linalg.norm(found - self.center, axis=1) < _REACH * self.radius
+        if floor is not None:
+            near &= found @ up > floor
+        assert self.points is not None
+        points = np.concatenate([self.points, found[near][:: max(1, int(near.sum()) // 5000)]])
+        center, radius = sphere_of(points, self.rotation)
+        if np.linalg.norm(center - self.center) + abs(radius - self.radius) < 0.01 * self.radius:
+            return replace(self, points=points, frames=[*self.frames, frame]), self.converted(system, frame)
+        again = replace(self, center=center, radius=radius, points=points, frames=[*self.frames, frame])
+        views = [again.converted(system, one) for one in again.frames]
+        poses, again.memory = [self.turn @ view.pose for view in views], self.programs.blank()
+        for view, one in zip(views[:-1], poses[:-1], strict=True):
+            again.memory, _ = self.programs.see(system.parts, again.memory, view.depth, one)
+        history.depths[:], history.poses[:] = [view.depth for view in views[:-1]], poses[:-1]
+        return again, views[-1]
+
+
+def sphere_of(points: np.ndarray, rotation: np.ndarray) -> tuple[np.ndarray, float]:
+    """Centre and radius of an object by points on it, with its bounding box along the axes of its own frame."""
+    center, radius = estimate_sphere(points @ rotation)
+    return rotation @ center, radius
