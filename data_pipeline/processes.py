@@ -155,8 +155,10 @@ def shared(
         except BaseException as error:
             if isinstance(error, Exception) and _is_broken(pool):
                 raise _death(children, notes) from error
-            for child in children:
-                child.terminate()
             raise
         finally:
+            for (
+                child
+            ) in children:  # they have nothing to do, and if one dies now, the others wait for ever for a lock of its
+                child.terminate()
             pool.shutdown(wait=bool(children), cancel_futures=True)
