@@ -148,15 +148,21 @@ def shared(
             yield map(work, jobs)
             return
         before = set(multiprocessing.active_children())
+
+        def begun() -> list[Any]:
+            return [child for child in multiprocessing.active_children() if child not in before]
+
         try:
             results = pool.map(partial(_noted, work, name_of), jobs, chunksize=chunk)
-            children = [child for child in multiprocessing.active_children() if child not in before]
+            children = begun()
             yield results
         except BaseException as error:
             if isinstance(error, Exception) and _is_broken(pool):
                 raise _death(children, notes) from error
-            for child in children:
-                child.terminate()
             raise
         finally:
-            pool.shutdown(wait=bool(children), cancel_futures=True)
+            # Idle processes are ended, too: if one were killed now, others would wait for ever for a lock that it held.
+            running = begun()
+            for child in running:
+                child.terminate()
+            pool.shutdown(wait=bool(children or running), cancel_futures=True)

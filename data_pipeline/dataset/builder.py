@@ -161,6 +161,10 @@ def _builder_class() -> type:
     tfds.disable_progress_bar()
     _spill_without_tensorflow()
 
+    class Info(tfds.core.DatasetInfo):
+        def initialize_from_bucket(self) -> None:
+            """Does nothing: TFDS looks for known data sets here, and leaves an empty folder among the temporary files."""
+
     class MultiViewObjects(tfds.core.GeneratorBasedBuilder):
         """Objects captured from a lattice of viewpoints: depth, shaded image, pose and depth entropy of each view."""
 
@@ -177,7 +181,7 @@ def _builder_class() -> type:
 
         def _info(self):
             features = tfds.features.FeaturesDict(_features(self._source.classes, self._data.capture))
-            return tfds.core.DatasetInfo(builder=self, description=self.__doc__, features=features)
+            return Info(builder=self, description=self.__doc__, features=features)
 
         def _split_generators(self, dl_manager):
             del dl_manager  # nothing to download: the captures are on disk

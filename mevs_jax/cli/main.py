@@ -104,6 +104,12 @@ def _interrupt(signum: int, frame: object) -> None:
     raise KeyboardInterrupt
 
 
+def _say_unraisable(lost: sys.UnraisableHookArgs) -> None:
+    """Prints an exception that Python cannot raise, as Python does, except an interrupt, which comes again."""
+    if not issubclass(lost.exc_type, KeyboardInterrupt):
+        sys.__unraisablehook__(lost)
+
+
 def _begin_with_large_pages() -> None:
     """Starts the program again with large pages, which glibc requests from Linux only if an environment variable says so.
 
@@ -243,6 +249,7 @@ def _main(arguments: list[str]) -> None:
     if hasattr(signal, "setitimer"):
         signal.signal(signal.SIGINT, _interrupt)
         signal.signal(signal.SIGALRM, _interrupt)
+        sys.unraisablehook = _say_unraisable
     try:
         _run(name, rest)
     except KeyboardInterrupt:

@@ -6,7 +6,9 @@ import errno
 import multiprocessing.spawn
 import os
 import signal
+import threading
 import time
+from contextlib import suppress
 from pathlib import Path
 
 import pytest
@@ -72,6 +74,27 @@ def test_a_process_that_dies_while_it_starts_ends_the_job(size, monkeypatch, tmp
         shared(times, range(20), workers=2, start=begin, given=(bytes(size),), name_of=name_of) as found,
     ):
         list(found)
+
+
+@pytest.mark.parametrize("victim", [0, 1])
+def test_a_process_that_is_killed_when_all_is_done_does_not_block_the_job(victim):
+    """One of two processes without work holds the lock of the queue; the other waited for it for ever."""
+
+    def kill() -> None:
+        time.sleep(1)
+        for at, worker in enumerate(workers):
+            with suppress(ProcessLookupError):
+                os.kill(worker.pid, signal.SIGKILL if at == victim else signal.SIGCONT)
+
+    with shared(times, range(20), workers=2, start=begin, given=(3,), name_of=name_of) as found:
+        assert len(list(found)) == 20
+        workers: list = multiprocessing.active_children()
+        for worker in workers:
+            os.kill(worker.pid, signal.SIGSTOP)
+        killer = threading.Thread(target=kill)
+        killer.start()
+    killer.join()
+    assert not any(worker.is_alive() for worker in workers)
 
 
 def test_an_interrupt_ends_the_workers_at_once():

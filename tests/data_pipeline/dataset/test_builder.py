@@ -75,6 +75,14 @@ def test_statistics_of_another_version_are_described(tmp_path):
         load_statistics(tmp_path)
 
 
+def test_nothing_is_left_in_the_folder_for_temporary_files(tmp_path, monkeypatch):
+    (tmp_path / "temporary").mkdir()
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path / "temporary"))
+    config = replace(CONFIG, train_per_class=2, test_per_class=1, capture=replace(CONFIG.capture, views=4))
+    prepare(config, tmp_path / "data")
+    assert list((tmp_path / "temporary").iterdir()) == []
+
+
 def test_a_data_set_is_not_made_twice_nor_mixed(data):
     before = {path: path.stat().st_mtime_ns for path in data.rglob("*") if path.is_file()}
     assert prepare(CONFIG, data) == load_statistics(data)
