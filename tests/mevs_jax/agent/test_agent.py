@@ -190,7 +190,7 @@ def test_an_unknown_sphere_is_estimated_and_refined(classifier):
             unknown.observe(depth, K, pose)
         with pytest.raises(ValueError, match="is seen by observe alone"):
             unknown.observe_view(depth, pose)
-        with pytest.raises(ValueError, match="no measured pixel|no pixel shows"):
+        with pytest.raises(ValueError, match=r"no measured pixel|no pixel shows"):
             unknown.observe(np.zeros_like(depth), K, pose, mask=depth > 0)
         np.testing.assert_array_equal(unknown.center, before[0])
     assert first > 0.05
