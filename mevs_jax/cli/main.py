@@ -104,10 +104,23 @@ def _interrupt(signum: int, frame: object) -> None:
     raise KeyboardInterrupt
 
 
+def _leave_interrupts() -> None:
+    """Lets an interrupt end the process from now on: all is done or said, and no Python code can handle one while Python ends."""
+    sys.stdout.flush()
+    if hasattr(signal, "setitimer"):
+        signal.setitimer(signal.ITIMER_REAL, 0)
+        signal.signal(signal.SIGINT, signal.SIG_DFL if _is_a_program() else signal.default_int_handler)
+
+
 def _say_unraisable(lost: sys.UnraisableHookArgs) -> None:
     """Prints an exception that Python cannot raise, as Python does, except an interrupt, which comes again."""
     if not issubclass(lost.exc_type, KeyboardInterrupt):
         sys.__unraisablehook__(lost)
+
+
+def _is_a_program() -> bool:
+    """Whether this is the program `mevs`, and not a part of another one that calls it."""
+    return Path(sys.argv[0]).name in ("mevs", "__main__.py")
 
 
 def _begin_with_large_pages() -> None:
@@ -116,8 +129,11 @@ def _begin_with_large_pages() -> None:
     Training on two CPU cores then takes 11 % (ResNet-34) to 25 % (PointNet++) less time, since every step allocates hundreds of
     megabytes anew.
     """
-    alone = Path(sys.argv[0]).name in ("mevs", "__main__.py")  # not called from another program
-    if not alone or "CS_GNU_LIBC_VERSION" not in getattr(os, "confstr_names", ()) or "GLIBC_TUNABLES" in os.environ:
+    if (
+        not _is_a_program()
+        or "CS_GNU_LIBC_VERSION" not in getattr(os, "confstr_names", ())
+        or "GLIBC_TUNABLES" in os.environ
+    ):
         return
     os.environ["GLIBC_TUNABLES"] = "glibc.malloc.hugetlb=1"
     os.execv(sys.executable, [sys.executable, *sys.orig_argv[1:]])
@@ -252,9 +268,9 @@ def _main(arguments: list[str]) -> None:
         sys.unraisablehook = _say_unraisable
     try:
         _run(name, rest)
+        _leave_interrupts()
     except KeyboardInterrupt:
-        if hasattr(signal, "setitimer"):
-            signal.setitimer(signal.ITIMER_REAL, 0)
+        _leave_interrupts()
         _fail("interrupted" if COMMANDS[name].tool else "interrupted; the same command goes on where it stopped", 130)
     except Exception as error:
         _say_and_end(error)

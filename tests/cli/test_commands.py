@@ -7,6 +7,7 @@ import json
 import os
 import re
 import shutil
+import signal
 import subprocess
 import sys
 from dataclasses import replace
@@ -287,6 +288,24 @@ cli.main()
     assert result.returncode == 130
     assert result.stdout == "lost\n"
     assert result.stderr == "mevs: interrupted; the same command goes on where it stopped\n"
+
+
+def test_an_interrupt_while_python_ends_ends_the_program():
+    """It ended by the signal of the timer a second later."""
+    script = """
+import atexit, os, signal, sys, time
+from mevs_jax.cli import main as cli
+
+def late():
+    os.kill(os.getpid(), signal.SIGINT)
+    time.sleep(5)
+
+atexit.register(late)
+cli._run, sys.argv = lambda *arguments: print("done"), ["mevs", "run"]
+cli.main()
+"""
+    result = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, timeout=120)
+    assert (result.returncode, result.stdout, result.stderr) == (-signal.SIGINT, "done\n", "")
 
 
 @pytest.mark.skipif("CS_GNU_LIBC_VERSION" not in os.confstr_names, reason="large pages are asked of glibc")
