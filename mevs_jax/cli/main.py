@@ -17,6 +17,8 @@ from typing import TYPE_CHECKING
 from mevs_jax.cli.commands import COMMANDS, Command, find, help_text
 
 if TYPE_CHECKING:
+    from types import FrameType
+
     from mevs_jax.cli.parsing import Invocation
 
 _HELP = ("-h", "--help")
@@ -98,10 +100,17 @@ def _run_in(call: Invocation, command: Command) -> None:
         keep_settings(call)
 
 
-def _interrupt(signum: int, frame: object) -> None:
-    """Ends the job, and tries again in a second: Python loses an interrupt that falls into a finaliser or a GC callback."""
-    signal.setitimer(signal.ITIMER_REAL, 1.0)
-    raise KeyboardInterrupt
+def _interrupt(signum: int, frame: FrameType | None) -> None:
+    """Ends the job, and tries again in a second: Python loses an interrupt that falls into a finaliser or a GC callback.
+
+    An import is not interrupted: extension modules may abort the process then.
+    """
+    imports = False
+    while frame is not None and not imports:
+        imports, frame = frame.f_code.co_filename.startswith("<frozen importlib"), frame.f_back
+    signal.setitimer(signal.ITIMER_REAL, 0.1 if imports else 1.0)
+    if not imports:
+        raise KeyboardInterrupt
 
 
 def _leave_interrupts() -> None:

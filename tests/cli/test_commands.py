@@ -290,6 +290,34 @@ cli.main()
     assert result.stderr == "mevs: interrupted; the same command goes on where it stopped\n"
 
 
+def test_an_interrupt_waits_for_an_import(tmp_path):
+    """Where extension modules are imported, it aborted the process."""
+    (tmp_path / "imported.py").write_text(
+        "import os, signal, time\nos.kill(os.getpid(), signal.SIGINT)\ntime.sleep(0.5)\nprint('whole', flush=True)\n"
+    )
+    script = """
+import sys, time
+from mevs_jax.cli import main as cli
+
+def job(*arguments):
+    import imported
+    time.sleep(300)
+
+cli._run, sys.argv = job, ["mevs", "run"]
+cli.main()
+"""
+    root = str(Path(mevs_jax.__file__).parents[1])
+    result = subprocess.run(
+        [sys.executable, "-c", script],
+        capture_output=True,
+        text=True,
+        timeout=120,
+        env=os.environ | {"PYTHONPATH": os.pathsep.join([str(tmp_path), root])},
+    )
+    said = "mevs: interrupted; the same command goes on where it stopped\n"
+    assert (result.returncode, result.stdout, result.stderr) == (130, "whole\n", said)
+
+
 def test_an_interrupt_while_python_ends_ends_the_program():
     """It ended by the signal of the timer a second later."""
     script = """
