@@ -192,6 +192,11 @@ def read_json(path: Path) -> Any:
 # ----------------------------------------------------------------------------------------------------------------- checks
 
 
+def digest_of(content: Any) -> str:
+    """Returns a short hash of what JSON can hold; the order of entries in dictionaries does not matter."""
+    return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()[:16]
+
+
 def check_of(content: bytes) -> str:
     """Returns size and CRC-32 of a file's content, which differ for damaged content."""
     return f"{len(content)}:{zlib.crc32(content):08x}"

@@ -24,13 +24,13 @@ from data_pipeline.dataset.inputs import metric_depth
 from data_pipeline.errors import DataError
 from data_pipeline.objects.mesh import Mesh
 from data_pipeline.progress import progress_bar
-from eval.camera import pairs, summary
+from eval.camera import Pair, pairs, summary
 from eval.numbers.comparison import intervals
-from eval.numbers.confidence import stops_at
+from eval.numbers.confidence import stopping as by_risk
 from eval.tables import ViewTables
 from mevs_jax.agent import Agent
 from mevs_jax.beliefs import running_sum
-from mevs_jax.selection import ViewTable, by_attention, select_from_table, sum_of_logits
+from mevs_jax.selection import ViewTable, select_from_table
 from mevs_jax.trained import TrainedSystem
 
 STOPS = (0.9, 0.95, 0.99)
@@ -68,17 +68,6 @@ class WalkAgreement:
     largest_difference: float
 
 
-def own_intrinsics(side: int, field_of_view: float) -> Float[np.ndarray, "3 3"]:
-    """Intrinsics of the data set's camera, whose pixel centres are at whole numbers here.
-
-    Args:
-        side: pixels per side of the image.
-        field_of_view: in degrees.
-    """
-    focal = side / 2 / np.tan(np.radians(field_of_view) / 2)
-    return np.array([[focal, 0, (side - 1) / 2], [0, focal, (side - 1) / 2], [0, 0, 1]])
-
-
 def placed(pose: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, "4 4"]:
     """A pose of the data set in metres, around an object away from the origin."""
     found = np.array(pose, float)
@@ -97,8 +86,7 @@ def walk_of(
         poses: of every view.
         first: the first view.
     """
-    camera = agent.system.description.camera
-    K = own_intrinsics(camera.resolution, camera.field_of_view)
+    K = agent.system.description.camera.intrinsics
     agent.reset(center=_CENTER, radius=_RADIUS, yaw=0.0)
     views, found, view = [], [], first
     while True:
@@ -126,7 +114,7 @@ def compare_walks(
     objects = min(config.objects, len(source))
     max_views = min(config.max_views, len(system.viewpoints))
     agents = {name: system.agent(name, stop=2.0, max_views=max_views) for name in policies}
-    fuse = by_attention(system.parts.fusion["posed"]) if system.parts.fusion else sum_of_logits
+    fuse = system.fuse(system.parts)
     scene_of = partial(ViewTable.scene, graph=system.graph, knowledge=system.parts.knowledge)
 
     @partial(jax.jit, static_argnames="name")
@@ -197,26 +185,19 @@ def stopping(
         return jax.vmap(from_view)(jnp.arange(len(graph.points)))
 
     confidence, right = map(np.asarray, jax.lax.map(walks, tables.stacked(), batch_size=16))
-    rows = []
-    for stop in stops:
-        sure = confidence >= stop
-        stopped, at = sure.any(axis=-1), stops_at(sure)
-        answer = np.take_along_axis(right, at[..., None], axis=-1)[..., 0]
-        wrong = (stopped & ~answer).mean(axis=1)
-        share = stopped.mean(axis=1)
-        error = float(wrong.sum() / max(share.sum(), 1e-9))
-        rows.append(
-            {
-                "stop": stop,
-                "promised_error": 1 - stop,
-                "error": error,
-                "excess": intervals(wrong - (1 - stop) * share),
-                "stopped": float(stopped.mean()),
-                "views": float((at + 1).mean()),
-                "accuracy": float(answer.mean()),
-            }
-        )
-    return rows
+    rows = by_risk(confidence, right, [1 - stop for stop in stops])
+    return [
+        {
+            "stop": stop,
+            "promised_error": row["risk"],
+            "error": row["error"] or 0.0,  # none stopped
+            "excess": row["excess"],
+            "stopped": row["sure"],
+            "views": row["views"],
+            "accuracy": row["accuracy"],
+        }
+        for stop, row in zip(stops, rows, strict=True)
+    ]
 
 
 def recognised(system: TrainedSystem, meshes: Sequence[tuple[Mesh, int]], config: AgentConfig) -> list[dict[str, Any]]:
@@ -242,14 +223,9 @@ def recognised(system: TrainedSystem, meshes: Sequence[tuple[Mesh, int]], config
             for number, (mesh, label) in enumerate(meshes):
                 taken = list(pairs(mesh, distance, shots=config.shots, camera=camera, seed=(0, number)))
                 found += [pair.agreement(camera) for pair in taken]
-                filled = [taken[shot % len(taken)] for shot in range(config.shots)] if taken else []
                 if taken:
-                    poses = np.stack([pair.view.pose for pair in filled])
-                    for kind, depth in enumerate(
-                        ([pair.view.depth for pair in filled], [pair.truth for pair in filled])
-                    ):
-                        answers = np.asarray(label_of(np.stack(depth), poses))
-                        right[kind, number] = (answers == label)[: len(taken)].mean()
+                    answers = [label_of(*images) for images in _images(taken, config.shots)]
+                    right[:, number] = (np.stack(answers) == label)[:, : len(taken)].mean(axis=1)
                 bar.advance(line)
         rows.append(
             {"distance": distance}
@@ -264,6 +240,13 @@ def recognised(system: TrainedSystem, meshes: Sequence[tuple[Mesh, int]], config
     return rows
 
 
+def _images(taken: Sequence[Pair], shots: int) -> list[tuple[np.ndarray, np.ndarray]]:
+    """Depth and poses of the views, and of the truth; the first ones again up to `shots`, so that nothing is compiled anew."""
+    filled = [taken[shot % len(taken)] for shot in range(shots)]
+    poses = np.stack([pair.view.pose for pair in filled])
+    return [(np.stack(depth), poses) for depth in zip(*((pair.view.depth, pair.truth) for pair in filled), strict=True)]
+
+
 def latency(system: TrainedSystem, data: Path, calls: int = 200, policy: str = "best") -> dict[str, float]:
     """Time in ms from a 640×480 depth image to the next pose: 50th and 99th percentile, and the number of compilations."""
     agent = system.agent(policy, stop=2.0, max_views=8)
@@ -271,10 +254,11 @@ def latency(system: TrainedSystem, data: Path, calls: int = 200, policy: str = "
     example = open_split(data, "test")[0]
     depth, poses = np.asarray(metric_depth(example["depth"])), example["pose"]
     camera = system.description.camera
-    side = camera.resolution
-    K = own_intrinsics(side, camera.field_of_view)
-    scale = 480 / side
-    wide = np.array([[scale, 0, (640 - 480) / 2 + (scale - 1) / 2], [0, scale, (scale - 1) / 2], [0, 0, 1]]) @ K
+    scale = 480 / camera.resolution
+    wide = (
+        np.array([[scale, 0, (640 - 480) / 2 + (scale - 1) / 2], [0, scale, (scale - 1) / 2], [0, 0, 1]])
+        @ camera.intrinsics
+    )
     index = (np.arange(480) / scale).astype(int)
     frames = np.full((len(depth), 480, 640), np.inf, np.float32)
     frames[:, :, 80:560] = np.where(depth > 0, depth * _RADIUS, np.inf)[:, index][:, :, index]

@@ -7,7 +7,6 @@ the same direction. Masks are compared by their intersection over union, depth w
 from __future__ import annotations
 
 import math
-import time
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 
@@ -16,6 +15,7 @@ from scipy.spatial.transform import Rotation
 
 from data_pipeline.capture.casting import Cast, default_caster
 from data_pipeline.objects.mesh import Mesh
+from eval.numbers import timing
 from mevs_jax import CanonicalView, ViewCamera, canonical_view, look_at_origin, pixel_directions
 
 SIZES = ((320, 240), (640, 480), (848, 480), (1280, 720))
@@ -255,12 +255,10 @@ def milliseconds(
     """
     shot = random_shot(np.random.default_rng(seed), distance, size)
     depth = cast_shot(default_caster()(mesh), shot)
-    taken = np.empty(calls)
-    for number in range(-3, calls):
-        start = time.perf_counter()
-        canonical_view(
-            depth, shot.K, shot.T_world_camera, center=shot.center, radius=shot.radius, camera=camera, mask=depth > 0
+
+    def convert(image: np.ndarray) -> CanonicalView:
+        return canonical_view(
+            image, shot.K, shot.T_world_camera, center=shot.center, radius=shot.radius, camera=camera, mask=image > 0
         )
-        if number >= 0:
-            taken[number] = 1000 * (time.perf_counter() - start)
-    return taken
+
+    return timing.milliseconds(convert, [depth] * calls)

@@ -90,7 +90,11 @@ def _encoder(out: Path, reference: str) -> dict[str, Any]:
 def _made_with() -> dict[str, Any]:
     import jax  # late, since parsing options does not need it
 
-    packages = ("mevs-jax", "jax", "flax", "optax", "numpy")
     device = jax.devices()[0]
     devices = {"platform": device.platform, "kind": device.device_kind, "count": jax.device_count()}
-    return {"python": platform.python_version(), **{name: version(name) for name in packages}, "devices": devices}
+    return {**versions_of("mevs-jax", "jax", "flax", "optax", "numpy"), "devices": devices}
+
+
+def versions_of(*packages: str) -> dict[str, str]:
+    """Versions of Python and of some packages."""
+    return {"python": platform.python_version(), **{name: version(name) for name in packages}}

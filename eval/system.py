@@ -7,11 +7,7 @@ each half of them walks with the knowledge of the other half.
 
 from __future__ import annotations
 
-import hashlib
-import json
-import platform
 from dataclasses import dataclass, replace
-from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
@@ -24,13 +20,14 @@ from jaxtyping import Array, Float, Int
 from data_pipeline.dataset.inputs import view_camera
 from data_pipeline.dataset.statistics import DatasetStatistics
 from data_pipeline.errors import DataError
-from data_pipeline.files import as_read
+from data_pipeline.files import as_read, digest_of
 from data_pipeline.progress import console
 from eval.numbers.confidence import logits_along
+from eval.run_file import versions_of
 from eval.tables import ViewTables
 from eval.walks.grid import run_grid
 from eval.walks.knowledge import learn
-from eval.walks.ladder import Rung
+from eval.walks.ladder import ladder
 from mevs_jax.beliefs import running_sum
 from mevs_jax.calibration import fit_temperature
 from mevs_jax.models.shapes import PointNet2Shape, ResNetShape
@@ -53,16 +50,16 @@ from mevs_jax.viewpoints import ViewGraph
 from train.tasks.classifier import ClassifierTask, ResNetConfig
 from train.tasks.entropy import EntropyTask
 
-USABLE = (
-    "random",
-    "farthest",
-    "predicted_entropy",
-    "predicted_entropy_without_maxima",
-    "remembered_entropy",
-    "fixed_order",
-    "information_gain",
+_RUNGS = tuple(
+    rung
+    for rung in ladder(draws=1)
+    if rung.knows in ("nothing", "networks", "others") and rung.policy != "random_with_repetition"
 )
+USABLE = tuple(rung.policy for rung in _RUNGS)
 """Policies of the ladder that a robot can use: those that know nothing, predictions of networks, or other objects."""
+
+MADE_WITH = ("mevs-jax", "jax", "flax", "numpy")
+"""Packages whose versions a system names."""
 
 _COUNTED = slice(1, 4)
 """The numbers of views, 2 to 4, whose accuracy decides which policy is the best."""
@@ -107,7 +104,6 @@ def _fit(logits: Float[Array, "walks steps classes"], labels: Int[Array, " walks
 def walk_validation(tables: ViewTables, graph: ViewGraph, max_views: int, seed: int = 0) -> OnValidation:
     """Walks every validation object from every view by every usable policy, with knowledge of the other half of them."""
     half = np.argsort(np.random.default_rng(seed).permutation(len(tables.labels))) % 2
-    rungs = tuple(Rung(name, name, "nothing") for name in USABLE)
     parts: dict[str, list[tuple[np.ndarray, np.ndarray]]] = {name: [] for name in USABLE}
     for held in range(2):
         walking, other = (_some(tables, np.flatnonzero((half == held) == inside)) for inside in (True, False))
@@ -118,7 +114,7 @@ def walk_validation(tables: ViewTables, graph: ViewGraph, max_views: int, seed: 
             replace(one_backbone, logits=one_backbone.logits[:, None]),
             graph,
             jax.tree.map(lambda leaf: leaf[None], knowledge),
-            rungs,
+            _RUNGS,
             max_views=max_views,
         )
         for name in USABLE:
@@ -154,15 +150,9 @@ def pointnet2_shape(task: EntropyTask) -> tuple[PointNet2Shape, CloudInput]:
     )
 
 
-def made_with() -> dict[str, str]:
-    """Versions of what a system was made with."""
-    packages = ("mevs-jax", "jax", "flax", "numpy")
-    return {"python": platform.python_version(), **{name: version(name) for name in packages}}
-
-
 def identity_of(*content: Any) -> str:
     """Returns a hash of what a system is made from."""
-    return hashlib.sha256(json.dumps(as_read(content), sort_keys=True).encode()).hexdigest()[:16]
+    return digest_of(as_read(content))
 
 
 def save_system(system: TrainedSystem, folder: Path) -> None:
@@ -236,7 +226,7 @@ def classifier_system(
         chosen_by="highest mean accuracy after 2 to 4 views on validation objects",
         data=data_of(statistics),
         made_by=made_by,
-        made_with=made_with(),
+        made_with=versions_of(*MADE_WITH),
         entropy=shape,
         cloud=cloud,
         evaluation=evaluation

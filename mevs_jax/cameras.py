@@ -16,6 +16,7 @@ from dataclasses import dataclass
 import flax.struct
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from mevs_jax.arrays import AnyArray
@@ -64,6 +65,13 @@ class ViewCamera:
                 "a camera has at least 1 pixel, a field of view between 0 and 180 degrees and a distance above 1 radius, "
                 f"got {self}"
             )
+
+    @property
+    def intrinsics(self) -> Float[np.ndarray, "3 3"]:
+        """Intrinsics in OpenCV's convention: in pixels, whose centres are at whole numbers."""
+        focal = self.resolution / 2 / np.tan(np.radians(self.field_of_view) / 2)
+        middle = (self.resolution - 1) / 2
+        return np.array([[focal, 0, middle], [0, focal, middle], [0, 0, 1]])
 
     def at(self, pose: Float[AnyArray, "*batch 4 4"], resolution: int | None = None) -> Camera:
         """Returns the pinhole camera at `pose`, with another resolution where one is given."""

@@ -16,7 +16,7 @@ def keep_compiled(folder: str | Path | None = None) -> Path:
     """Keeps what JAX compiles from now on in a folder, and uses what it holds; returns the folder.
 
     Changes JAX's settings for the whole process (its persistent compilation cache). Programs of other versions of JAX, or for
-    other devices, are told apart.
+    other devices, are kept under other names.
 
     A folder that JAX already uses, by `JAX_COMPILATION_CACHE_DIR` for example, is kept.
 

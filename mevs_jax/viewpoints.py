@@ -145,6 +145,26 @@ def viewpoint_lattice(n: int, lattice: Lattice | str = "golden_angle") -> Float[
     return fibonacci_sphere(n, lattice)
 
 
+def great_circle_distances(points: Float[np.ndarray, "views 3"]) -> Float[np.ndarray, "views views"]:
+    """Angles between unit vectors in radians, exactly 0 on the diagonal."""
+    distances = np.arccos(np.clip(points @ points.T, -1, 1))
+    np.fill_diagonal(distances, 0)
+    return distances
+
+
+def hull_edges(points: Float[np.ndarray, "views 3"], widest: float = np.inf) -> Bool[np.ndarray, "views views"]:
+    """Whether two points are joined by an edge of their convex hull.
+
+    Args:
+        points: not all in one plane.
+        widest: faces whose offset, minus their distance from the origin, is not below this are left out.
+    """
+    hull, near = ConvexHull(points), np.zeros((len(points), len(points)), bool)
+    for a, b, c in hull.simplices[hull.equations[:, 3] < widest]:
+        near[[a, b, c], [b, c, a]] = near[[b, c, a], [a, b, c]] = True
+    return near
+
+
 @flax.struct.dataclass
 class ViewGraph:
     """Candidate viewpoints, their neighbours, and the distances between them.
@@ -181,9 +201,7 @@ class ViewGraph:
             raise ValueError(f"a view graph needs at least 2 points of 3 coordinates, got shape {array.shape}")
         if np.abs(np.linalg.norm(array, axis=1) - 1).max() > 1e-4:
             raise ValueError("viewpoints must be unit vectors: divide each by its length")
-        distances = np.arccos(np.clip(array @ array.T, -1, 1))
-        np.fill_diagonal(distances, 0)
-        count = len(array)
+        distances, count = great_circle_distances(array), len(array)
         if np.min(distances + 10 * np.eye(count)) < 1e-4:
             raise ValueError("two viewpoints coincide: remove one of them")
         near = np.zeros((count, count), bool)
@@ -197,12 +215,10 @@ class ViewGraph:
         else:
             if np.linalg.matrix_rank(array - array.mean(axis=0), tol=1e-6) < 3:
                 raise ValueError("four or more viewpoints in one plane have no view graph")
-            hull = ConvexHull(array)
             # A face's distance from the origin is the cosine of the angle from its centre to its corners. Viewpoints all around
             # an object have no face beyond 75°, unless they are very few.
             widest = np.inf if count < 6 else -0.25
-            for a, b, c in hull.simplices[hull.equations[:, 3] < widest]:
-                near[[a, b, c], [b, c, a]] = near[[b, c, a], [a, b, c]] = True
+            near = hull_edges(array, widest)
         return cls(
             points=jnp.asarray(array, jnp.float32),
             neighbours=jnp.asarray(near),

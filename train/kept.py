@@ -5,8 +5,6 @@ An identity is whatever the result depends on: settings, the data set, the netwo
 
 from __future__ import annotations
 
-import hashlib
-import json
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, TypeVar
@@ -22,6 +20,7 @@ from data_pipeline.files import (
     check_of,
     checks_in,
     damage_in,
+    digest_of,
     keep_checks,
     keep_json,
     read_json,
@@ -273,4 +272,4 @@ def made_by(statistics: DatasetStatistics, *networks: Path) -> str:
             )
         summary = _of_a_network(network, "summary.json", {"best_epoch", "best"})
         content += [config_of(network), summary["best_epoch"], summary["best"]]
-    return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()[:16]
+    return digest_of(content)

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
-import json
 import os
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
@@ -14,7 +12,7 @@ import numpy as np
 
 from data_pipeline.capture.casting import CaptureConfig
 from data_pipeline.errors import DataError, Diverged
-from data_pipeline.files import read_json
+from data_pipeline.files import digest_of, read_json
 from data_pipeline.progress import console
 from mevs_jax.viewpoints import ViewGraph
 
@@ -75,7 +73,7 @@ class DatasetStatistics:
     @property
     def fingerprint(self) -> str:
         """Hash of all statistics, which changes with the objects, the views or their order."""
-        return hashlib.sha256(json.dumps(self.content(), sort_keys=True).encode()).hexdigest()[:16]
+        return digest_of(self.content())
 
     def content(self) -> dict[str, Any]:
         """Returns what the summary file holds."""

@@ -10,7 +10,8 @@ import jax.numpy as jnp
 from data_pipeline.dataset.inputs import view_camera
 from data_pipeline.dataset.statistics import load_statistics
 from eval.learned.study import learn
-from eval.system import data_of, identity_of, made_with, resnet_shape, save_system, stored_system
+from eval.run_file import versions_of
+from eval.system import MADE_WITH, data_of, identity_of, resnet_shape, save_system, stored_system
 from mevs_jax.models import Recogniser, ViewPolicy
 from mevs_jax.models.shapes import SetFusionShape, ViewPolicyShape
 from mevs_jax.trained import Description, ImageInput, Network, Parts, TrainedSystem, fit_strangeness
@@ -96,7 +97,7 @@ def learned_system(stages: Stages, found: dict[str, Any], figures: dict[str, Any
         chosen_by="the method of the learned study, not chosen by a comparison",
         data=data_of(stages.statistics),
         made_by=made,
-        made_with=made_with(),
+        made_with=versions_of(*MADE_WITH),
         fusion=SetFusionShape(shape.width, shape.heads, shape.blocks),
         view_policies={name: _shape_of(policy, config.policy) for name, policy in policies.items()},
         evaluation=figures,

@@ -6,6 +6,7 @@ well-chosen views differ from those along random views.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from functools import partial
 from typing import Any
 
@@ -93,13 +94,13 @@ def stops_at(enough: np.ndarray) -> np.ndarray:
     return np.where(enough.any(axis=-1), enough.argmax(axis=-1), enough.shape[-1] - 1)
 
 
-def stopping(confidence: np.ndarray, right: np.ndarray) -> list[dict[str, Any]]:
-    """Stops at the first step with a risk, 1 − confidence, of at most each of `RISKS`, or at the end of the walk.
+def stopping(confidence: np.ndarray, right: np.ndarray, risks: Sequence[float] = RISKS) -> list[dict[str, Any]]:
+    """Stops at the first step with a risk, 1 − confidence, of at most each of `risks`, or at the end of the walk.
 
     The predictions of the walks that stop early should be wrong at most as often as the risk; `error` is how often they are.
     """
     rows = []
-    for risk in RISKS:
+    for risk in risks:
         sure = confidence >= 1 - risk
         stops, at = sure.any(axis=-1), stops_at(sure)
         answer = np.take_along_axis(right, at[..., None], axis=-1)[..., 0]

@@ -102,10 +102,7 @@ class Agent:
         """
         camera = self.system.description.camera
         pose = pose_towards(np.array([0.6, 0.0, 0.8]), np.zeros(3), camera.distance, np.array([0.0, 0.0, 1.0]))
-        side = camera.resolution
-        focal = side / 2 / np.tan(np.radians(camera.field_of_view) / 2)
-        middle = (side - 1) / 2
-        K = np.array([[focal, 0, middle], [0, focal, middle], [0, 0, 1]])
+        depth = np.full((camera.resolution, camera.resolution), camera.distance - 0.5, np.float32)
         kept = self._object, self.history
         try:
             for yaw in (0.0, None):
@@ -114,7 +111,7 @@ class Agent:
                 except ValueError:
                     continue
                 self.decide(reachable=[0])  # before the first view, since afterwards it may be sure
-                self.observe(np.full((side, side), camera.distance - 0.5, np.float32), K, pose)
+                self.observe(depth, camera.intrinsics, pose)
         finally:
             self._object, self.history = kept
 
@@ -230,7 +227,7 @@ class Agent:
             depth: in radii of the object along the optical axis, 0 where nothing is hit.
             pose: from the camera to the object's frame, whose unit is the radius.
         """
-        begun, side = time.perf_counter(), self.system.description.camera.resolution
+        begun, of, side = time.perf_counter(), self._current, self.system.description.camera.resolution
         self._check_budget()
         image, placed = np.array(depth, np.float32), np.array(pose, np.float32)
         _check(
@@ -241,15 +238,14 @@ class Agent:
             bool(np.isfinite(placed).all()) and bool(placed[:3, 3].any()),
             "pose is not finite, or at the object's centre",
         )
-        _check(self._current.points is None, "an object of unknown size is seen by observe alone, in metres")
+        _check(of.points is None, "an object of unknown size is seen by observe alone, in metres")
         return self._add(image, placed, 0.0, begun)
 
     def _check_budget(self) -> None:
         _check(
-            self._object is None or self.history.views < self.max_views,
+            self.history.views < self.max_views,
             f"the budget of {self.max_views} views is spent; call reset, or make the agent with max_views above it",
         )
-        self._current  # noqa: B018  # refuses if there is no object
 
     def _add(self, depth: np.ndarray, pose: np.ndarray, unseen: float, begun: float) -> Belief:
         of, count = self._current, self.history.views

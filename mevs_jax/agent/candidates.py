@@ -5,10 +5,11 @@ from __future__ import annotations
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
-from scipy.spatial import ConvexHull, QhullError
+from scipy.spatial import QhullError
 
 from mevs_jax.agent.core import SAME, Candidates
 from mevs_jax.trained.system import TrainedSystem
+from mevs_jax.viewpoints import great_circle_distances, hull_edges
 
 _NEAREST = 3
 """Number of viewpoints that the values of a direction between them are interpolated from."""
@@ -36,8 +37,7 @@ def candidates_of(system: TrainedSystem, directions: Float[np.ndarray, "candidat
         graph = system.graph
         neighbours, distances = np.asarray(graph.neighbours), np.asarray(graph.distances)
     else:
-        distances = np.arccos(np.clip(points @ points.T, -1, 1))
-        np.fill_diagonal(distances, 0)
+        distances = great_circle_distances(points)
         neighbours = _neighbours(points, distances)
     apart = distances + 10 * np.eye(number)
     spacing = float(np.median(apart.min(axis=1))) if number > 1 else 1.0
@@ -64,12 +64,10 @@ def _neighbours(points: np.ndarray, distances: np.ndarray) -> np.ndarray:
     number = len(points)
     if number <= 4:
         return ~np.eye(number, dtype=bool)
-    neighbours = np.zeros((number, number), bool)
     try:
-        for a, b, c in ConvexHull(points).simplices:
-            neighbours[[a, b, c], [b, c, a]] = neighbours[[b, c, a], [a, b, c]] = True
+        neighbours = hull_edges(points)
     except QhullError:  # all in one plane
-        neighbours[:] = ~np.eye(number, dtype=bool)
+        neighbours = ~np.eye(number, dtype=bool)
     nearest = (distances + 10 * np.eye(number)).min(axis=1)
     return neighbours & (distances <= 3 * np.maximum(nearest[:, None], nearest[None]))
 

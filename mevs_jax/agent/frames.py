@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from mevs_jax.arrays import AnyArray, AnyVector
+from mevs_jax.source_view import upright
 
 
 def rotation_to_world(up: AnyVector, yaw: float) -> Float[np.ndarray, "3 3"]:
@@ -23,12 +24,8 @@ def rotation_to_world(up: AnyVector, yaw: float) -> Float[np.ndarray, "3 3"]:
     axis = np.asarray(up, float).reshape(-1)
     if axis.shape != (3,) or not np.isfinite(axis).all() or np.linalg.norm(axis) < 1e-9:
         raise ValueError(f"up must be a direction of three finite numbers, got {np.asarray(up).tolist()}")
-    x, y, z = axis / np.linalg.norm(axis)
     turn = np.array([[np.cos(yaw), -np.sin(yaw), 0], [np.sin(yaw), np.cos(yaw), 0], [0, 0, 1]])
-    if z < -1 + 1e-12:
-        return np.diag([1.0, -1.0, -1.0]) @ turn
-    cross = np.array([[0, 0, x], [0, 0, y], [-x, -y, 0]])
-    return (np.eye(3) + cross + cross @ cross / (1 + z)) @ turn
+    return upright(axis).T @ turn
 
 
 def pose_towards(

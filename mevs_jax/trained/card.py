@@ -50,7 +50,7 @@ def model_card(description: Description, size: int) -> str:
         *_figures(description),
         "## Limits",
         "",
-        "* Only these classes are known. How well objects of other classes are told from them was not measured for this system.",
+        "* Only these classes are known. Detection of objects of other classes was not measured for this system.",
         "* The figures are of perfect depth. Noise, missing depth and wrong centres cost accuracy.",
         "* Confidence is calibrated on validation objects of the same source.",
         "",

@@ -18,7 +18,7 @@ from mevs_jax.policies.registry import POLICIES, policy_named
 from mevs_jax.selection import Fuse, by_attention, sum_of_logits
 from mevs_jax.trained.description import Description
 from mevs_jax.trained.parts import Parts, observe
-from mevs_jax.viewpoints import ViewGraph
+from mevs_jax.viewpoints import ViewGraph, great_circle_distances
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -63,8 +63,7 @@ class TrainedSystem:
     def graph(self) -> ViewGraph:
         """The candidate views with their neighbours."""
         points = self.parts.viewpoints
-        distances = np.arccos(np.clip(np.asarray(points, float) @ np.asarray(points, float).T, -1, 1))
-        np.fill_diagonal(distances, 0)
+        distances = great_circle_distances(np.asarray(points, float))
         return ViewGraph(points, self.parts.neighbours, jnp.asarray(distances, jnp.float32))
 
     @property
@@ -109,13 +108,12 @@ class TrainedSystem:
         parts = self.parts if parts is None else parts
         if name == "best":
             name = self.description.best if posed else self.description.best_unposed
-        needs = "learned" if name == _AND_TABLE else name
-        if not posed and needs in parts.view_policies and self.description.view_policies[needs].posed:
-            raise ValueError("its network needs the object's yaw")
-        if name in parts.view_policies:
-            return learned(parts.view_policies[name].module, parts.single)
-        if name == _AND_TABLE and "learned" in parts.view_policies:
-            return learned(parts.view_policies["learned"].module, parts.single, by="table")
+        network = "learned" if name == _AND_TABLE else name
+        if network in parts.view_policies:
+            if not posed and self.description.view_policies[network].posed:
+                raise ValueError("its network needs the object's yaw")
+            by = "table" if name == _AND_TABLE else "belief"
+            return learned(parts.view_policies[network].module, parts.single, by=by)  # type: ignore[arg-type]
         if name not in POLICIES:
             known = ", ".join(("best", *parts.view_policies, *POLICIES))
             raise ValueError(f"unknown policy {name!r}; it is one of {known}")
