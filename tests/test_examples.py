@@ -14,7 +14,7 @@ EXAMPLES = Path(__file__).resolve().parents[1] / "examples"
 @pytest.mark.parametrize(
     ("name", "said"),
     [
-        ("own_policy", "opposite: "),
+        pytest.param("own_policy", "opposite: ", marks=pytest.mark.slow),
         ("load_and_ask", "confident after "),
         ("depth_camera", " views: sure"),
         pytest.param("gymnasium_ppo", "| PPO − random | +0.0 ", marks=pytest.mark.slow),

@@ -60,15 +60,16 @@ def resnet_from_torch(network: ResNet, state: StateDict, *, head: bool = True) -
     """Fills `network` with a torchvision `resnet18` or `resnet34` state dict.
 
     Args:
-        network: of the same depth, with width 64 and images of three channels.
+        network: of the same depth, with width 64, images of three channels and a convolution as its stem.
         state: arrays by torchvision's names.
         head: whether to fill the last layer too; if not, the network keeps its own, for other classes.
 
     Raises:
-        ValueError: for a missing or unexpected entry, or a different shape.
+        ValueError: for a missing or unexpected entry, a different shape, or a network with another stem.
     """
     reader = _Reader(state)
-    assert isinstance(network.convolution, Convolution), "torchvision's ResNets have no patch stem"
+    if not isinstance(network.convolution, Convolution):
+        raise ValueError("the network's stem is patches, torchvision's is a convolution")
     reader.put(network.convolution.kernel, "conv1.weight", 2, 3, 1, 0)
     reader.norm(network.norm, "bn1")
     names = [f"layer{stage + 1}.{block}" for stage, blocks in enumerate(network.stages) for block in range(blocks)]

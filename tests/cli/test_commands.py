@@ -98,7 +98,9 @@ def weights_for_another(root: Path) -> list:
 
 
 def weights_that_are_none(root: Path) -> list:
-    return [*weights_for_another(root), "--classifier.network.width", "64", "--classifier.network.channels", "3"]
+    fitting = {"width": "64", "channels": "3", "stem": "convolution"}
+    options = [word for name, value in fitting.items() for word in (f"--classifier.network.{name}", value)]
+    return [*weights_for_another(root), *options]
 
 
 @pytest.mark.parametrize(
@@ -115,7 +117,7 @@ def weights_that_are_none(root: Path) -> list:
         (no_archive, r"--archive .*ModelNet10.zip cannot be read: No such file"),
         (
             weights_for_another,
-            r"of width 64 with 3 input channels, this one has width 8 and 1 channels; use --preset thesis",
+            r"as its stem, this one has width 8, 1 channels and the stem \w+; use --preset thesis",
         ),
         (weights_that_are_none, r"resnet18.pth is not a file of weights that can be read safely"),
     ],

@@ -115,7 +115,8 @@ def net(classes, channels, resolution, rngs):
 """
 
 
-def test_an_encoder_is_the_classifier_of_a_run(data, whole, tmp_path, at_once, refuses, monkeypatch):
+@pytest.mark.parametrize("evaluated", [False, pytest.param(True, marks=pytest.mark.slow)], ids=["trained", "evaluated"])
+def test_an_encoder_is_the_classifier_of_a_run(evaluated, data, whole, tmp_path, at_once, refuses, monkeypatch):
     """Every file of the run names it, and none a ResNet."""
     monkeypatch.chdir(tmp_path)
     path, out = tmp_path / "nets.py", tmp_path / "run"
@@ -143,6 +144,8 @@ def test_an_encoder_is_the_classifier_of_a_run(data, whole, tmp_path, at_once, r
     assert (summary["encoder"]["module"], summary["encoder"]["name"]) == ("nets.py", "net")
     assert run["settings"]["classifier"]["network"] == {"channels": 1}
     assert run["settings"]["classifier"]["encoder"] == f"{path}:net"
+    if not evaluated:
+        return
     monkeypatch.chdir("/")
     ended(at_once("eval", "--out", out))
     ended(at_once("report", "--out", out))

@@ -55,10 +55,10 @@ def frames(tmp_path_factory):
     return path, stored
 
 
-def test_a_mesh_is_looked_at(system, chair, tmp_path):
+def test_a_mesh_is_looked_at(system, chair, at_once, tmp_path):
     picture, kept = tmp_path / "walk.png", tmp_path / "walk.npz"
     options = ["--system", system, "--mesh", chair, "--up", "y", "--max-views", 3, "--stop", 2, "--first", 4]
-    result = mevs("look", *options, "--json", "--draw", picture, "--save", kept)
+    result = at_once("look", *options, "--json", "--draw", picture, "--save", kept)
     assert result.returncode == 0, result.stderr
     walk = json.loads(result.stdout)
     assert walk["object"] == "chair.obj"
@@ -75,8 +75,8 @@ def test_a_mesh_is_looked_at(system, chair, tmp_path):
     assert str(again).splitlines()[-1].endswith("after 3 views (budget)")
 
 
-def test_recorded_images_are_looked_at(system, frames):
-    result = mevs("look", "--system", system, "--depth", frames[0], "--stop", 2, "--policy", "farthest")
+def test_recorded_images_are_looked_at(system, frames, at_once):
+    result = at_once("look", "--system", system, "--depth", frames[0], "--stop", 2, "--policy", "farthest")
     assert result.returncode == 0, result.stderr
     lines = result.stdout.splitlines()
     assert lines[0] == "frames.npz"
@@ -111,7 +111,7 @@ def test_what_cannot_be_looked_at_is_one_sentence(system, chair, frames, refuses
         assert message in refuses("look", "--system", system, "--depth", tmp_path / "bad.npz")
 
 
-def test_a_run_ends_with_a_system_which_can_be_exported(whole, tmp_path):
+def test_a_run_ends_with_a_system_which_can_be_exported(whole, at_once, tmp_path):
     of_run = load(whole)
     assert of_run.description.kind == "classifier"
     assert of_run.name == str(whole)
@@ -120,7 +120,7 @@ def test_a_run_ends_with_a_system_which_can_be_exported(whole, tmp_path):
     assert of_run.evaluation["after_views"]["random"] == metrics["policies"]["random"]["after_views"]
     run = shutil.copytree(whole, tmp_path / "run")
     (run / "system" / "weights.safetensors").write_bytes(b"damaged")
-    result = mevs("export", "--out", run, "--to", tmp_path / "mine", "--half")
+    result = at_once("export", "--out", run, "--to", tmp_path / "mine", "--half")
     assert result.returncode == 0, result.stderr
     assert "so it is made again" in " ".join(result.stderr.split())
     mine = load(tmp_path / "mine")

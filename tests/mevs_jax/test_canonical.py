@@ -97,7 +97,12 @@ def test_at_the_data_set_s_distance_it_is_an_inverse_warp(seed):
 
 @pytest.mark.parametrize(
     ("distance", "median", "low"),  # of two objects with thin legs
-    [(2.0, 0.965, 0.93), (1.5, 0.9, 0.85), (3.0, 0.94, 0.9), (5.0, 0.92, 0.8)],
+    [
+        (2.0, 0.965, 0.93),
+        (1.5, 0.9, 0.85),
+        pytest.param(3.0, 0.94, 0.9, marks=pytest.mark.slow),
+        pytest.param(5.0, 0.92, 0.8, marks=pytest.mark.slow),
+    ],
 )
 def test_views_of_random_cameras_agree_with_the_data_set_s_camera(distance, median, low):
     table = furniture("table", 2)
@@ -204,8 +209,8 @@ def test_images_of_all_sizes_share_one_program():
     mesh, random = default_caster()(chair()), np.random.default_rng(0)
     convert(cast_shot(mesh, data_set_shot()), data_set_shot(), camera=camera)
     before = [program._cache_size() for program in programs]
-    for size in (*SIZES, (64, 48), (100, 300)):
-        for distance in (1.3, 2, 7):
+    for size in (SIZES[0], (64, 48), (100, 300)):
+        for distance in (1.3, 7):
             shot = random_shot(random, distance, size)
             depth = cast_shot(mesh, shot)
             convert(depth, shot, camera=camera)

@@ -45,7 +45,7 @@ np.savez(sys.argv[3], **found, walk=step["probabilities"], views=views, strangen
 """
 
 
-@pytest.mark.parametrize("kind", ["classifier", "recogniser"])
+@pytest.mark.parametrize("kind", ["classifier", pytest.param("recogniser", marks=pytest.mark.slow)])
 def test_exported_programs_run_alone(kind, tmp_path):
     system, folder = making.system(kind), tmp_path / "programs"
     export(system, folder, max_views=5)

@@ -56,7 +56,9 @@ def walk_jitted(keys, tables, graph, starts, thresholds, policy, max_views):
     return jax.vmap(over_thresholds, in_axes=(0, 0, 0, None))(keys, tables, starts, thresholds)
 
 
-@pytest.mark.parametrize("policy", ["random", "predicted_entropy", "oracle_entropy"])
+@pytest.mark.parametrize(
+    "policy", ["random", "predicted_entropy", pytest.param("oracle_entropy", marks=pytest.mark.slow)]
+)
 def test_the_jitted_loop_walks_the_views_of_a_plain_loop(policy):
     views, classes, max_views = 10, 5, 6
     graph = ViewGraph.from_points(fibonacci_sphere(views))

@@ -73,7 +73,7 @@ def test_averaged_weights_are_never_untrained_nor_infinite(worth, validates):
         fit_averaged(config, loss_of, nnx.State({"a": jnp.ones(3), "b": jnp.full(2, worth)}), data, checks)
 
 
-@pytest.mark.parametrize("train", [train_policy, train_by_q_learning])
+@pytest.mark.parametrize("train", [train_policy, pytest.param(train_by_q_learning, marks=pytest.mark.slow)])
 def test_a_policy_that_diverges_is_named(train):
     config = {train_policy: PolicyConfig, train_by_q_learning: QLearningConfig}[train](
         width=8, heads=2, blocks=1, most_seen=2, walks=1, rounds=1, epochs=4, batch_size=8, learning_rate=1e38

@@ -43,18 +43,22 @@ def work(**asked) -> subprocess.CompletedProcess:
 
 
 @pytest.mark.parametrize(
-    ("devices", "steps"), [(4, 10), pytest.param(8, 50, marks=pytest.mark.slow)], ids=["4 devices", "8 devices"]
+    ("devices", "networks", "steps"),
+    [(4, 1, 10), pytest.param(8, 2, 50, marks=pytest.mark.slow)],
+    ids=["4 devices", "8 devices"],
 )
-def test_steps_on_many_devices_equal_those_on_one(data, devices, steps):
-    """Dropout and augmentation on; and PointNet++ with its weights split in two as well. Ten steps in a row, then again from
-    where one device was: after some dozens rounding decides whether a rectified unit is on, and how far the curves then part
-    depends on the processor. Batches and activations stay where they are: devices add up sums, and that is all they say to each
-    other, unless weights are split."""
-    done = work(data=data, devices=devices, steps=steps)
+def test_steps_on_many_devices_equal_those_on_one(data, devices, networks, steps):
+    """Dropout and augmentation on; PointNet++ or both networks, and PointNet++ with its weights split in two as well.
+
+    Ten steps in a row, then again from where one device was: after some dozens rounding decides whether a rectified unit is on,
+    and how far the curves then part depends on the processor. Batches and activations stay where they are: devices add up sums,
+    and that is all they say to each other, unless weights are split.
+    """
+    done = work(data=data, devices=devices, networks=networks, steps=steps)
     assert done.returncode == 0, done.stderr
     found = json.loads(done.stdout)
     alone, silent = found.pop("1")
-    assert len(alone) == 2
+    assert len(alone) == networks
     assert all(not said for said in silent.values())
     assert found["all"][1] == {name: ["all-reduce"] for name in alone}
     for mesh, (curve, _) in found.items():

@@ -205,7 +205,7 @@ def test_a_loss_that_is_no_number_stops_the_run(data, tmp_path):
     assert not list((tmp_path / "latest").iterdir())
 
 
-@pytest.mark.parametrize("what", ["validation accuracy", "weights"])
+@pytest.mark.parametrize("what", ["validation accuracy", pytest.param("weights", marks=pytest.mark.slow)])
 def test_what_is_not_finite_is_not_saved(what, data, tmp_path, monkeypatch):
     """Also where the loss is finite; and the way out that the message names works."""
     statistics = load_statistics(data)
@@ -235,6 +235,7 @@ def test_what_is_not_finite_is_not_saved(what, data, tmp_path, monkeypatch):
     assert fit(lower, data, statistics, tmp_path)["epoch"] == 1
 
 
+@pytest.mark.slow
 def test_a_best_epoch_of_an_older_version_without_a_loss_is_replaced(data, tmp_path, monkeypatch):
     statistics = load_statistics(data)
     task = tasks(SETTINGS, statistics)[0]

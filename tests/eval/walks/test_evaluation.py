@@ -290,9 +290,13 @@ def study(tables, statistics):
     return run_study(tables, tables, statistics, GridConfig(draws=2), by_view=tables, leak=None)
 
 
-def test_the_study_is_complete_and_repeats(study, tables, statistics):
+@pytest.mark.slow
+def test_the_study_repeats(study, tables, statistics):
     again = run_study(tables, tables, statistics, GridConfig(draws=2), by_view=tables, leak=None)
     assert json.dumps(study) == json.dumps(again)
+
+
+def test_the_study_is_complete(study):
     names = [rung["policy"] for rung in study["ladder"]]
     assert set(names) == set(POLICIES) - {"scrambled_entropy"} - {rung.policy for rung in ASCENT_RUNGS}
     assert set(study["policies"]) == set(names)

@@ -70,13 +70,13 @@ def walk(agent, views, first, **reset):
     ("kind", "policy"),
     [
         ("classifier", "information_gain"),
-        ("classifier", "predicted_entropy"),
+        pytest.param("classifier", "predicted_entropy", marks=pytest.mark.slow),
         ("classifier", "remembered_entropy"),
         ("classifier", "random"),
-        ("classifier", "farthest"),
-        ("classifier", "fixed_order"),
+        pytest.param("classifier", "farthest", marks=pytest.mark.slow),
+        pytest.param("classifier", "fixed_order", marks=pytest.mark.slow),
         ("recogniser", "learned"),
-        ("recogniser", "learned_and_table"),
+        pytest.param("recogniser", "learned_and_table", marks=pytest.mark.slow),
     ],
 )
 def test_walks_are_those_of_the_selection_loop_on_tables(request, kind, policy):

@@ -180,10 +180,10 @@ def test_small_maps_as_matrix_product_equal_the_convolution(monkeypatch):
     for size, stride in ((3, 1), (3, 2), (1, 2), (7, 2)):
         layer = Convolution(5, 6, size, stride, rngs=nnx.Rngs(0))
         x = jax.random.normal(jax.random.key(1), (2, 7, 7, 5))
-        by_product = layer(x)
+        by_product = outputs(layer, x)
         with monkeypatch.context() as patched:
             patched.setattr(jax, "default_backend", lambda: "gpu")
-            by_convolution = layer(x)
+            by_convolution = outputs(layer, x)
         np.testing.assert_allclose(by_product, by_convolution, atol=1e-5)
 
 
@@ -213,7 +213,7 @@ def test_directions_stand_in_the_place_of_the_normals(random):
     assert np.abs(np.asarray(seen - nothing)).max() > 1e-3
 
 
-@pytest.mark.parametrize("columns", [3, 6])
+@pytest.mark.parametrize("columns", [3, pytest.param(6, marks=pytest.mark.slow)])
 def test_pieces_of_a_cloud_equal_the_whole(columns, monkeypatch, random):
     """On a CPU neighbourhoods pass in pieces, elsewhere all at once; in bfloat16 coordinates keep their own precision."""
     network, halved = (
@@ -287,13 +287,13 @@ def test_clouds_without_points_are_refused():
 )
 def test_training_is_told_with_each_call(network, inputs):
     """Flax's modes would change nothing in silence; and statistics cannot be updated within a vmap."""
-    network = network()
-    before = network(inputs)
+    network = made(network)
+    before = outputs(network, inputs)
     with pytest.raises(ValueError, match="has no training mode: call it with train=True"):
         network.train()
     network.eval()
-    np.testing.assert_array_equal(network(inputs), before)
+    np.testing.assert_array_equal(outputs(network, inputs), before)
     rest = {"key": jax.random.key(0)} if not isinstance(network, ResNet) else {}
     with pytest.raises(ValueError, match="give the network the whole batch in one call"):
         jax.vmap(lambda one: network(one[None], train=True, **rest))(inputs)
-    network(inputs, train=True, **rest)
+    nnx.jit(lambda network, inputs: network(inputs, train=True, **rest))(network, inputs)

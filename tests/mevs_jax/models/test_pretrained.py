@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import jax
@@ -18,6 +20,7 @@ from tests.mevs_jax.models.test_networks import GOLDEN, golden_shapes, made, out
 from tests.reference.weights import made_up_inputs, made_up_weights
 from tests.train.weights_making import entry, safetensors
 from train.starting_weights import weights_from_network, weights_from_torch
+from train.tasks.classifier import ResNetConfig, starting_weights
 from train.weights_files import read_state_dict
 
 
@@ -29,10 +32,17 @@ def weights(tmp_path_factory) -> Path:
     return path
 
 
+def untrained(make: Callable[[], nnx.Module]) -> nnx.Module:
+    """A network whose weights are all 0.01, without compiling what would draw them."""
+    network = nnx.eval_shape(make)
+    nnx.update(network, jax.tree.map(lambda like: jnp.full(like.shape, 0.01, like.dtype), nnx.state(network)))
+    return network
+
+
 @pytest.mark.usefixtures("fully_compiled")
 def test_weights_from_a_file_give_pytorchs_outputs(weights):
     """Features are compared, since the head stays new: the stored logits are the file's head on them."""
-    network = made(lambda: ResNet(depth=18, rngs=nnx.Rngs(0)))
+    network = untrained(lambda: ResNet(depth=18, rngs=nnx.Rngs(0)))
     head = np.asarray(network.head.kernel[...])
     weights_from_torch((weights,), 18).put(network)
     np.testing.assert_array_equal(network.head.kernel[...], head)
@@ -46,7 +56,7 @@ def test_weights_from_a_file_give_pytorchs_outputs(weights):
 
 def test_standardised_images_are_what_torchvision_expects(weights):
     """A network that standardises gives on [0, 1] images what one that does not gives on standardised ones."""
-    plain, standard = (made(lambda s=s: ResNet(depth=18, standardise=s, rngs=nnx.Rngs(0))) for s in (False, True))
+    plain, standard = (untrained(lambda s=s: ResNet(depth=18, standardise=s, rngs=nnx.Rngs(0))) for s in (False, True))
     for network in (plain, standard):
         weights_from_torch((weights,), 18).put(network)
     images = jax.random.uniform(jax.random.key(0), (2, 64, 64, 3))
@@ -65,9 +75,17 @@ def test_the_file_of_the_right_depth_is_taken(weights, tmp_path):
         weights_from_torch((weights,), 34)
 
 
-def test_a_network_of_another_width_refuses_them(weights):
+def test_a_network_of_another_shape_refuses_them(weights):
     with pytest.raises(DataError, match=r"does not fit the classifier: conv1.weight has shape"):
-        weights_from_torch((weights,), 18).put(made(lambda: ResNet(depth=18, width=8, rngs=nnx.Rngs(0))))
+        weights_from_torch((weights,), 18).put(untrained(lambda: ResNet(depth=18, width=8, rngs=nnx.Rngs(0))))
+    with pytest.raises(DataError, match=r"does not fit the classifier: the network's stem is patches"):
+        weights_from_torch((weights,), 18).put(untrained(lambda: ResNet(depth=18, stem="patches", rngs=nnx.Rngs(0))))
+
+
+@pytest.mark.parametrize("other", [{"width": 32}, {"channels": 4, "standardise": False}, {"stem": "patches"}])
+def test_settings_that_they_cannot_fit_are_refused_before_anything_is_read(other):
+    with pytest.raises(DataError, match=r"--pretrained weights fit a ResNet of width 64 .* a convolution as its stem"):
+        starting_weights((Path("absent.pth"),), replace(ResNetConfig(depth=18), **other))
 
 
 def test_bfloat16_weights_are_used_as_float32(weights, tmp_path):
@@ -80,7 +98,7 @@ def test_bfloat16_weights_are_used_as_float32(weights, tmp_path):
     half, whole = tmp_path / "half.safetensors", tmp_path / "whole.safetensors"
     half.write_bytes(safetensors(header, content))
     save_file({name: array.astype(np.float32) for name, array in state.items()}, whole)
-    networks = [made(lambda: ResNet(depth=18, rngs=nnx.Rngs(0))) for _ in range(2)]
+    networks = [untrained(lambda: ResNet(depth=18, rngs=nnx.Rngs(0))) for _ in range(2)]
     for path, network in zip((half, whole), networks, strict=True):
         weights_from_torch((path,), 18).put(network)
     leaves = [jax.tree.leaves(nnx.state(network, nnx.Param, nnx.BatchStat)) for network in networks]

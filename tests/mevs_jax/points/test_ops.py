@@ -14,7 +14,8 @@ from mevs_jax import ball_query, farthest_point_sample
 from mevs_jax.points import kernels as point_kernels
 from tests.reference import numpy_rules
 
-pytestmark = pytest.mark.usefixtures("fully_compiled")
+sample = jax.jit(farthest_point_sample, static_argnums=1)
+query = jax.jit(ball_query, static_argnums=(2, 3))
 
 
 def clouds_of(kind: str, random: np.random.Generator, count: int, points: int) -> np.ndarray:
@@ -41,6 +42,7 @@ CASES = [
 ]
 
 
+@pytest.mark.usefixtures("fully_compiled")
 @pytest.mark.parametrize(("kind", "points", "k", "radius", "samples"), CASES)
 def test_indices_equal_an_obvious_loop(kind, points, k, radius, samples, random):
     clouds = clouds_of(kind, random, 125, points)
@@ -59,28 +61,28 @@ def test_indices_equal_an_obvious_loop(kind, points, k, radius, samples, random)
 )
 def test_indices_at_the_thesis_sizes(points, random):
     cloud = clouds_of("random", random, 1, points)[0]
-    chosen = np.asarray(farthest_point_sample(cloud, 512))
+    chosen = np.asarray(sample(cloud, 512))
     np.testing.assert_array_equal(chosen, numpy_rules.farthest_point_sample(cloud, 512))
-    groups = np.asarray(ball_query(cloud, cloud[chosen[:40]], 0.2, 64))
+    groups = np.asarray(query(cloud, cloud[chosen[:40]], 0.2, 64))
     np.testing.assert_array_equal(groups, numpy_rules.ball_query(cloud, cloud[chosen[:40]], 0.2, 64))
 
 
 def test_no_neighbour_gives_point_zero():
     points = np.ones((40, 3), np.float32)
-    np.testing.assert_array_equal(ball_query(points, np.zeros((2, 3), np.float32), 0.5, 5), np.zeros((2, 5)))
+    np.testing.assert_array_equal(query(points, np.zeros((2, 3), np.float32), 0.5, 5), np.zeros((2, 5)))
 
 
 def test_the_radius_is_strict():
     points = np.array([[1, 0, 0], [0.5, 0, 0]], np.float32)
-    np.testing.assert_array_equal(ball_query(points, np.zeros((1, 3), np.float32), 1.0, 3), [[1, 1, 1]])
+    np.testing.assert_array_equal(query(points, np.zeros((1, 3), np.float32), 1.0, 3), [[1, 1, 1]])
 
 
 def test_indices_are_int32_and_sampling_starts_at_point_zero(random):
     cloud = clouds_of("random", random, 1, 50)[0]
-    chosen = farthest_point_sample(cloud, 5)
+    chosen = sample(cloud, 5)
     assert chosen.dtype == jnp.int32
     assert chosen[0] == 0
-    assert ball_query(cloud, cloud[:2], 0.1, 3).dtype == jnp.int32
+    assert query(cloud, cloud[:2], 0.1, 3).dtype == jnp.int32
 
 
 @pytest.mark.parametrize("call", [lambda p: farthest_point_sample(p, 0), lambda p: ball_query(p, p, 0.1, 0)])
@@ -103,8 +105,9 @@ def test_kernels_give_the_same_indices(kind, points, k, radius, samples, random)
     clouds = clouds_of(kind, random, 2, points)
     chosen = jax.vmap(lambda cloud: point_kernels.farthest_point_sample(cloud, k, interpret=True))(clouds)
     centres = np.concatenate([clouds[:, : points // 2], np.full((2, 1, 3), 9, np.float32)], axis=1)
-    query = lambda p, c: point_kernels.ball_query(p, c, jnp.square(jnp.float32(radius)), samples, interpret=True)  # noqa: E731
-    groups = jax.vmap(query)(clouds, centres)
+    within = jnp.square(jnp.float32(radius))
+    ask = lambda p, c: point_kernels.ball_query(p, c, within, samples, interpret=True)  # noqa: E731
+    groups = jax.vmap(ask)(clouds, centres)
     for cloud, centre, indices, group in zip(clouds, centres, chosen, groups, strict=True):
         np.testing.assert_array_equal(indices, numpy_rules.farthest_point_sample(cloud, k))
         np.testing.assert_array_equal(group, numpy_rules.ball_query(cloud, centre, radius, samples))
@@ -139,7 +142,7 @@ def test_points_that_are_not_finite_are_no_neighbours():
     cloud = np.random.default_rng(7).normal(0, 0.2, (70, 3)).astype(np.float32)
     cloud[[3, 40], 1], cloud[[5, 41], 2], cloud[50] = np.nan, np.inf, -np.inf
     centres = np.concatenate([cloud[:8], np.full((1, 3), np.nan, np.float32)])
-    found = np.asarray(ball_query(cloud, centres, 0.4, 12))
+    found = np.asarray(query(cloud, centres, 0.4, 12))
     with np.errstate(invalid="ignore"):
         np.testing.assert_array_equal(found, numpy_rules.ball_query(cloud, centres, 0.4, 12))
     finite = np.isfinite(cloud).all(axis=1)
@@ -161,7 +164,8 @@ def test_points_that_are_not_finite_are_no_neighbours():
     ],
 )
 def test_what_is_no_cloud_is_described(points, said):
-    sample, query = map(inspect.unwrap, (farthest_point_sample, ball_query))  # without the check of shapes in tests
-    for call in (lambda: sample(points, 2), lambda: query(points, points, 0.1, 2)):
+    unchecked = map(inspect.unwrap, (farthest_point_sample, ball_query))  # without the check of shapes in tests
+    choose, neighbours = unchecked
+    for call in (lambda: choose(points, 2), lambda: neighbours(points, points, 0.1, 2)):
         with pytest.raises(ValueError, match=said):
             call()

@@ -13,8 +13,10 @@ from data_pipeline.capture.workers import capture_all, capture_path
 from data_pipeline.objects.mesh import Mesh, ObjectEntry
 from data_pipeline.objects.recipes import FurniturePiece
 from data_pipeline.objects.sources import load_object, open_source
-from mevs_jax import Camera, look_at_origin
-from mevs_jax.rendering import pad_triangles, render_depth
+from mevs_jax import Camera, look_at_origin, rendering
+from mevs_jax.rendering import pad_triangles
+
+render_depth = jax.jit(rendering.render_depth)
 
 
 def furniture(name: str, seed: int = 5) -> Mesh:
@@ -55,11 +57,11 @@ def test_a_camera_inside_sees_only_what_is_before_it():
     """Nothing is clipped, and what is behind does not shine through."""
     wall = [[[-5, -5, z], [5, -5, z], [0, 9, z]] for z in (1.0, -3.0)]
     pose = jnp.eye(4)  # at the origin, looking along +z
-    seen = render_depth(jnp.array(wall), Camera(pose, np.pi / 3, 16))
+    seen = render_depth(np.array(wall, np.float32), Camera(pose, np.pi / 3, 16))
     np.testing.assert_allclose(seen.depth, 1.0, rtol=1e-6)
     assert (np.asarray(seen.face) == 0).all()
     turned = pose.at[:3, :3].set(jnp.diag(jnp.array([1.0, -1.0, -1.0])))
-    seen = render_depth(jnp.array(wall), Camera(turned, np.pi / 3, 16))
+    seen = render_depth(np.array(wall, np.float32), Camera(turned, np.pi / 3, 16))
     np.testing.assert_allclose(seen.depth, 3.0, rtol=1e-6)
     assert (np.asarray(seen.face) == 1).all()
 
