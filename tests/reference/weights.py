@@ -3,8 +3,23 @@
 from __future__ import annotations
 
 import zlib
+from collections.abc import Callable
+from typing import TypeVar
 
+import jax
+import jax.numpy as jnp
 import numpy as np
+from flax import nnx
+
+Network = TypeVar("Network", bound=nnx.Module)
+
+
+def untrained(make: Callable[[], Network]) -> Network:
+    """A network whose weights are all 0.01, without compiling what would draw them."""
+    network = nnx.eval_shape(make)
+    weights = jax.tree.map(lambda like: jnp.asarray(np.full(like.shape, 0.01, like.dtype)), nnx.state(network))
+    nnx.update(network, weights)
+    return network
 
 
 def made_up_weights(shapes: dict[str, tuple[int, ...]]) -> dict[str, np.ndarray]:

@@ -19,6 +19,7 @@ from eval.settings import TINY
 from eval.stages import _check_metrics, tasks
 from eval.tables import ViewTables, compute_view_tables
 from tests.reference.choosing import CLASSES, fusion_of, some_features
+from tests.reference.weights import untrained
 from train.chance import Chance, warn_of_chance, wilson_interval
 from train.choosing.averaged import AveragedConfig, fit_averaged
 from train.choosing.calibrated import calibrated
@@ -99,7 +100,7 @@ def test_a_fusion_is_not_calibrated_on_beliefs_that_are_not_finite():
 def test_tables_of_numbers_that_are_not_finite_are_not_made(data, monkeypatch, tmp_path):
     statistics = load_statistics(data)
     task, predict = tasks(TINY, statistics)
-    network, predictor = task.network(nnx.Rngs(0)), predict.network(nnx.Rngs(0))
+    network, predictor = (untrained(lambda one=one: one.network(nnx.Rngs(0))) for one in (task, predict))
     network.head.bias[...] = network.head.bias[...].at[1].set(jnp.nan)
     with pytest.raises(Diverged, match="outputs of the classifier are not finite for 10 of 10 test objects"):
         compute_view_tables(data, "test", statistics, task, network, predict, predictor)

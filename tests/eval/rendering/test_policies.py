@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -11,21 +12,20 @@ from data_pipeline.objects.recipes import FurniturePiece
 from data_pipeline.objects.sources import load_object
 from eval.rendering.policies import RenderingConfig, chosen_objects, scores_of_object, view_scores
 from eval.walks.ladder import ASCENT_RUNGS
-from mevs_jax import cameras_at, fibonacci_sphere
-from mevs_jax.rendering import render_depth
+from mevs_jax import cameras_at, fibonacci_sphere, rendering
 from tests.conftest import open3d_or_skip
 
 VIEWS = 12
 
 
 def test_distinct_optima_come_first_in_their_order_each_as_its_nearest_candidate(random):
-    points = fibonacci_sphere(VIEWS)
+    points, scored = fibonacci_sphere(VIEWS), jax.jit(view_scores)
     for _ in range(20):
         optima = random.normal(size=(5, 3))
         optima /= np.linalg.norm(optima, axis=1, keepdims=True)
         twins = np.concatenate([optima, optima + random.normal(scale=1e-3, size=optima.shape)])
         values = np.concatenate([random.permutation(5), np.full(5, -1.0)])
-        scores = np.asarray(view_scores(cameras_at(twins).pose, jnp.asarray(values), jnp.asarray(points)))
+        scores = np.asarray(scored(cameras_at(twins).pose, jnp.asarray(values), jnp.asarray(points)))
         kept, expected = [], []
         for at in np.argsort(-values, kind="stable"):
             if all(np.arccos(np.clip(twins[at] @ twins[other], -1, 1)) > 0.2 for other in kept):
@@ -43,7 +43,7 @@ def test_objects_are_spread_evenly_and_never_twice():
 
 def views_of(mesh: Mesh, views: int, side: int) -> tuple[np.ndarray, np.ndarray]:
     cameras = cameras_at(fibonacci_sphere(views), resolution=side)
-    images = []
+    images, render_depth = [], jax.jit(rendering.render_depth)
     for pose in cameras.pose:
         depth = np.asarray(render_depth(mesh.vertices[mesh.faces], cameras.replace(pose=pose)).depth)
         images.append(np.where(np.isfinite(depth), depth, 0))

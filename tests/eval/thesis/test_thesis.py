@@ -31,6 +31,7 @@ from eval.thesis.tables import all_tables, markdown
 from eval.walks.grid import THRESHOLDS, GridConfig, Results
 from mevs_jax.viewpoints import ViewGraph, fibonacci_sphere
 from tests.reference.policies import maxima_first
+from tests.reference.weights import untrained
 from train.tasks.entropy import EntropyTask
 from train.thesis_networks import BACKBONES, FRAMES, PIPELINE, VIEWS, ThesisFolder, backbone_task, entropy_task
 
@@ -323,7 +324,7 @@ def test_the_stages_make_everything_and_go_on(results, tmp_path, monkeypatch, ca
 
     monkeypatch.setattr(thesis_networks, "fit", fit)
     for module in (thesis_networks, thesis_run):
-        monkeypatch.setattr(module, "load_best", lambda task, folder: task.network(nnx.Rngs(0)))
+        monkeypatch.setattr(module, "load_best", lambda task, _: untrained(lambda: task.network(nnx.Rngs(0))))
     monkeypatch.setattr(thesis_run, "network_outputs", outputs)
     monkeypatch.setattr(thesis_run, "_memory", lambda *_: results["memory"])
     monkeypatch.setattr(thesis_run, "_ascents", lambda *_: results["ascent"])

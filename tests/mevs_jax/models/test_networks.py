@@ -295,5 +295,5 @@ def test_training_is_told_with_each_call(network, inputs):
     np.testing.assert_array_equal(outputs(network, inputs), before)
     rest = {"key": jax.random.key(0)} if not isinstance(network, ResNet) else {}
     with pytest.raises(ValueError, match="give the network the whole batch in one call"):
-        jax.vmap(lambda one: network(one[None], train=True, **rest))(inputs)
+        jax.jit(jax.vmap(lambda one: network(one[None], train=True, **rest)))(inputs)
     nnx.jit(lambda network, inputs: network(inputs, train=True, **rest))(network, inputs)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -17,7 +16,7 @@ from safetensors.numpy import save_file
 from data_pipeline.errors import DataError
 from mevs_jax import ResNet
 from tests.mevs_jax.models.test_networks import GOLDEN, golden_shapes, made, outputs
-from tests.reference.weights import made_up_inputs, made_up_weights
+from tests.reference.weights import made_up_inputs, made_up_weights, untrained
 from tests.train.weights_making import entry, safetensors
 from train.starting_weights import weights_from_network, weights_from_torch
 from train.tasks.classifier import ResNetConfig, starting_weights
@@ -30,13 +29,6 @@ def weights(tmp_path_factory) -> Path:
     path = tmp_path_factory.mktemp("weights") / "resnet18.safetensors"
     save_file({name: np.asarray(array) for name, array in made_up_weights(golden_shapes("resnet18")).items()}, path)
     return path
-
-
-def untrained(make: Callable[[], nnx.Module]) -> nnx.Module:
-    """A network whose weights are all 0.01, without compiling what would draw them."""
-    network = nnx.eval_shape(make)
-    nnx.update(network, jax.tree.map(lambda like: jnp.full(like.shape, 0.01, like.dtype), nnx.state(network)))
-    return network
 
 
 @pytest.mark.usefixtures("fully_compiled")
