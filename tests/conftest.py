@@ -27,7 +27,7 @@ if "PYTEST_XDIST_WORKER" not in os.environ:
     # is not imported yet.
     compiled = tempfile.mkdtemp(prefix="mevs_jax-compiled-")
     atexit.register(shutil.rmtree, compiled, ignore_errors=True)
-    os.environ |= {"JAX_COMPILATION_CACHE_DIR": compiled, "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0.2"}
+    os.environ |= {"JAX_COMPILATION_CACHE_DIR": compiled, "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0.05"}
     # Tests compile much and run little: without most optimisations, and by XLA's older emitters, that takes a third of the time.
     # What is compared with PyTorch and plain loops, and what runs long, has all optimisations (`fully_compiled`).
     jaxlib = tuple(map(int, version("jaxlib").split(".")[:2]))

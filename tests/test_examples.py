@@ -16,7 +16,7 @@ EXAMPLES = Path(__file__).resolve().parents[1] / "examples"
     [
         pytest.param("own_policy", "opposite: ", marks=pytest.mark.slow),
         ("load_and_ask", "confident after "),
-        ("depth_camera", " views: sure"),
+        pytest.param("depth_camera", " views: sure", marks=pytest.mark.slow),
         pytest.param("gymnasium_ppo", "| PPO − random | +0.0 ", marks=pytest.mark.slow),
         pytest.param("own_encoder", "validation accuracy", marks=pytest.mark.slow),
     ],

@@ -141,7 +141,7 @@ def test_published_code_and_ascents_fill_their_tables(whole, tmp_path):
     ],
     ids=len,
 )
-def test_live_walks_what_the_tables_say(policies, whole, tmp_path, refuses):
+def test_live_walks_what_the_tables_say(policies, whole, tmp_path, at_once, refuses):
     shutil.copytree(whole, tmp_path / "run")
     arguments = (
         "check",
@@ -154,7 +154,7 @@ def test_live_walks_what_the_tables_say(policies, whole, tmp_path, refuses):
         tmp_path / "run",
         "--live.policies",
     )
-    result = mevs(*arguments, *policies)
+    result = at_once(*arguments, *policies)
     assert result.returncode == 0, result.stderr
     found = json.loads((tmp_path / "run" / "live.json").read_text())
     assert set(found) == set(policies)

@@ -159,7 +159,7 @@ def test_a_hostile_file_is_refused_and_nothing_runs(tmp_path, kind):
     assert marker.exists()
 
 
-@pytest.mark.parametrize("make", [legacy, zipped])
+@pytest.mark.parametrize("make", [legacy, pytest.param(zipped, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("hazard", HOSTILE_PICKLES)
 def test_hostile_pickles_give_one_sentence_in_little_memory(tmp_path, hazard, make):
     content, message = HOSTILE_PICKLES[hazard]

@@ -35,7 +35,7 @@ from tests.reference.weights import untrained
 from train.tasks.entropy import EntropyTask
 from train.thesis_networks import BACKBONES, FRAMES, PIPELINE, VIEWS, ThesisFolder, backbone_task, entropy_task
 
-OBJECTS = 20
+OBJECTS = 10
 
 
 # ------------------------------------------------------------------------------------------------------ the printed numbers

@@ -72,7 +72,7 @@ def walk(agent, views, first, **reset):
         ("classifier", "information_gain"),
         pytest.param("classifier", "predicted_entropy", marks=pytest.mark.slow),
         ("classifier", "remembered_entropy"),
-        ("classifier", "random"),
+        pytest.param("classifier", "random", marks=pytest.mark.slow),
         pytest.param("classifier", "farthest", marks=pytest.mark.slow),
         pytest.param("classifier", "fixed_order", marks=pytest.mark.slow),
         ("recogniser", "learned"),
