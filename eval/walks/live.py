@@ -24,6 +24,7 @@ from data_pipeline.progress import progress_bar
 from eval.tables import ViewTables
 from eval.walks.ladder import ASCENT_RUNGS, Rung
 from eval.walks.over_objects import over_objects
+from mevs_jax.arrays import AnyArray
 from mevs_jax.policies.base import Knowledge, Observation, Policy, Scene
 from mevs_jax.policies.registry import POLICIES
 from mevs_jax.selection import Episode, ViewTable, select_from_table, select_views
@@ -44,8 +45,8 @@ class Captures:
         clouds: the sampled points of each view, in the form that `EntropyTask.inputs` takes.
     """
 
-    images: Integer[Array, "*batch views height width"]
-    clouds: dict[str, Array]
+    images: Integer[AnyArray, "*batch views height width"]
+    clouds: dict[str, AnyArray]
 
 
 @dataclass(frozen=True)
