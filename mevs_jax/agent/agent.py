@@ -208,7 +208,7 @@ class Agent:
                 )
             of, view = of.refined(self.system, frame, self.history)
             self._object = of
-        return self._add(view.depth, of.turn @ view.pose, view.unknown, begun)
+        return self._add(view.depth, of.placed(self.system, view), view.unknown, begun)
 
     @property
     def center(self) -> Float[np.ndarray, " 3"]:

@@ -6,6 +6,7 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
+from jaxtyping import Float
 
 from mevs_jax.agent import core
 from mevs_jax.agent.frames import points_of
@@ -17,6 +18,9 @@ from mevs_jax.trained.system import TrainedSystem
 
 _REACH = 1.3
 """Points up to this many radii from the estimated centre belong to the object, since an estimate from one side is too small."""
+
+_AT_VIEWPOINT = 1e-5
+"""Poses that differ by less, in radii, are the same to rounding. Sampling of a cloud has ties, which rounding would decide."""
 
 Frame = tuple[Any, ...]
 """An image as it is given to `Agent.observe`: depth, intrinsics, pose, mask or None, floor or None."""
@@ -65,6 +69,12 @@ class Present:
             floor=None if floor is None else float(floor) - float(self.center @ up),
         )
 
+    def placed(self, system: TrainedSystem, view: CanonicalView) -> Float[np.ndarray, "4 4"]:
+        """Pose of a view's camera in the object's frame; exactly that of a viewpoint of the data set, where it is at one."""
+        pose = self.turn @ view.pose
+        off = np.abs(system.poses - pose).max(axis=(1, 2))
+        return system.poses[off.argmin()] if off.min() < _AT_VIEWPOINT else pose
+
     def refined(self, system: TrainedSystem, frame: Frame, history: History) -> tuple[Present, CanonicalView]:
         """The object with its sphere estimated again, by the points of a new image too, and the new view.
 
@@ -84,7 +94,7 @@ class Present:
             return replace(self, points=points, frames=[*self.frames, frame]), self.converted(system, frame)
         again = replace(self, center=center, radius=radius, points=points, frames=[*self.frames, frame])
         views = [again.converted(system, one) for one in again.frames]
-        poses, again.memory = [self.turn @ view.pose for view in views], self.programs.blank()
+        poses, again.memory = [self.placed(system, view) for view in views], self.programs.blank()
         for view, one in zip(views[:-1], poses[:-1], strict=True):
             again.memory, _ = self.programs.see(system.parts, again.memory, view.depth, one)
         history.depths[:], history.poses[:] = [view.depth for view in views[:-1]], poses[:-1]

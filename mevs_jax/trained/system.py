@@ -12,6 +12,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from mevs_jax.arrays import AnyArray
+from mevs_jax.cameras import look_at_origin
 from mevs_jax.policies.base import Observation, Policy
 from mevs_jax.policies.learned import learned
 from mevs_jax.policies.registry import POLICIES, policy_named
@@ -58,6 +59,11 @@ class TrainedSystem:
     def evaluation(self) -> dict[str, Any]:
         """Figures of the system's own evaluation on test objects."""
         return self.description.evaluation
+
+    @cached_property
+    def poses(self) -> Float[np.ndarray, "views 4 4"]:
+        """Poses of the camera at the viewpoints, in the frame of an upright object, in radii."""
+        return np.stack([look_at_origin(self.description.camera.distance * point) for point in self.viewpoints])
 
     @cached_property
     def graph(self) -> ViewGraph:
