@@ -85,7 +85,13 @@ def load(folder: str | Path) -> dict[str, Program]:
             content = file.read_bytes()
         except OSError as error:
             raise ValueError(f"{file} cannot be read ({error.strerror}); export the programs again") from error
-        if hashlib.sha256(content).hexdigest() != about["sha256"]:
+        if not isinstance(about, dict) or hashlib.sha256(content).hexdigest() != about.get("sha256"):
             raise ValueError(f"{file} is damaged, since its hash differs; export the programs again")
-        found[name] = Program(name, about, jax.jit(jax.export.deserialize(bytearray(content)).call))
+        try:
+            call = jax.export.deserialize(bytearray(content)).call
+        except Exception as error:  # of flatbuffers, of many kinds
+            raise ValueError(
+                f"{file} is no exported program ({type(error).__name__}); export the programs again"
+            ) from error
+        found[name] = Program(name, about, jax.jit(call))
     return found

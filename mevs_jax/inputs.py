@@ -7,10 +7,31 @@ from that of any depth camera.
 from __future__ import annotations
 
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from mevs_jax.arrays import AnyArray
 from mevs_jax.cameras import ViewCamera, pixel_directions, unproject
+
+_BEYOND = 0.1
+"""Radii by which depth may lie outside the unit sphere."""
+
+
+def check_depth(depth: AnyArray, camera: ViewCamera) -> None:
+    """Refuses what cannot be depth in radii of an object, as this camera sees it.
+
+    Raises:
+        ValueError: for whole numbers; and, where numbers are known, for depth outside the object's sphere.
+    """
+    if not jnp.issubdtype(jnp.asarray(depth).dtype, jnp.floating):
+        raise ValueError(f"depth must be in radii of the object, of a floating type, got {jnp.asarray(depth).dtype}")
+    if isinstance(depth, np.ndarray) and (hit := depth[depth > 0]).size:
+        near, far = camera.distance - 1 - _BEYOND, camera.distance + 1 + _BEYOND
+        if not (near <= hit.min() and hit.max() <= far):
+            raise ValueError(
+                f"depth is {hit.min():.3g} to {hit.max():.3g}; an object seen from {camera.distance:g} radii has {near:.3g} to "
+                f"{far:.3g} radii, and 0 where nothing is hit: make it from any camera's image with mevs_jax.canonical_view"
+            )
 
 
 def depth_image(

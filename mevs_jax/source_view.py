@@ -63,7 +63,7 @@ def window_of(
         ValueError: for an argument out of its range, a camera inside the object's sphere, or a sphere outside the image.
     """
     image, inside = _checked_images(depth, mask)
-    K, pose = _checked_intrinsics(K), _checked_pose(T_world_camera)
+    K, pose = _checked_intrinsics(K), checked_pose(T_world_camera)
     center, turn = _checked_sphere(center, radius), upright(up)
     axes = turn @ pose[:3, :3]
     eye = turn @ (pose[:3, 3] - center) / radius
@@ -95,7 +95,7 @@ def check_source(depth: AnyArray, K: AnyArray, T_world_camera: AnyArray, mask: A
     """Raises `ValueError` unless depth image, intrinsics, pose and mask are such as `window_of` takes."""
     _checked_images(depth, mask)
     _checked_intrinsics(K)
-    _checked_pose(T_world_camera)
+    checked_pose(T_world_camera)
 
 
 def why_empty(window: Window) -> str:
@@ -144,6 +144,8 @@ def _checked_images(depth: AnyArray, mask: AnyArray | None) -> tuple[np.ndarray,
     if mask is None:
         return image, None
     inside = np.asarray(mask)
+    if inside.dtype.kind == "f" and np.isnan(inside).any():
+        raise ValueError("mask has NaN; give True for the pixels of the object and False for the others")
     if inside.shape != image.shape:
         raise ValueError(f"mask has shape {inside.shape}, depth {image.shape}; they must be equal")
     return image, inside.astype(bool)
@@ -164,7 +166,7 @@ def _checked_intrinsics(K: AnyArray) -> np.ndarray:
     return array
 
 
-def _checked_pose(T_world_camera: AnyArray) -> np.ndarray:
+def checked_pose(T_world_camera: AnyArray) -> np.ndarray:
     """Returns the pose in float64.
 
     Raises:

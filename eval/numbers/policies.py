@@ -153,6 +153,8 @@ def evaluate_policies(
     Raises:
         DataError: if the run has no view tables, or a policy cannot be used; the message is one sentence.
     """
+    if not isinstance(run, str | Path | EvaluationInputs):
+        raise DataError(f"evaluate_policies needs a run directory, or view tables, not a {type(run).__name__}")
     inputs = run if isinstance(run, EvaluationInputs) else EvaluationInputs.of_run(Path(run))
     own = tuple(_own(name, policy, knows) for name, policy in policies.items() if not _is_baseline(name, policy))
     tables, graph, config = inputs.tables, inputs.graph, inputs.config

@@ -12,15 +12,16 @@ from typing import Any
 
 import jax
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from mevs_jax.agent import core
 from mevs_jax.agent.candidates import candidates_of
-from mevs_jax.agent.frames import mask_of, pose_towards, rotation_to_world
+from mevs_jax.agent.frames import aimed, mask_of, pose_towards, rotation_to_world
 from mevs_jax.agent.present import Present, sphere_of
 from mevs_jax.agent.programs import Programs
 from mevs_jax.agent.records import Belief, History, Reason, Step, plain
 from mevs_jax.arrays import AnyArray, AnyVector
+from mevs_jax.inputs import check_depth
 from mevs_jax.policies.base import Policy
 from mevs_jax.source_view import check_source
 from mevs_jax.trained.system import TrainedSystem
@@ -142,6 +143,10 @@ class Agent:
             f"center must be three finite numbers, got {np.asarray(center).tolist()}",
         )
         _check(0 < float(radius) < np.inf, f"radius must be positive, in metres, got {radius}")
+        _check(
+            self.distance is None or self.distance > radius,
+            f"the agent's distance of {self.distance} m is inside the object's radius of {radius:.3g} m; make it larger",
+        )
         _check(yaw is None or bool(np.isfinite(yaw)), f"yaw must be a finite angle in radians, or None, got {yaw}")
         rotation = rotation_to_world(up, yaw or 0.0)
         program = self._program(yaw is not None)  # refuses a policy first
@@ -199,7 +204,7 @@ class Agent:
         self._check_budget()
         frame = (depth, K, T_world_camera, mask, floor)
         if of.points is None:
-            view = of.converted(self.system, frame)
+            view = of.seen(self.system, frame)
         else:
             check_source(depth, K, T_world_camera, mask)
             if mask is None and floor is None:
@@ -229,6 +234,8 @@ class Agent:
         """
         begun, of, side = time.perf_counter(), self._current, self.system.description.camera.resolution
         self._check_budget()
+        _check(of.points is None, "an object of unknown size is seen by observe alone, in metres")
+        check_depth(depth, self.system.description.camera)
         image, placed = np.array(depth, np.float32), np.array(pose, np.float32)
         _check(
             image.shape == (side, side) and placed.shape == (4, 4),
@@ -238,26 +245,25 @@ class Agent:
             bool(np.isfinite(placed).all()) and bool(placed[:3, 3].any()),
             "pose is not finite, or at the object's centre",
         )
-        _check(of.points is None, "an object of unknown size is seen by observe alone, in metres")
         return self._add(image, placed, 0.0, begun)
 
     def _check_budget(self) -> None:
         _check(
-            self.history.views < self.max_views,
+            self._current.belief is None or self._current.belief.views < self.max_views,
             f"the budget of {self.max_views} views is spent; call reset, or make the agent with max_views above it",
         )
 
     def _add(self, depth: np.ndarray, pose: np.ndarray, unseen: float, begun: float) -> Belief:
-        of, count = self._current, self.history.views
+        of = self._current
         of.memory, found = of.programs.see(self.system.parts, of.memory, depth, pose)
-        probabilities, strangeness = jax.device_get(found)
+        (probabilities, strangeness), count = jax.device_get((found, of.memory.count))
         label = int(probabilities.argmax())
         belief = Belief(
             probabilities=probabilities,
             label=label,
             name=self.system.classes[label],
             confidence=float(probabilities[label]),
-            views=count + 1,
+            views=int(count),
             strangeness=float(strangeness),
             known=self.unknown is None or not strangeness > self.unknown,
             unseen=float(unseen),
@@ -274,7 +280,7 @@ class Agent:
         reachable: Reachable = None,
         *,
         cost: AnyVector | None = None,
-        candidates: AnyArray | None = None,
+        candidates: AnyArray | Sequence[AnyArray] | None = None,
     ) -> Step:
         """Chooses the next view, or ends.
 
@@ -282,18 +288,18 @@ class Agent:
             reachable: which candidates can be reached: a boolean mask, indices, or a function of a pose (4, 4); all by default.
             cost: of moving to each candidate, in any unit; `gain_per_cost` says what a unit is worth.
             candidates: (candidates, 4, 4) poses `T_world_camera` to choose from; by default the system's viewpoints, from which
-                the camera looks at the object's centre.
+                the camera looks at the object's centre. Poses inside its sphere or that look away from it are never chosen.
 
         Returns:
             The next pose; or, when done, why: `sure`, `budget`, `nothing reachable`, `unknown object`.
 
         Raises:
-            ValueError: for a mask or costs of another length, or poses that are no poses.
+            ValueError: for a mask or costs of another length, poses that are no poses, or if no candidate looks at the object.
         """
         begun, of = time.perf_counter(), self._current
-        where = self._lattice if candidates is None else self._given(candidates)
         poses = self.poses if candidates is None else np.asarray(candidates, float)
         number = len(poses)
+        where, useful = (self._lattice, np.ones(number, bool)) if candidates is None else self._given(poses)
         allowed = (
             np.array([bool(reachable(pose)) for pose in poses]) if callable(reachable) else mask_of(reachable, number)
         )
@@ -305,19 +311,21 @@ class Agent:
         _check(
             worth, "costs differ, but gain_per_cost is 0; make the agent with the gain that one unit of cost is worth"
         )
-        allowed = allowed & np.isfinite(costs)
-        priced = np.where(np.isfinite(costs), self.gain_per_cost * costs, 0.0)
+        allowed = allowed & useful & np.isfinite(costs)
+        weighted = np.where(np.isfinite(costs), self.gain_per_cost * costs, 0.0)
         reason = self._reason()
+        if not reason and not allowed.any():
+            reason = self._nothing()
         if not reason:
             wide = np.zeros((2, self.size), np.float32)
-            wide[0, :number], wide[1, :number] = allowed, priced
+            wide[0, :number], wide[1, :number] = allowed, weighted
             index, gains = jax.device_get(
                 of.programs.choose(
                     self.system.parts, of.memory, where, self._is_failed(where), wide[0] > 0, wide[1], self._key
                 )
             )
             if index < 0:
-                reason = "nothing reachable"
+                reason = self._nothing()
         elapsed = 1e3 * (time.perf_counter() - begun)
         if reason:
             step = Step(None, None, -1, float("nan"), True, reason, elapsed)
@@ -339,6 +347,10 @@ class Agent:
             return "unknown object"
         return "sure" if sure else "budget" if spent else ""
 
+    def _nothing(self) -> Reason:
+        belief = self._current.belief
+        return "nothing reachable" if belief is None or belief.known else "unknown object"
+
     @property
     def poses(self) -> Float[np.ndarray, "views 4 4"]:
         """Poses `T_world_camera` of the system's viewpoints around the object, in metres."""
@@ -347,17 +359,13 @@ class Agent:
         directions = self.system.viewpoints.astype(float) @ of.rotation.T
         return np.stack([pose_towards(one, of.center, distance, of.rotation[:, 2]) for one in directions])
 
-    def _given(self, candidates: AnyArray) -> core.Candidates:
-        poses = np.asarray(candidates, float)
-        _check(
-            poses.ndim == 3 and poses.shape[1:] == (4, 4) and len(poses) > 0 and bool(np.isfinite(poses).all()),
-            f"candidates must be poses (candidates, 4, 4) of finite numbers, got shape {poses.shape}",
-        )
+    def _given(self, poses: np.ndarray) -> tuple[core.Candidates, Bool[np.ndarray, " candidates"]]:
+        """Candidates of a caller, and which of them `observe` could use."""
         of = self._current
-        away = poses[:, :3, 3] - of.center
-        lengths = np.linalg.norm(away, axis=1)
-        _check(bool((lengths > 1e-9).all()), "a candidate is at the object's centre")
-        return candidates_of(self.system, (away / lengths[:, None]) @ of.rotation, self.size)
+        if not poses.size:
+            return self._lattice, np.zeros(len(poses), bool)
+        directions, useful = aimed(poses, of.center, of.radius)
+        return candidates_of(self.system, directions @ of.rotation, self.size), useful
 
     def mark_failed(self, step: Step | AnyArray) -> None:
         """Says that a view could not be taken, so that it is not chosen again.
@@ -370,6 +378,10 @@ class Agent:
         if pose is None or np.shape(pose) != (4, 4):
             raise ValueError("mark_failed needs a step that has a pose, or a pose (4, 4)")
         away = pose[:3, 3] - of.center
+        _check(
+            bool(np.isfinite(away).all() and np.linalg.norm(away) > 1e-9),
+            "mark_failed needs a pose of finite numbers, away from the object's centre",
+        )
         of.failed = np.concatenate([of.failed, (away / np.linalg.norm(away) @ of.rotation)[None]])
         self.history.events.append({"call": "mark_failed", "direction": of.failed[-1].tolist()})
 

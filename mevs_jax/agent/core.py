@@ -22,6 +22,8 @@ from mevs_jax.trained.parts import Parts
 from mevs_jax.trained.system import TrainedSystem
 from mevs_jax.viewpoints import ViewGraph
 
+REPEATED = 0.02
+"""Views whose directions differ by less, in radians, are one view taken again."""
 SAME = 1e-3
 """Directions closer than this, in radians, are the same view."""
 
@@ -91,15 +93,27 @@ def remember(
     direction: Float[Array, 3],
     posed: bool,
 ) -> Memory:
-    """The memory with one more view, and the belief after it."""
-    count = memory.count
-    seen = jax.tree.map(lambda history, now: history.at[count].set(now), memory.seen, observation)
-    memory = replace(memory, count=count + 1, directions=memory.directions.at[count].set(direction), seen=seen)
+    """The memory with one more view, and the belief after it.
+
+    A view from the direction of an earlier one takes its place: it holds no new evidence.
+    """
     most = len(memory.directions)
+    apart = jnp.where(jnp.arange(most) < memory.count, angles(direction[None], memory.directions)[0], jnp.inf)
+    again = jnp.min(apart) < REPEATED
+    slot = jnp.where(again, jnp.argmin(apart), memory.count)
+    before = memory.belief - jnp.where(again, memory.seen.logits[slot], 0.0)  # of a fusion that adds logits
+    seen = jax.tree.map(lambda history, now: history.at[slot].set(now), memory.seen, observation)
+    memory = replace(
+        memory,
+        count=memory.count + ~again,
+        directions=memory.directions.at[slot].set(direction),
+        seen=seen,
+        belief=before,
+    )
     graph = ViewGraph(memory.directions, jnp.zeros((most, most), bool), jnp.zeros((most, most)))
     state = SelectionState(
         count=memory.count,
-        view=count,
+        view=slot,
         attempted=jnp.arange(most) < memory.count,
         belief=memory.belief,
         latest=observation,

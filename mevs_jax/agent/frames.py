@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from mevs_jax.arrays import AnyArray, AnyVector
-from mevs_jax.source_view import upright
+from mevs_jax.source_view import checked_pose, upright
 
 
 def rotation_to_world(up: AnyVector, yaw: float) -> Float[np.ndarray, "3 3"]:
@@ -67,6 +67,39 @@ def points_of(
     return (rays * image[rows, columns, None]) @ pose[:3, :3].T + pose[:3, 3]
 
 
+def aimed(
+    poses: np.ndarray, center: Float[np.ndarray, " 3"], radius: float
+) -> tuple[Float[np.ndarray, "candidates 3"], Bool[np.ndarray, " candidates"]]:
+    """Directions of candidate cameras from an object, in the world; and which of them are outside its sphere and look at it.
+
+    Args:
+        poses: (candidates, 4, 4) `T_world_camera`.
+        center: of the object, in metres.
+        radius: of the object, in metres.
+
+    Raises:
+        ValueError: for another shape, a matrix that is no pose, a camera at the centre, or if none looks at the object.
+    """
+    if poses.ndim != 3 or poses.shape[1:] != (4, 4):
+        raise ValueError(f"candidates must be poses (candidates, 4, 4), got shape {poses.shape}")
+    for number, pose in enumerate(poses):
+        try:
+            checked_pose(pose)
+        except ValueError as error:
+            raise ValueError(f"candidate {number}: {error}") from error
+    away = poses[:, :3, 3] - center
+    lengths = np.linalg.norm(away, axis=1)
+    if (lengths < 1e-9).any():
+        raise ValueError("a candidate is at the object's centre")
+    directions = away / lengths[:, None]
+    looks = np.einsum("ni,ni->n", poses[:, :3, 2], directions) < 0
+    if not looks.any():
+        raise ValueError(
+            "no candidate looks at the object; T_world_camera takes the camera's axes x right, y down, z forward to the world"
+        )
+    return directions, looks & (lengths > radius)
+
+
 def mask_of(reachable: AnyArray | Sequence[int] | None, number: int) -> Bool[np.ndarray, " candidates"]:
     """A mask of candidates from what a caller gives: None for all, a boolean mask, or indices.
 
@@ -82,6 +115,8 @@ def mask_of(reachable: AnyArray | Sequence[int] | None, number: int) -> Bool[np.
         return given
     if given.size and (given.dtype.kind not in "iu" or given.min() < 0 or given.max() >= number):
         raise ValueError(f"reachable must be a boolean mask of {number} candidates, or indices from 0 to {number - 1}")
+    if given.size > 1 and len(np.unique(given)) < given.size:
+        raise ValueError("reachable repeats an index; a mask of zeros and ones must be boolean: reachable.astype(bool)")
     found = np.zeros(number, bool)
     found[given.astype(int).reshape(-1)] = True
     return found

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import partial
 from typing import Any
 
@@ -31,12 +31,14 @@ class Walk:
         beliefs: after each of them.
         reason: why it ended: `sure`, `budget`, `nothing reachable` or `unknown object`.
         history: everything, so that it can be saved and repeated.
+        left_out: recorded frames that could not be used, with the reason.
     """
 
     views: tuple[int, ...]
     beliefs: tuple[Belief, ...]
     reason: Reason
     history: History
+    left_out: dict[int, str] = field(default_factory=dict)
 
     @property
     def name(self) -> str:
@@ -53,6 +55,7 @@ class Walk:
             f"view {view:3d}: {belief.name} {100 * belief.confidence:.1f} %"
             for view, belief in zip(self.views, self.beliefs, strict=True)
         ]
+        lines += [f"view {view:3d}: left out, {why}" for view, why in self.left_out.items()]
         count = f"{len(self.views)} view{'s' * (len(self.views) > 1)}"
         lines.append(f"{self.name}, {100 * self.confidence:.1f} % confident after {count} ({self.reason})")
         return "\n".join(lines)
@@ -184,6 +187,8 @@ class Frames:
             raise ValueError(f"mask must have the shape of depth, {depth.shape}, got {mask.shape}")
         if "center" in stored and "radius" in stored:
             center, radius = np.asarray(stored["center"], float).reshape(-1), _number(stored, "radius")
+        elif "center" in stored or "radius" in stored:
+            raise ValueError("center and radius of the object belong together; give both, or neither and a mask")
         elif mask is not None:
             found = [points_of(*one) for one in zip(depth, K, poses, mask, strict=True)]
             center, radius = estimate_sphere(np.concatenate(found), up=stored.get("up", (0.0, 0.0, 1.0)))
@@ -215,14 +220,21 @@ def look_at_frames(agent: Agent, frames: Frames, *, first: int = 0) -> Walk:
         raise ValueError(f"first must be a frame from 0 to {number - 1}, got {first}")
     agent.reset(center=frames.center, radius=frames.radius, up=frames.up, yaw=frames.yaw)
     left, index = np.ones(number, bool), first
-    seen, beliefs = [], []
+    seen, beliefs, left_out = [], [], {}
     while True:
         mask = None if frames.mask is None else frames.mask[index]
         pose = frames.T_world_camera[index]
-        seen.append(index)
         left[index] = False
-        beliefs.append(agent.observe(frames.depth[index], frames.K[index], pose, mask=mask, floor=frames.floor))
+        try:
+            beliefs.append(agent.observe(frames.depth[index], frames.K[index], pose, mask=mask, floor=frames.floor))
+            seen.append(index)
+        except ValueError as error:
+            left_out[index] = str(error)
+            if not beliefs and not left.any():
+                raise
         step = agent.decide(left, candidates=frames.T_world_camera)
+        if step.done and not beliefs:
+            raise ValueError(f"no frame can be used; of the first, {next(iter(left_out.values()))}")
         if step.done:
-            return Walk(tuple(seen), tuple(beliefs), step.reason, agent.history)
+            return Walk(tuple(seen), tuple(beliefs), step.reason, agent.history, left_out)
         index = step.index

@@ -19,6 +19,8 @@ from mevs_jax.trained.system import TrainedSystem
 _REACH = 1.3
 """Points up to this many radii from the estimated centre belong to the object, since an estimate from one side is too small."""
 
+_LEAST = 0.5
+"""Share of an object's sphere that an image must show, and of a mask's pixels that must have a depth."""
 _AT_VIEWPOINT = 1e-5
 """Poses that differ by less, in radii, are the same to rounding. Sampling of a cloud has ties, which rounding would decide."""
 
@@ -52,6 +54,29 @@ class Present:
     failed: np.ndarray
     points: np.ndarray | None = None
     frames: list[Frame] = field(default_factory=list)
+
+    def seen(self, system: TrainedSystem, frame: Frame) -> CanonicalView:
+        """`converted`, of a new image.
+
+        Raises:
+            ValueError: for an image that shows too little of the object.
+        """
+        depth, *_, mask, _ = frame
+        view = self.converted(system, frame)
+        if view.in_image < _LEAST:
+            raise ValueError(
+                f"only {view.in_image:.0%} of the object's sphere is in the image, and half of it is needed; aim the camera at "
+                "its center, or move back"
+            )
+        if mask is not None and (inside := np.asarray(mask, bool)).any():
+            measured = np.asarray(depth)[inside]
+            share = float(np.mean((measured > 0) & np.isfinite(measured)))
+            if share < _LEAST:
+                raise ValueError(
+                    f"only {share:.0%} of the mask's pixels have a measured depth, and half of them are needed; move the camera, "
+                    "or take another image"
+                )
+        return view
 
     def converted(self, system: TrainedSystem, frame: Frame) -> CanonicalView:
         """The image of the data set's camera from the direction of an image."""
@@ -91,9 +116,9 @@ class Present:
         points = np.concatenate([self.points, found[near][:: max(1, int(near.sum()) // 5000)]])
         center, radius = sphere_of(points, self.rotation)
         if np.linalg.norm(center - self.center) + abs(radius - self.radius) < 0.01 * self.radius:
-            return replace(self, points=points, frames=[*self.frames, frame]), self.converted(system, frame)
+            return replace(self, points=points, frames=[*self.frames, frame]), self.seen(system, frame)
         again = replace(self, center=center, radius=radius, points=points, frames=[*self.frames, frame])
-        views = [again.converted(system, one) for one in again.frames]
+        views = [*(again.converted(system, one) for one in self.frames), again.seen(system, frame)]
         poses, again.memory = [self.placed(system, view) for view in views], self.programs.blank()
         for view, one in zip(views[:-1], poses[:-1], strict=True):
             again.memory, _ = self.programs.see(system.parts, again.memory, view.depth, one)

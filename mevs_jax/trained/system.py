@@ -13,6 +13,7 @@ from jaxtyping import Array, Float
 
 from mevs_jax.arrays import AnyArray
 from mevs_jax.cameras import look_at_origin
+from mevs_jax.inputs import check_depth
 from mevs_jax.policies.base import Observation, Policy
 from mevs_jax.policies.learned import learned
 from mevs_jax.policies.registry import POLICIES, policy_named
@@ -141,9 +142,10 @@ class TrainedSystem:
             pose: from the camera to the object's frame: origin at its centre, z up, unit the radius.
 
         Raises:
-            ValueError: for a depth image of another size.
+            ValueError: for a depth image of another size, of whole numbers, or not in radii.
         """
         side = self.description.camera.resolution
+        check_depth(depth, self.description.camera)
         if np.shape(depth) != (side, side):
             raise ValueError(
                 f"this system needs depth images of {side}×{side} pixels, got {'×'.join(map(str, np.shape(depth)))}; make one "

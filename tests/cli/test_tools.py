@@ -99,7 +99,8 @@ def test_what_cannot_be_looked_at_is_one_sentence(system, chair, frames, refuses
     assert "is no .npz of arrays" in refuses("look", "--system", system, "--depth", tmp_path / "text.npz")
     for change, message in (
         ({"depth": None}, "there is no array 'depth'"),
-        ({"radius": None}, "or a mask of its pixels"),
+        ({"radius": None}, "center and radius of the object belong together"),
+        ({"radius": None, "center": None}, "or a mask of its pixels"),
         ({"depth": np.zeros((6, 8))}, "depth must be (frames, height, width)"),
         ({"T_world_camera": np.zeros((5, 4, 4))}, "T_world_camera must be (6, 4, 4)"),
         ({"K": np.zeros(3)}, "K must be (3, 3)"),

@@ -219,7 +219,8 @@ def test_candidates_may_be_any_poses(classifier):
     step = agent.decide(candidates=around)
     np.testing.assert_array_equal(step.T_world_camera, around[step.index])
     assert agent.decide(candidates=around[:1]).index == 0
-    near = pose_towards(views[2][1][:3, 3] / 2 + np.array([0.01, 0, 0]), CENTER, 0.9, np.array([0, 0, 1.0]))
+    beside = views[2][1][:3, 3] / 2 + np.array([0.01, 0, 0])
+    near = pose_towards(beside / np.linalg.norm(beside), CENTER, 0.9, np.array([0, 0, 1.0]))
     assert agent.decide(candidates=near[None]).reason == "nothing reachable"  # it was seen from there
     with pytest.raises(ValueError, match="make it with max_candidates=200"):
         agent.decide(candidates=np.repeat(around[:1], 200, axis=0))

@@ -1,0 +1,141 @@
+"""What an agent does not take for evidence, and what it cannot use: one sentence each."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from mevs_jax.agent import Agent
+from mevs_jax.agent.frames import aimed, mask_of, pose_towards
+from mevs_jax.agent.looking import Frames, look_at_frames
+from mevs_jax.inputs import check_depth
+from tests.mevs_jax.agent.test_agent import CENTER, RADIUS, K, views_of
+from tests.mevs_jax.trained import making
+
+UP = np.array([0, 0, 1.0])
+
+
+@pytest.fixture(scope="module")
+def system():
+    return making.system("classifier")
+
+
+@pytest.fixture
+def agent(system):
+    made = Agent(system, stop=2, max_views=3, unknown=None)
+    made.reset(center=CENTER, radius=RADIUS, yaw=0.0)
+    return made
+
+
+def shot(system, view: int, aim=(0.0, 0.0, 0.0)) -> tuple[np.ndarray, np.ndarray]:
+    """Depth in metres and pose of a view; its camera may aim beside the object, which is then elsewhere in the image."""
+    direction = system.viewpoints[view].astype(float)
+    depth = making.depth_of_ball(direction)
+    return np.where(depth > 0, RADIUS * depth, np.inf).astype(np.float32), pose_towards(
+        direction, CENTER + aim, 0.6, UP
+    )
+
+
+def test_a_view_taken_again_is_no_new_evidence(system, agent):
+    first = agent.observe(*_camera(shot(system, 2)))
+    for _ in range(4):
+        again = agent.observe(*_camera(shot(system, 2)))
+    assert again.views == 1
+    np.testing.assert_allclose(again.probabilities, first.probabilities, atol=1e-5)
+    third, fourth = (agent.observe(*_camera(shot(system, view))) for view in (5, 7))
+    assert (third.views, fourth.views) == (2, 3)
+    other = Agent(system, stop=2, max_views=3)
+    other.reset(center=CENTER, radius=RADIUS, yaw=0.0)
+    for view in (2, 5, 7):
+        once = other.observe(*_camera(shot(system, view)))
+    np.testing.assert_allclose(fourth.probabilities, once.probabilities, atol=1e-5)
+    with pytest.raises(ValueError, match="the budget of 3 views is spent"):
+        agent.observe(*_camera(shot(system, 9)))
+
+
+def _camera(taken):
+    return taken[0], K, taken[1]
+
+
+def test_an_image_that_shows_too_little_is_refused(system, agent):
+    depth, pose = shot(system, 2)
+    turned = pose.copy()
+    angle = np.deg2rad(35)
+    turn = np.array([[np.cos(angle), 0, np.sin(angle)], [0, 1, 0], [-np.sin(angle), 0, np.cos(angle)]])
+    turned[:3, :3] = pose[:3, :3] @ turn
+    with pytest.raises(ValueError, match=r"only \d+% of the object's sphere is in the image, and half of it is needed"):
+        agent.observe(depth, K, turned)
+    mask, holes = np.isfinite(depth), depth.copy()
+    holes[np.random.default_rng(0).uniform(size=depth.shape) < 0.7] = 0
+    with pytest.raises(ValueError, match=r"only \d+% of the mask's pixels have a measured depth"):
+        agent.observe(holes, K, pose, mask=mask)
+    with pytest.raises(ValueError, match="mask has NaN"):
+        agent.observe(depth, K, pose, mask=np.full(depth.shape, np.nan))
+    assert agent.history.views == 0
+
+
+def test_views_that_are_not_in_radii_are_refused(system, agent):
+    depth, pose = views_of(system)[0]
+    for wrong, message in (
+        (0.1 * depth, r"an object seen from 2 radii has 0.9 to 3.1 radii"),
+        (900 * depth, r"make it from any camera's image with mevs_jax.canonical_view"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            agent.observe_view(wrong, pose)
+        with pytest.raises(ValueError, match=message):
+            system.observe(wrong, pose)
+    with pytest.raises(ValueError, match="of a floating type, got uint16"):
+        check_depth((1000 * depth).astype(np.uint16), system.description.camera)
+
+
+def test_nothing_to_choose_from_is_a_result(system, agent):
+    agent.observe(*_camera(shot(system, 2)))
+    for none in ([], np.zeros((0, 4, 4))):
+        step = agent.decide(candidates=none)
+        assert (step.done, step.reason, step.index) == (True, "nothing reachable", -1)
+    inside = np.stack([pose_towards(system.viewpoints[5].astype(float), CENTER, 0.5 * RADIUS, UP)])
+    assert agent.decide(candidates=inside).reason == "nothing reachable"
+    stranger = Agent(system, stop=2, max_views=3, unknown=1e-9)
+    stranger.reset(center=CENTER, radius=RADIUS, yaw=0.0)
+    if not stranger.observe(*_camera(shot(system, 2))).known:
+        assert stranger.decide(reachable=[]).reason == "unknown object"
+
+
+def test_candidates_that_are_no_cameras_at_the_object_are_refused(system, agent):
+    poses = agent.poses
+    opengl = poses @ np.diag([1.0, -1, -1, 1])
+    with pytest.raises(ValueError, match="no candidate looks at the object"):
+        agent.decide(candidates=opengl)
+    _, useful = aimed(np.concatenate([poses[:2], opengl[2:4]]), CENTER, RADIUS)
+    assert useful.tolist() == [True, True, False, False]
+    scaled = poses.copy()
+    scaled[1, :3, :3] *= 3
+    with pytest.raises(ValueError, match=r"candidate 1: .* is not a rotation"):
+        agent.decide(candidates=scaled)
+    with pytest.raises(ValueError, match="candidates must be poses"):
+        agent.decide(candidates=np.eye(4))
+    with pytest.raises(ValueError, match="away from the object's centre"):
+        agent.mark_failed(np.block([[np.eye(3), CENTER[:, None]], [0, 0, 0, 1]]))
+    near = Agent(system, distance=0.1)
+    with pytest.raises(ValueError, match=r"distance of 0.1 m is inside the object's radius of 0.3 m"):
+        near.reset(center=CENTER, radius=RADIUS)
+
+
+def test_zeros_and_ones_are_no_indices():
+    with pytest.raises(ValueError, match=r"reachable.astype\(bool\)"):
+        mask_of((np.arange(40) >= 20).astype(np.uint8), 40)
+    assert np.flatnonzero(mask_of([1, 0], 3)).tolist() == [0, 1]
+
+
+def test_frames_that_cannot_be_used_are_left_out_by_name(system):
+    shots = [shot(system, view) for view in range(6)]
+    depth, poses = np.stack([one[0] for one in shots]), np.stack([one[1] for one in shots])
+    depth[3] = 0
+    frames = Frames(depth, np.stack([K] * 6), poses, CENTER, RADIUS, UP, None, None, 0.0)
+    walk = look_at_frames(Agent(system, "farthest", stop=2, max_views=8, max_candidates=12), frames)
+    assert sorted(walk.views) == [0, 1, 2, 4, 5]
+    assert list(walk.left_out) == [3]
+    assert "view   3: left out, depth has no measured pixel" in str(walk)
+    nothing = Frames(np.zeros_like(depth), np.stack([K] * 6), poses, CENTER, RADIUS, UP, None, None, 0.0)
+    with pytest.raises(ValueError, match="no measured pixel"):
+        look_at_frames(Agent(system, "farthest", stop=2, max_views=8, max_candidates=12), nothing)
