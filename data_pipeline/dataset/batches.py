@@ -72,7 +72,7 @@ def sample_pixels(depth: np.ndarray, points: int, random: np.random.Generator) -
     return np.resize(random.permutation(hit), points).astype(np.int32)
 
 
-def select_views(
+def views_of_example(
     example: dict[str, Any], views: np.ndarray, *, points: int, images: str | None, random: np.random.Generator
 ) -> dict[str, np.ndarray]:
     """Returns the given views of one object as arrays with a leading axis of views.
@@ -104,7 +104,7 @@ class _DrawViews(grain.transforms.RandomMap):
     def random_map(self, element: dict[str, Any], rng: np.random.Generator) -> dict[str, np.ndarray]:
         config = self.config
         views = rng.choice(element["trainable"], config.views_per_object, replace=False)
-        return select_views(element, views, points=config.points, images=config.images, random=rng)
+        return views_of_example(element, views, points=config.points, images=config.images, random=rng)
 
 
 def fold_of(objects: int, folds: int) -> np.ndarray:
@@ -192,7 +192,7 @@ def validation_batches(
             aside = views_aside(count, index, config.seed)
             keep = aside[: max(1, round(VIEWS_ASIDE * views))] if views else aside
         random = np.random.default_rng([config.seed, index])
-        yield select_views(example, keep, points=config.points, images=config.images, random=random)
+        yield views_of_example(example, keep, points=config.points, images=config.images, random=random)
 
 
 def _join(elements: list[dict[str, np.ndarray]]) -> dict[str, np.ndarray]:
@@ -250,7 +250,7 @@ def evaluation_batches(
 ) -> Iterator[dict[str, np.ndarray]]:
     """Yields all views of the objects of a split, one object per batch, in the order of the shards; equal at every call.
 
-    Batches are those of `select_views`, with the key `position`: the position of the object in the split, for each view.
+    Batches are those of `views_of_example`, with the key `position`: the position of the object in the split, for each view.
 
     Args:
         chosen: positions of the objects; all by default.
@@ -260,5 +260,5 @@ def evaluation_batches(
         example = source[index]
         views = np.arange(len(example["entropy"]))
         random = np.random.default_rng([seed, index])
-        batch = select_views(example, views, points=points, images=images, random=random)
+        batch = views_of_example(example, views, points=points, images=images, random=random)
         yield batch | {"position": np.full(len(views), index, np.int32)}

@@ -21,7 +21,7 @@ import jax.numpy as jnp
 import numpy as np
 from flax import nnx
 
-from data_pipeline.dataset.batches import select_views
+from data_pipeline.dataset.batches import views_of_example
 from data_pipeline.dataset.builder import open_split
 from data_pipeline.objects.mesh import Mesh
 from eval.rendering.ascent import Method, ascend_on_sphere
@@ -60,7 +60,9 @@ def time_predictor(
         clouds = []
         for index in random.choice(members, runs):
             views = random.integers(task.views, size=1)
-            chosen = select_views(source[index], views, points=task.network_config.points, images=None, random=random)
+            chosen = views_of_example(
+                source[index], views, points=task.network_config.points, images=None, random=random
+            )
             clouds.append(task.inputs({name: jnp.asarray(array) for name, array in chosen.items()})[0])
         times = milliseconds(partial(predict, state), clouds)
         out[name] = [float(times.mean()), float(times.std())]

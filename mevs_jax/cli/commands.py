@@ -98,13 +98,13 @@ COMMANDS = {
     ),
     "study learned": Command(
         "learn to fuse views and to choose them; compare with all policies",
-        "WithViews",
+        "StudyOptions",
         ("dataset", "learned"),
         "studies:learned",
     ),
     "study rendering": Command(
         "policies by differentiable rendering; evaluate and report again",
-        "WithViews",
+        "StudyOptions",
         ("dataset", "rendering", "evaluation"),
         "studies:rendering",
     ),
@@ -180,7 +180,7 @@ common options:
   --pretrained FILE ...   ImageNet weights for the classifiers: torchvision's .pth or .safetensors
   --policy FILE.py:NAME   a policy of your own, evaluated like all others (docs/own.md)
   --encoder FILE.py:NAME  a network of your own as the classifier
-  --seed N                seed of everything that is random (default 0)
+  --seed N                seed of weights, training and random policies (default 0)
   --print-config          print the resolved configuration as JSON, and stop
 
 `mevs COMMAND --help` lists the options of a command, --help-all its settings too. Examples:

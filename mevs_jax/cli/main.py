@@ -243,7 +243,7 @@ def main() -> None:
 
 
 def _main(arguments: list[str]) -> None:
-    if not arguments or arguments[0] in _HELP:
+    if not arguments or arguments[0] in (*_HELP, "--help-all"):
         print(help_text(), end="")
         sys.exit(0 if arguments else 2)
     if arguments[0] == "--version":

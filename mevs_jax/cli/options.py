@@ -67,7 +67,7 @@ class WithEncoder(Options):
 
 
 @dataclass(frozen=True)
-class WithData(WithSeed):
+class WithData(Options):
     """Commands that make a data set."""
 
     data: Annotated[str | None, _arg("SOURCE", "furniture10, built in")] = None
@@ -82,6 +82,11 @@ class WithViews(WithData):
 
     views: Annotated[int | None, _arg("N", "40")] = None
     """number of candidate viewpoints around an object"""
+
+
+@dataclass(frozen=True)
+class StudyOptions(WithViews, WithSeed):
+    """Options of studies of one data set."""
 
 
 @dataclass(frozen=True)

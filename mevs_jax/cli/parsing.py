@@ -41,11 +41,12 @@ class Invocation:
 
 
 def tool_options(name: str, arguments: list[str]) -> Any:
-    """The options of a tool, which has no settings.
+    """The options of a tool, which has no settings, so that `--help-all` is `--help`.
 
     Raises:
         SystemExit: for options that tyro refuses, after its message.
     """
+    arguments = ["--help" if argument == "--help-all" else argument for argument in arguments]
     return tyro.cli(
         _class_of(COMMANDS[name]), prog=f"mevs {name}", description=f"{COMMANDS[name].title}.", args=arguments
     )
