@@ -29,7 +29,7 @@ if "PYTEST_XDIST_WORKER" not in os.environ:
     atexit.register(shutil.rmtree, compiled, ignore_errors=True)
     os.environ |= {"JAX_COMPILATION_CACHE_DIR": compiled, "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0.05"}
     # Tests compile much and run little: without most optimisations, and by XLA's older emitters, that takes a third of the time.
-    # What is compared with PyTorch and plain loops, and what runs long, has all optimisations (`fully_compiled`).
+    # What runs long has all optimisations (`fully_compiled`); CI compares with PyTorch and plain loops with all of them, too.
     jaxlib = tuple(map(int, version("jaxlib").split(".")[:2]))
     if not DEFAULT_FLAGS:
         if jaxlib < (0, 11):  # later versions have the newer emitters alone, and end at the name of this flag

@@ -180,6 +180,7 @@ def test_a_dearer_way_is_a_shorter_one(tables, graph, knowledge):
     assert means[0] > means[1] > means[2]
 
 
+@pytest.mark.slow
 def test_devices_and_chunks_change_nothing(tables, graph, knowledge, tmp_path):
     """Eight simulated devices, and fewer walks at once, give the numbers of one device, which this process has."""
     save_view_tables(tmp_path / "t.npz", tables)

@@ -132,7 +132,6 @@ def fingerprint(array: np.ndarray) -> np.ndarray:
     return np.concatenate([[np.linalg.norm(array), array.sum()], flat])
 
 
-@pytest.mark.usefixtures("fully_compiled")
 @pytest.mark.parametrize(
     "kind", [pytest.param(kind, marks=[pytest.mark.slow] * (kind == "resnet34")) for kind in KINDS]
 )
@@ -149,7 +148,6 @@ def test_forward_and_gradients_equal_stored_pytorch(kind):
 @pytest.mark.skipif(
     importlib.util.find_spec("torch") is None, reason="PyTorch is not installed; stored outputs are compared"
 )
-@pytest.mark.usefixtures("fully_compiled")
 @pytest.mark.parametrize("kind", KINDS)
 def test_forward_gradients_and_running_statistics_equal_live_pytorch(kind):
     from tests.reference.torch_networks import run

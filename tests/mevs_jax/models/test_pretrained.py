@@ -31,7 +31,6 @@ def weights(tmp_path_factory) -> Path:
     return path
 
 
-@pytest.mark.usefixtures("fully_compiled")
 def test_weights_from_a_file_give_pytorchs_outputs(weights):
     """Features are compared, since the head stays new: the stored logits are the file's head on them."""
     network = untrained(lambda: ResNet(depth=18, rngs=nnx.Rngs(0)))

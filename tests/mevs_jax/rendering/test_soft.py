@@ -210,7 +210,7 @@ def volume_of(name: str) -> np.ndarray:
 @pytest.mark.parametrize(
     ("values", "thing", "directions"),
     [
-        (of_mesh, lambda name: triangles_of(name)[:24], 8),
+        pytest.param(of_mesh, lambda name: triangles_of(name)[:24], 8, marks=pytest.mark.slow),
         pytest.param(
             of_mesh,
             lambda name: triangles_of(name)[:128],
@@ -291,6 +291,7 @@ def test_the_approximate_gradient_is_finite_everywhere_and_agrees_with_the_soft_
     assert np.median(agree) > 0.95
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("fully_compiled")
 def test_climbing_with_the_approximate_gradient_rises():
     value = lambda pose: silhouette_gaussian(render_silhouette(triangles_of("sofa")[:512], Camera(pose, resolution=32)))  # noqa: E731
@@ -411,7 +412,6 @@ def test_a_surface_is_reconstructed_through_what_was_seen():
 
 
 @pytest.mark.parametrize("method", ["volume", pytest.param("mesh", marks=pytest.mark.slow)])
-@pytest.mark.usefixtures("fully_compiled")
 def test_the_command_climbs_and_draws(method, tmp_path):
     from PIL import Image
 
