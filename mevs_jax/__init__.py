@@ -14,8 +14,11 @@ _MODULES = {
     "agent": (
         "Agent",
         "Belief",
+        "History",
         "Step",
+        "load_history",
         "look",
+        "replay",
     ),
     "beliefs": (
         "CalibratedFusion",
