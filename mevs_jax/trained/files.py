@@ -40,6 +40,8 @@ SHIPPED = Path(__file__).parents[1] / "systems"
 LARGEST = 2**31
 """Largest size of a file of weights in bytes."""
 LARGEST_DESCRIPTION = 2**24
+LARGEST_SIZE, MOST_LAYERS = 2**16, 64
+"""Largest number in the shape of a network, and of its layers."""
 _HUB_ID = re.compile(r"[A-Za-z0-9][\w.-]{0,95}/[A-Za-z0-9][\w.-]{0,95}")
 
 
@@ -291,9 +293,23 @@ def check(description: Description) -> None:
         raise ValueError("the number of points of a cloud is impossible")
     if (description.kind == "recogniser") != (description.fusion is not None):
         raise ValueError("a recogniser, and nothing else, has a fusion")
+    shapes = description.encoder, description.fusion, description.entropy, *description.view_policies.values()
+    for shape in filter(None, shapes):
+        _check_sizes(asdict(shape))
     for name in (description.best, description.best_unposed):
         if name not in POLICIES and name not in description.view_policies:
             raise ValueError(f"it has no policy {name!r:.40}")
+
+
+def _check_sizes(shape: Any, least: int = 1) -> None:
+    """Raises `ValueError` for numbers that no network has, before anything is made from them."""
+    if isinstance(shape, dict | list | tuple):
+        if len(shape) > MOST_LAYERS:
+            raise ValueError(f"a network has {len(shape)} layers")
+        for name, part in shape.items() if isinstance(shape, dict) else enumerate(shape):
+            _check_sizes(part, least=0 if name == "blocks" else 1)  # a fusion may have none
+    elif type(shape) in (int, float) and not (0 if isinstance(shape, float) else least) <= shape <= LARGEST_SIZE:
+        raise ValueError(f"a network has the size {shape!r:.20}")
 
 
 def _read_weights(path: Path, expected: Any) -> bytes:

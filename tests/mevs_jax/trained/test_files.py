@@ -111,6 +111,7 @@ CHANGES = {
     "no width": lambda c: c["encoder"].pop("width"),
     "a width of text": lambda c: c["encoder"].update(width="8"),
     "a negative width": lambda c: c["encoder"].update(width=-8),
+    "a width beyond all": lambda c: c["encoder"].update(width=10**5),
     "an unknown depth": lambda c: c["encoder"].update(depth=11),
     "no classes": lambda c: c.update(classes=[]),
     "two classes of one name": lambda c: c.update(classes=["a", "a", "b", "c"]),
@@ -197,6 +198,29 @@ def test_weights_of_another_form_are_refused(written, tmp_path):
     (copy / WEIGHTS).unlink()
     with pytest.raises(UnreadableSystem, match="is missing"):
         load(copy)
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        lambda level, entropy: level.update(centres=10**9),
+        lambda level, entropy: level.update(centres=-1),
+        lambda level, entropy: level.update(samples=0),
+        lambda level, entropy: level.update(radius=float("nan")),
+        lambda level, entropy: entropy.update(head_layers=[8] * 200_000),
+        lambda level, entropy: entropy.update(abstractions=[level] * 100),
+    ],
+)
+def test_networks_of_impossible_sizes_are_not_made(change, tmp_path):
+    save(making.system("classifier"), tmp_path / "system")
+
+    def changed(content):
+        change(content["entropy"]["abstractions"][0], content["entropy"])
+
+    with pytest.raises(
+        UnreadableSystem, match=r"a network has (the size|\d+ layers)|radius is nan, not a finite number"
+    ):
+        load(damaged(tmp_path / "system", tmp_path, changed))
 
 
 def test_any_damage_of_the_files_is_one_sentence(written, tmp_path):
