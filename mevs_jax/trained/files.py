@@ -308,7 +308,9 @@ def _check_sizes(shape: Any, least: int = 1) -> None:
             raise ValueError(f"a network has {len(shape)} layers")
         for name, part in shape.items() if isinstance(shape, dict) else enumerate(shape):
             _check_sizes(part, least=0 if name == "blocks" else 1)  # a fusion may have none
-    elif type(shape) in (int, float) and not (0 if isinstance(shape, float) else least) <= shape <= LARGEST_SIZE:
+    elif isinstance(shape, bool) or not isinstance(shape, int | float):
+        return
+    elif not (0 if isinstance(shape, float) else least) <= shape <= LARGEST_SIZE:
         raise ValueError(f"a network has the size {shape!r:.20}")
 
 
