@@ -293,9 +293,10 @@ def check(description: Description) -> None:
         raise ValueError("the number of points of a cloud is impossible")
     if (description.kind == "recogniser") != (description.fusion is not None):
         raise ValueError("a recogniser, and nothing else, has a fusion")
-    shapes = description.encoder, description.fusion, description.entropy, *description.view_policies.values()
-    for shape in filter(None, shapes):
-        _check_sizes(asdict(shape))
+    shapes = (description.encoder, description.fusion, description.entropy, *description.view_policies.values())
+    for shape in shapes:
+        if shape is not None:
+            _check_sizes(asdict(shape))
     for name in (description.best, description.best_unposed):
         if name not in POLICIES and name not in description.view_policies:
             raise ValueError(f"it has no policy {name!r:.40}")
