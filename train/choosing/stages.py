@@ -141,6 +141,14 @@ def check_learned(config: LearnedConfig, views: int) -> None:
         raise DataError("--learned.folds must be at least 2 and --learned.seeds at least 1")
     if config.changed < 0:
         raise DataError(f"--learned.changed must be at least 0, got {config.changed}")
+    network, optimiser = config.recogniser.network, config.recogniser.optimiser
+    if (network.channels, network.standardise) != (4, False) or optimiser.validation_by != "object":
+        raise DataError(
+            "the recogniser sees depth and normals, four channels that are not standardised, and is validated by object; leave "
+            "out --learned.recogniser.network.channels, .standardise and --learned.recogniser.optimiser.validation-by"
+        )
+    if {optimiser.seed, optimiser.data_seed, config.policy.seed, config.q_learning.seed} - {0, config.seed}:
+        raise DataError("the seeds of a study are counted up from --learned.seed; leave out those of its networks")
     for name in config.ablations:
         if name not in ABLATIONS:
             raise DataError(f"unknown ablation {name!r} in --learned.ablations; choose from {', '.join(ABLATIONS)}")

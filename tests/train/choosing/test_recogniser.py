@@ -119,6 +119,15 @@ def test_an_epoch_without_a_part_is_shorter(turned):
     ("changes", "said"),
     [
         ({"folds": 1}, "--learned.folds must be at least 2"),
+        ({"policy": replace(TINY.learned.policy, seed=3)}, "counted up from --learned.seed"),
+        (
+            {
+                "recogniser": replace(
+                    TINY.learned.recogniser, network=replace(TINY.learned.recogniser.network, channels=1)
+                )
+            },
+            "four channels that are not standardised",
+        ),
         ({"seeds": 0}, "--learned.seeds at least 1"),
         ({"changed": -1}, "--learned.changed must be at least 0, got -1"),
         ({"ablations": ("magic",)}, "unknown ablation 'magic'"),
