@@ -143,7 +143,7 @@ def _map(function: Callable, clouds: Any, at_once: int = 1) -> Any:
     device busy and bounds the memory (64 clouds of the thesis's size take 2 GB). A symbolic number of clouds, in exported
     programs, cannot be divided into batches: clouds are then processed one by one.
     """
-    if not jax.core.is_constant_dim(jax.tree.leaves(clouds)[0].shape[0]):
+    if not isinstance(jax.tree.leaves(clouds)[0].shape[0], int):
         return jax.lax.map(function, clouds)
     return jax.lax.map(function, clouds, batch_size=at_once if jax.default_backend() == "cpu" else 64)
 
