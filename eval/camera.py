@@ -140,9 +140,9 @@ def agreement(view: CanonicalView, truth: np.ndarray, visible: float = 1.0) -> A
     """Compares a canonical view with the image of the data set's camera from its direction (`cast_canonical`)."""
     ours, theirs = view.depth > 0, truth > 0
     both = ours & theirs
-    overlap = both.sum() / max(1, (ours | theirs).sum())
+    overlap = int(both.sum()) / max(1, int((ours | theirs).sum()))
     error = float(np.median(np.abs(view.depth - truth)[both])) if both.any() else math.nan
-    return Agreement(float(overlap), error, view.unknown, visible)
+    return Agreement(overlap, error, view.unknown, visible)
 
 
 def visible_share(cast: Cast, shot: Shot, truth: np.ndarray, view: CanonicalView, camera: ViewCamera) -> float:
