@@ -2,8 +2,11 @@
 
 from mevs_jax.agent import Agent as Agent
 from mevs_jax.agent import Belief as Belief
+from mevs_jax.agent import History as History
 from mevs_jax.agent import Step as Step
+from mevs_jax.agent import load_history as load_history
 from mevs_jax.agent import look as look
+from mevs_jax.agent import replay as replay
 from mevs_jax.beliefs import CalibratedFusion as CalibratedFusion
 from mevs_jax.beliefs import confidence as confidence
 from mevs_jax.beliefs import discounted as discounted
