@@ -23,8 +23,8 @@ def check_depth(depth: AnyArray, camera: ViewCamera) -> None:
     Raises:
         ValueError: for whole numbers; and, where numbers are known, for depth outside the object's sphere.
     """
-    if not jnp.issubdtype(jnp.asarray(depth).dtype, jnp.floating):
-        raise ValueError(f"depth must be in radii of the object, of a floating type, got {jnp.asarray(depth).dtype}")
+    if not jnp.issubdtype(depth.dtype, jnp.floating):
+        raise ValueError(f"depth must be in radii of the object, of a floating type, got {depth.dtype}")
     if isinstance(depth, np.ndarray) and (hit := depth[depth > 0]).size:
         near, far = camera.distance - 1 - _BEYOND, camera.distance + 1 + _BEYOND
         if not (near <= hit.min() and hit.max() <= far):

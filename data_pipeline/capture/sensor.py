@@ -13,6 +13,7 @@ take one image: `jax.vmap` them over views and objects.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Literal
 
@@ -21,7 +22,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from mevs_jax.arrays import AnyArray
-from mevs_jax.cameras import ViewCamera, pixel_directions
+from mevs_jax.cameras import ViewCamera, partial_cloud, pixel_directions
 from mevs_jax.inputs import depth_and_normals
 
 Kind = Literal["none", "structured-light", "stereo"]
@@ -61,13 +62,13 @@ REALSENSE = Triangulation(focal=424.0, baseline=0.050, step=1 / 32)
 SUBPIXEL = 0.08
 """Standard deviation of a D435's disparity on a textured surface, in pixels."""
 
-_GRAZING, _GRAZING_WIDTH = jnp.deg2rad(78.0), jnp.deg2rad(3.0)
+_GRAZING, _GRAZING_WIDTH = math.radians(78), math.radians(3)
 _AT_EDGE, _FLYING, _DARK = 0.3, 0.2, 0.05
 _FAR = 0.3
 """Metres between an edge and what is behind it, where nothing of the object is."""
 _JUMP = 0.05
 """Difference between neighbours that is an edge, as a share of the depth."""
-_STEEPEST = jnp.deg2rad(85.0)
+_STEEPEST = math.radians(85)
 
 
 def axial_deviation(
@@ -84,7 +85,7 @@ def axial_deviation(
     if kind == "stereo":
         return jnp.square(depth) * SUBPIXEL / (REALSENSE.focal * REALSENSE.baseline)
     steep = 1e-4 / jnp.sqrt(jnp.maximum(depth, 0.1)) * jnp.square(angle / (jnp.pi / 2 - angle))
-    return 0.0012 + 0.0019 * jnp.square(depth - 0.4) + jnp.where(angle > jnp.deg2rad(60.0), steep, 0.0)
+    return 0.0012 + 0.0019 * jnp.square(depth - 0.4) + jnp.where(angle > math.radians(60), steep, 0.0)
 
 
 def lateral_deviation(angle: Float[AnyArray, "height width"]) -> Float[Array, "height width"]:
@@ -120,22 +121,22 @@ def sense(
     keys = dict(zip(("across", "along", "mix", "mixed", "lost", "dark"), jax.random.split(key, 6), strict=True))
     scale = config.distance / camera.distance  # metres in a radius
     metres, angle = depth * scale, _angle(depth, camera)
-    hit = metres > 0
+    sensor = REALSENSE
     if config.kind == "structured-light":
+        sensor = KINECT
         metres, angle = _displaced(keys["across"], metres, angle, strength, camera)
-        hit = metres > 0
     found = metres + strength * axial_deviation(metres, angle, config.kind) * jax.random.normal(
         keys["along"], depth.shape
     )
     behind, edge = _behind(metres)
     mixed = edge & jax.random.bernoulli(keys["mix"], _share(_FLYING, strength), depth.shape)
     found = jnp.where(mixed, found + jax.random.uniform(keys["mixed"], depth.shape) * (behind - metres), found)
-    found = _rounded(found, KINECT if config.kind == "structured-light" else REALSENSE, strength)
+    found = _rounded(found, sensor, strength)
     kept = (1 - _share(_AT_EDGE, strength) * edge) * (
         1 - _share(jax.nn.sigmoid((angle - _GRAZING) / _GRAZING_WIDTH), strength)
     )
     dark = _dark(keys["dark"] if surface is None else surface, depth, pose, camera, _share(_DARK, strength))
-    seen = hit & ~dark & (jax.random.uniform(keys["lost"], depth.shape) < kept) & (found > 0)
+    seen = (metres > 0) & ~dark & (jax.random.uniform(keys["lost"], depth.shape) < kept) & (found > 0)
     return jnp.where(seen, found / scale, 0.0)
 
 
@@ -194,9 +195,8 @@ def _dark(
 ) -> Bool[Array, "height width"]:
     """Pixels of areas too dark to be measured: where a smooth random field over the object's space is largest."""
     waves, phases = jax.random.split(key)
-    points = pixel_directions(camera.at(jnp.eye(4), len(depth))) * depth[..., None]
-    pose = jnp.asarray(pose, jnp.float32)
-    points = points @ pose[:3, :3].T + pose[:3, 3]
+    points, hit = partial_cloud(depth, camera.at(jnp.asarray(pose, jnp.float32), len(depth)))
     angles = points @ (3.0 * jax.random.normal(waves, (3, 16))) + jax.random.uniform(phases, (16,), maxval=2 * jnp.pi)
     field = jnp.sqrt(2 / 16) * jnp.sum(jnp.cos(angles), axis=-1)  # about normal with variance 1
-    return (depth > 0) & (field > jax.scipy.stats.norm.isf(jnp.clip(share, 1e-12, 1 - 1e-7))) & (share > 0)
+    dark = hit & (field > jax.scipy.stats.norm.isf(jnp.clip(share, 1e-12, 1 - 1e-7))) & (share > 0)
+    return dark.reshape(depth.shape)

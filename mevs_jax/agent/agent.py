@@ -314,8 +314,6 @@ class Agent:
         allowed = allowed & useful & np.isfinite(costs)
         weighted = np.where(np.isfinite(costs), self.gain_per_cost * costs, 0.0)
         reason = self._reason()
-        if not reason and not allowed.any():
-            reason = self._nothing()
         if not reason:
             wide = np.zeros((2, self.size), np.float32)
             wide[0, :number], wide[1, :number] = allowed, weighted
@@ -325,7 +323,7 @@ class Agent:
                 )
             )
             if index < 0:
-                reason = self._nothing()
+                reason = "nothing reachable" if of.belief is None or of.belief.known else "unknown object"
         elapsed = 1e3 * (time.perf_counter() - begun)
         if reason:
             step = Step(None, None, -1, float("nan"), True, reason, elapsed)
@@ -346,10 +344,6 @@ class Agent:
         if not belief.known and (sure or spent):
             return "unknown object"
         return "sure" if sure else "budget" if spent else ""
-
-    def _nothing(self) -> Reason:
-        belief = self._current.belief
-        return "nothing reachable" if belief is None or belief.known else "unknown object"
 
     @property
     def poses(self) -> Float[np.ndarray, "views 4 4"]:

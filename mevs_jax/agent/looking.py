@@ -230,8 +230,6 @@ def look_at_frames(agent: Agent, frames: Frames, *, first: int = 0) -> Walk:
             seen.append(index)
         except ValueError as error:
             left_out[index] = str(error)
-            if not beliefs and not left.any():
-                raise
         step = agent.decide(left, candidates=frames.T_world_camera)
         if step.done and not beliefs:
             raise ValueError(f"no frame can be used; of the first, {next(iter(left_out.values()))}")

@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from mevs_jax.arrays import AnyArray
-from mevs_jax.cameras import look_at_origin
+from mevs_jax.cameras import cameras_at
 from mevs_jax.inputs import check_depth
 from mevs_jax.policies.base import Observation, Policy
 from mevs_jax.policies.learned import learned
@@ -64,7 +64,7 @@ class TrainedSystem:
     @cached_property
     def poses(self) -> Float[np.ndarray, "views 4 4"]:
         """Poses of the camera at the viewpoints, in the frame of an upright object, in radii."""
-        return np.stack([look_at_origin(self.description.camera.distance * point) for point in self.viewpoints])
+        return np.asarray(cameras_at(self.viewpoints, distance=self.description.camera.distance).pose)
 
     @cached_property
     def graph(self) -> ViewGraph:
