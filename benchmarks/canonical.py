@@ -1,9 +1,9 @@
 """How well images of any depth camera become those of the data set's camera: `python benchmarks/canonical.py [FOLDER]`.
 
-Random cameras take images of objects (`eval.camera`), `mevs_jax.canonical_view` converts them, and the results are compared with
-what the data set's camera takes from the same directions: the overlap (intersection over union) of the masks, and depth where
-both images show the object. "Visible" is the share of the object's pixels that the random camera sees at all, which bounds
-the overlap. Then the conversion is timed. The objects are furniture10's, or the meshes in FOLDER and below.
+Random cameras take images of objects (`eval.checks.camera`), `mevs_jax.canonical_view` converts them, and the results are
+compared with what the data set's camera takes from the same directions: the overlap (intersection over union) of the masks, and
+depth where both images show the object. "Visible" is the share of the object's pixels that the random camera sees at all,
+which bounds the overlap. Then the conversion is timed. The objects are furniture10's, or the meshes in FOLDER and below.
 
 The tables are written to `benchmarks/results/canonical.json` and `canonical.md`.
 """
@@ -27,9 +27,9 @@ from data_pipeline.objects.formats import MESH_SUFFIXES
 from data_pipeline.objects.mesh import Mesh, normalise
 from data_pipeline.objects.recipes import MeshFile
 from data_pipeline.objects.sources import furniture10, load_object
-from eval.camera import SIZES, agreements, milliseconds, summary
-from eval.report.markdown import markdown_row, markdown_table
+from eval.checks.camera import SIZES, agreements, milliseconds, summary
 from mevs_jax import ViewCamera
+from mevs_jax.markdown import markdown_row, markdown_table
 
 RESULTS = Path(__file__).parent / "results" / "canonical.json"
 DISTANCES = (2.0, 1.5, 3.0, 4.0, 5.0, 6.0)

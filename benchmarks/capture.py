@@ -33,8 +33,8 @@ from data_pipeline.files import write_json, write_text
 from data_pipeline.objects.mesh import Mesh, ObjectEntry
 from data_pipeline.objects.recipes import FurniturePiece
 from data_pipeline.objects.sources import load_object
-from eval.report.markdown import markdown_row, markdown_table
 from mevs_jax import Camera
+from mevs_jax.markdown import markdown_row, markdown_table
 from mevs_jax.rendering import pad_triangles, render_depth
 
 RESULTS = Path(__file__).parent / "results" / "capture.json"

@@ -26,9 +26,9 @@ from scipy.ndimage import label as connected
 from data_pipeline.dataset.builder import open_split
 from data_pipeline.files import write_text
 from eval.numbers.comparison import intervals
-from eval.report.markdown import markdown_table
 from eval.settings import PRESETS
 from mevs_jax.beliefs import CalibratedFusion
+from mevs_jax.markdown import markdown_table
 from train.choosing.calibrated import beliefs_of_sets
 from train.choosing.features import Features, sets_of_size
 from train.choosing.stages import Stages

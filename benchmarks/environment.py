@@ -26,8 +26,8 @@ import numpy as np
 import tyro
 
 from data_pipeline.files import write_text
-from eval.report.markdown import markdown_table
 from mevs_jax import ActiveRecognition, ViewGraph, ViewTable, fibonacci_sphere
+from mevs_jax.markdown import markdown_table
 
 RESULT = Path(__file__).parent / "results" / "environment.md"
 OBJECTS, VIEWS, CLASSES, MAX_VIEWS = 800, 40, 10, 9

@@ -22,10 +22,10 @@ import jax.numpy as jnp
 import numpy as np
 
 from data_pipeline.files import write_json
-from eval.report.markdown import markdown_table
 from eval.walks.grid import FIRST_MV, LAST_MV, THRESHOLDS, run_grid
 from eval.walks.ladder import Rung
 from mevs_jax import Knowledge, ViewGraph, ViewTable, fibonacci_sphere
+from mevs_jax.markdown import markdown_table
 from tests.reference import numpy_rules
 
 OBJECTS, VIEWS, CLASSES, BACKBONES = 908, 40, 10, 3

@@ -36,7 +36,6 @@ from scipy.spatial import cKDTree
 
 from data_pipeline.files import read_json, write_json, write_text
 from eval.numbers.timing import time_local_maxima
-from eval.report.markdown import markdown_row, markdown_table
 from mevs_jax import (
     NextView,
     PointNet2,
@@ -46,6 +45,7 @@ from mevs_jax import (
     fibonacci_sphere,
     pointnet2_from_torch,
 )
+from mevs_jax.markdown import markdown_row, markdown_table
 from tests.reference import numpy_rules
 from tests.reference.weights import made_up_weights
 

@@ -26,11 +26,11 @@ from flax import nnx
 
 from data_pipeline.dataset.statistics import load_statistics
 from data_pipeline.files import write_text
-from eval.report.markdown import markdown_table
 from eval.settings import PRESETS
 from eval.stages import tasks
 from eval.tables import objects_of
 from mevs_jax import bootstrap_interval, maxima_first
+from mevs_jax.markdown import markdown_table
 from mevs_jax.models.batch_norm import BatchNorm
 from train.loop import load_best
 from train.outputs import network_outputs

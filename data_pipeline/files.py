@@ -194,7 +194,12 @@ def read_json(path: Path) -> Any:
 
 def digest_of(content: Any) -> str:
     """Returns a short hash of what JSON can hold; the order of entries in dictionaries does not matter."""
-    return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()[:16]
+    return short_hash(json.dumps(content, sort_keys=True).encode())
+
+
+def short_hash(content: bytes) -> str:
+    """Returns the first 64 bits of the SHA-256 of bytes, in hexadecimal."""
+    return hashlib.sha256(content).hexdigest()[:16]
 
 
 def check_of(content: bytes) -> str:

@@ -11,6 +11,7 @@ import pickle
 import signal
 import tempfile
 import threading
+import time
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Executor, ProcessPoolExecutor, ThreadPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
@@ -72,8 +73,13 @@ def _noted(work: Callable[[Job], Result], name_of: Callable[[Job], str], job: Jo
 
 def _death(children: Sequence[Any], notes: Path) -> DataError:
     """Returns the error about worker processes of which one died."""
-    for child in children:
-        child.join(5)
+    deadline = time.monotonic() + 5
+    for (
+        child
+    ) in children:  # `join` also returns when the executor's thread has just waited for it, its exit code not yet noted
+        while child.exitcode is None and time.monotonic() < deadline:
+            child.join(0.1)
+            time.sleep(0.001)
     dead = [child for child in children if child.exitcode not in (None, 0, -signal.SIGTERM)]
     on = [(notes / str(child.pid)).read_text() for child in dead or children if (notes / str(child.pid)).exists()]
     how = "ended"

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 from data_pipeline.capture.casting import CaptureConfig
 from data_pipeline.dataset.augment import CloudAugmentation, ViewAugmentation
 from data_pipeline.dataset.builder import DataConfig
-from eval.agent import AgentConfig
+from eval.checks.agent import AgentConfig
 from eval.rendering.ascent import AscentConfig
 from eval.rendering.policies import RenderingConfig
 from eval.walks.grid import GridConfig

@@ -22,7 +22,7 @@ from data_pipeline.errors import DataError, Diverged, Unreadable
 from data_pipeline.files import check_of_file, keep_json, read_json, write_json
 from data_pipeline.objects.sources import load_object
 from data_pipeline.progress import console
-from eval.agent import compare_walks, latency, recognised, stopping
+from eval.checks.agent import compare_walks, latency, recognised, stopping
 from eval.consistency import check_classifier, check_evaluated_with, check_made_with
 from eval.learned.measure import measure, together, train_all
 from eval.learned.page import write_learned_page

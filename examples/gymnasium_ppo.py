@@ -28,11 +28,11 @@ from flax import nnx
 
 from data_pipeline.dataset.statistics import load_statistics
 from eval.numbers.comparison import intervals
-from eval.report.markdown import markdown_table
 from eval.tables import load_view_tables
 from eval.walks.knowledge import learn
 from mevs_jax import POLICIES, ActiveRecognition, EnvironmentObservation, ViewGraph, ViewTable
 from mevs_jax.calibration import fit_exponent
+from mevs_jax.markdown import markdown_table
 from mevs_jax.metrics import is_right
 from mevs_jax.selection import best_view
 

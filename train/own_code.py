@@ -13,6 +13,7 @@ from types import ModuleType
 from typing import Any
 
 from data_pipeline.errors import DataError, kind_and_reason_of
+from data_pipeline.files import short_hash
 
 
 @dataclass(frozen=True)
@@ -82,7 +83,7 @@ def load_own(reference: str, option: str) -> OwnCode:
     content = content or _source_of(module, reference, option)
     if (defined := _file_of(function)) not in (None, _file_of(module)):
         content += Path(str(defined)).read_bytes()
-    return OwnCode(reference, *named(reference), hashlib.sha256(content).hexdigest()[:16], function)
+    return OwnCode(reference, *named(reference), short_hash(content), function)
 
 
 def _from_file(path: Path, reference: str, option: str) -> tuple[ModuleType, bytes]:

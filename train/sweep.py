@@ -12,7 +12,7 @@ import time
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -29,6 +29,7 @@ from train.devices import DATA, device_mesh
 from train.finite import all_finite, not_finite
 from train.kept import check_config, why
 from train.loop import Lead, identity_of, steps_of_an_epoch, validation_set, weighted_means
+from train.optimiser import OptimiserConfig
 from train.preemption import Preempted, Preemption
 from train.step import Hyperparameters, TrainState, abstract_state, evaluate_step_of, initial_state, train_step_of
 from train.tasks.classifier import ClassifierTask
@@ -84,6 +85,10 @@ class Member:
     def loss(self) -> float:
         """Validation loss of the best epoch, by which members are compared; infinite if it diverged."""
         return self.best["loss"] if self.best and not self.diverged else float("inf")
+
+    def is_training(self, patience: int) -> bool:
+        """Whether the member is still trained: it has not diverged, and improved within the last `patience` epochs."""
+        return not self.diverged and self.epochs - self.best_epoch < patience
 
 
 def draw_members(config: SweepConfig, task: SweepTask) -> list[Member]:
@@ -178,42 +183,14 @@ def sweep(
 
     optimiser = task.optimiser
     epoch_steps = steps_of_an_epoch(task, statistics)
-    hyper = jax.tree.map(lambda *numbers: np.stack(numbers), *(task_of(task, m).hyperparameters for m in members))
-    structure, _ = abstract_state(task)
+    programs = _compiled(task, mesh, epoch_steps)
     by_member = NamedSharding(mesh, PartitionSpec(DATA))
-
-    def over_members(function: Callable, arguments: str) -> Callable:
-        """Returns `function` mapped over all members, which the devices share.
-
-        Args:
-            arguments: a letter for each argument: m (one value per member) or s (the same for all).
-        """
-        axes = tuple(0 if kind == "m" else None for kind in arguments)
-        specs = tuple(PartitionSpec(DATA) if kind == "m" else PartitionSpec() for kind in arguments)
-        vmapped = jax.vmap(function, axes)
-        return jax.shard_map(vmapped, mesh=mesh, in_specs=specs, out_specs=PartitionSpec(DATA), check_vma=False)
-
-    step = train_step_of(task, structure, epoch_steps)
-
-    def step_if(training: jax.Array, state: TrainState, batch: Any, hyper: Hyperparameters):
-        after, loss = step(state, batch, hyper)
-        return jax.tree.map(lambda new, old: jnp.where(training, new, old), after, state), loss
-
-    train_step = jax.jit(over_members(step_if, "mmsm"), donate_argnums=1)
-    evaluate_step = jax.jit(over_members(evaluate_step_of(task, structure), "mmss"))
-    is_finite = jax.jit(over_members(all_finite, "m"))
-    keep = jax.jit(
-        over_members(lambda better, new, old: jax.tree.map(lambda a, b: jnp.where(better, a, b), new, old), "mmm")
-    )
-    state = jax.jit(over_members(lambda seed: initial_state(task, seed)[1], "m"))(jax.device_put(hyper.seed, by_member))
+    hyper = jax.tree.map(lambda *numbers: np.stack(numbers), *(task_of(task, m).hyperparameters for m in members))
     hyper = jax.device_put(hyper, by_member)
+    state = programs.start(hyper.seed)
     best = jax.tree.map(jnp.copy, (state.parameters, state.statistics))
-
     progress: dict[str, Any] = {"epoch": 0, "seconds": 0.0, "histories": [[] for _ in members]}
     validation = validation_set(task, data, statistics, devices=1)  # every member is evaluated on the whole batch
-
-    def is_training(member: Member) -> bool:
-        return not member.diverged and member.epochs - member.best_epoch < optimiser.patience
 
     lead = Lead()
     drop_damaged(folder, "so the sweep begins again")
@@ -229,33 +206,86 @@ def sweep(
             completed=progress["epoch"] * epoch_steps * optimiser.batch_size,
             note="",
         )
-        while progress["epoch"] < optimiser.epochs and any(map(is_training, members)):
+        while progress["epoch"] < optimiser.epochs:
+            training = np.array([member.is_training(optimiser.patience) for member in members])
+            if not training.any():
+                break
             started = time.perf_counter()
-            training = np.array([is_training(member) for member in members])
             for _ in range(epoch_steps):
-                state, loss = train_step(training, state, next(batches), hyper)
+                state, loss = programs.train(training, state, next(batches), hyper)
                 lead.limit(loss)
                 bar.advance(line, optimiser.batch_size)
             means = {name: np.asarray(sums) / epoch_steps for name, sums in state.sums.items()}
-            found = [evaluate_step(state.parameters, state.statistics, *batch) for batch in validation]
+            checked = weighted_means([programs.evaluate(state.parameters, state.statistics, *b) for b in validation])
             progress["epoch"] += 1
-            finite = np.asarray(is_finite((state.parameters, state.statistics)))
-            members, better = _after_epoch(members, training, means, weighted_means(found), finite, progress)
-            best = keep(better, (state.parameters, state.statistics), best)
+            finite = np.asarray(programs.is_finite((state.parameters, state.statistics)))
+            members, better = _after_epoch(members, training, means, checked, finite, progress)
+            best = programs.keep(better, (state.parameters, state.statistics), best)
             progress["seconds"] += time.perf_counter() - started
-            checkpoints.save(
-                "latest", progress["epoch"], (state, best), progress | {"members": [asdict(m) for m in members]}
-            )
-            leader = min(members, key=lambda member: member.loss)
-            console.print(
-                f"Sweep of {len(members)}, epoch {progress['epoch']}/{optimiser.epochs}: "
-                f"{sum(map(is_training, members))} still train, best val loss {leader.loss:.4f}"
-            )
+            saving = progress | {"members": [asdict(member) for member in members]}
+            checkpoints.save("latest", progress["epoch"], (state, best), saving)
+            _print_epoch(members, progress["epoch"], optimiser)
             if preemption.after(progress["epoch"]):
                 raise Preempted(f"the sweep was asked to end after epoch {progress['epoch']}")
     _export(task, statistics, folder, members, progress, jax.device_get(best), epoch_steps)
     keep_json(folder / "members.json", [asdict(member) for member in members])
     return members
+
+
+class _Programs(NamedTuple):
+    """Compiled functions of all members, which the devices share.
+
+    Attributes:
+        start: (seeds) -> states.
+        train: (whether each member is training, states, batch, hyper-parameters) -> states and losses.
+        evaluate: (parameters, statistics, inputs, targets) -> metrics.
+        is_finite: (weights) -> whether all are finite.
+        keep: (whether each member is better, its weights, the best so far) -> the best weights.
+    """
+
+    start: Callable
+    train: Callable
+    evaluate: Callable
+    is_finite: Callable
+    keep: Callable
+
+
+def _compiled(task: SweepTask, mesh: Mesh, epoch_steps: int) -> _Programs:
+    structure, _ = abstract_state(task)
+    step = train_step_of(task, structure, epoch_steps)
+
+    def over_members(function: Callable, arguments: str, **options: Any) -> Callable:
+        """Returns `function` mapped over all members.
+
+        Args:
+            arguments: a letter for each argument: m (one value per member) or s (the same for all).
+        """
+        axes = tuple(0 if kind == "m" else None for kind in arguments)
+        specs = tuple(PartitionSpec(DATA) if kind == "m" else PartitionSpec() for kind in arguments)
+        vmapped = jax.vmap(function, axes)
+        shared = jax.shard_map(vmapped, mesh=mesh, in_specs=specs, out_specs=PartitionSpec(DATA), check_vma=False)
+        return jax.jit(shared, **options)
+
+    def step_if(training: jax.Array, state: TrainState, batch: Any, hyper: Hyperparameters):
+        after, loss = step(state, batch, hyper)
+        return jax.tree.map(lambda new, old: jnp.where(training, new, old), after, state), loss
+
+    return _Programs(
+        start=over_members(lambda seed: initial_state(task, seed)[1], "m"),
+        train=over_members(step_if, "mmsm", donate_argnums=1),
+        evaluate=over_members(evaluate_step_of(task, structure), "mmss"),
+        is_finite=over_members(all_finite, "m"),
+        keep=over_members(lambda better, new, old: jax.tree.map(lambda a, b: jnp.where(better, a, b), new, old), "mmm"),
+    )
+
+
+def _print_epoch(members: list[Member], epoch: int, optimiser: OptimiserConfig) -> None:
+    leader = min(members, key=lambda member: member.loss)
+    console.print(
+        f"Sweep of {len(members)}, epoch {epoch}/{optimiser.epochs}: "
+        f"{sum(member.is_training(optimiser.patience) for member in members)} still train, "
+        f"best val loss {leader.loss:.4f}"
+    )
 
 
 def _finished(folder: Path) -> list[Member] | None:

@@ -6,7 +6,6 @@ So does this: `--dataset.capture.lattice file:PATH`. What identifies the viewpoi
 
 from __future__ import annotations
 
-import hashlib
 import json
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
@@ -17,6 +16,7 @@ import numpy as np
 
 from data_pipeline.capture.casting import CaptureConfig
 from data_pipeline.errors import DataError
+from data_pipeline.files import short_hash
 
 FILE = "file:"
 """What the lattice of a data set with viewpoints from a file begins with; a path follows, or the hash of the content."""
@@ -41,7 +41,7 @@ class OwnViewpoints:
     def digest(self) -> str:
         """Hash of the viewpoints and their neighbours."""
         content = self.points.tobytes() + repr(self.neighbours).encode()
-        return hashlib.sha256(content).hexdigest()[:16]
+        return short_hash(content)
 
 
 def is_file(lattice: str) -> bool:

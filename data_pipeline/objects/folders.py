@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import hashlib
 import os
 import stat
 from collections import Counter
 from pathlib import Path, PurePosixPath
 
 from data_pipeline.errors import DataError
+from data_pipeline.files import short_hash
 from data_pipeline.objects.formats import MESH_SUFFIXES, Up
 from data_pipeline.objects.layout import Found, Listing
 from data_pipeline.objects.names import is_ignored, kind_of_ignored, shown, unread_reason
@@ -91,4 +91,4 @@ def _state_of_buffers(entries: list[os.DirEntry[str]]) -> str:
                 found.append(f"{os.fsencode(entry.name)!r} {stamp_of(entry.stat())}")
             except OSError:
                 found.append(f"{os.fsencode(entry.name)!r} gone")
-    return f"{hashlib.sha256(' '.join(found).encode()).hexdigest()[:16]}+" if found else ""
+    return f"{short_hash(' '.join(found).encode())}+" if found else ""

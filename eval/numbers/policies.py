@@ -14,18 +14,16 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any, Literal
 
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from data_pipeline.dataset.statistics import load_statistics
 from data_pipeline.errors import DataError
 from eval.numbers.comparison import cells, difference, summarise
-from eval.numbers.study import BASELINE, check_own, exactly_random, reachable_views, walk_tables
+from eval.numbers.study import BASELINE, Setting, check_own
 from eval.run_file import load_run
 from eval.tables import ViewTables, load_view_tables
 from eval.walks.grid import FIRST_MV, THRESHOLDS, GridConfig, Results
-from eval.walks.knowledge import learn
 from eval.walks.ladder import Rung
 from eval.walks.own_policies import OwnPolicy, own_rungs
 from mevs_jax.policies.base import Policy
@@ -157,18 +155,14 @@ def evaluate_policies(
         raise DataError(f"evaluate_policies needs a run directory, or view tables, not a {type(run).__name__}")
     inputs = run if isinstance(run, EvaluationInputs) else EvaluationInputs.of_run(Path(run))
     own = tuple(_own(name, policy, knows) for name, policy in policies.items() if not _is_baseline(name, policy))
-    tables, graph, config = inputs.tables, inputs.graph, inputs.config
-    can_reach = reachable_views(np.asarray(graph.points), config.lowest_elevation)
-    config = replace(config, max_views=min(config.max_views, int(can_reach.sum())))
-    reachable = None if can_reach.all() else jnp.asarray(can_reach)
-    knowledge = learn(jnp.asarray(inputs.validation.logits), jnp.asarray(inputs.validation.labels))
-    further = own_rungs(own, graph, tables.logits.shape[-1], config.draws)
-    rungs = (Rung.of(BASELINE, config.draws), *further)
-    results = walk_tables(tables, rungs, graph, knowledge, config, reachable=reachable)
-    logits, labels = jnp.asarray(tables.logits)[:, None], jnp.asarray(tables.labels)
-    results[BASELINE], _ = exactly_random(results[BASELINE], logits, labels, can_reach)
-    check_own(own, further, results, tables, graph, knowledge, reachable, config)
-    return PolicyStudy(tables.names, tables.labels, rungs, results, can_reach)
+    tables = inputs.tables
+    setting = Setting.of(inputs.graph, inputs.validation, inputs.config)
+    draws = setting.config.draws
+    further = own_rungs(own, setting.graph, tables.logits.shape[-1], draws)
+    rungs = (Rung.of(BASELINE, draws), *further)
+    results, _ = setting.with_random(tables, rungs)
+    check_own(own, further, results, tables, setting)
+    return PolicyStudy(tables.names, tables.labels, rungs, results, setting.can_reach)
 
 
 def _is_baseline(name: str, policy: Policy) -> bool:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import jax
@@ -147,7 +147,7 @@ def reachable_views(viewpoints: np.ndarray, lowest_elevation: float) -> np.ndarr
         ValueError: fewer than two viewpoints are.
     """
     elevation = np.degrees(np.arcsin(np.clip(viewpoints[:, 2], -1, 1)))
-    reachable = elevation >= lowest_elevation - 1e-6
+    reachable = elevation >= lowest_elevation - 1e-4  # float32 rounds by less
     if reachable.sum() < 2:
         raise ValueError(
             f"only {reachable.sum()} of {len(viewpoints)} viewpoints have an elevation of at least {lowest_elevation:g}°; "
@@ -156,14 +156,47 @@ def reachable_views(viewpoints: np.ndarray, lowest_elevation: float) -> np.ndarr
     return reachable
 
 
-def walk_tables(
-    tables: ViewTables, rungs: tuple[Rung, ...], graph: ViewGraph, knowledge: Knowledge, config: GridConfig, **rest: Any
-) -> dict[str, Results]:
-    """Results of some policies on all objects of a split, by name; `rest` are further arguments of `run_grid`."""
-    one_backbone = tables.stacked()
-    stacked = replace(one_backbone, logits=one_backbone.logits[:, None])
-    knowledge = jax.tree.map(lambda leaf: leaf[None], knowledge)
-    return run_grid(jax.random.key(config.seed), stacked, graph, knowledge, rungs, max_views=config.max_views, **rest)
+@dataclass(frozen=True)
+class Setting:
+    """What all walks of a study share."""
+
+    graph: ViewGraph
+    knowledge: Knowledge
+    config: GridConfig
+    can_reach: np.ndarray
+
+    @staticmethod
+    def of(graph: ViewGraph, validation: ViewTables, config: GridConfig) -> Setting:
+        """What follows from the settings of an evaluation, with the knowledge learned from validation objects."""
+        can_reach = reachable_views(np.asarray(graph.points), config.lowest_elevation)
+        config = replace(config, max_views=min(config.max_views, int(can_reach.sum())))
+        knowledge = learn(jnp.asarray(validation.logits), jnp.asarray(validation.labels))
+        return Setting(graph, knowledge, config, can_reach)
+
+    @property
+    def reachable(self) -> jax.Array | None:
+        return None if self.can_reach.all() else jnp.asarray(self.can_reach)
+
+    def walk(self, tables: ViewTables, rungs: tuple[Rung, ...], **rest: Any) -> dict[str, Results]:
+        """Results of some policies on all objects of a split, by name; `rest` are further arguments of `run_grid`."""
+        one_backbone = tables.stacked()
+        stacked = replace(one_backbone, logits=one_backbone.logits[:, None])
+        knowledge = jax.tree.map(lambda leaf: leaf[None], self.knowledge)
+        key, max_views = jax.random.key(self.config.seed), self.config.max_views
+        return run_grid(
+            key, stacked, self.graph, knowledge, rungs, max_views=max_views, reachable=self.reachable, **rest
+        )
+
+    def with_random(self, tables: ViewTables, rungs: tuple[Rung, ...]) -> tuple[dict[str, Results], int]:
+        """Walks of policies, among them random selection, whose results are exact up to the number of views returned."""
+        results = self.walk(tables, rungs)
+        logits, labels = jnp.asarray(tables.logits)[:, None], jnp.asarray(tables.labels)
+        results[BASELINE], exact = exactly_random(results[BASELINE], logits, labels, self.can_reach)
+        return results, exact
+
+    def starts_of(self, result: Results) -> np.ndarray:
+        """The stored walks from reachable views, (objects, starts, steps)."""
+        return np.asarray(result.views)[0, :, self.can_reach, 0].swapaxes(0, 1)
 
 
 def check_own(
@@ -171,16 +204,59 @@ def check_own(
     rungs: tuple[Rung, ...],
     results: dict[str, Results],
     tables: ViewTables,
-    graph: ViewGraph,
-    knowledge: Knowledge,
-    reachable: jax.Array | None,
-    config: GridConfig,
+    setting: Setting,
 ) -> None:
     """Raises `DataError` if scores of a user's policy mean nothing (`check_scores`); `rungs` are the policies as evaluated."""
     for policy, rung in zip(own, rungs, strict=True):
         walks = np.asarray(results[rung.policy].views)[0, :, :, 0]
-        key, stacked = jax.random.key(config.seed), tables.stacked()
-        check_scores(policy, rung, key, stacked, walks, graph, knowledge, reachable)
+        key, stacked = jax.random.key(setting.config.seed), tables.stacked()
+        check_scores(policy, rung, key, stacked, walks, setting.graph, setting.knowledge, setting.reachable)
+
+
+def _confidence(
+    setting: Setting,
+    tables: ViewTables,
+    validation: ViewTables,
+    results: dict[str, Results],
+    rungs: tuple[Rung, ...],
+) -> dict[str, Any]:
+    fitting = tuple(replace(rung, draws=1) for rung in rungs if rung.policy in CONFIDENCE_OF)
+    walks = setting.walk(validation, fitting)
+    return {
+        name: confidence_of(
+            setting.starts_of(walks[name]),
+            validation.logits,
+            validation.labels,
+            setting.starts_of(results[name]),
+            tables.logits,
+            tables.labels,
+        )
+        for name in CONFIDENCE_OF
+    }
+
+
+def _movement(
+    setting: Setting, tables: ViewTables, results: dict[str, Results], rungs: tuple[Rung, ...]
+) -> dict[str, list[dict[str, Any]]]:
+    found = {name: [{"cost": 0.0} | accuracy_by_distance(results[name])] for name in MOVING}
+    moving = tuple(rung for rung in rungs if rung.policy in MOVING)
+    for cost in MOVEMENT_COSTS:
+        for name, result in setting.walk(tables, moving, movement_cost=jnp.float32(cost)).items():
+            found[name].append({"cost": cost} | accuracy_by_distance(result))
+    return found
+
+
+def _policies(
+    setting: Setting, tables: ViewTables, shown: dict[str, Results], mv: int, column: int
+) -> dict[str, dict[str, Any]]:
+    return {
+        name: summarise(result, tables.labels)
+        | {
+            "headline_interval": intervals(cells(result)[0][mv - FIRST_MV, column]),
+            "headline_confusion": headline_confusion(setting.starts_of(result), tables, mv).tolist(),
+        }
+        for name, result in shown.items()
+    }
 
 
 def run_study(
@@ -206,63 +282,24 @@ def run_study(
     Raises:
         DataError: if a further policy cannot be used.
     """
-    viewpoints = np.array(statistics.viewpoints)
-    can_reach = reachable_views(viewpoints, config.lowest_elevation)
-    config = replace(config, max_views=min(config.max_views, int(can_reach.sum())))
-    graph = statistics.graph
-    reachable = None if can_reach.all() else jnp.asarray(can_reach)
-    knowledge = learn(jnp.asarray(validation.logits), jnp.asarray(validation.labels))
-    labels = jnp.asarray(tables.labels)
+    setting = Setting.of(statistics.graph, validation, config)
+    config, can_reach = setting.config, setting.can_reach
 
-    further = own_rungs(own, graph, len(statistics.classes), config.draws)
+    further = own_rungs(own, setting.graph, len(statistics.classes), config.draws)
     rungs = ladder(config.draws, further)
     console.print(f"Walking {len(tables.labels)} test objects from {can_reach.sum()} views by {len(rungs)} policies")
-    results = walk_tables(tables, (*rungs, SCRAMBLED), graph, knowledge, config, reachable=reachable)
-    results[BASELINE], exact = exactly_random(results[BASELINE], jnp.asarray(tables.logits)[:, None], labels, can_reach)
+    results, exact = setting.with_random(tables, (*rungs, SCRAMBLED))
     shown = {rung.policy: results[rung.policy] for rung in rungs}
-
-    check_own(own, further, results, tables, graph, knowledge, reachable, config)
-
-    fitting = tuple(replace(rung, draws=1) for rung in rungs if rung.policy in CONFIDENCE_OF)
-    validation_walks = walk_tables(validation, fitting, graph, knowledge, config, reachable=reachable)
-
-    def starts_of(result: Results) -> np.ndarray:
-        """The stored walks from reachable views, (objects, starts, steps)."""
-        return np.asarray(result.views)[0, :, can_reach, 0].swapaxes(0, 1)
-
-    confidence = {
-        name: confidence_of(
-            starts_of(validation_walks[name]),
-            validation.logits,
-            validation.labels,
-            starts_of(results[name]),
-            tables.logits,
-            tables.labels,
-        )
-        for name in CONFIDENCE_OF
-    }
-
-    movement: dict[str, list[dict[str, Any]]] = {
-        name: [{"cost": 0.0} | accuracy_by_distance(results[name])] for name in MOVING
-    }
-    moving = tuple(rung for rung in rungs if rung.policy in MOVING)
-    for cost in MOVEMENT_COSTS:
-        with_cost = walk_tables(
-            tables, moving, graph, knowledge, config, reachable=reachable, movement_cost=jnp.float32(cost)
-        )
-        for name, result in with_cost.items():
-            movement[name].append({"cost": cost} | accuracy_by_distance(result))
+    check_own(own, further, results, tables, setting)
 
     other = None
     if by_view is not None:
         wanted = ("random", "random_with_repetition", "predicted_entropy")
         switched = (*(rung for rung in rungs if rung.policy in wanted), SCRAMBLED)
-        other = walk_tables(by_view, switched, graph, knowledge, config, reachable=reachable)
-        other[BASELINE], _ = exactly_random(other[BASELINE], jnp.asarray(by_view.logits)[:, None], labels, can_reach)
+        other, _ = setting.with_random(by_view, switched)
 
     sources = {policy.entry.name: {"own": policy.code.identity if policy.code else {}} for policy in own}
     mv = min(HEADLINE_MV, config.max_views)
-    column = THRESHOLDS.index(HEADLINE_CT)
     return {
         "objects": len(tables.labels),
         "validation_objects": len(validation.labels),
@@ -281,20 +318,13 @@ def run_study(
             {"policy": rung.policy, "title": rung.title, "knows": rung.knows} | sources.get(rung.policy, {})
             for rung in rungs
         ],
-        "policies": {
-            name: summarise(result, tables.labels)
-            | {
-                "headline_interval": intervals(cells(result)[0][mv - FIRST_MV, column]),
-                "headline_confusion": headline_confusion(starts_of(result), tables, mv).tolist(),
-            }
-            for name, result in shown.items()
-        },
+        "policies": _policies(setting, tables, shown, mv, THRESHOLDS.index(HEADLINE_CT)),
         "against_random": {
             name: difference(result, shown[BASELINE]) for name, result in shown.items() if name != BASELINE
         },
         "views_to_reach": views_to_reach(shown, BASELINE),
         "best_pair": best_pair(tables, can_reach),
-        "confidence": confidence,
-        "movement": movement,
+        "confidence": _confidence(setting, tables, validation, results, rungs),
+        "movement": _movement(setting, tables, results, rungs),
         "compatibility": compatibility(results, other, statistics.views, leak),
     }

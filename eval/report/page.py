@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import html
 import json
 import platform
@@ -16,7 +15,7 @@ import numpy as np
 
 from data_pipeline.capture.viewpoints import FILE, is_file
 from data_pipeline.dataset.builder import open_split
-from data_pipeline.files import damage_in, write_text
+from data_pipeline.files import damage_in, short_hash, write_text
 from data_pipeline.progress import console
 from eval.learned.page import active_section
 from eval.report import figures
@@ -209,7 +208,7 @@ def _mark(described: Any, content: str) -> str:
     """Returns the last line of a page: hashes of what it was made from, with the versions of the packages, and of itself."""
     versions = [version(package) for package in ("mevs-jax", "jax", "matplotlib")]
     made_of = json.dumps([described, versions], sort_keys=True, default=str)
-    hashes = [hashlib.sha256(text.encode()).hexdigest()[:16] for text in (made_of, content)]
+    hashes = [short_hash(text.encode()) for text in (made_of, content)]
     return f"<!-- made of {hashes[0]}, content {hashes[1]} -->\n"
 
 

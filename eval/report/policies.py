@@ -73,39 +73,55 @@ def lead(inputs: ReportInputs) -> str:
     )
 
 
+def _ladder_row(rung: dict[str, Any], metrics: dict[str, Any], steps: Sequence[int]) -> list[str]:
+    name, result, against = rung["policy"], metrics["policies"][rung["policy"]], metrics["against_random"]
+    row = [html.escape(rung["title"])]
+    for step in steps:
+        cell = f"<b>{percent(result['after_views'][step - 1])}</b>"
+        if name in against:
+            gain, interval = (against[name][f"after_views_{key}"][step - 1] for key in ("difference", "interval"))
+            cell += "<br>" + difference(gain, interval)
+        row.append(cell)
+    area = f"<b>{percent(result['area'])}</b>"
+    if name in against:
+        area += "<br>" + difference(against[name]["area_difference"], against[name]["area_interval"])
+    return [*row, area]
+
+
+def _views_to_reach(reach: dict[str, Any], name: str) -> str:
+    views = reach["views"][name]
+    low, high = ("∞" if end is None else f"{end:.1f}" for end in reach["interval"][name])
+    return ("never" if views is None else f"<b>{views:.1f}</b>") + f"<br><small>[{low}, {high}]</small>"
+
+
+def _every_step(metrics: dict[str, Any]) -> str:
+    """The folded table of accuracies after each number of views."""
+    steps = _steps(metrics, range(1, 10))
+    rows = []
+    for rung in metrics["ladder"]:
+        result = metrics["policies"][rung["policy"]]
+        cells = [
+            f"{percent(result['after_views'][step - 1])}<br><small class='note'>"
+            f"{span(result['after_views_interval'][step - 1])}</small>"
+            for step in steps
+        ]
+        rows.append([html.escape(rung["title"]), *cells])
+    return (
+        "<details><summary>Accuracy (%) after each number of views, with 95 % intervals</summary>"
+        + table(["policy", *map(str, steps)], rows)
+        + "</details>"
+    )
+
+
 def ladder_section(inputs: ReportInputs) -> str:
     metrics = inputs.metrics
     policies, against = metrics["policies"], metrics["against_random"]
     steps = _steps(metrics, (2, 3, 4, 6, 9))
     reach = metrics["views_to_reach"].get("5") or metrics["views_to_reach"].get("3")
-    rows, details = [], []
+    rows = []
     for rung in metrics["ladder"]:
-        name, result = rung["policy"], policies[rung["policy"]]
-        row = [html.escape(rung["title"])]
-        for step in steps:
-            cell = f"<b>{percent(result['after_views'][step - 1])}</b>"
-            if name in against:
-                gain, interval = (against[name][f"after_views_{key}"][step - 1] for key in ("difference", "interval"))
-                cell += "<br>" + difference(gain, interval)
-            row.append(cell)
-        area = f"<b>{percent(result['area'])}</b>"
-        if name in against:
-            area += "<br>" + difference(against[name]["area_difference"], against[name]["area_interval"])
-        row.append(area)
-        if reach:
-            views = reach["views"][name]
-            low, high = ("∞" if end is None else f"{end:.1f}" for end in reach["interval"][name])
-            row.append(("never" if views is None else f"<b>{views:.1f}</b>") + f"<br><small>[{low}, {high}]</small>")
-        rows.append((rung["knows"], row))
-        every = _steps(metrics, range(1, 10))
-        details.append(
-            [html.escape(rung["title"])]
-            + [
-                f"{percent(result['after_views'][step - 1])}<br><small class='note'>"
-                f"{span(result['after_views_interval'][step - 1])}</small>"
-                for step in every
-            ]
-        )
+        row = _ladder_row(rung, metrics, steps)
+        rows.append((rung["knows"], [*row, _views_to_reach(reach, rung["policy"])] if reach else row))
     header = ["next view chosen by", *(f"{step} views" for step in steps), "area"]
     if reach:
         target = next(key for key, value in metrics["views_to_reach"].items() if value is reach)
@@ -144,9 +160,7 @@ def ladder_section(inputs: ReportInputs) -> str:
             ),
             "Bands: 95 % intervals over objects.",
         )
-        + "<details><summary>Accuracy (%) after each number of views, with 95 % intervals</summary>"
-        + table(["policy", *map(str, _steps(metrics, range(1, 10)))], details)
-        + "</details>"
+        + _every_step(metrics)
     )
 
 

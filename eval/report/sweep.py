@@ -11,7 +11,7 @@ from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
 
 from data_pipeline.files import write_bytes, write_text
-from eval.report.markdown import markdown_table
+from mevs_jax.markdown import markdown_table
 from train.sweep import Member
 
 _AXES = {

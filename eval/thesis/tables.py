@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 
 from eval.rendering.ascent import FACES
-from eval.report.markdown import markdown_table
 from eval.thesis.layout import Cell, Row, ThesisTable, thesis_numbers
 from eval.thesis.results import ORACLE_MV
+from mevs_jax.markdown import markdown_table
 from train.thesis_networks import BACKBONES, FRAMES, PIPELINE
 
 

@@ -312,7 +312,7 @@ class Agent:
             worth, "costs differ, but gain_per_cost is 0; make the agent with the gain that one unit of cost is worth"
         )
         allowed = allowed & useful & np.isfinite(costs)
-        weighted = np.where(np.isfinite(costs), self.gain_per_cost * costs, 0.0)
+        weighted = self.gain_per_cost * np.where(np.isfinite(costs), costs, 0.0)
         reason = self._reason()
         if not reason:
             wide = np.zeros((2, self.size), np.float32)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from mevs_jax.markdown import markdown_table
 from mevs_jax.trained.description import Description
 
 _INPUTS = {
@@ -74,8 +75,4 @@ def _figures(description: Description) -> list[str]:
     about = (
         f"Share of {description.evaluation.get('objects', 'the')} test objects recognised, in %, from all first views:"
     )
-    return ["## Evaluation", "", about, "", _row(head), _row(["---"] * len(head)), *map(_row, rows), ""]
-
-
-def _row(cells: list[str]) -> str:
-    return "| " + " | ".join(cells) + " |"
+    return ["## Evaluation", "", about, "", markdown_table(head, rows), ""]

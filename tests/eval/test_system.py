@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from eval.agent import stopping
+from eval.checks.agent import stopping
 from eval.system import USABLE, walk_validation
 from eval.tables import ViewTables
 from mevs_jax.trained import Strangeness, fit_strangeness

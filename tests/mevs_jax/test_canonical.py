@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 from data_pipeline.capture.casting import default_caster
 from data_pipeline.objects.furniture import furniture
 from data_pipeline.objects.mesh import Mesh, normalise
-from eval.camera import SIZES, Shot, agreement, agreements, cast_canonical, cast_shot, random_shot, summary
+from eval.checks.camera import SIZES, Shot, agreement, agreements, cast_canonical, cast_shot, random_shot, summary
 from mevs_jax import CanonicalView, ViewCamera, canonical_view, look_at_origin
 from mevs_jax import canonical as canonical_module
 

@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 from data_pipeline.capture.casting import default_caster
 from data_pipeline.objects.furniture import furniture
 from data_pipeline.objects.mesh import normalise
-from eval.camera import cast_canonical
+from eval.checks.camera import cast_canonical
 from mevs_jax import ViewCamera, estimate_sphere, look_at_origin, partial_cloud
 
 CAMERA = ViewCamera(resolution=96)

@@ -24,7 +24,8 @@ from data_pipeline.dataset.inputs import metric_depth
 from data_pipeline.errors import DataError
 from data_pipeline.objects.mesh import Mesh
 from data_pipeline.progress import progress_bar
-from eval.camera import Pair, pairs, summary
+from eval.checks.camera import Pair, pairs, summary
+from eval.checks.walks import beliefs_along
 from eval.numbers.comparison import intervals
 from eval.numbers.confidence import stopping as by_risk
 from eval.tables import ViewTables
@@ -146,14 +147,7 @@ def compare_walks(
 
 def probabilities_along(system: TrainedSystem, table: ViewTable, views: Sequence[int], policy: str) -> np.ndarray:
     """Calibrated probabilities after each view of a walk on a table."""
-    order = jnp.asarray(views)
-    if system.parts.fusion:
-        assert table.features is not None
-        fusion, points = system.parts.fusion["posed"], system.parts.viewpoints[order]
-        present = jnp.tril(jnp.ones((len(views), len(views)), bool))
-        beliefs = jnp.stack([fusion(table.features[order], points, seen) for seen in present])
-    else:
-        beliefs = running_sum(table.logits[order])
+    beliefs = beliefs_along(system.parts, table, jnp.asarray(views))
     steps = [system.log_probabilities(belief, count, policy) for count, belief in enumerate(beliefs, 1)]
     return np.exp(np.stack([np.asarray(step) for step in steps]))
 
@@ -209,8 +203,8 @@ def recognised(system: TrainedSystem, meshes: Sequence[tuple[Mesh, int]], config
         config: how many cameras, and how far away.
 
     Returns:
-        For each distance: overlap of the masks and error of depth (`eval.camera.summary`), accuracy by the camera and by the
-        data set's own, and the 95 % interval over objects of their difference.
+        For each distance: overlap of the masks and error of depth (`eval.checks.camera.summary`), accuracy by the camera and by
+        the data set's own, and the 95 % interval over objects of their difference.
     """
     camera, rows = system.description.camera, []
     if any(not 1 < distance < 100 for distance in config.distances):
