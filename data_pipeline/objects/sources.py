@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import os
 from collections import Counter
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path, PurePosixPath
 
 from data_pipeline.errors import DataError, EmptyMesh
@@ -43,11 +43,13 @@ class Reading:
         up: which axis of the files is up.
         split: empty for folders of splits, a share of training objects, or the path of a list.
         seed: seed of the choice by share.
+        all_tested: whether no object is for training: those for testing are taken if the folders name a split, else all.
     """
 
     up: Up = "auto"
     split: str = ""
     seed: int = 0
+    all_tested: bool = False
 
 
 def load_object(entry: ObjectEntry) -> Mesh:
@@ -96,7 +98,10 @@ def _arranged(listing: Listing, name: str, where: str, reading: Reading) -> Obje
         )
     with_splits = has_split_folders(found)
     placed = by_split_folders(found) if with_splits else by_class_folders(found)
-    if reading.split:
+    notes: tuple[str, ...] = ()
+    if reading.all_tested:
+        placed, notes = _all_tested(placed)
+    elif reading.split:
         placed = divide(placed, reading.split, reading.seed, where)
     elif not with_splits:
         folders = {one.class_name for one in placed if one.class_name}
@@ -106,7 +111,7 @@ def _arranged(listing: Listing, name: str, where: str, reading: Reading) -> Obje
         )
     placed = sorted(without_copies(placed), key=lambda one: (one.class_name, one.split, one.parts))
     members = [one for one in placed if one.recipe is not None and one.class_name and one.split]
-    _check_classes(placed, members, where)
+    _check_classes(placed, members, where, all_tested=reading.all_tested)
     classes = tuple(sorted({one.class_name for one in members}))
     entries: list[ObjectEntry] = []
     left_out: dict[str, dict[str, str]] = {}
@@ -117,10 +122,19 @@ def _arranged(listing: Listing, name: str, where: str, reading: Reading) -> Obje
             reason = one.reason or "lies in no folder of a class with train, val or test"
             left_out.setdefault(one.split or "other", {})[unique] = reason
     said = (*say_ignored(listing.ignored), *listing.notes)
-    return ObjectSource(name, classes, tuple(entries), left_out, _axes(members, reading.up), said)
+    return ObjectSource(name, classes, tuple(entries), left_out, (*notes, *_axes(members, reading.up)), said)
 
 
-def _check_classes(placed: list[Found], members: list[Found], where: str) -> None:
+def _all_tested(placed: list[Found]) -> tuple[list[Found], tuple[str, ...]]:
+    """The files for testing; all files of classes, now for testing, if there are none. A sentence says which."""
+    tested = [one for one in placed if one.split == "test" or not one.class_name]
+    if not any(one.split for one in tested):
+        return [replace(one, split="test") if one.class_name else one for one in placed], ()
+    others = len(placed) - len(tested)
+    return tested, (f"{others} files for training or validation are not used",) if others else ()
+
+
+def _check_classes(placed: list[Found], members: list[Found], where: str, *, all_tested: bool) -> None:
     """Raises DataError if fewer than two classes have meshes, or a class lacks meshes of a split that it needs."""
     classes = sorted({one.class_name for one in placed if one.class_name and one.split})
     there = Counter((one.class_name, one.split) for one in members)
@@ -130,6 +144,8 @@ def _check_classes(placed: list[Found], members: list[Found], where: str) -> Non
             raise DataError(
                 f"{where}: no file of class {name} can be read ({first.path} {first.reason}); mend or remove the class"
             )
+    if all_tested and members:
+        return
     if len(classes) < 2:
         only = classes[0] if classes else "none"
         raise DataError(f"{where} has one class only ({only}); add the folder of at least one other class")
@@ -180,6 +196,21 @@ def mesh_zip(archive: Path, reading: Reading = Reading()) -> ObjectSource:
         DataError: as `mesh_folder`, or if the archive is not readable or contains paths outside of it.
     """
     return _arranged(list_zip(archive, reading.up), shown(archive.stem), shown(str(archive)), reading)
+
+
+def objects_to_test(data: str, up: Up = "auto") -> ObjectSource:
+    """Returns the objects of a folder, zip or `.npz` to test a system on: those for testing, or all where no split is named.
+
+    Raises:
+        DataError: as `open_source`, but one class is enough, and none needs objects for training.
+    """
+    path, reading = Path(os.path.expanduser(data)), Reading(up, all_tested=True)
+    if path.is_dir():
+        return mesh_folder(path.resolve(), reading)
+    if path.suffix.lower() == ".zip" and path.exists():
+        return mesh_zip(path.resolve(), reading)
+    source = open_source(data, train_per_class=2, test_per_class=20, up=up)
+    return replace(source, entries=tuple(entry for entry in source.entries if entry.split == "test"))
 
 
 def open_source(

@@ -1,8 +1,15 @@
-"""Checks: `mevs check live`, `mevs check agent`."""
+"""Checks: `mevs check live`, `mevs check agent`, `mevs check transfer`."""
 
 from __future__ import annotations
 
+import json
+from typing import TYPE_CHECKING, Any
+
+from mevs_jax.cli.failure import Unusable
 from mevs_jax.cli.parsing import Invocation
+
+if TYPE_CHECKING:
+    from mevs_jax.cli.options import TransferOptions
 
 
 def live(call: Invocation) -> None:
@@ -42,3 +49,87 @@ def agent(call: Invocation) -> None:
         f"640×480 image to next pose: {time['p50']:.1f} ms (99th percentile {time['p99']:.1f}), "
         f"{time['compilations']:.0f} compilations"
     )
+
+
+def transfer(options: TransferOptions) -> None:
+    """Measures a trained system on other objects."""
+    from data_pipeline.files import write_json
+    from eval.checks.transfer import check_transfer
+    from mevs_jax.cli.tools import load_system
+
+    renamed = dict(pair.partition("=")[::2] for pair in options.names)
+    if wrong := next((pair for pair in options.names if "=" not in pair), None):
+        raise Unusable(f"--names {wrong} is not FOLDER=CLASS, as in --names armchair=chair")
+    if options.max_views < 1 or options.draws < 1:
+        raise Unusable("--max-views and --draws must be at least 1")
+    if options.to is not None and not options.to.parent.is_dir():
+        raise Unusable(f"there is no folder {options.to.parent} to write {options.to.name} into; make it first")
+    found = check_transfer(
+        load_system(options.system),
+        options.data,
+        up=options.up,
+        renamed=renamed,
+        posed=not options.unknown_yaw,
+        max_views=options.max_views,
+        draws=options.draws,
+    )
+    if options.to is not None:
+        write_json(options.to, found)
+    print(json.dumps(found) if options.json else transfer_text(found))
+
+
+def transfer_text(found: dict[str, Any]) -> str:
+    """The figures of `check_transfer`, for a terminal."""
+    classes, known_as = found["classes"], found["known_as"]
+    named = {
+        known: [f"{name} ({classes[name]})" for name in classes if (name in known_as) == known]
+        for known in (True, False)
+    }
+    lines = [f"{found['known']} objects of known classes: {', '.join(named[True])}"]
+    if found["strangers"]:
+        lines.append(f"{found['strangers']} objects of unknown classes: {', '.join(named[False])}")
+    lines += [f"left out: {name}: {reason}" for name, reason in found["left_out"].items()]
+    lines += [*found["notes"], "", *_policy_lines(found)]
+    lines += ["", "By class: accuracy of single views, and after 2 and 4 views by the best policy:"]
+    for row in found["by_class"]:
+        shares = [row["single"], *(row["chosen"][count - 1] for count in (2, 4) if count <= len(row["chosen"]))]
+        lines.append(f"  {row['class']:20}{row['objects']:>5}" + "".join(f"{_percent(share):>9}" for share in shares))
+    lines += ["", "Calibration: mean probability less accuracy, in points (above 0: too sure):"]
+    for row in found["calibration"]:
+        lines.append(f"  {row['policy']:20}{row['views']:>3}  {_percent(row['too_sure'], row['interval'], '+')}")
+    for row in found["stopping"]:
+        error = "none stopped" if row["error"] is None else f"wrong {100 * row['error']:.1f} %"
+        lines.append(
+            f"  stops at {row['stop']:g}: {error} (promised {100 * row['risk']:g} %), "
+            f"{100 * row['sure']:.0f} % of walks stop, {row['views']:.1f} views"
+        )
+    for row in (found["unknown_objects"] or {"after": []})["after"]:
+        lines.append(
+            f"unknown objects, {row['views']} seen: AUROC {row['auroc']:.3f}; stranger than 95 % of validation objects: "
+            f"{100 * row['unknown_found']:.0f} % of the unknown, {100 * row['known_refused']:.0f} % of the known"
+        )
+    return "\n".join(lines)
+
+
+def _percent(share: float, interval: list[float] | None = None, sign: str = "") -> str:
+    ends = f" [{100 * interval[0]:{sign}.1f}, {100 * interval[1]:{sign}.1f}]" if interval else ""
+    return f"{100 * share:{sign}.1f}{ends}"
+
+
+def _policy_lines(found: dict[str, Any]) -> list[str]:
+    counts = sorted({row["views"] for row in found["policies"]})
+    cells = {(row["policy"], row["views"]): row for row in found["policies"]}
+    policies = dict.fromkeys(row["policy"] for row in found["policies"])
+    width = max(map(len, policies)) + len(" (best)")
+    lines = [
+        "Accuracy in % after each number of views, from all first views, with 95 % intervals over objects;",
+        "below it the difference from random views:",
+        " " * width + "".join(f"{count:>20}" for count in counts),
+    ]
+    for name in policies:
+        rows = [cells[name, count] for count in counts]
+        mark = " (best)" if name == found["best"] else ""
+        lines.append(f"{name + mark:{width}}" + "".join(f"{_percent(r['accuracy'], r['interval']):>20}" for r in rows))
+        if name != "random":
+            lines.append(" " * width + "".join(f"{_percent(r['gain'], r['gain_interval'], '+'):>20}" for r in rows))
+    return lines

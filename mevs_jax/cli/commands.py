@@ -128,6 +128,13 @@ COMMANDS = {
         "checks:agent",
         writes_run=False,
     ),
+    "check transfer": Command(
+        "how a trained system does on objects that it has never seen, of any makers",
+        "TransferOptions",
+        (),
+        "checks:transfer",
+        tool=True,
+    ),
     "draw ascent": Command(
         "ascend to the best view of one object by a renderer's gradient; draw it",
         "WithViews",
@@ -196,7 +203,9 @@ def help_text() -> str:
     """What `mevs --help` prints."""
 
     def lines(grouped: bool, tools: bool = False) -> str:
-        shown = {name: of for name, of in COMMANDS.items() if (" " in name) == grouped and of.tool == tools}
+        shown = {
+            name: of for name, of in COMMANDS.items() if (" " in name) == grouped and (grouped or of.tool == tools)
+        }
         width = max(map(len, shown)) + 2
         return "\n".join(f"  {name:<{width}}{command.title}" for name, command in shown.items())
 

@@ -149,6 +149,31 @@ class LookOptions:
 
 
 @dataclass(frozen=True)
+class TransferOptions:
+    """Options of `mevs check transfer`."""
+
+    data: Annotated[str, _arg("SOURCE")]
+    """objects: a folder or zip of meshes in class folders, or an .npz of voxel grids; those for testing where the folders name a
+    split, else all"""
+    system: Annotated[str, _arg("PATH|NAME", "furniture10, which comes with the package")] = "furniture10"
+    """the trained system, as for mevs look"""
+    up: Annotated[Literal["auto", "z", "y"], _arg("auto|z|y", "auto: y for glTF, as declared for DAE, else z")] = "auto"
+    """the upward axis of the meshes"""
+    names: Annotated[tuple[str, ...], _arg("FOLDER=CLASS ...")] = ()
+    """what the system calls classes that have another name in the data; classes that it does not know are strangers"""
+    unknown_yaw: Annotated[tyro.conf.FlagCreatePairsOff[bool], _arg("")] = False
+    """do not tell the system which way the objects face; else they face as in their files"""
+    max_views: Annotated[int, _arg("N", "8")] = 8
+    """number of views of each walk"""
+    draws: Annotated[int, _arg("N", "4")] = 4
+    """random walks from each first view"""
+    to: Annotated[Path | None, _arg("FILE")] = None
+    """write all figures into this .json file"""
+    json: Annotated[tyro.conf.FlagCreatePairsOff[bool], _arg("")] = False
+    """print all figures as JSON"""
+
+
+@dataclass(frozen=True)
 class ExportOptions:
     """Options of `mevs export`."""
 

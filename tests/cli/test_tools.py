@@ -152,3 +152,32 @@ def test_what_an_agent_promises_is_measured(whole, tmp_path):
     assert found["camera"][0]["overlap_median"] > 0.9
     assert "information_gain: 3 of 3 walks are those on view tables" in result.stdout
     assert refused(mevs("check", "agent", "--out", run, "--agent.objects", 0))
+
+
+def test_a_system_meets_other_objects(system, chair, tmp_path, at_once, refuses):
+    for place in ("seat/a.obj", "lamp/b.obj"):
+        (tmp_path / "others" / place).parent.mkdir(parents=True)
+        shutil.copy(chair, tmp_path / "others" / place)
+    (tmp_path / "others" / "lamp" / "c.obj").write_text("v 0 0 0\n")
+    command = (
+        "check",
+        "transfer",
+        "--system",
+        system,
+        "--data",
+        tmp_path / "others",
+        "--draws",
+        "1",
+        "--max-views",
+        "2",
+    )
+    named = f"seat={load(system).classes[0]}"
+    shown = at_once(*command, "--names", named, "--up", "y", "--to", tmp_path / "found.json")
+    assert shown.returncode == 0, shown.stderr
+    assert "1 objects of known classes: seat (1)\n1 objects of unknown classes: lamp (1)" in shown.stdout
+    assert "left out: lamp/c.obj: mesh has no faces" in shown.stdout
+    assert json.loads((tmp_path / "found.json").read_text())["known_as"] == {"seat": load(system).classes[0]}
+    assert "none of the classes lamp, seat is one that the system knows" in refuses(*command)
+    assert "--names seat is not FOLDER=CLASS" in refuses(*command, "--names", "seat")
+    assert "there is no folder" in refuses(*command, "--to", tmp_path / "none" / "found.json")
+    assert "no such file or folder" in refuses("check", "transfer", "--data", tmp_path / "nothing")

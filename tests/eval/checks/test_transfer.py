@@ -1,0 +1,102 @@
+"""A trained system on objects of other makers: which are used, and what is measured."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+import mevs_jax
+from data_pipeline.errors import DataError
+from data_pipeline.objects.recipes import FurniturePiece
+from data_pipeline.objects.sources import objects_to_test
+from eval.checks.transfer import STRANGER, auroc, check_transfer, matched
+
+
+def write_off(path, vertices, faces) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    lines = ["OFF", f"{len(vertices)} {len(faces)} 0"]
+    lines += [" ".join(f"{x:.6g}" for x in vertex) for vertex in vertices]
+    lines += ["3 " + " ".join(map(str, face)) for face in faces]
+    path.write_text("\n".join(lines) + "\n")
+
+
+@pytest.fixture(scope="module")
+def others(tmp_path_factory):
+    """Five objects in metres: chairs under another name, sofas, and spikes, which no furniture is; one file is damaged."""
+    folder = tmp_path_factory.mktemp("others")
+    for folder_name, kind in (("Chairs", "chair"), ("couch", "sofa")):
+        for seed in (7_000_001, 7_000_002):
+            write_off(folder / folder_name / f"{seed}.off", *FurniturePiece(kind, seed).load())
+    random = np.random.default_rng(0)
+    tips = random.normal(size=(30, 3))
+    base = np.cross(tips, random.normal(size=(30, 3))) * 0.03
+    corners = np.stack([tips, base, -base], axis=1).reshape(-1, 3)
+    write_off(folder / "spikes" / "one.off", corners, np.arange(90).reshape(-1, 3))
+    (folder / "spikes" / "two.off").write_text("OFF\n3 1 0\n0 0")
+    return folder
+
+
+@pytest.fixture(scope="module")
+def found(others):
+    system = mevs_jax.load("furniture10")
+    return check_transfer(system, str(others), renamed={"couch": "sofa"}, max_views=3, draws=1)
+
+
+def test_objects_are_matched_counted_and_named(found):
+    assert (found["known"], found["strangers"]) == (4, 1)
+    assert found["known_as"] == {"Chairs": "chair", "couch": "sofa"}
+    assert list(found["left_out"]) == ["spikes/two.off"]
+    assert found["classes"] == {"Chairs": 2, "couch": 2, "spikes": 1}
+    assert [row["class"] for row in found["by_class"]] == ["chair", "sofa"]
+
+
+def test_other_furniture_of_known_kinds_is_recognised(found):
+    rows = {(row["policy"], row["views"]): row for row in found["policies"]}
+    assert {views for _, views in rows} == {1, 2, 3}
+    assert rows["random", 1]["accuracy"] == found["single_view"]["accuracy"] > 0.6
+    assert rows["random", 2]["gain_interval"] == [0, 0]
+    for (policy, views), row in rows.items():
+        assert row["gain"] == pytest.approx(row["accuracy"] - rows["random", views]["accuracy"])
+        if views == 1:  # the same first views
+            assert row["accuracy"] == rows["random", 1]["accuracy"], policy
+    assert [row["views"] for row in found["unknown_objects"]["after"]] == [1, 2, 4]
+    assert all(4 * row["auroc"] in range(5) for row in found["unknown_objects"]["after"])  # one stranger, four known
+    single = np.mean([answer["single"] for answer in found["answers"]])
+    assert single == pytest.approx(found["single_view"]["accuracy"])
+
+
+def test_walks_without_yaw_use_policies_that_need_none(others):
+    system = mevs_jax.load("furniture10")
+    found = check_transfer(system, str(others), renamed={"couch": "sofa"}, posed=False, max_views=2, draws=1)
+    assert found["best"] == system.description.best_unposed
+    assert "information_gain" not in {row["policy"] for row in found["policies"]}
+
+
+def test_names_of_classes(tmp_path):
+    known = ("chair", "night_stand", "glass")
+    assert matched(["Night Stands", "CHAIR", "Glass", "lamp"], known, {}) == {
+        "Night Stands": 1,
+        "CHAIR": 0,
+        "Glass": 2,
+        "lamp": STRANGER,
+    }
+    with pytest.raises(DataError, match="none of the classes lamp is one that the system knows"):
+        matched(["lamp"], known, {})
+    with pytest.raises(DataError, match="the objects have no class couch, but lamp"):
+        matched(["lamp"], known, {"couch": "chair"})
+    with pytest.raises(DataError, match="the system knows no class sofa, but chair"):
+        matched(["lamp"], known, {"lamp": "sofa"})
+
+
+def test_only_test_objects_are_used_where_there_are_any(tmp_path):
+    for split in ("train", "test"):
+        write_off(tmp_path / "chair" / split / "a.off", *FurniturePiece("chair", len(split)).load())
+    found = objects_to_test(str(tmp_path), "auto")
+    assert [(entry.name, entry.split) for entry in found.entries] == [("chair/test/a.off", "test")]
+    assert found.notes == ("1 files for training or validation are not used",)
+
+
+def test_area_under_the_curve(random):
+    scores, positive = random.normal(size=200).round(1), random.random(200) < 0.3  # rounded, so that some are equal
+    above = np.sign(scores[positive][:, None] - scores[~positive])
+    assert auroc(scores, positive) == pytest.approx(np.mean((above + 1) / 2))
