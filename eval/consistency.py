@@ -63,6 +63,7 @@ def _classifier(settings: Settings) -> dict[str, Any]:
         "images": config.images,
         "augmentation": asdict(config.augmentation),
         "optimiser": asdict(config.optimiser),
+        "reality": asdict(config.reality) if config.reality.strength else None,
     }
     network = plain(settings)["classifier"]["network"]
     if config.encoder:
@@ -83,5 +84,5 @@ def _differences(was: dict[str, Any], wanted: dict[str, Any], place: str) -> dic
     if ("module" in before) != ("module" in now):
         shown = (f"{network['module']}:{network['name']}" if "module" in network else "" for network in (before, now))
         return {f"{place}.encoder": tuple(shown)}  # type: ignore[dict-item]
-    found = differences(was, wanted, place, shared=True)
+    found = differences({"reality": None} | was, wanted, place, shared=True)
     return {name.replace(".network_config", ".network"): pair for name, pair in found.items()}

@@ -6,6 +6,7 @@ An identity is whatever the result depends on: settings, the data set, the netwo
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -34,6 +35,12 @@ from train.devices import is_first
 
 Network = TypeVar("Network", bound=nnx.Module)
 Result = TypeVar("Result")
+
+
+def content_of(task: Any) -> dict[str, Any]:
+    """Returns a task as JSON keeps it; what was added since version 0.1 and is off is left out, as it was then."""
+    content = as_read(asdict(task))
+    return content if content.get("reality") else {name: content[name] for name in content if name != "reality"}
 
 
 def kept(

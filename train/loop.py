@@ -12,7 +12,7 @@ import time
 from collections import deque
 from collections.abc import Callable, Iterator
 from contextlib import suppress
-from dataclasses import asdict, replace
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -38,7 +38,7 @@ from data_pipeline.progress import console, progress_bar
 from train.checkpoints import Checkpoints, drop_damaged
 from train.devices import DATA, check_batch, device_mesh, is_first, parameter_sharding, place, place_batch, summed_over
 from train.finite import all_finite, not_finite
-from train.kept import check_config, config_of, finished
+from train.kept import check_config, config_of, content_of, finished
 from train.optimiser import learning_rate
 from train.preemption import Preempted, Preemption
 from train.starting_weights import StartingWeights
@@ -167,7 +167,7 @@ class MetricsLog:
 
 def identity_of(task: Task, statistics: DatasetStatistics, start: StartingWeights | None = None) -> dict[str, Any]:
     """Returns what identifies a run, as stored in its `config.json`: task, data set, starting weights."""
-    return as_read({"task": asdict(task), "data": statistics.fingerprint, "start": start and start.name})  # type: ignore[call-overload]
+    return as_read({"task": content_of(task), "data": statistics.fingerprint, "start": start and start.name})
 
 
 class _Training:
@@ -416,7 +416,7 @@ def load_best(task: Task, folder: Path) -> nnx.Module:
     if not (folder / "best").is_dir():
         raise DataError(f"no trained {task.name} in {folder}; train one with: mevs train")
     saved = config_of(folder)["task"]
-    wanted = as_read(asdict(task))  # type: ignore[call-overload]
+    wanted = content_of(task)
     for name in ("views", "classes"):
         if name in saved and saved[name] != wanted[name]:
             raise DataError(

@@ -27,7 +27,7 @@ from data_pipeline.progress import console, progress_bar
 from train.checkpoints import Checkpoints, drop_damaged
 from train.devices import DATA, device_mesh
 from train.finite import all_finite, not_finite
-from train.kept import check_config, why
+from train.kept import check_config, content_of, why
 from train.loop import Lead, identity_of, steps_of_an_epoch, validation_set, weighted_means
 from train.optimiser import OptimiserConfig
 from train.preemption import Preempted, Preemption
@@ -169,7 +169,7 @@ def sweep(
         Preempted: after SIGTERM, at the end of an epoch.
         Diverged: if every member diverged.
     """
-    identity = as_read({"task": asdict(task), "sweep": asdict(config), "data": statistics.fingerprint})
+    identity = as_read({"task": content_of(task), "sweep": asdict(config), "data": statistics.fingerprint})
     check_config(folder, identity, "a sweep made")
     members = draw_members(config, task)
     if (made := _finished(folder)) is not None:

@@ -15,8 +15,10 @@ from flax import nnx
 from data_pipeline.capture.casting import CaptureConfig
 from data_pipeline.dataset.augment import ImageAugmentation, augment_image
 from data_pipeline.dataset.batches import ViewBatches
-from data_pipeline.dataset.inputs import image_input
+from data_pipeline.dataset.inputs import image_input, view_camera
+from data_pipeline.dataset.reality import RealityAugmentation, realistic_depth, used_reality
 from data_pipeline.errors import DataError
+from mevs_jax.inputs import depth_image
 from mevs_jax.models import ResNet
 from train.optimiser import OptimiserConfig
 from train.starting_weights import StartingWeights, weights_from_torch
@@ -70,7 +72,20 @@ class ClassifierConfig:
     images: Literal["depth", "image"] = "depth"
     """its input: depth, or the shaded image"""
     augmentation: ImageAugmentation = ImageAugmentation()
+    reality: RealityAugmentation = RealityAugmentation()
     optimiser: OptimiserConfig = OptimiserConfig(weight_decay=1e-4)
+
+
+def reality_of(config: ClassifierConfig) -> RealityAugmentation | None:
+    """Returns the errors of training images; None if there are none.
+
+    Raises:
+        DataError: if they are not valid, or the images are not of depth.
+    """
+    reality = used_reality(config.reality, "--classifier.reality")
+    if reality and config.images != "depth":
+        raise DataError("--classifier.reality is for images of depth; leave out --classifier.images image")
+    return reality
 
 
 @dataclass(frozen=True)
@@ -83,6 +98,7 @@ class ClassifierTask:
     camera: CaptureConfig
     augmentation: ImageAugmentation
     optimiser: OptimiserConfig
+    reality: RealityAugmentation | None = None
     name: str = "classifier"
 
     @classmethod
@@ -91,7 +107,8 @@ class ClassifierTask:
             from train.tasks.own_encoder import OwnEncoderTask  # which needs this module
 
             return OwnEncoderTask.of_encoder(config, classes, camera)
-        return cls(config.network, classes, config.images, camera, config.augmentation, config.optimiser)
+        reality = reality_of(config)
+        return cls(config.network, classes, config.images, camera, config.augmentation, config.optimiser, reality)
 
     @property
     def batches(self) -> ViewBatches:
@@ -130,11 +147,19 @@ class ClassifierTask:
         convert = partial(image_input, images=self.images, channels=self.network_config.channels, camera=self.camera)
         return jax.vmap(convert)(batch[self.images])
 
+    def realistic(self, key: jax.Array, batch: Batch) -> jax.Array:
+        """Returns the images of a batch with the errors of `reality`, (views, height, width, channels)."""
+        assert self.reality is not None
+        camera, channels = view_camera(self.camera), self.network_config.channels
+        depth = realistic_depth(key, batch, camera, self.reality)
+        return jax.vmap(lambda image: depth_image(image, camera, channels))(depth)
+
     def loss(
         self, network: Any, batch: Batch, key: jax.Array, samples: jax.Array, hyper: Hyperparameters
     ) -> tuple[jax.Array, Metrics]:
         del samples
-        images = self.inputs(batch)
+        key, reality = jax.random.split(key) if self.reality else (key, key)
+        images = self.realistic(reality, batch) if self.reality else self.inputs(batch)
         keys = jax.random.split(key, len(images))
         images = jax.vmap(augment_image, in_axes=(0, 0, None, None))(
             keys, images, self.augmentation, hyper.augmentation

@@ -18,7 +18,7 @@ from flax import nnx
 from data_pipeline.capture.casting import CaptureConfig
 from data_pipeline.errors import DataError, kind_and_reason_of
 from train.own_code import load_own
-from train.tasks.classifier import ClassifierConfig, ClassifierTask
+from train.tasks.classifier import ClassifierConfig, ClassifierTask, reality_of
 
 
 @dataclass(frozen=True)
@@ -63,7 +63,8 @@ class OwnEncoderTask(ClassifierTask):
         code = load_own(config.encoder, "--encoder")
         described = OwnEncoderConfig(**code.identity, channels=config.network.channels)
         _FUNCTIONS[described] = code.function
-        task = cls(described, classes, config.images, camera, config.augmentation, config.optimiser)
+        reality = reality_of(config)
+        task = cls(described, classes, config.images, camera, config.augmentation, config.optimiser, reality)
         _check(task, config.encoder)
         return task
 

@@ -23,7 +23,9 @@ from data_pipeline.dataset.augment import (
     views_after,
 )
 from data_pipeline.dataset.batches import ViewBatches
-from data_pipeline.dataset.inputs import depth_and_normals
+from data_pipeline.dataset.inputs import depth_and_normals, view_camera
+from data_pipeline.dataset.reality import RealityAugmentation, realistic_depth, used_reality
+from mevs_jax import inputs as inputs_of
 from mevs_jax.models import Recogniser, ResNet
 from train.choosing.features import SetFusionConfig, new_fusion, random_sets
 from train.optimiser import OptimiserConfig
@@ -43,6 +45,7 @@ class RecogniserConfig:
     """augmentation of training objects"""
     shift: int = 3
     """maximal shift of training images in pixels, in each direction"""
+    reality: RealityAugmentation = RealityAugmentation()
     balanced: bool = False
     """draw equally many training objects of each class, objects of rarer classes more often; else each object equally often"""
     optimiser: OptimiserConfig = OptimiserConfig()
@@ -65,6 +68,7 @@ class RecogniserTask:
     optimiser: OptimiserConfig
     fold: tuple[int, int] | None = None
     """(k, n): trained without part k of n parts of the training objects"""
+    reality: RealityAugmentation | None = None
     name: str = "recogniser"
 
     @classmethod
@@ -82,6 +86,7 @@ class RecogniserTask:
             config.balanced,
             config.optimiser,
             fold,
+            used_reality(config.reality, "--learned.recogniser.reality"),
             name,
         )
 
@@ -122,6 +127,14 @@ class RecogniserTask:
         """Returns the images of a batch, (views, height, width, 4)."""
         return jax.vmap(partial(depth_and_normals, camera=self.camera))(batch["depth"])
 
+    def realistic(self, key: jax.Array, batch: Batch) -> jax.Array:
+        """Returns the images of a batch with the errors of `reality`, (views, height, width, 4)."""
+        assert self.reality is not None
+        camera = view_camera(self.camera)
+        return jax.vmap(partial(inputs_of.depth_and_normals, camera=camera))(
+            realistic_depth(key, batch, camera, self.reality)
+        )
+
     def directions(self, batch: Batch) -> jax.Array:
         """Returns the unit vectors from the object to the cameras, (views, 3)."""
         position = batch["pose"][:, :3, 3]
@@ -133,7 +146,8 @@ class RecogniserTask:
         del samples, hyper
         change, move, sets, drop = jax.random.split(key, 4)
         by_object = partial(views_by_object, views=self.optimiser.views_per_object)
-        images, poses = by_object(self.inputs(batch)), by_object(batch["pose"])
+        inputs = self.realistic(jax.random.fold_in(key, 4), batch) if self.reality else self.inputs(batch)
+        images, poses = by_object(inputs), by_object(batch["pose"])
         labels = batch["label"].reshape(images.shape[:2])[:, 0]
         changes = object_changes(change, len(images), self.augmentation)
         images, directions = jax.vmap(partial(views_after, camera=self.camera))(changes, images, poses)

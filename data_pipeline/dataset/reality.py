@@ -1,0 +1,183 @@
+"""Augmentation of training views by what real images have: errors of the sensor, a wrong sphere, a table, something in front.
+
+Functions take one depth image of the data set's camera, in radii, 0 where nothing is hit, and return what would reach the
+networks in its place. They work on the device, one image at a time: `jax.vmap` them over views.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Literal
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from data_pipeline.capture.sensor import Kind, SensorConfig, sense
+from data_pipeline.dataset.inputs import metric_depth
+from data_pipeline.errors import DataError
+from mevs_jax.arrays import AnyArray
+from mevs_jax.cameras import ViewCamera, look_at_origin, partial_cloud, pixel_directions
+
+_OUTSIDE = 1.02
+"""Radii beyond which points are not the object's, as in `mevs_jax.canonical_view`."""
+
+
+@dataclass(frozen=True)
+class RealityAugmentation:
+    """Errors of real images in training images."""
+
+    strength: float = 0.0
+    """magnitude of all of them: each image draws its own strength between 0 and this; 0: none, 1: as in real images"""
+    sensor: Literal["any", "structured-light", "stereo", "none"] = "any"
+    """the depth camera (data_pipeline.capture.sensor); any: one or the other for each image"""
+    distance: float = 1.0
+    """metres from the camera to the object"""
+    sphere: float = 0.1
+    """largest error of the object's centre and of its radius, as a share of the radius"""
+    floor: float = 0.1
+    """largest height that is cut off with the table on which the object stands, in radii"""
+    hidden: float = 0.3
+    """largest share of the object that something else hides"""
+
+
+def used_reality(config: RealityAugmentation, option: str) -> RealityAugmentation | None:
+    """Returns the configuration, or None if its strength is 0.
+
+    Args:
+        option: the group of options that it was given by, for messages.
+
+    Raises:
+        DataError: for numbers out of their range.
+    """
+    limits = {"strength": (0, 4), "sphere": (0, 0.5), "floor": (0, 1), "hidden": (0, 0.9), "distance": (0.1, 10)}
+    for name, (least, most) in limits.items():
+        if not least <= getattr(config, name) <= most:
+            raise DataError(
+                f"{option}.{name} {getattr(config, name):g} is not from {least:g} to {most:g}; choose another"
+            )
+    return config if config.strength else None
+
+
+def realistic_depth(
+    key: Array, batch: Mapping[str, Array], camera: ViewCamera, config: RealityAugmentation
+) -> Float[Array, "views side side"]:
+    """Returns the depth images of a batch of stored views, in radii, each with errors of its own (`as_in_reality`)."""
+    depth, poses = metric_depth(batch["depth"]), batch["pose"]
+    keys = jax.random.split(key, len(depth))
+    return jax.vmap(lambda key, image, pose: as_in_reality(key, image, pose, camera, config))(keys, depth, poses)
+
+
+def as_in_reality(
+    key: Array,
+    depth: Float[AnyArray, "side side"],
+    pose: Float[AnyArray, "4 4"],
+    camera: ViewCamera,
+    config: RealityAugmentation,
+) -> Float[Array, "side side"]:
+    """Returns a depth image with the errors that `config` describes, of a strength drawn for this image.
+
+    Args:
+        key: of this image.
+        depth: in radii, 0 where nothing is hit.
+        pose: camera to object.
+        camera: that took the image.
+        config: the errors.
+    """
+    amount, hide, cut, kind, noise, sphere = jax.random.split(key, 6)
+    depth, pose = jnp.asarray(depth, jnp.float32), jnp.asarray(pose, jnp.float32)
+    strength = config.strength * jax.random.uniform(amount)
+    depth = hidden(hide, depth, jnp.minimum(strength * config.hidden, 0.9))
+    depth = without_floor(cut, depth, pose, camera, strength * config.floor)
+    if config.sensor == "any":
+        structured = measured(noise, depth, pose, camera, config, "structured-light", strength)
+        stereo = measured(noise, depth, pose, camera, config, "stereo", strength)
+        depth = jnp.where(jax.random.bernoulli(kind), structured, stereo)
+    else:
+        depth = measured(noise, depth, pose, camera, config, config.sensor, strength)
+    where, size = jax.random.split(sphere)
+    offset = jax.random.ball(where, 3) * strength * config.sphere
+    factor = 1 + strength * config.sphere * jax.random.uniform(size, minval=-1.0)
+    return around_another_sphere(depth, pose, camera, offset, factor)
+
+
+def measured(
+    key: Array,
+    depth: Float[Array, "side side"],
+    pose: Float[Array, "4 4"],
+    camera: ViewCamera,
+    config: RealityAugmentation,
+    kind: Kind,
+    strength: float | Array,
+) -> Float[Array, "side side"]:
+    """What a sensor of some kind measures in place of the image (`data_pipeline.capture.sensor.sense`)."""
+    return sense(key, depth, pose, camera, SensorConfig(kind, 1.0, config.distance), strength)
+
+
+def hidden(key: Array, depth: Float[Array, "side side"], most: float | Array) -> Float[Array, "side side"]:
+    """Removes one side of the object in the image, as something in front of it does.
+
+    Args:
+        key: of the direction, and of the share that is removed: between 0 and `most` of the object's pixels.
+    """
+    turn, share = jax.random.split(key)
+    side = len(depth)
+    angle = jax.random.uniform(turn, maxval=2 * jnp.pi)
+    at = jnp.arange(side) - (side - 1) / 2
+    across = jnp.cos(angle) * at[:, None] + jnp.sin(angle) * at
+    ordered = jnp.sort(jnp.where(depth > 0, across, jnp.inf), axis=None)
+    removed = jnp.floor(jax.random.uniform(share, maxval=most) * jnp.sum(depth > 0)).astype(jnp.int32)
+    return jnp.where(across < ordered[removed], 0.0, depth)
+
+
+def without_floor(
+    key: Array,
+    depth: Float[Array, "side side"],
+    pose: Float[Array, "4 4"],
+    camera: ViewCamera,
+    most: float | Array,
+) -> Float[Array, "side side"]:
+    """Removes the lowest part of what the image shows, as happens where a table is removed with a margin.
+
+    Args:
+        key: of the height that is removed, between 0 and `most`, in radii.
+    """
+    points, hit = partial_cloud(depth, camera.at(pose, len(depth)))
+    height = points[:, 2].reshape(depth.shape)
+    seen = hit.reshape(depth.shape)
+    lowest = jnp.min(jnp.where(seen, height, jnp.inf))
+    return jnp.where(height < lowest + jax.random.uniform(key, maxval=most), 0.0, depth)
+
+
+def around_another_sphere(
+    depth: Float[Array, "side side"],
+    pose: Float[Array, "4 4"],
+    camera: ViewCamera,
+    offset: Float[Array, "3"],
+    factor: float | Array,
+) -> Float[Array, "side side"]:
+    """Returns the image that follows from a wrong centre and radius of the object.
+
+    The camera stays where it is, so that the view from the wrong centre's side is the same image, turned and scaled; points
+    outside of the wrong sphere are lost. Pixels are sampled from the nearest old pixel.
+
+    Args:
+        offset: of the believed centre from the true one, in true radii.
+        factor: believed radius in true radii.
+    """
+    side, distance = len(depth), camera.distance
+    pinhole = camera.at(jnp.eye(4), side)
+    towards = (pose[:3, 3] - offset) / factor
+    away = jnp.linalg.norm(towards)  # in believed radii
+    turned = look_at_origin(towards)[:3, :3]
+    rays = pixel_directions(pinhole) * jnp.stack([distance / away, distance / away, jnp.float32(1)])
+    old = rays @ (pose[:3, :3].T @ turned).T  # in the old camera's frame
+    pixel = jnp.floor(old[..., :2] / old[..., 2:] * pinhole.focal_length + side / 2).astype(jnp.int32)
+    inside = jnp.all((pixel >= 0) & (pixel < side), axis=-1) & (old[..., 2] > 0)
+    pixel = jnp.clip(pixel, 0, side - 1)
+    sampled = jnp.where(inside, depth[pixel[..., 1], pixel[..., 0]], 0.0)
+    along = sampled / old[..., 2] / factor  # new depth, from where the camera is
+    point = rays * along[..., None] + turned.T @ towards  # from the believed centre, in the new camera's axes
+    kept = (sampled > 0) & (jnp.linalg.norm(point, axis=-1) < _OUTSIDE)
+    return jnp.where(kept, along + distance - away, 0.0)

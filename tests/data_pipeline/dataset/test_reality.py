@@ -1,0 +1,139 @@
+"""Training views as real images would be: beside `canonical_view` with a wrong sphere, and what is removed where."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from data_pipeline.capture.casting import default_caster
+from data_pipeline.dataset.reality import (
+    RealityAugmentation,
+    around_another_sphere,
+    as_in_reality,
+    hidden,
+    used_reality,
+    without_floor,
+)
+from data_pipeline.errors import DataError
+from data_pipeline.objects.mesh import normalise
+from data_pipeline.objects.recipes import FurniturePiece
+from eval.checks.camera import cast_canonical
+from eval.settings import TINY
+from mevs_jax import canonical_view
+from mevs_jax.cameras import ViewCamera, cameras_at, partial_cloud
+from train.tasks.classifier import ClassifierTask
+from train.tasks.recogniser import RecogniserTask
+
+CAMERA = ViewCamera(resolution=64)
+DIRECTIONS = np.array([[1, 0.2, 0.4], [-0.6, -0.7, 0.1], [0.3, -0.9, -0.5]])
+DIRECTIONS /= np.linalg.norm(DIRECTIONS, axis=1, keepdims=True)
+POSES = np.asarray(cameras_at(DIRECTIONS.astype(np.float32), distance=CAMERA.distance).pose)
+
+
+@pytest.fixture(scope="module")
+def chair():
+    return default_caster()(normalise(*FurniturePiece("chair", 4).load(), "chair"))
+
+
+@pytest.fixture(scope="module")
+def images(chair):
+    return np.stack([cast_canonical(chair, direction, CAMERA) for direction in DIRECTIONS])
+
+
+def test_a_wrong_sphere_gives_what_the_agent_would_see(chair, images):
+    """The agent's own image of a camera of four times the resolution, which knows nothing of pixels."""
+    fine = replace(CAMERA, resolution=256)
+    offset, factor = np.array([0.06, -0.05, 0.04], np.float32), 1.08
+    changed = jax.jit(around_another_sphere, static_argnums=2)
+    for direction, pose, image in zip(DIRECTIONS, POSES, images, strict=True):
+        depth = cast_canonical(chair, direction, fine)
+        shown = canonical_view(
+            np.where(depth > 0, depth, np.inf).astype(np.float32),
+            fine.intrinsics,
+            pose.astype(float),
+            center=offset,
+            radius=factor,
+            camera=CAMERA,
+        )
+        found = np.asarray(changed(image, jnp.asarray(pose), CAMERA, jnp.asarray(offset), factor))
+        both = (found > 0) & (shown.depth > 0)
+        overlap = both.sum() / ((found > 0) | (shown.depth > 0)).sum()
+        before = ((image > 0) & (shown.depth > 0)).sum() / ((image > 0) | (shown.depth > 0)).sum()
+        assert overlap > max(0.75, before + 0.1)
+        assert np.median(np.abs(found - shown.depth)[both]) < 0.01
+
+
+def test_the_true_sphere_changes_nothing(images):
+    for pose, image in zip(POSES, images, strict=True):
+        found = around_another_sphere(jnp.asarray(image), jnp.asarray(pose), CAMERA, jnp.zeros(3), 1.0)
+        assert (np.abs(np.asarray(found) - image) < 1e-5).mean() > 0.99
+
+
+def test_one_side_is_hidden_by_at_most_the_share(images):
+    for seed in range(8):
+        kept = np.asarray(hidden(jax.random.key(seed), jnp.asarray(images[0]), 0.4))
+        gone = (images[0] > 0) & (kept == 0)
+        assert gone.sum() <= 0.4 * (images[0] > 0).sum()
+        np.testing.assert_array_equal(kept[~gone], images[0][~gone])
+        if gone.any():  # a straight line separates what is gone from what is kept
+            rest = np.argwhere((images[0] > 0) & ~gone)
+            apart = np.argwhere(gone).mean(axis=0) - rest.mean(axis=0)
+            assert (np.argwhere(gone) @ apart).mean() > (rest @ apart).mean()
+    np.testing.assert_array_equal(hidden(jax.random.key(0), jnp.asarray(images[0]), 0.0), images[0])
+
+
+def test_the_lowest_part_is_cut_off(images):
+    for pose, image in zip(POSES, images, strict=True):
+        camera = CAMERA.at(jnp.asarray(pose))
+        kept = np.asarray(without_floor(jax.random.key(1), jnp.asarray(image), jnp.asarray(pose), CAMERA, 0.5))
+        points, hit = map(np.asarray, partial_cloud(image, camera))
+        left = kept.reshape(-1) > 0
+        assert 0 < (hit & ~left).sum() < hit.sum()
+        assert points[hit & ~left, 2].max() <= points[left, 2].min()
+        assert points[left, 2].min() <= points[hit, 2].min() + 0.5
+
+
+def test_errors_grow_with_the_strength(images):
+    def errors(strength: float) -> float:
+        config = RealityAugmentation(strength)
+        changed = jax.jit(jax.vmap(lambda key: as_in_reality(key, images[0], POSES[0], CAMERA, config)))
+        found = np.asarray(changed(jax.random.split(jax.random.key(0), 32)))
+        assert np.isfinite(found).all()
+        assert ((found == 0) | ((found > CAMERA.distance - 1.2) & (found < CAMERA.distance + 1.2))).all()
+        return float(np.abs(found - images[0]).mean())
+
+    assert errors(1e-3) < 0.2 * errors(1.0)
+
+
+@pytest.mark.parametrize("task", [ClassifierTask, RecogniserTask])
+def test_networks_train_on_it(task, images):
+    group = TINY.classifier if task is ClassifierTask else TINY.learned.recogniser
+    camera = replace(TINY.dataset.capture, resolution=64)
+    plain = task.of(group, 10, camera)
+    assert plain.reality is None
+    changed = task.of(replace(group, reality=RealityAugmentation(1.0)), 10, camera)
+    batch = {"depth": jnp.asarray(images * 10_000).astype(jnp.uint16), "pose": jnp.asarray(POSES)}
+    found = changed.realistic(jax.random.key(0), batch)
+    assert found.shape == plain.inputs(batch).shape
+    assert 0.01 < np.abs(np.asarray(found - plain.inputs(batch))).mean() < 0.2
+    assert np.isfinite(np.asarray(found)).all()
+
+
+def test_numbers_out_of_range_are_refused():
+    assert used_reality(RealityAugmentation(), "--x") is None
+    for name, value in (
+        ("strength", -1.0),
+        ("sphere", 0.6),
+        ("hidden", 1.0),
+        ("floor", float("nan")),
+        ("distance", 0.0),
+    ):
+        with pytest.raises(DataError, match=rf"--x\.{name} .* is not from"):
+            used_reality(replace(RealityAugmentation(1.0), **{name: value}), "--x")
+    config = replace(TINY.classifier, images="image", reality=RealityAugmentation(1.0))
+    with pytest.raises(DataError, match="for images of depth"):
+        ClassifierTask.of(config, 10, TINY.dataset.capture)
