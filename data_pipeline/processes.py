@@ -73,10 +73,9 @@ def _noted(work: Callable[[Job], Result], name_of: Callable[[Job], str], job: Jo
 
 def _death(children: Sequence[Any], notes: Path) -> DataError:
     """Returns the error about worker processes of which one died."""
+    # `join` also returns when the executor's thread has just waited for a child, whose exit code is not noted yet.
     deadline = time.monotonic() + 5
-    for (
-        child
-    ) in children:  # `join` also returns when the executor's thread has just waited for it, its exit code not yet noted
+    for child in children:
         while child.exitcode is None and time.monotonic() < deadline:
             child.join(0.1)
             time.sleep(0.001)
@@ -99,7 +98,7 @@ def _is_broken(pool: Executor) -> bool:
     """Returns whether a process of the pool died. While others are started, this also raises errors about closed handles."""
     try:
         pool.submit(int)
-    except BrokenProcessPool:
+    except (BrokenProcessPool, BrokenPipeError):
         return True
     except RuntimeError:  # it is shut down
         return False
@@ -159,7 +158,10 @@ def shared(
             return [child for child in multiprocessing.active_children() if child not in before]
 
         try:
-            results = pool.map(partial(_noted, work, name_of), jobs, chunksize=chunk)
+            try:
+                results = pool.map(partial(_noted, work, name_of), jobs, chunksize=chunk)
+            except BrokenPipeError as error:  # a process died before Python had given it its work
+                raise _death(begun(), notes) from error
             children = begun()
             yield results
         except BaseException as error:

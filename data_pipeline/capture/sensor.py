@@ -69,6 +69,8 @@ _FAR = 0.3
 _JUMP = 0.05
 """Difference between neighbours that is an edge, as a share of the depth."""
 _STEEPEST = math.radians(85)
+_WAVES = 8
+"""Plane waves of the random field whose peaks are dark."""
 
 
 def axial_deviation(
@@ -196,7 +198,9 @@ def _dark(
     """Pixels of areas too dark to be measured: where a smooth random field over the object's space is largest."""
     waves, phases = jax.random.split(key)
     points, hit = partial_cloud(depth, camera.at(jnp.asarray(pose, jnp.float32), len(depth)))
-    angles = points @ (3.0 * jax.random.normal(waves, (3, 16))) + jax.random.uniform(phases, (16,), maxval=2 * jnp.pi)
-    field = jnp.sqrt(2 / 16) * jnp.sum(jnp.cos(angles), axis=-1)  # about normal with variance 1
+    angles = points @ (3.0 * jax.random.normal(waves, (3, _WAVES))) + jax.random.uniform(
+        phases, (_WAVES,), maxval=2 * jnp.pi
+    )
+    field = jnp.sqrt(2 / _WAVES) * jnp.sum(jnp.cos(angles), axis=-1)  # about normal with variance 1
     dark = hit & (field > jax.scipy.stats.norm.isf(jnp.clip(share, 1e-12, 1 - 1e-7))) & (share > 0)
     return dark.reshape(depth.shape)

@@ -6,8 +6,9 @@ networks in its place. They work on the device, one image at a time: `jax.vmap` 
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from functools import partial
 from typing import Literal
 
 import jax
@@ -31,7 +32,7 @@ class RealityAugmentation:
     strength: float = 0.0
     """magnitude of all of them: each image draws its own strength between 0 and this; 0: none, 1: as in real images"""
     sensor: Literal["any", "structured-light", "stereo", "none"] = "any"
-    """the depth camera (data_pipeline.capture.sensor); any: one or the other for each image"""
+    """the depth camera (data_pipeline.capture.sensor); any: one or the other for each batch"""
     distance: float = 1.0
     """metres from the camera to the object"""
     sphere: float = 0.1
@@ -39,7 +40,7 @@ class RealityAugmentation:
     floor: float = 0.1
     """largest height that is cut off with the table on which the object stands, in radii"""
     hidden: float = 0.3
-    """largest share of the object that something else hides"""
+    """largest share of the object's width that something else hides"""
 
 
 def used_reality(config: RealityAugmentation, option: str) -> RealityAugmentation | None:
@@ -63,10 +64,21 @@ def used_reality(config: RealityAugmentation, option: str) -> RealityAugmentatio
 def realistic_depth(
     key: Array, batch: Mapping[str, Array], camera: ViewCamera, config: RealityAugmentation
 ) -> Float[Array, "views side side"]:
-    """Returns the depth images of a batch of stored views, in radii, each with errors of its own (`as_in_reality`)."""
+    """Returns the depth images of a batch of stored views, in radii, each with errors of its own (`as_in_reality`).
+
+    Of two sensors, all images of a batch have one or the other.
+    """
     depth, poses = metric_depth(batch["depth"]), batch["pose"]
+    either, key = jax.random.split(key)
     keys = jax.random.split(key, len(depth))
-    return jax.vmap(lambda key, image, pose: as_in_reality(key, image, pose, camera, config))(keys, depth, poses)
+
+    def by(kind: Kind) -> Callable[[], Array]:
+        one = partial(as_in_reality, camera=camera, config=config, kind=kind)
+        return lambda: jax.vmap(one)(keys, depth, poses)
+
+    if config.sensor == "any":
+        return jax.lax.cond(jax.random.bernoulli(either), by("structured-light"), by("stereo"))
+    return by(config.sensor)()
 
 
 def as_in_reality(
@@ -75,6 +87,7 @@ def as_in_reality(
     pose: Float[AnyArray, "4 4"],
     camera: ViewCamera,
     config: RealityAugmentation,
+    kind: Kind,
 ) -> Float[Array, "side side"]:
     """Returns a depth image with the errors that `config` describes, of a strength drawn for this image.
 
@@ -84,51 +97,35 @@ def as_in_reality(
         pose: camera to object.
         camera: that took the image.
         config: the errors.
+        kind: of the sensor.
     """
-    amount, hide, cut, kind, noise, sphere = jax.random.split(key, 6)
+    amount, hide, cut, noise, where, size = jax.random.split(key, 6)
     depth, pose = jnp.asarray(depth, jnp.float32), jnp.asarray(pose, jnp.float32)
     strength = config.strength * jax.random.uniform(amount)
     depth = hidden(hide, depth, jnp.minimum(strength * config.hidden, 0.9))
     depth = without_floor(cut, depth, pose, camera, strength * config.floor)
-    if config.sensor == "any":
-        structured = measured(noise, depth, pose, camera, config, "structured-light", strength)
-        stereo = measured(noise, depth, pose, camera, config, "stereo", strength)
-        depth = jnp.where(jax.random.bernoulli(kind), structured, stereo)
-    else:
-        depth = measured(noise, depth, pose, camera, config, config.sensor, strength)
-    where, size = jax.random.split(sphere)
+    depth = jax.lax.optimization_barrier(
+        depth
+    )  # else XLA computes each stage again for every pixel that the next one reads
+    depth = sense(noise, depth, pose, camera, SensorConfig(kind, 1.0, config.distance), strength)
+    depth = jax.lax.optimization_barrier(depth)
     offset = jax.random.ball(where, 3) * strength * config.sphere
     factor = 1 + strength * config.sphere * jax.random.uniform(size, minval=-1.0)
-    return around_another_sphere(depth, pose, camera, offset, factor)
-
-
-def measured(
-    key: Array,
-    depth: Float[Array, "side side"],
-    pose: Float[Array, "4 4"],
-    camera: ViewCamera,
-    config: RealityAugmentation,
-    kind: Kind,
-    strength: float | Array,
-) -> Float[Array, "side side"]:
-    """What a sensor of some kind measures in place of the image (`data_pipeline.capture.sensor.sense`)."""
-    return sense(key, depth, pose, camera, SensorConfig(kind, 1.0, config.distance), strength)
+    return around_another_sphere(jnp.asarray(depth), pose, camera, offset, factor)
 
 
 def hidden(key: Array, depth: Float[Array, "side side"], most: float | Array) -> Float[Array, "side side"]:
     """Removes one side of the object in the image, as something in front of it does.
 
     Args:
-        key: of the direction, and of the share that is removed: between 0 and `most` of the object's pixels.
+        key: of the direction, and of the share of the object's width that is removed, between 0 and `most`.
     """
     turn, share = jax.random.split(key)
-    side = len(depth)
-    angle = jax.random.uniform(turn, maxval=2 * jnp.pi)
+    side, angle = len(depth), jax.random.uniform(turn, maxval=2 * jnp.pi)
     at = jnp.arange(side) - (side - 1) / 2
     across = jnp.cos(angle) * at[:, None] + jnp.sin(angle) * at
-    ordered = jnp.sort(jnp.where(depth > 0, across, jnp.inf), axis=None)
-    removed = jnp.floor(jax.random.uniform(share, maxval=most) * jnp.sum(depth > 0)).astype(jnp.int32)
-    return jnp.where(across < ordered[removed], 0.0, depth)
+    first, last = jnp.min(across, where=depth > 0, initial=side), jnp.max(across, where=depth > 0, initial=-side)
+    return jnp.where(across < first + jax.random.uniform(share, maxval=most) * (last - first), 0.0, depth)
 
 
 def without_floor(

@@ -122,3 +122,17 @@ def test_nothing_is_left_in_the_folder_for_temporary_files(tmp_path, monkeypatch
     monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
     results(times, range(3), threads=True)
     assert list(Path(tmp_path).iterdir()) == []
+
+
+def test_a_process_that_dies_before_python_writes_to_it_is_named(monkeypatch):
+    """Python 3.14 closes its own end of the pipe first, so that writing fails."""
+
+    def start(self: multiprocessing.process.BaseProcess) -> None:
+        raise BrokenPipeError(32, "Broken pipe")
+
+    monkeypatch.setattr(multiprocessing.get_context("spawn").Process, "start", start)
+    with (
+        pytest.raises(DataError, match=r"a worker process was .* while it worked on nothing yet"),
+        shared(times, range(20), workers=2, start=begin, given=(3,), name_of=name_of) as found,
+    ):
+        list(found)

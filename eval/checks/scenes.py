@@ -1,0 +1,211 @@
+"""What a depth camera sees of an object in a scene, and what the agent makes of it: the conditions of `mevs check reality`.
+
+The images are cast from meshes at a resolution of their own, a sensor model adds its errors (`data_pipeline.capture.sensor`),
+and `mevs_jax.canonical_view` turns them into the networks' images, with the centre and radius that the robot believes in. Nothing
+here is used in training, where errors are added to the data set's own images (`data_pipeline.dataset.reality`).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+from scipy.spatial.transform import Rotation
+
+from data_pipeline.capture.casting import Cast, default_caster
+from data_pipeline.capture.sensor import Kind, SensorConfig, sense
+from data_pipeline.objects.mesh import Mesh
+from mevs_jax import canonical_view
+from mevs_jax.cameras import ViewCamera, cameras_at, pixel_directions
+
+RADIUS = 0.5
+"""Metres in a radius of an object: furniture seen from two radii is one metre away."""
+LOWEST = 0.0
+"""Elevation in degrees below which a camera cannot go, where the object stands on a table."""
+
+_CAMERA = ViewCamera(resolution=160, field_of_view=75.0)
+_MARGIN = 0.03
+"""Radii above the table that are removed with it."""
+_TABLE = 3.0
+"""Radius of the table, in radii of the object."""
+_BESIDE, _SMALLER = 1.15, 0.6
+"""Where another object stands, in radii from the centre, and its size relative to this one."""
+
+
+@dataclass(frozen=True)
+class Condition:
+    """What differs from perfect images of known objects.
+
+    Attributes:
+        name: in results.
+        title: in tables.
+        sensor: the depth camera's errors.
+        metres: from the camera to the object's centre, for the sensor's errors.
+        table: whether the object stands on a table, which is removed with a margin; views from below cannot be reached.
+        upper: whether only views from above can be reached.
+        beside: whether another object stands beside it, whose pixels a mask names.
+        sphere: largest error of the centre and of the radius, as a share of the radius.
+        turned: whether the object faces anywhere, and the system is not told where.
+        roll: whether the camera is rolled by any angle.
+    """
+
+    name: str
+    title: str
+    sensor: Kind = "none"
+    metres: float = 1.0
+    table: bool = False
+    upper: bool = False
+    beside: bool = False
+    sphere: float = 0.0
+    turned: bool = False
+    roll: bool = False
+
+
+CONDITIONS = (
+    Condition("clean", "perfect images"),
+    Condition("roll", "camera rolled by any angle", roll=True),
+    Condition("structured_light", "structured light at 1 m", "structured-light"),
+    Condition("stereo", "stereo at 1 m", "stereo"),
+    Condition("stereo_far", "stereo at 2 m", "stereo", metres=2.0),
+    Condition("sphere_5", "centre and radius off by up to 5 %", sphere=0.05),
+    Condition("sphere_10", "centre and radius off by up to 10 %", sphere=0.1),
+    Condition("beside", "another object beside it", beside=True),
+    Condition("turned", "unknown yaw", turned=True),
+    Condition("upper", "perfect images, from above only", upper=True),
+    Condition("table", "on a table, from above only", table=True, upper=True),
+    Condition("together", "stereo at 1 m, 10 % off, on a table", "stereo", table=True, upper=True, sphere=0.1),
+)
+
+
+def reachable_in(condition: Condition, viewpoints: Float[np.ndarray, "views 3"]) -> np.ndarray | None:
+    """Which viewpoints can be reached, (views,); None if all can."""
+    return viewpoints[:, 2] > np.sin(np.radians(LOWEST)) if condition.upper else None
+
+
+@dataclass(frozen=True)
+class Placed:
+    """An object in a scene. All lengths are in its true radii, in its own frame.
+
+    Attributes:
+        cast: casts rays at it.
+        lowest: height of its lowest point.
+        other: casts rays at the object beside it, in that object's frame.
+        other_lowest: height of that object's lowest point, in that object's frame.
+    """
+
+    cast: Cast
+    lowest: float
+    other: Cast
+    other_lowest: float
+
+    @classmethod
+    def of(cls, mesh: Mesh, other: Mesh) -> Placed:
+        caster = default_caster()
+        return cls(caster(mesh), float(mesh.vertices[:, 2].min()), caster(other), float(other.vertices[:, 2].min()))
+
+
+def views_in(
+    condition: Condition,
+    placed: Placed,
+    viewpoints: Float[np.ndarray, "views 3"],
+    camera: ViewCamera,
+    seed: tuple[int, ...],
+) -> Float[np.ndarray, "views side side"]:
+    """Returns the networks' images of an object in a scene, from every viewpoint; all 0 where nothing is seen.
+
+    Args:
+        condition: what the scene and the camera are like.
+        placed: the object.
+        viewpoints: unit vectors from the believed centre to the cameras.
+        camera: of the networks' images.
+        seed: of everything that is drawn: it is the same for all views of the object.
+    """
+    random = np.random.default_rng(seed)
+    offset, factor = np.zeros(3), 1.0
+    if condition.sphere:
+        offset = random.normal(size=3)
+        offset *= condition.sphere * random.random() / np.linalg.norm(offset)
+        factor = 1 + condition.sphere * random.uniform(-1, 1)
+    yaw = Rotation.from_rotvec([0, 0, random.uniform(0, 2 * np.pi) if condition.turned else 0.0]).as_matrix()
+    source = replace(_CAMERA, distance=camera.distance)
+    poses = np.asarray(cameras_at(viewpoints.astype(np.float32), distance=source.distance).pose, float)
+    poses[:, :3, 3] = poses[:, :3, 3] * factor + offset
+    if condition.roll:
+        turns = Rotation.from_rotvec(random.uniform(0, 2 * np.pi, len(poses))[:, None] * [0, 0, 1.0]).as_matrix()
+        poses[:, :3, :3] = poses[:, :3, :3] @ turns
+    beside = random.uniform(0, 2 * np.pi)
+    at = np.array([np.cos(beside) * _BESIDE, np.sin(beside) * _BESIDE, 0.0])
+    local = np.asarray(pixel_directions(source.at(jnp.eye(4)))).reshape(-1, 3)
+    images = np.stack([_seen(condition, placed, pose, local, yaw, at) for pose in poses])
+    images = images.reshape(-1, source.resolution, source.resolution)
+    object_is_nearest = images > 0
+    depth = np.abs(images)
+    measured = depth
+    if condition.sensor != "none":
+        measured = _measured(depth, poses, source, condition, random)
+    found = np.zeros((len(poses), camera.resolution, camera.resolution), np.float32)
+    for view, pose in enumerate(poses):
+        world = pose.copy()
+        world[:3, 3] *= RADIUS
+        try:
+            found[view] = canonical_view(
+                np.where(depth[view] > 0, measured[view] * RADIUS, np.inf).astype(np.float32),
+                source.intrinsics,
+                world,
+                center=offset * RADIUS,
+                radius=factor * RADIUS,
+                camera=camera,
+                mask=object_is_nearest[view] if condition.beside else None,
+                floor=(placed.lowest - offset[2] + _MARGIN) * RADIUS if condition.table else None,
+            ).depth
+        except ValueError:  # nothing of the object is in the image
+            continue
+    return found
+
+
+def _seen(
+    condition: Condition, placed: Placed, pose: np.ndarray, local: np.ndarray, yaw: np.ndarray, at: np.ndarray
+) -> np.ndarray:
+    """Depth of every ray, 0 where nothing is hit, negative where something else is in front of the object."""
+    eye, rays = pose[:3, 3], local @ pose[:3, :3].T
+    depth = placed.cast(*_rays(eye @ yaw, rays @ yaw))[0].astype(float)
+    other = np.full(len(depth), np.inf)
+    if condition.beside:
+        where = at + np.array([0, 0, placed.lowest - _SMALLER * placed.other_lowest])
+        other = placed.other(*_rays((eye - where) / _SMALLER, rays))[0].astype(float) * _SMALLER
+    if condition.table:
+        with np.errstate(divide="ignore"):
+            down = (placed.lowest - eye[2]) / rays[:, 2]
+        on = np.linalg.norm((eye + rays * np.where(np.isfinite(down), down, 0)[:, None])[:, :2], axis=1) < _TABLE
+        other = np.minimum(other, np.where((down > 0) & on, down, np.inf))
+    nearest = np.minimum(depth, other)
+    return np.where(np.isfinite(nearest), np.where(other < depth, -nearest, nearest), 0.0)
+
+
+def _rays(eye: np.ndarray, rays: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    return np.tile(eye.astype(np.float32), (len(rays), 1)), np.ascontiguousarray(rays, np.float32)
+
+
+def _measured(
+    depth: np.ndarray, poses: np.ndarray, camera: ViewCamera, condition: Condition, random: np.random.Generator
+) -> np.ndarray:
+    keys = jax.random.split(jax.random.key(int(random.integers(2**31))), len(depth) + 1)
+    config = SensorConfig(condition.sensor, 1.0, condition.metres)
+    images, poses = (np.asarray(array, np.float32) for array in (depth, poses))
+    return np.asarray(_sense(keys[1:], images, poses, keys[0], camera, config))
+
+
+@partial(jax.jit, static_argnames=("camera", "config"))
+def _sense(
+    keys: Array, depth: Array, poses: Array, surface: Array, camera: ViewCamera, config: SensorConfig
+) -> Float[Array, "views side side"]:
+    """What the sensor measures of all views of an object, whose dark areas are those of `surface`."""
+
+    def one(key: Array, image: Array, pose: Array) -> Array:
+        return sense(key, image, pose, camera, config, surface=surface)
+
+    return jax.vmap(one)(keys, depth, poses)
