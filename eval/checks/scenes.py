@@ -16,8 +16,9 @@ import numpy as np
 from jaxtyping import Array, Float
 from scipy.spatial.transform import Rotation
 
-from data_pipeline.capture.casting import Cast, default_caster
+from data_pipeline.capture.casting import default_caster
 from data_pipeline.capture.sensor import Kind, SensorConfig, sense
+from data_pipeline.files import digest_of
 from data_pipeline.objects.mesh import Mesh
 from mevs_jax import canonical_view
 from mevs_jax.cameras import ViewCamera, cameras_at, pixel_directions
@@ -27,12 +28,12 @@ RADIUS = 0.5
 LOWEST = 0.0
 """Elevation in degrees below which a camera cannot go, where the object stands on a table."""
 
-_CAMERA = ViewCamera(resolution=160, field_of_view=75.0)
+_CAMERA = ViewCamera(resolution=224, field_of_view=70.0)
 _MARGIN = 0.03
 """Radii above the table that are removed with it."""
 _TABLE = 3.0
 """Radius of the table, in radii of the object."""
-_BESIDE, _SMALLER = 1.15, 0.6
+_BESIDE, _SMALLER = 1.0, 0.8
 """Where another object stands, in radii from the centre, and its size relative to this one."""
 
 
@@ -43,8 +44,8 @@ class Condition:
     Attributes:
         name: in results.
         title: in tables.
-        sensor: the depth camera's errors.
-        metres: from the camera to the object's centre, for the sensor's errors.
+        sensor: the depth camera's errors, at one metre from the object's centre.
+        strength: of these errors.
         table: whether the object stands on a table, which is removed with a margin; views from below cannot be reached.
         upper: whether only views from above can be reached.
         beside: whether another object stands beside it, whose pixels a mask names.
@@ -56,7 +57,7 @@ class Condition:
     name: str
     title: str
     sensor: Kind = "none"
-    metres: float = 1.0
+    strength: float = 1.0
     table: bool = False
     upper: bool = False
     beside: bool = False
@@ -65,17 +66,19 @@ class Condition:
     roll: bool = False
 
 
+UPPER = Condition("upper", "perfect images, from above only", upper=True)
+
 CONDITIONS = (
     Condition("clean", "perfect images"),
     Condition("roll", "camera rolled by any angle", roll=True),
     Condition("structured_light", "structured light at 1 m", "structured-light"),
     Condition("stereo", "stereo at 1 m", "stereo"),
-    Condition("stereo_far", "stereo at 2 m", "stereo", metres=2.0),
+    Condition("stereo_strong", "stereo at 1 m, errors doubled", "stereo", strength=2.0),
     Condition("sphere_5", "centre and radius off by up to 5 %", sphere=0.05),
     Condition("sphere_10", "centre and radius off by up to 10 %", sphere=0.1),
     Condition("beside", "another object beside it", beside=True),
     Condition("turned", "unknown yaw", turned=True),
-    Condition("upper", "perfect images, from above only", upper=True),
+    UPPER,
     Condition("table", "on a table, from above only", table=True, upper=True),
     Condition("together", "stereo at 1 m, 10 % off, on a table", "stereo", table=True, upper=True, sphere=0.1),
 )
@@ -86,26 +89,31 @@ def reachable_in(condition: Condition, viewpoints: Float[np.ndarray, "views 3"])
     return viewpoints[:, 2] > np.sin(np.radians(LOWEST)) if condition.upper else None
 
 
-@dataclass(frozen=True)
 class Placed:
-    """An object in a scene. All lengths are in its true radii, in its own frame.
+    """An object in a scene, with another one beside it. All lengths are in its true radii, in its own frame.
 
     Attributes:
-        cast: casts rays at it.
         lowest: height of its lowest point.
-        other: casts rays at the object beside it, in that object's frame.
-        other_lowest: height of that object's lowest point, in that object's frame.
+        beside_lowest: height of the other object's lowest point, in that object's frame.
     """
 
-    cast: Cast
-    lowest: float
-    other: Cast
-    other_lowest: float
-
-    @classmethod
-    def of(cls, mesh: Mesh, other: Mesh) -> Placed:
+    def __init__(self, mesh: Mesh, beside: Mesh) -> None:
         caster = default_caster()
-        return cls(caster(mesh), float(mesh.vertices[:, 2].min()), caster(other), float(other.vertices[:, 2].min()))
+        self._cast, self._beside = caster(mesh), caster(beside)
+        self.lowest, self.beside_lowest = (float(one.vertices[:, 2].min()) for one in (mesh, beside))
+        self._known: dict[str, np.ndarray] = {}
+
+    def depth(self, eye: np.ndarray, rays: np.ndarray) -> np.ndarray:
+        """Depth along rays (n, 3) from an eye, inf where nothing is hit; what was cast before is kept."""
+        key = digest_of([eye.round(9).tolist(), rays[0].round(9).tolist(), rays[-1].round(9).tolist(), len(rays)])
+        if key not in self._known:
+            self._known[key] = self._cast(*_rays(eye, rays))[0].astype(float)
+        return self._known[key]
+
+    def depth_beside(self, eye: np.ndarray, rays: np.ndarray, at: np.ndarray) -> np.ndarray:
+        """Depth of the other object, which stands at a place (2,) on the same floor."""
+        where = np.array([*at, self.lowest - _SMALLER * self.beside_lowest])
+        return self._beside(*_rays((eye - where) / _SMALLER, rays))[0].astype(float) * _SMALLER
 
 
 def views_in(
@@ -138,7 +146,7 @@ def views_in(
         turns = Rotation.from_rotvec(random.uniform(0, 2 * np.pi, len(poses))[:, None] * [0, 0, 1.0]).as_matrix()
         poses[:, :3, :3] = poses[:, :3, :3] @ turns
     beside = random.uniform(0, 2 * np.pi)
-    at = np.array([np.cos(beside) * _BESIDE, np.sin(beside) * _BESIDE, 0.0])
+    at = _BESIDE * np.array([np.cos(beside), np.sin(beside)])
     local = np.asarray(pixel_directions(source.at(jnp.eye(4)))).reshape(-1, 3)
     images = np.stack([_seen(condition, placed, pose, local, yaw, at) for pose in poses])
     images = images.reshape(-1, source.resolution, source.resolution)
@@ -172,11 +180,8 @@ def _seen(
 ) -> np.ndarray:
     """Depth of every ray, 0 where nothing is hit, negative where something else is in front of the object."""
     eye, rays = pose[:3, 3], local @ pose[:3, :3].T
-    depth = placed.cast(*_rays(eye @ yaw, rays @ yaw))[0].astype(float)
-    other = np.full(len(depth), np.inf)
-    if condition.beside:
-        where = at + np.array([0, 0, placed.lowest - _SMALLER * placed.other_lowest])
-        other = placed.other(*_rays((eye - where) / _SMALLER, rays))[0].astype(float) * _SMALLER
+    depth = placed.depth(eye @ yaw, rays @ yaw)
+    other = placed.depth_beside(eye, rays, at) if condition.beside else np.full(len(depth), np.inf)
     if condition.table:
         with np.errstate(divide="ignore"):
             down = (placed.lowest - eye[2]) / rays[:, 2]
@@ -194,7 +199,7 @@ def _measured(
     depth: np.ndarray, poses: np.ndarray, camera: ViewCamera, condition: Condition, random: np.random.Generator
 ) -> np.ndarray:
     keys = jax.random.split(jax.random.key(int(random.integers(2**31))), len(depth) + 1)
-    config = SensorConfig(condition.sensor, 1.0, condition.metres)
+    config = SensorConfig(condition.sensor, condition.strength)
     images, poses = (np.asarray(array, np.float32) for array in (depth, poses))
     return np.asarray(_sense(keys[1:], images, poses, keys[0], camera, config))
 

@@ -20,7 +20,7 @@ from data_pipeline.objects.formats import Up
 from data_pipeline.objects.mesh import ObjectSource
 from data_pipeline.objects.sources import load_object, objects_to_test
 from data_pipeline.progress import progress_bar
-from eval.checks.walks import BASELINE, Walks, observed, rows_of, walk
+from eval.checks.walks import BASELINE, Walker, Walks, observed, rows_of
 from eval.numbers.comparison import intervals
 from eval.numbers.confidence import stopping
 from eval.system import USABLE
@@ -159,10 +159,10 @@ def check_transfer(
     of_known = jax.tree.map(lambda leaf: leaf[known], tables)
     best = system.description.best if posed else system.description.best_unposed
     policies = [name for name in dict.fromkeys((BASELINE, *USABLE, best)) if can_run(system, name, posed)]
-    walks = {}
+    walker, walks = Walker(system), {}
     for name in policies:
         times = draws if name == BASELINE else 1
-        walks[name] = walk(system, of_known, name, max_views, posed=posed, draws=times)
+        walks[name] = walker.walk(of_known, name, max_views, posed=posed, draws=times)
     single = walks[BASELINE].accuracy[:, 0]
     return {
         "system": system.name,

@@ -71,56 +71,83 @@ def beliefs_along(
     return jax.vmap(lambda seen: fusion(features, points, seen))(present)
 
 
-def walk(
-    system: TrainedSystem,
-    tables: ViewTable,
-    policy: str,
-    steps: int,
-    *,
-    posed: bool = True,
-    reachable: Bool[np.ndarray, " views"] | None = None,
-    draws: int = 1,
-    seed: int = 0,
-) -> Walks:
-    """Walks around every object from every reachable first view.
+class Walker:
+    """Walks with a trained system's policies; a policy is compiled once, for all tables of one size.
 
     Args:
-        system: whose policy it is.
-        tables: of `observed`.
-        policy: its name, as `TrainedSystem.policy` takes it.
-        steps: number of views of each walk.
-        posed: whether the yaw of the objects is known.
-        reachable: viewpoints that can be reached; all if None.
-        draws: walks from each first view, for policies that draw at random.
-        seed: of these draws.
+        system: whose policies they are.
     """
-    views = len(system.viewpoints)
-    can_reach = np.ones(views, bool) if reachable is None else np.asarray(reachable)
-    steps = min(steps, int(can_reach.sum()))
-    firsts, graph = jnp.asarray(np.flatnonzero(can_reach)), system.graph
 
-    @jax.jit
-    def around(parts: Parts, item: tuple[Array, ViewTable]) -> tuple[Array, Array]:
-        number, table = item
-        fuse, run = system.fuse(parts, posed), system.policy(policy, parts, posed)
-        scene = table.scene(
-            graph, parts.knowledge if posed else None, None if reachable is None else jnp.asarray(can_reach)
+    def __init__(self, system: TrainedSystem) -> None:
+        self.system = system
+        self._walks = jax.jit(self._around_all, static_argnames=("policy", "steps", "posed", "draws"))
+
+    def walk(
+        self,
+        tables: ViewTable,
+        policy: str,
+        steps: int,
+        *,
+        posed: bool = True,
+        reachable: Bool[np.ndarray, " views"] | None = None,
+        draws: int = 1,
+        seed: int = 0,
+    ) -> Walks:
+        """Walks around every object from every reachable first view.
+
+        Args:
+            tables: of `observed`.
+            policy: its name, as `TrainedSystem.policy` takes it.
+            steps: number of views of each walk.
+            posed: whether the yaw of the objects is known.
+            reachable: viewpoints that can be reached; all if None.
+            draws: walks from each first view, for policies that draw at random.
+            seed: of these draws.
+        """
+        can_reach = np.ones(len(self.system.viewpoints), bool) if reachable is None else np.asarray(reachable)
+        steps, firsts = min(steps, int(can_reach.sum())), jnp.asarray(np.flatnonzero(can_reach))
+        given = (
+            self.system.parts,
+            jax.tree.map(jnp.asarray, tables),
+            firsts,
+            jnp.asarray(can_reach),
+            jax.random.key(seed),
         )
+        return Walks(*map(np.asarray, self._walks(*given, policy=policy, steps=steps, posed=posed, draws=draws)))
 
-        def from_view(first: Array, draw: Array) -> tuple[Array, Array]:
-            key = jax.random.fold_in(jax.random.fold_in(jax.random.key(seed), number), first * draws + draw)
-            chosen = select_from_table(key, table, scene, run, first, max_views=steps, fuse=fuse).views
-            beliefs = beliefs_along(parts, table, chosen, posed)
-            calibrated = jax.vmap(partial(system.log_probabilities, policy=policy))(beliefs, jnp.arange(1, steps + 1))
-            return jnp.argmax(calibrated, axis=-1) == table.label, jnp.exp(jnp.max(calibrated, axis=-1))
-
+    def _around_all(
+        self,
+        parts: Parts,
+        tables: ViewTable,
+        firsts: Array,
+        can_reach: Array,
+        key: Array,
+        *,
+        policy: str,
+        steps: int,
+        posed: bool,
+        draws: int,
+    ) -> tuple[Array, Array]:
+        system, graph = self.system, self.system.graph
+        fuse, run = system.fuse(parts, posed), system.policy(policy, parts, posed)
         pairs = jnp.repeat(firsts, draws), jnp.tile(jnp.arange(draws), len(firsts))
-        return jax.vmap(from_view)(*pairs)
 
-    numbers = jnp.arange(len(tables.label))
-    items = jax.tree.map(jnp.asarray, (numbers, tables))
-    found = jax.lax.map(partial(around, system.parts), items, batch_size=_AT_ONCE)
-    return Walks(*map(np.asarray, found))
+        def around(item: tuple[Array, ViewTable]) -> tuple[Array, Array]:
+            number, table = item
+            scene = table.scene(graph, parts.knowledge if posed else None, can_reach)
+
+            def from_view(first: Array, draw: Array) -> tuple[Array, Array]:
+                own = jax.random.fold_in(jax.random.fold_in(key, number), first * draws + draw)
+                views = select_from_table(own, table, scene, run, first, max_views=steps, fuse=fuse).views
+                beliefs = beliefs_along(parts, table, views, posed)
+                calibrated = jax.vmap(partial(system.log_probabilities, policy=policy))(
+                    beliefs, jnp.arange(1, steps + 1)
+                )
+                return jnp.argmax(calibrated, axis=-1) == table.label, jnp.exp(jnp.max(calibrated, axis=-1))
+
+            return jax.vmap(from_view)(*pairs)
+
+        return jax.lax.map(around, (jnp.arange(len(tables.label)), tables), batch_size=_AT_ONCE)
 
 
 def rows_of(walks: dict[str, Walks], views: Sequence[int]) -> list[dict[str, Any]]:

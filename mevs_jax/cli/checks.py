@@ -1,4 +1,4 @@
-"""Checks: `mevs check live`, `mevs check agent`, `mevs check transfer`."""
+"""Checks: `mevs check live`, `mevs check agent`, `mevs check transfer`, `mevs check reality`."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from mevs_jax.cli.failure import Unusable
 from mevs_jax.cli.parsing import Invocation
 
 if TYPE_CHECKING:
-    from mevs_jax.cli.options import TransferOptions
+    from mevs_jax.cli.options import RealityOptions, TransferOptions
 
 
 def live(call: Invocation) -> None:
@@ -109,6 +109,57 @@ def transfer_text(found: dict[str, Any]) -> str:
             f"{100 * row['unknown_found']:.0f} % of the unknown, {100 * row['known_refused']:.0f} % of the known"
         )
     return "\n".join(lines)
+
+
+def reality(options: RealityOptions) -> None:
+    """Measures trained systems in scenes as a robot meets them."""
+    from data_pipeline.files import write_json
+    from data_pipeline.lock import locked
+    from eval.checks.reality import RealityConfig, check_reality
+    from eval.stages import check_output
+    from mevs_jax.cli.tools import load_system
+
+    if options.objects < 0 or options.draws < 1:
+        raise Unusable("--objects must not be below 0, and --draws at least 1")
+    if len(set(options.system)) < len(options.system):
+        raise Unusable("--system names one system twice; name each once")
+    config = RealityConfig(options.conditions, options.objects, options.draws, options.seed)
+    systems = {name: load_system(name) for name in options.system}
+    check_output(options.to)
+    with locked(options.to, "mevs check reality"):
+        found = check_reality(systems, options.data, options.to / "views", config, options.up)
+        write_json(options.to / "reality.json", found)
+    print(json.dumps(found) if options.json else reality_text(found))
+
+
+def reality_text(found: dict[str, Any]) -> str:
+    """The figures of `check_reality`, for a terminal."""
+    lines = [f"{found['objects']} objects", *(f"left out: {name}: {why}" for name, why in found["left_out"].items())]
+    width = max(map(len, found["conditions"].values()))
+    for name, rows in found["systems"].items():
+        cells = {(row["condition"], row["policy"], row["views"]): row for row in rows}
+        policies = list(dict.fromkeys(row["policy"] for row in rows))
+        lines += ["", f"{name}: accuracy in %, with 95 % intervals over objects; in brackets what the condition costs"]
+        for count in sorted({row["views"] for row in rows}):
+            heading = f"after {count} view{'s' * (count > 1)}"
+            lines.append(f"{heading:{width}}" + "".join(f"{policy:>28}" for policy in policies))
+            for condition, title in found["conditions"].items():
+                row_of = (cells.get((condition, policy, count)) for policy in policies)
+                lines.append(f"{title:{width}}" + "".join(f"{_cost(row):>28}" for row in row_of))
+    for name, rows in found["won_back"].items():
+        lines += ["", f"{name} less {next(iter(found['systems']))}, in points, on the same images:"]
+        for row in rows:
+            title = found["conditions"][row["condition"]]
+            shown = _percent(row["difference"], row["interval"], "+")
+            lines.append(f"{title:{width}}  {row['policy']:8}{row['views']:>2}  {shown}")
+    return "\n".join(lines)
+
+
+def _cost(row: dict[str, Any] | None) -> str:
+    if row is None:
+        return "–"
+    lost = f" ({-100 * row['loss']:+.1f})" if row.get("loss") else ""
+    return _percent(row["accuracy"], row["interval"]) + lost
 
 
 def _percent(share: float, interval: list[float] | None = None, sign: str = "") -> str:

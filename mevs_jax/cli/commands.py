@@ -135,6 +135,13 @@ COMMANDS = {
         "checks:transfer",
         tool=True,
     ),
+    "check reality": Command(
+        "what noise, tables, wrong centres and other objects cost trained systems",
+        "RealityOptions",
+        (),
+        "checks:reality",
+        tool=True,
+    ),
     "draw ascent": Command(
         "ascend to the best view of one object by a renderer's gradient; draw it",
         "WithViews",

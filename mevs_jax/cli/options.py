@@ -174,6 +174,31 @@ class TransferOptions:
 
 
 @dataclass(frozen=True)
+class RealityOptions:
+    """Options of `mevs check reality`."""
+
+    data: Annotated[str, _arg("SOURCE")]
+    """objects of the systems' classes, as for mevs check transfer"""
+    to: Annotated[Path, _arg("FOLDER")]
+    """where images and figures (reality.json) are written; an interrupted check goes on there"""
+    system: Annotated[tuple[str, ...], _arg("PATH|NAME ...", "furniture10")] = ("furniture10",)
+    """trained systems, which see the same images; the first is the one that others are compared with"""
+    conditions: Annotated[tuple[str, ...], _arg("NAME ...", "all")] = ()
+    """conditions: clean, roll, structured_light, stereo, stereo_strong, sphere_5, sphere_10, beside, turned, upper, table,
+    together"""
+    objects: Annotated[int, _arg("N", "0, all")] = 0
+    """number of objects, spread over all; half a minute each ten"""
+    up: Annotated[Literal["auto", "z", "y"], _arg("auto|z|y", "auto: y for glTF, as declared for DAE, else z")] = "auto"
+    """the upward axis of the meshes"""
+    draws: Annotated[int, _arg("N", "4")] = 4
+    """random walks from each first view"""
+    seed: Annotated[int, _arg("N", "0")] = 0
+    """seed of noise, wrong centres, and random walks"""
+    json: Annotated[tyro.conf.FlagCreatePairsOff[bool], _arg("")] = False
+    """print all figures as JSON"""
+
+
+@dataclass(frozen=True)
 class ExportOptions:
     """Options of `mevs export`."""
 

@@ -1,0 +1,282 @@
+"""What reality costs a trained system: `mevs check reality`. Accuracy by condition and policy, and what training wins back."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float
+
+from data_pipeline.capture.casting import DEPTH_SCALE
+from data_pipeline.dataset.inputs import metric_depth
+from data_pipeline.errors import DataError, EmptyMesh, reason_of
+from data_pipeline.files import digest_of, write_npz
+from data_pipeline.objects.formats import Up
+from data_pipeline.objects.mesh import Mesh, ObjectEntry
+from data_pipeline.objects.sources import load_object, objects_to_test
+from data_pipeline.progress import console, progress_bar
+from eval.checks.scenes import CONDITIONS, UPPER, Condition, Placed, reachable_in, views_in
+from eval.checks.transfer import STRANGER, matched
+from eval.checks.walks import BASELINE, Walker, Walks
+from eval.numbers.comparison import intervals
+from mevs_jax.agent.core import can_run
+from mevs_jax.selection import ViewTable
+from mevs_jax.trained import TrainedSystem
+
+VIEWS = (1, 2, 4)
+"""Numbers of views after which accuracy is reported."""
+THESIS = "predicted_entropy"
+_VERSION = 1
+"""Of what a scene's images are made by; raised when they change."""
+
+
+@dataclass(frozen=True)
+class RealityConfig:
+    """The check of systems in scenes.
+
+    Attributes:
+        conditions: names of the conditions; all if empty.
+        objects: number of test objects, spread over all; 0 for all of them.
+        draws: random walks from each first view.
+        seed: of everything that is drawn.
+    """
+
+    conditions: tuple[str, ...] = ()
+    objects: int = 0
+    draws: int = 4
+    seed: int = 0
+
+
+def conditions_of(names: Sequence[str]) -> tuple[Condition, ...]:
+    """Returns the conditions of these names, and perfect images, which all are compared with.
+
+    Raises:
+        DataError: for a name that does not exist.
+    """
+    known = {condition.name: condition for condition in CONDITIONS}
+    if wrong := next((name for name in names if name not in known), None):
+        raise DataError(f"there is no condition {wrong!r}; it is one of {', '.join(known)}")
+    base = [condition.name for condition in CONDITIONS if not names or condition.name in names]
+    wanted = {"clean", *base, *("upper" for name in base if known[name].upper)}
+    return tuple(condition for condition in CONDITIONS if condition.name in wanted)
+
+
+def check_reality(
+    systems: Mapping[str, TrainedSystem],
+    data: str,
+    folder: Path,
+    config: RealityConfig,
+    up: Up = "auto",
+) -> dict[str, Any]:
+    """Measures systems on test objects in every condition; all see the same images.
+
+    Args:
+        systems: by the name that results have; the first is the one that others are compared with.
+        data: the objects, as `mevs check transfer` takes them.
+        folder: where the images are kept, so that an interrupted check goes on.
+        config: which conditions and objects.
+        up: upward axis of the meshes.
+
+    Raises:
+        DataError: if the data cannot be used, or the systems do not see the same views.
+    """
+    conditions, first = conditions_of(config.conditions), next(iter(systems.values()))
+    for name, system in systems.items():
+        same = system.classes == first.classes and np.array_equal(system.viewpoints, first.viewpoints)
+        if not same or system.description.camera != first.description.camera:
+            raise DataError(f"{name} has other classes, viewpoints or another camera than the first system")
+    source = objects_to_test(data, up)
+    labels = matched(source.classes, first.classes, {})
+    entries = [entry for entry in source.entries if labels[source.classes[entry.label]] != STRANGER]
+    meshes, left_out = meshes_of(entries, config.objects)
+    if len(meshes) < 2:
+        raise DataError(f"{data} has {len(meshes)} objects that can be used; this check needs at least 2")
+    truth = np.array([labels[source.classes[entry.label]] for entry, _ in meshes])
+    tables = _tables(systems, conditions, meshes, truth, folder, config.seed)
+    walks = {}
+    for name, system in systems.items():
+        walker = Walker(system)
+        walks[name] = {one.name: _walks(walker, tables[name][one.name], one, config) for one in conditions}
+    return {
+        "data": data,
+        "objects": len(meshes),
+        "left_out": left_out,
+        "conditions": {one.name: one.title for one in conditions},
+        "systems": {name: _rows(system, walks[name], conditions) for name, system in systems.items()},
+        "won_back": {name: _won_back(systems, walks, conditions, name) for name in list(systems)[1:]},
+    }
+
+
+def meshes_of(entries: Sequence[ObjectEntry], most: int) -> tuple[list[tuple[ObjectEntry, Mesh]], dict[str, str]]:
+    """Returns at most so many objects, spread over all (0 for all of them), and why others are left out, by name."""
+    count = min(most or len(entries), len(entries))
+    found, left_out = [], {}
+    for entry in (entries[number * len(entries) // count] for number in range(count)):
+        try:
+            found.append((entry, load_object(entry)))
+        except (DataError, EmptyMesh) as error:
+            left_out[entry.name] = reason_of(error)
+    return found, left_out
+
+
+def _tables(
+    systems: Mapping[str, TrainedSystem],
+    conditions: Sequence[Condition],
+    meshes: Sequence[tuple[ObjectEntry, Mesh]],
+    truth: np.ndarray,
+    folder: Path,
+    seed: int,
+) -> dict[str, dict[str, ViewTable]]:
+    """View tables of every system in every condition, of all objects."""
+    first = next(iter(systems.values()))
+    poses = jnp.asarray(first.poses)
+    of_object = {name: jax.jit(jax.vmap(system.observe)) for name, system in systems.items()}
+    seen: dict[str, dict[str, list[Any]]] = {name: {one.name: [] for one in conditions} for name in systems}
+    with progress_bar("objects") as bar:
+        line = bar.add_task("Scenes", total=len(meshes), note="")
+        for number, (entry, mesh) in enumerate(meshes):
+            other = meshes[(number + len(meshes) // 2) % len(meshes)]  # most often of another class
+            images = images_of(first, conditions, entry, mesh, other, folder, seed)
+            for one in conditions:
+                for name in systems:
+                    seen[name][one.name].append(of_object[name](jnp.asarray(images[one.name]), poses))
+            bar.advance(line)
+    tables: dict[str, dict[str, ViewTable]] = {}
+    for name in systems:
+        tables[name] = {}
+        for one in conditions:
+            found = jax.tree.map(lambda *leaves: jnp.stack(leaves), *seen[name].pop(one.name))
+            tables[name][one.name] = ViewTable(
+                found.logits, found.predicted_entropy, None, jnp.asarray(truth), features=found.features
+            )
+    return tables
+
+
+def images_of(
+    system: TrainedSystem,
+    conditions: Sequence[Condition],
+    entry: ObjectEntry,
+    mesh: Mesh,
+    other: tuple[ObjectEntry, Mesh],
+    folder: Path,
+    seed: int,
+) -> dict[str, Float[np.ndarray, "views side side"]]:
+    """Images of one object in every condition, in radii; those that were made before are read."""
+    camera, viewpoints = system.description.camera, system.viewpoints
+    images: dict[str, np.ndarray] = {}
+    placed: Placed | None = None
+    key = int(digest_of([entry.name, seed]), 16)
+    for one in conditions:
+        if one == UPPER:  # fewer views can be reached of the same images
+            images[one.name] = images["clean"]
+            continue
+        made = digest_of(
+            [_VERSION, repr(one), repr(camera), viewpoints.tolist(), entry.name, other[0].name, seed, _of(mesh)]
+        )
+        path = folder / one.name / f"{made}.npz"
+        if (stored := _stored(path)) is None:
+            placed = placed or Placed(mesh, other[1])
+            depth = views_in(one, placed, viewpoints, camera, (key, _seed_of(one)))
+            stored = np.round(depth * DEPTH_SCALE).astype(np.uint16)
+            path.parent.mkdir(parents=True, exist_ok=True)
+            write_npz(path, depth=stored)
+        images[one.name] = np.asarray(metric_depth(stored))
+    return images
+
+
+def _of(mesh: Mesh) -> list[float]:
+    """What tells a mesh from another one of the same name."""
+    return [float(mesh.vertices.shape[0]), float(np.float64(mesh.vertices).sum()), *map(float, mesh.extent)]
+
+
+def _seed_of(condition: Condition) -> int:
+    return next(number for number, one in enumerate(CONDITIONS) if one.name == condition.name)
+
+
+def _stored(path: Path) -> np.ndarray | None:
+    if not path.exists():
+        return None
+    try:
+        with np.load(path) as stored:
+            return stored["depth"]
+    except Exception as error:  # the content of a damaged file decides which
+        console.print(f"{path} cannot be read ({reason_of(error)}), so it is made again", markup=False)
+        return None
+
+
+def _policies(system: TrainedSystem, posed: bool) -> dict[str, str]:
+    """Names of the policies by their part in the table."""
+    best = system.description.best if posed else system.description.best_unposed
+    parts = {BASELINE: BASELINE, "thesis": THESIS, "best": best}
+    return {part: name for part, name in parts.items() if can_run(system, name, posed)}
+
+
+def _walks(walker: Walker, tables: ViewTable, condition: Condition, config: RealityConfig) -> dict[str, Walks]:
+    posed, reachable = not condition.turned, reachable_in(condition, walker.system.viewpoints)
+    walks = {}
+    for part, name in _policies(walker.system, posed).items():
+        draws = config.draws if part == BASELINE else 1
+        walks[part] = walker.walk(
+            tables, name, max(VIEWS), posed=posed, reachable=reachable, draws=draws, seed=config.seed
+        )
+    return walks
+
+
+def _rows(
+    system: TrainedSystem, walks: dict[str, dict[str, Walks]], conditions: Sequence[Condition]
+) -> list[dict[str, Any]]:
+    """Accuracy, difference from random selection, and from perfect images of the same views; all with 95 % intervals."""
+    rows = []
+    for one in conditions:
+        for part, found in walks[one.name].items():
+            perfect = walks["upper" if one.upper else "clean"].get(part)
+            for views in (views for views in VIEWS if views <= found.right.shape[-1]):
+                right = found.accuracy[:, views - 1]
+                gain = right - walks[one.name][BASELINE].accuracy[:, views - 1]
+                row = {
+                    "condition": one.name,
+                    "policy": part,
+                    "name": _policies(system, not one.turned)[part],
+                    "views": views,
+                    "accuracy": float(right.mean()),
+                    "interval": intervals(right),
+                    "gain": float(gain.mean()),
+                    "gain_interval": intervals(gain),
+                }
+                if perfect is not None:
+                    loss = perfect.accuracy[:, views - 1] - right
+                    row |= {"loss": float(loss.mean()), "loss_interval": intervals(loss)}
+                rows.append(row)
+    return rows
+
+
+def _won_back(
+    systems: Mapping[str, TrainedSystem],
+    walks: Mapping[str, dict[str, dict[str, Walks]]],
+    conditions: Sequence[Condition],
+    name: str,
+) -> list[dict[str, Any]]:
+    """Accuracy of a system less that of the first one, on the same images, with 95 % intervals over objects."""
+    base, rows = next(iter(systems)), []
+    for one in conditions:
+        for part in walks[name][one.name]:
+            before = walks[base][one.name].get(part)
+            if before is None:
+                continue
+            for views in (views for views in VIEWS if views <= before.right.shape[-1]):
+                gain = walks[name][one.name][part].accuracy[:, views - 1] - before.accuracy[:, views - 1]
+                rows.append(
+                    {
+                        "condition": one.name,
+                        "policy": part,
+                        "views": views,
+                        "difference": float(gain.mean()),
+                        "interval": intervals(gain),
+                    }
+                )
+    return rows
