@@ -32,9 +32,13 @@ if "PYTEST_XDIST_WORKER" not in os.environ:
     # What runs long has all optimisations (`fully_compiled`); CI compares with PyTorch and plain loops with all of them, too.
     jaxlib = tuple(map(int, version("jaxlib").split(".")[:2]))
     if not DEFAULT_FLAGS:
+        flags = [
+            os.environ.get("XLA_FLAGS", ""),
+            "--xla_cpu_parallel_codegen_split_count=1",
+        ]  # small programs: no threads
         if jaxlib < (0, 11):  # later versions have the newer emitters alone, and end at the name of this flag
-            flags = os.environ.get("XLA_FLAGS", "")
-            os.environ["XLA_FLAGS"] = f"{flags} --xla_cpu_use_fusion_emitters=false".strip()
+            flags.append("--xla_cpu_use_fusion_emitters=false")
+        os.environ["XLA_FLAGS"] = " ".join(flags).strip()
         os.environ.setdefault("JAX_DISABLE_MOST_OPTIMIZATIONS", "1")
 
 # Tracing leaves many small objects that live: looking through them all as often as Python does takes up to a tenth of the time.

@@ -71,7 +71,8 @@ class TrainedSystem:
         """The candidate views with their neighbours."""
         points = self.parts.viewpoints
         distances = great_circle_distances(np.asarray(points, float))
-        return ViewGraph(points, self.parts.neighbours, jnp.asarray(distances, jnp.float32))
+        with jax.ensure_compile_time_eval():  # it may be asked for first within a compiled function
+            return ViewGraph(points, self.parts.neighbours, jnp.asarray(distances, jnp.float32))
 
     @property
     def policies(self) -> tuple[str, ...]:

@@ -156,7 +156,7 @@ def test_a_command_shows_its_own_options(name, at_once):
     assert len(shown.stdout.splitlines()) <= 80
     command = COMMANDS[ALIASES.get(name, name)]
     assert ("--preset" in shown.stdout) != command.tool
-    assert ("--data " in shown.stdout) == ("dataset" in command.settings or name == "check transfer")
+    assert ("--data " in shown.stdout) == ("dataset" in command.settings or name in ("check transfer", "check reality"))
     for group in command.settings:
         assert f"--{group}.*" in shown.stdout
 

@@ -136,6 +136,7 @@ def test_conditions_by_name_bring_what_they_are_compared_with():
         conditions_of(["rain"])
 
 
+@pytest.mark.slow
 def test_systems_are_compared_on_the_same_images_which_are_kept(tmp_path):
     system, data, folder = making.system(), tmp_path / "data", tmp_path / "views"
     for number, name in enumerate(system.classes[:2]):

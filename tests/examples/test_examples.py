@@ -7,8 +7,9 @@ import sys
 from pathlib import Path
 
 import pytest
+from PIL import Image
 
-EXAMPLES = Path(__file__).resolve().parents[1] / "examples"
+EXAMPLES = Path(__file__).resolve().parents[2] / "examples"
 
 
 @pytest.mark.parametrize(
@@ -32,6 +33,20 @@ def test_an_example_runs(name, said, whole, tmp_path):
     assert ended.returncode == 0, ended.stderr
     assert said in ended.stdout
     assert f"examples/{name}.py" in (EXAMPLES / f"{name}.py").read_text().splitlines()[0]
+
+
+@pytest.mark.slow
+def test_an_arm_recognises_an_object_on_its_table(tmp_path):
+    """With a film and the errors of a depth camera, without a display."""
+    pytest.importorskip("mujoco", reason="MuJoCo is not installed: pip install mujoco")
+    command = [sys.executable, "-m", "examples.robot_arm", "--object", "sofa", "--film", str(tmp_path / "film.gif")]
+    ended = subprocess.run(command, capture_output=True, text=True, timeout=600, cwd=EXAMPLES.parent)
+    if "EGL" in ended.stderr:
+        pytest.skip("MuJoCo cannot draw here: the system has no libEGL (libegl1)")
+    assert ended.returncode == 0, ended.stderr
+    assert "sofa after " in ended.stdout
+    with Image.open(tmp_path / "film.gif") as film:
+        assert film.n_frames >= 10
 
 
 def test_all_examples_are_run():

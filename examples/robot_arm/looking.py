@@ -1,0 +1,111 @@
+"""An agent on the arm: it decides among the poses that can be reached, the arm moves, the camera looks."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass, field
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+
+from examples.robot_arm.arm import Arm, Reach
+from examples.robot_arm.camera import DepthCamera
+from examples.robot_arm.scene import HOME, RADIUS, Scene
+from mevs_jax.agent import Agent, Belief
+from mevs_jax.trained import TrainedSystem
+
+DISTANCE = 2.4 * RADIUS
+"""Metres from the object's centre, from which its sphere fits into the image."""
+FLOOR = 0.004
+"""Metres above the table up to which everything is removed."""
+
+
+@dataclass
+class Looked:
+    """One look.
+
+    Attributes:
+        belief: after it.
+        depth: the image, in metres.
+        passed: joint angles on the way there.
+        seconds: that the decision took: which poses can be reached, and which is the best.
+    """
+
+    belief: Belief
+    depth: np.ndarray
+    passed: list[np.ndarray]
+    seconds: float
+
+
+@dataclass
+class Recognition:
+    """How an object was recognised.
+
+    Attributes:
+        name: the answer.
+        reason: why the agent ended.
+        radians: length of the arm's whole path in joint angles, without the way to the first view.
+        looks: in order.
+    """
+
+    name: str
+    reason: str
+    radians: float
+    looks: list[Looked] = field(default_factory=list)
+
+
+def nearest(key: Any, state: Any, scene: Any) -> Any:
+    """The policy that cares for nothing but the motion: all views have the same score, from which costs are subtracted."""
+    del key, state
+    return jnp.zeros(len(scene.graph.points))
+
+
+def agent_of(system: TrainedSystem, policy: str, views: int, stop: float, seed: int = 0) -> Agent:
+    """Returns an agent by the name of a row of the study: `best`, `best, near`, `nearest`, `random` or a policy's name."""
+    options: dict[str, Any] = {"stop": stop, "max_views": views, "distance": DISTANCE, "seed": seed}
+    if policy == "nearest":
+        return Agent(system, nearest, gain_per_cost=1.0, **options)
+    if policy == "best, near":
+        return Agent(system, "best", gain_per_cost=0.01, **options)
+    return Agent(system, policy, **options)
+
+
+def recognise(
+    agent: Agent, scene: Scene, camera: DepthCamera, reach: Reach, first: int, frames: int = 1
+) -> Recognition:
+    """Looks at the object until the agent is sure, or its views are spent.
+
+    Args:
+        agent: of `agent_of`; its object becomes the one of the scene.
+        scene: with the arm.
+        camera: at its wrist.
+        reach: of the agent's poses.
+        first: the first view.
+        frames: moments of each motion that are kept.
+    """
+    arm = Arm(scene)
+    arm.place(HOME)
+    agent.reset(center=scene.center, radius=RADIUS, yaw=0.0)
+    seen: list[Looked] = []
+    while True:
+        begun = time.perf_counter()
+        costs, paths = arm.costs(reach)
+        if not seen:
+            costs = np.where(np.arange(len(costs)) == first, costs, np.inf)
+        costed = agent.gain_per_cost > 0
+        step = agent.decide(
+            reachable=np.isfinite(costs), cost=np.where(np.isfinite(costs), costs, 0.0) if costed else None
+        )
+        seconds = time.perf_counter() - begun
+        if step.done:
+            answer = seen[-1].belief.name if seen else "nothing"
+            return Recognition(answer, step.reason, arm.travelled, seen)
+        corners = paths[step.index]
+        assert corners is not None
+        passed = arm.move(corners, frames)
+        if not seen:
+            arm.travelled = 0.0
+        depth = camera.take()
+        belief = agent.observe(depth, scene.K, scene.camera_pose, floor=FLOOR)
+        seen.append(Looked(belief, depth, passed, seconds))

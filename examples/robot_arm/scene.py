@@ -1,0 +1,124 @@
+"""The scene: an arm of seven joints with a camera at its wrist, a table, and an object on it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import mujoco
+import numpy as np
+from jaxtyping import Float
+
+from data_pipeline.objects.mesh import Mesh
+
+WIDTH, HEIGHT, FIELD_OF_VIEW = 640, 480, 58.0
+"""Of the depth camera: pixels, and degrees from top to bottom, as a RealSense D435."""
+RADIUS = 0.1
+"""Metres in a radius of an object."""
+PLACE = np.array([0.5, 0.0])
+"""Where the object stands on the table, in front of the arm."""
+HOME = np.array([0.0, -0.6, 0.0, -2.2, 0.0, 1.9, 0.8])
+"""Joint angles where nothing is near."""
+
+# Lengths, axes and ranges of the joints are those of a Franka Emika Panda; its shape is simplified to capsules.
+_LINKS = (
+    # position and turn of each joint in the frame before it, range, capsule: from, to, radius
+    ("0 0 0.333", "1 0 0 0", (-2.90, 2.90), "0 0 -0.22 0 0 0", 0.06),
+    ("0 0 0", "1 -1 0 0", (-1.76, 1.76), "0 0 0 0 -0.2 0", 0.06),
+    ("0 -0.316 0", "1 1 0 0", (-2.90, 2.90), "0 0 -0.12 0 0 0", 0.055),
+    ("0.0825 0 0", "1 1 0 0", (-3.07, -0.07), "0 0 0 -0.0825 0.1 0", 0.055),
+    ("-0.0825 0.384 0", "1 -1 0 0", (-2.90, 2.90), "0 0.03 -0.25 0 0.06 0", 0.045),
+    ("0 0 0", "1 1 0 0", (-0.02, 3.75), "0 0 0 0.05 0 0", 0.045),
+    ("0.088 0 0", "1 1 0 0", (-2.90, 2.90), "0 0 0 0 0 0.09", 0.04),
+)
+
+
+@dataclass(frozen=True)
+class Scene:
+    """A simulated scene.
+
+    Attributes:
+        model, data: of MuJoCo.
+        center: (3,) centre of the object in the world, in metres.
+        K: (3, 3) intrinsics of the depth camera, with the centres of pixels at whole numbers.
+    """
+
+    model: mujoco.MjModel
+    data: mujoco.MjData
+    center: np.ndarray
+    K: np.ndarray
+
+    @property
+    def camera_pose(self) -> Float[np.ndarray, "4 4"]:
+        """`T_world_camera` of the depth camera: x right, y down, z forward."""
+        pose = np.eye(4)
+        pose[:3, :3] = self.data.cam("depth").xmat.reshape(3, 3) * (1, -1, -1)
+        pose[:3, 3] = self.data.cam("depth").xpos
+        return pose
+
+
+def make_scene(mesh: Mesh) -> Scene:
+    """Returns a scene with an object on the table.
+
+    Args:
+        mesh: the object, in its own frame, z up; its radius becomes `RADIUS`.
+    """
+    vertices = mesh.vertices.astype(float) * RADIUS
+    center = np.array([*PLACE, -vertices[:, 2].min()])
+    specification = mujoco.MjSpec.from_string(_xml(center))
+    specification.add_mesh(
+        name="object", uservert=vertices.reshape(-1).tolist(), userface=mesh.faces.reshape(-1).tolist()
+    )
+    for mesh_of in specification.meshes:
+        mesh_of.inertia = mujoco.mjtMeshInertia.mjMESH_INERTIA_SHELL  # furniture is not always closed
+    body = specification.body("object")
+    body.add_geom(
+        name="object", type=mujoco.mjtGeom.mjGEOM_MESH, meshname="object", rgba=[0.85, 0.55, 0.25, 1], contype=0
+    )
+    model = specification.compile()
+    # MuJoCo moves a mesh to its centre of mass; this puts it back.
+    number = model.geom("object").id
+    data = mujoco.MjData(model)
+    data.qpos[:] = HOME
+    mujoco.mj_forward(model, data)
+    focal = HEIGHT / 2 / np.tan(np.radians(FIELD_OF_VIEW) / 2)
+    K = np.array([[focal, 0, (WIDTH - 1) / 2], [0, focal, (HEIGHT - 1) / 2], [0, 0, 1.0]])
+    assert number >= 0
+    return Scene(model, data, center, K)
+
+
+def _xml(center: np.ndarray) -> str:
+    """The scene without the object's mesh. Of the arm, only what hits the table or the object counts as a collision."""
+    arm, closing = "", ""
+    for number, (place, turn, (low, high), capsule, radius) in enumerate(_LINKS, 1):
+        arm += (
+            f'<body name="link{number}" pos="{place}" quat="{turn}">'
+            f'<joint name="joint{number}" axis="0 0 1" range="{low} {high}" limited="true"/>'
+            f'<geom type="capsule" fromto="{capsule}" size="{radius}" class="arm"/>'
+        )
+        closing += "</body>"
+    camera = (
+        '<geom type="box" pos="0 0 0.105" size="0.045 0.02 0.015" class="arm" rgba="0.1 0.1 0.1 1"/>'
+        f'<camera name="depth" pos="0 0 0.125" xyaxes="1 0 0 0 -1 0" fovy="{FIELD_OF_VIEW}"/>'
+    )
+    return f"""
+<mujoco>
+  <compiler angle="radian" autolimits="true"/>
+  <statistic center="0.35 0 0.3" extent="1"/>
+  <visual>
+    <global offwidth="{WIDTH}" offheight="{HEIGHT}"/>
+    <map znear="0.01" zfar="20"/>
+    <headlight ambient="0.4 0.4 0.4" diffuse="0.4 0.4 0.4"/>
+  </visual>
+  <default><default class="arm"><geom contype="1" conaffinity="0" rgba="0.92 0.93 0.95 1" mass="1"/></default></default>
+  <asset>
+    <texture type="skybox" builtin="gradient" rgb1="1 1 1" rgb2="0.85 0.9 0.95" width="64" height="64"/>
+  </asset>
+  <worldbody>
+    <light pos="0.3 -1 2" dir="0 0.4 -1" castshadow="false"/>
+    <geom name="table" type="box" pos="0.35 0 -0.02" size="0.6 0.6 0.02" rgba="0.75 0.72 0.68 1" contype="0" conaffinity="1"/>
+    <geom type="cylinder" pos="0 0 0.08" size="0.07 0.08" rgba="0.3 0.33 0.36 1" contype="0" conaffinity="0"/>
+    <body name="object" pos="{center[0]} {center[1]} {center[2]}"/>
+    {arm}{camera}{closing}
+    <camera name="outside" pos="1.25 -1.15 0.95" xyaxes="0.74 0.67 0 -0.33 0.36 0.87" fovy="42"/>
+  </worldbody>
+</mujoco>"""

@@ -1,0 +1,190 @@
+"""The node: the action `recognise_object`, from depth images, CameraInfo and the camera's transform at the time of each image."""
+
+from __future__ import annotations
+
+import threading
+import time
+
+import numpy as np
+import rclpy
+from geometry_msgs.msg import PoseStamped
+from mevs_interfaces.action import RecogniseObject
+from rclpy.action import ActionServer, CancelResponse, GoalResponse
+from rclpy.callback_groups import ReentrantCallbackGroup
+from rclpy.duration import Duration
+from rclpy.executors import MultiThreadedExecutor
+from rclpy.node import Node
+from rclpy.qos import qos_profile_sensor_data
+from sensor_msgs.msg import CameraInfo, Image
+from tf2_ros import Buffer, TransformException, TransformListener
+
+import mevs_jax
+from mevs_ros.recognising import Frame, depth_of, goal_of, is_at, matrix_of, quaternion_of, recognise
+
+DEFAULTS = {
+    "system": "furniture10",
+    "world": "base_link",
+    "policy": "best",
+    "max_views": 8,
+    "stop": 0.95,
+    "distance": 0.0,  # of the camera from the object's centre in metres; 0: that of the training views, in radii
+    "seconds": 30.0,  # to wait for the camera at each pose
+    "near_metres": 0.03,  # how close it has to get
+    "near_degrees": 5.0,
+    "still_seconds": 0.3,  # how long it has to stand still there
+}
+
+
+class RecogniseNode(Node):
+    """Serves one goal at a time."""
+
+    def __init__(self) -> None:
+        super().__init__("mevs_recognise")
+        for name, value in DEFAULTS.items():
+            self.declare_parameter(name, value)
+        self._frames = Frames(self)
+        self._busy = threading.Lock()
+        self.system = mevs_jax.load(self._given("system"))
+        self._agent(self._given("max_views"), self._given("stop")).warm_up()  # compiled programs are kept in memory
+        group = ReentrantCallbackGroup()
+        self.create_subscription(Image, "depth", self._frames.on_depth, qos_profile_sensor_data, callback_group=group)
+        self.create_subscription(CameraInfo, "camera_info", self._frames.on_info, 10, callback_group=group)
+        self._server = ActionServer(
+            self,
+            RecogniseObject,
+            "recognise_object",
+            execute_callback=self._recognise,
+            goal_callback=self._accept,
+            cancel_callback=lambda _: CancelResponse.ACCEPT,
+            callback_group=group,
+        )
+        self.get_logger().info(f"ready: {len(self.system.classes)} classes, {', '.join(self.system.classes)}")
+
+    def _given(self, name: str):
+        return self.get_parameter(name).value
+
+    def _agent(self, max_views: int, stop: float) -> mevs_jax.Agent:
+        distance = self._given("distance") or None
+        return self.system.agent(self._given("policy"), max_views=max_views, stop=stop, distance=distance)
+
+    def _accept(self, goal: RecogniseObject.Goal) -> GoalResponse:
+        world = self._given("world")
+        if goal.header.frame_id not in ("", world):
+            self.get_logger().error(f"the goal is in the frame {goal.header.frame_id}, not {world}: refused")
+            return GoalResponse.REJECT
+        try:
+            self._goal_of(goal)
+        except ValueError as error:
+            self.get_logger().error(f"{error}: refused")
+            return GoalResponse.REJECT
+        return GoalResponse.REJECT if self._busy.locked() else GoalResponse.ACCEPT
+
+    @staticmethod
+    def _goal_of(goal: RecogniseObject.Goal):
+        center = np.array([goal.center.x, goal.center.y, goal.center.z])
+        size = np.array([goal.size.x, goal.size.y, goal.size.z])
+        yaw, floor = goal.yaw if goal.yaw_known else None, goal.floor if goal.has_floor else None
+        return goal_of(center, size, goal.radius, yaw, floor)
+
+    def _recognise(self, handle):
+        with self._busy:
+            goal, world = handle.request, self._given("world")
+
+            def tell(pose: np.ndarray, belief) -> None:
+                message = RecogniseObject.Feedback()
+                message.next_pose = pose_message(pose, world, self.get_clock().now().to_msg())
+                if belief is not None:
+                    message.views, message.label = belief.views, belief.name
+                    message.confidence, message.probabilities = belief.confidence, belief.probabilities.tolist()
+                handle.publish_feedback(message)
+
+            agent = self._agent(goal.max_views or self._given("max_views"), goal.stop or self._given("stop"))
+            found = recognise(
+                agent,
+                self._goal_of(goal),
+                self._frames,
+                tell,
+                lambda: handle.is_cancel_requested,
+                self._given("seconds"),
+                self.get_logger().warning,
+            )
+            handle.canceled() if found.reason == "cancelled" else handle.succeed()
+            result = RecogniseObject.Result()
+            result.label, result.confidence = found.label, found.confidence
+            result.views, result.reason = found.views, found.reason
+            return result
+
+
+class Frames:
+    """The latest depth images with their poses, as `recognising.Camera`."""
+
+    def __init__(self, node: RecogniseNode) -> None:
+        self._node, self._info, self._depth = node, None, None
+        self._arrived = threading.Condition()
+        self._buffer = Buffer()
+        self._listener = TransformListener(self._buffer, node)
+
+    def on_info(self, info: CameraInfo) -> None:
+        self._info = info
+
+    def on_depth(self, image: Image) -> None:
+        with self._arrived:
+            self._depth = image
+            self._arrived.notify_all()
+
+    def wait_for(self, pose: np.ndarray, seconds: float) -> Frame | None:
+        """Waits until the camera has stood at the pose for a while, and returns the image of that moment."""
+        given, end, since = self._node._given, time.monotonic() + seconds, None
+        while time.monotonic() < end:
+            with self._arrived:
+                self._arrived.wait(0.2)
+                image, info = self._depth, self._info
+            if image is None or info is None or (at := self._pose_at(image)) is None:
+                continue
+            if not is_at(at, pose, given("near_metres"), np.radians(given("near_degrees"))):
+                since = None
+                continue
+            since = since or time.monotonic()
+            if time.monotonic() - since >= given("still_seconds"):
+                depth = depth_of(
+                    image.encoding, image.height, image.width, image.step, image.is_bigendian, bytes(image.data)
+                )
+                return Frame(depth, np.array(info.k).reshape(3, 3), at)
+        return None
+
+    def _pose_at(self, image: Image) -> np.ndarray | None:
+        """`T_world_camera` at the time of an image, not the latest one, since the camera moves."""
+        try:
+            found = self._buffer.lookup_transform(
+                self._node._given("world"), image.header.frame_id, image.header.stamp, Duration(seconds=0.1)
+            )
+        except TransformException:
+            return None
+        return matrix_of(found.transform.translation, found.transform.rotation)
+
+
+def pose_message(pose: np.ndarray, frame: str, stamp) -> PoseStamped:
+    message = PoseStamped()
+    message.header.frame_id, message.header.stamp = frame, stamp
+    position, turn = message.pose.position, message.pose.orientation
+    position.x, position.y, position.z = map(float, pose[:3, 3])
+    turn.x, turn.y, turn.z, turn.w = quaternion_of(pose[:3, :3])
+    return message
+
+
+def main() -> None:
+    rclpy.init()
+    node = RecogniseNode()
+    executor = MultiThreadedExecutor()
+    executor.add_node(node)
+    try:
+        executor.spin()
+    except KeyboardInterrupt:
+        pass
+    finally:
+        node.destroy_node()
+        rclpy.try_shutdown()
+
+
+if __name__ == "__main__":
+    main()

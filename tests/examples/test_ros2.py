@@ -1,0 +1,148 @@
+"""What the ROS 2 node does without ROS: messages become arrays, and a simulated camera is sent around an object."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+import mevs_jax
+from data_pipeline.capture.casting import default_caster
+from data_pipeline.objects.mesh import Mesh, normalise
+from data_pipeline.objects.recipes import FurniturePiece
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "examples" / "ros2" / "mevs_ros"))
+from mevs_ros.recognising import (  # type: ignore[import-not-found]
+    Frame,
+    depth_of,
+    goal_of,
+    is_at,
+    matrix_of,
+    quaternion_of,
+    recognise,
+)
+
+CENTER, RADIUS = np.array([0.6, -0.2, 0.15]), 0.15
+K = np.array([[260.0, 0.0, 159.5], [0.0, 260.0, 119.5], [0.0, 0.0, 1.0]])
+
+
+class SimulatedCamera:
+    """Goes where it is sent, except where it is told not to."""
+
+    def __init__(self, kind: str, refuses: int = 0, blind: int = 0) -> None:
+        mesh = normalise(*FurniturePiece(kind, 1_000_003).load(), kind)
+        self.cast = default_caster()(
+            Mesh((mesh.vertices * RADIUS + CENTER).astype(np.float32), mesh.faces, mesh.extent)
+        )
+        self.refuses, self.blind, self.asked = refuses, blind, []
+        rows, columns = np.mgrid[:240, :320]
+        self.rays = np.stack([columns, rows, np.ones_like(rows)], axis=-1).reshape(-1, 3) @ np.linalg.inv(K).T
+
+    def wait_for(self, pose: np.ndarray, seconds: float) -> Frame | None:
+        self.asked.append(pose)
+        if len(self.asked) <= self.refuses:
+            return None
+        if len(self.asked) <= self.refuses + self.blind:
+            return Frame(np.zeros((240, 320), np.float32), K, pose)
+        rays = (self.rays @ pose[:3, :3].T).astype(np.float32)
+        depth, _ = self.cast(np.tile(pose[:3, 3].astype(np.float32), (len(rays), 1)), rays)
+        return Frame(depth.reshape(240, 320), K, pose)
+
+
+def looked(camera: SimulatedCamera, **options):
+    agent = mevs_jax.load("furniture10").agent(max_views=3, stop=0.9, distance=0.42)
+    told, said = [], []
+    found = recognise(
+        agent,
+        goal_of(CENTER, np.zeros(3), RADIUS, 0.0, None),
+        camera,
+        lambda pose, belief: told.append((pose, belief)),
+        options.get("cancelled", lambda: False),
+        log=said.append,
+    )
+    return found, told, said
+
+
+def test_an_object_is_recognised_and_every_pose_is_told_first():
+    camera = SimulatedCamera("toilet")
+    found, told, said = looked(camera)
+    assert (found.label, found.reason) == ("toilet", "sure")
+    assert found.confidence >= 0.9
+    assert found.views == len(camera.asked) == len(told)
+    assert not said
+    assert told[0][1] is None
+    for (pose, _), asked in zip(told, camera.asked, strict=True):
+        np.testing.assert_array_equal(pose, asked)
+        assert np.linalg.norm(pose[:3, 3] - CENTER) == pytest.approx(0.42)
+
+
+def test_poses_that_are_not_reached_and_images_that_show_nothing_are_replaced():
+    camera = SimulatedCamera("toilet", refuses=2, blind=1)
+    found, told, said = looked(camera)
+    assert found.reason == "sure"
+    assert found.views == len(told) - 3
+    assert [("did not get to the pose" in one, "cannot be used" in one) for one in said] == [
+        (True, False),
+        (True, False),
+        (False, True),
+    ]
+    places = [tuple(pose[:3, 3].round(6)) for pose in camera.asked]
+    assert len(set(places)) == len(places)
+
+
+def test_a_cancelled_goal_ends_with_what_is_known():
+    camera = SimulatedCamera("toilet")
+    found, _, _ = looked(camera, cancelled=lambda: True)
+    assert (found.label, found.views, found.reason) == ("", 0, "cancelled")
+
+
+@pytest.mark.parametrize(("encoding", "kind", "unit"), [("16UC1", "u2", 1000), ("32FC1", "f4", 1)])
+@pytest.mark.parametrize("big", [False, True])
+def test_depth_is_read_from_messages(encoding, kind, unit, big, random):
+    depth = random.uniform(0.3, 3, (5, 7)).round(3)
+    depth[0, :2] = 0
+    stored = np.zeros((5, 9), np.dtype((">" if big else "<") + kind))  # two elements of padding in every row
+    stored[:, :7] = (depth * unit).round() if unit > 1 else depth
+    if kind == "f4":
+        stored[0, 1] = np.nan
+    found = depth_of(encoding, 5, 7, stored.strides[0], big, stored.tobytes())
+    np.testing.assert_allclose(found, depth, atol=1e-6)
+    with pytest.raises(ValueError, match="encoding 'rgb8' cannot be read"):
+        depth_of("rgb8", 5, 7, 21, False, bytes(105))
+    with pytest.raises(ValueError, match="has 3 bytes"):
+        depth_of(encoding, 5, 7, stored.strides[0], big, b"abc")
+
+
+def test_rotations_go_to_messages_and_back(random):
+    for turn in Rotation.random(50, random_state=np.random.RandomState(0)):
+        x, y, z, w = turn.as_quat() * random.uniform(0.5, 2)  # messages are not always of length one
+        place = SimpleNamespace(x=1.0, y=2.0, z=3.0)
+        matrix = matrix_of(place, SimpleNamespace(x=x, y=y, z=z, w=w))
+        np.testing.assert_allclose(matrix[:3, :3], turn.as_matrix(), atol=1e-12)
+        np.testing.assert_array_equal(matrix[:3, 3], [1, 2, 3])
+        again = Rotation.from_quat(quaternion_of(matrix[:3, :3]))
+        np.testing.assert_allclose((again * turn.inv()).magnitude(), 0, atol=1e-7)
+
+
+def test_arrival_is_judged_without_roll():
+    wanted = np.eye(4)
+    at = np.eye(4)
+    at[:3, :3] = Rotation.from_rotvec([0, 0, 2.0]).as_matrix()
+    at[:3, 3] = 0.01, 0, 0
+    assert is_at(at, wanted, 0.02, 0.05)
+    assert not is_at(at, wanted, 0.005, 0.05)
+    at[:3, :3] = Rotation.from_rotvec([0.1, 0, 0]).as_matrix()
+    assert not is_at(at, wanted, 0.02, 0.05)
+
+
+def test_goals():
+    assert goal_of(CENTER, np.array([0.6, 0.8, 0.0]), 0.0, None, None).radius == pytest.approx(0.5)
+    for size, radius in ((np.zeros(3), 0.0), (np.ones(3), 1.0), (np.zeros(3), -1.0)):
+        with pytest.raises(ValueError, match="one of them"):
+            goal_of(CENTER, size, radius, None, None)
+    with pytest.raises(ValueError, match="not finite"):
+        goal_of(CENTER, np.zeros(3), float("nan"), None, None)
