@@ -31,9 +31,21 @@ def write_film(found: Recognition, scene: Scene, camera: DepthCamera, classes: S
             frames.append(_frame(camera.picture("outside"), shown, classes, _title(number, found, there)))
             times.append(900 if there else 70)
     times[-1] = 3000
-    palette = frames[-1].quantize(96, dither=Image.Dither.NONE)
+    palette = _palette(frames)
     images = [frame.quantize(palette=palette, dither=Image.Dither.NONE) for frame in frames]
     images[0].save(path, save_all=True, append_images=images[1:], duration=times, loop=0, optimize=True)
+
+
+def _palette(frames: list[Image.Image]) -> Image.Image:
+    """Colours of some frames, with enough greys for depth, and the bars."""
+    some = [frames[at] for at in np.linspace(0, len(frames) - 1, 4).astype(int)]
+    sheet = Image.new("RGB", (SIZE[0], SIZE[1] * len(some) + 128))
+    for row, frame in enumerate(some):
+        sheet.paste(frame, (0, row * SIZE[1]))
+    shades = [(grey, grey, grey) for grey in range(40, 256, 12)]
+    for number, colour in enumerate((*shades, _BAR, _BEST, _INK, _FAINT)):
+        sheet.paste(colour, (number * 30, SIZE[1] * len(some), number * 30 + 30, sheet.height))
+    return sheet.quantize(160, dither=Image.Dither.NONE)
 
 
 def _title(number: int, found: Recognition, there: bool) -> str:

@@ -119,6 +119,6 @@ def _xml(center: np.ndarray) -> str:
     <geom type="cylinder" pos="0 0 0.08" size="0.07 0.08" rgba="0.3 0.33 0.36 1" contype="0" conaffinity="0"/>
     <body name="object" pos="{center[0]} {center[1]} {center[2]}"/>
     {arm}{camera}{closing}
-    <camera name="outside" pos="1.25 -1.15 0.95" xyaxes="0.74 0.67 0 -0.33 0.36 0.87" fovy="42"/>
+    <camera name="outside" pos="1.15 -1.05 0.9" xyaxes="0.78 0.63 0 -0.32 0.39 0.86" fovy="40"/>
   </worldbody>
 </mujoco>"""
