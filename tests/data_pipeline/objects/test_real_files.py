@@ -13,6 +13,7 @@ import trimesh
 from data_pipeline.objects.archives import ZipMember
 from data_pipeline.objects.formats import parse_off
 from data_pipeline.objects.mesh import normalise
+from data_pipeline.objects.voxels import FEWEST_VOXELS, voxel_archive
 from tests.conftest import beside_the_checkout
 from tests.data_pipeline.objects.making import area, extent
 
@@ -39,3 +40,21 @@ def test_modelnet_meshes_have_the_counts_of_their_headers(real_meshes):
         counts = content[:64].removeprefix(b"OFF").split()[:2]
         vertices, triangles = parse_off(content, path.name)
         assert [len(vertices), len(triangles)] == [int(count) for count in counts]
+
+
+def test_surfaces_of_voxel_grids_are_half_a_cell_outside_of_them(real_voxels):
+    """Marching cubes at 0.5 between full and empty cells, against the cells themselves."""
+    entries = voxel_archive(real_voxels).entries
+    for entry in entries[:: len(entries) // 60]:
+        grid = np.unpackbits(np.frombuffer(entry.recipe.bits, np.uint8), count=32**3).reshape(32, 32, 32)
+        if grid.sum() < FEWEST_VOXELS:
+            continue
+        vertices, faces = entry.recipe.load()
+        cells = np.argwhere(grid)
+        np.testing.assert_allclose(vertices.min(axis=0), cells.min(axis=0) - 0.5, atol=1e-6)
+        np.testing.assert_allclose(vertices.max(axis=0), cells.max(axis=0) + 0.5, atol=1e-6)
+        surface = trimesh.Trimesh(vertices, faces, process=False)
+        _, times = np.unique(surface.edges_sorted, axis=0, return_counts=True)
+        assert (times % 2 == 0).all()  # closed; four faces meet where two cells touch along an edge
+        corners_cut = 0.5 * area(vertices, faces)  # no part of the surface is further from the cells' than half a cell
+        assert grid.sum() - corners_cut < surface.volume < grid.sum()
