@@ -20,9 +20,7 @@ from data_pipeline.dataset.inputs import metric_depth
 from data_pipeline.errors import DataError
 from mevs_jax.arrays import AnyArray
 from mevs_jax.cameras import ViewCamera, look_at_origin, partial_cloud, pixel_directions
-
-_OUTSIDE = 1.02
-"""Radii beyond which points are not the object's, as in `mevs_jax.canonical_view`."""
+from mevs_jax.source_view import MARGIN
 
 
 @dataclass(frozen=True)
@@ -30,7 +28,7 @@ class RealityAugmentation:
     """Errors of real images in training images."""
 
     strength: float = 0.0
-    """magnitude of all of them: each image draws its own strength between 0 and this; 0: none, 1: as in real images"""
+    """magnitude of all of them: each object draws its own strength between 0 and this; 0: none, 1: as in real images"""
     sensor: Literal["any", "structured-light", "stereo", "none"] = "any"
     """the depth camera (data_pipeline.capture.sensor); any: one or the other for each batch"""
     distance: float = 1.0
@@ -58,23 +56,40 @@ def used_reality(config: RealityAugmentation, option: str) -> RealityAugmentatio
             raise DataError(
                 f"{option}.{name} {getattr(config, name):g} is not from {least:g} to {most:g}; choose another"
             )
+    if config.strength * config.sphere > 0.5 or config.strength * config.floor > 1:
+        raise DataError(
+            f"{option}.strength {config.strength:g} times .sphere {config.sphere:g} is above 0.5, or times .floor "
+            f"{config.floor:g} above 1, so that nothing of some objects would be left; lower one of them"
+        )
     return config if config.strength else None
 
 
-def realistic_depth(
-    key: Array, batch: Mapping[str, Array], camera: ViewCamera, config: RealityAugmentation
-) -> Float[Array, "views side side"]:
-    """Returns the depth images of a batch of stored views, in radii, each with errors of its own (`as_in_reality`).
+def realistic_views(
+    key: Array, batch: Mapping[str, Array], camera: ViewCamera, config: RealityAugmentation, views: int = 1
+) -> tuple[Float[Array, "batch side side"], Float[Array, "batch 4 4"]]:
+    """Returns a batch of stored views with the errors that `config` describes.
 
-    Of two sensors, all images of a batch have one or the other.
+    The strength of the errors and the wrong sphere are the same for all views of an object, and so are its dark areas. Of two
+    sensors, all images of a batch have one or the other.
+
+    Args:
+        key: of the batch.
+        batch: with `depth` and `pose`, the views of an object one after another.
+        camera: that took them.
+        config: the errors.
+        views: number of views of each object in the batch.
+
+    Returns:
+        Depth in radii, 0 where nothing is measured; and the poses that the robot believes in, around the believed centre.
     """
     depth, poses = metric_depth(batch["depth"]), batch["pose"]
-    either, key = jax.random.split(key)
-    keys = jax.random.split(key, len(depth))
+    either, of_objects, of_views = jax.random.split(key, 3)
+    objects = jnp.repeat(jax.random.split(of_objects, len(depth) // views), views)
+    keys = jax.random.split(of_views, len(depth))
 
-    def by(kind: Kind) -> Callable[[], Array]:
+    def by(kind: Kind) -> Callable[[], tuple[Array, Array]]:
         one = partial(as_in_reality, camera=camera, config=config, kind=kind)
-        return lambda: jax.vmap(one)(keys, depth, poses)
+        return lambda: jax.vmap(one)(keys, objects, depth, poses)
 
     if config.sensor == "any":
         return jax.lax.cond(jax.random.bernoulli(either), by("structured-light"), by("stereo"))
@@ -83,23 +98,26 @@ def realistic_depth(
 
 def as_in_reality(
     key: Array,
+    of_object: Array,
     depth: Float[AnyArray, "side side"],
     pose: Float[AnyArray, "4 4"],
     camera: ViewCamera,
     config: RealityAugmentation,
     kind: Kind,
-) -> Float[Array, "side side"]:
-    """Returns a depth image with the errors that `config` describes, of a strength drawn for this image.
+) -> tuple[Float[Array, "side side"], Float[Array, "4 4"]]:
+    """Returns a depth image with the errors that `config` describes, and the pose around the believed centre.
 
     Args:
         key: of this image.
+        of_object: key of what all views of the object share: strength, sphere, dark areas.
         depth: in radii, 0 where nothing is hit.
         pose: camera to object.
         camera: that took the image.
         config: the errors.
         kind: of the sensor.
     """
-    amount, hide, cut, noise, where, size = jax.random.split(key, 6)
+    hide, cut, noise = jax.random.split(key, 3)
+    amount, surface, where, size = jax.random.split(of_object, 4)
     depth, pose = jnp.asarray(depth, jnp.float32), jnp.asarray(pose, jnp.float32)
     strength = config.strength * jax.random.uniform(amount)
     depth = hidden(hide, depth, jnp.minimum(strength * config.hidden, 0.9))
@@ -107,11 +125,13 @@ def as_in_reality(
     depth = jax.lax.optimization_barrier(
         depth
     )  # else XLA computes each stage again for every pixel that the next one reads
-    depth = sense(noise, depth, pose, camera, SensorConfig(kind, 1.0, config.distance), strength)
-    depth = jax.lax.optimization_barrier(depth)
+    depth = sense(noise, depth, pose, camera, SensorConfig(kind, 1.0, config.distance), strength, surface)
+    depth = jnp.asarray(jax.lax.optimization_barrier(depth))
     offset = jax.random.ball(where, 3) * strength * config.sphere
     factor = 1 + strength * config.sphere * jax.random.uniform(size, minval=-1.0)
-    return around_another_sphere(jnp.asarray(depth), pose, camera, offset, factor)
+    believed = pose[:3, 3] - offset
+    believed = look_at_origin(camera.distance * believed / jnp.linalg.norm(believed))
+    return around_another_sphere(depth, pose, camera, offset, factor), believed
 
 
 def hidden(key: Array, depth: Float[Array, "side side"], most: float | Array) -> Float[Array, "side side"]:
@@ -176,5 +196,5 @@ def around_another_sphere(
     sampled = jnp.where(inside, depth[pixel[..., 1], pixel[..., 0]], 0.0)
     along = sampled / old[..., 2] / factor  # new depth, from where the camera is
     point = rays * along[..., None] + turned.T @ towards  # from the believed centre, in the new camera's axes
-    kept = (sampled > 0) & (jnp.linalg.norm(point, axis=-1) < _OUTSIDE)
+    kept = (sampled > 0) & (jnp.linalg.norm(point, axis=-1) < 1 + MARGIN)  # as in `mevs_jax.canonical_view`
     return jnp.where(kept, along + distance - away, 0.0)

@@ -129,9 +129,13 @@ def _all_tested(placed: list[Found]) -> tuple[list[Found], tuple[str, ...]]:
     """The files for testing; all files of classes, now for testing, if there are none. A sentence says which."""
     tested = [one for one in placed if one.split == "test" or not one.class_name]
     if not any(one.split for one in tested):
-        return [replace(one, split="test") if one.class_name else one for one in placed], ()
-    others = len(placed) - len(tested)
-    return tested, (f"{others} files for training or validation are not used",) if others else ()
+        named = any(one.split for one in placed)
+        note = ("no file is for testing, so that all are used, also those for training",) if named else ()
+        return [replace(one, split="test") if one.class_name else one for one in placed], note
+    others = [one for one in placed if one.class_name and one.split != "test"]
+    lost = sorted({one.class_name for one in others} - {one.class_name for one in tested})
+    notes = (f"{len(others)} files for training or validation are not used",) if others else ()
+    return tested, (*notes, *[f"classes without files for testing: {', '.join(lost)}"] * bool(lost))
 
 
 def _check_classes(placed: list[Found], members: list[Found], where: str, *, all_tested: bool) -> None:
@@ -205,11 +209,18 @@ def objects_to_test(data: str, up: Up = "auto") -> ObjectSource:
         DataError: as `open_source`, but one class is enough, and none needs objects for training.
     """
     path, reading = Path(os.path.expanduser(data)), Reading(up, all_tested=True)
+    if data != "furniture10" and not os.path.exists(path):
+        raise DataError(
+            f"no such file or folder: {data}; --data takes a folder or zip of meshes in class folders, an .npz of voxel grids, "
+            f"or furniture10"
+        )
     if path.is_dir():
         return mesh_folder(path.resolve(), reading)
-    if path.suffix.lower() == ".zip" and path.exists():
+    if path.suffix.lower() == ".zip":
         return mesh_zip(path.resolve(), reading)
-    source = open_source(data, train_per_class=2, test_per_class=20, up=up)
+    if up != "auto" and (data == "furniture10" or path.suffix.lower() == ".npz"):
+        raise DataError(f"--up goes with meshes, not with {data}; leave it out")
+    source = open_source(data, train_per_class=2, test_per_class=20)
     return replace(source, entries=tuple(entry for entry in source.entries if entry.split == "test"))
 
 

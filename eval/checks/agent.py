@@ -119,9 +119,8 @@ def compare_walks(
     scene_of = partial(ViewTable.scene, graph=system.graph, knowledge=system.parts.knowledge)
 
     @partial(jax.jit, static_argnames="name")
-    def by_table(table: ViewTable, first: Int[Array, ""], name: str) -> Int[Array, " steps"]:
+    def by_table(key: Array, table: ViewTable, first: Int[Array, ""], name: str) -> Int[Array, " steps"]:
         run = system.policy(name)
-        key = jax.random.key(0)
         return select_from_table(key, table, scene_of(table), run, first, max_views=max_views, fuse=fuse).views
 
     found: dict[str, list[tuple[bool, float]]] = {name: [] for name in policies}
@@ -133,7 +132,7 @@ def compare_walks(
             table, first = table_of(system, depth, poses), int(index) % len(poses)
             for name, agent in agents.items():
                 views, probabilities = walk_of(agent, depth, poses, first)
-                same = views == np.asarray(by_table(table, jnp.int32(first), name)).tolist()
+                same = views == np.asarray(by_table(agent.key, table, jnp.int32(first), name)).tolist()
                 expected = probabilities_along(system, table, views, name)
                 found[name].append((same, float(np.abs(probabilities - expected).max())))
             bar.advance(line)

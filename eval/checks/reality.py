@@ -7,23 +7,22 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
 from data_pipeline.capture.casting import DEPTH_SCALE
 from data_pipeline.dataset.inputs import metric_depth
 from data_pipeline.errors import DataError, EmptyMesh, reason_of
-from data_pipeline.files import digest_of, write_npz
+from data_pipeline.files import digest_of, short_hash, write_npz
 from data_pipeline.objects.formats import Up
 from data_pipeline.objects.mesh import Mesh, ObjectEntry
 from data_pipeline.objects.sources import load_object, objects_to_test
 from data_pipeline.progress import console, progress_bar
-from eval.checks.scenes import CONDITIONS, UPPER, Condition, Placed, reachable_in, views_in
+from eval.checks.scenes import CONDITIONS, UPPER, Condition, Placed, reachable_in, version, views_in
 from eval.checks.transfer import STRANGER, matched
-from eval.checks.walks import BASELINE, Walker, Walks
+from eval.checks.walks import BASELINE, Observer, Walker, Walks
 from eval.numbers.comparison import intervals
+from eval.numbers.confidence import stopping
 from mevs_jax.agent.core import can_run
 from mevs_jax.selection import ViewTable
 from mevs_jax.trained import TrainedSystem
@@ -31,8 +30,10 @@ from mevs_jax.trained import TrainedSystem
 VIEWS = (1, 2, 4)
 """Numbers of views after which accuracy is reported."""
 THESIS = "predicted_entropy"
-_VERSION = 1
-"""Of what a scene's images are made by; raised when they change."""
+_VERSION = 2
+"""Raised when the same numbers make other images."""
+STOP = 0.95
+"""Calibrated probability at which walks stop, to see whether those who are sure are right."""
 
 
 @dataclass(frozen=True)
@@ -42,12 +43,14 @@ class RealityConfig:
     Attributes:
         conditions: names of the conditions; all if empty.
         objects: number of test objects, spread over all; 0 for all of them.
+        renamed: the systems' class for classes that the data calls otherwise.
         draws: random walks from each first view.
         seed: of everything that is drawn.
     """
 
     conditions: tuple[str, ...] = ()
     objects: int = 0
+    renamed: tuple[tuple[str, str], ...] = ()
     draws: int = 4
     seed: int = 0
 
@@ -91,11 +94,15 @@ def check_reality(
         if not same or system.description.camera != first.description.camera:
             raise DataError(f"{name} has other classes, viewpoints or another camera than the first system")
     source = objects_to_test(data, up)
-    labels = matched(source.classes, first.classes, {})
+    labels = matched(source.classes, first.classes, dict(config.renamed))
     entries = [entry for entry in source.entries if labels[source.classes[entry.label]] != STRANGER]
     meshes, left_out = meshes_of(entries, config.objects)
+    left_out |= {name: reason for by_name in source.left_out.values() for name, reason in by_name.items()}
     if len(meshes) < 2:
-        raise DataError(f"{data} has {len(meshes)} objects that can be used; this check needs at least 2")
+        why = "".join(f"; left out: {name} {reason}" for name, reason in list(left_out.items())[:2])
+        raise DataError(
+            f"this check needs at least 2 objects of classes that the systems know; {data} has {len(meshes)}{why}"
+        )
     truth = np.array([labels[source.classes[entry.label]] for entry, _ in meshes])
     tables = _tables(systems, conditions, meshes, truth, folder, config.seed)
     walks = {}
@@ -105,7 +112,9 @@ def check_reality(
     return {
         "data": data,
         "objects": len(meshes),
+        "strangers": len(source.entries) - len(entries),
         "left_out": left_out,
+        "notes": [*source.notes, *source.said],
         "conditions": {one.name: one.title for one in conditions},
         "systems": {name: _rows(system, walks[name], conditions) for name, system in systems.items()},
         "won_back": {name: _won_back(systems, walks, conditions, name) for name in list(systems)[1:]},
@@ -114,14 +123,18 @@ def check_reality(
 
 def meshes_of(entries: Sequence[ObjectEntry], most: int) -> tuple[list[tuple[ObjectEntry, Mesh]], dict[str, str]]:
     """Returns at most so many objects, spread over all (0 for all of them), and why others are left out, by name."""
-    count = min(most or len(entries), len(entries))
-    found, left_out = [], {}
-    for entry in (entries[number * len(entries) // count] for number in range(count)):
+    wanted = min(most or len(entries), len(entries))
+    spread = [number * len(entries) // wanted for number in range(wanted)] if wanted else []
+    found: dict[int, Mesh] = {}
+    left_out: dict[str, str] = {}
+    for number in (*spread, *sorted(set(range(len(entries))) - set(spread))):  # others where some cannot be used
+        if len(found) == wanted:
+            break
         try:
-            found.append((entry, load_object(entry)))
+            found[number] = load_object(entries[number])
         except (DataError, EmptyMesh) as error:
-            left_out[entry.name] = reason_of(error)
-    return found, left_out
+            left_out[entries[number].name] = reason_of(error)
+    return [(entries[number], found[number]) for number in sorted(found)], left_out
 
 
 def _tables(
@@ -134,27 +147,19 @@ def _tables(
 ) -> dict[str, dict[str, ViewTable]]:
     """View tables of every system in every condition, of all objects."""
     first = next(iter(systems.values()))
-    poses = jnp.asarray(first.poses)
-    of_object = {name: jax.jit(jax.vmap(system.observe)) for name, system in systems.items()}
-    seen: dict[str, dict[str, list[Any]]] = {name: {one.name: [] for one in conditions} for name in systems}
+    observers = {name: {one.name: Observer(system) for one in conditions} for name, system in systems.items()}
     with progress_bar("objects") as bar:
         line = bar.add_task("Scenes", total=len(meshes), note="")
         for number, (entry, mesh) in enumerate(meshes):
-            other = meshes[(number + len(meshes) // 2) % len(meshes)]  # most often of another class
-            images = images_of(first, conditions, entry, mesh, other, folder, seed)
-            for one in conditions:
-                for name in systems:
-                    seen[name][one.name].append(of_object[name](jnp.asarray(images[one.name]), poses))
+            other = meshes[(number + len(meshes) // 2) % len(meshes)][1]  # most often of another class
+            for name, depth in images_of(first, conditions, entry, mesh, other, folder, seed).items():
+                for by_condition in observers.values():
+                    by_condition[name].add(depth)
             bar.advance(line)
-    tables: dict[str, dict[str, ViewTable]] = {}
-    for name in systems:
-        tables[name] = {}
-        for one in conditions:
-            found = jax.tree.map(lambda *leaves: jnp.stack(leaves), *seen[name].pop(one.name))
-            tables[name][one.name] = ViewTable(
-                found.logits, found.predicted_entropy, None, jnp.asarray(truth), features=found.features
-            )
-    return tables
+    return {
+        name: {condition: observer.tables(truth) for condition, observer in by_condition.items()}
+        for name, by_condition in observers.items()
+    }
 
 
 def images_of(
@@ -162,7 +167,7 @@ def images_of(
     conditions: Sequence[Condition],
     entry: ObjectEntry,
     mesh: Mesh,
-    other: tuple[ObjectEntry, Mesh],
+    other: Mesh,
     folder: Path,
     seed: int,
 ) -> dict[str, Float[np.ndarray, "views side side"]]:
@@ -170,18 +175,17 @@ def images_of(
     camera, viewpoints = system.description.camera, system.viewpoints
     images: dict[str, np.ndarray] = {}
     placed: Placed | None = None
-    key = int(digest_of([entry.name, seed]), 16)
+    meshes = [_VERSION, version(), repr(camera), viewpoints.tolist(), entry.name, seed, _hash_of(mesh), _hash_of(other)]
     for one in conditions:
         if one == UPPER:  # fewer views can be reached of the same images
             images[one.name] = images["clean"]
             continue
-        made = digest_of(
-            [_VERSION, repr(one), repr(camera), viewpoints.tolist(), entry.name, other[0].name, seed, _of(mesh)]
-        )
+        made = digest_of([*meshes, repr(one)])
         path = folder / one.name / f"{made}.npz"
         if (stored := _stored(path)) is None:
-            placed = placed or Placed(mesh, other[1])
-            depth = views_in(one, placed, viewpoints, camera, (key, _seed_of(one)))
+            placed = placed or Placed(mesh, other)
+            drawn = int(digest_of([entry.name, seed, one.name]), 16)
+            depth = views_in(one, placed, viewpoints, camera, (drawn,))
             stored = np.round(depth * DEPTH_SCALE).astype(np.uint16)
             path.parent.mkdir(parents=True, exist_ok=True)
             write_npz(path, depth=stored)
@@ -189,13 +193,8 @@ def images_of(
     return images
 
 
-def _of(mesh: Mesh) -> list[float]:
-    """What tells a mesh from another one of the same name."""
-    return [float(mesh.vertices.shape[0]), float(np.float64(mesh.vertices).sum()), *map(float, mesh.extent)]
-
-
-def _seed_of(condition: Condition) -> int:
-    return next(number for number, one in enumerate(CONDITIONS) if one.name == condition.name)
+def _hash_of(mesh: Mesh) -> str:
+    return short_hash(mesh.vertices.tobytes() + mesh.faces.tobytes())
 
 
 def _stored(path: Path) -> np.ndarray | None:
@@ -230,11 +229,15 @@ def _walks(walker: Walker, tables: ViewTable, condition: Condition, config: Real
 def _rows(
     system: TrainedSystem, walks: dict[str, dict[str, Walks]], conditions: Sequence[Condition]
 ) -> list[dict[str, Any]]:
-    """Accuracy, difference from random selection, and from perfect images of the same views; all with 95 % intervals."""
+    """Accuracy, gain over random selection, loss against perfect images, and error of those who stop; with 95 % intervals.
+
+    `loss` is against perfect images and all views, `loss_there` against perfect images of the views that can be reached.
+    """
     rows = []
     for one in conditions:
         for part, found in walks[one.name].items():
-            perfect = walks["upper" if one.upper else "clean"].get(part)
+            bases = {"loss": walks["clean"].get(part), "loss_there": walks["upper" if one.upper else "clean"].get(part)}
+            (stops,) = stopping(found.confidence, found.right, [1 - STOP])
             for views in (views for views in VIEWS if views <= found.right.shape[-1]):
                 right = found.accuracy[:, views - 1]
                 gain = right - walks[one.name][BASELINE].accuracy[:, views - 1]
@@ -247,10 +250,12 @@ def _rows(
                     "interval": intervals(right),
                     "gain": float(gain.mean()),
                     "gain_interval": intervals(gain),
+                    "stop": {"at": STOP, "error": stops["error"], "stopped": stops["sure"], "views": stops["views"]},
                 }
-                if perfect is not None:
-                    loss = perfect.accuracy[:, views - 1] - right
-                    row |= {"loss": float(loss.mean()), "loss_interval": intervals(loss)}
+                for key, base in bases.items():
+                    if base is not None:
+                        lost = base.accuracy[:, views - 1] - right
+                        row |= {key: float(lost.mean()), f"{key}_interval": intervals(lost)}
                 rows.append(row)
     return rows
 

@@ -14,12 +14,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
+from scipy import ndimage
 from scipy.spatial.transform import Rotation
 
 from data_pipeline.capture.casting import default_caster
 from data_pipeline.capture.sensor import Kind, SensorConfig, sense
 from data_pipeline.files import digest_of
 from data_pipeline.objects.mesh import Mesh
+from eval.numbers.study import reachable_views
 from mevs_jax import canonical_view
 from mevs_jax.cameras import ViewCamera, cameras_at, pixel_directions
 
@@ -29,12 +31,12 @@ LOWEST = 0.0
 """Elevation in degrees below which a camera cannot go, where the object stands on a table."""
 
 _CAMERA = ViewCamera(resolution=224, field_of_view=70.0)
-_MARGIN = 0.03
-"""Radii above the table that are removed with it."""
+_MARGINS = (0.01, 0.05)
+"""Radii above the table up to which it is removed, drawn for each view: no robot knows its table exactly."""
 _TABLE = 3.0
 """Radius of the table, in radii of the object."""
-_BESIDE, _SMALLER = 1.0, 0.8
-"""Where another object stands, in radii from the centre, and its size relative to this one."""
+_SMALLER, _GAP = 0.8, 0.05
+"""Size of the object beside, relative to this one, and the gap between both, in radii."""
 
 
 @dataclass(frozen=True)
@@ -46,10 +48,10 @@ class Condition:
         title: in tables.
         sensor: the depth camera's errors, at one metre from the object's centre.
         strength: of these errors.
-        table: whether the object stands on a table, which is removed with a margin; views from below cannot be reached.
+        table: whether the object stands on a table, which is removed with a margin.
         upper: whether only views from above can be reached.
-        beside: whether another object stands beside it, whose pixels a mask names.
-        sphere: largest error of the centre and of the radius, as a share of the radius.
+        beside: whether another object stands beside it, whose pixels a mask names, to a pixel.
+        sphere: largest error of the centre (uniform in a ball) and of the radius, as a share of the radius.
         turned: whether the object faces anywhere, and the system is not told where.
         roll: whether the camera is rolled by any angle.
     """
@@ -86,7 +88,12 @@ CONDITIONS = (
 
 def reachable_in(condition: Condition, viewpoints: Float[np.ndarray, "views 3"]) -> np.ndarray | None:
     """Which viewpoints can be reached, (views,); None if all can."""
-    return viewpoints[:, 2] > np.sin(np.radians(LOWEST)) if condition.upper else None
+    return reachable_views(viewpoints, LOWEST) if condition.upper else None
+
+
+def version() -> str:
+    """Hash of the numbers that all scenes share."""
+    return digest_of([repr(_CAMERA), RADIUS, _MARGINS, _TABLE, _SMALLER, _GAP])
 
 
 class Placed:
@@ -94,13 +101,13 @@ class Placed:
 
     Attributes:
         lowest: height of its lowest point.
-        beside_lowest: height of the other object's lowest point, in that object's frame.
     """
 
     def __init__(self, mesh: Mesh, beside: Mesh) -> None:
         caster = default_caster()
         self._cast, self._beside = caster(mesh), caster(beside)
-        self.lowest, self.beside_lowest = (float(one.vertices[:, 2].min()) for one in (mesh, beside))
+        self._corners, self._others = mesh.vertices.astype(float), _SMALLER * beside.vertices.astype(float)
+        self.lowest = float(self._corners[:, 2].min())
         self._known: dict[str, np.ndarray] = {}
 
     def depth(self, eye: np.ndarray, rays: np.ndarray) -> np.ndarray:
@@ -110,10 +117,15 @@ class Placed:
             self._known[key] = self._cast(*_rays(eye, rays))[0].astype(float)
         return self._known[key]
 
-    def depth_beside(self, eye: np.ndarray, rays: np.ndarray, at: np.ndarray) -> np.ndarray:
-        """Depth of the other object, which stands at a place (2,) on the same floor."""
-        where = np.array([*at, self.lowest - _SMALLER * self.beside_lowest])
-        return self._beside(*_rays((eye - where) / _SMALLER, rays))[0].astype(float) * _SMALLER
+    def place_beside(self, angle: float) -> Float[np.ndarray, "3"]:
+        """Where the other object stands in some direction: on the same floor, with a gap between both."""
+        away = np.array([np.cos(angle), np.sin(angle), 0.0])
+        distance = (self._corners @ away).max() + (self._others @ -away).max() + _GAP
+        return distance * away + np.array([0.0, 0.0, self.lowest - self._others[:, 2].min()])
+
+    def depth_beside(self, eye: np.ndarray, rays: np.ndarray, place: np.ndarray) -> np.ndarray:
+        """Depth of the other object at a place, inf where it is not hit."""
+        return self._beside(*_rays((eye - place) / _SMALLER, rays))[0].astype(float) * _SMALLER
 
 
 def views_in(
@@ -136,7 +148,7 @@ def views_in(
     offset, factor = np.zeros(3), 1.0
     if condition.sphere:
         offset = random.normal(size=3)
-        offset *= condition.sphere * random.random() / np.linalg.norm(offset)
+        offset *= condition.sphere * np.cbrt(random.random()) / np.linalg.norm(offset)
         factor = 1 + condition.sphere * random.uniform(-1, 1)
     yaw = Rotation.from_rotvec([0, 0, random.uniform(0, 2 * np.pi) if condition.turned else 0.0]).as_matrix()
     source = replace(_CAMERA, distance=camera.distance)
@@ -145,10 +157,10 @@ def views_in(
     if condition.roll:
         turns = Rotation.from_rotvec(random.uniform(0, 2 * np.pi, len(poses))[:, None] * [0, 0, 1.0]).as_matrix()
         poses[:, :3, :3] = poses[:, :3, :3] @ turns
-    beside = random.uniform(0, 2 * np.pi)
-    at = _BESIDE * np.array([np.cos(beside), np.sin(beside)])
+    place = placed.place_beside(random.uniform(0, 2 * np.pi))
+    margins, wider = random.uniform(*_MARGINS, len(poses)), random.integers(-1, 2, len(poses))
     local = np.asarray(pixel_directions(source.at(jnp.eye(4)))).reshape(-1, 3)
-    images = np.stack([_seen(condition, placed, pose, local, yaw, at) for pose in poses])
+    images = np.stack([_seen(condition, placed, pose, local, yaw, place) for pose in poses])
     images = images.reshape(-1, source.resolution, source.resolution)
     object_is_nearest = images > 0
     depth = np.abs(images)
@@ -167,21 +179,22 @@ def views_in(
                 center=offset * RADIUS,
                 radius=factor * RADIUS,
                 camera=camera,
-                mask=object_is_nearest[view] if condition.beside else None,
-                floor=(placed.lowest - offset[2] + _MARGIN) * RADIUS if condition.table else None,
+                mask=_wider(object_is_nearest[view], int(wider[view])) if condition.beside else None,
+                floor=(placed.lowest - offset[2] + margins[view]) * RADIUS if condition.table else None,
             ).depth
-        except ValueError:  # nothing of the object is in the image
-            continue
+        except ValueError as error:
+            if "pixel" not in str(error):  # not that the image shows nothing of the object
+                raise
     return found
 
 
 def _seen(
-    condition: Condition, placed: Placed, pose: np.ndarray, local: np.ndarray, yaw: np.ndarray, at: np.ndarray
+    condition: Condition, placed: Placed, pose: np.ndarray, local: np.ndarray, yaw: np.ndarray, place: np.ndarray
 ) -> np.ndarray:
     """Depth of every ray, 0 where nothing is hit, negative where something else is in front of the object."""
     eye, rays = pose[:3, 3], local @ pose[:3, :3].T
     depth = placed.depth(eye @ yaw, rays @ yaw)
-    other = placed.depth_beside(eye, rays, at) if condition.beside else np.full(len(depth), np.inf)
+    other = placed.depth_beside(eye, rays, place) if condition.beside else np.full(len(depth), np.inf)
     if condition.table:
         with np.errstate(divide="ignore"):
             down = (placed.lowest - eye[2]) / rays[:, 2]
@@ -189,6 +202,14 @@ def _seen(
         other = np.minimum(other, np.where((down > 0) & on, down, np.inf))
     nearest = np.minimum(depth, other)
     return np.where(np.isfinite(nearest), np.where(other < depth, -nearest, nearest), 0.0)
+
+
+def _wider(mask: np.ndarray, pixels: int) -> np.ndarray:
+    """A mask that is so many pixels wider than the truth."""
+    if not pixels:
+        return mask
+    change = ndimage.binary_dilation if pixels > 0 else ndimage.binary_erosion
+    return change(mask, iterations=abs(pixels))
 
 
 def _rays(eye: np.ndarray, rays: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

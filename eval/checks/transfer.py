@@ -10,7 +10,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Int
 from scipy.stats import rankdata
 
 from data_pipeline.capture.casting import Rig, capture
@@ -20,7 +20,7 @@ from data_pipeline.objects.formats import Up
 from data_pipeline.objects.mesh import ObjectSource
 from data_pipeline.objects.sources import load_object, objects_to_test
 from data_pipeline.progress import progress_bar
-from eval.checks.walks import BASELINE, Walker, Walks, observed, rows_of
+from eval.checks.walks import BASELINE, Observer, Walker, Walks, rows_of
 from eval.numbers.comparison import intervals
 from eval.numbers.confidence import stopping
 from eval.system import USABLE
@@ -38,20 +38,20 @@ STRANGER = -1
 
 @dataclass(frozen=True)
 class Objects:
-    """Captured objects.
+    """Objects as a system sees them.
 
     Attributes:
         names: of the objects.
         folders: the class of each, as the source calls it.
         labels: the system's label of that class, or `STRANGER`.
-        depth: in radii, 0 where nothing is hit.
+        tables: what the networks compute from every view.
         left_out: reasons by name.
     """
 
     names: list[str]
     folders: list[str]
     labels: Int[np.ndarray, " objects"]
-    depth: Float[np.ndarray, "objects views side side"]
+    tables: ViewTable
     left_out: dict[str, str]
 
 
@@ -88,8 +88,8 @@ def _plain(name: str) -> str:
     return letters.removesuffix("s") if len(letters) > 3 else letters
 
 
-def capture_objects(system: TrainedSystem, source: ObjectSource, labels: Mapping[str, int]) -> Objects:
-    """Captures every object of a source from the system's viewpoints, by its camera.
+def see_objects(system: TrainedSystem, source: ObjectSource, labels: Mapping[str, int]) -> Objects:
+    """Captures every object of a source from the system's viewpoints, by its camera, for its networks.
 
     An object that cannot be read, or that no view shows, is left out with its reason.
 
@@ -100,7 +100,7 @@ def capture_objects(system: TrainedSystem, source: ObjectSource, labels: Mapping
     directions = jax.vmap(lambda pose: pixel_directions(camera.at(pose)))(poses)
     rig = Rig(np.asarray(poses, np.float32), np.asarray(directions, np.float32), np.deg2rad(camera.field_of_view))
     left_out = {name: reason for by_name in source.left_out.values() for name, reason in by_name.items()}
-    names, folders, depths = [], [], []
+    names, folders, observer = [], [], Observer(system)
     with progress_bar("objects") as bar:
         line = bar.add_task("Capture", total=len(source.entries), note="")
         for entry in source.entries:
@@ -115,10 +115,14 @@ def capture_objects(system: TrainedSystem, source: ObjectSource, labels: Mapping
                 continue
             names.append(entry.name)
             folders.append(source.classes[entry.label])
-            depths.append(np.asarray(metric_depth(depth)))
+            observer.add(np.asarray(metric_depth(depth)))
     if not names:
-        raise DataError(f"{source.name} has no object that can be used; {len(left_out)} were left out")
-    return Objects(names, folders, np.array([labels[folder] for folder in folders]), np.stack(depths), left_out)
+        first = next(iter(left_out.items()))
+        raise DataError(
+            f"{source.name} has no object that can be used ({len(left_out)} left out: {first[0]} {first[1]})"
+        )
+    found = np.array([labels[folder] for folder in folders])
+    return Objects(names, folders, found, observer.tables(found), left_out)
 
 
 def check_transfer(
@@ -151,12 +155,11 @@ def check_transfer(
     """
     source = objects_to_test(data, up)
     labels = matched(source.classes, system.classes, renamed or {})
-    objects = capture_objects(system, source, labels)
+    objects = see_objects(system, source, labels)
     known = objects.labels != STRANGER
     if not known.any():
         raise DataError(f"{data} has no object left of a class that the system knows; {len(objects.left_out)} left out")
-    tables = observed(system, objects.depth, objects.labels)
-    of_known = jax.tree.map(lambda leaf: leaf[known], tables)
+    of_known = jax.tree.map(lambda leaf: leaf[known], objects.tables)
     best = system.description.best if posed else system.description.best_unposed
     policies = [name for name in dict.fromkeys((BASELINE, *USABLE, best)) if can_run(system, name, posed)]
     walker, walks = Walker(system), {}
@@ -181,7 +184,7 @@ def check_transfer(
         "by_class": _by_class(objects, known, system.classes, walks, best),
         "calibration": _calibration(walks, (BASELINE, best)),
         "stopping": [row | {"stop": 1 - row["risk"]} for row in _stops(walks[best])],
-        "unknown_objects": strangers(system, tables, known),
+        "unknown_objects": strangers(system, objects.tables, known),
         "answers": _answers(objects, known, walks[best]),
     }
 
@@ -238,25 +241,25 @@ def strangers(
     """How well strangeness tells objects of unknown classes from the others, on random walks; None if one kind is missing.
 
     Returns:
-        For 1, 2, 4 views: the area under the ROC curve (½ is chance, 1 perfect), and the shares of unknown and of known objects
-        that are stranger than 95 % of the validation objects.
+        For 1, 2, 4 views: the area under the ROC curve (½ is chance, 1 perfect) of one walk of each object, averaged over
+        draws, and the shares of unknown and of known objects that are stranger than 95 % of the validation objects.
     """
     if system.parts.strangeness is None or known.all() or not known.any():
         return None
     views, measure, rows = tables.logits.shape[1], jax.jit(jax.vmap(system.parts.strangeness.of)), []
-    random = np.random.default_rng(seed)
-    energy = -np.asarray(jax.nn.logsumexp(jnp.asarray(tables.logits), axis=-1))
+    random, all_logits = np.random.default_rng(seed), np.asarray(tables.logits)
+    energy = -np.asarray(jax.nn.logsumexp(tables.logits, axis=-1))
     for count in (count for count in (1, 2, 4) if count <= views):
-        scores, beyond = np.zeros(len(known)), np.zeros(len(known))
+        areas, beyond = [], np.zeros(len(known))
         for _ in range(draws):
             chosen = np.argsort(random.random((len(known), views)), axis=1)[:, :count]
-            scores += np.take_along_axis(energy, chosen, axis=1).mean(axis=1) / draws
-            logits = jnp.asarray(np.take_along_axis(np.asarray(tables.logits), chosen[..., None], axis=1))
+            areas.append(auroc(np.take_along_axis(energy, chosen, axis=1).mean(axis=1), ~known))
+            logits = jnp.asarray(np.take_along_axis(all_logits, chosen[..., None], axis=1))
             beyond += (np.asarray(measure(logits, jnp.ones((len(known), count), bool))) > 0.95) / draws
         rows.append(
             {
                 "views": count,
-                "auroc": auroc(scores, ~known),
+                "auroc": float(np.mean(areas)),
                 "unknown_found": float(beyond[~known].mean()),
                 "known_refused": float(beyond[known].mean()),
             }

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
 
@@ -14,6 +14,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from eval.numbers.comparison import intervals
 from mevs_jax.beliefs import running_sum
+from mevs_jax.policies.base import Observation
 from mevs_jax.selection import ViewTable, select_from_table
 from mevs_jax.trained import TrainedSystem
 from mevs_jax.trained.parts import Parts
@@ -30,10 +31,12 @@ class Walks:
     Attributes:
         right: after each number of views, whether the most likely class is the true one; False for an object of no known class.
         confidence: calibrated probability of the most likely class.
+        views: the views of every walk, in order.
     """
 
     right: Bool[np.ndarray, "objects walks steps"]
     confidence: Float[np.ndarray, "objects walks steps"]
+    views: Int[np.ndarray, "objects walks steps"]
 
     @property
     def accuracy(self) -> Float[np.ndarray, "objects steps"]:
@@ -41,21 +44,34 @@ class Walks:
         return self.right.mean(axis=1)
 
 
-def observed(
-    system: TrainedSystem, depth: Float[np.ndarray, "objects views side side"], labels: Int[np.ndarray, " objects"]
-) -> ViewTable:
-    """What the system's networks compute from the views of some objects, as one table with a leading axis of objects.
+class Observer:
+    """What a system's networks compute from the views of one object after another.
 
     Args:
         system: whose viewpoints the views are from.
-        depth: in radii of the object as it was believed to be, 0 where nothing is hit.
-        labels: of the objects; −1 for one of no known class.
     """
-    poses = jnp.asarray(system.poses)
-    of_object = jax.jit(jax.vmap(system.observe))
-    seen = [of_object(jnp.asarray(views, jnp.float32), poses) for views in depth]
-    stacked = jax.tree.map(lambda *leaves: jnp.stack(leaves), *seen)
-    return ViewTable(stacked.logits, stacked.predicted_entropy, None, jnp.asarray(labels), features=stacked.features)
+
+    def __init__(self, system: TrainedSystem) -> None:
+        self._poses, self._seen = jnp.asarray(system.poses), list[Observation]()
+        self._of_object = jax.jit(jax.vmap(system.observe))
+
+    def add(self, depth: Float[np.ndarray, "views side side"]) -> None:
+        """Adds the views of an object, in radii, 0 where nothing is hit.
+
+        A view that shows nothing, which an agent would refuse, is no evidence: its logits are 0.
+        """
+        seen = self._of_object(jnp.asarray(depth, jnp.float32), self._poses)
+        shows = jnp.asarray(depth.any(axis=(1, 2)))
+        self._seen.append(replace(seen, logits=jnp.where(shows[:, None], seen.logits, 0.0)))
+
+    def tables(self, labels: Int[np.ndarray, " objects"]) -> ViewTable:
+        """The view tables of all objects, with a leading axis of objects.
+
+        Args:
+            labels: of the objects; −1 for one of no known class.
+        """
+        found = jax.tree.map(lambda *leaves: jnp.stack(leaves), *self._seen)
+        return ViewTable(found.logits, found.predicted_entropy, None, jnp.asarray(labels), features=found.features)
 
 
 def beliefs_along(
@@ -96,7 +112,7 @@ class Walker:
         """Walks around every object from every reachable first view.
 
         Args:
-            tables: of `observed`.
+            tables: of an `Observer`.
             policy: its name, as `TrainedSystem.policy` takes it.
             steps: number of views of each walk.
             posed: whether the yaw of the objects is known.
@@ -127,23 +143,25 @@ class Walker:
         steps: int,
         posed: bool,
         draws: int,
-    ) -> tuple[Array, Array]:
+    ) -> tuple[Array, Array, Array]:
         system, graph = self.system, self.system.graph
         fuse, run = system.fuse(parts, posed), system.policy(policy, parts, posed)
+        calibrated_as = system.calibrated_as(policy, posed)
         pairs = jnp.repeat(firsts, draws), jnp.tile(jnp.arange(draws), len(firsts))
 
-        def around(item: tuple[Array, ViewTable]) -> tuple[Array, Array]:
+        def around(item: tuple[Array, ViewTable]) -> tuple[Array, Array, Array]:
             number, table = item
             scene = table.scene(graph, parts.knowledge if posed else None, can_reach)
 
-            def from_view(first: Array, draw: Array) -> tuple[Array, Array]:
+            def from_view(first: Array, draw: Array) -> tuple[Array, Array, Array]:
                 own = jax.random.fold_in(jax.random.fold_in(key, number), first * draws + draw)
                 views = select_from_table(own, table, scene, run, first, max_views=steps, fuse=fuse).views
                 beliefs = beliefs_along(parts, table, views, posed)
-                calibrated = jax.vmap(partial(system.log_probabilities, policy=policy))(
+                calibrated = jax.vmap(partial(system.log_probabilities, policy=calibrated_as))(
                     beliefs, jnp.arange(1, steps + 1)
                 )
-                return jnp.argmax(calibrated, axis=-1) == table.label, jnp.exp(jnp.max(calibrated, axis=-1))
+                right = jnp.argmax(calibrated, axis=-1) == table.label
+                return right, jnp.exp(jnp.max(calibrated, axis=-1)), views
 
             return jax.vmap(from_view)(*pairs)
 
@@ -174,4 +192,5 @@ def rows_of(walks: dict[str, Walks], views: Sequence[int]) -> list[dict[str, Any
 
 
 def _within(walks: Walks, views: Sequence[int]) -> list[int]:
-    return sorted({count for count in views if 1 <= count <= walks.right.shape[-1]})
+    most = walks.right.shape[-1]
+    return sorted({most, *(count for count in views if 1 <= count <= most)})

@@ -45,6 +45,9 @@ class Agent:
         max_candidates: largest number of candidates of `decide`.
         seed: of random policies.
 
+    Attributes:
+        key: of a random policy's draws for the present object; each object has another one.
+
     Raises:
         ValueError: for an option out of its range, or a policy that needs what an agent does not have.
     """
@@ -84,7 +87,7 @@ class Agent:
         self.gain_per_cost, self.seed = float(gain_per_cost), int(seed)
         self.size = max(views, 128 if max_candidates is None else int(max_candidates))
         self.policy = policy
-        self._key = jax.random.key(seed)
+        self._resets, self.key = 0, jax.random.key(seed)
         self._programs: dict[bool, Programs] = {}
         self._lattice = candidates_of(system, None, self.size)
         self._object: Present | None = None
@@ -104,7 +107,7 @@ class Agent:
         camera = self.system.description.camera
         pose = pose_towards(np.array([0.6, 0.0, 0.8]), np.zeros(3), camera.distance, np.array([0.0, 0.0, 1.0]))
         depth = np.full((camera.resolution, camera.resolution), camera.distance - 0.5, np.float32)
-        kept = self._object, self.history
+        kept = self._object, self.history, self._resets
         try:
             for yaw in (0.0, None):
                 try:
@@ -114,7 +117,7 @@ class Agent:
                 self.decide(reachable=[0])  # before the first view, since afterwards it may be sure
                 self.observe(depth, camera.intrinsics, pose)
         finally:
-            self._object, self.history = kept
+            self._object, self.history, self._resets = kept
 
     def reset(
         self,
@@ -150,6 +153,8 @@ class Agent:
         _check(yaw is None or bool(np.isfinite(yaw)), f"yaw must be a finite angle in radians, or None, got {yaw}")
         rotation = rotation_to_world(up, yaw or 0.0)
         program = self._program(yaw is not None)  # refuses a policy first
+        self._resets += 1
+        self.key = jax.random.fold_in(jax.random.key(self.seed), self._resets)
         turn = np.eye(4, dtype=np.float32)
         turn[:3, :3] = rotation.T @ rotation_to_world(up, 0.0)
         self._object = Present(middle, float(radius), rotation, turn, program, program.blank(), None, np.zeros((0, 3)))
@@ -319,7 +324,7 @@ class Agent:
             wide[0, :number], wide[1, :number] = allowed, weighted
             index, gains = jax.device_get(
                 of.programs.choose(
-                    self.system.parts, of.memory, where, self._is_failed(where), wide[0] > 0, wide[1], self._key
+                    self.system.parts, of.memory, where, self._is_failed(where), wide[0] > 0, wide[1], self.key
                 )
             )
             if index < 0:

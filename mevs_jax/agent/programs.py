@@ -28,11 +28,7 @@ class Programs:
             raise ValueError(f"the policy {name} cannot be used here{without}: {reason}")
         self._system, self._policy, self._posed = system, policy, posed
         self._entropy, self._most = entropy, most
-        self._temperatures_of = policy if isinstance(policy, str) else "random"
-        if policy == "best":
-            self._temperatures_of = system.description.best
-        if not posed and (policy == "best" or system.parts.fusion):  # whose fusion is another one then
-            self._temperatures_of = system.description.best_unposed
+        self._temperatures_of = system.calibrated_as(policy if isinstance(policy, str) else "random", posed)
         self.choose = jax.jit(self.choose_next)
         # Compiled once for all policies of a system that need the same.
         shared = system.__dict__.setdefault("programs", {})

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Sequence
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from mevs_jax.cli.failure import Unusable
@@ -57,18 +59,15 @@ def transfer(options: TransferOptions) -> None:
     from eval.checks.transfer import check_transfer
     from mevs_jax.cli.tools import load_system
 
-    renamed = dict(pair.partition("=")[::2] for pair in options.names)
-    if wrong := next((pair for pair in options.names if "=" not in pair), None):
-        raise Unusable(f"--names {wrong} is not FOLDER=CLASS, as in --names armchair=chair")
     if options.max_views < 1 or options.draws < 1:
         raise Unusable("--max-views and --draws must be at least 1")
-    if options.to is not None and not options.to.parent.is_dir():
-        raise Unusable(f"there is no folder {options.to.parent} to write {options.to.name} into; make it first")
+    if options.to is not None:
+        check_file(options.to)
     found = check_transfer(
         load_system(options.system),
         options.data,
         up=options.up,
-        renamed=renamed,
+        renamed=dict(renamed(options.names)),
         posed=not options.unknown_yaw,
         max_views=options.max_views,
         draws=options.draws,
@@ -76,6 +75,27 @@ def transfer(options: TransferOptions) -> None:
     if options.to is not None:
         write_json(options.to, found)
     print(json.dumps(found) if options.json else transfer_text(found))
+
+
+def renamed(names: Sequence[str]) -> tuple[tuple[str, str], ...]:
+    """Pairs of what the data and what the system calls a class, from FOLDER=CLASS."""
+    if wrong := next((pair for pair in names if "=" not in pair), None):
+        raise Unusable(f"--names {wrong} is not FOLDER=CLASS, as in --names armchair=chair")
+    return tuple((pair.partition("=")[0], pair.partition("=")[2]) for pair in names)
+
+
+def check_file(path: Path) -> None:
+    """Raises `Unusable` if a file cannot be written, before anything is measured."""
+    if path.is_dir():
+        raise Unusable(f"{path} is a folder; name a file to write the figures into")
+    there = path.exists()
+    try:
+        with path.open("a"):
+            pass
+        if not there:
+            path.unlink()
+    except OSError as error:
+        raise Unusable(f"cannot write {path} ({error.strerror}); choose another file") from error
 
 
 def transfer_text(found: dict[str, Any]) -> str:
@@ -116,16 +136,20 @@ def reality(options: RealityOptions) -> None:
     from data_pipeline.files import write_json
     from data_pipeline.lock import locked
     from eval.checks.reality import RealityConfig, check_reality
-    from eval.stages import check_output
     from mevs_jax.cli.tools import load_system
 
-    if options.objects < 0 or options.draws < 1:
-        raise Unusable("--objects must not be below 0, and --draws at least 1")
+    if options.objects < 0 or options.objects == 1 or options.draws < 1:
+        raise Unusable("--objects must be at least 2, or 0 for all, and --draws at least 1")
     if len(set(options.system)) < len(options.system):
         raise Unusable("--system names one system twice; name each once")
-    config = RealityConfig(options.conditions, options.objects, options.draws, options.seed)
+    names = renamed(options.names)
+    config = RealityConfig(options.conditions, options.objects, names, options.draws, options.seed)
     systems = {name: load_system(name) for name in options.system}
-    check_output(options.to)
+    try:
+        options.to.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise Unusable(f"cannot write to {options.to} ({error.strerror}); choose another --to") from error
+    check_file(options.to / "reality.json")
     with locked(options.to, "mevs check reality"):
         found = check_reality(systems, options.data, options.to / "views", config, options.up)
         write_json(options.to / "reality.json", found)
@@ -134,18 +158,29 @@ def reality(options: RealityOptions) -> None:
 
 def reality_text(found: dict[str, Any]) -> str:
     """The figures of `check_reality`, for a terminal."""
-    lines = [f"{found['objects']} objects", *(f"left out: {name}: {why}" for name, why in found["left_out"].items())]
+    strangers = f", {found['strangers']} of classes that the systems do not know are not used" * bool(
+        found["strangers"]
+    )
+    lines = [f"{found['objects']} objects{strangers}", *found["notes"]]
+    lines += [f"left out: {name}: {why}" for name, why in found["left_out"].items()]
     width = max(map(len, found["conditions"].values()))
     for name, rows in found["systems"].items():
         cells = {(row["condition"], row["policy"], row["views"]): row for row in rows}
         policies = list(dict.fromkeys(row["policy"] for row in rows))
-        lines += ["", f"{name}: accuracy in %, with 95 % intervals over objects; in brackets what the condition costs"]
+        lines += ["", f"{name}: accuracy in %, with 95 % intervals over objects; in brackets the loss against perfect"]
+        lines[-1] += " images and all views; last how often the walks that stop at 95 % are wrong"
         for count in sorted({row["views"] for row in rows}):
             heading = f"after {count} view{'s' * (count > 1)}"
             lines.append(f"{heading:{width}}" + "".join(f"{policy:>28}" for policy in policies))
             for condition, title in found["conditions"].items():
                 row_of = (cells.get((condition, policy, count)) for policy in policies)
                 lines.append(f"{title:{width}}" + "".join(f"{_cost(row):>28}" for row in row_of))
+        for condition, title in found["conditions"].items():
+            stops = {
+                policy: cells[condition, policy, 1]["stop"] for policy in policies if (condition, policy, 1) in cells
+            }
+            said = (f"{policy} {_wrong(stop)}" for policy, stop in stops.items())
+            lines.append(f"{title:{width}}  wrong when sure: {', '.join(said)}")
     for name, rows in found["won_back"].items():
         lines += ["", f"{name} less {next(iter(found['systems']))}, in points, on the same images:"]
         for row in rows:
@@ -153,6 +188,12 @@ def reality_text(found: dict[str, Any]) -> str:
             shown = _percent(row["difference"], row["interval"], "+")
             lines.append(f"{title:{width}}  {row['policy']:8}{row['views']:>2}  {shown}")
     return "\n".join(lines)
+
+
+def _wrong(stop: dict[str, Any]) -> str:
+    if stop["error"] is None:
+        return "– (none is sure)"
+    return f"{100 * stop['error']:.1f} % of the {100 * stop['stopped']:.0f} % that stop"
 
 
 def _cost(row: dict[str, Any] | None) -> str:
@@ -175,12 +216,12 @@ def _policy_lines(found: dict[str, Any]) -> list[str]:
     lines = [
         "Accuracy in % after each number of views, from all first views, with 95 % intervals over objects;",
         "below it the difference from random views:",
-        " " * width + "".join(f"{count:>20}" for count in counts),
+        " " * width + "".join(f"{count:>23}" for count in counts),
     ]
     for name in policies:
         rows = [cells[name, count] for count in counts]
         mark = " (best)" if name == found["best"] else ""
-        lines.append(f"{name + mark:{width}}" + "".join(f"{_percent(r['accuracy'], r['interval']):>20}" for r in rows))
+        lines.append(f"{name + mark:{width}}" + "".join(f"{_percent(r['accuracy'], r['interval']):>23}" for r in rows))
         if name != "random":
-            lines.append(" " * width + "".join(f"{_percent(r['gain'], r['gain_interval'], '+'):>20}" for r in rows))
+            lines.append(" " * width + "".join(f"{_percent(r['gain'], r['gain_interval'], '+'):>23}" for r in rows))
     return lines

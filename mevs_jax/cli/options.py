@@ -187,7 +187,9 @@ class RealityOptions:
     """conditions: clean, roll, structured_light, stereo, stereo_strong, sphere_5, sphere_10, beside, turned, upper, table,
     together"""
     objects: Annotated[int, _arg("N", "0, all")] = 0
-    """number of objects, spread over all; half a minute each ten"""
+    """number of objects, spread over all: about 20 s for every ten, on two cores"""
+    names: Annotated[tuple[str, ...], _arg("FOLDER=CLASS ...")] = ()
+    """what the systems call classes that have another name in the data"""
     up: Annotated[Literal["auto", "z", "y"], _arg("auto|z|y", "auto: y for glTF, as declared for DAE, else z")] = "auto"
     """the upward axis of the meshes"""
     draws: Annotated[int, _arg("N", "4")] = 4

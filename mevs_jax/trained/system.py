@@ -154,6 +154,12 @@ class TrainedSystem:
             )
         return self._observe(self.parts, jnp.asarray(depth, jnp.float32), jnp.asarray(pose, jnp.float32))
 
+    def calibrated_as(self, policy: str, posed: bool = True) -> str:
+        """The policy whose temperatures are those of a policy's walks: itself, unless its yaw-free fusion is another one's."""
+        if not posed and (policy == "best" or self.parts.fusion):
+            return self.description.best_unposed
+        return self.description.best if policy == "best" else policy
+
     def log_probabilities(
         self, belief: Float[Array, "*batch classes"], count: int | Array, policy: str = "random"
     ) -> Float[Array, "*batch classes"]:

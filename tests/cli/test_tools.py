@@ -179,5 +179,7 @@ def test_a_system_meets_other_objects(system, chair, tmp_path, at_once, refuses)
     assert json.loads((tmp_path / "found.json").read_text())["known_as"] == {"seat": load(system).classes[0]}
     assert "none of the classes lamp, seat is one that the system knows" in refuses(*command)
     assert "--names seat is not FOLDER=CLASS" in refuses(*command, "--names", "seat")
-    assert "there is no folder" in refuses(*command, "--to", tmp_path / "none" / "found.json")
+    assert "No such file or directory); choose another file" in refuses(
+        *command, "--to", tmp_path / "none" / "found.json"
+    )
     assert "no such file or folder" in refuses("check", "transfer", "--data", tmp_path / "nothing")

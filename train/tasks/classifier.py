@@ -16,7 +16,7 @@ from data_pipeline.capture.casting import CaptureConfig
 from data_pipeline.dataset.augment import ImageAugmentation, augment_image
 from data_pipeline.dataset.batches import ViewBatches
 from data_pipeline.dataset.inputs import image_input, view_camera
-from data_pipeline.dataset.reality import RealityAugmentation, realistic_depth, used_reality
+from data_pipeline.dataset.reality import RealityAugmentation, realistic_views, used_reality
 from data_pipeline.errors import DataError
 from mevs_jax.inputs import depth_image
 from mevs_jax.models import ResNet
@@ -151,7 +151,7 @@ class ClassifierTask:
         """Returns the images of a batch with the errors of `reality`, (views, height, width, channels)."""
         assert self.reality is not None
         camera, channels = view_camera(self.camera), self.network_config.channels
-        depth = realistic_depth(key, batch, camera, self.reality)
+        depth, _ = realistic_views(key, batch, camera, self.reality)
         return jax.vmap(lambda image: depth_image(image, camera, channels))(depth)
 
     def loss(

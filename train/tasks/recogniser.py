@@ -24,7 +24,7 @@ from data_pipeline.dataset.augment import (
 )
 from data_pipeline.dataset.batches import ViewBatches
 from data_pipeline.dataset.inputs import depth_and_normals, view_camera
-from data_pipeline.dataset.reality import RealityAugmentation, realistic_depth, used_reality
+from data_pipeline.dataset.reality import RealityAugmentation, realistic_views, used_reality
 from mevs_jax import inputs as inputs_of
 from mevs_jax.models import Recogniser, ResNet
 from train.choosing.features import SetFusionConfig, new_fusion, random_sets
@@ -127,13 +127,12 @@ class RecogniserTask:
         """Returns the images of a batch, (views, height, width, 4)."""
         return jax.vmap(partial(depth_and_normals, camera=self.camera))(batch["depth"])
 
-    def realistic(self, key: jax.Array, batch: Batch) -> jax.Array:
-        """Returns the images of a batch with the errors of `reality`, (views, height, width, 4)."""
+    def realistic(self, key: jax.Array, batch: Batch) -> tuple[jax.Array, jax.Array]:
+        """Returns the images of a batch with the errors of `reality`, (views, height, width, 4), and their poses."""
         assert self.reality is not None
         camera = view_camera(self.camera)
-        return jax.vmap(partial(inputs_of.depth_and_normals, camera=camera))(
-            realistic_depth(key, batch, camera, self.reality)
-        )
+        depth, poses = realistic_views(key, batch, camera, self.reality, self.optimiser.views_per_object)
+        return jax.vmap(partial(inputs_of.depth_and_normals, camera=camera))(depth), poses
 
     def directions(self, batch: Batch) -> jax.Array:
         """Returns the unit vectors from the object to the cameras, (views, 3)."""
@@ -146,8 +145,10 @@ class RecogniserTask:
         del samples, hyper
         change, move, sets, drop = jax.random.split(key, 4)
         by_object = partial(views_by_object, views=self.optimiser.views_per_object)
-        inputs = self.realistic(jax.random.fold_in(key, 4), batch) if self.reality else self.inputs(batch)
-        images, poses = by_object(inputs), by_object(batch["pose"])
+        inputs, poses = self.inputs(batch), batch["pose"]
+        if self.reality:
+            inputs, poses = self.realistic(jax.random.fold_in(key, 4), batch)
+        images, poses = by_object(inputs), by_object(poses)
         labels = batch["label"].reshape(images.shape[:2])[:, 0]
         changes = object_changes(change, len(images), self.augmentation)
         images, directions = jax.vmap(partial(views_after, camera=self.camera))(changes, images, poses)

@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from flax import nnx
 
 from data_pipeline.capture.casting import default_caster
 from data_pipeline.dataset.reality import (
@@ -15,6 +16,7 @@ from data_pipeline.dataset.reality import (
     around_another_sphere,
     as_in_reality,
     hidden,
+    realistic_views,
     used_reality,
     without_floor,
 )
@@ -25,6 +27,7 @@ from eval.checks.camera import cast_canonical
 from eval.settings import TINY
 from mevs_jax import canonical_view
 from mevs_jax.cameras import ViewCamera, cameras_at, partial_cloud
+from train.kept import content_of
 from train.tasks.classifier import ClassifierTask
 from train.tasks.recogniser import RecogniserTask
 
@@ -102,8 +105,11 @@ def test_the_lowest_part_is_cut_off(images):
 def test_errors_grow_with_the_strength(images):
     def errors(strength: float) -> float:
         config = RealityAugmentation(strength)
-        changed = jax.jit(jax.vmap(lambda key: as_in_reality(key, images[0], POSES[0], CAMERA, config, "stereo")))
-        found = np.asarray(changed(jax.random.split(jax.random.key(0), 32)))
+
+        def one(key):
+            return as_in_reality(key, key, images[0], POSES[0], CAMERA, config, "stereo")[0]
+
+        found = np.asarray(jax.jit(jax.vmap(one))(jax.random.split(jax.random.key(0), 32)))
         assert np.isfinite(found).all()
         assert ((found == 0) | ((found > CAMERA.distance - 1.2) & (found < CAMERA.distance + 1.2))).all()
         return float(np.abs(found - images[0]).mean())
@@ -111,18 +117,51 @@ def test_errors_grow_with_the_strength(images):
     assert errors(1e-3) < 0.2 * errors(1.0)
 
 
-@pytest.mark.parametrize("task", [ClassifierTask, RecogniserTask])
-def test_networks_train_on_it(task, images):
-    group = TINY.classifier if task is ClassifierTask else TINY.learned.recogniser
+@pytest.mark.parametrize("kind", ["classifier", "recogniser"])
+def test_networks_train_on_it(kind, images):
+    task, group = {
+        "classifier": (ClassifierTask, TINY.classifier),
+        "recogniser": (RecogniserTask, TINY.learned.recogniser),
+    }[kind]
+    optimiser = replace(group.optimiser, views_per_object=3)
     camera = replace(TINY.dataset.capture, resolution=64)
-    plain = task.of(group, 10, camera)
+    plain = task.of(replace(group, optimiser=optimiser), 10, camera)
+    changed = task.of(replace(group, optimiser=optimiser, reality=RealityAugmentation(1.0)), 10, camera)
     assert plain.reality is None
-    changed = task.of(replace(group, reality=RealityAugmentation(1.0)), 10, camera)
-    batch = {"depth": jnp.asarray(images * 10_000).astype(jnp.uint16), "pose": jnp.asarray(POSES)}
-    found = changed.realistic(jax.random.key(0), batch)
-    assert found.shape == plain.inputs(batch).shape
-    assert 0.01 < np.abs(np.asarray(found - plain.inputs(batch))).mean() < 0.2
-    assert np.isfinite(np.asarray(found)).all()
+    assert "reality" not in content_of(plain)  # as version 0.1 kept it
+    assert content_of(changed)["reality"]["strength"] == 1.0
+    batch = {
+        "depth": jnp.asarray(images * 10_000).astype(jnp.uint16),
+        "pose": jnp.asarray(POSES),
+        "label": jnp.zeros(3, jnp.int32),
+    }
+    network = plain.network(nnx.Rngs(0))
+
+    def loss(task) -> float:
+        return float(nnx.jit(task.loss)(network, batch, jax.random.key(0), jnp.arange(3), task.hyperparameters)[0])
+
+    losses = [loss(plain), loss(changed)]
+    assert np.isfinite(losses).all()
+    assert abs(losses[0] - losses[1]) > 1e-4  # the same draws otherwise
+
+
+def test_views_of_an_object_share_its_wrong_sphere(images):
+    """The believed poses of three views are those around one centre, and each object has a centre of its own."""
+    batch = {"depth": jnp.asarray(np.tile(images, (2, 1, 1)) * 10_000).astype(jnp.uint16)}
+    batch["pose"] = jnp.asarray(np.tile(POSES, (2, 1, 1)))
+    config = RealityAugmentation(1.0, sensor="stereo", sphere=0.3)
+    depth, poses = realistic_views(jax.random.key(3), batch, CAMERA, config, views=3)
+    assert depth.shape == batch["depth"].shape
+    eyes, centres = np.asarray(POSES)[:, :3, 3].astype(float), []
+    for believed in np.asarray(poses, float).reshape(2, 3, 4, 4):
+        towards = believed[:, :3, 3] / np.linalg.norm(believed[:, :3, 3], axis=1, keepdims=True)
+        # The centre lies on each line from a camera against its believed direction: least squares of the three lines.
+        across = np.eye(3) - towards[:, :, None] * towards[:, None, :]
+        centre = np.linalg.solve(across.sum(axis=0), np.einsum("vij,vj->i", across, eyes))
+        np.testing.assert_allclose(np.einsum("vij,vj->vi", across, eyes - centre), 0, atol=1e-5)
+        centres.append(centre)
+    assert 0.01 < np.linalg.norm(centres, axis=1).max() < 0.3
+    assert np.linalg.norm(centres[0] - centres[1]) > 0.01
 
 
 def test_numbers_out_of_range_are_refused():
@@ -136,6 +175,9 @@ def test_numbers_out_of_range_are_refused():
     ):
         with pytest.raises(DataError, match=rf"--x\.{name} .* is not from"):
             used_reality(replace(RealityAugmentation(1.0), **{name: value}), "--x")
+    for changes in ({"strength": 4.0, "sphere": 0.3}, {"strength": 3.0, "floor": 0.5}):
+        with pytest.raises(DataError, match="nothing of some objects would be left"):
+            used_reality(RealityAugmentation(**changes), "--x")
     config = replace(TINY.classifier, images="image", reality=RealityAugmentation(1.0))
     with pytest.raises(DataError, match="for images of depth"):
         ClassifierTask.of(config, 10, TINY.dataset.capture)

@@ -88,13 +88,13 @@ def test_walks_are_those_of_the_selection_loop_on_tables(request, kind, policy):
     run, scene = system.policy(policy), table.scene(graph, system.parts.knowledge)
 
     @jax.jit
-    def by_table(first):
-        return select_from_table(jax.random.key(0), table, scene, run, first, max_views=6, fuse=fuse)
+    def by_table(key, first):
+        return select_from_table(key, table, scene, run, first, max_views=6, fuse=fuse)
 
     agent = Agent(system, policy, stop=2, max_views=6)
     for first, placed in ((0, {}), (7, {"up": (0.3, -1.0, 0.2), "yaw": 0.7})):
-        episode = by_table(first)
         seen, probabilities, reason = walk(agent, views, first, **placed)
+        episode = by_table(agent.key, first)
         assert seen == list(map(int, episode.views))
         assert reason == "budget"
         if kind == "classifier":
@@ -103,6 +103,15 @@ def test_walks_are_those_of_the_selection_loop_on_tables(request, kind, policy):
             np.testing.assert_allclose(probabilities, np.exp(np.stack(expected)), atol=1e-4)
         else:
             np.testing.assert_allclose(probabilities.argmax(-1), episode.predictions)
+
+
+def test_random_views_differ_between_objects_and_repeat_with_the_seed(classifier):
+    views, orders = views_of(classifier), []
+    for seed in (0, 0, 1):
+        agent = Agent(classifier, "random", stop=2, max_views=5, seed=seed)
+        orders.append([tuple(walk(agent, views, 0)[0]) for _ in range(3)])
+    assert orders[0] == orders[1] != orders[2]
+    assert len(set(orders[0])) == 3
 
 
 def test_it_stops_when_it_is_sure(classifier):
