@@ -25,7 +25,7 @@ from data_pipeline.objects.recipes import FurniturePiece
 from eval.numbers.comparison import intervals
 from mevs_jax.markdown import markdown_table
 
-POLICIES = ("random", "nearest", "best", "best, near")
+POLICIES = ("random", "nearest", "best", "information_gain", "information_gain, near")
 FIRSTS = 3
 """First views of each object in the study."""
 HELD_OUT = 1_000_000
@@ -50,15 +50,37 @@ def main() -> None:
     parser.add_argument("--each", type=int, default=5, help="objects of each class in the study (5)")
     parser.add_argument("--to", type=Path, help="write the study's figures into this .json")
     options = parser.parse_args()
+    if options.each < 1 or options.seed < 0:
+        parser.error("--each must be at least 1, and --seed at least 0")
+    for path, suffix in ((options.film, ".gif"), (options.to, ".json")):
+        if path is not None and (path.suffix.lower() != suffix or not path.parent.is_dir()):
+            parser.error(f"{path} must be a {suffix} in a folder that exists")
     try:
-        import mujoco  # noqa: F401
+        import mujoco
+
+        from examples.robot_arm.looking import agent_of
+
+        system = mevs_jax.load(options.system)
+        if missing := sorted(set(CLASSES) - set(system.classes)):
+            parser.error(f"{options.system} does not know {', '.join(missing)}, which may stand on the table")
+        agents = {name: agent_of(system, name, options.views, options.stop) for name in _wanted(options)}
+        mujoco.GLContext(64, 64).free()
     except ImportError as error:
-        sys.exit(f"this example needs MuJoCo ({error}): pip install mujoco; without a display also the package libegl1")
-    system = mevs_jax.load(options.system)
+        parser.error(f"this example needs MuJoCo ({error}): pip install mujoco")
+    except AttributeError as error:
+        parser.error(f"MuJoCo cannot draw here ({error}): install libegl1 and libgl1-mesa-dri, or set MUJOCO_GL")
+    except (ValueError, OSError) as error:
+        parser.error(str(error))
+    for agent in agents.values():
+        agent.warm_up()
     if options.study:
-        study(system, options)
+        study(agents, options)
     else:
-        show(system, options)
+        show(agents[options.policy], options)
+
+
+def _wanted(options: argparse.Namespace) -> tuple[str, ...]:
+    return POLICIES if options.study else (options.policy,)
 
 
 def piece(kind: str, seed: int) -> Mesh:
@@ -66,23 +88,24 @@ def piece(kind: str, seed: int) -> Mesh:
     return normalise(*FurniturePiece(kind, HELD_OUT + seed).load(), kind)
 
 
-def show(system: Any, options: argparse.Namespace) -> None:
+def show(agent: Any, options: argparse.Namespace) -> None:
     """Recognises one object, and films it."""
     from examples.robot_arm.arm import Arm
     from examples.robot_arm.camera import DepthCamera
     from examples.robot_arm.film import write_film
-    from examples.robot_arm.looking import agent_of, recognise
+    from examples.robot_arm.looking import recognise
     from examples.robot_arm.scene import RADIUS, make_scene
 
     scene = make_scene(piece(options.object, options.seed))
     camera = DepthCamera(scene, options.sensor)
-    agent = agent_of(system, options.policy, options.views, options.stop)
-    agent.warm_up()
+    camera.begin(options.seed)
     agent.reset(center=scene.center, radius=RADIUS, yaw=0.0)
     arm = Arm(scene)
     reach = arm.reach(agent.poses)
     free = np.isfinite(arm.costs(reach)[0])
     print(f"{free.sum()} of {len(free)} viewpoints can be reached")
+    if not free.any():
+        return
     found = recognise(agent, scene, camera, reach, int(np.argmax(free)), frames=14 if options.film else 1)
     for number, look in enumerate(found.looks, 1):
         print(
@@ -91,41 +114,41 @@ def show(system: Any, options: argparse.Namespace) -> None:
     print(
         f"{found.name} after {len(found.looks)} views ({found.reason}), {found.radians:.1f} rad of joint motion after the first"
     )
-    if options.film:
-        write_film(found, scene, camera, system.classes, options.film)
+    if options.film and found.looks:
+        write_film(found, scene, camera, agent.system.classes, options.film)
         print(f"Film: {options.film}")
     camera.close()
 
 
-def study(system: Any, options: argparse.Namespace) -> None:
+def study(agents: dict[str, Any], options: argparse.Namespace) -> None:
     """Compares policies by objects recognised, views, and joint motion."""
     from examples.robot_arm.arm import Arm
     from examples.robot_arm.camera import DepthCamera
-    from examples.robot_arm.looking import agent_of, recognise
+    from examples.robot_arm.looking import recognise
     from examples.robot_arm.scene import RADIUS, make_scene
 
-    agents = {name: agent_of(system, name, options.views, options.stop) for name in POLICIES}
-    for agent in agents.values():
-        agent.warm_up()
     rows: dict[str, list[list[float]]] = {name: [] for name in POLICIES}
     reached = []
     for kind, seed in ((kind, seed) for kind in CLASSES for seed in range(options.each)):
         scene = make_scene(piece(kind, seed))
-        camera, arm = DepthCamera(scene, options.sensor, seed=seed), Arm(scene)
+        camera, arm = DepthCamera(scene, options.sensor), Arm(scene)
         agents["best"].reset(center=scene.center, radius=RADIUS, yaw=0.0)
         reach = arm.reach(agents["best"].poses)
         firsts = np.flatnonzero(np.isfinite(arm.costs(reach)[0]))
         reached.append(len(firsts))
+        if not len(firsts):
+            sys.exit(f"no viewpoint of {kind} {seed} can be reached")
         for first in firsts[np.linspace(0, len(firsts) - 1, FIRSTS).astype(int)]:
             for name, agent in agents.items():
+                camera.begin(CLASSES.index(kind) * 10_000 + seed, int(first))
                 found = recognise(agent, scene, camera, reach, int(first))
-                seconds = float(np.mean([look.seconds for look in found.looks]))
+                seconds = float(np.mean([look.seconds for look in found.looks] or [0.0]))
                 rows[name].append([found.name == kind, len(found.looks), found.radians, seconds])
         camera.close()
         right = (f"{name} {np.mean([row[0] for row in rows[name][-FIRSTS:]]):.2f}" for name in rows)
         print(f"{kind} {seed}: {', '.join(right)}", file=sys.stderr)
     figures = {name: _figures(np.array(found, float), np.array(rows["random"], float)) for name, found in rows.items()}
-    count, viewpoints = options.each * len(CLASSES), len(system.viewpoints)
+    count, viewpoints = options.each * len(CLASSES), len(agents["random"].system.viewpoints)
     print(
         f"{count} objects, {FIRSTS} first views each; {np.mean(reached):.1f} of {viewpoints} viewpoints can be reached"
     )

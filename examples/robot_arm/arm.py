@@ -99,17 +99,17 @@ class Arm:
         return not any(self.collides(begin + part * (end - begin)) for part in np.linspace(0, 1, count))
 
     def costs(self, reach: Reach) -> tuple[Float[np.ndarray, " poses"], list[list[np.ndarray] | None]]:
-        """The shortest motion to each pose, in radians of all joints together (the length of the path), and its corners.
+        """The shortest free motion to each pose, in radians of all joints together (the length of the path), and its corners.
 
         Infinite where there is none.
         """
         lengths = np.full(len(reach.angles), np.inf)
         paths: list[list[np.ndarray] | None] = [None] * len(reach.angles)
         for pose, (angles, found) in enumerate(zip(reach.angles, reach.found, strict=True)):
-            for goal in sorted(angles[found], key=lambda goal: float(np.linalg.norm(goal - self.angles))):
-                if (corners := self.path(goal)) is not None:
-                    lengths[pose], paths[pose] = length_of(corners), corners
-                    break
+            ways = [corners for goal in angles[found] if (corners := self.path(goal)) is not None]
+            if ways:
+                paths[pose] = min(ways, key=length_of)
+                lengths[pose] = length_of(paths[pose])  # type: ignore[arg-type]
         return lengths, paths
 
     def move(self, corners: list[np.ndarray], frames: int = 1) -> list[np.ndarray]:

@@ -65,9 +65,9 @@ def _frame(picture: np.ndarray, look: Looked | None, classes: Sequence[str], tit
     size = (_IMAGE[2] - _IMAGE[0], _IMAGE[3] - _IMAGE[1])
     frame.paste(_depth_picture(look.depth).resize(size, Image.Resampling.NEAREST), _IMAGE[:2])
     belief = look.belief
-    names = np.argsort(-belief.probabilities)[:7]
+    labels = np.argsort(-belief.probabilities)[:7]
     draw.text((492, 184), "what the agent believes", fill=_FAINT, font=small)
-    for row, label in enumerate(sorted(names, key=lambda label: -belief.probabilities[label])):
+    for row, label in enumerate(labels):
         top, share = 204 + 21 * row, float(belief.probabilities[label])
         draw.text((492, top), classes[label], fill=_INK, font=small)
         draw.rectangle((570, top, 570 + int(100 * share), top + 13), fill=_BEST if label == belief.label else _BAR)

@@ -75,14 +75,11 @@ def make_scene(mesh: Mesh) -> Scene:
         name="object", type=mujoco.mjtGeom.mjGEOM_MESH, meshname="object", rgba=[0.85, 0.55, 0.25, 1], contype=0
     )
     model = specification.compile()
-    # MuJoCo moves a mesh to its centre of mass; this puts it back.
-    number = model.geom("object").id
     data = mujoco.MjData(model)
     data.qpos[:] = HOME
     mujoco.mj_forward(model, data)
     focal = HEIGHT / 2 / np.tan(np.radians(FIELD_OF_VIEW) / 2)
     K = np.array([[focal, 0, (WIDTH - 1) / 2], [0, focal, (HEIGHT - 1) / 2], [0, 0, 1.0]])
-    assert number >= 0
     return Scene(model, data, center, K)
 
 
