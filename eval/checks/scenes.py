@@ -103,10 +103,10 @@ class Placed:
         lowest: height of its lowest point.
     """
 
-    def __init__(self, mesh: Mesh, beside: Mesh) -> None:
+    def __init__(self, mesh: Mesh, other: Mesh) -> None:
         caster = default_caster()
-        self._cast, self._beside = caster(mesh), caster(beside)
-        self._corners, self._others = mesh.vertices.astype(float), _SMALLER * beside.vertices.astype(float)
+        self._cast, self._cast_other = caster(mesh), caster(other)
+        self._corners, self._others = mesh.vertices.astype(float), _SMALLER * other.vertices.astype(float)
         self.lowest = float(self._corners[:, 2].min())
         self._known: dict[str, np.ndarray] = {}
 
@@ -125,7 +125,7 @@ class Placed:
 
     def depth_beside(self, eye: np.ndarray, rays: np.ndarray, place: np.ndarray) -> np.ndarray:
         """Depth of the other object at a place, inf where it is not hit."""
-        return self._beside(*_rays((eye - place) / _SMALLER, rays))[0].astype(float) * _SMALLER
+        return self._cast_other(*_rays((eye - place) / _SMALLER, rays))[0].astype(float) * _SMALLER
 
 
 def views_in(

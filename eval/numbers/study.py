@@ -158,7 +158,14 @@ def reachable_views(viewpoints: np.ndarray, lowest_elevation: float) -> np.ndarr
 
 @dataclass(frozen=True)
 class Setting:
-    """What all walks of a study share."""
+    """What all walks of a study share.
+
+    Attributes:
+        graph: the candidate views.
+        knowledge: statistics over validation objects.
+        config: settings of the evaluation; `max_views` at most the number of views that can be reached.
+        can_reach: (views,) bool.
+    """
 
     graph: ViewGraph
     knowledge: Knowledge

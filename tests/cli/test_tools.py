@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import inspect
 import json
+import re
 import shutil
 
 import jax.numpy as jnp
@@ -11,7 +13,9 @@ import pytest
 
 import mevs_jax
 from data_pipeline.objects.furniture import furniture
+from eval.checks.scenes import CONDITIONS
 from mevs_jax.agent import load_history
+from mevs_jax.cli.options import RealityOptions
 from mevs_jax.trained import load, save
 from tests.cli.conftest import mevs, refused
 from tests.mevs_jax.trained import making
@@ -152,6 +156,11 @@ def test_what_an_agent_promises_is_measured(whole, tmp_path):
     assert found["camera"][0]["overlap_median"] > 0.9
     assert "information_gain: 3 of 3 walks are those on view tables" in result.stdout
     assert refused(mevs("check", "agent", "--out", run, "--agent.objects", 0))
+
+
+def test_the_conditions_are_those_that_the_help_names():
+    text = re.sub(r"\s+", " ", inspect.getsource(RealityOptions))
+    assert f"conditions: {', '.join(condition.name for condition in CONDITIONS)}" in text
 
 
 def test_a_system_meets_other_objects(system, chair, tmp_path, at_once, refuses):

@@ -33,19 +33,21 @@ K = np.array([[260.0, 0.0, 159.5], [0.0, 260.0, 119.5], [0.0, 0.0, 1.0]])
 class SimulatedCamera:
     """Goes where it is sent, except where it is told not to."""
 
-    def __init__(self, kind: str, refuses: int = 0, blind: int = 0) -> None:
+    def __init__(self, kind: str, refuses: int = 0, blind: int = 0, garbled: int = -1) -> None:
         mesh = normalise(*FurniturePiece(kind, 1_000_003).load(), kind)
         self.cast = default_caster()(
             Mesh((mesh.vertices * RADIUS + CENTER).astype(np.float32), mesh.faces, mesh.extent)
         )
-        self.refuses, self.blind, self.asked = refuses, blind, []
+        self.refuses, self.blind, self.garbled, self.asked = refuses, blind, garbled, []
         rows, columns = np.mgrid[:240, :320]
         self.rays = np.stack([columns, rows, np.ones_like(rows)], axis=-1).reshape(-1, 3) @ np.linalg.inv(K).T
 
-    def wait_for(self, pose: np.ndarray, seconds: float) -> Frame | None:
+    def wait_for(self, pose: np.ndarray, seconds: float, cancelled) -> Frame | None:
         self.asked.append(pose)
         if len(self.asked) <= self.refuses:
             return None
+        if len(self.asked) == self.garbled:
+            raise ValueError("depth images of encoding 'rgb8' cannot be read")
         if len(self.asked) <= self.refuses + self.blind:
             return Frame(np.zeros((240, 320), np.float32), K, pose)
         rays = (self.rays @ pose[:3, :3].T).astype(np.float32)
@@ -92,6 +94,12 @@ def test_poses_that_are_not_reached_and_images_that_show_nothing_are_replaced():
     ]
     places = [tuple(pose[:3, 3].round(6)) for pose in camera.asked]
     assert len(set(places)) == len(places)
+
+
+def test_an_image_that_cannot_be_read_does_not_end_the_goal():
+    found, _, said = looked(SimulatedCamera("toilet", garbled=1))
+    assert found.reason == "sure"
+    assert "encoding 'rgb8' cannot be read" in said[0]
 
 
 def test_a_cancelled_goal_ends_with_what_is_known():

@@ -15,6 +15,7 @@ from rclpy.duration import Duration
 from rclpy.executors import MultiThreadedExecutor
 from rclpy.node import Node
 from rclpy.qos import qos_profile_sensor_data
+from rclpy.time import Time
 from sensor_msgs.msg import CameraInfo, Image
 from tf2_ros import Buffer, TransformException, TransformListener
 
@@ -45,7 +46,8 @@ class RecogniseNode(Node):
         self._frames = Frames(self)
         self._busy = threading.Lock()
         self.system = mevs_jax.load(self._given("system"))
-        self._agent(self._given("max_views"), self._given("stop")).warm_up()  # compiled programs are kept in memory
+        self._agents: dict[tuple[int, float], mevs_jax.Agent] = {}
+        self._agent(self._given("max_views"), self._given("stop"))
         group = ReentrantCallbackGroup()
         self.create_subscription(Image, "depth", self._frames.on_depth, qos_profile_sensor_data, callback_group=group)
         self.create_subscription(CameraInfo, "camera_info", self._frames.on_info, 10, callback_group=group)
@@ -64,20 +66,31 @@ class RecogniseNode(Node):
         return self.get_parameter(name).value
 
     def _agent(self, max_views: int, stop: float) -> mevs_jax.Agent:
-        distance = self._given("distance") or None
-        return self.system.agent(self._given("policy"), max_views=max_views, stop=stop, distance=distance)
+        """The agent with these options, which compiles for some seconds when it is first asked for."""
+        if (max_views, stop) not in self._agents:
+            distance = self._given("distance") or None
+            agent = self.system.agent(self._given("policy"), max_views=max_views, stop=stop, distance=distance)
+            agent.warm_up()
+            self._agents[max_views, stop] = agent
+        return self._agents[max_views, stop]
+
+    def _agent_of(self, goal: RecogniseObject.Goal) -> mevs_jax.Agent:
+        return self._agent(goal.max_views or self._given("max_views"), goal.stop or self._given("stop"))
 
     def _accept(self, goal: RecogniseObject.Goal) -> GoalResponse:
+        """Refuses a goal that could not be served, with the reason in the log."""
         world = self._given("world")
-        if goal.header.frame_id not in ("", world):
-            self.get_logger().error(f"the goal is in the frame {goal.header.frame_id}, not {world}: refused")
-            return GoalResponse.REJECT
         try:
-            self._goal_of(goal)
+            if goal.header.frame_id not in ("", world):
+                raise ValueError(f"the goal is in the frame {goal.header.frame_id}, not {world}")
+            if self._busy.locked():
+                raise ValueError("another goal is being served")
+            wanted = self._goal_of(goal)
+            self._agent_of(goal).reset(center=wanted.center, radius=wanted.radius, yaw=wanted.yaw)
         except ValueError as error:
-            self.get_logger().error(f"{error}: refused")
+            self.get_logger().error(f"goal refused: {error}")
             return GoalResponse.REJECT
-        return GoalResponse.REJECT if self._busy.locked() else GoalResponse.ACCEPT
+        return GoalResponse.ACCEPT
 
     @staticmethod
     def _goal_of(goal: RecogniseObject.Goal):
@@ -98,9 +111,8 @@ class RecogniseNode(Node):
                     message.confidence, message.probabilities = belief.confidence, belief.probabilities.tolist()
                 handle.publish_feedback(message)
 
-            agent = self._agent(goal.max_views or self._given("max_views"), goal.stop or self._given("stop"))
             found = recognise(
-                agent,
+                self._agent_of(goal),
                 self._goal_of(goal),
                 self._frames,
                 tell,
@@ -132,20 +144,24 @@ class Frames:
             self._depth = image
             self._arrived.notify_all()
 
-    def wait_for(self, pose: np.ndarray, seconds: float) -> Frame | None:
-        """Waits until the camera has stood at the pose for a while, and returns the image of that moment."""
-        given, end, since = self._node._given, time.monotonic() + seconds, None
-        while time.monotonic() < end:
+    def wait_for(self, pose: np.ndarray, seconds: float, cancelled) -> Frame | None:
+        """Waits until the camera has stood at the pose for a while, and returns an image of that time, taken after this call."""
+        given, clock = self._node._given, self._node.get_clock()
+        end, called, since = time.monotonic() + seconds, clock.now(), None
+        while time.monotonic() < end and not cancelled():
             with self._arrived:
-                self._arrived.wait(0.2)
+                arrived = self._arrived.wait(0.2)
                 image, info = self._depth, self._info
-            if image is None or info is None or (at := self._pose_at(image)) is None:
+            if not arrived or image is None or info is None:
+                continue
+            taken = Time.from_msg(image.header.stamp)
+            if taken < called or (at := self._pose_at(image)) is None:
                 continue
             if not is_at(at, pose, given("near_metres"), np.radians(given("near_degrees"))):
                 since = None
                 continue
-            since = since or time.monotonic()
-            if time.monotonic() - since >= given("still_seconds"):
+            since = since or taken
+            if taken - since >= Duration(seconds=given("still_seconds")):
                 depth = depth_of(
                     image.encoding, image.height, image.width, image.step, image.is_bigendian, bytes(image.data)
                 )

@@ -32,8 +32,14 @@ class Frame:
 class Camera(Protocol):
     """Where frames come from."""
 
-    def wait_for(self, pose: np.ndarray, seconds: float) -> Frame | None:
-        """Returns an image taken from (about) a pose while the camera stood still; None if there is none within the time."""
+    def wait_for(self, pose: np.ndarray, seconds: float, cancelled: Callable[[], bool]) -> Frame | None:
+        """Returns an image taken from (about) a pose after this call, while the camera stood still.
+
+        None if there is none within the time, or if the request is cancelled.
+
+        Raises:
+            ValueError: for an image that cannot be read.
+        """
 
 
 @dataclass(frozen=True)
@@ -98,12 +104,13 @@ def recognise(
         if step.T_world_camera is None:
             return result(step.reason)
         tell(step.T_world_camera, belief)
-        frame = camera.wait_for(step.T_world_camera, seconds)
-        if frame is None:
-            log(f"the camera did not get to the pose within {seconds:g} s; another is chosen")
-            agent.mark_failed(step)
-            continue
         try:
+            frame = camera.wait_for(step.T_world_camera, seconds, cancelled)
+            if frame is None:
+                if not cancelled():
+                    log(f"the camera did not get to the pose within {seconds:g} s; another is chosen")
+                agent.mark_failed(step)
+                continue
             belief = agent.observe(frame.depth, frame.K, frame.T_world_camera, floor=goal.floor)
         except ValueError as error:
             log(f"the image cannot be used: {error}; another view is chosen")
@@ -117,7 +124,7 @@ def depth_of(encoding: str, height: int, width: int, step: int, is_bigendian: bo
     Raises:
         ValueError: for an encoding other than 16UC1 (millimetres) and 32FC1 (metres), or too little data.
     """
-    kinds = {"16UC1": ("u2", 1e-3), "mono16": ("u2", 1e-3), "32FC1": ("f4", 1.0)}
+    kinds = {"16UC1": ("u2", 1e-3), "32FC1": ("f4", 1.0)}
     if encoding not in kinds:
         raise ValueError(f"depth images of encoding {encoding!r} cannot be read; publish 16UC1 (mm) or 32FC1 (m)")
     kind, unit = kinds[encoding]
