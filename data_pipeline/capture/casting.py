@@ -36,6 +36,8 @@ LARGEST_RESOLUTION = 4096
 """Largest number of pixels along each side of a view."""
 
 _RAYS_PER_BATCH = 100_000
+_ROUNDING = 1e-3
+"""Radii by which a hit may be outside of the unit sphere."""
 
 
 @dataclass(frozen=True)
@@ -238,7 +240,8 @@ def capture(mesh: Mesh, rig: Rig, caster: Caster | None = None) -> Capture:
         rays = [rig.directions[view][windows[view]].reshape(-1, 3) for view in batch_views]
         ends = np.cumsum([len(view_rays) for view_rays in rays])
         directions = np.concatenate(rays)
-        found, triangle = cast(np.repeat(rig.poses[batch_views, :3, 3], np.diff(ends, prepend=0), axis=0), directions)
+        origins = np.repeat(rig.poses[batch_views, :3, 3], np.diff(ends, prepend=0), axis=0)
+        found, triangle = _cast_inside(cast, origins, directions)
         hit = np.flatnonzero(np.isfinite(found))
         shades = np.zeros(len(found), np.uint8)
         shades[hit] = shade(normals[triangle[hit]], directions[hit])
@@ -248,6 +251,25 @@ def capture(mesh: Mesh, rig: Rig, caster: Caster | None = None) -> Capture:
             depth[view][window] = stored.reshape(depth[view][window].shape)
             image[view][window] = shaded.reshape(depth[view][window].shape)
     return Capture(depth, image, mesh.extent)
+
+
+def _cast_inside(cast: Cast, origins: np.ndarray, directions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Casts rays at a mesh inside the unit sphere.
+
+    Embree now and then returns a hit far from a triangle that is seen edge-on. Such hits are outside of the sphere; these rays
+    are cast again from where they may enter it.
+    """
+    found, triangle = cast(origins, directions)
+    distance = np.linalg.norm(origins, axis=1)
+    near, far = distance - 1 - _ROUNDING, distance + 1 + _ROUNDING
+    wrong = np.flatnonzero(np.isfinite(found) & ((found < near) | (found > far)))
+    if len(wrong):
+        ahead = near[wrong].astype(np.float32)
+        again, hit = cast(origins[wrong] + ahead[:, None] * directions[wrong], directions[wrong])
+        found, triangle = found.copy(), triangle.copy()
+        found[wrong] = np.where(again + ahead <= far[wrong], again + ahead, np.inf)
+        triangle[wrong] = hit
+    return found, triangle
 
 
 def _windows(vertices: np.ndarray, rig: Rig) -> list[tuple[slice, slice]]:

@@ -100,6 +100,12 @@ def walk_of(
         view = step.index
 
 
+def inside(depth: np.ndarray, system: TrainedSystem) -> np.ndarray:
+    """Depth without the hits outside of the object's sphere that data sets have which were made before they were refused."""
+    distance = system.description.camera.distance
+    return np.where((depth > distance - 1.01) & (depth < distance + 1.01), depth, 0).astype(np.float32)
+
+
 def table_of(system: TrainedSystem, depth: Float[np.ndarray, "views side side"], poses: np.ndarray) -> ViewTable:
     """What the system's networks compute from every view of one object."""
     seen = [system.observe(depth[view], poses[view]) for view in range(len(depth))]
@@ -128,7 +134,7 @@ def compare_walks(
         line = bar.add_task("Walking with an agent", total=objects, note="")
         for index in np.linspace(0, len(source) - 1, objects).astype(int):
             example = source[index]
-            depth, poses = np.asarray(metric_depth(example["depth"])), example["pose"]
+            depth, poses = inside(np.asarray(metric_depth(example["depth"])), system), example["pose"]
             table, first = table_of(system, depth, poses), int(index) % len(poses)
             for name, agent in agents.items():
                 views, probabilities = walk_of(agent, depth, poses, first)
@@ -245,7 +251,7 @@ def latency(system: TrainedSystem, data: Path, calls: int = 200, policy: str = "
     agent = system.agent(policy, stop=2.0, max_views=8)
     agent.warm_up()
     example = open_split(data, "test")[0]
-    depth, poses = np.asarray(metric_depth(example["depth"])), example["pose"]
+    depth, poses = inside(np.asarray(metric_depth(example["depth"])), system), example["pose"]
     camera = system.description.camera
     scale = 480 / camera.resolution
     wide = (

@@ -15,6 +15,7 @@ import trimesh
 
 from data_pipeline.capture.casting import (
     CaptureConfig,
+    Cast,
     Rig,
     capture,
     cast_embree,
@@ -27,7 +28,7 @@ from data_pipeline.capture.casting import (
 from data_pipeline.capture.workers import capture_all, capture_path
 from data_pipeline.dataset.builder import view_entropies
 from data_pipeline.errors import DamagedMesh
-from data_pipeline.objects.mesh import ObjectEntry, normalise
+from data_pipeline.objects.mesh import Mesh, ObjectEntry, normalise
 from data_pipeline.objects.recipes import FurniturePiece, MeshFile
 from data_pipeline.objects.sources import load_object
 from data_pipeline.objects.voxels import VoxelGrid
@@ -244,3 +245,30 @@ def test_without_a_display_the_visualizer_says_so(monkeypatch):
     code = SEE_BOTH.replace("import sys", "import sys; sys.argv[1:] = ['.', 'chair']", 1)
     result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=300)
     assert "DataError: the visualizer backend needs a display; run it under xvfb-run -a" in result.stderr
+
+
+def test_hits_outside_of_the_objects_sphere_are_cast_again():
+    """Embree returns some for triangles that are seen edge-on; here a caster gives wrong hits before and behind."""
+    mesh = normalise(*FurniturePiece("chair", 3).load(), "chair")
+    rig = rig_for(CaptureConfig(views=6, resolution=24))
+    right = capture(mesh, rig)
+    hits = np.flatnonzero(right.depth[0])
+    wrong = {int(hits[0]): 0.06, int(hits[5]): 4.2}
+
+    def caster(mesh: Mesh) -> Cast:
+        cast = default_caster()(mesh)
+
+        def sometimes_wrong(origins: np.ndarray, directions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+            found, triangle = cast(origins, directions)
+            found = found.copy()
+            for pixel, depth in wrong.items():
+                ray = rig.directions[0].reshape(-1, 3)[pixel]
+                at = (directions == ray).all(axis=1) & (np.linalg.norm(origins, axis=1) > 1.9)
+                found[at] = depth
+            return found, triangle
+
+        return sometimes_wrong
+
+    found = capture(mesh, rig, caster)
+    np.testing.assert_allclose(found.depth.astype(int), right.depth.astype(int), atol=1)
+    np.testing.assert_array_equal(found.image, right.image)
