@@ -112,7 +112,7 @@ def canonical_view(
         image, known, pose, in_image, unknown = jax.device_get(_render(window, inverse, camera))
     if not image.any():
         raise ValueError(why_empty(window))
-    image = np.round(image * DEPTH_SCALE) / np.float32(DEPTH_SCALE)  # as the data set stores it
+    image = np.round(image * DEPTH_SCALE) * np.float32(1 / DEPTH_SCALE)  # to the bit as the data set's views are read
     direction = np.asarray(window.eye / np.linalg.norm(window.eye), np.float32)
     return CanonicalView(image, known, pose, direction, float(in_image), float(unknown))
 

@@ -13,8 +13,11 @@ from mevs_jax.cameras import ViewCamera
 
 
 def metric_depth(stored: jax.Array | np.ndarray) -> jax.Array:
-    """Returns metric depth, float32, from stored depth; 0 (nothing hit) stays 0."""
-    return jnp.asarray(stored, jnp.float32) / DEPTH_SCALE
+    """Returns metric depth, float32, from stored depth; 0 (nothing hit) stays 0.
+
+    It is multiplied, as XLA does where a division by a constant is written, and as `mevs_jax.canonical_view` does.
+    """
+    return jnp.asarray(stored, jnp.float32) * np.float32(1 / DEPTH_SCALE)
 
 
 def view_camera(camera: CaptureConfig) -> ViewCamera:
