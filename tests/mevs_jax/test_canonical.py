@@ -11,6 +11,7 @@ import trimesh
 from scipy.spatial.transform import Rotation
 
 from data_pipeline.capture.casting import default_caster
+from data_pipeline.dataset.inputs import metric_depth
 from data_pipeline.objects.furniture import furniture
 from data_pipeline.objects.mesh import Mesh, normalise
 from eval.checks.camera import SIZES, Shot, agreement, agreements, cast_canonical, cast_shot, random_shot, summary
@@ -61,7 +62,8 @@ def test_the_image_of_the_data_set_s_own_camera_stays_as_it_is():
     assert overlap(view.depth, depth) == 1
     assert view.depth.dtype == np.float32
     np.testing.assert_allclose(view.depth, depth, atol=5.1e-5)  # in the steps of stored depth
-    np.testing.assert_array_equal(view.depth, np.round(view.depth * 10_000) / np.float32(10_000))
+    stored = np.round(view.depth * 10_000).astype(np.uint16)
+    np.testing.assert_array_equal(view.depth, metric_depth(stored))  # to the bit as the data set's views are read
     np.testing.assert_allclose(view.pose, shot.T_world_camera, atol=1e-6)
     np.testing.assert_allclose(view.direction, DIRECTION, atol=1e-6)
     assert view.in_image == 1
