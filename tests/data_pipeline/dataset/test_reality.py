@@ -117,7 +117,7 @@ def test_errors_grow_with_the_strength(images):
     assert errors(1e-3) < 0.2 * errors(1.0)
 
 
-@pytest.mark.parametrize("kind", ["classifier", "recogniser"])
+@pytest.mark.parametrize("kind", ["classifier", pytest.param("recogniser", marks=pytest.mark.slow)])
 def test_networks_train_on_it(kind, images):
     task, group = {
         "classifier": (ClassifierTask, TINY.classifier),

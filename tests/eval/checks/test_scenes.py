@@ -122,7 +122,7 @@ def test_a_wrong_sphere_moves_the_object_in_all_views_alike(table, placed, clean
     assert min(map(overlap, found, clean)) < 0.8
 
 
-@pytest.mark.parametrize("name", ["structured_light", "stereo"])
+@pytest.mark.parametrize("name", [pytest.param("structured_light", marks=pytest.mark.slow), "stereo"])
 def test_sensors_add_errors_of_the_size_of_their_strength(placed, clean, name):
     condition = BY_NAME[name]
     none, twice = (seen(replace(condition, strength=strength), placed) for strength in (0.0, 2.0))

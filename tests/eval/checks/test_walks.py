@@ -2,18 +2,15 @@
 
 from __future__ import annotations
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 
-import mevs_jax
 from eval.checks.walks import Observer, Walker, rows_of
 from mevs_jax.agent import Agent
 from tests.mevs_jax.trained import making
 
 
-@pytest.fixture(scope="module", params=["classifier", "recogniser"])
+@pytest.fixture(scope="module", params=["classifier", pytest.param("recogniser", marks=pytest.mark.slow)])
 def system(request):
     return making.system(request.param)
 
@@ -81,5 +78,3 @@ def test_draws_differ_and_repeat_with_the_seed(system, tables):
 def test_rows_hold_the_last_number_of_views(system, tables):
     walks = {"random": Walker(system).walk(tables, "random", 3)}
     assert [row["views"] for row in rows_of(walks, (1, 2, 8))] == [1, 2, 3]
-    assert isinstance(mevs_jax.load, object)
-    assert jax.tree.leaves(tables)[0].dtype == jnp.float32
