@@ -25,7 +25,7 @@ from jaxtyping import Array, Bool, Float
 
 from mevs_jax.arrays import AnyArray, AnyVector
 from mevs_jax.cameras import ViewCamera, look_at_origin, pixel_directions
-from mevs_jax.entropy import DEPTH_SCALE
+from mevs_jax.entropy import DEPTH_SCALE, DEPTH_STEP
 from mevs_jax.source_view import MARGIN, Window, why_empty, window_of
 
 _STRIDE = 1.0
@@ -112,7 +112,7 @@ def canonical_view(
         image, known, pose, in_image, unknown = jax.device_get(_render(window, inverse, camera))
     if not image.any():
         raise ValueError(why_empty(window))
-    image = np.round(image * DEPTH_SCALE) * np.float32(1 / DEPTH_SCALE)  # to the bit as the data set's views are read
+    image = np.round(image * DEPTH_SCALE) * DEPTH_STEP  # to the bit as the data set's views are read
     direction = np.asarray(window.eye / np.linalg.norm(window.eye), np.float32)
     return CanonicalView(image, known, pose, direction, float(in_image), float(unknown))
 

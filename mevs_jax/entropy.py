@@ -10,12 +10,15 @@ from __future__ import annotations
 from typing import Literal
 
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float, Int
 
 from mevs_jax.arrays import AnyArray
 
 DEPTH_SCALE = 10_000
 """Units of the stored 16-bit depth per metric unit."""
+DEPTH_STEP = np.float32(1 / DEPTH_SCALE)
+"""A unit of stored depth, by which it is multiplied: a division by `DEPTH_SCALE` differs by a bit between NumPy and XLA."""
 _LEVELS = 256
 
 EntropyVariant = Literal["thesis", "foreground"]

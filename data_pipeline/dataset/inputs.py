@@ -7,17 +7,15 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int, Integer
 
-from data_pipeline.capture.casting import DEPTH_SCALE, CaptureConfig
+from data_pipeline.capture.casting import CaptureConfig
 from mevs_jax import inputs
 from mevs_jax.cameras import ViewCamera
+from mevs_jax.entropy import DEPTH_STEP
 
 
 def metric_depth(stored: jax.Array | np.ndarray) -> jax.Array:
-    """Returns metric depth, float32, from stored depth; 0 (nothing hit) stays 0.
-
-    It is multiplied, as XLA does where a division by a constant is written, and as `mevs_jax.canonical_view` does.
-    """
-    return jnp.asarray(stored, jnp.float32) * np.float32(1 / DEPTH_SCALE)
+    """Returns metric depth, float32, from stored depth; 0 (nothing hit) stays 0."""
+    return jnp.asarray(stored, jnp.float32) * DEPTH_STEP
 
 
 def view_camera(camera: CaptureConfig) -> ViewCamera:

@@ -122,9 +122,8 @@ def as_in_reality(
     strength = config.strength * jax.random.uniform(amount)
     depth = hidden(hide, depth, jnp.minimum(strength * config.hidden, 0.9))
     depth = without_floor(cut, depth, pose, camera, strength * config.floor)
-    depth = jax.lax.optimization_barrier(
-        depth
-    )  # else XLA computes each stage again for every pixel that the next one reads
+    # Without the barriers XLA computes each stage again for every pixel that the next one reads.
+    depth = jax.lax.optimization_barrier(depth)
     depth = sense(noise, depth, pose, camera, SensorConfig(kind, 1.0, config.distance), strength, surface)
     depth = jnp.asarray(jax.lax.optimization_barrier(depth))
     offset = jax.random.ball(where, 3) * strength * config.sphere

@@ -202,6 +202,13 @@ def mesh_zip(archive: Path, reading: Reading = Reading()) -> ObjectSource:
     return _arranged(list_zip(archive, reading.up), shown(archive.stem), shown(str(archive)), reading)
 
 
+def _of_meshes(path: Path, reading: Reading) -> ObjectSource | None:
+    """The objects of a folder or zip of meshes; None for anything else."""
+    if path.is_dir():
+        return mesh_folder(path.resolve(), reading)
+    return mesh_zip(path.resolve(), reading) if path.suffix.lower() == ".zip" else None
+
+
 def objects_to_test(data: str, up: Up = "auto") -> ObjectSource:
     """Returns the objects of a folder, zip or `.npz` to test a system on: those for testing, or all where no split is named.
 
@@ -214,10 +221,8 @@ def objects_to_test(data: str, up: Up = "auto") -> ObjectSource:
             f"no such file or folder: {data}; --data takes a folder or zip of meshes in class folders, an .npz of voxel grids, "
             f"or furniture10"
         )
-    if path.is_dir():
-        return mesh_folder(path.resolve(), reading)
-    if path.suffix.lower() == ".zip":
-        return mesh_zip(path.resolve(), reading)
+    if (meshes := _of_meshes(path, reading)) is not None:
+        return meshes
     if up != "auto" and (data == "furniture10" or path.suffix.lower() == ".npz"):
         raise DataError(f"--up goes with meshes, not with {data}; leave it out")
     source = open_source(data, train_per_class=2, test_per_class=20)
@@ -242,10 +247,8 @@ def open_source(
             f"no such file or folder: {data}; --data takes furniture10, modelnet10, modelnet40, a folder of class folders, "
             f"a .zip or a .npz"
         )
-    if path.is_dir():
-        return mesh_folder(path.resolve(), reading)
-    if path.suffix.lower() == ".zip":
-        return mesh_zip(path.resolve(), reading)
+    if (meshes := _of_meshes(path, reading)) is not None:
+        return meshes
     if path.suffix.lower() == ".npz":
         return voxel_archive(path.resolve())
     if path.suffix.lower() in MESH_SUFFIXES:

@@ -143,7 +143,7 @@ def check_transfer(
             folders name a split, else all.
         up: upward axis of the meshes.
         renamed: the system's class for classes of the data that are called otherwise.
-        posed: whether the system is told the objects' yaw, which is then that of the files.
+        posed: whether the yaw of the objects is known; it is then that of the files.
         max_views: number of views of each walk.
         draws: random walks from each first view.
 

@@ -40,7 +40,7 @@ def main() -> None:
     parser.add_argument("--object", default="chair", choices=CLASSES, help="what stands on the table (chair)")
     parser.add_argument("--seed", type=int, default=0, help="which one of its kind (0)")
     parser.add_argument(
-        "--policy", default="best, near", help='best, "best, near" (pays for motion), nearest, random, …'
+        "--policy", default="information_gain, near", help='a policy; "POLICY, near", which pays for motion; or nearest'
     )
     parser.add_argument("--sensor", default="stereo", choices=("stereo", "structured-light", "none"))
     parser.add_argument("--views", type=int, default=4, help="most views of an object (4)")
@@ -108,12 +108,10 @@ def show(agent: Any, options: argparse.Namespace) -> None:
         return
     found = recognise(agent, scene, camera, reach, int(np.argmax(free)), frames=14 if options.film else 1)
     for number, look in enumerate(found.looks, 1):
-        print(
-            f"view {number}: {look.belief.name}, {100 * look.belief.confidence:.1f} % ({1e3 * look.seconds:.0f} ms to decide)"
-        )
-    print(
-        f"{found.name} after {len(found.looks)} views ({found.reason}), {found.radians:.1f} rad of joint motion after the first"
-    )
+        sure = 100 * look.belief.confidence
+        print(f"view {number}: {look.belief.name}, {sure:.1f} % ({1e3 * look.seconds:.0f} ms to decide)")
+    views = f"{len(found.looks)} view{'s' * (len(found.looks) != 1)}"
+    print(f"{found.name} after {views} ({found.reason}), {found.radians:.1f} rad of joint motion after the first")
     if options.film and found.looks:
         write_film(found, scene, camera, agent.system.classes, options.film)
         print(f"Film: {options.film}")

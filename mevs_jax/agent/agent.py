@@ -107,7 +107,7 @@ class Agent:
         camera = self.system.description.camera
         pose = pose_towards(np.array([0.6, 0.0, 0.8]), np.zeros(3), camera.distance, np.array([0.0, 0.0, 1.0]))
         depth = np.full((camera.resolution, camera.resolution), camera.distance - 0.5, np.float32)
-        kept = self._object, self.history, self._resets
+        kept = self._object, self.history, self._resets, self.key
         try:
             for yaw in (0.0, None):
                 try:
@@ -117,7 +117,7 @@ class Agent:
                 self.decide(reachable=[0])  # before the first view, since afterwards it may be sure
                 self.observe(depth, camera.intrinsics, pose)
         finally:
-            self._object, self.history, self._resets = kept
+            self._object, self.history, self._resets, self.key = kept
 
     def reset(
         self,

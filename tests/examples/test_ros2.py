@@ -31,7 +31,7 @@ K = np.array([[260.0, 0.0, 159.5], [0.0, 260.0, 119.5], [0.0, 0.0, 1.0]])
 
 
 class SimulatedCamera:
-    """Goes where it is sent, except where it is told not to."""
+    """Moves to every requested pose, apart from the first `refuses` of them."""
 
     def __init__(self, kind: str, refuses: int = 0, blind: int = 0, garbled: int = -1) -> None:
         mesh = normalise(*FurniturePiece(kind, 1_000_003).load(), kind)

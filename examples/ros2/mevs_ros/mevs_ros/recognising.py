@@ -1,4 +1,4 @@
-"""One recognition, without ROS: an agent, a camera that somebody moves, and someone who is told where it should go.
+"""One recognition, without ROS: an agent, a camera that something else moves, and a function that receives the next pose.
 
 The node (`mevs_ros.node`) gives this its topics and transforms; tests give it a simulated camera.
 """
@@ -86,10 +86,10 @@ def recognise(
         agent: which is reset.
         goal: the object.
         camera: gives the images.
-        tell: is given the next pose (4, 4) and the belief so far (None before the first view).
+        tell: receives the next pose (4, 4) and the belief so far (None before the first view).
         cancelled: whether to end.
         seconds: to wait for the camera at each pose.
-        log: is told what failed.
+        log: receives a sentence about each failure.
     """
     agent.reset(center=goal.center, radius=goal.radius, yaw=goal.yaw)
     belief = None
