@@ -147,7 +147,10 @@ def _tables(
 ) -> dict[str, dict[str, ViewTable]]:
     """View tables of every system in every condition, of all objects."""
     first = next(iter(systems.values()))
-    observers = {name: {one.name: Observer(system) for one in conditions} for name, system in systems.items()}
+    observers: dict[str, dict[str, Observer]] = {}
+    for name, system in systems.items():
+        program = Observer(system)
+        observers[name] = {one.name: Observer(system, like=program) for one in conditions}
     with progress_bar("objects") as bar:
         line = bar.add_task("Scenes", total=len(meshes), note="")
         for number, (entry, mesh) in enumerate(meshes):
@@ -233,7 +236,7 @@ def _rows(
 
     `loss` is against perfect images and all views, `loss_there` against perfect images of the views that can be reached.
     """
-    rows = []
+    rows, names = [], {posed: _policies(system, posed) for posed in (True, False)}
     for one in conditions:
         for part, found in walks[one.name].items():
             bases = {"loss": walks["clean"].get(part), "loss_there": walks["upper" if one.upper else "clean"].get(part)}
@@ -244,7 +247,7 @@ def _rows(
                 row = {
                     "condition": one.name,
                     "policy": part,
-                    "name": _policies(system, not one.turned)[part],
+                    "name": names[not one.turned][part],
                     "views": views,
                     "accuracy": float(right.mean()),
                     "interval": intervals(right),

@@ -49,11 +49,12 @@ class Observer:
 
     Args:
         system: whose viewpoints the views are from.
+        like: another observer of the same system, whose compiled program is used.
     """
 
-    def __init__(self, system: TrainedSystem) -> None:
+    def __init__(self, system: TrainedSystem, like: Observer | None = None) -> None:
         self._poses, self._seen = jnp.asarray(system.poses), list[Observation]()
-        self._of_object = jax.jit(jax.vmap(system.observe))
+        self._of_object: Any = like._of_object if like else jax.jit(jax.vmap(system.observe))
 
     def add(self, depth: Float[np.ndarray, "views side side"]) -> None:
         """Adds the views of an object, in radii, 0 where nothing is hit.
