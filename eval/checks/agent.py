@@ -25,12 +25,11 @@ from data_pipeline.errors import DataError
 from data_pipeline.objects.mesh import Mesh
 from data_pipeline.progress import progress_bar
 from eval.checks.camera import Pair, pairs, summary
-from eval.checks.walks import beliefs_along
+from eval.checks.walks import Walker, beliefs_along
 from eval.numbers.comparison import intervals
 from eval.numbers.confidence import stopping as by_risk
 from eval.tables import ViewTables
 from mevs_jax.agent import Agent
-from mevs_jax.beliefs import running_sum
 from mevs_jax.selection import ViewTable, select_from_table
 from mevs_jax.trained import TrainedSystem
 
@@ -168,23 +167,8 @@ def stopping(
         For each probability: the promised and the measured error with its 95 % interval over objects, the share of walks that
         stopped, their mean number of views, and the accuracy of all walks.
     """
-    run, graph = system.policy(policy), system.graph
-    max_views = min(max_views, len(system.viewpoints))
-
-    @jax.jit
-    def walks(table: ViewTable) -> tuple[Array, Array]:
-        def from_view(first: Array) -> tuple[Array, Array]:
-            scene = table.scene(graph, system.parts.knowledge)
-            views = select_from_table(jax.random.key(0), table, scene, run, first, max_views=max_views).views
-            beliefs = running_sum(table.logits[views])
-            counts = jnp.arange(1, max_views + 1)
-            steps = jax.vmap(lambda belief, count: system.log_probabilities(belief, count, policy))(beliefs, counts)
-            return jnp.exp(jnp.max(steps, axis=-1)), jnp.argmax(steps, axis=-1) == table.label
-
-        return jax.vmap(from_view)(jnp.arange(len(graph.points)))
-
-    confidence, right = map(np.asarray, jax.lax.map(walks, tables.stacked(), batch_size=16))
-    rows = by_risk(confidence, right, [1 - stop for stop in stops])
+    walks = Walker(system).walk(tables.stacked(), policy, max_views)
+    rows = by_risk(walks.confidence, walks.right, [1 - stop for stop in stops])
     return [
         {
             "stop": stop,

@@ -20,6 +20,7 @@ from data_pipeline.objects.formats import Up
 from data_pipeline.objects.mesh import ObjectSource
 from data_pipeline.objects.sources import load_object, objects_to_test
 from data_pipeline.progress import progress_bar
+from eval.checks.agent import STOPS
 from eval.checks.walks import BASELINE, Observer, Walker, Walks, rows_of
 from eval.numbers.comparison import intervals
 from eval.numbers.confidence import stopping
@@ -31,7 +32,6 @@ from mevs_jax.trained import TrainedSystem
 
 VIEWS = (1, 2, 3, 4, 8)
 """Numbers of views after which accuracy is reported."""
-STOPS = (0.9, 0.95, 0.99)
 STRANGER = -1
 """Label of an object whose class the system does not know."""
 
