@@ -43,11 +43,12 @@ def reach(scene, poses):
 
 
 @pytest.fixture
-def camera(scene):
+def camera(request, scene):
+    """A depth camera without errors, or of the sensor that a test is given."""
     from examples.robot_arm.camera import DepthCamera
 
     try:
-        found = DepthCamera(scene, "none")
+        found = DepthCamera(scene, getattr(request, "param", "none"))
     except Exception as error:  # of MuJoCo, whose kind depends on what is missing
         pytest.skip(f"MuJoCo cannot draw here ({error}): the system has no libEGL")
     yield found
@@ -142,19 +143,13 @@ def test_the_nearest_view_is_the_cheapest_and_motion_that_costs_is_less(scene, r
     assert radians["nearest"] == pytest.approx(costs.min())
 
 
-def test_errors_are_the_same_for_the_same_walk(scene, reach):
-    from examples.robot_arm.camera import DepthCamera
-
-    arm = Arm(scene)
-    arm.place(reach.angles[_first(scene, reach)][reach.found[_first(scene, reach)]][0])
-    try:
-        noisy = DepthCamera(scene, "stereo")
-    except Exception as error:
-        pytest.skip(f"MuJoCo cannot draw here ({error}): the system has no libEGL")
+@pytest.mark.parametrize("camera", ["stereo"], indirect=True)
+def test_errors_are_the_same_for_the_same_walk(scene, reach, camera):
+    first = _first(scene, reach)
+    Arm(scene).place(reach.angles[first][reach.found[first]][0])
     images = []
     for seed in ((1, 2), (1, 2), (1, 3)):
-        noisy.begin(*seed)
-        images.append(noisy.take())
-    noisy.close()
+        camera.begin(*seed)
+        images.append(camera.take())
     np.testing.assert_array_equal(images[0], images[1])
     assert (images[0] != images[2]).any()
