@@ -23,7 +23,7 @@ from jaxtyping import Array
 from mevs_jax.agent.candidates import candidates_of
 from mevs_jax.agent.programs import Programs
 from mevs_jax.points.ops import portable
-from mevs_jax.trained.parts import image_of, logits_of
+from mevs_jax.trained.parts import features_of, logits_of
 from mevs_jax.trained.system import TrainedSystem
 
 PLATFORMS = ("cpu", "cuda", "tpu")
@@ -111,23 +111,30 @@ def _recognise(system: TrainedSystem) -> _Program:
     side, classes = description.camera.resolution, len(system.classes)
     (b,) = jax.export.symbolic_shape("b")
 
-    def recognise(depth: Array) -> dict[str, Array]:
-        images = jax.vmap(lambda one: image_of(one, description.image, description.camera))(depth)
-        encoder = parts.encoder.module
-        features = encoder.features(images)
-        logits = logits_of(parts, encoder, features) / parts.single
+    def recognise(depth: Array, radius: Array | float = jnp.nan) -> dict[str, Array]:
+        of, radii = description, jnp.broadcast_to(jnp.asarray(radius), depth.shape[:1])
+        features = features_of(parts, depth, radii, image=of.image, size=of.size, camera=of.camera)
+        logits = logits_of(parts, parts.encoder.module, features) / parts.single
         return {"features": features, "probabilities": jax.nn.softmax(logits, axis=-1)}
 
     about = {
         "inputs": [
-            _described("depth", ["b", side, side], "float32", "radii along the optical axis; 0 where nothing is hit")
+            _described("depth", ["b", side, side], "float32", "radii along the optical axis; 0 where nothing is hit"),
+            *_radius_input(system, ["b"]),
         ],
         "outputs": [
             _described("features", ["b", 8 * description.encoder.width], "float32", "of each view"),
             _described("probabilities", ["b", classes], "float32", "of the classes, from each view alone"),
         ],
     }
-    return recognise, (jax.ShapeDtypeStruct((b, side, side), jnp.float32),), about
+    depth, radius = (jax.ShapeDtypeStruct(shape, jnp.float32) for shape in ((b, side, side), (b,)))
+    return recognise, (depth, radius) if description.size else (depth,), about
+
+
+def _radius_input(system: TrainedSystem, shape: Sequence[Any]) -> list[dict[str, Any]]:
+    """The input of a system that uses the size of objects; none for another one."""
+    about = "of the object in metres; NaN if its size is unknown"
+    return [_described("radius", shape, "float32", about)] if system.description.size else []
 
 
 def _entropies(system: TrainedSystem) -> _Program:
@@ -163,11 +170,19 @@ def _decide(system: TrainedSystem, policy: str, max_views: int) -> _Program:
     views, side = len(system.viewpoints), system.description.camera.resolution
     lattice = candidates_of(system, None, views)
 
-    def decide(memory: Any, depth: Array, pose: Array, reachable: Array, cost: Array, seed: Array) -> dict[str, Any]:
+    def decide(
+        memory: Any,
+        depth: Array,
+        pose: Array,
+        reachable: Array,
+        cost: Array,
+        seed: Array,
+        radius: Array | float = jnp.nan,
+    ) -> dict[str, Any]:
         structure = jax.tree.structure(programs.blank())
         unpacked = jax.tree.unflatten(structure, [memory[name] for name in sorted(memory)])
         unpacked, (probabilities, strangeness) = programs.see_view(
-            system.parts, unpacked, depth, pose, programs.temperatures(system.parts)
+            system.parts, unpacked, depth, pose, jnp.asarray(radius, jnp.float32), programs.temperatures(system.parts)
         )
         key = jax.random.key(seed)
         failed = jnp.zeros(views, bool)
@@ -189,6 +204,7 @@ def _decide(system: TrainedSystem, policy: str, max_views: int) -> _Program:
         jax.ShapeDtypeStruct((views,), bool),
         jax.ShapeDtypeStruct((views,), jnp.float32),
         jax.ShapeDtypeStruct((), jnp.uint32),
+        *[jax.ShapeDtypeStruct((), jnp.float32)] * (system.description.size is not None),
     )
     about = {
         "inputs": [
@@ -202,6 +218,7 @@ def _decide(system: TrainedSystem, policy: str, max_views: int) -> _Program:
             _described("reachable", [views], "bool", "viewpoints that the camera can go to"),
             _described("cost", [views], "float32", "subtracted from the scores of the viewpoints"),
             _described("seed", [], "uint32", "of random policies"),
+            *_radius_input(system, []),
         ],
         "outputs": [
             {"name": "memory", "about": "after this view"},

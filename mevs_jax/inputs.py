@@ -6,6 +6,9 @@ from that of any depth camera.
 
 from __future__ import annotations
 
+import math
+from dataclasses import dataclass
+
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
@@ -110,3 +113,26 @@ def view_cloud(
     offset = eye - cloud
     length = jnp.linalg.norm(offset, axis=-1, keepdims=True)
     return jnp.concatenate([cloud, offset / jnp.maximum(length, 1e-6)], axis=-1)
+
+
+@dataclass(frozen=True)
+class SizeInput:
+    """How a network is given an object's radius: as `steps` Gaussians of its logarithm, which are about 0 outside of the range.
+
+    Attributes:
+        smallest, largest: radii in metres where the first and the last Gaussian have their peaks.
+        steps: number of Gaussians; their width is the distance between their peaks.
+    """
+
+    smallest: float = 0.05
+    largest: float = 5.0
+    steps: int = 10
+
+    def code(self, radius: Float[AnyArray, "*batch"]) -> Float[Array, "*batch {self.steps}"]:
+        """The Gaussians of radii in metres; all 0 for an unknown radius, which is NaN."""
+        radius = jnp.asarray(radius, jnp.float32)
+        known = radius > 0
+        peaks = jnp.linspace(math.log(self.smallest), math.log(self.largest), self.steps)
+        logarithm = jnp.log(jnp.where(known, radius, 1.0))
+        away = (logarithm[..., None] - peaks) / (peaks[1] - peaks[0])
+        return jnp.where(known[..., None], jnp.exp(-0.5 * away**2), 0.0)

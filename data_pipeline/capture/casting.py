@@ -115,11 +115,13 @@ class Capture:
         depth: (views, resolution, resolution) uint16, in units of 1/10,000, 0 where nothing is hit.
         image: (views, resolution, resolution) uint8, shaded with the light at the camera, 0 where nothing is hit.
         extent: (3,) float32, size of the object before normalisation.
+        radius: of the object before normalisation; NaN if unknown.
     """
 
     depth: np.ndarray
     image: np.ndarray
     extent: np.ndarray
+    radius: float = np.nan
 
 
 def check_camera(config: CaptureConfig) -> None:
@@ -250,7 +252,7 @@ def capture(mesh: Mesh, rig: Rig, caster: Caster | None = None) -> Capture:
             window = windows[view]
             depth[view][window] = stored.reshape(depth[view][window].shape)
             image[view][window] = shaded.reshape(depth[view][window].shape)
-    return Capture(depth, image, mesh.extent)
+    return Capture(depth, image, mesh.extent, mesh.radius)
 
 
 def _cast_inside(cast: Cast, origins: np.ndarray, directions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -317,7 +319,8 @@ def save_capture(path: Path, capture: Capture) -> None:
     It is not waited for, since a capture that a power failure damaged is made again.
     """
     depth, image = (np.frombuffer(zlib.compress(a.tobytes(), 1), np.uint8) for a in (capture.depth, capture.image))
-    content = npz_bytes(shape=np.array(capture.depth.shape), extent=capture.extent, depth=depth, image=image)
+    size = {"extent": capture.extent, "radius": np.array(capture.radius)}
+    content = npz_bytes(shape=np.array(capture.depth.shape), **size, depth=depth, image=image)
     write_bytes(path, content, durable=False)
 
 
@@ -327,4 +330,4 @@ def load_capture(path: Path) -> Capture:
         shape = tuple(stored["shape"])
         depth = np.frombuffer(zlib.decompress(stored["depth"].tobytes()), np.uint16).reshape(shape)
         image = np.frombuffer(zlib.decompress(stored["image"].tobytes()), np.uint8).reshape(shape)
-        return Capture(depth, image, stored["extent"])
+        return Capture(depth, image, stored["extent"], float(stored["radius"]))

@@ -28,7 +28,7 @@ def capture_by_rasterising(mesh: Mesh, rig: Rig) -> Capture:
     normals = np.zeros((len(triangles), 3), np.float32)
     normals[: len(mesh.faces)] = face_normals(mesh)
     depth, image = _render(triangles, normals, rig.poses, rig.directions.shape[1], rig.field_of_view)
-    return Capture(np.asarray(depth), np.asarray(image), mesh.extent)
+    return Capture(np.asarray(depth), np.asarray(image), mesh.extent, mesh.radius)
 
 
 @partial(jax.jit, static_argnums=(3, 4))

@@ -67,4 +67,4 @@ def capture_with_visualizer(mesh: Mesh, rig: Rig) -> Capture:
             image[view] = np.where(depth[view] > 0, np.round(255 * shaded), 0)
     finally:
         visualizer.destroy_window()
-    return Capture(store_depth(np.where(depth > 0, depth, np.inf)), image, mesh.extent)
+    return Capture(store_depth(np.where(depth > 0, depth, np.inf)), image, mesh.extent, mesh.radius)

@@ -77,14 +77,16 @@ def views_of_example(
 ) -> dict[str, np.ndarray]:
     """Returns the given views of one object as arrays with a leading axis of views.
 
-    The keys are `label`, `view`, `pose`, `entropy` (of all views of the object), `depth` or `image` as `images` says, and, if
-    `points` is not 0, `pixels` and `pixel_depth`.
+    The keys are `label`, `view`, `pose`, `entropy` (of all views of the object), `radius` (of the object, in the units of its
+    file; NaN in data sets that lack it), `depth` or `image` as `images` says, and, if `points` is not 0, `pixels` and
+    `pixel_depth`.
     """
     out = {
         "label": np.full(len(views), example["label"], np.int32),
         "view": views.astype(np.int32),
         "pose": example["pose"][views],
         "entropy": np.repeat(example["entropy"][None], len(views), axis=0),
+        "radius": np.full(len(views), example.get("radius", np.nan), np.float32),
     }
     if images:
         out[images] = example[images][views]

@@ -13,7 +13,7 @@ import struct
 import zlib
 from collections.abc import Iterator, Sequence
 from contextlib import redirect_stdout
-from dataclasses import asdict, replace
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 from zipfile import BadZipFile
@@ -28,6 +28,8 @@ from data_pipeline.capture.workers import capture_all, capture_entry, capture_pa
 from data_pipeline.dataset.beam import beam_options, capture_by_beam, examples_by_beam
 from data_pipeline.dataset.config import DataConfig as DataConfig
 from data_pipeline.dataset.config import check_viewpoints, identity_of
+from data_pipeline.dataset.origin import open_objects as open_objects
+from data_pipeline.dataset.origin import state_of
 from data_pipeline.dataset.proof import (
     SHARDS,
     SOURCE_STATE,
@@ -45,10 +47,8 @@ from data_pipeline.dataset.statistics import (
 )
 from data_pipeline.errors import DataError, reason_of
 from data_pipeline.files import check_of_file, keep_checks, keep_json
-from data_pipeline.objects.changes import changes_between, source_state
-from data_pipeline.objects.downloads import ARCHIVES, download, download_folder, local
+from data_pipeline.objects.changes import changes_between
 from data_pipeline.objects.mesh import SOURCE_SPLITS, ObjectEntry, ObjectSource
-from data_pipeline.objects.sources import Reading, mesh_zip, open_source
 from data_pipeline.progress import console, progress_bar
 from mevs_jax.entropy import level_entropy
 
@@ -98,6 +98,7 @@ def _features(classes: Sequence[str], config: CaptureConfig) -> dict[str, Any]:
         "pose": tensor(shape=(views, 4, 4), dtype=np.float32),
         "entropy": tensor(shape=(views,), dtype=np.float32),
         "extent": tensor(shape=(3,), dtype=np.float32),
+        "radius": tensor(shape=(), dtype=np.float32),
     }
 
 
@@ -150,6 +151,7 @@ def example_of(entry: ObjectEntry, captures: Path, rig: Rig, backend: str) -> tu
         "pose": rig.poses_around(entry.name),
         "entropy": view_entropies(capture),
         "extent": capture.extent,
+        "radius": np.float32(capture.radius),
     }
 
 
@@ -249,48 +251,10 @@ def _write_shards(
     )
 
 
-def open_objects(config: DataConfig) -> ObjectSource:
-    """Returns the source of objects. Official archives are downloaded, unless `config.archive` names a local file.
-
-    Raises:
-        DataError: if the source is not usable, or `config.archive` is set for another kind of source.
-    """
-    official = ARCHIVES.get(config.source)
-    if official is None:
-        if config.archive:
-            raise DataError(f"--archive goes with --data {' or '.join(ARCHIVES)}, not with {config.source}")
-        return open_source(
-            config.source,
-            train_per_class=config.train_per_class,
-            test_per_class=config.test_per_class,
-            up=config.up,
-            split=config.split,
-            seed=config.seed,
-        )
-    if config.archive:
-        path = local(official, Path(config.archive).expanduser().resolve())
-    else:
-        path = download(official, download_folder())
-    source = mesh_zip(path, Reading(config.up, config.split, config.seed))
-    counts = {split: sum(entry.split == split for entry in source.entries) for split in SOURCE_SPLITS}
-    if (len(source.classes), counts["train"], counts["test"]) != (official.classes, official.train, official.test):
-        console.print(
-            f"{path} has {len(source.classes)} classes, {counts['train']} training and {counts['test']} test objects; "
-            f"{official.name} has {official.classes}, {official.train} and {official.test}"
-        )
-    return replace(source, name=official.name)
-
-
-def _state(config: DataConfig) -> dict[str, str] | None:
-    """Returns the state of the source's files, or None if it has none or they are an official archive's."""
-    data = config.archive if config.source in ARCHIVES else config.source
-    return source_state(data, config.split) if data else None
-
-
 def _say_changes(config: DataConfig, folder: Path) -> None:
     """Prints a sentence if the source has changed since the data set in `folder` was made."""
     before = state_before(folder)
-    if before is None or (now := _state(config)) is None:
+    if before is None or (now := state_of(config)) is None:
         return
     if changes := changes_between(before, now):
         console.print(
@@ -333,7 +297,7 @@ def _reasons(source: ObjectSource, left_out: dict[str, str]) -> dict[str, dict[s
 def _check_source(config: DataConfig, folder: Path, damage: str) -> None:
     """Raises DataError if a damaged data set cannot be made again, since its source is gone or has changed."""
     try:
-        before, now = state_before(folder), _state(config)
+        before, now = state_before(folder), state_of(config)
         changes = before is not None and now is not None and changes_between(before, now)
         open_objects(config)
     except DataError as error:
@@ -375,7 +339,7 @@ def prepare(config: DataConfig, folder: Path, beam: str | None = None) -> Datase
         _check_source(config, folder, found)
         console.print(f"{found}, so the data set is made again from {config.source}", markup=False)
     options = None if beam is None else beam_options(beam)
-    source, state = open_objects(config), _state(config)
+    source, state = open_objects(config), state_of(config)
     for sentence in source.said:
         console.print(f"{config.source}: {sentence}", markup=False)
     folder.mkdir(parents=True, exist_ok=True)

@@ -40,6 +40,8 @@ class DataConfig:
     split: str = ""
     """for a folder or zip without train and test folders: the share of training objects of each class, such as 0.8, or a .json
     or .csv list of splits"""
+    more: tuple[str, ...] = ()
+    """further sources of any of these kinds, whose objects are added: classes of one name are one class"""
     capture: CaptureConfig = CaptureConfig()
 
 
@@ -53,7 +55,8 @@ def identity_of(config: DataConfig, folder: Path | None = None) -> dict[str, Any
     if is_file(config.capture.lattice) and folder is not None and (folder / SUMMARY).exists():
         made = load_statistics(folder).capture
     identity, default = asdict(replace(config, capture=identified(config.capture, made))), asdict(DataConfig())
-    return {key: value for key, value in identity.items() if key not in ("up", "split") or value != default[key]}
+    later = ("up", "split", "more")
+    return as_read({key: value for key, value in identity.items() if key not in later or value != default[key]})
 
 
 def made_with_other_settings(config: DataConfig, folder: Path) -> dict[str, tuple[Any, Any]]:

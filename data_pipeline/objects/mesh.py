@@ -27,11 +27,13 @@ class Mesh:
         vertices: (n, 3) float32.
         faces: (m, 3) int32.
         extent: (3,) float32, size of the bounding box before normalisation, in the units of the file.
+        radius: distance of the furthest vertex from the centre before normalisation, in the units of the file; NaN if unknown.
     """
 
     vertices: np.ndarray
     faces: np.ndarray
     extent: np.ndarray
+    radius: float = np.nan
 
 
 @runtime_checkable
@@ -109,4 +111,5 @@ def normalise(vertices: np.ndarray, faces: np.ndarray, where: str) -> Mesh:
     area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1) / 2
     if area.sum() < 1e-9:
         raise EmptyMesh("mesh has no area: all its faces are degenerate")
-    return Mesh(centred.astype(np.float32), faces[area > 0].astype(np.int32), (high - low).astype(np.float32))
+    extent = (high - low).astype(np.float32)
+    return Mesh(centred.astype(np.float32), faces[area > 0].astype(np.int32), extent, float(radius))

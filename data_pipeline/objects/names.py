@@ -27,6 +27,15 @@ def _is_unicode(name: str) -> bool:
     return True
 
 
+def plain_class(name: str) -> str:
+    """Returns a class name without what does not matter: `Night Stands` and `night_stand` are one class.
+
+    Case, spaces, punctuation and a plural s do not matter.
+    """
+    letters = "".join(letter for letter in name.casefold() if letter.isalnum())
+    return letters.removesuffix("s") if len(letters) > 3 else letters
+
+
 def is_ignored(name: str) -> bool:
     """Returns whether a file or folder is ignored by rule: what macOS adds to folders and archives, and hidden files."""
     return name.startswith(".") or name == "__MACOSX"

@@ -6,6 +6,7 @@ Quadric decimation, Poisson reconstruction and voxelisation, with Open3D, as the
 from __future__ import annotations
 
 import functools
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -57,7 +58,8 @@ def decimate(mesh: Mesh, faces: int) -> Mesh:
     surface = _surface(mesh)
     surface.merge_close_vertices(1e-6)  # the faces of a CAD model often share no vertices and could not be simplified
     simpler = surface.simplify_quadric_decimation(faces)
-    return Mesh(np.asarray(simpler.vertices, np.float32), np.asarray(simpler.triangles, np.int32), mesh.extent)
+    vertices, faces_left = np.asarray(simpler.vertices, np.float32), np.asarray(simpler.triangles, np.int32)
+    return replace(mesh, vertices=vertices, faces=faces_left)
 
 
 def normals_towards(points: np.ndarray, camera: np.ndarray) -> np.ndarray:

@@ -8,8 +8,10 @@ start.
 
 from __future__ import annotations
 
+import itertools
 import os
 from collections import Counter
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path, PurePosixPath
 
@@ -29,7 +31,7 @@ from data_pipeline.objects.layout import (
     without_copies,
 )
 from data_pipeline.objects.mesh import SOURCE_SPLITS, Mesh, ObjectEntry, ObjectSource, normalise
-from data_pipeline.objects.names import is_ignored, say_ignored, shown
+from data_pipeline.objects.names import is_ignored, plain_class, say_ignored, shown
 from data_pipeline.objects.recipes import FurniturePiece, MeshFile
 from data_pipeline.objects.splits import divide
 from data_pipeline.objects.voxels import voxel_archive
@@ -261,3 +263,35 @@ def open_source(
             f"{data} is a single mesh; --data takes a folder laid out as <class>/train/*.off and <class>/test/*.off"
         )
     raise DataError(f"{data} is not a data set; --data takes a folder of class folders, a .zip or a .npz")
+
+
+def together(sources: Sequence[ObjectSource]) -> ObjectSource:
+    """Returns the objects of several sources as one. Classes of one name are one class (`plain_class`), called as in the first.
+
+    The objects of the first source keep their names; before those of others stands the name of their source, with a number if
+    it is not the only one of that name.
+    """
+    first, classes = sources[0], list(sources[0].classes)
+    entries, left_out = list(first.entries), {split: dict(reasons) for split, reasons in first.left_out.items()}
+    notes, said, prefixes = list(first.notes), list(first.said), {first.name}
+    for source in sources[1:]:
+        number = next(number for number in itertools.count(1) if _numbered(source.name, number) not in prefixes)
+        prefix = _numbered(source.name, number)
+        prefixes.add(prefix)
+        known = {plain_class(name): label for label, name in enumerate(classes)}
+        classes += [name for name in source.classes if plain_class(name) not in known]
+        label_of = {plain_class(name): label for label, name in enumerate(classes)}
+        entries += [
+            replace(entry, name=f"{prefix}/{entry.name}", label=label_of[plain_class(source.classes[entry.label])])
+            for entry in source.entries
+        ]
+        for split, reasons in source.left_out.items():
+            left_out.setdefault(split, {}).update({f"{prefix}/{name}": reason for name, reason in reasons.items()})
+        notes += [f"{prefix}: {note}" for note in source.notes]
+        said += [f"{prefix}: {sentence}" for sentence in source.said]
+    name = " + ".join(source.name for source in sources)
+    return ObjectSource(name, tuple(classes), tuple(entries), left_out, tuple(notes), tuple(said))
+
+
+def _numbered(name: str, number: int) -> str:
+    return name if number == 1 else f"{name} {number}"

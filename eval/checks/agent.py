@@ -87,7 +87,7 @@ def walk_of(
         first: the first view.
     """
     K = agent.system.description.camera.intrinsics
-    agent.reset(center=_CENTER, radius=_RADIUS, yaw=0.0)
+    agent.reset(center=_CENTER, radius=_RADIUS, yaw=0.0, true_size=False)
     views, found, view = [], [], first
     while True:
         metres = np.where(depth[view] > 0, depth[view] * _RADIUS, np.inf).astype(np.float32)

@@ -18,6 +18,7 @@ from data_pipeline.dataset.inputs import metric_depth
 from data_pipeline.errors import DataError, EmptyMesh, reason_of
 from data_pipeline.objects.formats import Up
 from data_pipeline.objects.mesh import ObjectSource
+from data_pipeline.objects.names import plain_class
 from data_pipeline.objects.sources import load_object, objects_to_test
 from data_pipeline.progress import progress_bar
 from eval.checks.agent import STOPS
@@ -68,13 +69,13 @@ def matched(classes: Sequence[str], known: Sequence[str], renamed: Mapping[str, 
     Raises:
         DataError: if no class is known, or `renamed` names a class that is not there.
     """
-    labels = {_plain(name): label for label, name in enumerate(known)}
+    labels = {plain_class(name): label for label, name in enumerate(known)}
     for folder, name in renamed.items():
         if folder not in classes:
             raise DataError(f"--names {folder}={name}: the objects have no class {folder}, but {', '.join(classes)}")
-        if _plain(name) not in labels:
+        if plain_class(name) not in labels:
             raise DataError(f"--names {folder}={name}: the system knows no class {name}, but {', '.join(known)}")
-    found = {folder: labels.get(_plain(renamed.get(folder, folder)), STRANGER) for folder in classes}
+    found = {folder: labels.get(plain_class(renamed.get(folder, folder)), STRANGER) for folder in classes}
     if all(label == STRANGER for label in found.values()):
         raise DataError(
             f"none of the classes {', '.join(classes)} is one that the system knows ({', '.join(known)}); if one only has "
@@ -83,15 +84,16 @@ def matched(classes: Sequence[str], known: Sequence[str], renamed: Mapping[str, 
     return found
 
 
-def _plain(name: str) -> str:
-    letters = "".join(letter for letter in name.casefold() if letter.isalnum())
-    return letters.removesuffix("s") if len(letters) > 3 else letters
-
-
-def see_objects(system: TrainedSystem, source: ObjectSource, labels: Mapping[str, int]) -> Objects:
+def see_objects(system: TrainedSystem, source: ObjectSource, labels: Mapping[str, int], metres: float) -> Objects:
     """Captures every object of a source from the system's viewpoints, by its camera, for its networks.
 
     An object that cannot be read, or that no view shows, is left out with its reason.
+
+    Args:
+        system: the trained system.
+        source: of the objects.
+        labels: the system's label of each class of the source.
+        metres: in one unit of the files, for a system that uses sizes; NaN: sizes are unknown.
 
     Raises:
         DataError: if none is left.
@@ -106,7 +108,8 @@ def see_objects(system: TrainedSystem, source: ObjectSource, labels: Mapping[str
         for entry in source.entries:
             bar.advance(line)
             try:
-                depth = capture(load_object(entry), rig).depth
+                mesh = load_object(entry)
+                depth = capture(mesh, rig).depth
             except (DataError, EmptyMesh) as error:
                 left_out[entry.name] = reason_of(error)
                 continue
@@ -115,7 +118,7 @@ def see_objects(system: TrainedSystem, source: ObjectSource, labels: Mapping[str
                 continue
             names.append(entry.name)
             folders.append(source.classes[entry.label])
-            observer.add(np.asarray(metric_depth(depth)))
+            observer.add(np.asarray(metric_depth(depth)), mesh.radius * metres)
     if not names:
         first = next(iter(left_out.items()))
         raise DataError(
@@ -132,6 +135,7 @@ def check_transfer(
     up: Up = "auto",
     renamed: Mapping[str, str] | None = None,
     posed: bool = True,
+    metres: float = np.nan,
     max_views: int = 8,
     draws: int = 4,
 ) -> dict[str, Any]:
@@ -144,6 +148,7 @@ def check_transfer(
         up: upward axis of the meshes.
         renamed: the system's class for classes of the data that are called otherwise.
         posed: whether the yaw of the objects is known; it is then that of the files.
+        metres: in one unit of the files, for a system that uses sizes; NaN: sizes are unknown.
         max_views: number of views of each walk.
         draws: random walks from each first view.
 
@@ -155,7 +160,7 @@ def check_transfer(
     """
     source = objects_to_test(data, up)
     labels = matched(source.classes, system.classes, renamed or {})
-    objects = see_objects(system, source, labels)
+    objects = see_objects(system, source, labels, metres)
     known = objects.labels != STRANGER
     if not known.any():
         raise DataError(f"{data} has no object left of a class that the system knows; {len(objects.left_out)} left out")
@@ -171,6 +176,7 @@ def check_transfer(
         "system": system.name,
         "data": data,
         "posed": posed,
+        "metres": None if np.isnan(metres) or system.description.size is None else metres,
         "best": best,
         "objects": len(objects.names),
         "known": int(known.sum()),

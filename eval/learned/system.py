@@ -98,12 +98,14 @@ def learned_system(stages: Stages, found: dict[str, Any], figures: dict[str, Any
         data=data_of(stages.statistics),
         made_by=made,
         made_with=versions_of(*MADE_WITH),
+        size=recogniser.size_input,
         fusion=SetFusionShape(shape.width, shape.heads, shape.blocks),
         view_policies={name: _shape_of(policy, config.policy) for name, policy in policies.items()},
         evaluation=figures,
     )
     parts = Parts(
         encoder=Network.of(recogniser.encoder),
+        size=None if recogniser.size is None else recogniser.size[...],
         viewpoints=graph.points,
         neighbours=graph.neighbours,
         single=fusions["posed"].single,

@@ -126,6 +126,7 @@ class Agent:
         radius: float,
         up: AnyVector = (0.0, 0.0, 1.0),
         yaw: float | None = None,
+        true_size: bool = True,
     ) -> None:
         """Begins with a new object.
 
@@ -136,6 +137,8 @@ class Agent:
             yaw: how far the object is turned about `up` against the objects of the data set, in radians, after the smallest
                 rotation from z to `up`; None if this is unknown. Then policies that need the object's own frame cannot be used,
                 and `best` is the system's best without it.
+            true_size: False for a model of an object at another scale, whose radius says nothing about its class. This matters
+                for systems that use the size alone (`system.description.size`).
 
         Raises:
             ValueError: for an argument out of its range, or a policy that cannot be used without the yaw.
@@ -157,8 +160,12 @@ class Agent:
         self.key = jax.random.fold_in(jax.random.key(self.seed), self._resets)
         turn = np.eye(4, dtype=np.float32)
         turn[:3, :3] = rotation.T @ rotation_to_world(up, 0.0)
-        self._object = Present(middle, float(radius), rotation, turn, program, program.blank(), None, np.zeros((0, 3)))
+        none_failed = np.zeros((0, 3))
+        self._object = Present(
+            middle, float(radius), rotation, turn, program, program.blank(), None, none_failed, bool(true_size)
+        )
         options = {"center": middle.tolist(), "radius": float(radius), "up": np.asarray(up, float).tolist()}
+        options |= {} if true_size else {"true_size": False}
         options |= {"yaw": None if yaw is None else float(yaw)}
         policy = self.policy if isinstance(self.policy, str) else getattr(self.policy, "__name__", "a function")
         mine = {"policy": policy, "stop": self.stop, "max_views": self.max_views, "unknown": self.unknown}
@@ -173,7 +180,7 @@ class Agent:
 
         Args:
             points: (points, 3) in the world, in metres, of the object alone.
-            options: `up` and `yaw` as of `reset`.
+            options: `up`, `yaw` and `true_size` as of `reset`.
         """
         cloud = np.array(points, float)
         rotation = rotation_to_world(options.get("up", (0.0, 0.0, 1.0)), options.get("yaw") or 0.0)
@@ -260,7 +267,7 @@ class Agent:
 
     def _add(self, depth: np.ndarray, pose: np.ndarray, unseen: float, begun: float) -> Belief:
         of = self._current
-        of.memory, found = of.programs.see(self.system.parts, of.memory, depth, pose)
+        of.memory, found = of.programs.see(self.system.parts, of.memory, depth, pose, of.known_radius)
         (probabilities, strangeness), count = jax.device_get((found, of.memory.count))
         label = int(probabilities.argmax())
         belief = Belief(

@@ -34,6 +34,7 @@ class Present:
 
     Attributes:
         center, radius: of its sphere, in metres.
+        true_size: whether the radius says something about the object's class.
         rotation: (3, 3) from its frame to the world.
         turn: (4, 4) from the upright frame of `canonical_view` to its own, which differ by the yaw.
         programs: compiled for its policy.
@@ -52,8 +53,14 @@ class Present:
     memory: core.Memory
     belief: Belief | None
     failed: np.ndarray
+    true_size: bool = True
     points: np.ndarray | None = None
     frames: list[Frame] = field(default_factory=list)
+
+    @property
+    def known_radius(self) -> float:
+        """The radius that the networks are told, in metres; NaN for an object that is not of its true size."""
+        return self.radius if self.true_size else np.nan
 
     def seen(self, system: TrainedSystem, frame: Frame) -> CanonicalView:
         """`converted`, of a new image.
@@ -121,7 +128,7 @@ class Present:
         views = [*(again.converted(system, one) for one in self.frames), again.seen(system, frame)]
         poses, again.memory = [self.placed(system, view) for view in views], self.programs.blank()
         for view, one in zip(views[:-1], poses[:-1], strict=True):
-            again.memory, _ = self.programs.see(system.parts, again.memory, view.depth, one)
+            again.memory, _ = self.programs.see(system.parts, again.memory, view.depth, one, again.known_radius)
         history.depths[:], history.poses[:] = [view.depth for view in views[:-1]], poses[:-1]
         return again, views[-1]
 

@@ -34,9 +34,9 @@ class Programs:
         shared = system.__dict__.setdefault("programs", {})
         self._see = shared.setdefault((entropy, posed, most), jax.jit(self.see_view))
 
-    def see(self, parts: Parts, memory: core.Memory, depth: np.ndarray, pose: np.ndarray) -> Any:
+    def see(self, parts: Parts, memory: core.Memory, depth: np.ndarray, pose: np.ndarray, radius: float) -> Any:
         """`see_view`, compiled, with the temperatures of the policy."""
-        return self._see(parts, memory, depth, pose, self.temperatures(parts))
+        return self._see(parts, memory, depth, pose, np.float32(radius), self.temperatures(parts))
 
     def temperatures(self, parts: Parts) -> Float[Array, " counts"]:
         """The temperatures of the policy's walks; those of random ones for a policy without its own."""
@@ -52,16 +52,18 @@ class Programs:
         memory: core.Memory,
         depth: Float[Array, "side side"],
         pose: Float[Array, "4 4"],
+        radius: Float[Array, ""],
         temperatures: Float[Array, " counts"],
     ) -> tuple[core.Memory, tuple[Array, Array]]:
         """The memory after a view; calibrated probabilities and strangeness.
 
         Args:
+            radius: of the object in metres; NaN if its size is unknown.
             temperatures: of the belief after 1, 2, … views; the last one holds for more.
         """
-        system, description = self._system, self._system.description
-        cloud = description.cloud if self._entropy else None
-        seen = observe(parts, depth, pose, image=description.image, cloud=cloud, camera=description.camera)
+        system, of = self._system, self._system.description
+        cloud = of.cloud if self._entropy else None
+        seen = observe(parts, depth, pose, radius, image=of.image, size=of.size, cloud=cloud, camera=of.camera)
         direction = pose[:3, 3] / jnp.linalg.norm(pose[:3, 3])
         memory = core.remember(system, parts, memory, seen, direction, self._posed)
         at = jnp.clip(memory.count, 1, len(temperatures)) - 1

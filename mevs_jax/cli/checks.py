@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -61,14 +62,22 @@ def transfer(options: TransferOptions) -> None:
 
     if options.max_views < 1 or options.draws < 1:
         raise Unusable("--max-views and --draws must be at least 1")
+    if not 0 <= options.metres < math.inf:
+        raise Unusable(
+            f"--metres must be the metres in one unit of the files, 0.001 for millimetres, got {options.metres}"
+        )
     if options.to is not None:
         check_file(options.to)
+    system = load_system(options.system)
+    if options.metres and system.description.size is None:
+        raise Unusable(f"{options.system} does not use sizes; leave out --metres")
     found = check_transfer(
-        load_system(options.system),
+        system,
         options.data,
         up=options.up,
         renamed=dict(renamed(options.names)),
         posed=not options.unknown_yaw,
+        metres=options.metres or math.nan,
         max_views=options.max_views,
         draws=options.draws,
     )

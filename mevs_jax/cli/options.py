@@ -163,6 +163,8 @@ class TransferOptions:
     """what the system calls classes that have another name in the data; classes that it does not know are strangers"""
     unknown_yaw: Annotated[tyro.conf.FlagCreatePairsOff[bool], _arg("")] = False
     """do not tell the system which way the objects face; else they face as in their files"""
+    metres: Annotated[float, _arg("M", "0, sizes are unknown")] = 0.0
+    """metres in one unit of the files, for a system that was trained to use sizes"""
     max_views: Annotated[int, _arg("N", "8")] = 8
     """number of views of each walk"""
     draws: Annotated[int, _arg("N", "4")] = 4

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import jax.numpy as jnp
+from flax import nnx
 from jaxtyping import Array, Bool, Float
 
 from mevs_jax.arrays import AnyArray
+from mevs_jax.inputs import SizeInput
 from mevs_jax.models.calling import TrainedByCall
 from mevs_jax.models.resnet import ResNet
 from mevs_jax.models.set_fusion import SetFusion
@@ -19,16 +21,40 @@ class Recogniser(TrainedByCall):
     Args:
         encoder: computes the features of a view and, by its own head, the logits.
         fusion: computes logits from the features and directions of any set of views.
+        size: how the object's radius is used: a vector that depends on it is added to the features of its views. None: not at
+            all.
     """
 
-    def __init__(self, encoder: ResNet, fusion: SetFusion):
-        self.encoder, self.fusion = encoder, fusion
+    def __init__(self, encoder: ResNet, fusion: SetFusion, size: SizeInput | None = None):
+        self.encoder, self.fusion, self.size_input = encoder, fusion, size
+        shape = (size.steps, encoder.head.in_features) if size else None
+        self.size = nnx.Param(jnp.zeros(shape)) if shape else None
+
+    def features(
+        self,
+        images: Float[AnyArray, "*batch height width channels"],
+        radius: Float[AnyArray, "*batch"] | None = None,
+        *,
+        train: bool = False,
+    ) -> Float[Array, "*batch features"]:
+        """Features of single views.
+
+        Args:
+            images: of every view.
+            radius: of the object of every view, in metres, NaN where it is unknown; all are unknown by default.
+            train: whether batch norm uses the statistics of the batch.
+        """
+        features = self.encoder.features(images, train=train)
+        if self.size is None or self.size_input is None or radius is None:
+            return features
+        return features + self.size_input.code(radius) @ self.size[...]
 
     def __call__(
         self,
         images: Float[AnyArray, "*batch views height width channels"],
         directions: Float[AnyArray, "*batch views 3"],
         present: Bool[AnyArray, "*batch views"],
+        radius: Float[AnyArray, "*batch views"] | None = None,
         *,
         train: bool = False,
         key: Array | None = None,
@@ -39,17 +65,20 @@ class Recogniser(TrainedByCall):
             images: of every view.
             directions: unit vectors from the object to the cameras.
             present: True for the views to fuse.
+            radius: of the object, for each of its views; as of `features`.
             train: whether batch norm uses the statistics of the batch.
             key: PRNG key for dropout in the fusion; no dropout without.
 
         Returns:
             Logits of single views; fused logits for a known pose; fused logits for an unknown pose.
         """
-        features = self.encoder.features(images, train=train)
+        features = self.features(images, radius, train=train)
         posed, unposed = (self.fusion(features, directions, present, key, posed=known) for known in (True, False))
         return self.encoder.head(features), posed, unposed
 
-    def see(self, images: Float[AnyArray, "*batch height width channels"]) -> Float[Array, "*batch both"]:
-        """Features and logits of single views, concatenated: the data that is stored of a view."""
-        features = self.encoder.features(images)
+    def see(
+        self, images: Float[AnyArray, "*batch height width channels"], radius: Float[AnyArray, "*batch"] | None = None
+    ) -> Float[Array, "*batch both"]:
+        """Features and logits of single views, concatenated: the data that is stored of a view. Arguments as of `features`."""
+        features = self.features(images, radius)
         return jnp.concatenate([features, self.encoder.head(features)], axis=-1)

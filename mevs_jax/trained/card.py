@@ -42,6 +42,7 @@ def model_card(description: Description, size: int) -> str:
         f"* Camera: {camera.resolution}×{camera.resolution} pixels, field of view {camera.field_of_view:g}°, "
         f"{camera.distance:g} radii from the object's centre, z up in the image.",
         f"* Image: {_INPUTS[description.image.content]}; {channels}.",
+        *_size(description),
         f"* Kind: {_kind(description)}.",
         f"* Policy by default: `{description.best}` ({description.chosen_by}); with unknown yaw `{description.best_unposed}`.",
         f"* Weights: {size / 1e6:.1f} MB. Made with "
@@ -57,6 +58,13 @@ def model_card(description: Description, size: int) -> str:
         "",
     ]
     return "\n".join(lines)
+
+
+def _size(description: Description) -> list[str]:
+    size = description.size
+    if size is None:
+        return []
+    return [f"* Size: the object's radius, where it is told, from {size.smallest:g} to {size.largest:g} m."]
 
 
 def _kind(description: Description) -> str:

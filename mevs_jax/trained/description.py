@@ -6,6 +6,7 @@ from dataclasses import dataclass, field
 from typing import Any, Literal
 
 from mevs_jax.cameras import ViewCamera
+from mevs_jax.inputs import SizeInput
 from mevs_jax.models.shapes import PointNet2Shape, ResNetShape, SetFusionShape, ViewPolicyShape
 
 FORM = 1
@@ -74,6 +75,7 @@ class Description:
         image: input of the classifier or recogniser.
         encoder: its shape.
         fusion: shape of the set fusion, for a recogniser.
+        size: how the object's radius is used, for a recogniser that was trained with it.
         entropy: shape of the entropy predictor, if there is one.
         cloud: input of the entropy predictor.
         view_policies: shapes of the networks that score views, by name of the policy.
@@ -99,6 +101,7 @@ class Description:
     made_by: str
     made_with: dict[str, str]
     fusion: SetFusionShape | None = None
+    size: SizeInput | None = None
     entropy: PointNet2Shape | None = None
     cloud: CloudInput | None = None
     view_policies: dict[str, ViewPolicyShape] = field(default_factory=dict)

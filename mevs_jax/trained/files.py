@@ -207,6 +207,8 @@ def _arrays_of(parts: Parts) -> dict[str, Any]:
             "knowledge.expected_logits": parts.knowledge.expected_logits,
         }
     found |= {f"temperatures.{name}": values for name, values in parts.temperatures.items()}
+    if parts.size is not None:
+        found["size"] = parts.size
     if parts.strangeness is not None:
         found["strangeness.quantiles"] = parts.strangeness.quantiles
     return found
@@ -287,6 +289,10 @@ def check(description: Description) -> None:
         raise ValueError("depth and normals have 4 channels")
     if description.encoder.channels != description.image.channels:
         raise ValueError("encoder and image differ in their channels")
+    if (size := description.size) is not None and not (
+        description.fusion is not None and 0 < size.smallest < size.largest < 1e9 and 2 <= size.steps <= 1000
+    ):
+        raise ValueError("the size is impossible, or used by another kind than a recogniser")
     if (description.entropy is None) != (description.cloud is None):
         raise ValueError("an entropy predictor and its cloud belong together")
     if description.cloud is not None and not 1 <= description.cloud.points <= 2**20:
@@ -414,6 +420,7 @@ def _parts_of(description: Description, arrays: dict[str, np.ndarray]) -> Parts:
         viewpoints=viewpoints,
         neighbours=take.take("neighbours", (views, views), bool),
         single=_positive(take.take("single", ())),
+        size=None if description.size is None else take.take("size", (description.size.steps, features)),
         entropy=entropy,
         fusion=fusion,
         view_policies={

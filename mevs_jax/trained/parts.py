@@ -13,7 +13,7 @@ from jaxtyping import Array, Float, Int
 
 from mevs_jax.beliefs import CalibratedFusion
 from mevs_jax.cameras import ViewCamera
-from mevs_jax.inputs import depth_and_normals, depth_image, view_cloud
+from mevs_jax.inputs import SizeInput, depth_and_normals, depth_image, view_cloud
 from mevs_jax.policies.base import Knowledge, Observation
 from mevs_jax.trained.description import CloudInput, ImageInput
 from mevs_jax.trained.strangeness import Strangeness
@@ -46,6 +46,7 @@ class Parts:
         viewpoints: (views, 3) unit vectors from the object to the candidate cameras.
         neighbours: (views, views) True for neighbours on the view graph.
         entropy: PointNet++, from a cloud to the entropies of all views.
+        size: (steps, features) of a recogniser that uses the object's radius; see `Recogniser`.
         fusion: of a recogniser, for a known and for an unknown yaw: `posed` and `unposed`.
         single: temperature of the logits of a single view.
         view_policies: networks that score views, by name of the policy.
@@ -59,6 +60,7 @@ class Parts:
     neighbours: Array
     single: Float[Array, ""]
     entropy: Network | None = None
+    size: Float[Array, "steps features"] | None = None
     fusion: dict[str, CalibratedFusion] = flax.struct.field(default_factory=dict)
     view_policies: dict[str, Network] = flax.struct.field(default_factory=dict)
     knowledge: Knowledge | None = None
@@ -97,12 +99,29 @@ def logits_of(parts: Parts, encoder: Any, features: Float[Array, "*batch feature
     return logits - parts.fusion["posed"].prior if parts.fusion else logits
 
 
+def features_of(
+    parts: Parts,
+    depth: Float[Array, "*batch side side"],
+    radius: Float[Array, "*batch"],
+    *,
+    image: ImageInput,
+    size: SizeInput | None,
+    camera: ViewCamera,
+) -> Float[Array, "*batch features"]:
+    """The features of single views; arguments as of `observe`."""
+    images = jnp.vectorize(lambda one: image_of(one, image, camera), signature="(h,w)->(h,w,c)")(depth)
+    features = parts.encoder.module.features(images)
+    return features if size is None or parts.size is None else features + size.code(radius) @ parts.size
+
+
 def observe(
     parts: Parts,
     depth: Float[Array, "side side"],
     pose: Float[Array, "4 4"],
+    radius: Float[Array, ""],
     *,
     image: ImageInput,
+    size: SizeInput | None,
     cloud: CloudInput | None,
     camera: ViewCamera,
 ) -> Observation:
@@ -112,15 +131,16 @@ def observe(
         parts: of the system.
         depth: along the optical axis, in radii of the object; 0 where nothing is hit.
         pose: from the camera to the object's frame, whose unit is the radius.
+        radius: of the object in metres; NaN if it is unknown.
         image: input of the encoder.
+        size: how the radius is used; None if not.
         cloud: input of the entropy predictor; None if its predictions are not needed.
         camera: of the view.
     """
-    encoder = parts.encoder.module
-    features = encoder.features(image_of(depth, image, camera))
+    features = features_of(parts, depth, radius, image=image, size=size, camera=camera)
     entropies = None
     if cloud is not None and parts.entropy is not None:
         pixels = sample_pixels(depth, cloud.points)
         seen = view_cloud(pixels, depth.reshape(-1)[pixels], pose, camera, cloud.frame, cloud.directions)
         entropies = parts.entropy.module(seen)
-    return Observation(logits_of(parts, encoder, features), entropies, features)
+    return Observation(logits_of(parts, parts.encoder.module, features), entropies, features)

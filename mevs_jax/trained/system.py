@@ -129,11 +129,15 @@ class TrainedSystem:
 
     @cached_property
     def _observe(self) -> Any:
-        description = self.description
-        given = {"image": description.image, "cloud": description.cloud, "camera": description.camera}
-        return jax.jit(partial(observe, **given))  # type: ignore[arg-type]
+        of = self.description
+        return jax.jit(partial(observe, image=of.image, size=of.size, cloud=of.cloud, camera=of.camera))
 
-    def observe(self, depth: Float[AnyArray, "side side"], pose: Float[AnyArray, "4 4"]) -> Observation:
+    def observe(
+        self,
+        depth: Float[AnyArray, "side side"],
+        pose: Float[AnyArray, "4 4"],
+        radius: float | Float[AnyArray, ""] = np.nan,
+    ) -> Observation:
         """What the networks compute from one view, taken by the camera `description.camera`.
 
         `mevs_jax.canonical_view` makes such a view from that of any depth camera.
@@ -141,6 +145,7 @@ class TrainedSystem:
         Args:
             depth: along the optical axis, in radii of the object; 0 where nothing is hit.
             pose: from the camera to the object's frame: origin at its centre, z up, unit the radius.
+            radius: of the object in metres, for a system that uses it (`description.size`); NaN if it is unknown.
 
         Raises:
             ValueError: for a depth image of another size, of whole numbers, or not in radii.
@@ -152,7 +157,8 @@ class TrainedSystem:
                 f"this system needs depth images of {side}×{side} pixels, got {'×'.join(map(str, np.shape(depth)))}; make one "
                 f"from any camera's image with mevs_jax.canonical_view"
             )
-        return self._observe(self.parts, jnp.asarray(depth, jnp.float32), jnp.asarray(pose, jnp.float32))
+        given = (jnp.asarray(array, jnp.float32) for array in (depth, pose, radius))
+        return self._observe(self.parts, *given)
 
     def calibrated_as(self, policy: str, posed: bool = True) -> str:
         """The policy whose temperatures are those of a policy's walks: itself, unless its yaw-free fusion is another one's."""

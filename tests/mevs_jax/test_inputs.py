@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from mevs_jax import ViewCamera, look_at_origin, partial_cloud
-from mevs_jax.inputs import depth_and_normals, depth_image, view_cloud
+from mevs_jax.inputs import SizeInput, depth_and_normals, depth_image, view_cloud
 
 CAMERA = ViewCamera(resolution=16, distance=2.5)
 POSE = look_at_origin(np.array([1.5, -1.2, 1.6], np.float32) * np.float32(2.5 / np.linalg.norm([1.5, -1.2, 1.6])))
@@ -30,3 +30,17 @@ def test_directions_of_a_cloud_point_to_the_camera_in_both_frames(frame):
     expected = expected / np.linalg.norm(expected, axis=1, keepdims=True)
     rotation = np.asarray(POSE)[:3, :3]
     np.testing.assert_allclose(cloud[:, 3:] if frame == "world" else cloud[:, 3:] @ rotation.T, expected, atol=1e-5)
+
+
+def test_a_radius_is_gaussians_of_its_logarithm_and_0_where_it_is_unknown():
+    size = SizeInput(0.1, 10.0, 3)
+    width = np.log(10.0)
+    radii = np.array([0.1, 1.0, 2.0, np.nan, 0.0, -1.0, 1e6], np.float32)
+    found = np.asarray(size.code(radii))
+    np.testing.assert_allclose(found[0], np.exp(-0.5 * np.array([0.0, 1, 2]) ** 2), rtol=1e-5)
+    np.testing.assert_allclose(found[1], np.exp(-0.5 * np.array([-1.0, 0, 1]) ** 2), rtol=1e-5)
+    away = (np.log(2.0) - np.log([0.1, 1, 10])) / width
+    np.testing.assert_allclose(found[2], np.exp(-0.5 * away**2), rtol=1e-5)
+    assert not found[3:6].any()
+    assert found[6].max() < 1e-3
+    assert np.isfinite(found).all()

@@ -24,12 +24,12 @@ from train.tasks.recogniser import RecogniserTask, views_by_object
 def see(network: Recogniser, task: Task, batch: Batch) -> jax.Array:
     """Returns features, logits, direction and label of every view, concatenated: (views, features + classes + 3 + 1)."""
     assert isinstance(task, RecogniserTask)
-    return _see_images(network, task.inputs(batch), task.directions(batch), batch)
+    return _see_images(network, task, task.inputs(batch), task.directions(batch), batch)
 
 
-def _see_images(network: Recogniser, images: Array, directions: Array, batch: Batch) -> jax.Array:
+def _see_images(network: Recogniser, task: RecogniserTask, images: Array, directions: Array, batch: Batch) -> jax.Array:
     label = batch["label"][:, None].astype(jnp.float32)
-    return jnp.concatenate([network.see(images), directions, label], axis=-1)
+    return jnp.concatenate([network.see(images, task.radii(batch)), directions, label], axis=-1)
 
 
 def _see_changed_by(changes: Array, network: Recogniser, task: RecogniserTask, batch: Batch) -> jax.Array:
@@ -40,7 +40,7 @@ def _see_changed_by(changes: Array, network: Recogniser, task: RecogniserTask, b
     """
     images, poses = (views_by_object(array, task.camera.views) for array in (task.inputs(batch), batch["pose"]))
     images, directions = jax.vmap(partial(views_after, camera=task.camera))(changes, images, poses)
-    return _see_images(network, images.reshape(-1, *images.shape[2:]), directions.reshape(-1, 3), batch)
+    return _see_images(network, task, images.reshape(-1, *images.shape[2:]), directions.reshape(-1, 3), batch)
 
 
 @cache

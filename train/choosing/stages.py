@@ -41,6 +41,7 @@ from train.outputs import Ask, network_outputs
 from train.starting_weights import StartingWeights
 from train.tasks.entropy import EntropyConfig, EntropyTask
 from train.tasks.recogniser import RecogniserConfig, RecogniserTask
+from train.tasks.size import check_sizes, used_size
 
 
 @dataclass(frozen=True)
@@ -131,6 +132,7 @@ VARIANTS = {
 
 ABLATIONS = tuple(name for name in VARIANTS if not name.startswith("learned"))
 
+_SIZE = "--learned.recogniser.size"
 _FURTHER_RATE = 0.4
 """Learning rate of the further training on turned objects, relative to that of the first training."""
 
@@ -204,6 +206,8 @@ class Stages:
         """Makes the data set of views from turned directions."""
         capture = replace(self.dataset.capture, turned=True)
         prepare(replace(self.dataset, capture=capture), self.turned)
+        if size := used_size(self.config.recogniser.size, _SIZE):
+            check_sizes(size, open_split(self.turned, "train"), _SIZE)
 
     @cached_property
     def statistics(self) -> DatasetStatistics:

@@ -26,11 +26,13 @@ from data_pipeline.dataset.batches import ViewBatches
 from data_pipeline.dataset.inputs import depth_and_normals, view_camera
 from data_pipeline.dataset.reality import RealityAugmentation, realistic_views, used_reality
 from mevs_jax import inputs as inputs_of
+from mevs_jax.inputs import SizeInput
 from mevs_jax.models import Recogniser, ResNet
 from train.choosing.features import SetFusionConfig, new_fusion, random_sets
 from train.optimiser import OptimiserConfig
 from train.step import Batch, Hyperparameters, Metrics
 from train.tasks.classifier import ResNetConfig
+from train.tasks.size import SizeConfig, radii_for_training, used_size
 
 
 @dataclass(frozen=True)
@@ -46,6 +48,7 @@ class RecogniserConfig:
     shift: int = 3
     """maximal shift of training images in pixels, in each direction"""
     reality: RealityAugmentation = RealityAugmentation()
+    size: SizeConfig = SizeConfig()
     balanced: bool = False
     """draw equally many training objects of each class, objects of rarer classes more often; else each object equally often"""
     optimiser: OptimiserConfig = OptimiserConfig()
@@ -69,6 +72,7 @@ class RecogniserTask:
     fold: tuple[int, int] | None = None
     """(k, n): trained without part k of n parts of the training objects"""
     reality: RealityAugmentation | None = None
+    size: SizeConfig | None = None
     name: str = "recogniser"
 
     @classmethod
@@ -87,6 +91,7 @@ class RecogniserTask:
             config.optimiser,
             fold,
             used_reality(config.reality, "--learned.recogniser.reality"),
+            used_size(config.size, "--learned.recogniser.size"),
             name,
         )
 
@@ -121,7 +126,8 @@ class RecogniserTask:
             dtype=jnp.dtype(self.optimiser.compute),
             rngs=rngs,
         )
-        return Recogniser(encoder, new_fusion(self.fusion_config, 8 * shape.width, self.classes, rngs))
+        fusion = new_fusion(self.fusion_config, 8 * shape.width, self.classes, rngs)
+        return Recogniser(encoder, fusion, SizeInput() if self.size else None)
 
     def inputs(self, batch: Batch) -> jax.Array:
         """Returns the images of a batch, (views, height, width, 4)."""
@@ -138,6 +144,10 @@ class RecogniserTask:
         """Returns the unit vectors from the object to the cameras, (views, 3)."""
         position = batch["pose"][:, :3, 3]
         return position / jnp.linalg.norm(position, axis=-1, keepdims=True)
+
+    def radii(self, batch: Batch) -> jax.Array | None:
+        """Returns the radius of the object of every view in metres, (views,); None if sizes are not used."""
+        return batch["radius"] * self.size.metres if self.size else None
 
     def loss(
         self, network: Recogniser, batch: Batch, key: jax.Array, samples: jax.Array, hyper: Hyperparameters
@@ -156,7 +166,10 @@ class RecogniserTask:
         moves = jax.random.split(move, images.shape[:2])
         images = jax.vmap(jax.vmap(partial(augment_image, config=shift)))(moves, images)
         present = random_sets(sets, len(images), images.shape[1], images.shape[1])
-        found = _metrics_of(*network(images, directions, present, train=True, key=drop), labels)
+        radii = self.radii(batch)
+        if self.size and radii is not None:
+            radii = radii_for_training(jax.random.fold_in(key, 5), by_object(radii), self.size)
+        found = _metrics_of(*network(images, directions, present, radii, train=True, key=drop), labels)
         means = {name: jnp.mean(values) for name, values in found.items()}
         return means["loss"], means
 
@@ -173,7 +186,9 @@ class RecogniserTask:
                 turns, images, by_object(batch["pose"])
             )
         labels = batch["label"].reshape(images.shape[:2])[:, 0]
-        found = _metrics_of(*network(images, directions, jnp.ones(images.shape[:2], bool)), labels)
+        radii = self.radii(batch)
+        radii = None if radii is None else by_object(radii)
+        found = _metrics_of(*network(images, directions, jnp.ones(images.shape[:2], bool), radii), labels)
         return {name: values.reshape(-1) for name, values in found.items()}
 
 

@@ -99,6 +99,7 @@ def test_a_capture_is_saved_whole(tmp_path, rig):
     np.testing.assert_array_equal(again.depth, seen.depth)
     np.testing.assert_array_equal(again.image, seen.image)
     np.testing.assert_array_equal(again.extent, seen.extent)
+    assert again.radius == seen.radius > 0
     assert [path.name for path in tmp_path.iterdir()] == ["c.npz"]
 
 

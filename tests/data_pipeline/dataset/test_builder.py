@@ -45,6 +45,9 @@ def test_an_example_is_an_object_as_it_was_captured(data):
         np.testing.assert_array_equal(example["image"], seen.image)
         np.testing.assert_allclose(example["pose"], rig.poses)
         np.testing.assert_allclose(example["extent"], seen.extent)
+        vertices = entry.recipe.load()[0]
+        centre = (vertices.min(axis=0) + vertices.max(axis=0)) / 2
+        assert example["radius"] == pytest.approx(np.linalg.norm(vertices - centre, axis=1).max(), rel=1e-6)
         assert example["label"] == entry.label
         for view in range(8):
             expected = depth_entropy((seen.depth[view] + 0.5).astype(np.float32) * (seen.depth[view] > 0) / 10_000)

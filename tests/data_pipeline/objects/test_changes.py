@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+from collections import Counter
 from dataclasses import asdict, replace
 from pathlib import Path
 
@@ -12,7 +13,8 @@ import pytest
 
 from data_pipeline.capture import workers
 from data_pipeline.capture.casting import CaptureConfig, check_camera, rig_for
-from data_pipeline.dataset.builder import DataConfig, open_split, prepare
+from data_pipeline.dataset.builder import DataConfig, open_objects, open_split, prepare
+from data_pipeline.dataset.config import check_same_data
 from data_pipeline.dataset.statistics import load_statistics, report_left_out
 from data_pipeline.errors import DamagedMesh, DataError
 from tests.data_pipeline.objects.making import box, glb, members, off, write, zipped
@@ -109,7 +111,7 @@ def test_data_sets_of_before_are_still_found(tmp_path):
     config = DataConfig(source=str(write(tmp_path / "set", members(("mug", "rack")))), capture=CAPTURE)
     statistics = prepare(config, tmp_path / "data")
     stored = json.loads((tmp_path / "data" / "config.json").read_text())
-    assert set(asdict(config)) - set(stored) == {"up", "split"}
+    assert set(asdict(config)) - set(stored) == {"up", "split", "more"}
     assert "notes" not in json.loads((tmp_path / "data" / "summary.json").read_text())
     assert load_statistics(tmp_path / "data").fingerprint == statistics.fingerprint
     for other in ({"up": "y"}, {"split": "0.5"}):
@@ -175,3 +177,39 @@ def test_the_farthest_camera_still_stores_depth():
     check_camera(replace(CAPTURE, distance=5.55))
     with pytest.raises(DataError, match=r"at most 5\.55"):
         check_camera(replace(CAPTURE, distance=5.56))
+
+
+def test_several_sources_are_one_data_set(tmp_path, capsys):
+    """Classes of one name are one, names of objects stay unique, splits stay as they are, and every file is counted."""
+    first = write(tmp_path / "one" / "set", members(("mug", "night_stand")))
+    second = write(
+        tmp_path / "two" / "set", members(("Night Stands", "rack"), "in/") | {"in/rack/train/bad.off": b"OFF"}
+    )
+    (tmp_path / "three.zip").write_bytes(zipped(members(("MUG", "rack"))))
+    more = (str(second), str(tmp_path / "three.zip"))
+    config = DataConfig(source=str(first), more=more, capture=CAPTURE, skip_damaged=True)
+    source = open_objects(config)
+    assert source.classes == ("mug", "night_stand", "rack")
+    names = [entry.name for entry in source.entries]
+    assert len(set(names)) == len(names) == len(members(("a", "b"))) * 3 + 1
+    alone = open_objects(DataConfig(source=str(first)))
+    assert source.entries[: len(alone.entries)] == alone.entries
+    labels = {entry.name: source.classes[entry.label] for entry in source.entries}
+    assert labels["set 2/Night Stands/train/Night Stands_0.off"] == "night_stand"
+    assert labels["three/MUG/test/MUG_2.off"] == "mug"
+    splits = Counter((entry.name.split("/")[0], entry.split) for entry in source.entries)
+    assert splits["set 2", "test"] == splits["three", "test"]
+    statistics = prepare(config, tmp_path / "data")
+    assert statistics.source == "set + set + three"
+    (left_out,) = (reasons for reasons in statistics.left_out.values() if reasons)
+    assert list(left_out) == ["set 2/rack/train/bad.off"]
+    assert len(extents(tmp_path / "data")) == len(source.entries) - 1
+    capsys.readouterr()
+    (tmp_path / "three.zip").write_bytes(zipped(members(("MUG", "rack")) | {"MUG/test/new.off": off(*box())}))
+    assert prepare(config, tmp_path / "data") == statistics
+    said = " ".join(capsys.readouterr().err.split())
+    assert f"(1 new, such as {tmp_path / 'three.zip'}: MUG/test/new.off)" in said
+    with pytest.raises(DataError, match=r"dataset\.more"):
+        check_same_data(replace(config, more=more[:1]), tmp_path / "data")
+    with pytest.raises(DataError, match=r"is given twice, as --data or in --dataset\.more; leave one out"):
+        open_objects(replace(config, more=(str(first),)))

@@ -8,6 +8,7 @@ from flax import nnx
 
 from mevs_jax.beliefs import CalibratedFusion
 from mevs_jax.cameras import ViewCamera
+from mevs_jax.inputs import SizeInput
 from mevs_jax.models import Abstraction
 from mevs_jax.models.shapes import PointNet2Shape, ResNetShape, SetFusionShape, ViewPolicyShape
 from mevs_jax.policies.base import Knowledge
@@ -57,8 +58,14 @@ def description(kind: str, **changes) -> Description:
 
 
 def system(kind: str = "classifier", seed: int = 0) -> TrainedSystem:
-    """A small system; its networks are random, and sure of what they see."""
-    of, rngs, random = description(kind), nnx.Rngs(seed), np.random.default_rng(seed)
+    """A small system; its networks are random, and sure of what they see.
+
+    Args:
+        kind: `classifier`, `recogniser`, or `sized`, a recogniser that uses the size of objects.
+        seed: of its weights.
+    """
+    rngs, random = nnx.Rngs(seed), np.random.default_rng(seed)
+    of = description("recogniser", size=SizeInput()) if kind == "sized" else description(kind)
     classes, graph = len(CLASSES), ViewGraph.from_points(fibonacci_sphere(VIEWS))
     encoder = of.encoder.network(classes, rngs)
     encoder.head.kernel.set_value(8 * encoder.head.kernel[...])
@@ -86,6 +93,7 @@ def system(kind: str = "classifier", seed: int = 0) -> TrainedSystem:
         viewpoints=graph.points,
         neighbours=graph.neighbours,
         single=jnp.float32(1.2),
+        size=None if of.size is None else jnp.asarray(random.normal(size=(of.size.steps, features)), jnp.float32),
         entropy=Network.of(of.entropy.network(VIEWS, rngs)) if of.entropy is not None else None,
         fusion=fusion,
         view_policies=policies,

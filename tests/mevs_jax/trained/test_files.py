@@ -18,7 +18,7 @@ from mevs_jax.trained.files import DESCRIPTION, WEIGHTS, _hash_of
 from tests.mevs_jax.trained import making
 
 
-@pytest.fixture(scope="module", params=["classifier", "recogniser"])
+@pytest.fixture(scope="module", params=["classifier", "sized"])
 def written(request, tmp_path_factory):
     made = making.system(request.param)
     folder = tmp_path_factory.mktemp(request.param) / "system"
@@ -116,6 +116,9 @@ CHANGES = {
     "no classes": lambda c: c.update(classes=[]),
     "two classes of one name": lambda c: c.update(classes=["a", "a", "b", "c"]),
     "one class more": lambda c: c["classes"].append("desk"),
+    "sizes of nothing": lambda c: c.update(size={"smallest": 0.0, "largest": 5.0, "steps": 10}),
+    "sizes in no order": lambda c: c.update(size={"smallest": 9.0, "largest": 5.0, "steps": 10}),
+    "another number of sizes": lambda c: c.update(size={"smallest": 0.1, "largest": 5.0, "steps": 11}),
     "an unknown setting": lambda c: c.update(colour="red"),
     "a camera within the object": lambda c: c["camera"].update(distance=0.5),
     "an infinite camera": lambda c: c["camera"].update(distance=float("inf")),
