@@ -26,8 +26,9 @@ from data_pipeline.files import write_json
 from eval.settings import SMALL, TINY
 from eval.stages import tasks
 from train.loop import fit
+from train.many.members import task_of
+from train.many.sweep import SweepConfig, draw_members, sweep
 from train.step import initial_state, train_step_of
-from train.sweep import SweepConfig, draw_members, sweep, task_of
 from train.tasks.entropy import EntropyTask
 
 MEMBERS = 16

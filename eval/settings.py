@@ -16,8 +16,8 @@ from mevs_jax.models import Abstraction
 from train.choosing.features import SetFusionConfig
 from train.choosing.policy import PolicyConfig
 from train.choosing.stages import ABLATIONS, LearnedConfig
+from train.many.sweep import SweepConfig
 from train.optimiser import OptimiserConfig
-from train.sweep import SweepConfig
 from train.tasks.classifier import ClassifierConfig, ResNetConfig
 from train.tasks.entropy import EntropyConfig, PointNet2Config
 from train.tasks.recogniser import RecogniserConfig
@@ -41,6 +41,8 @@ class Settings:
     learned: LearnedConfig = LearnedConfig()
     policies: tuple[str, ...] = ()
     """further policies to evaluate, as module:function or path/to/file.py:function (`--policy`)"""
+    seeds: int = 1
+    """number of trainings of the run's networks, from other seeds (`--seeds`)"""
 
 
 THESIS = Settings()

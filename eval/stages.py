@@ -6,7 +6,7 @@ also holds `classifier_by_view/` if the validation of the published code is comp
 
 from __future__ import annotations
 
-import os
+import tempfile
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
@@ -49,20 +49,20 @@ from train.choosing.stages import Stages, check_learned
 from train.finite import check_results, place_not_finite
 from train.kept import keep_beside, kept, kept_json, made_by, summary_of
 from train.loop import fit, load_best
+from train.many.members import Member
+from train.many.sweep import sweep
 from train.starting_weights import StartingWeights
 from train.step import Task
-from train.sweep import Member, sweep
 from train.tasks.classifier import ClassifierTask
 from train.tasks.entropy import EntropyTask
 
 
 def check_output(out: Path) -> None:
     """Raises `DataError` if the directory `out` is not writable."""
-    probe = out / f".probe.{os.getpid()}"
     try:
         out.mkdir(parents=True, exist_ok=True)
-        probe.touch()
-        probe.unlink()
+        with tempfile.NamedTemporaryFile(prefix=".probe.", dir=out):
+            pass
     except OSError as error:
         raise DataError(f"cannot write to {out} ({error.strerror}); choose another --out") from error
 
@@ -365,7 +365,8 @@ def report(settings: Settings, preset: str, out: Path) -> Path:
     networks = {"classifier": out / "classifier", "entropy predictor": out / "entropy"}
     of_networks = [folder / name for folder in networks.values() for name in ("summary.json", "metrics.jsonl")]
     data, tables = out / "data", out / "tables" / "test.npz"
-    made_of = (metrics, active, data / SUMMARY, tables, *of_networks)
+    over_seeds = out / "seeds.json"
+    made_of = (metrics, active, over_seeds, data / SUMMARY, tables, *of_networks)
 
     def described() -> list[Any]:
         return [preset, plain(settings), *(path.is_file() and check_of_file(path) for path in made_of)]
@@ -383,6 +384,7 @@ def report(settings: Settings, preset: str, out: Path) -> Path:
         preset=preset,
         settings=plain(settings),
         learned=_metrics(active, f"mevs study learned --out {out}") if active.exists() else None,
+        seeds=_metrics(over_seeds, f"mevs eval --out {out}") if settings.seeds > 1 and over_seeds.exists() else None,
     )
     write_report(inputs, page, described())  # the tables may have been made again
     return page

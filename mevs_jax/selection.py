@@ -28,7 +28,8 @@ class ViewTable:
 
     Attributes:
         logits: (views, classes) of the classifier at each view; with a leading axis if several classifiers are compared.
-        predicted_entropy: (views, views); row i holds the entropies of all views predicted from view i.
+        predicted_entropy: (views, views); row i holds the entropies of all views predicted from view i; with a leading axis if
+            several predictors are compared.
         entropy: (views,) true depth entropies.
         label: the true class.
         ascent_scores: by policy name, (views, views); row i scores the views after view i, by gradient ascent on a rendering.
@@ -37,7 +38,7 @@ class ViewTable:
     """
 
     logits: Float[Array, "*batch_and_backbones views classes"]
-    predicted_entropy: Float[Array, "*batch views views"] | None
+    predicted_entropy: Float[Array, "*batch_and_predictors views views"] | None
     entropy: Float[Array, "*batch views"] | None
     label: Int[Array, "*batch"]
     ascent_scores: dict[str, Float[Array, "*batch views views"]] | None = None

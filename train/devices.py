@@ -101,6 +101,11 @@ def check_batch(task: Task, mesh: Mesh) -> None:
             f"{task.name}: a batch of {config.batch_size} views{parts} cannot be shared equally by {devices} devices; "
             f"choose another optimiser.batch-size or optimiser.parts, or use fewer devices"
         )
+    if config.batch_size % (config.parts * task.group):
+        raise DataError(
+            f"{task.name}: a batch of {config.batch_size} views, {task.group} of an object, cannot be cut into {config.parts} "
+            "parts of whole objects; choose another optimiser.batch-size, optimiser.parts or optimiser.views-per-object"
+        )
     if config.batch_size % (config.views_per_object * processes):
         raise DataError(
             f"{task.name}: a batch of {config.batch_size} views, {config.views_per_object} of an object, cannot be read "

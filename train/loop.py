@@ -101,8 +101,10 @@ def validation_set(
     read = list(validation_batches(data, task.batches, task.optimiser.validation_views, own))
     whole = {name: np.concatenate([batch[name] for batch in read]) for name in read[0]}
     most = -(-objects // processes) * len(read[0]["label"])  # of any process
-    own_devices = devices // processes
-    size = -(-min(256, most) // own_devices) * own_devices
+    together = (devices // processes) * (
+        len(read[0]["label"]) if task.group > 1 else 1
+    )  # views of an object stay on a device
+    size = -(-min(256, most) // together) * together
     count = -(-most // size)
     weights = np.zeros(count * size, np.float32)
     if index < objects:

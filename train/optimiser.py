@@ -89,5 +89,8 @@ def learning_rate(config: OptimiserConfig, steps: int) -> Callable[[jax.Array, j
         share = optax.warmup_cosine_decay_schedule(1 / 20, 1.0, max(1, min(200, steps // 10)), max(2, steps))
         return lambda step, first: first * share(step)
     if config.schedule == "steps":
-        return lambda step, first: jnp.maximum(first * 0.7 ** (step * config.batch_size // 20_000), 1e-5)
+        last = (2**31 - 1) // config.batch_size  # later steps would overflow; the rate is at its end long before
+        return lambda step, first: jnp.maximum(
+            first * 0.7 ** (jnp.minimum(step, last) * config.batch_size // 20_000), 1e-5
+        )
     return lambda step, first: jnp.asarray(first, jnp.float32)

@@ -73,6 +73,10 @@ class Task(Protocol):
     @property
     def hyperparameters(self) -> Hyperparameters: ...
 
+    @property
+    def group(self) -> int:
+        """Number of successive views of a batch that belong together, those of one object, and stay in one part; else 1."""
+
     def network(self, rngs: nnx.Rngs) -> Any:
         """Returns a new network with random weights."""
 
@@ -125,6 +129,17 @@ def abstract_state(task: Task) -> tuple[nnx.GraphDef, TrainState]:
     return jax.eval_shape(lambda: initial_state(task, 0))
 
 
+def part_of(array: jax.Array, parts: int, group: int) -> jax.Array:
+    """Returns a batch (views, …) in parts, (parts, views of a part, …): each takes every `parts`-th group of successive views."""
+    split = array.reshape(-1, parts, group, *array.shape[1:]).swapaxes(0, 1)
+    return split.reshape(parts, -1, *array.shape[1:])
+
+
+def samples_before(step: jax.Array, batch_size: int) -> jax.Array:
+    """Returns the number of views trained on before a step; at most 2³¹ − 1, beyond which no schedule changes any more."""
+    return jnp.minimum(step, (2**31 - 1) // batch_size) * batch_size
+
+
 def train_step_of(
     task: Task, structure: nnx.GraphDef, epoch_steps: int
 ) -> Callable[[TrainState, Batch, Hyperparameters], tuple[TrainState, jax.Array]]:
@@ -138,17 +153,15 @@ def train_step_of(
     def gradients_of(state: TrainState, statistics: nnx.State, batch: Batch, key: jax.Array, hyper: Hyperparameters):
         def loss_of(parameters: nnx.State):
             network = nnx.merge(structure, parameters, statistics, copy=True)
-            loss, metrics = task.loss(network, batch, key, state.step * config.batch_size, hyper)
+            loss, metrics = task.loss(network, batch, key, samples_before(state.step, config.batch_size), hyper)
             return loss, (metrics, nnx.state(network, nnx.Not(nnx.Param)))
 
         gradients, (metrics, changed) = jax.grad(loss_of, has_aux=True)(state.parameters)
         return gradients, metrics, changed
 
     def accumulated(state: TrainState, batch: Batch, key: jax.Array, hyper: Hyperparameters):
-        # A part is every `parts`-th view: each device then holds an equal share of every part, and no view is moved.
-        split = {
-            name: array.reshape(-1, config.parts, *array.shape[1:]).swapaxes(0, 1) for name, array in batch.items()
-        }
+        # A part is every `parts`-th group of views: each device then holds an equal share of every part, and no view is moved.
+        split = {name: part_of(array, config.parts, task.group) for name, array in batch.items()}
 
         def add(carry, numbered: tuple[jax.Array, Batch]):
             statistics, sums = carry

@@ -48,6 +48,12 @@ class ViewBatches:
     validation_by: Literal["object", "view"] = "object"
     balanced: bool = False
 
+    def __post_init__(self) -> None:
+        if self.fold is not None and self.validation_by == "view":
+            raise ValueError(
+                "folds are parts of the objects; with validation by view, an object of each part is trained on"
+            )
+
 
 VIEWS_ASIDE = 0.2
 """Share of each object's views that is held out if validation is by view (thesis §5.2)."""

@@ -149,8 +149,14 @@ def decision_memory(classify: ClassifierTask, predict: EntropyTask | None) -> di
 
 
 def decision_memory_alone(classify: ClassifierTask, predict: EntropyTask | None) -> dict[str, float | None]:
-    """`decision_memory` in a separate process if the device reports peaks, which cover the whole life of a process."""
-    if not jax.devices()[0].memory_stats():
+    """`decision_memory` in a separate process if the device reports peaks, which cover the whole life of a process.
+
+    A TPU serves one process, so that its peak cannot be measured.
+    """
+    device = jax.devices()[0]
+    if device.platform == "tpu":
+        return decision_memory(classify, predict) | {"device_peak": None}
+    if not device.memory_stats():
         return decision_memory(classify, predict)
     before = os.environ.get("XLA_PYTHON_CLIENT_PREALLOCATE")
     os.environ["XLA_PYTHON_CLIENT_PREALLOCATE"] = "false"  # this process has already allocated most of the device

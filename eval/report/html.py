@@ -48,6 +48,8 @@ class ReportInputs:
     settings: dict[str, Any]
     learned: dict[str, Any] | None = None
     """metrics of `mevs study learned`, if it was run"""
+    seeds: dict[str, Any] | None = None
+    """metrics over several trainings, if there are any"""
 
 
 def drawn(figure: Figure, kind: str) -> bytes:

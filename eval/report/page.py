@@ -30,6 +30,7 @@ from eval.report.policies import (
     lead,
     movement_section,
 )
+from eval.report.seeds import seeds_section
 from mevs_jax.viewpoints import local_maxima
 from train.chance import Chance
 from train.loop import read_log
@@ -191,6 +192,7 @@ _SECTIONS = (
     _chance_notice,
     lead,
     ladder_section,
+    seeds_section,
     ascent_section,
     active_section,
     movement_section,

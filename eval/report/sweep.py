@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 
 from data_pipeline.files import write_bytes, write_text
 from mevs_jax.markdown import markdown_table
-from train.sweep import Member
+from train.many.members import Member
 
 _AXES = {
     "learning_rate": "learning rate",

@@ -121,7 +121,8 @@ def run_grid(
 
     Args:
         key: for random policies.
-        tables: view tables with a leading axis of objects; logits (objects, backbones, views, classes).
+        tables: view tables with a leading axis of objects; logits (objects, backbones, views, classes). Predicted entropies may
+            have an axis of backbones too: a backbone is then a whole system, such as one of several trainings.
         graph: the candidate views.
         knowledge: statistics of other objects, with a leading axis of backbones; None if no policy needs them.
         rungs: the policies.
@@ -151,10 +152,13 @@ def run_grid(
             over_draws = jax.vmap(walk, (0, None, None, None))
             over_starts = jax.vmap(over_draws, (0, None, None, 0))
 
-            def with_backbone(logits: Array, knowledge: Knowledge | None) -> Array:
-                return over_starts(keys, replace(table, logits=logits), knowledge, jnp.arange(starts))
+            def with_backbone(logits: Array, entropies: Array | None, knowledge: Knowledge | None) -> Array:
+                own = replace(table, logits=logits, predicted_entropy=entropies)
+                return over_starts(keys, own, knowledge, jnp.arange(starts))
 
-            views = jax.vmap(with_backbone)(table.logits, knowledge)
+            entropies = table.predicted_entropy
+            each = 0 if entropies is not None and entropies.ndim == 3 else None
+            views = jax.vmap(with_backbone, (0, each, 0))(table.logits, entropies, knowledge)
             steps_first = views.reshape(*views.shape[:-3], -1, max_views).swapaxes(-1, -2)
             read = jax.vmap(read_object, (0, None, None, 0, None))
             found = read(

@@ -37,6 +37,14 @@ class WithSeed(Options):
 
 
 @dataclass(frozen=True)
+class WithSeeds(WithSeed):
+    """Commands that train or evaluate the networks of a run from several seeds."""
+
+    seeds: Annotated[int | None, _arg("K", "1, or that of the run")] = None
+    """train both networks from K seeds, --seed and those after it, and report means over the trainings"""
+
+
+@dataclass(frozen=True)
 class WithPolicies(Options):
     """Commands that run policies."""
 
@@ -46,7 +54,7 @@ class WithPolicies(Options):
 
 
 @dataclass(frozen=True)
-class EvalOptions(WithSeed, WithPolicies):
+class EvalOptions(WithSeeds, WithPolicies):
     """Options of `mevs eval`."""
 
 
@@ -98,8 +106,11 @@ class DataOptions(WithViews):
 
 
 @dataclass(frozen=True)
-class RunOptions(WithViews, WithWeights, WithEncoder, WithPolicies):
+class RunOptions(WithViews, WithSeeds, WithWeights, WithEncoder, WithPolicies):
     """Options of `mevs run`."""
+
+    seeds_at_once: Annotated[int, _arg("N", "0, all")] = 0
+    """train at most N seeds together, which bounds memory"""
 
 
 @dataclass(frozen=True)
@@ -108,8 +119,11 @@ class ThesisOptions(WithData, WithWeights):
 
 
 @dataclass(frozen=True)
-class TrainOptions(WithWeights, WithEncoder):
+class TrainOptions(WithSeeds, WithWeights, WithEncoder):
     """Options of `mevs train`."""
+
+    seeds_at_once: Annotated[int, _arg("N", "0, all")] = 0
+    """train at most N seeds together, which bounds memory"""
 
     distributed: Annotated[tyro.conf.FlagCreatePairsOff[bool], _arg("")] = False
     """this is one of several processes that train together (docs/scaling.md)"""

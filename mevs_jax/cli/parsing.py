@@ -147,7 +147,7 @@ def _check_unchanged(base: Settings, settings: Settings, groups: list[str], comm
     from data_pipeline.differences import differences, in_words
     from data_pipeline.errors import DataError
 
-    own = {*groups, "policies"}
+    own = {*groups, "policies", "seeds"}
     was, now = ({n: v for n, v in dataclasses.asdict(all_of).items() if n not in own} for all_of in (base, settings))
     if found := differences(was, now):
         raise DataError(
@@ -194,6 +194,8 @@ def keep_settings(call: Invocation) -> None:
         settings = replace(run.settings, **{group: getattr(call.settings, group) for group in groups})
         if hasattr(call.options, "policy"):
             settings = replace(settings, policies=call.settings.policies)
+        if hasattr(call.options, "seeds"):
+            settings = replace(settings, seeds=call.settings.seeds)
         save_run(call.out, run.preset, settings, call.arguments)
 
 
@@ -221,6 +223,8 @@ def settings_of(options: Any, groups: list[str], base: Settings) -> Settings:
     if is_file(capture.lattice) and capture.lattice != base.dataset.capture.lattice:
         dataset = replace(dataset, capture=_with_own_viewpoints(capture, options, base))
     settings = replace(settings, dataset=dataset, policies=_policies(options, base))
+    if getattr(options, "seeds", None) is not None:
+        settings = replace(settings, seeds=options.seeds)
     encoder = absolute(getattr(options, "encoder", None) or settings.classifier.encoder)
     settings = replace(settings, classifier=replace(settings.classifier, encoder=encoder))
     seed = getattr(options, "seed", None)

@@ -2,12 +2,19 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 from mevs_jax.cli.parsing import Invocation, keep_settings
+
+if TYPE_CHECKING:
+    from jax.sharding import Mesh
+
+    from train.starting_weights import StartingWeights
 
 
 def run(call: Invocation) -> None:
     """All stages, one after the other."""
-    from eval import stages
+    from eval import seeds, stages
     from eval.walks.own_policies import load_policies
     from train.own_code import load_own
     from train.tasks.classifier import starting_weights
@@ -17,12 +24,25 @@ def run(call: Invocation) -> None:
     load_policies(call.settings.policies)  # so that an error in a policy is found before anything is computed
     if classifier.encoder:
         load_own(classifier.encoder, "--encoder")
+    seeds.check_seeds(call.settings)
     stages.policies_of(call.settings, stages.make_data(call.settings, call.out))
-    stages.train(call.settings, call.out, start)
+    _train(call, start)
     evaluate(call)
     if not call.settings.classifier.encoder:  # of which no trained system can be made
         print(f"Trained system: {stages.make_system(call.settings, call.out).absolute()}")
     report(call)
+
+
+def _train(call: Invocation, start: StartingWeights | None, mesh: Mesh | None = None) -> None:
+    """Both networks, from one seed or several."""
+    from eval import seeds, stages
+
+    seeds.check_seeds(call.settings)
+    if call.settings.seeds == 1:
+        stages.train(call.settings, call.out, start, mesh)
+        return
+    seeds.make_folders(call.settings, call.preset, call.out, call.arguments)
+    seeds.train(call.settings, call.out, start, mesh, call.options.seeds_at_once)
 
 
 def data(call: Invocation) -> None:
@@ -54,7 +74,7 @@ def train(call: Invocation) -> None:
                 held.enter_context(locked(call.out, " ".join(["mevs", *call.arguments])))
                 keep_settings(call)
         start = starting_weights(call.options.pretrained, classifier.network, classifier.encoder)
-        stages.train(call.settings, call.out, start, device_mesh(call.options.model_devices))
+        _train(call, start, device_mesh(call.options.model_devices))
 
 
 def sweep(call: Invocation) -> None:
@@ -85,6 +105,20 @@ def evaluate(call: Invocation) -> None:
     )
     print(f"After two views: {after_two}")
     print(f"Metrics: {call.out / 'metrics.json'}")
+    if call.settings.seeds > 1:
+        _print_seeds(call)
+
+
+def _print_seeds(call: Invocation) -> None:
+    from eval import seeds
+
+    found = seeds.evaluate(call.settings, call.out)
+    print(f"Over {found['seeds']} trainings, after two views, less random (95 % for other objects and trainings):")
+    for row in found["rows"]:
+        if row["views"] == 2 and row["policy"] in ("predicted_entropy", "information_gain"):
+            low, high = row["difference_over_both"]
+            print(f"  {row['title']}: {100 * row['difference']:+.1f} points [{100 * low:+.1f}, {100 * high:+.1f}]")
+    print(f"Means over trainings: {call.out / 'seeds.csv'}")
 
 
 def report(call: Invocation) -> None:

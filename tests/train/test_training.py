@@ -28,7 +28,7 @@ from train.loop import fit, load_best
 from train.optimiser import OptimiserConfig, descent, learning_rate
 from train.preemption import Preempted
 from train.starting_weights import weights_from_network
-from train.step import abstract_state
+from train.step import abstract_state, samples_before
 from train.tasks.entropy import EntropyTask
 
 SETTINGS = replace(
@@ -174,6 +174,16 @@ def test_networks_of_another_size_are_described(trained, data):
         load_best(replace(classify, network_config=replace(classify.network_config, width=16)), trained / "classifier")
     with pytest.raises(DataError, match="no trained classifier in"):
         load_best(classify, trained / "nothing")
+
+
+def test_schedules_end_where_they_are_beyond_two_thousand_million_samples():
+    task = EntropyTask.of(TINY.entropy, 6, 5.0, TINY.dataset.capture)
+    rate = learning_rate(OptimiserConfig(batch_size=64, schedule="steps"), 0)
+    for step in (2**25, 2**26, 2**31 - 1):
+        samples = samples_before(jnp.int32(step), 64)
+        assert int(samples) == min(step * 64, (2**31 - 1) // 64 * 64)
+        assert float(task.momentum(samples)) == pytest.approx(0.01)
+        assert float(rate(jnp.int32(step), 1e-3)) == pytest.approx(1e-5)
 
 
 def test_schedules():

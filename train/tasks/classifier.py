@@ -122,6 +122,10 @@ class ClassifierTask:
         )
 
     @property
+    def group(self) -> int:
+        return 1
+
+    @property
     def metrics(self) -> tuple[str, ...]:
         return ("accuracy", "loss")
 

@@ -76,6 +76,10 @@ class EntropyTask:
         )
 
     @property
+    def group(self) -> int:
+        return 1
+
+    @property
     def metrics(self) -> tuple[str, ...]:
         return ("loss",)
 

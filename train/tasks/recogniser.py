@@ -108,6 +108,10 @@ class RecogniserTask:
         )
 
     @property
+    def group(self) -> int:
+        return self.optimiser.views_per_object
+
+    @property
     def metrics(self) -> tuple[str, ...]:
         return ("accuracy", "fused_accuracy", "unposed_accuracy", "loss")
 

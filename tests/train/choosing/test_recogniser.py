@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+import os
 import re
+import subprocess
+import sys
 from dataclasses import replace
 from functools import partial
 from itertools import islice
+from pathlib import Path
 
 import jax
 import jax.numpy as jnp
@@ -23,7 +27,10 @@ from mevs_jax.models import Recogniser
 from mevs_jax.viewpoints import viewpoint_lattice
 from train.choosing.looks import see_changed, see_rotated
 from train.choosing.stages import Stages, check_learned
-from train.loop import load_best, steps_of_an_epoch
+from train.devices import check_batch, device_mesh
+from train.kept import summary_of
+from train.loop import fit, load_best, steps_of_an_epoch, validation_set
+from train.step import part_of
 from train.tasks.recogniser import RecogniserTask
 
 
@@ -138,3 +145,45 @@ def test_a_study_that_cannot_be_made_is_refused(changes, said):
     check_learned(TINY.learned, 6)
     with pytest.raises(DataError, match=re.escape(said)):
         check_learned(replace(TINY.learned, **changes), 6)
+
+
+def test_parts_of_a_batch_and_shares_of_devices_hold_whole_objects(turned):
+    optimiser = replace(TINY.learned.recogniser.optimiser, batch_size=16, views_per_object=4, parts=2)
+    config = replace(TINY.learned.recogniser, optimiser=optimiser)
+    statistics = load_statistics(turned)
+    task = RecogniserTask.of(config, 10, statistics.camera)
+    objects = np.repeat(np.arange(4), 4)
+    parts = np.asarray(part_of(jnp.asarray(objects), 2, task.group))
+    assert [sorted(set(part.tolist())) for part in parts] == [[0, 2], [1, 3]]
+    assert (parts.reshape(2, 2, 4) == parts.reshape(2, 2, 4)[..., :1]).all()
+    check_batch(task, device_mesh())
+    with pytest.raises(DataError, match="16 views, 4 of an object, cannot be cut into 8 parts of whole objects"):
+        check_batch(replace(task, optimiser=replace(optimiser, parts=8)), device_mesh())
+    for batch, weights in validation_set(task, turned, statistics, devices=8):
+        shares = batch["label"].reshape(8, -1, task.optimiser.validation_views)
+        assert (shares == shares[..., :1]).all()
+        assert len(weights) == len(batch["label"])
+
+
+@pytest.mark.slow
+def test_eight_devices_train_the_recogniser(turned, tmp_path):
+    """The data set has fewer validation objects than there are devices."""
+    program = (
+        "import sys, jax; jax.config.update('jax_num_cpu_devices', 8); from pathlib import Path\n"
+        "from data_pipeline.dataset.statistics import load_statistics; from eval.settings import TINY\n"
+        "from train.loop import fit; from train.tasks.recogniser import RecogniserTask\n"
+        "data, statistics = Path(sys.argv[1]), load_statistics(Path(sys.argv[1]))\n"
+        "task = RecogniserTask.of(TINY.learned.recogniser, 10, statistics.camera)\n"
+        "assert len(jax.devices()) == 8; fit(task, data, statistics, Path(sys.argv[2]))\n"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", program, str(turned), str(tmp_path / "many")],
+        capture_output=True,
+        text=True,
+        env=os.environ | {"JAX_PLATFORMS": "cpu", "PYTHONPATH": str(Path(__file__).resolve().parents[3])},
+        timeout=600,
+    )
+    assert done.returncode == 0, done.stderr
+    statistics = load_statistics(turned)
+    alone = fit(RecogniserTask.of(TINY.learned.recogniser, 10, statistics.camera), turned, statistics, tmp_path / "one")
+    assert summary_of(tmp_path / "many")["best"]["loss"] == pytest.approx(alone["best"]["loss"], rel=0.05)

@@ -13,7 +13,8 @@ import numpy as np
 import pytest
 from flax import nnx
 
-import train.sweep
+import train.many.sweep
+import train.many.training
 from data_pipeline.dataset.statistics import load_statistics
 from data_pipeline.errors import DataError, Diverged
 from eval.report.sweep import sweep_table
@@ -21,9 +22,10 @@ from eval.stages import tasks, train_sweep
 from tests.train.scaling_worker import SETTINGS
 from train.devices import device_mesh
 from train.loop import fit, load_best, validate, validation_set
+from train.many.members import Member, Together, task_of
+from train.many.sweep import SweepConfig, draw_members, sweep
 from train.preemption import Preempted
 from train.step import TrainState, evaluate_step_of, initial_state
-from train.sweep import Member, SweepConfig, draw_members, sweep, task_of
 
 SWEEP = SweepConfig(members=4, learning_rate=(1e-5, 3e-4))
 """Low rates: what rounding does to a rectified unit grows with the rate."""
@@ -78,7 +80,7 @@ def test_a_stopped_sweep_ends_as_if_it_had_not_been(out, tmp_path, monkeypatch):
     statistics, task = load_statistics(out / "data"), task_named("entropy", out)
     task = replace(task, optimiser=replace(task.optimiser, patience=5, epochs=3))
     whole = sweep(task, out / "data", statistics, tmp_path / "whole", SWEEP)
-    real = train.sweep.train_batches
+    real = train.many.training.train_batches
 
     def told_to_end(*arguments, **options):
         for number, batch in enumerate(real(*arguments, **options)):
@@ -86,7 +88,7 @@ def test_a_stopped_sweep_ends_as_if_it_had_not_been(out, tmp_path, monkeypatch):
                 os.kill(os.getpid(), signal.SIGTERM)
             yield batch
 
-    monkeypatch.setattr(train.sweep, "train_batches", told_to_end)
+    monkeypatch.setattr(train.many.training, "train_batches", told_to_end)
     with pytest.raises(Preempted, match="after epoch 1"):
         sweep(task, out / "data", statistics, tmp_path / "stopped", SWEEP)
     monkeypatch.undo()
@@ -102,7 +104,7 @@ def test_a_member_whose_loss_is_no_number_leaves_the_others_alone(out, tmp_path,
     statistics, task = load_statistics(out / "data"), task_named("classifier", out)
     task = replace(task, optimiser=replace(task.optimiser, schedule="constant", epochs=1))
     chosen = [Member(rate, 1e-3, 0.0, 1.0, 7) for rate in (1e-4, 1e30)]
-    monkeypatch.setattr(train.sweep, "draw_members", lambda *_: chosen)
+    monkeypatch.setattr(train.many.sweep, "draw_members", lambda *_: chosen)
     members = sweep(task, out / "data", statistics, tmp_path / "sweep", SWEEP)
     assert [member.diverged for member in members] == [False, True]
     assert "diverged" in sweep_table(members)
@@ -125,9 +127,10 @@ def test_members_that_diverge_late_are_never_the_best():
     ]
     means = {"loss": np.ones(4), "accuracy": np.array([1, np.nan, 1, 1])}
     checked = {"loss": np.array([0.01, 0.01, np.inf, 0.35])}
-    progress = {"epoch": 2, "histories": [[] for _ in members]}
+    together = Together(members, epoch_steps=1, epoch=2, histories=[[] for _ in members])
     finite = np.array([False, True, True, True])
-    after, better = train.sweep._after_epoch(members, np.ones(4, bool), means, checked, finite, progress)
+    better = together.after_epoch(np.ones(4, bool), means, checked, finite)
+    after = together.members
     assert [member.diverged for member in after] == [True, True, True, False]
     np.testing.assert_array_equal(better, [False, False, False, True])
     assert min(after, key=lambda member: member.loss) is after[3]

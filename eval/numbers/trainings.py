@@ -1,0 +1,135 @@
+"""Numbers over several trainings: means with intervals over objects, and over objects and trainings."""
+
+from __future__ import annotations
+
+import csv
+import io
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float
+from scipy import stats
+
+from data_pipeline.errors import DataError
+from eval.numbers.comparison import intervals
+from eval.numbers.policies import EvaluationInputs
+from eval.numbers.study import BASELINE, Setting, exactly_random
+from eval.walks.grid import Results, run_grid
+from eval.walks.ladder import Rung, ladder
+from eval.walks.own_policies import OwnPolicy, own_rungs
+from mevs_jax.selection import ViewTable
+
+LEVEL = 0.95
+
+
+def interval_of_both(values: Float[np.ndarray, "*cells trainings objects"]) -> Float[np.ndarray, "*cells 2"]:
+    """95 % intervals of means for other objects *and* other trainings, of values of the same objects in every training.
+
+    The variance of the mean has two parts: the variance of the objects' means over trainings, divided by the number of objects;
+    and that of the trainings' means over objects, divided by the number of trainings. The result is a t interval with
+    Satterthwaite's degrees of freedom. A bootstrap that resamples both is too narrow for a few trainings: three of them resampled
+    have two thirds of their variance, and it does not know how uncertain a variance of three numbers is (a test compares both).
+    """
+    *_, trainings, objects = values.shape
+    mean = values.mean(axis=(-2, -1))
+    parts = (
+        (values.mean(axis=-2).var(axis=-1, ddof=1) / objects, objects - 1),
+        (values.mean(axis=-1).var(axis=-1, ddof=1) / trainings, trainings - 1),
+    )
+    variance = sum(part for part, _ in parts)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        freedom = variance**2 / sum(part**2 / degrees for part, degrees in parts)
+    half = np.where(variance > 0, stats.t.ppf((1 + LEVEL) / 2, np.nan_to_num(freedom, nan=1.0)), 0) * np.sqrt(variance)
+    return np.stack([mean - half, mean + half], axis=-1)
+
+
+def walks_of_all(
+    inputs: Sequence[EvaluationInputs], own: tuple[OwnPolicy, ...] = ()
+) -> tuple[tuple[Rung, ...], dict[str, Results]]:
+    """The grid of all trainings as one program: trainings × objects × start views × draws × policies × thresholds.
+
+    Args:
+        inputs: of each training, on the same objects.
+        own: further policies.
+
+    Returns:
+        The policies, and their results with a leading axis of trainings.
+
+    Raises:
+        DataError: if the trainings were evaluated on different objects.
+    """
+    first = inputs[0]
+    for other in inputs[1:]:
+        if other.tables.names != first.tables.names:
+            raise DataError("the trainings were evaluated on different objects; evaluate them again: mevs eval")
+    settings = [Setting.of(one.graph, one.validation, one.config) for one in inputs]
+    config, can_reach = settings[0].config, settings[0].can_reach
+    knowledge = jax.tree.map(lambda *leaves: jnp.stack(leaves), *(setting.knowledge for setting in settings))
+    logits, entropies = (
+        jnp.stack([jnp.asarray(getattr(one.tables, name)) for one in inputs], axis=1)
+        for name in ("logits", "predicted_entropy")
+    )
+    labels = jnp.asarray(first.tables.labels)
+    table = ViewTable(logits, entropies, jnp.asarray(first.tables.entropy), labels)
+    rungs = ladder(config.draws, own_rungs(own, first.graph, logits.shape[-1], config.draws))
+    results = run_grid(
+        jax.random.key(config.seed),
+        table,
+        first.graph,
+        knowledge,
+        rungs,
+        max_views=config.max_views,
+        reachable=settings[0].reachable,
+    )
+    results[BASELINE], _ = exactly_random(results[BASELINE], logits, labels, can_reach)
+    return rungs, results
+
+
+def rows_over_trainings(rungs: Sequence[Rung], results: Mapping[str, Results]) -> list[dict[str, Any]]:
+    """A row for each policy and number of views: accuracy and difference from random, with both kinds of interval."""
+    after = {name: np.moveaxis(np.asarray(result.after, float), -1, 0) for name, result in results.items()}
+    rows = []
+    for rung in rungs:
+        found, gain = after[rung.policy], after[rung.policy] - after[BASELINE]
+        columns = {
+            "accuracy": found.mean(axis=(-2, -1)),
+            "over_objects": intervals(found.mean(axis=-2)),
+            "over_both": interval_of_both(found),
+            "difference": gain.mean(axis=(-2, -1)),
+            "difference_over_objects": intervals(gain.mean(axis=-2)),
+            "difference_over_both": interval_of_both(gain),
+            "each": found.mean(axis=-1),
+            "difference_each": gain.mean(axis=-1),
+        }
+        for step in range(len(found)):
+            numbers = {name: np.asarray(column[step], float).tolist() for name, column in columns.items()}
+            rows.append({"policy": rung.policy, "title": rung.title, "knows": rung.knows, "views": step + 1} | numbers)
+    return rows
+
+
+def csv_over_trainings(rows: Sequence[Mapping[str, Any]]) -> bytes:
+    """The rows as CSV, with a column for each end of an interval and for each training."""
+    text = io.StringIO()
+    flat = [dict(_flat(row)) for row in rows]
+    writer = csv.DictWriter(text, list(flat[0]), lineterminator="\n")
+    writer.writeheader()
+    writer.writerows(flat)
+    return text.getvalue().encode()
+
+
+def _flat(row: Mapping[str, Any]) -> list[tuple[str, Any]]:
+    found: list[tuple[str, Any]] = []
+    for name, value in row.items():
+        if not isinstance(value, list):
+            found.append((name, value.lstrip("— ") if name == "title" else value))
+        elif name.endswith("each"):
+            found += [
+                (f"{name.removesuffix('each') or 'accuracy_'}training_{number}", one)
+                for number, one in enumerate(value)
+            ]
+        else:
+            found += [(f"{name}_{end}", one) for end, one in zip(("low", "high"), value, strict=True)]
+    return found

@@ -1,0 +1,130 @@
+"""A run from several seeds (`--seeds K`): the run itself, and a run of its own for each further seed in `seeds/`.
+
+All have the same data, settings and objects, and differ in the seeds of weights, augmentation, batches and dropout. The networks
+of all seeds are trained as one job, and walked as one program. `seeds.json` and `seeds.csv` hold means over the trainings.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import jax
+
+from data_pipeline.dataset.statistics import load_statistics
+from data_pipeline.errors import DataError
+from data_pipeline.progress import console
+from eval import stages
+from eval.numbers.policies import EvaluationInputs
+from eval.numbers.trainings import csv_over_trainings, rows_over_trainings, walks_of_all
+from eval.run_file import save_run
+from eval.settings import Settings
+from train.chance import warn_of_chance
+from train.kept import keep_beside, kept_json, made_by
+from train.many.members import SweepTask
+from train.many.seeds import train_seeds
+from train.optimiser import OptimiserConfig
+from train.starting_weights import StartingWeights
+
+LARGEST = 1000
+"""Largest number of seeds of a run."""
+
+
+def seed_folder(out: Path, number: int) -> Path:
+    """The run of a seed; the first is the run itself."""
+    return out if number == 0 else out / "seeds" / str(number)
+
+
+def seed_settings(settings: Settings, number: int) -> Settings:
+    """The settings of the run of a seed."""
+
+    def shifted(config: OptimiserConfig) -> OptimiserConfig:
+        return replace(config, seed=config.seed + number, data_seed=config.data_seed + number)
+
+    classifier = replace(settings.classifier, optimiser=shifted(settings.classifier.optimiser))
+    entropy = replace(settings.entropy, optimiser=shifted(settings.entropy.optimiser))
+    return replace(settings, classifier=classifier, entropy=entropy, seeds=1)
+
+
+def check_seeds(settings: Settings) -> None:
+    """Raises `DataError` for an impossible number of seeds."""
+    if not 1 <= settings.seeds <= LARGEST:
+        raise DataError(f"--seeds {settings.seeds} is not from 1 to {LARGEST}; choose another")
+
+
+def make_folders(settings: Settings, preset: str, out: Path, arguments: Sequence[str]) -> None:
+    """Makes a run of its own for each further seed, which has the data of the run."""
+    for number in range(1, settings.seeds):
+        folder = seed_folder(out, number)
+        folder.mkdir(parents=True, exist_ok=True)
+        if not (folder / "data").exists():
+            (folder / "data").symlink_to(Path("..") / ".." / "data", target_is_directory=True)
+        save_run(folder, preset, seed_settings(settings, number), list(arguments))
+
+
+def train(
+    settings: Settings,
+    out: Path,
+    start: StartingWeights | None = None,
+    mesh: jax.sharding.Mesh | None = None,
+    at_once: int = 0,
+) -> None:
+    """Trains both networks from all seeds.
+
+    Args:
+        settings: of the run.
+        out: folder of the run.
+        start: initial weights of the classifiers; random if None.
+        mesh: devices to train on; all if None.
+        at_once: largest number of seeds that are trained together, which bounds memory; 0: all.
+    """
+    statistics, numbers = load_statistics(out / "data"), range(settings.seeds)
+    size = at_once or settings.seeds
+    for place, (name, weights) in enumerate((("classifier", start), ("entropy", None))):
+        tasks: list[SweepTask] = [
+            stages.tasks(seed_settings(settings, number), statistics)[place] for number in numbers
+        ]
+        folders, work = [seed_folder(out, number) / name for number in numbers], out / "seeds" / f"{name}_together"
+        option, summaries = f"--{name}.optimiser.learning-rate", []
+        for first in range(0, settings.seeds, size):
+            part = slice(first, first + size)
+            summaries += train_seeds(tasks[part], out / "data", statistics, folders[part], work, weights, mesh, option)
+        for number, summary in enumerate(summaries):
+            best = ", ".join(f"{key} {value:.4f}" for key, value in summary["best"].items())
+            console.print(
+                f"{tasks[number].name}, seed {number}: best epoch {summary['best_epoch']} of {summary['epoch']}, "
+                f"validation {best}"
+            )
+            warn_of_chance(tasks[number], summary, statistics)
+
+
+def evaluate(settings: Settings, out: Path) -> dict[str, Any]:
+    """Evaluates the run of every seed, and all together; returns what `seeds.json` holds."""
+    runs = [seed_folder(out, number) for number in range(settings.seeds)]
+    for number, run in enumerate(runs):
+        stages.evaluate(seed_settings(settings, number), run)
+    statistics = load_statistics(out / "data")
+    own = stages.policies_of(settings, statistics)
+    identity = {
+        "evaluation": vars(settings.evaluation),
+        "made_by": [made_by(statistics, run / "classifier", run / "entropy") for run in runs],
+        "policies": [policy.identity for policy in own],
+    }
+
+    def compute() -> dict[str, Any]:
+        inputs = [replace(EvaluationInputs.of_run(run), config=settings.evaluation) for run in runs]
+        rungs, results = walks_of_all(inputs, own)
+        return {
+            "seeds": settings.seeds,
+            "objects": len(inputs[0].tables.names),
+            "single_view": [
+                float((one.tables.logits.argmax(-1) == one.tables.labels[:, None]).mean()) for one in inputs
+            ],
+            "rows": rows_over_trainings(rungs, results),
+        }
+
+    found = kept_json(out / "seeds.json", identity, compute)
+    keep_beside(out / "seeds.csv", csv_over_trainings(found["rows"]))
+    return found

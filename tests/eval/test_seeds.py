@@ -1,0 +1,81 @@
+"""A run from several seeds is the runs of each seed, and means over them."""
+
+from __future__ import annotations
+
+import csv
+import json
+import os
+import shutil
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from data_pipeline.errors import DataError
+from eval import seeds, stages
+from eval.run_file import load_run, save_run
+from eval.settings import TINY, Settings
+
+SETTINGS = replace(TINY, seeds=2)
+
+
+def run(settings: Settings, out: Path) -> dict:
+    save_run(out, "tiny", settings, [])
+    seeds.make_folders(settings, "tiny", out, [])
+    seeds.train(settings, out)
+    return seeds.evaluate(settings, out)
+
+
+@pytest.mark.slow
+def test_the_run_of_a_seed_equals_a_run_from_that_seed_alone(data, tmp_path):
+    together, alone = tmp_path / "together", tmp_path / "alone"
+    for out in (together, alone):
+        out.mkdir()
+        shutil.copytree(data, out / "data")
+    found = run(SETTINGS, together)
+    one = seeds.seed_settings(SETTINGS, 1)
+    assert one.classifier.optimiser.seed == one.entropy.optimiser.data_seed == 1
+    assert (one.evaluation, one.dataset) == (SETTINGS.evaluation, SETTINGS.dataset)
+    stages.train(one, alone)
+    metrics = stages.evaluate(one, alone)
+    of_seed = json.loads((together / "seeds" / "1" / "metrics.json").read_text())
+    for name, policy in metrics["policies"].items():
+        assert of_seed["policies"][name]["after_views"] == pytest.approx(policy["after_views"], abs=1e-5), name
+    for row in found["rows"]:
+        expected = metrics["policies"][row["policy"]]["after_views"][row["views"] - 1]
+        assert row["each"][1] == pytest.approx(expected, abs=1e-5)
+    assert found["single_view"][1] == pytest.approx(metrics["single_view"]["accuracy"])
+    with (together / "seeds.csv").open(newline="") as file:
+        rows = list(csv.DictReader(file))
+    assert len(rows) == len(found["rows"])
+
+    page = stages.report(SETTINGS, "tiny", together).read_text()
+    assert "Over 2 trainings" in page
+    kept = load_run(together / "seeds" / "1")
+    assert kept is not None
+    page = stages.report(kept.settings, "tiny", together / "seeds" / "1").read_text()
+    assert "Over 2 trainings" not in page
+    before = {path: path.stat().st_mtime_ns for path in together.rglob("*.json")}
+    assert run(SETTINGS, together) == found  # nothing is done again
+    assert {path: path.stat().st_mtime_ns for path in together.rglob("*.json")} == before
+    more = run(replace(SETTINGS, seeds=3), together)
+    assert [row["each"][:2] for row in more["rows"]] == [row["each"] for row in found["rows"]]
+
+
+def test_impossible_numbers_of_seeds_are_refused():
+    for count in (0, -1, 10_000):
+        with pytest.raises(DataError, match=f"--seeds {count} is not from 1 to 1000"):
+            seeds.check_seeds(replace(TINY, seeds=count))
+
+
+def test_processes_of_one_number_try_a_folder_at_once(tmp_path, monkeypatch):
+    """In containers every process is number 1."""
+    made = []
+    real = os.open
+    monkeypatch.setattr(os, "getpid", lambda: 1)
+    monkeypatch.setattr(os, "open", lambda path, *rest: made.append(path) or real(path, *rest))
+    for _ in range(3):
+        stages.check_output(tmp_path)
+    tried = [path for path in made if ".probe." in str(path)]
+    assert len(set(tried)) == len(tried) == 3
+    assert not list(tmp_path.iterdir())

@@ -1,0 +1,212 @@
+"""Networks from several seeds are those that are trained from each seed alone."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import jax
+import numpy as np
+import pytest
+from flax import nnx
+
+import train.many.training
+from data_pipeline.dataset.batches import train_batches
+from data_pipeline.dataset.statistics import load_statistics
+from data_pipeline.errors import DataError, Diverged
+from eval.settings import TINY
+from eval.stages import tasks
+from tests.train.scaling_worker import SETTINGS
+from tests.train.test_training import lines
+from train.devices import device_mesh
+from train.kept import config_of, summary_of
+from train.loop import fit, load_best
+from train.many.members import Member, member_of, task_of
+from train.many.seeds import train_seeds
+from train.many.trainers import TRAINERS
+from train.tasks.recogniser import RecogniserTask
+
+ROOT = Path(__file__).resolve().parents[3]
+
+
+def of_seeds(data, name: str, seeds=(3, 4)):
+    """The same task from several seeds."""
+    statistics = load_statistics(data)
+    if name == "recogniser":
+        optimiser = replace(TINY.learned.recogniser.optimiser, learning_rate=1e-4)
+        task = RecogniserTask.of(replace(TINY.learned.recogniser, optimiser=optimiser), 10, statistics.camera)
+    else:
+        task = tasks(SETTINGS, statistics)[("classifier", "entropy").index(name)]
+    task = replace(task, optimiser=replace(task.optimiser, epochs=2))
+    return [replace(task, optimiser=replace(task.optimiser, seed=seed, data_seed=seed)) for seed in seeds]
+
+
+@pytest.mark.parametrize(
+    "name", ["entropy", *(pytest.param(name, marks=pytest.mark.slow) for name in ("classifier", "recogniser"))]
+)
+def test_every_seed_ends_as_it_does_alone(name, request, tmp_path):
+    data = request.getfixturevalue("turned" if name == "recogniser" else "data")
+    statistics, each = load_statistics(data), of_seeds(data, name)
+    folders = [tmp_path / str(number) for number in range(2)]
+    summaries = train_seeds(each, data, statistics, folders, tmp_path / "work")
+    assert not (tmp_path / "work").exists()
+    alone = fit(each[1], data, statistics, tmp_path / "alone")
+    assert config_of(folders[1]) == config_of(tmp_path / "alone")
+    assert summaries[1] == summary_of(folders[1])
+    for key in set(alone) - {"seconds", "best", "best_loss"}:
+        assert summaries[1][key] == alone[key], key
+    assert summaries[1]["best"] == pytest.approx(alone["best"], rel=1e-5)
+    assert summaries[0]["best_loss"] != summaries[1]["best_loss"]
+    for mine, theirs in zip(lines(folders[1]), lines(tmp_path / "alone"), strict=True):
+        assert {name: mine[name] for name in mine} == pytest.approx({name: theirs[name] for name in mine}, rel=1e-4)
+    networks = [nnx.state(load_best(each[1], folder), nnx.Param) for folder in (folders[1], tmp_path / "alone")]
+    mine, theirs = (jax.tree_util.tree_leaves_with_path(network) for network in networks)
+    for (place, weights), (_, expected) in zip(mine, theirs, strict=True):
+        if "['key']['bias']" not in jax.tree_util.keystr(place):  # of attention, which has no gradient but rounding
+            np.testing.assert_allclose(weights, expected, rtol=1e-5, atol=1e-6, err_msg=jax.tree_util.keystr(place))
+
+
+def test_both_ways_of_training_members_take_the_same_steps(data):
+    """Twenty steps of two members, each on its own batches; the second stops half way."""
+    each = of_seeds(data, "entropy")
+    members, mesh = [member_of(task) for task in each], device_mesh()
+    found = []
+    for way in ("at once", "in turn"):
+        trainer = TRAINERS[way](each[0], members, mesh, 10, True)
+        streams = [train_batches(data, task.batches) for task in each]
+        for step in range(20):
+            drawn = [next(stream) for stream in streams]
+            batch = {name: np.stack([one[name] for one in drawn]) for name in drawn[0]}
+            trainer.train(np.array([True, step < 10]), batch)
+        trainer.keep(np.array([True, False]))
+        found.append((trainer.saved(), trainer.sums(), trainer.finite()))
+    (at_once, sums, finite), (in_turn, turned_sums, turned_finite) = found
+    assert finite.tolist() == turned_finite.tolist() == [True, True]
+    assert np.asarray(at_once[0].step).tolist() == np.asarray(in_turn[0].step).tolist() == [20, 10]
+    for name, values in sums.items():
+        np.testing.assert_allclose(values, turned_sums[name], rtol=1e-5)
+    # A bias before batch norm has no gradient but rounding, along which Adam walks by its learning rate.
+    step = 20 * each[0].optimiser.learning_rate
+    for mine, theirs in zip(jax.tree.leaves(at_once[1]), jax.tree.leaves(in_turn[1]), strict=True):
+        np.testing.assert_allclose(mine[0], theirs[0], rtol=1e-4, atol=step if np.ndim(mine[0]) < 2 else 0.1 * step)
+
+
+def test_an_interrupted_training_of_seeds_goes_on(data, tmp_path, monkeypatch):
+    """Interrupted after the first epoch, and once more while the networks are written."""
+    statistics, each = load_statistics(data), of_seeds(data, "entropy", seeds=(0, 1))
+    folders, real = [tmp_path / "0", tmp_path / "1"], train.many.training.train_batches
+    monkeypatch.setattr(
+        train.many.training,
+        "train_batches",
+        lambda *given, first_step=0: _until(real(*given, first_step=first_step), 5 if first_step == 0 else 100),
+    )
+    with pytest.raises(KeyboardInterrupt):
+        train_seeds(each, data, statistics, folders, tmp_path / "work")
+    monkeypatch.undo()
+    written = []
+
+    def export(task, of, index, *rest):
+        if written:
+            raise KeyboardInterrupt
+        written.append(of.members[index])
+        return train.many.members.export_member(task, of, index, *rest)
+
+    monkeypatch.setattr(train.many.seeds, "export_member", export)
+    with pytest.raises(KeyboardInterrupt):
+        train_seeds(each, data, statistics, folders, tmp_path / "work")
+    monkeypatch.undo()
+    assert (folders[0] / "summary.json").exists()
+    assert not (folders[1] / "summary.json").exists()
+    summaries = train_seeds(each, data, statistics, folders, tmp_path / "work")
+    whole = train_seeds(each, data, statistics, [tmp_path / "2", tmp_path / "3"], tmp_path / "work")
+    assert [one["best"] for one in summaries] == [one["best"] for one in whole]
+    assert train_seeds(each, data, statistics, folders, tmp_path / "work") == summaries  # not trained again
+
+
+def _until(batches, steps: int):
+    for number, batch in enumerate(batches):
+        if number == steps:
+            raise KeyboardInterrupt
+        yield batch
+
+
+@pytest.mark.slow
+def test_a_seed_that_diverges_is_named_and_the_others_are_kept(data, tmp_path, monkeypatch):
+    statistics, each = load_statistics(data), of_seeds(data, "entropy", seeds=(0, 1))
+    folders = [tmp_path / "0", tmp_path / "1"]
+    real = train.many.trainers.InTurn.finite
+    monkeypatch.setattr(train.many.trainers.InTurn, "finite", lambda self: real(self) & np.array([True, False]))
+    with pytest.raises(
+        Diverged, match=r"diverged from seed 1; to train it again, lower --rate .* choose another --out"
+    ):
+        train_seeds(each, data, statistics, folders, tmp_path / "work", rate_option="--rate")
+    assert (folders[0] / "summary.json").exists()
+    assert not folders[1].exists()
+
+
+def test_a_run_with_other_settings_is_refused(data, tmp_path):
+    statistics, each = load_statistics(data), of_seeds(data, "entropy", seeds=(0, 1))
+    folders = [tmp_path / "0", tmp_path / "1"]
+    folders[1].mkdir()
+    (folders[1] / "latest").mkdir()
+    (folders[1] / "config.json").write_text(json.dumps({"task": {}, "data": "", "start": None}))
+    with pytest.raises(DataError, match="holds a network trained with other settings"):
+        train_seeds(each, data, statistics, folders, tmp_path / "work")
+
+
+def test_a_member_trains_as_its_task_says(data, turned):
+    for name in ("classifier", "entropy", "recogniser"):
+        (task,) = of_seeds(turned if name == "recogniser" else data, name, seeds=(7,))
+        assert task_of(task, member_of(task)) == task
+    changed = task_of(task, Member(1e-2, 0.5, 0.0, 1.0, 9, data_seed=2))
+    optimiser = changed.optimiser
+    assert (optimiser.learning_rate, optimiser.weight_decay, optimiser.seed, optimiser.data_seed) == (1e-2, 0.5, 9, 2)
+
+
+ON_DEVICES = """
+import json, sys
+import jax
+jax.config.update("jax_num_cpu_devices", 4)
+import numpy as np
+from tests.train.many.test_seeds import of_seeds
+from tests.train.scaling_worker import COLLECTIVES
+from data_pipeline.dataset.batches import train_batches
+from train.devices import device_mesh
+from train.many.members import member_of
+from train.many.trainers import AtOnce, way_for
+from pathlib import Path
+
+data = Path(sys.argv[1])
+each = of_seeds(data, "entropy", seeds=range(4))
+mesh = device_mesh()
+assert way_for(mesh) == "at once"
+trainer = AtOnce(each[0], [member_of(task) for task in each], mesh, 10, True)
+streams = [train_batches(data, task.batches) for task in each]
+losses = []
+for step in range(4):
+    drawn = [next(stream) for stream in streams]
+    batch = {name: np.stack([one[name] for one in drawn]) for name in drawn[0]}
+    losses.append(np.asarray(trainer.train(np.ones(4, bool), batch)).tolist())
+program = trainer._train.lower(np.ones(4, bool), trainer.saved()[0], batch, trainer._hyper).compile().as_text()
+print(json.dumps({"losses": losses, "said": COLLECTIVES.findall(program)}))
+"""
+
+
+@pytest.mark.slow
+def test_devices_train_a_seed_each_and_say_nothing_to_each_other(data):
+    environment = os.environ | {"JAX_PLATFORMS": "cpu", "PYTHONPATH": str(ROOT)}
+    done = subprocess.run(
+        [sys.executable, "-c", ON_DEVICES, str(data)], capture_output=True, text=True, env=environment, timeout=600
+    )
+    assert done.returncode == 0, done.stderr
+    found = json.loads(done.stdout)
+    assert found["said"] == []
+    each = of_seeds(data, "entropy", seeds=range(4))
+    trainer = TRAINERS["in turn"](each[2], [member_of(each[2])], device_mesh(), 10, False)
+    stream = train_batches(data, each[2].batches)
+    alone = [float(trainer.train(np.ones(1, bool), next(stream))) for _ in range(4)]
+    np.testing.assert_allclose([losses[2] for losses in found["losses"]], alone, rtol=1e-4)

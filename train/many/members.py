@@ -1,0 +1,175 @@
+"""Networks that are trained together: what they differ in, their results, and each as a run of its own."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import asdict, dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from data_pipeline.dataset.statistics import DatasetStatistics
+from data_pipeline.files import check_of_file, keep_checks, keep_json, write_text
+from train.checkpoints import Checkpoints
+from train.finite import not_finite
+from train.loop import identity_of
+from train.step import Task, initial_state
+from train.tasks.classifier import ClassifierTask
+from train.tasks.entropy import EntropyTask
+from train.tasks.recogniser import RecogniserTask
+
+SweepTask = ClassifierTask | EntropyTask | RecogniserTask
+
+
+@dataclass(frozen=True)
+class Member:
+    """One network and its result.
+
+    Attributes:
+        data_seed: seed of its batches.
+        best: validation metrics of the best epoch.
+        epochs: number of epochs trained.
+        diverged: whether a metric or a weight became infinite or NaN; such a member is never the best.
+    """
+
+    learning_rate: float
+    weight_decay: float
+    dropout: float
+    augmentation: float
+    seed: int
+    best_epoch: int = 0
+    best: dict[str, float] | None = None
+    epochs: int = 0
+    diverged: bool = False
+    data_seed: int = 0
+
+    @property
+    def loss(self) -> float:
+        """Validation loss of the best epoch, by which members are compared; infinite if it diverged."""
+        return self.best["loss"] if self.best and not self.diverged else float("inf")
+
+    def is_training(self, patience: int) -> bool:
+        """Whether the member is still trained: it has not diverged, and improved within the last `patience` epochs."""
+        return not self.diverged and self.epochs - self.best_epoch < patience
+
+
+def member_of(task: SweepTask) -> Member:
+    """Returns the member that trains as `task` says."""
+    hyper, optimiser = task.hyperparameters, task.optimiser
+    return Member(
+        learning_rate=float(optimiser.learning_rate),
+        weight_decay=float(optimiser.weight_decay),
+        dropout=float(hyper.dropout),
+        augmentation=float(hyper.augmentation),
+        seed=optimiser.seed,
+        data_seed=optimiser.data_seed,
+    )
+
+
+def task_of(task: SweepTask, member: Member) -> SweepTask:
+    """Returns the task with which `train.loop.fit` trains the same network alone."""
+    optimiser = replace(
+        task.optimiser,
+        learning_rate=member.learning_rate,
+        weight_decay=member.weight_decay,
+        seed=member.seed,
+        data_seed=member.data_seed,
+    )
+    if isinstance(task, RecogniserTask):
+        return replace(task, optimiser=optimiser)
+    if isinstance(task, ClassifierTask):
+        image = replace(task.augmentation, strength=member.augmentation)
+        return replace(task, optimiser=optimiser, augmentation=image)
+    cloud = replace(task.augmentation, strength=member.augmentation)
+    network = replace(task.network_config, dropout=member.dropout)
+    return replace(task, optimiser=optimiser, augmentation=cloud, network_config=network)
+
+
+@dataclass
+class Together:
+    """Members while they are trained.
+
+    Attributes:
+        members: with their results so far.
+        epoch: number of epochs done.
+        seconds: training time so far.
+        histories: of each member, the metrics of every epoch.
+        best: weights and statistics of each member's best epoch, with a leading axis of members.
+        epoch_steps: number of steps of an epoch.
+    """
+
+    members: list[Member]
+    epoch_steps: int
+    epoch: int = 0
+    seconds: float = 0.0
+    histories: list[list[dict[str, float]]] = field(default_factory=list)
+    best: Any = None
+
+    def progress(self) -> dict[str, Any]:
+        """What a checkpoint holds beside arrays."""
+        members = [asdict(member) for member in self.members]
+        return {"epoch": self.epoch, "seconds": self.seconds, "histories": self.histories, "members": members}
+
+    def after_epoch(
+        self, training: np.ndarray, means: dict[str, Any], checked: dict[str, Any], finite: np.ndarray
+    ) -> np.ndarray:
+        """Takes the results of an epoch; returns for each member whether this is its best epoch so far.
+
+        Args:
+            training: whether each member was trained in this epoch.
+            means: training metrics by name, each (members,).
+            checked: validation metrics by name, each (members,).
+            finite: whether all weights of each member are finite.
+        """
+        better = np.zeros(len(self.members), bool)
+        for index in np.flatnonzero(training):
+            now = {name: float(values[index]) for name, values in checked.items()}
+            trained = {f"train/{name}": float(values[index]) for name, values in means.items()}
+            entry = {"epoch": self.epoch} | trained | {f"val/{name}": value for name, value in now.items()}
+            self.histories[index].append(entry)
+            member = replace(self.members[index], epochs=self.epoch)
+            if not_finite(trained | now) or not finite[index]:
+                member = replace(member, diverged=True)
+            elif now["loss"] < member.loss:
+                better[index] = True
+                member = replace(member, best=now, best_epoch=self.epoch)
+            self.members[index] = member
+        return better
+
+
+def export_member(task: Task, of: Together, index: int, statistics: DatasetStatistics, out: Path) -> dict[str, Any]:
+    """Writes a trained member in the form in which `train.loop.fit` stores a run; returns its summary.
+
+    Args:
+        task: with which it would be trained alone.
+        of: all members.
+        index: of the member.
+        statistics: those of the data set.
+        out: folder of the run.
+    """
+    member, steps = of.members[index], of.epoch_steps
+    _, state = initial_state(task, member.seed)
+    parameters, rest = jax.tree.map(lambda leaf: jnp.asarray(leaf[index]), of.best)
+    step = member.best_epoch * steps
+    state = replace(state, step=jnp.int32(step), parameters=parameters, statistics=rest)
+    summary = {
+        "epoch": member.epochs,
+        "best_loss": member.loss,
+        "best_epoch": member.best_epoch,
+        "best": member.best,
+        "seconds": of.seconds,
+        "steps": member.epochs * steps,
+        "start": "random weights",
+        "stopped_early": member.epochs < task.optimiser.epochs,
+    }
+    with Checkpoints(out) as checkpoints:
+        checkpoints.save("best", step, state, summary)
+    lines = [entry | {"step": entry["epoch"] * steps} for entry in of.histories[index]]
+    write_text(out / "metrics.jsonl", "".join(json.dumps(line) + "\n" for line in lines))
+    keep_checks(out, {"metrics.jsonl": check_of_file(out / "metrics.jsonl")})
+    keep_json(out / "config.json", identity_of(task, statistics))
+    keep_json(out / "summary.json", summary)
+    return summary
