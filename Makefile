@@ -30,7 +30,7 @@ bench: $(READY)  ## what is fast, beside its peers, in one run
 	$(BIN)/python benchmarks/points.py
 	$(BIN)/python benchmarks/capture.py
 	$(BIN)/python benchmarks/evaluation.py
-	$(BIN)/python benchmarks/sweep.py
+	$(BIN)/python benchmarks/members.py
 
 wheel: $(READY)  ## the library alone, as a wheel in dist/
 	$(BIN)/python -m pip wheel --quiet --disable-pip-version-check --no-deps --wheel-dir dist .

@@ -32,7 +32,6 @@ from eval.numbers.study import reachable_views, run_study
 from eval.rendering.policies import ascend_objects, ascent_study, load_ascent_scores
 from eval.report.html import ReportInputs
 from eval.report.page import is_current, read_history, write_report
-from eval.report.sweep import write_sweep_report
 from eval.run_file import plain
 from eval.settings import Settings
 from eval.system import USABLE, classifier_system, figures_of, identity_of, save_system, stored_system
@@ -49,8 +48,6 @@ from train.choosing.stages import Stages, check_learned
 from train.finite import check_results, place_not_finite
 from train.kept import keep_beside, kept, kept_json, made_by, summary_of
 from train.loop import fit, load_best
-from train.many.members import Member
-from train.many.sweep import sweep
 from train.starting_weights import StartingWeights
 from train.step import Task
 from train.tasks.classifier import ClassifierTask
@@ -100,17 +97,6 @@ def train(
             + f", {summary['seconds'] / 60:.1f} min"
         )
         warn_of_chance(task, summary, statistics)
-
-
-def train_sweep(settings: Settings, out: Path, mesh: jax.sharding.Mesh | None = None) -> tuple[Path, list[Member]]:
-    """Trains many configurations of one network together; returns the folder of the sweep and its members."""
-    statistics = load_statistics(out / "data")
-    name = settings.sweep.network
-    task = tasks(settings, statistics)[("classifier", "entropy").index(name)]
-    folder = out / "sweep" / name
-    members = sweep(task, out / "data", statistics, folder, settings.sweep, mesh)
-    write_sweep_report(members, folder)
-    return folder, members
 
 
 BY_VIEW = "classifier_by_view"

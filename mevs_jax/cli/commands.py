@@ -61,10 +61,10 @@ COMMANDS = {
     ),
     "sweep": Command(
         "train many configurations of one network as one program",
-        "WithSeed",
-        ("sweep", "classifier", "entropy"),
+        "SweepOptions",
+        ("sweep", "classifier", "entropy", "learned"),
         "stages:sweep",
-        tries=("classifier", "entropy"),
+        tries=("classifier", "entropy", "learned"),
     ),
     "eval": Command(
         "run every policy on every test object from every start view",

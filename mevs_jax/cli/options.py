@@ -37,6 +37,18 @@ class WithSeed(Options):
 
 
 @dataclass(frozen=True)
+class SweepOptions(WithSeed):
+    """Options of `mevs sweep`."""
+
+    grid: Annotated[tuple[str, ...], _arg("NAME=V,V ...")] = ()
+    """all combinations of these values instead of drawn ones, as learning-rate=1e-4,3e-4 weight-decay=0.01,0.05"""
+    seeds: Annotated[int | None, _arg("K", "1")] = None
+    """train each configuration from K seeds"""
+    adopt: Annotated[tyro.conf.FlagCreatePairsOff[bool], _arg("")] = False
+    """make the best network that of the run, and its hyper-parameters those of the run's settings"""
+
+
+@dataclass(frozen=True)
 class WithSeeds(WithSeed):
     """Commands that train or evaluate the networks of a run from several seeds."""
 

@@ -189,12 +189,13 @@ def keep_settings(call: Invocation) -> None:
     if run is None:
         save_run(call.out, call.preset, call.settings, call.arguments)
     else:
-        tried = [group for group in COMMANDS[call.name].tries if (call.out / group / "config.json").exists()]
+        made = {group: ("config.json", "metrics.json") for group in COMMANDS[call.name].tries}
+        tried = [group for group, files in made.items() if any((call.out / group / file).exists() for file in files)]
         groups = [group for group in call.groups if group not in tried]
         settings = replace(run.settings, **{group: getattr(call.settings, group) for group in groups})
         if hasattr(call.options, "policy"):
             settings = replace(settings, policies=call.settings.policies)
-        if hasattr(call.options, "seeds"):
+        if hasattr(call.options, "seeds") and "sweep" not in call.groups:
             settings = replace(settings, seeds=call.settings.seeds)
         save_run(call.out, run.preset, settings, call.arguments)
 
@@ -223,7 +224,10 @@ def settings_of(options: Any, groups: list[str], base: Settings) -> Settings:
     if is_file(capture.lattice) and capture.lattice != base.dataset.capture.lattice:
         dataset = replace(dataset, capture=_with_own_viewpoints(capture, options, base))
     settings = replace(settings, dataset=dataset, policies=_policies(options, base))
-    if getattr(options, "seeds", None) is not None:
+    if "sweep" in groups:
+        sweep = replace(settings.sweep, grid=getattr(options, "grid", ()) or settings.sweep.grid)
+        settings = replace(settings, sweep=replace(sweep, seeds=getattr(options, "seeds", None) or sweep.seeds))
+    elif getattr(options, "seeds", None) is not None:
         settings = replace(settings, seeds=options.seeds)
     encoder = absolute(getattr(options, "encoder", None) or settings.classifier.encoder)
     settings = replace(settings, classifier=replace(settings.classifier, encoder=encoder))

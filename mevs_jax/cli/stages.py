@@ -79,15 +79,21 @@ def train(call: Invocation) -> None:
 
 def sweep(call: Invocation) -> None:
     """A sweep over one network's hyperparameters."""
-    from eval import stages
+    from eval import sweeping
+    from eval.run_file import save_run
+    from train.many.sweep import best_of
 
-    folder, members = stages.train_sweep(call.settings, call.out)
-    best = min(members, key=lambda member: member.loss)
+    folder, members = sweeping.train_sweep(call.settings, call.out)
+    best = best_of(members)
     print(
         f"Best of {len(members)}: validation loss {best.loss:.4f} with learning rate {best.learning_rate:.2e}, weight decay "
         f"{best.weight_decay:.2e}, dropout {best.dropout:.2f}, augmentation {best.augmentation:.2f}"
     )
     print(f"All of them: {folder / 'members.md'}; the best network: {folder / 'network'}")
+    if call.options.adopt:
+        there, settings = sweeping.adopt(call.settings, call.out)
+        save_run(call.out, call.preset, settings, call.arguments)
+        print(f"The run has it now: {there}")
 
 
 def evaluate(call: Invocation) -> None:

@@ -195,6 +195,16 @@ def test_a_sweep_is_made_by_command(whole, tmp_path):
     assert result.returncode == 0, result.stderr
     assert "Best of 3: validation loss" in result.stdout
     assert len(json.loads((tmp_path / "sweep" / "entropy" / "members.json").read_text())) == 3
+    grid = ("--grid", "learning-rate=1e-4,1e-3", "--seeds", "2", "--adopt", "--sweep.network", "classifier")
+    result = mevs("sweep", "--out", tmp_path, *grid)
+    assert result.returncode == 0, result.stderr
+    assert "Best of 4: validation loss" in result.stdout
+    assert f"The run has it now: {tmp_path / 'classifier'}" in result.stdout
+    kept = json.loads((tmp_path / "run.json").read_text())["settings"]
+    assert kept["classifier"]["optimiser"]["learning_rate"] in (1e-4, 1e-3)
+    assert kept["seeds"] == 1
+    result = mevs("train", "--out", tmp_path)  # trains the other network alone
+    assert result.returncode == 0, result.stderr
 
 
 def test_a_reach_that_leaves_nothing_is_refused(whole, refuses):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -33,6 +34,7 @@ class Member:
         best: validation metrics of the best epoch.
         epochs: number of epochs trained.
         diverged: whether a metric or a weight became infinite or NaN; such a member is never the best.
+        dropped: whether it was left behind by successive halving.
     """
 
     learning_rate: float
@@ -45,6 +47,7 @@ class Member:
     epochs: int = 0
     diverged: bool = False
     data_seed: int = 0
+    dropped: bool = False
 
     @property
     def loss(self) -> float:
@@ -52,8 +55,8 @@ class Member:
         return self.best["loss"] if self.best and not self.diverged else float("inf")
 
     def is_training(self, patience: int) -> bool:
-        """Whether the member is still trained: it has not diverged, and improved within the last `patience` epochs."""
-        return not self.diverged and self.epochs - self.best_epoch < patience
+        """Whether the member is still trained: it has not diverged, was not dropped, and improved within `patience` epochs."""
+        return not self.diverged and not self.dropped and self.epochs - self.best_epoch < patience
 
 
 def member_of(task: SweepTask) -> Member:
@@ -67,6 +70,15 @@ def member_of(task: SweepTask) -> Member:
         seed=optimiser.seed,
         data_seed=optimiser.data_seed,
     )
+
+
+def by_configurations(members: Sequence[Member]) -> dict[tuple[float, ...], list[Member]]:
+    """Returns the members of each configuration, which differ in their seeds alone."""
+    found: dict[tuple[float, ...], list[Member]] = {}
+    for member in members:
+        key = (member.learning_rate, member.weight_decay, member.dropout, member.augmentation)
+        found.setdefault(key, []).append(member)
+    return found
 
 
 def task_of(task: SweepTask, member: Member) -> SweepTask:
@@ -138,6 +150,18 @@ class Together:
                 member = replace(member, best=now, best_epoch=self.epoch)
             self.members[index] = member
         return better
+
+    def halve(self) -> None:
+        """Drops the worse half of the configurations that are not dropped yet, by their mean loss."""
+        left = {
+            key: float(np.mean([member.loss for member in own]))
+            for key, own in by_configurations(self.members).items()
+            if not own[0].dropped
+        }
+        worse = set(sorted(left, key=lambda key: left[key])[-(-len(left) // 2) :])
+        for key, own in by_configurations(self.members).items():
+            for member in own if key in worse else ():
+                self.members[self.members.index(member)] = replace(member, dropped=True)
 
 
 def export_member(task: Task, of: Together, index: int, statistics: DatasetStatistics, out: Path) -> dict[str, Any]:

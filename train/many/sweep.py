@@ -2,32 +2,38 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
+import csv
+import io
+import itertools
+import json
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 from jax.sharding import Mesh
 
 from data_pipeline.dataset.statistics import DatasetStatistics
-from data_pipeline.errors import DataError, Diverged, Unreadable
-from data_pipeline.files import as_read, keep_json, read_json
+from data_pipeline.errors import DataError, Diverged, Unreadable, reason_of
+from data_pipeline.files import as_read, keep_json, read_json, write_text
 from data_pipeline.progress import console
 from train.devices import device_mesh
 from train.kept import check_config, content_of, why
-from train.many.members import Member, SweepTask, export_member, task_of
+from train.many.members import Member, SweepTask, Together, by_configurations, export_member, member_of, task_of
 from train.many.training import train_members
 from train.tasks.entropy import EntropyTask
+from train.tasks.recogniser import RecogniserTask
 
 Range = tuple[float, float]
 
 
 @dataclass(frozen=True)
 class SweepConfig:
-    """The configurations of a sweep. A range with equal ends fixes the value."""
+    """The configurations of a sweep: drawn from ranges, or a grid, or a list. A range with equal ends fixes the value."""
 
-    network: Literal["entropy", "classifier"] = "entropy"
-    """the network to train"""
+    network: Literal["entropy", "classifier", "recogniser"] = "entropy"
+    """the network to train; the recogniser is that of mevs study learned"""
     members: int = 16
     """number of configurations, drawn from the ranges by a Sobol sequence"""
     learning_rate: Range = (3e-4, 1e-2)
@@ -35,21 +41,47 @@ class SweepConfig:
     weight_decay: Range = (1e-4, 1e-1)
     """range of the weight decay, uniform in its logarithm"""
     dropout: Range = (0.0, 0.5)
-    """range of the dropout rate of the entropy predictor; the classifier has none"""
+    """range of the dropout rate of the entropy predictor; the others have none to sweep"""
     augmentation: Range = (0.0, 1.0)
-    """range of the strength of the augmentations that the network's settings switch on"""
+    """range of the strength of the augmentations that the network's settings switch on; not of the recogniser"""
+    grid: tuple[str, ...] = ()
+    """instead of drawing: all combinations of values, such as learning-rate=1e-4,3e-4 weight-decay=0.01,0.05; the rest is as in
+    the network's settings"""
+    list: str = ""
+    """instead of drawing: a .csv or .json file of configurations, one in a row, with such names"""
+    seeds: int = 1
+    """number of trainings of each configuration; the best has the lowest mean validation loss"""
+    halving: bool = False
+    """successive halving: after 1/8, 1/4 and 1/2 of the epochs only the better half of the configurations goes on"""
     same_start: bool = False
-    """give all members the network's seed; else member i has that seed + i, and so other initial weights and random draws"""
+    """give all drawn configurations the network's seed; else configuration i has that seed + i, and so other initial weights and
+    random draws. Those of a grid or list, and of several seeds, have the same seeds"""
     seed: int = 0
     """seed of the drawn configurations"""
 
 
 def draw_members(config: SweepConfig, task: SweepTask) -> list[Member]:
-    """Returns the configurations of a sweep.
+    """Returns the members of a sweep: its configurations, each from all its seeds.
 
     Raises:
-        DataError: if there are no members, or a range is not valid.
+        DataError: if there are no members, or a range, grid or list is not valid.
     """
+    if not 1 <= config.seeds <= 1000:
+        raise DataError(f"--sweep.seeds {config.seeds} is not from 1 to 1000; choose another")
+    base, first = member_of(task), task.optimiser.seed
+    if config.grid and config.list:
+        raise DataError("--sweep.grid and --sweep.list exclude each other; leave one out")
+    given = grid_of(config.grid, task) if config.grid else list_of(Path(config.list), task) if config.list else None
+    configurations = drawn_of(config, task) if given is None else given
+    members = []
+    for index, values in enumerate(configurations):
+        start = first + (index if given is None and config.seeds == 1 and not config.same_start else 0)
+        members += [replace(base, **{**values, "seed": start + number}) for number in range(config.seeds)]  # type: ignore[arg-type]
+    return members
+
+
+def drawn_of(config: SweepConfig, task: SweepTask) -> list[dict[str, float]]:
+    """Returns configurations drawn from the ranges by a Sobol sequence."""
     if config.members < 1:
         raise DataError(f"--sweep.members {config.members} is too few; it must be at least 1")
     ranges = {"learning_rate": config.learning_rate, "weight_decay": config.weight_decay}
@@ -65,19 +97,83 @@ def draw_members(config: SweepConfig, task: SweepTask) -> list[Member]:
 
     low, high = np.array([*(np.log(pair) for pair in ranges.values()), *shares.values()]).T
     drawn = qmc.Sobol(len(low), seed=config.seed).random_base2(int(np.ceil(np.log2(config.members))))
-    members = []
-    for index, place in enumerate(low + drawn[: config.members] * (high - low)):
-        rate, decay, dropout, augmentation = place
-        members.append(
-            Member(
-                learning_rate=float(np.exp(rate)),
-                weight_decay=float(np.exp(decay)),
-                dropout=float(dropout) if isinstance(task, EntropyTask) else 0.0,
-                augmentation=float(augmentation),
-                seed=task.optimiser.seed + (0 if config.same_start else index),
-            )
+    places, names = low + drawn[: config.members] * (high - low), (*ranges, *shares)
+    swept = names_of(task)
+    return [
+        {
+            name: float(np.exp(value) if name in ranges else value)
+            for name, value in zip(names, place, strict=True)
+            if name in swept
+        }
+        for place in places
+    ]
+
+
+def names_of(task: SweepTask) -> tuple[str, ...]:
+    """Returns the hyper-parameters of a network that can be swept."""
+    names = ("learning_rate", "weight_decay")
+    if isinstance(task, EntropyTask):
+        return (*names, "dropout", "augmentation")
+    return names if isinstance(task, RecogniserTask) else (*names, "augmentation")
+
+
+def grid_of(grid: Sequence[str], task: SweepTask) -> list[dict[str, float]]:
+    """Returns all combinations of the values of `NAME=VALUE,VALUE,…`.
+
+    Raises:
+        DataError: for another form, a name twice, or a value out of its range.
+    """
+    axes: dict[str, list[float]] = {}
+    for axis in grid:
+        name, equals, values = axis.partition("=")
+        if not equals or not values:
+            raise DataError(f"--sweep.grid {axis} is not NAME=VALUE,VALUE, as in learning-rate=1e-4,3e-4")
+        if (plain := name.replace("-", "_")) in axes:
+            raise DataError(f"--sweep.grid names {name} twice; give all its values once")
+        axes[plain] = [_checked(plain, value, task, f"--sweep.grid {axis}") for value in values.split(",")]
+    return [dict(zip(axes, values, strict=True)) for values in itertools.product(*axes.values())]
+
+
+def list_of(path: Path, task: SweepTask) -> list[dict[str, float]]:
+    """Returns the configurations in a .csv file with a header, or in a .json file with a list of objects.
+
+    Raises:
+        DataError: for a file that cannot be read, of another form, or with a value out of its range.
+    """
+    try:
+        text = path.expanduser().read_text()
+        rows = json.loads(text) if path.suffix.lower() == ".json" else list(csv.DictReader(io.StringIO(text)))
+    except (OSError, ValueError) as error:
+        raise DataError(
+            f"--sweep.list {path} cannot be read ({reason_of(error)}); give a .csv or .json file"
+        ) from error
+    if not isinstance(rows, list) or not rows or not all(isinstance(row, dict) and row for row in rows):
+        raise DataError(
+            f"--sweep.list {path} has no configurations: a .csv has a header and rows, a .json a list of objects"
         )
-    return members
+    return [
+        {
+            plain: _checked(plain, value, task, f"--sweep.list {path}, configuration {number}")
+            for name, value in row.items()
+            for plain in [str(name).strip().replace("-", "_")]
+        }
+        for number, row in enumerate(rows, 1)
+    ]
+
+
+def _checked(name: str, value: Any, task: SweepTask, where: str) -> float:
+    """Returns a value of a hyper-parameter as a number; raises `DataError` if it is none, or out of its range."""
+    if name not in names_of(task):
+        known = ", ".join(one.replace("_", "-") for one in names_of(task))
+        raise DataError(f"{where}: {name.replace('_', '-')!s:.40} cannot be swept for the {task.name}; {known} can")
+    try:
+        number = float(value)
+    except (TypeError, ValueError):
+        raise DataError(f"{where}: {value!r:.40} is not a number") from None
+    most = {"dropout": 1.0, "augmentation": 1.0}.get(name, 1e9)
+    if not 0 <= number <= most or (name == "learning_rate" and number == 0) or (name == "dropout" and number == 1):
+        raise DataError(f"{where}: {number:g} is out of the range of {name.replace('_', '-')}")
+    return number
 
 
 def sweep(
@@ -90,32 +186,34 @@ def sweep(
 ) -> list[Member]:
     """Trains all members and returns them with their results.
 
-    Writes `members.json`, and the best member as a run of its own in `network/`. An interrupted sweep resumes after its last
-    complete epoch; a finished one is read from `members.json`.
+    Writes `members.json`, the metrics of every epoch into `epochs.csv`, and the best member as a run of its own into `network/`.
+    An interrupted sweep resumes after its last complete epoch; a finished one is read from `members.json`.
 
     Args:
         task: the network's training; each member changes its hyper-parameters.
         data: folder of the data set.
         statistics: those of the data set.
         folder: where the sweep is stored.
-        config: the ranges to draw from.
+        config: the configurations.
         mesh: devices to train on; all if None.
 
     Raises:
-        DataError: if the ranges are not valid, the devices cannot share the members equally, or the folder holds another sweep.
+        DataError: if the configurations are not valid, the devices cannot share the members equally, or the folder holds
+            another sweep.
         Preempted: after SIGTERM, at the end of an epoch.
         Diverged: if every member diverged.
     """
-    identity = as_read({"task": content_of(task), "sweep": asdict(config), "data": statistics.fingerprint})
+    identity = as_read({"task": content_of(task), "sweep": _identity(config), "data": statistics.fingerprint})
     check_config(folder, identity, "a sweep made")
     members = draw_members(config, task)
     if (made := _finished(folder)) is not None:
         return made
     mesh = mesh or device_mesh()
     keep_json(folder / "config.json", identity)
-    of = train_members(task, members, data, statistics, folder, mesh, f"Sweep of {len(members)}")
-    index = int(np.argmin([member.loss for member in of.members]))
-    best = of.members[index]
+    title = f"Sweep of {len(members)}"
+    of = train_members(task, members, data, statistics, folder, mesh, title, halving=config.halving)
+    best = best_of(of.members)
+    index = of.members.index(best)
     if best.best is None or best.diverged:
         low, high = (end(member.learning_rate for member in members) for end in (min, max))
         raise Diverged(
@@ -123,8 +221,34 @@ def sweep(
             f"network is kept; to sweep again, lower --sweep.learning-rate, and delete {folder} or choose another --out"
         )
     export_member(task_of(task, best), of, index, statistics, folder / "network")
+    write_text(folder / "epochs.csv", csv_of_epochs(of))
     keep_json(folder / "members.json", [asdict(member) for member in of.members])
     return of.members
+
+
+def csv_of_epochs(of: Together) -> str:
+    """Returns a row for each member and epoch, with the metrics of training and validation."""
+    text = io.StringIO()
+    names = dict.fromkeys(name for history in of.histories for entry in history for name in entry)
+    writer = csv.DictWriter(text, ["member", *names], lineterminator="\n")
+    writer.writeheader()
+    for number, history in enumerate(of.histories):
+        writer.writerows({"member": number} | entry for entry in history)
+    return text.getvalue()
+
+
+def _identity(config: SweepConfig) -> dict[str, Any]:
+    """What a sweep's `config.json` holds of its settings; what was added since version 0.1 and is off is left out."""
+    later = ("grid", "list", "seeds", "halving")
+    default = asdict(SweepConfig())
+    return {name: value for name, value in asdict(config).items() if name not in later or value != default[name]}
+
+
+def best_of(members: Sequence[Member]) -> Member:
+    """Returns the member with the lowest loss of the configuration with the lowest mean loss."""
+    by_configuration = by_configurations(members)
+    means = {key: float(np.mean([member.loss for member in own])) for key, own in by_configuration.items()}
+    return min(by_configuration[min(means, key=lambda key: means[key])], key=lambda member: member.loss)
 
 
 def _finished(folder: Path) -> list[Member] | None:

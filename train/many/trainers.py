@@ -2,7 +2,7 @@
 
 *At once*: the step is mapped over members (`vmap`), and each device trains its share of them. *In turn*: one compiled step is
 called for one member after the other. On one CPU the latter is used, since a mapped convolution is slower there than its members
-one by one (`benchmarks/seeds.py`).
+one by one (`benchmarks/members.py`).
 """
 
 from __future__ import annotations
@@ -92,7 +92,7 @@ class AtOnce:
         self._state = self._over_members(lambda seed: initial_state(task, seed)[1], "m")(self._hyper.seed)
         self._best = jax.tree.map(jnp.copy, (self._state.parameters, self._state.statistics))
 
-    def _over_members(self, function: Callable, arguments: str, **options: Any) -> Callable:
+    def _over_members(self, function: Callable, arguments: str, **options: Any) -> Any:
         """Returns `function` mapped over all members.
 
         Args:
@@ -107,6 +107,10 @@ class AtOnce:
     def train(self, training: np.ndarray, batch: dict[str, np.ndarray]) -> jax.Array:
         self._state, loss = self._train(training, self._state, batch, self._hyper)
         return loss
+
+    def program(self, training: np.ndarray, batch: dict[str, np.ndarray]) -> str:
+        """The compiled step as text."""
+        return self._train.lower(training, self._state, batch, self._hyper).compile().as_text()
 
     def sums(self) -> dict[str, np.ndarray]:
         return {name: np.asarray(sums) for name, sums in self._state.sums.items()}

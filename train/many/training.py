@@ -36,6 +36,8 @@ def train_members(
     mesh: Mesh,
     title: str,
     way: Way | None = None,
+    *,
+    halving: bool = False,
 ) -> Together:
     """Trains all members; an interrupted training resumes after its last complete epoch.
 
@@ -48,6 +50,7 @@ def train_members(
         mesh: devices to train on.
         title: for messages.
         way: how steps are computed; by the devices if None.
+        halving: whether only the better half of the configurations goes on after 1/8, 1/4 and 1/2 of the epochs.
 
     Raises:
         DataError: if the devices cannot share the members equally.
@@ -88,6 +91,8 @@ def train_members(
             checked = weighted_means([trainer.evaluate(*batch) for batch in validation])
             of.epoch += 1
             trainer.keep(of.after_epoch(training, means, checked, trainer.finite()))
+            if halving and of.epoch in {max(1, optimiser.epochs // share) for share in (8, 4, 2)}:
+                of.halve()
             of.seconds += time.perf_counter() - started
             checkpoints.save("latest", of.epoch, trainer.saved(), of.progress())
             _print_epoch(title, of, optimiser)

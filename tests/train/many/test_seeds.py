@@ -191,8 +191,8 @@ for step in range(4):
     drawn = [next(stream) for stream in streams]
     batch = {name: np.stack([one[name] for one in drawn]) for name in drawn[0]}
     losses.append(np.asarray(trainer.train(np.ones(4, bool), batch)).tolist())
-program = trainer._train.lower(np.ones(4, bool), trainer.saved()[0], batch, trainer._hyper).compile().as_text()
-print(json.dumps({"losses": losses, "said": COLLECTIVES.findall(program)}))
+said = COLLECTIVES.findall(trainer.program(np.ones(4, bool), batch))
+print(json.dumps({"losses": losses, "said": said}))
 """
 
 

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import csv
 import json
 import os
+import re
+import shutil
 import signal
 from dataclasses import replace
 from pathlib import Path
@@ -18,12 +21,16 @@ import train.many.training
 from data_pipeline.dataset.statistics import load_statistics
 from data_pipeline.errors import DataError, Diverged
 from eval.report.sweep import sweep_table
-from eval.stages import tasks, train_sweep
+from eval.settings import TINY
+from eval.stages import tasks
+from eval.sweeping import adopt, train_sweep
 from tests.train.scaling_worker import SETTINGS
+from train.choosing.stages import Stages
 from train.devices import device_mesh
+from train.kept import summary_of
 from train.loop import fit, load_best, validate, validation_set
-from train.many.members import Member, Together, task_of
-from train.many.sweep import SweepConfig, draw_members, sweep
+from train.many.members import Member, Together, by_configurations, task_of
+from train.many.sweep import SweepConfig, best_of, draw_members, sweep
 from train.preemption import Preempted
 from train.step import TrainState, evaluate_step_of, initial_state
 
@@ -155,6 +162,120 @@ def test_configurations_fill_their_ranges(out):
     ):
         with pytest.raises(DataError, match=told):
             draw_members(config, task)
+
+
+def test_grids_and_lists_give_every_configuration_the_same_seeds(out, tmp_path):
+    task = task_named("entropy", out)
+    config = SweepConfig(grid=("learning-rate=1e-4,3e-4,1e-3", "dropout=0,0.5"), seeds=2)
+    members = draw_members(config, task)
+    assert len(members) == len(set(members)) == 12
+    assert {(one.learning_rate, one.dropout, one.seed) for one in members} == {
+        (rate, dropout, seed) for rate in (1e-4, 3e-4, 1e-3) for dropout in (0.0, 0.5) for seed in (0, 1)
+    }
+    assert {one.weight_decay for one in members} == {task.optimiser.weight_decay}
+    assert len(by_configurations(members)) == 6
+    (tmp_path / "some.csv").write_text("learning-rate,weight_decay\n1e-4,0.1\n2e-4,0.2\n")
+    content = '[{"learning_rate": 1e-4, "weight-decay": 0.1}, {"learning_rate": 2e-4, "weight-decay": 0.2}]'
+    (tmp_path / "some.json").write_text(content)
+    listed = [draw_members(SweepConfig(list=str(tmp_path / name)), task) for name in ("some.csv", "some.json")]
+    assert listed[0] == listed[1]
+    assert [(one.learning_rate, one.weight_decay, one.seed) for one in listed[0]] == [(1e-4, 0.1, 0), (2e-4, 0.2, 0)]
+
+
+@pytest.mark.parametrize(
+    ("config", "told"),
+    [
+        ({"grid": ("learning-rate",)}, "--sweep.grid learning-rate is not NAME=VALUE,VALUE"),
+        (
+            {"grid": ("rate=1",)},
+            "rate cannot be swept for the entropy predictor; learning-rate, weight-decay, dropout",
+        ),
+        ({"grid": ("learning-rate=1e-4,fast",)}, "'fast' is not a number"),
+        ({"grid": ("learning-rate=0",)}, "0 is out of the range of learning-rate"),
+        ({"grid": ("dropout=1",)}, "1 is out of the range of dropout"),
+        ({"grid": ("dropout=nan",)}, "nan is out of the range of dropout"),
+        ({"grid": ("dropout=0.1", "dropout=0.2")}, "--sweep.grid names dropout twice"),
+        ({"grid": ("dropout=0.1",), "list": "a.csv"}, "exclude each other"),
+        ({"list": "nowhere.csv"}, "--sweep.list nowhere.csv cannot be read"),
+        ({"seeds": 0}, "--sweep.seeds 0 is not from 1 to 1000"),
+    ],
+)
+def test_grids_that_mean_nothing_are_refused(config, told, out):
+    with pytest.raises(DataError, match=re.escape(told)):
+        draw_members(SweepConfig(**config), task_named("entropy", out))
+
+
+def test_lists_that_mean_nothing_are_refused(out, tmp_path):
+    task = task_named("entropy", out)
+    for content in ("[]", "{}", "[1]", "learning-rate\n", "[{}]", '[{"learning-rate": null}]', "{"):
+        for suffix in (".json", ".csv"):
+            (tmp_path / f"some{suffix}").write_text(content)
+            with pytest.raises(DataError, match=r"--sweep\.list"):
+                draw_members(SweepConfig(list=str(tmp_path / f"some{suffix}")), task)
+
+
+def test_halving_drops_the_worse_half_of_the_configurations():
+    """Configurations are compared by the mean over their seeds."""
+    losses = {1e-1: (0.1, 0.9), 1e-2: (0.4, 0.4), 1e-3: (0.3, 0.3), 1e-4: (0.8, 0.8), 1e-5: (0.45, 0.46)}
+    members = [
+        Member(rate, 0.0, 0.0, 1.0, seed, 1, {"loss": loss}, 1)
+        for rate, pair in losses.items()
+        for seed, loss in enumerate(pair)
+    ]
+    assert best_of(members).learning_rate == 1e-3
+    together = Together(members, epoch_steps=1)
+    left = []
+    for _ in range(3):
+        together.halve()
+        left.append(sorted({one.learning_rate for one in together.members if not one.dropped}))
+    assert left == [[1e-5, 1e-3, 1e-2], [1e-3, 1e-2], [1e-3]]
+    assert [one.is_training(5) for one in together.members].count(True) == 2
+
+
+@pytest.mark.slow
+def test_a_halved_sweep_trains_the_best_to_the_end_and_the_run_adopts_it(out, tmp_path):
+    shutil.copytree(out / "data", tmp_path / "data")
+    entropy = replace(SETTINGS.entropy, optimiser=replace(SETTINGS.entropy.optimiser, epochs=4))
+    config = SweepConfig(grid=("learning-rate=1e-7,1e-3,1e-6,3e-6",), halving=True)
+    settings = replace(SETTINGS, entropy=entropy, sweep=config)
+    folder, members = train_sweep(settings, tmp_path)
+    assert [one.epochs for one in members] == [1, 4, 1, 2]
+    assert best_of(members) is members[1]
+    rows = list(csv.DictReader((folder / "epochs.csv").open()))
+    assert len(rows) == sum(one.epochs for one in members)
+    assert {"member", "epoch", "train/loss", "val/loss"} <= set(rows[0])
+    there, adopted = adopt(settings, tmp_path)
+    assert there == tmp_path / "entropy"
+    assert adopted.entropy.optimiser.learning_rate == 1e-3
+    assert replace(adopted.entropy, optimiser=entropy.optimiser) == entropy
+    summary = fit(
+        tasks(adopted, load_statistics(tmp_path / "data"))[1],
+        tmp_path / "data",
+        load_statistics(tmp_path / "data"),
+        there,
+    )
+    assert summary["best_loss"] == members[1].loss  # nothing is trained again
+    assert adopt(settings, tmp_path) == (there, adopted)
+    (there / "config.json").write_text((there / "config.json").read_text().replace("0.001", "0.002"))
+    (there / "checks.json").unlink()
+    with pytest.raises(DataError, match="holds another network; delete it"):
+        adopt(settings, tmp_path)
+
+
+@pytest.mark.slow
+def test_the_recogniser_is_swept_too(turned, data, tmp_path):
+    (tmp_path / "learned").mkdir()
+    shutil.copytree(data, tmp_path / "data")
+    shutil.copytree(turned, tmp_path / "learned" / "turned")
+    settings = replace(TINY, sweep=SweepConfig(network="recogniser", grid=("learning-rate=1e-4,1e-3",)))
+    _, members = train_sweep(settings, tmp_path)
+    assert len(members) == 2
+    there, adopted = adopt(settings, tmp_path)
+    assert there == tmp_path / "learned" / "seed_0" / "recogniser"
+    assert adopted.learned.recogniser.optimiser.learning_rate == best_of(members).learning_rate
+    study = Stages(adopted.learned, adopted.dataset, tmp_path, 0)
+    study.train_recogniser()  # it is trained
+    assert summary_of(there)["best_loss"] == best_of(members).loss
 
 
 def test_the_command_leaves_table_plot_and_network(out):
