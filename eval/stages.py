@@ -44,7 +44,7 @@ from eval.walks.own_policies import OwnPolicy, load_policies, own_rungs
 from mevs_jax.policies.registry import policy_named
 from mevs_jax.trained import load as load_system
 from train.chance import warn_of_chance
-from train.choosing.stages import Stages, check_learned
+from train.choosing.stages import Stages, check_learned, train_recognisers
 from train.finite import check_results, place_not_finite
 from train.kept import keep_beside, kept, kept_json, made_by, summary_of
 from train.loop import fit, load_best
@@ -256,6 +256,8 @@ def learn_to_choose(settings: Settings, out: Path) -> Path:
         Stages(config, settings.dataset, out, seed, settings.entropy)
         for seed in range(config.seed, config.seed + config.seeds)
     ]
+    seeds[0].prepare()
+    train_recognisers(seeds)
     for stages in seeds:
         train_all(stages)
         found.append(measure(stages))

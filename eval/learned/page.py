@@ -36,12 +36,25 @@ def _accuracy(share: float, interval: list[float]) -> str:
     return f"{percent(share)}<br><small class='note'>{span(interval)}</small>"
 
 
+def _closed(found: dict[str, Any], name: str) -> list[str]:
+    """Shares of the gap that a policy closes, in percent, with their intervals where they have one."""
+    cells = []
+    shares = found["gap_closed"].get(name, ())
+    intervals = found.get("gap_closed_interval", {}).get(name) or [None] * len(shares)
+    for share, interval in zip(shares, intervals, strict=True):
+        cell = "–" if share is None else signed(share, 0).lstrip("+")
+        if share is not None and interval is not None:
+            cell += f" <small class='note'>[{', '.join(signed(end, 0).lstrip('+') for end in interval)}]</small>"
+        cells.append(cell)
+    return cells
+
+
 def _ladder(found: dict[str, Any]) -> str:
     rows, with_gap = [], bool(found["gap_closed"])
     steps = [step for step in _SHOWN if step < len(found["policies"]["random"]["after_views"])]
     for name, policy in found["policies"].items():
         cells = [_accuracy(*cell) for cell in zip(policy["after_views"], policy["interval"], strict=True)]
-        closed = ["–" if share is None else signed(share, 0).lstrip("+") for share in found["gap_closed"].get(name, ())]
+        closed = _closed(found, name)
         row = [
             html.escape(policy["title"]),
             *(cells[step] if step < len(cells) else "" for step in steps),
@@ -318,8 +331,12 @@ def _seeds(metrics: dict[str, Any], views: str) -> str:
     for name, title in titles.items():
         after = [found["policies"][name]["after_views"][:4] for found in each]
         rows += [[html.escape(title), str(seed), *map(percent, shares)] for seed, shares in enumerate(after)]
-    gains = []
+    gains, both = [], metrics["together"][views].get("against_over_both", {})
     for base in ("random", "farthest", "fixed_order"):
+        if METHOD in both.get(base, {}):
+            mean = metrics["together"][views]["against"][base][METHOD]["difference"][1:4]
+            cells = zip(mean, both[base][METHOD][1:4], strict=True)
+            gains.append([html.escape(titles[base]), "mean, over both", *(difference(*cell) for cell in cells)])
         for seed, found in enumerate(each):
             gain = found["against"][base][METHOD]
             cells = zip(gain["difference"][1:4], gain["interval"][1:4], strict=True)
@@ -330,7 +347,8 @@ def _seeds(metrics: dict[str, Any], views: str) -> str:
         + _ladder(metrics["together"][views])
         + _against(metrics["together"][views])
         + f"<p>Calibration error (%) of the view policy after 1 to {len(errors)} views, mean over the seeds: "
-        + f"{', '.join(map(percent, errors))}.</p><p>Each seed:</p>"
+        + f"{', '.join(map(percent, errors))}.</p><p>Each seed, with intervals over objects; rows of means have t intervals over "
+        + "objects and trainings:</p>"
         + table(["next view chosen by", "seed", "1 view", "2", "3", "4"], rows)
         + table(["view policy minus", "seed", "2 views", "3", "4"], gains)
     )

@@ -28,7 +28,7 @@ from eval.learned.walks import (
     walk_all,
     walker,
 )
-from eval.numbers.comparison import intervals
+from eval.numbers.comparison import interval_of_both, intervals
 from eval.numbers.confidence import stopping
 from eval.walks.knowledge import class_view_table
 from mevs_jax.arrays import AnyArray
@@ -40,6 +40,7 @@ from mevs_jax.calibration import (
     fit_temperature,
     log_likelihood,
 )
+from mevs_jax.metrics import bootstrap_means
 from mevs_jax.models import ViewPolicy
 from mevs_jax.policies.base import Knowledge
 from train.choosing.calibrated import beliefs_of_sets
@@ -306,13 +307,19 @@ def compared(each: Mapping[str, ByObject], method: str) -> dict[str, Any]:
         for name, mine in from_some.items()
         if "belief_oracle" in each and name not in ("random", "belief_oracle", "label_oracle")
     }
-    return {"against": against, "gap_closed": gap_closed}
+    walked = {name: policy.from_some for name, policy in each.items()}
+    intervals_of_gap = {
+        name: _interval_of_gap(walked[name], walked["random"], walked["belief_oracle"]) for name in gap_closed
+    }
+    return {"against": against, "gap_closed": gap_closed, "gap_closed_interval": intervals_of_gap}
 
 
 def seeds_together(
     found: Sequence[dict[str, Any]], seeds: Sequence[Mapping[str, ByObject]], method: str
 ) -> dict[str, Any]:
     """Means over several seeds; each object is averaged first, since all seeds have the same objects.
+
+    Intervals are over objects, these trainings given; `over_both` are those over objects and trainings.
 
     Args:
         found: the metrics that `study` returned for each seed.
@@ -335,7 +342,19 @@ def seeds_together(
         }
         for name, policy in first["policies"].items()
     }
-    same = {key: first[key] for key in ("views", "trying_starts")}
+    every = {name: np.stack([seed[name].right for seed in seeds], axis=1) for name in policies}
+    for name, policy in policies.items():
+        policy["over_both"] = interval_of_both(every[name]).tolist()
+    over_both = {
+        base: {
+            name: interval_of_both(right - every[base]).tolist()
+            for name, right in every.items()
+            if name != base and right.shape == every[base].shape
+        }
+        for base in BASELINES
+        if base in every
+    }
+    same = {key: first[key] for key in ("views", "trying_starts")} | {"against_over_both": over_both}
     return same | {"policies": policies} | compared(each, method)
 
 
@@ -379,6 +398,25 @@ def _difference(mine: np.ndarray, base: np.ndarray) -> dict[str, Any]:
     steps = min(len(mine), len(base))
     gain = mine[:steps] - base[:steps]
     return {"difference": gain.mean(axis=1).tolist(), "interval": intervals(gain)}
+
+
+def _interval_of_gap(mine: np.ndarray, random: np.ndarray, oracle: np.ndarray) -> list[list[float] | None]:
+    """95 % intervals of `_gap_closed` by a bootstrap over objects; None where the oracle's gain is not clearly positive.
+
+    Args:
+        mine, random, oracle: (steps, objects) results by object.
+    """
+    found: list[list[float] | None] = []
+    for step in range(1, min(len(oracle), 1 + _GAP)):
+        gain, gap = (np.asarray(_resampled(one[step] - random[step])) for one in (mine, oracle))
+        clear = np.quantile(gap, 0.025) > 0
+        found.append(np.quantile(gain / gap, (0.025, 0.975)).tolist() if clear else None)
+    return found
+
+
+@jax.jit
+def _resampled(values: Array) -> Array:
+    return bootstrap_means(jax.random.key(1), values)
 
 
 def _gap_closed(mine: np.ndarray, random: np.ndarray, oracle: np.ndarray) -> list[float | None]:

@@ -34,20 +34,22 @@ MOVEMENT_COSTS = (0.02, 0.05, 0.1, 0.2, 0.5)
 """In units of the policy's score (normalised entropy or nats) per radian of movement."""
 
 
-def single_view(tables: ViewTables, classes: int) -> dict[str, Any]:
-    """Accuracy on single views, over all views of all objects."""
+def single_view(tables: ViewTables, classes: int, reachable: np.ndarray) -> dict[str, Any]:
+    """Accuracy on single views, over all reachable views of all objects; `by_view` is of every view."""
     predictions = tables.logits.argmax(-1)
+    of_view = (predictions == tables.labels[:, None]).mean(axis=0)
+    predictions = predictions[:, reachable]
     right = predictions == tables.labels[:, None]
     views = predictions.shape[1]
     confusion = confusion_matrix(
         jnp.repeat(jnp.asarray(tables.labels), views), jnp.asarray(predictions.reshape(-1)), classes
     )
-    every = tables.logits.sum(axis=1).argmax(-1) == tables.labels
+    every = tables.logits[:, reachable].sum(axis=1).argmax(-1) == tables.labels
     return {
         "accuracy": float(accuracy(confusion)),
         "interval": intervals(right.mean(axis=1)),
         "class_accuracy": float(class_accuracy(confusion)),
-        "by_view": right.mean(axis=0).tolist(),
+        "by_view": of_view.tolist(),
         "all_views": float(every.mean()),
         "all_views_interval": intervals(every),
     }
@@ -319,7 +321,7 @@ def run_study(
         "thresholds": list(THRESHOLDS),
         "max_views": list(range(FIRST_MV, config.max_views + 1)),
         "headline": {"threshold": HEADLINE_CT, "max_views": mv},
-        "single_view": single_view(tables, len(statistics.classes)),
+        "single_view": single_view(tables, len(statistics.classes), can_reach),
         "entropy": entropy_errors(tables, statistics),
         "ladder": [
             {"policy": rung.policy, "title": rung.title, "knows": rung.knows} | sources.get(rung.policy, {})

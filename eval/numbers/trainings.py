@@ -10,40 +10,15 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
-from scipy import stats
 
 from data_pipeline.errors import DataError
-from eval.numbers.comparison import intervals
+from eval.numbers.comparison import interval_of_both, intervals
 from eval.numbers.policies import EvaluationInputs
 from eval.numbers.study import BASELINE, Setting, exactly_random
 from eval.walks.grid import Results, run_grid
 from eval.walks.ladder import Rung, ladder
 from eval.walks.own_policies import OwnPolicy, own_rungs
 from mevs_jax.selection import ViewTable
-
-LEVEL = 0.95
-
-
-def interval_of_both(values: Float[np.ndarray, "*cells trainings objects"]) -> Float[np.ndarray, "*cells 2"]:
-    """95 % intervals of means for other objects *and* other trainings, of values of the same objects in every training.
-
-    The variance of the mean has two parts: the variance of the objects' means over trainings, divided by the number of objects;
-    and that of the trainings' means over objects, divided by the number of trainings. The result is a t interval with
-    Satterthwaite's degrees of freedom. A bootstrap that resamples both is too narrow for a few trainings: three of them resampled
-    have two thirds of their variance, and it does not know how uncertain a variance of three numbers is (a test compares both).
-    """
-    *_, trainings, objects = values.shape
-    mean = values.mean(axis=(-2, -1))
-    parts = (
-        (values.mean(axis=-2).var(axis=-1, ddof=1) / objects, objects - 1),
-        (values.mean(axis=-1).var(axis=-1, ddof=1) / trainings, trainings - 1),
-    )
-    variance = sum(part for part, _ in parts)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        freedom = variance**2 / sum(part**2 / degrees for part, degrees in parts)
-    half = np.where(variance > 0, stats.t.ppf((1 + LEVEL) / 2, np.nan_to_num(freedom, nan=1.0)), 0) * np.sqrt(variance)
-    return np.stack([mean - half, mean + half], axis=-1)
 
 
 def walks_of_all(

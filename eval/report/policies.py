@@ -133,6 +133,7 @@ def ladder_section(inputs: ReportInputs) -> str:
     return (
         "<h2>Accuracy by policy</h2><p>Accuracy (%) after exactly the given number of views. Below it: the difference from "
         "random in percentage points with its 95 % interval, in <span class='faint'>grey</span> if the interval contains zero. "
+        "Each interval is for its own cell: of twenty differences that do not exist, one would be expected not to be grey. "
         f"Area: mean accuracy over 1 to {len(policies['random']['after_views'])} views.{reach_note}</p>"
         + table(header, rows_by_knowledge(rows))
         + f"<p class='note'>Random selection without repetition is computed as an exact expectation up to {exact} views"
@@ -345,7 +346,8 @@ def grid_section(inputs: ReportInputs) -> str:
     shown = ("predicted_entropy", "oracle_entropy", "information_gain")
     parts = [
         "<h2>The thesis's grid</h2><p>A walk stops at a confidence threshold (CT, columns) or at a limit on views (MV, "
-        "rows).</p>",
+        "rows). Each interval is for its own cell, and neighbouring cells share their walks: if a policy did not differ "
+        "from random, about one cell in twenty would be bold all the same.</p>",
         '<div class="figures">',
     ]
     for name in shown:

@@ -98,7 +98,7 @@ COMMANDS = {
     ),
     "study learned": Command(
         "learn to fuse views and to choose them; compare with all policies",
-        "StudyOptions",
+        "LearnedOptions",
         ("dataset", "learned"),
         "studies:learned",
     ),

@@ -110,6 +110,14 @@ class StudyOptions(WithViews, WithSeed):
 
 
 @dataclass(frozen=True)
+class LearnedOptions(StudyOptions):
+    """Options of `mevs study learned`."""
+
+    seeds: Annotated[int | None, _arg("K", "1, or 3 with --preset best")] = None
+    """train everything from K seeds, --learned.seed and those after it, and report means over the trainings"""
+
+
+@dataclass(frozen=True)
 class DataOptions(WithViews):
     """Options of `mevs data`."""
 

@@ -195,7 +195,7 @@ def keep_settings(call: Invocation) -> None:
         settings = replace(run.settings, **{group: getattr(call.settings, group) for group in groups})
         if hasattr(call.options, "policy"):
             settings = replace(settings, policies=call.settings.policies)
-        if hasattr(call.options, "seeds") and "sweep" not in call.groups:
+        if hasattr(call.options, "seeds") and not {"sweep", "learned"} & set(call.groups):
             settings = replace(settings, seeds=call.settings.seeds)
         save_run(call.out, run.preset, settings, call.arguments)
 
@@ -224,11 +224,7 @@ def settings_of(options: Any, groups: list[str], base: Settings) -> Settings:
     if is_file(capture.lattice) and capture.lattice != base.dataset.capture.lattice:
         dataset = replace(dataset, capture=_with_own_viewpoints(capture, options, base))
     settings = replace(settings, dataset=dataset, policies=_policies(options, base))
-    if "sweep" in groups:
-        sweep = replace(settings.sweep, grid=getattr(options, "grid", ()) or settings.sweep.grid)
-        settings = replace(settings, sweep=replace(sweep, seeds=getattr(options, "seeds", None) or sweep.seeds))
-    elif getattr(options, "seeds", None) is not None:
-        settings = replace(settings, seeds=options.seeds)
+    settings = _with_seeds(settings, options, groups)
     encoder = absolute(getattr(options, "encoder", None) or settings.classifier.encoder)
     settings = replace(settings, classifier=replace(settings.classifier, encoder=encoder))
     seed = getattr(options, "seed", None)
@@ -236,6 +232,20 @@ def settings_of(options: Any, groups: list[str], base: Settings) -> Settings:
         return settings
     seeded = [group for group in groups if group != "dataset"]
     return replace(settings, **{group: with_seed(getattr(settings, group), seed) for group in seeded})
+
+
+def _with_seeds(settings: Settings, options: Any, groups: list[str]) -> Settings:
+    """The settings with the number of seeds of `--seeds`, and the grid of `--grid`, of what the command trains."""
+    seeds = getattr(options, "seeds", None)
+    if "sweep" in groups:
+        sweep = settings.sweep
+        sweep = replace(sweep, grid=getattr(options, "grid", ()) or sweep.grid)
+        return replace(settings, sweep=sweep if seeds is None else replace(sweep, seeds=seeds))
+    if seeds is None:
+        return settings
+    if "learned" in groups:
+        return replace(settings, learned=replace(settings.learned, seeds=seeds))
+    return replace(settings, seeds=seeds)
 
 
 def _with_own_viewpoints(capture: CaptureConfig, options: Any, base: Settings) -> CaptureConfig:

@@ -9,6 +9,7 @@ Folders within a run's folder: `learned/turned/` (data), `learned/seed_0/` with 
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
@@ -37,6 +38,7 @@ from train.choosing.q_learning import QLearningConfig, train_by_q_learning
 from train.finite import check_outputs
 from train.kept import kept_array, made_by, trained_once
 from train.loop import fit, load_best
+from train.many.seeds import train_seeds
 from train.outputs import Ask, network_outputs
 from train.starting_weights import StartingWeights
 from train.tasks.entropy import EntropyConfig, EntropyTask
@@ -389,6 +391,21 @@ class Stages:
         folder = self.policy_folder("_".join(map(str, (name, *(f"without_{label}" for label in without)))))
         untrained = nnx.eval_shape(lambda: new_policy(config, len(self.statistics.classes), variant.posed, cloud))
         return trained_once(folder, identity, untrained, train)
+
+
+def train_recognisers(each: Sequence[Stages]) -> None:
+    """Trains the recognisers of several seeds as one job; those that are trained already are left as they are."""
+    first, tasks = each[0], [stages.task() for stages in each]
+    summaries = train_seeds(
+        tasks,
+        first.turned,
+        first.statistics,
+        [stages.recogniser_folder() for stages in each],
+        first.out / "learned" / "recognisers_together",
+        rate_option="--learned.recogniser.optimiser.learning-rate",
+    )
+    for task, summary in zip(tasks, summaries, strict=True):
+        warn_of_chance(task, summary, first.statistics)
 
 
 def lattice_data(dataset: DataConfig, out: Path, views: int) -> Path:

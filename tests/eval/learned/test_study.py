@@ -73,6 +73,13 @@ def test_what_looking_was_worth_is_learned_and_the_study_says_so(adding):
     assert after["learned"][2] > after["random"][2] + 0.1
     assert found["against"]["random"]["learned"]["interval"][2][0] > 0
     assert found["gap_closed"]["learned"][1] > 0.4
+    low, high = found["gap_closed_interval"]["learned"][1]
+    assert 0 < low < found["gap_closed"]["learned"][1] < high
+    for name, step in (("learned", 1), ("random", 2)):
+        low, high = same["policies"][name]["over_both"][step]
+        assert low <= same["policies"][name]["after_views"][step] <= high
+    low, high = same["against_over_both"]["random"]["learned"][1]
+    assert low < found["against"]["random"]["learned"]["difference"][1] < high
     assert found["trying_starts"] == 6  # all of them, where there are so few
     assert after["label_oracle"][1] >= after["learned"][1]
     for name in ("look_ahead", "learned_and_table"):

@@ -10,9 +10,10 @@ import numpy as np
 import pytest
 
 from data_pipeline.errors import DataError
+from eval.numbers.comparison import interval_of_both
 from eval.numbers.policies import EvaluationInputs
 from eval.numbers.study import Setting
-from eval.numbers.trainings import csv_over_trainings, interval_of_both, rows_over_trainings, walks_of_all
+from eval.numbers.trainings import csv_over_trainings, rows_over_trainings, walks_of_all
 from eval.tables import ViewTables
 from eval.walks.grid import GridConfig
 from eval.walks.ladder import ladder

@@ -260,7 +260,7 @@ def test_95_percent_intervals_cover_the_truth_95_times_in_100(graph):
 
 
 def test_single_view_and_entropy_errors(tables, statistics):
-    result = single_view(tables, CLASSES)
+    result = single_view(tables, CLASSES, np.ones(tables.logits.shape[1], bool))
     assert result["accuracy"] == pytest.approx((tables.logits.argmax(-1) == tables.labels[:, None]).mean(), abs=1e-6)
     assert result["interval"][0] <= result["accuracy"] <= result["interval"][1]
     errors = entropy_errors(tables, statistics)
