@@ -195,6 +195,28 @@ def check_config(folder: Path, identity: dict[str, Any], holds: str) -> None:
         keep_json(path, identity)
 
 
+def goes_on_with(folder: Path, identity: dict[str, Any]) -> dict[str, tuple[Any, Any]]:
+    """Returns the settings in which an interrupted or finished training differs from `identity`, if it may go on with these.
+
+    More epochs (unless the learning rate falls with them, as by a cosine) and more patience lengthen a training. `parts` and the
+    precision of the computation change rounding and batch norm alone, so that an interrupted training may move to a smaller
+    device. There are none if something else differs, or nothing does.
+    """
+    try:
+        was = read_json(folder / "config.json")
+    except (FileNotFoundError, Unreadable):
+        return {}
+    found, done = differences(was, identity), (folder / "summary.json").exists()
+    longer = {"task.optimiser.patience"}
+    if identity["task"]["optimiser"]["schedule"] != "cosine":
+        longer.add("task.optimiser.epochs")
+    for where, (before, now) in found.items():
+        is_longer = where in longer and isinstance(before, int) and before < now
+        if not is_longer and (done or where not in ("task.optimiser.parts", "task.optimiser.compute")):
+            return {}
+    return found if (folder / "latest").is_dir() else {}
+
+
 def _other(folder: Path, holds: str, was: Any, identity: dict[str, Any]) -> DataError:
     """The refusal of a folder that holds something else, which names what differs."""
     found = differences(was, identity)

@@ -38,7 +38,7 @@ from data_pipeline.progress import console, progress_bar
 from train.checkpoints import Checkpoints, drop_damaged
 from train.devices import DATA, check_batch, device_mesh, is_first, parameter_sharding, place, place_batch, summed_over
 from train.finite import all_finite, not_finite
-from train.kept import check_config, config_of, content_of, finished
+from train.kept import check_config, config_of, content_of, finished, goes_on_with
 from train.optimiser import learning_rate
 from train.preemption import Preempted, Preemption
 from train.starting_weights import StartingWeights
@@ -370,12 +370,17 @@ def fit(
             those of the epochs before.
     """
     identity = identity_of(task, statistics, start)
-    check_config(folder, identity, "a network trained")
-    if (made := finished(folder)) is not None:
-        return made
+    changed = goes_on_with(folder, identity)
+    if not changed:
+        check_config(folder, identity, "a network trained")
+        if (made := finished(folder)) is not None:
+            return made
     mesh = mesh or device_mesh()
     check_batch(task, mesh)
+    if changed:
+        console.print(f"{task.name}: goes on with other settings than it began with ({in_words(changed)})")
     if is_first():
+        (folder / "summary.json").unlink(missing_ok=True)
         keep_json(folder / "config.json", identity)
     drop_damaged(folder)
     training, config = _Training(task, data, statistics, folder, start, mesh, rate_option), task.optimiser

@@ -24,6 +24,7 @@ from data_pipeline.errors import DataError, Diverged
 from eval.settings import TINY
 from eval.stages import tasks
 from train.checkpoints import Checkpoints
+from train.kept import config_of
 from train.loop import fit, load_best
 from train.optimiser import OptimiserConfig, descent, learning_rate
 from train.preemption import Preempted
@@ -149,6 +150,51 @@ def test_a_finished_run_is_not_repeated_nor_mixed(trained, data):
     other = replace(task, optimiser=replace(task.optimiser, learning_rate=1e-4))
     with pytest.raises(DataError, match="other settings"):
         fit(other, data, statistics, trained / "classifier")
+
+
+def test_a_finished_run_may_be_lengthened(data, tmp_path, capsys):
+    """More epochs at a constant rate, where more patience is needed too; the result is that of one long run."""
+    statistics = load_statistics(data)
+    task = tasks(SETTINGS, statistics)[1]
+    task = replace(task, optimiser=replace(task.optimiser, epochs=1, schedule="constant", epoch_views=2))
+    fit(task, data, statistics, tmp_path / "lengthened")
+    longer = replace(task, optimiser=replace(task.optimiser, epochs=2, patience=9))
+    summary = fit(longer, data, statistics, tmp_path / "lengthened")
+    assert "(task.optimiser.epochs 1, not 2; task.optimiser.patience" in " ".join(capsys.readouterr().err.split())
+    whole = fit(longer, data, statistics, tmp_path / "whole")
+    for key in ("epoch", "steps", "best_epoch", "best"):
+        assert summary[key] == whole[key], key
+    assert config_of(tmp_path / "lengthened") == config_of(tmp_path / "whole")
+    assert fit(longer, data, statistics, tmp_path / "lengthened") == summary
+    for change in ({"epochs": 1}, {"patience": 3}, {"parts": 2}, {"compute": "bfloat16"}, {"epochs": 3, "seed": 1}):
+        other = replace(longer, optimiser=replace(longer.optimiser, **change))
+        with pytest.raises(DataError, match="other settings"):
+            fit(other, data, statistics, tmp_path / "lengthened")
+    falling = replace(longer, optimiser=replace(longer.optimiser, schedule="cosine"))
+    with pytest.raises(DataError, match="other settings"):
+        fit(falling, data, statistics, tmp_path / "lengthened")
+
+
+def test_an_interrupted_run_may_go_on_in_parts_and_half_precision(data, tmp_path, monkeypatch):
+    statistics = load_statistics(data)
+    task = tasks(SETTINGS, statistics)[1]
+    task = replace(task, optimiser=replace(task.optimiser, epochs=2, epoch_views=2))
+    real = train.loop.validate
+    seen: list[int] = []
+
+    def interrupted(*given):
+        seen.append(1)
+        if len(seen) == 2:
+            raise KeyboardInterrupt
+        return real(*given)
+
+    monkeypatch.setattr(train.loop, "validate", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        fit(task, data, statistics, tmp_path)
+    monkeypatch.undo()
+    smaller = replace(task, optimiser=replace(task.optimiser, parts=2, compute="bfloat16"))
+    assert fit(smaller, data, statistics, tmp_path)["epoch"] == 2
+    assert config_of(tmp_path)["task"]["optimiser"]["parts"] == 2
 
 
 def test_training_stops_when_validation_gets_no_better(data, tmp_path, monkeypatch):
