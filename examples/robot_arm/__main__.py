@@ -99,7 +99,7 @@ def show(agent: Any, options: argparse.Namespace) -> None:
     scene = make_scene(piece(options.object, options.seed))
     camera = DepthCamera(scene, options.sensor)
     camera.begin(options.seed)
-    agent.reset(center=scene.center, radius=RADIUS, yaw=0.0)
+    agent.reset(center=scene.center, radius=RADIUS, yaw=0.0, true_size=False)
     arm = Arm(scene)
     reach = arm.reach(agent.poses)
     free = np.isfinite(arm.costs(reach)[0])
@@ -130,7 +130,7 @@ def study(agents: dict[str, Any], options: argparse.Namespace) -> None:
     for kind, seed in ((kind, seed) for kind in CLASSES for seed in range(options.each)):
         scene = make_scene(piece(kind, seed))
         camera, arm = DepthCamera(scene, options.sensor), Arm(scene)
-        agents["best"].reset(center=scene.center, radius=RADIUS, yaw=0.0)
+        agents["best"].reset(center=scene.center, radius=RADIUS, yaw=0.0, true_size=False)
         reach = arm.reach(agents["best"].poses)
         firsts = np.flatnonzero(np.isfinite(arm.costs(reach)[0]))
         reached.append(len(firsts))

@@ -99,7 +99,7 @@ def recognise(
     """
     arm = Arm(scene)
     arm.place(HOME)
-    agent.reset(center=scene.center, radius=RADIUS, yaw=0.0)
+    agent.reset(center=scene.center, radius=RADIUS, yaw=0.0, true_size=False)
     seen: list[Looked] = []
     while True:
         begun = time.perf_counter()

@@ -67,6 +67,7 @@ def look(
     faces: Int[np.ndarray, "faces 3"],
     *,
     first: int | None = None,
+    metres: float | None = None,
     **options: Any,
 ) -> Walk:
     """Recognises a mesh: renders it from the views that the agent chooses.
@@ -76,6 +77,7 @@ def look(
         vertices: corners, z up, in any unit; centre and size are taken from the mesh.
         faces: (faces, 3) indices of corners.
         first: index of the first view; by default the agent chooses it.
+        metres: in one unit of the mesh, for a system that uses sizes; None if the size of the object is unknown.
         options: of `mevs_jax.Agent`.
 
     Raises:
@@ -85,9 +87,11 @@ def look(
     views = len(system.viewpoints)
     if first is not None and not 0 <= first < views:
         raise ValueError(f"first must be a view from 0 to {views - 1}, got {first}")
-    triangles = pad_triangles(unit_triangles(vertices, faces))
+    corners, radius = _centred(vertices, faces)
+    triangles = pad_triangles((corners / radius).astype(np.float32))
     camera = system.description.camera
-    agent.reset(center=(0.0, 0.0, 0.0), radius=1.0, yaw=0.0)
+    known = 1.0 if metres is None else radius * metres
+    agent.reset(center=(0.0, 0.0, 0.0), radius=known, yaw=0.0, true_size=metres is not None)
     seen, beliefs = [], []
     index = agent.decide().index if first is None else first
     while True:
@@ -115,6 +119,14 @@ def unit_triangles(
     Raises:
         ValueError: for a mesh without faces, with indices out of range, with corners that are not finite, or without a size.
     """
+    corners, radius = _centred(vertices, faces)
+    return (corners / radius).astype(np.float32)
+
+
+def _centred(
+    vertices: Float[np.ndarray, "vertices 3"], faces: Int[np.ndarray, "faces 3"]
+) -> tuple[Float[np.ndarray, "faces 3 3"], float]:
+    """Triangles of a mesh, centred on its bounding box, and the distance of the furthest corner from there."""
     vertices, faces = np.asarray(vertices, np.float64), np.asarray(faces)
     if vertices.ndim != 2 or vertices.shape[1] != 3 or faces.ndim != 2 or faces.shape[1] != 3 or not len(faces):
         raise ValueError(
@@ -130,7 +142,7 @@ def unit_triangles(
     radius = np.linalg.norm(corners, axis=-1).max()
     if not 0 < radius < np.inf:
         raise ValueError("the mesh is a single point")
-    return (corners / radius).astype(np.float32)
+    return corners, float(radius)
 
 
 @dataclass(frozen=True)

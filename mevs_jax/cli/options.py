@@ -174,6 +174,8 @@ class LookOptions:
     """answer "unknown object" for an object that is stranger than this share of the known ones, as 0.99"""
     up: Annotated[Literal["auto", "z", "y"], _arg("auto|z|y", "auto: y for glTF, as declared for DAE, else z")] = "auto"
     """the upward axis of the mesh"""
+    metres: Annotated[float, _arg("M", "0, its size is unknown")] = 0.0
+    """metres in one unit of the mesh, for a system that was trained to use sizes"""
     json: Annotated[tyro.conf.FlagCreatePairsOff[bool], _arg("")] = False
     """print the walk as JSON"""
     draw: Annotated[Path | None, _arg("FILE")] = None

@@ -37,7 +37,7 @@ def look(options: LookOptions) -> None:
         if mesh is not None:
             from mevs_jax.agent import look as look_at_mesh
 
-            walk = look_at_mesh(system, *mesh, first=options.first, **given)
+            walk = look_at_mesh(system, *mesh, first=options.first, metres=options.metres or None, **given)
         else:
             walk = _look_at_frames(system, stored, options, given)
     except ValueError as error:

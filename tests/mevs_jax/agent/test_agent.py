@@ -412,3 +412,33 @@ def test_the_smallest_rotation_takes_z_to_up():
         np.testing.assert_allclose(np.linalg.det(rotation), 1)
         np.testing.assert_allclose(rotation[:, 2], np.asarray(up) / np.linalg.norm(up), atol=1e-12)
     np.testing.assert_allclose(rotation_to_world((0, 0, 1), np.pi / 2)[:, 0], [0, 1, 0], atol=1e-12)
+
+
+def test_size_is_told_unless_it_is_not_true():
+    """A system that uses sizes: agents tell it their radius, and a mesh's only where its unit is known."""
+    sized = making.system("sized")
+    view = 3
+    depth, pose = making.depth_of_ball(sized.viewpoints[view]), sized.poses[view]
+    agent, found = sized.agent(stop=2.0, max_views=3), {}
+    for name, options in {
+        "small": {"radius": 0.1},
+        "large": {"radius": 1.0},
+        "model": {"radius": 0.1, "true_size": False},
+        "other model": {"radius": 1.0, "true_size": False},
+    }.items():
+        agent.reset(center=(0, 0, 0), yaw=0.0, **options)
+        found[name] = agent.observe_view(depth, pose).probabilities
+    assert np.abs(found["small"] - found["large"]).max() > 1e-3
+    np.testing.assert_array_equal(found["model"], found["other model"])
+    again = agent.history.options["reset"]
+    assert again["true_size"] is False
+    expected = sized.observe(depth, pose, 0.1)
+    assert np.abs(np.asarray(expected.features - sized.observe(depth, pose).features)).max() > 0.1
+    cube = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)], float)
+    faces = np.array([[0, 1, 3], [0, 3, 2], [4, 6, 7], [4, 7, 5], [0, 4, 5], [0, 5, 1], [2, 3, 7], [2, 7, 6]])
+    walks = [mevs_jax.look(sized, cube, faces, stop=2.0, max_views=1, metres=metres) for metres in (None, 0.1, 1.0)]
+    unknown, small, large = (walk.beliefs[0].probabilities for walk in walks)
+    assert np.abs(small - large).max() > 1e-3
+    assert np.abs(small - unknown).max() > 1e-4
+    far = mevs_jax.look(sized, 1000 * cube, faces, stop=2.0, max_views=1, metres=0.001)
+    np.testing.assert_allclose(far.beliefs[0].probabilities, large, atol=1e-5)
