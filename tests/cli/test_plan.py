@@ -143,7 +143,7 @@ def shape_of(line: str, comment: str) -> tuple[int, int]:
 
 
 def options_of(command: str) -> tuple[str, ...]:
-    words = command.split("mevs train")[1].replace("…", "").split('"')[0].split("  #")[0]
+    words = command.split("mevs train")[1].replace("…", "").split('"')[0]
     return tuple(shlex.split(words))
 
 
@@ -153,7 +153,7 @@ def launches(text: str) -> list[Launch]:
     plain = re.sub(r"```yaml.*?```", "", text, flags=re.S)
     for line in plain.splitlines():
         in_code = [line.strip()] if line.startswith("    ") else re.findall(r"`([^`]*)`", line)
-        for code in in_code:
+        for code in (code.split("  #")[0] for code in in_code):
             if "mevs train" in code and "--plan" not in code:
                 found.append(Launch(options_of(code), *shape_of(code, above)))
         above = line
