@@ -22,9 +22,9 @@ from eval.numbers.trainings import csv_over_trainings, rows_over_trainings, walk
 from eval.run_file import save_run
 from eval.settings import Settings
 from train.chance import warn_of_chance
+from train.devices import device_mesh
 from train.kept import keep_beside, kept_json, made_by
-from train.many.members import SweepTask
-from train.many.seeds import train_seeds
+from train.many.seeds import check_networks, train_seeds
 from train.optimiser import OptimiserConfig
 from train.starting_weights import StartingWeights
 
@@ -71,7 +71,7 @@ def train(
     mesh: jax.sharding.Mesh | None = None,
     at_once: int = 0,
 ) -> None:
-    """Trains both networks from all seeds.
+    """Trains both networks from all seeds, once all are checked.
 
     Args:
         settings: of the run.
@@ -81,15 +81,20 @@ def train(
         at_once: largest number of seeds that are trained together, which bounds memory; 0: all.
     """
     statistics, numbers = load_statistics(out / "data"), range(settings.seeds)
-    size = at_once or settings.seeds
-    for place, (name, weights) in enumerate((("classifier", start), ("entropy", None))):
-        tasks: list[SweepTask] = [
-            stages.tasks(seed_settings(settings, number), statistics)[place] for number in numbers
-        ]
+    size, mesh = at_once or settings.seeds, mesh or device_mesh()
+    parts = [slice(first, first + size) for first in range(0, settings.seeds, size)]
+    seeds = [stages.trainings(seed_settings(settings, number), statistics, start) for number in numbers]
+    networks = []
+    for same in zip(*seeds, strict=True):
+        _, name, weights = same[0]
+        tasks: list[Any] = [task for task, _, _ in same]
         folders, work = [seed_folder(out, number) / name for number in numbers], out / "seeds" / f"{name}_together"
+        networks.append((tasks, name, folders, work, weights))
+        for part in parts:
+            check_networks(tasks[part], statistics, folders[part], work, weights, mesh)
+    for tasks, name, folders, work, weights in networks:
         option, summaries = f"--{name}.optimiser.learning-rate", []
-        for first in range(0, settings.seeds, size):
-            part = slice(first, first + size)
+        for part in parts:
             summaries += train_seeds(tasks[part], out / "data", statistics, folders[part], work, weights, mesh, option)
         for number, summary in enumerate(summaries):
             best = ", ".join(f"{key} {value:.4f}" for key, value in summary["best"].items())

@@ -45,9 +45,11 @@ from mevs_jax.policies.registry import policy_named
 from mevs_jax.trained import load as load_system
 from train.chance import warn_of_chance
 from train.choosing.stages import Stages, check_learned, train_recognisers
+from train.devices import Layout, check_batch, device_mesh
 from train.finite import check_results, place_not_finite
 from train.kept import keep_beside, kept, kept_json, made_by, summary_of
-from train.loop import fit, load_best
+from train.loop import check_launch, fit, load_best
+from train.plan import plan_of, planned_statistics
 from train.starting_weights import StartingWeights
 from train.step import Task
 from train.tasks.classifier import ClassifierTask
@@ -79,16 +81,39 @@ def tasks(settings: Settings, statistics: DatasetStatistics) -> tuple[Classifier
     )
 
 
+def trainings(
+    settings: Settings, statistics: DatasetStatistics, start: StartingWeights | None
+) -> tuple[tuple[Task, str, StartingWeights | None], ...]:
+    """What `train` trains, in this order: each network's task, the folder in the run, and the weights it starts from."""
+    classify, predict = tasks(settings, statistics)
+    return (classify, "classifier", start), (predict, "entropy", None)
+
+
+def check_batches(settings: Settings, out: Path) -> None:
+    """Raises `DataError` if the devices that are here cannot share the batches of a network that is not trained yet.
+
+    Several seeds may be trained without sharing batches; they are checked when the data are there.
+    """
+    if settings.seeds > 1:
+        return
+    layout = Layout.of_mesh(device_mesh())
+    networks = ("classifier", "classifier", settings.classifier), ("entropy predictor", "entropy", settings.entropy)
+    for name, folder, config in networks:
+        if not (out / folder / "summary.json").exists():
+            check_batch(name, config.optimiser, layout)
+
+
 def train(
     settings: Settings, out: Path, start: StartingWeights | None = None, mesh: jax.sharding.Mesh | None = None
 ) -> None:
-    """Trains both networks, the classifier from `start` or from random weights, on `mesh` or on all devices."""
+    """Trains both networks, the classifier from `start` or from random weights, on `mesh` or on all devices.
+
+    Both are checked before the first is trained.
+    """
     statistics = load_statistics(out / "data")
-    classify, predict = tasks(settings, statistics)
-    planned: list[tuple[Task, str, StartingWeights | None]] = [
-        (classify, "classifier", start),
-        (predict, "entropy", None),
-    ]
+    planned, mesh = trainings(settings, statistics, start), mesh or device_mesh()
+    for task, name, weights in planned:
+        check_launch(task, statistics, out / name, weights, Layout.of_mesh(mesh))
     for task, name, weights in planned:
         summary = fit(task, out / "data", statistics, out / name, weights, mesh, f"--{name}.optimiser.learning-rate")
         console.print(
@@ -97,6 +122,35 @@ def train(
             + f", {summary['seconds'] / 60:.1f} min"
         )
         warn_of_chance(task, summary, statistics)
+
+
+def plan_training(
+    settings: Settings, out: Path, start: StartingWeights | None, layout: Layout, objects: int | None = None
+) -> dict[str, Any]:
+    """Returns what `train` would do on these devices, as values that JSON can hold; nothing is trained.
+
+    Args:
+        objects: number of training objects of a data set that is not made yet; None for the run's own data set.
+
+    Raises:
+        DataError: if there is no data set, or `train` would refuse to begin.
+    """
+    if objects is not None:
+        made, statistics = None, planned_statistics(settings.dataset, objects)
+        waiting = [task for task, _, _ in trainings(settings, statistics, start)]
+    else:
+        made = out / "data"
+        if not (made / SUMMARY).exists():
+            raise DataError(
+                f"no data set in {made}; create one with: mevs data --out {out}, or plan for one of N objects by --plan-objects N"
+            )
+        statistics = load_statistics(made)
+        waiting = [
+            task
+            for task, name, weights in trainings(settings, statistics, start)
+            if check_launch(task, statistics, out / name, weights, layout)
+        ]
+    return plan_of(waiting, statistics, layout, made)
 
 
 BY_VIEW = "classifier_by_view"

@@ -6,9 +6,11 @@ their last axis. The compiler derives the rest.
 
 from __future__ import annotations
 
+import math
 import os
 import socket
 from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Any
 
 import jax
@@ -16,7 +18,7 @@ import numpy as np
 from jax.sharding import AbstractMesh, Mesh, NamedSharding, PartitionSpec
 
 from data_pipeline.errors import DataError
-from train.step import Task
+from train.optimiser import OptimiserConfig
 
 DATA, MODEL = "data", "model"
 _SMALLEST_SPLIT = 2**12
@@ -72,6 +74,54 @@ def is_first() -> bool:
     return jax.process_index() == 0
 
 
+@dataclass(frozen=True)
+class Layout:
+    """How the devices of all processes share the work, as numbers: of a mesh, or of one that is not there yet.
+
+    Attributes:
+        processes: number of processes, which have equally many devices.
+        data: number of parts into which a batch is split.
+        model: number of devices that share one copy of the weights.
+    """
+
+    processes: int = 1
+    data: int = 1
+    model: int = 1
+
+    @classmethod
+    def of(cls, devices: int, processes: int = 1, model: int = 1) -> Layout:
+        """Returns the layout of so many devices, of all processes together.
+
+        Raises:
+            DataError: if the processes cannot have equally many devices, or `model` does not divide the devices of a process.
+        """
+        if processes < 1 or devices < 1 or devices % processes:
+            raise DataError(
+                f"{devices} devices cannot be shared equally by {processes} processes; each process needs as many as the others"
+            )
+        local = devices // processes
+        if model < 1 or local % model:
+            raise DataError(
+                f"--model-devices {model} does not divide the {local} devices of a process; use 1, or a divisor"
+            )
+        return cls(processes, devices // model, model)
+
+    @classmethod
+    def of_mesh(cls, mesh: Mesh) -> Layout:
+        """Returns the layout of a mesh of devices."""
+        return cls(jax.process_count(), mesh.shape[DATA], mesh.shape[MODEL])
+
+    @property
+    def devices(self) -> int:
+        """Number of devices of all processes."""
+        return self.data * self.model
+
+    @property
+    def abstract_mesh(self) -> AbstractMesh:
+        """The mesh without its devices, which tells the shapes of shards."""
+        return AbstractMesh((self.data, self.model), (DATA, MODEL))
+
+
 def device_mesh(model: int = 1) -> Mesh:
     """Returns the mesh of all devices of all processes.
 
@@ -84,32 +134,42 @@ def device_mesh(model: int = 1) -> Mesh:
         DataError: if `model` does not divide the devices of a process.
     """
     devices = sorted(jax.devices(), key=lambda device: (device.process_index, device.id))
-    local = jax.local_device_count()
-    if model < 1 or local % model:
-        raise DataError(
-            f"--model-devices {model} does not divide the {local} devices of a process; use 1, or a divisor"
-        )
-    return Mesh(np.array(devices).reshape(-1, model), (DATA, MODEL))
+    layout = Layout.of(len(devices), jax.process_count(), model)
+    return Mesh(np.array(devices).reshape(layout.data, layout.model), (DATA, MODEL))
 
 
-def check_batch(task: Task, mesh: Mesh) -> None:
-    """Raises `DataError` if a batch cannot be split equally over the mesh and the processes."""
-    config, processes, devices = task.optimiser, jax.process_count(), mesh.shape[DATA]
-    if config.parts < 1 or config.batch_size % (devices * config.parts):
+def check_batch(name: str, config: OptimiserConfig, layout: Layout, group: int = 1) -> None:
+    """Raises `DataError` if a batch cannot be split equally over the devices and the processes; it names a batch that can.
+
+    Args:
+        name: of the network.
+        group: number of successive views that stay in one part.
+    """
+    for option, value in (
+        ("batch-size", config.batch_size),
+        ("parts", config.parts),
+        ("views-per-object", config.views_per_object),
+    ):
+        if value < 1:
+            raise DataError(f"{name}: optimiser.{option} must be at least 1, and is {value}")
+    unit = math.lcm(layout.data * config.parts, config.parts * group, config.views_per_object * layout.processes)
+    fits = f"such as {unit * -(-config.batch_size // unit)}"
+    if config.batch_size % (layout.data * config.parts):
         parts = f" in {config.parts} parts" if config.parts != 1 else ""
         raise DataError(
-            f"{task.name}: a batch of {config.batch_size} views{parts} cannot be shared equally by {devices} devices; "
-            f"choose another optimiser.batch-size or optimiser.parts, or use fewer devices"
+            f"{name}: a batch of {config.batch_size} views{parts} cannot be shared equally by {layout.data} devices; "
+            f"choose another optimiser.batch-size ({fits}) or optimiser.parts, or use fewer devices"
         )
-    if config.batch_size % (config.parts * task.group):
+    if config.batch_size % (config.parts * group):
         raise DataError(
-            f"{task.name}: a batch of {config.batch_size} views, {task.group} of an object, cannot be cut into {config.parts} "
-            "parts of whole objects; choose another optimiser.batch-size, optimiser.parts or optimiser.views-per-object"
+            f"{name}: a batch of {config.batch_size} views, {group} of an object, cannot be cut into {config.parts} parts of "
+            f"whole objects; choose another optimiser.batch-size ({fits}), optimiser.parts or optimiser.views-per-object"
         )
-    if config.batch_size % (config.views_per_object * processes):
+    if config.batch_size % (config.views_per_object * layout.processes):
         raise DataError(
-            f"{task.name}: a batch of {config.batch_size} views, {config.views_per_object} of an object, cannot be read "
-            f"equally by {processes} processes; choose another optimiser.batch-size or optimiser.views-per-object"
+            f"{name}: a batch of {config.batch_size} views, {config.views_per_object} of an object, cannot be read "
+            f"equally by {layout.processes} processes; choose another optimiser.batch-size ({fits}) or "
+            f"optimiser.views-per-object"
         )
 
 

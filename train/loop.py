@@ -29,6 +29,7 @@ from data_pipeline.dataset.batches import (
     training_splits,
     validation_batches,
     validation_splits,
+    views_aside,
 )
 from data_pipeline.dataset.statistics import DatasetStatistics
 from data_pipeline.differences import differences, in_words
@@ -36,7 +37,17 @@ from data_pipeline.errors import DataError, Diverged
 from data_pipeline.files import as_read, check_of_file, keep_checks, keep_json, write_text
 from data_pipeline.progress import console, progress_bar
 from train.checkpoints import Checkpoints, drop_damaged
-from train.devices import DATA, check_batch, device_mesh, is_first, parameter_sharding, place, place_batch, summed_over
+from train.devices import (
+    DATA,
+    Layout,
+    check_batch,
+    device_mesh,
+    is_first,
+    parameter_sharding,
+    place,
+    place_batch,
+    summed_over,
+)
 from train.finite import all_finite, not_finite
 from train.kept import check_config, config_of, content_of, finished, goes_on_with
 from train.optimiser import learning_rate
@@ -170,6 +181,38 @@ class MetricsLog:
 def identity_of(task: Task, statistics: DatasetStatistics, start: StartingWeights | None = None) -> dict[str, Any]:
     """Returns what identifies a run, as stored in its `config.json`: task, data set, starting weights."""
     return as_read({"task": content_of(task), "data": statistics.fingerprint, "start": start and start.name})
+
+
+def check_training(task: Task, statistics: DatasetStatistics, layout: Layout) -> None:
+    """Raises `DataError` if a network cannot be trained on a data set by these devices and processes."""
+    config = task.optimiser
+    check_batch(task.name, config, layout, task.group)
+    by_view = config.validation_by == "view"
+    trainable = statistics.views - (len(views_aside(statistics.views, 0, config.data_seed)) if by_view else 0)
+    if config.views_per_object > trainable:
+        raise DataError(
+            f"{task.name}: {config.views_per_object} views of an object in a batch are more than the {trainable} that an object "
+            f"has for training; choose a smaller optimiser.views-per-object"
+        )
+
+
+def check_launch(
+    task: Task, statistics: DatasetStatistics, folder: Path, start: StartingWeights | None, layout: Layout
+) -> bool:
+    """Returns whether a network has still to be trained in `folder`, once nothing was found that forbids it.
+
+    Several networks are checked so before the first of them is trained.
+
+    Raises:
+        DataError: as `fit` does, if the folder holds a run with another configuration, or the devices cannot share a batch.
+    """
+    identity = identity_of(task, statistics, start)
+    if not goes_on_with(folder, identity):
+        check_config(folder, identity, "a network trained")
+        if (folder / "summary.json").exists():
+            return False
+    check_training(task, statistics, layout)
+    return True
 
 
 class _Training:
@@ -376,7 +419,7 @@ def fit(
         if (made := finished(folder)) is not None:
             return made
     mesh = mesh or device_mesh()
-    check_batch(task, mesh)
+    check_training(task, statistics, Layout.of_mesh(mesh))
     if changed:
         console.print(f"{task.name}: goes on with other settings than it began with ({in_words(changed)})")
     if is_first():

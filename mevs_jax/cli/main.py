@@ -68,6 +68,12 @@ def _run(name: str, arguments: list[str]) -> None:
         print(json.dumps(configuration(call.preset, call.settings), indent=1, default=str))
         return
     command = COMMANDS[name]
+    if getattr(call.options, "plan", None) is not None:
+        from mevs_jax.cli.planning import is_asked, plan
+
+        if is_asked(call.options):  # nothing is written for it
+            plan(call)
+            return
     if getattr(call.options, "distributed", False):
         command.load()(call)  # which joins the other processes first; one of them keeps the settings
         return

@@ -149,6 +149,16 @@ class TrainOptions(WithSeeds, WithWeights, WithEncoder):
     """this is one of several processes that train together (docs/scaling.md)"""
     model_devices: Annotated[int, _arg("N", "1")] = 1
     """devices that share one copy of a network's weights; batches are split over the others"""
+    plan: Annotated[tyro.conf.FlagCreatePairsOff[bool], _arg("")] = False
+    """print what this command would do, or why it cannot, and train nothing (docs/scaling.md)"""
+    plan_devices: Annotated[int | None, _arg("N", "those that are here")] = None
+    """with --plan: devices to plan for, of all processes together"""
+    plan_processes: Annotated[int | None, _arg("N", "1")] = None
+    """with --plan --distributed: processes to plan for"""
+    plan_objects: Annotated[int | None, _arg("N", "the run's data set")] = None
+    """with --plan: plan for a data set of so many training objects that is not made yet"""
+    json: Annotated[tyro.conf.FlagCreatePairsOff[bool], _arg("")] = False
+    """with --plan: print the plan as JSON, in bytes and operations"""
 
 
 @dataclass(frozen=True)

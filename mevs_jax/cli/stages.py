@@ -25,6 +25,7 @@ def run(call: Invocation) -> None:
     if classifier.encoder:
         load_own(classifier.encoder, "--encoder")
     seeds.check_seeds(call.settings)
+    stages.check_batches(call.settings, call.out)
     stages.policies_of(call.settings, stages.make_data(call.settings, call.out))
     _train(call, start)
     evaluate(call)

@@ -22,7 +22,7 @@ from data_pipeline.errors import DataError
 from eval.stages import tasks
 from tests.train.scaling_worker import SETTINGS
 from tests.train.test_training import lines
-from train.devices import check_batch, device_mesh, is_lost_process, parameter_sharding
+from train.devices import Layout, check_batch, device_mesh, is_lost_process, parameter_sharding
 from train.loop import fit, load_best
 from train.step import Task, initial_state, train_step_of
 
@@ -89,8 +89,7 @@ def test_a_run_goes_on_with_fewer_devices(before, data, tmp_path):
         np.testing.assert_allclose(mine, theirs, rtol=1e-3, atol=2e-4)
 
 
-def test_what_cannot_be_shared_is_told(data):
-    task = tasks(SETTINGS, load_statistics(data))[0]
+def test_what_cannot_be_shared_is_told():
     with pytest.raises(DataError, match="--model-devices 3 does not divide the 1 devices"):
         device_mesh(3)
     for changed, told in (
@@ -98,7 +97,7 @@ def test_what_cannot_be_shared_is_told(data):
         ({"views_per_object": 3}, "16 views, 3 of an object, cannot be read equally by 1 processes"),
     ):
         with pytest.raises(DataError, match=told):
-            check_batch(replace(task, optimiser=replace(task.optimiser, **changed)), device_mesh())
+            check_batch("classifier", replace(SETTINGS.classifier.optimiser, **changed), Layout.of_mesh(device_mesh()))
     assert not is_lost_process(RuntimeError("Gloo: connection closed by peer"))  # there are no others here
 
 

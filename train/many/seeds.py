@@ -13,12 +13,39 @@ from jax.sharding import Mesh
 from data_pipeline.dataset.statistics import DatasetStatistics
 from data_pipeline.errors import Diverged
 from data_pipeline.files import as_read, keep_json, read_json
-from train.devices import device_mesh
+from train.devices import Layout, device_mesh
 from train.kept import check_config, finished
-from train.loop import fit, identity_of
+from train.loop import check_training, fit, identity_of
 from train.many.members import SweepTask, export_member, member_of
 from train.many.training import train_members
 from train.starting_weights import StartingWeights
+
+
+def number_together(networks: int, mesh: Mesh, start: StartingWeights | None) -> int:
+    """Returns how many of so many networks that are not begun yet are trained together; all devices train each of the others."""
+    alone = start is not None or jax.process_count() > 1 or mesh.shape["model"] > 1
+    together = 0 if alone else networks // mesh.size * mesh.size
+    return together if together > 1 else 0
+
+
+def check_networks(
+    tasks: Sequence[SweepTask],
+    statistics: DatasetStatistics,
+    folders: Sequence[Path],
+    work: Path,
+    start: StartingWeights | None,
+    mesh: Mesh,
+) -> None:
+    """Raises `DataError` if `train_seeds` would: folders hold something else, or batches cannot be shared."""
+    for task, folder in zip(tasks, folders, strict=True):
+        check_config(folder, identity_of(task, statistics, start), "a network trained")
+    if (work / "config.json").exists():  # begun together
+        return
+    waiting = sum(not (folder / "summary.json").exists() for folder in folders)
+    if together := number_together(waiting, mesh, start):
+        check_training(tasks[0], statistics, Layout())  # a batch is that of one device
+    if together < waiting:
+        check_training(tasks[0], statistics, Layout.of_mesh(mesh))
 
 
 def train_seeds(
@@ -57,8 +84,7 @@ def train_seeds(
     missing = [index for index, folder in enumerate(folders) if finished(folder) is None]
     begun = [index for index in missing if (folders[index] / "latest").exists()]  # alone, by `fit`
     fresh = [index for index in missing if index not in begun]
-    alone = start is not None or jax.process_count() > 1 or mesh.shape["model"] > 1
-    together = [] if alone else fresh[: len(fresh) // mesh.size * mesh.size]
+    together = fresh[: number_together(len(fresh), mesh, start)]
     if (work / "config.json").exists():  # of an interrupted training, some of whose networks may be finished
         stored = read_json(work / "config.json")["networks"]
         together = [index for index, task in enumerate(tasks) if as_read(identity_of(task, statistics)) in stored]

@@ -27,7 +27,7 @@ from mevs_jax.models import Recogniser
 from mevs_jax.viewpoints import viewpoint_lattice
 from train.choosing.looks import see_changed, see_rotated
 from train.choosing.stages import Stages, check_learned
-from train.devices import check_batch, device_mesh
+from train.devices import Layout, check_batch, device_mesh
 from train.kept import summary_of
 from train.loop import fit, load_best, steps_of_an_epoch, validation_set
 from train.step import part_of
@@ -156,9 +156,10 @@ def test_parts_of_a_batch_and_shares_of_devices_hold_whole_objects(turned):
     parts = np.asarray(part_of(jnp.asarray(objects), 2, task.group))
     assert [sorted(set(part.tolist())) for part in parts] == [[0, 2], [1, 3]]
     assert (parts.reshape(2, 2, 4) == parts.reshape(2, 2, 4)[..., :1]).all()
-    check_batch(task, device_mesh())
+    layout = Layout.of_mesh(device_mesh())
+    check_batch(task.name, optimiser, layout, task.group)
     with pytest.raises(DataError, match="16 views, 4 of an object, cannot be cut into 8 parts of whole objects"):
-        check_batch(replace(task, optimiser=replace(optimiser, parts=8)), device_mesh())
+        check_batch(task.name, replace(optimiser, parts=8), layout, task.group)
     for batch, weights in validation_set(task, turned, statistics, devices=8):
         shares = batch["label"].reshape(8, -1, task.optimiser.validation_views)
         assert (shares == shares[..., :1]).all()
