@@ -122,7 +122,7 @@ class DataOptions(WithViews):
     """Options of `mevs data`."""
 
     beam: Annotated[str | None, _arg("OPTIONS")] = None
-    """use Apache Beam with these pipeline options, as "--runner=DirectRunner" (docs/scaling.md)"""
+    """use Apache Beam with these pipeline options, as --beam=--runner=DirectRunner (docs/scaling.md)"""
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,141 @@
+"""Commands in the documentation exist with their options, blocks of Python run, and links lead somewhere."""
+
+from __future__ import annotations
+
+import re
+import shlex
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import mevs_jax
+from data_pipeline.capture.casting import default_caster
+from data_pipeline.objects.furniture import furniture
+from mevs_jax.cli.commands import ALIASES, COMMANDS
+from mevs_jax.cli.parsing import parse, tool_options
+
+ROOT = Path(__file__).resolve().parents[2]
+PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
+CENTER, RADIUS = np.array([0.5, 0.1, 0.8]), 0.15
+K = np.array([[300.0, 0, 159.5], [0, 300.0, 119.5], [0, 0, 1]])
+
+
+def commands_in(page: Path) -> list[str]:
+    """The calls of `mevs` in a page's blocks of code, without comments."""
+    text = page.read_text()
+    fenced = re.findall(r"```sh\n(.*?)```", text, re.DOTALL)
+    outside = re.sub(r"```.*?```", "", text, flags=re.DOTALL)
+    indented = [line.strip() for line in outside.splitlines() if line.startswith("    ")]
+    lines = "\n".join([*fenced, *indented]).replace("\\\n", " ").splitlines()
+    found = [re.search(r"(?:^|[ /\"])mevs (.*)", re.sub(r"\s#.*", "", line)) for line in lines]
+    calls = [match[1].strip() for match in found if match]
+    return [call.removesuffix('"') if call.count('"') % 2 else call for call in calls]
+
+
+COMMANDS_OF_PAGES = [(page.name, command) for page in PAGES for command in dict.fromkeys(commands_in(page))]
+
+
+def test_pages_have_commands():
+    assert len(COMMANDS_OF_PAGES) > 30
+    assert {page for page, _ in COMMANDS_OF_PAGES} >= {"README.md", "start.md", "scaling.md", "robot.md", "agent.md"}
+
+
+@pytest.mark.parametrize(("page", "command"), COMMANDS_OF_PAGES, ids=lambda value: value[:60])
+def test_documented_commands_take_their_options(page, command, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    words = [word for word in shlex.split(command) if word != "…"]
+    if words[:1] in (["COMMAND"], ["--help"]):
+        return
+    name = " ".join(words[:2]) if " ".join(words[:2]) in COMMANDS else words[0]
+    arguments = words[len(name.split()) :]
+    name = ALIASES.get(name, name)
+    assert name in COMMANDS, command
+    tool_options(name, arguments) if COMMANDS[name].tool else parse(name, arguments)
+
+
+def look_from(pose: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Depth of a chair around the centre of the documented calls, by a camera of 320×240 pixels."""
+    piece = furniture("chair", 900)
+    corners = np.asarray(piece.vertices, float)
+    corners -= (corners.min(axis=0) + corners.max(axis=0)) / 2
+    radius = LOOKED["radius"]
+    corners = (corners * radius / np.linalg.norm(corners, axis=1).max() + CENTER).astype(np.float32)
+    rows, columns = np.mgrid[:240, :320]
+    rays = np.stack([columns, rows, np.ones_like(rows)], axis=-1) @ np.linalg.inv(K).T @ pose[:3, :3].T
+    origins = np.repeat(pose[:3, 3][None], rays.size // 3, axis=0)
+    cast = default_caster()(mevs_mesh(corners, np.asarray(piece.faces, np.int32)))
+    depth, _ = cast(origins.astype(np.float32), rays.reshape(-1, 3).astype(np.float32))
+    return depth.reshape(240, 320), K
+
+
+def mevs_mesh(vertices: np.ndarray, faces: np.ndarray):
+    from data_pipeline.objects.mesh import Mesh
+
+    return Mesh(vertices, faces, np.ptp(vertices, axis=0))
+
+
+LOOKED = {"radius": RADIUS}
+
+
+def world_of(page: str, whole: Path) -> dict:
+    """Names that a page's blocks use and a reader has: a camera, arrays, tables."""
+    import jax
+
+    from eval.tables import load_view_tables
+
+    LOOKED["radius"] = 0.45 if page == "README.md" else RADIUS
+    pose = np.asarray(mevs_jax.look_at_origin(np.array([0.3, -0.2, 0.25], np.float32)))
+    pose = np.array(pose, float)
+    pose[:3, 3] += CENTER
+    depth, _ = look_from(pose)
+    tables = load_view_tables(whole / "tables" / "test.npz")
+    return {
+        "look_from": look_from if page == "README.md" else lambda pose: (*look_from(pose), pose),
+        "can_reach": lambda pose: pose[2, 3] > CENTER[2] - 0.2,
+        "depth": depth,
+        "K": K,
+        "T_world_camera": pose,
+        "points": CENTER + RADIUS * np.random.default_rng(0).uniform(-0.5, 0.5, (500, 3)),
+        "tables": tables.stacked(),
+        "graph": mevs_jax.ViewGraph.from_points(mevs_jax.fibonacci_sphere(tables.logits.shape[1])),
+        "key": jax.random.key(0),
+    }
+
+
+WITH_PYTHON = [page.name for page in PAGES if "```python" in page.read_text()]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("page", WITH_PYTHON)
+def test_documented_python_runs(page, whole, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "runs").mkdir()
+    (tmp_path / "runs" / "demo").symlink_to(whole)
+    if page == "environment.md":
+        pytest.importorskip("ap_gym", reason="its second block needs the extra gym")
+    piece = furniture("chair", 900)
+    piece.export(tmp_path / "chair.obj")
+    (path,) = (one for one in PAGES if one.name == page)
+    world = world_of(page, whole)
+    for number, block in enumerate(re.findall(r"```python\n(.*?)```", path.read_text(), re.DOTALL)):
+        exec(compile(block, f"{page}, block {number}", "exec"), world)
+
+
+def test_links_lead_somewhere():
+    for page in [*PAGES, ROOT / "CHANGELOG.md", ROOT / "CONTRIBUTING.md", *ROOT.glob("examples/**/README.md")]:
+        text = re.sub(r"```.*?```", "", page.read_text(), flags=re.DOTALL)
+        for target in re.findall(r"\]\(([^)\s]+)\)", text):
+            if target.startswith(("http://", "https://")):
+                continue
+            file, _, anchor = target.partition("#")
+            there = (page.parent / file).resolve() if file else page
+            assert there.exists(), f"{page.name}: {target}"
+            if anchor:
+                headings = re.findall(r"^#+ (.*)$", there.read_text(), re.MULTILINE)
+                assert anchor in {anchor_of(heading) for heading in headings}, f"{page.name}: {target}"
+
+
+def anchor_of(heading: str) -> str:
+    """The anchor that GitHub gives a heading."""
+    return re.sub(r"[^\w\- ]", "", heading.lower()).strip().replace(" ", "-")
