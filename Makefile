@@ -10,7 +10,7 @@ PYTEST := $(BIN)/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder
 # would compile them again, for 12 seconds.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: demo test test-all lint bench wheel clean
+.PHONY: demo test test-all lint bench docs wheel clean
 
 demo: $(READY)  ## environment, data, networks, evaluation, report
 	$(BIN)/mevs run --preset small --out $(OUT)
@@ -32,6 +32,14 @@ bench: $(READY)  ## what is fast, beside its peers, in one run
 	$(BIN)/python benchmarks/evaluation.py
 	$(BIN)/python benchmarks/members.py
 
+docs: .venv-docs/.ready  ## the documentation site, in site/; fails on a dead link
+	NO_MKDOCS_2_WARNING=1 .venv-docs/bin/mkdocs build --quiet --strict
+
+.venv-docs/.ready: docs/requirements.txt
+	$(PYTHON) -m venv .venv-docs
+	.venv-docs/bin/python -m pip install --quiet --disable-pip-version-check -r docs/requirements.txt
+	touch $@
+
 wheel: $(READY)  ## the library alone, as a wheel in dist/
 	$(BIN)/python -m pip wheel --quiet --disable-pip-version-check --no-deps --wheel-dir dist .
 
@@ -44,7 +52,7 @@ $(READY): requirements.lock pyproject.toml
 	touch $@
 
 clean:  ## environment and builds; runs/ stays
-	rm -rf .venv dist
+	rm -rf .venv .venv-docs dist site
 
 .PHONY: fuzz
 fuzz: $(READY)  ## 20,000 mutated inputs for each reader of foreign files

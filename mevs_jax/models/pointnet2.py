@@ -185,7 +185,9 @@ class PointNet2(TrainedByCall):
 
     Args:
         views: number of candidate views, at least 2.
-        abstractions, global_layers, head_layers: sizes of the layers; the thesis's by default.
+        abstractions: sizes of the set abstraction layers; the thesis's by default.
+        global_layers: widths of the layers before the pooling over all centres.
+        head_layers: widths of the layers after it.
         dropout: rate before the last layer, in [0, 1).
         rngs: source of the initial weights.
         dtype: type in which the hidden layers compute; that of the clouds by default. Coordinates, weights, batch-norm

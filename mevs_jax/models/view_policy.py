@@ -84,7 +84,8 @@ class ViewPolicy(nnx.Module):
         cloud: length of PointNet++'s embedding of the partial cloud of each view; 0 for none.
         posed: whether directions are in the object's own frame; if not, in one rotated about the vertical axis by an unknown
             angle.
-        utility, floor: the utility whose gain is predicted; see `utility_of`.
+        utility: whose gain is predicted; see `utility_of`.
+        floor: of that utility.
         rngs: source of the initial weights.
     """
 

@@ -126,7 +126,8 @@ def ball_query(
     Source: PointNet++ §3.2; the rule of `pointnet2_ops`.
 
     Args:
-        points, centres: coordinates in the same unit.
+        points: coordinates.
+        centres: coordinates in the same unit.
         radius: in that unit; compared as `d² < radius·radius` in float32, as in the reference.
         k: number of indices per centre, at least 1. Empty slots repeat the first hit; a centre without hits gets point 0.
 
