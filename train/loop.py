@@ -10,7 +10,7 @@ from __future__ import annotations
 import json
 import time
 from collections import deque
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import suppress
 from dataclasses import replace
 from functools import partial
@@ -27,8 +27,6 @@ from data_pipeline.dataset.batches import (
     steps_per_epoch,
     train_batches,
     training_splits,
-    validation_batches,
-    validation_splits,
     views_aside,
 )
 from data_pipeline.dataset.statistics import DatasetStatistics
@@ -54,6 +52,7 @@ from train.optimiser import learning_rate
 from train.preemption import Preempted, Preemption
 from train.starting_weights import StartingWeights
 from train.step import Metrics, Task, TrainState, abstract_state, evaluate_step_of, initial_state, train_step_of
+from train.validation import ValidationSet
 
 
 class Lead:
@@ -79,59 +78,13 @@ def steps_of_an_epoch(task: Task, statistics: DatasetStatistics) -> int:
     return steps_per_epoch(objects * (config.epoch_views or statistics.views) // config.views_per_object, task.batches)
 
 
-def class_weights_of(task: Task, statistics: DatasetStatistics) -> np.ndarray:
-    """Returns the weight of a validation view of each class, (classes,).
-
-    All are 1, unless training is `balanced`: then every class weighs the same in total.
-    """
-    objects = np.array(
-        [
-            sum(statistics.counts[split][name] for split in validation_splits(task.batches))
-            for name in statistics.classes
-        ]
-    )
-    if not task.batches.balanced:
-        return np.ones(len(objects), np.float32)
-    return (objects.sum() / (np.count_nonzero(objects) * np.maximum(objects, 1))).astype(np.float32)
-
-
-def validation_set(
-    task: Task, data: Path, statistics: DatasetStatistics, devices: int
-) -> list[tuple[dict[str, np.ndarray], np.ndarray]]:
-    """Returns this process's part of the validation views, as batches of equal size with the weight of every view.
-
-    Weights are those of `class_weights_of`, and 0 for views that only fill up a batch. With equal sizes, one compiled program
-    serves all batches in all processes.
-
-    Args:
-        devices: devices, of all processes together, that share a batch.
-    """
-    index, processes = jax.process_index(), jax.process_count()
-    objects = statistics.objects_of(validation_splits(task.batches))
-    own = slice(index, None, processes) if index < objects else slice(1)
-    read = list(validation_batches(data, task.batches, task.optimiser.validation_views, own))
-    whole = {name: np.concatenate([batch[name] for batch in read]) for name in read[0]}
-    most = -(-objects // processes) * len(read[0]["label"])  # of any process
-    together = (devices // processes) * (
-        len(read[0]["label"]) if task.group > 1 else 1
-    )  # views of an object stay on a device
-    size = -(-min(256, most) // together) * together
-    count = -(-most // size)
-    weights = np.zeros(count * size, np.float32)
-    if index < objects:
-        weights[: len(whole["label"])] = class_weights_of(task, statistics)[whole["label"]]
-    whole = {name: np.resize(array, (count * size, *array.shape[1:])) for name, array in whole.items()}
-    pieces = [slice(i * size, (i + 1) * size) for i in range(count)]
-    return [({name: array[piece] for name, array in whole.items()}, weights[piece]) for piece in pieces]
-
-
 def weighted_means(found: list[Metrics]) -> dict[str, Any]:
     """Returns the mean of every metric from the sums that `evaluate_step_of` returns for each batch."""
     sums = {name: np.sum([part[name] for part in found], axis=0, dtype=np.float64) for name in found[0]}
     return {name: total / sums["views"] for name, total in sums.items() if name != "views"}
 
 
-def validate(evaluate_step: Callable, state: TrainState, batches: list, mesh: Mesh) -> dict[str, float]:
+def validate(evaluate_step: Callable, state: TrainState, batches: Iterable, mesh: Mesh) -> dict[str, float]:
     """Returns the mean of every metric over the validation views of all processes."""
     found = [evaluate_step(state.parameters, state.statistics, *place_batch(mesh, batch)) for batch in batches]
     return {name: float(mean) for name, mean in weighted_means(found).items()}
@@ -254,7 +207,7 @@ class _Training:
         )
         self._evaluate_step = jax.jit(summed_over(mesh, evaluate_step_of(task, structure)))
         self._all_finite = jax.jit(all_finite, out_shardings=NamedSharding(mesh, PartitionSpec()))
-        self._validation = validation_set(task, data, statistics, mesh.shape[DATA])
+        self._validation = ValidationSet(task, data, statistics, mesh.shape[DATA])
         self._lead = Lead()
         self.step = 0
         self.progress: dict[str, Any] = {"epoch": 0, "best_loss": None, "best_epoch": 0, "seconds": 0.0}

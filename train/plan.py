@@ -56,7 +56,8 @@ class NetworkPlan:
         step_flop, device_flop: floating-point operations of a step by XLA's count, on all devices and on one.
         record_bytes: mean size of an object's record in storage.
         epoch_bytes, process_epoch_bytes: bytes read from storage in an epoch, by all processes and by one.
-        validation_views, validation_bytes: views that a process keeps in its own memory for validation.
+        validation_views, validation_bytes: views of validation of a process; those of more than `train.validation.MOST_KEPT`
+            bytes are read again after every epoch, all others are kept in memory.
     """
 
     network: str
@@ -172,7 +173,7 @@ def bytes_of_a_record(statistics: DatasetStatistics, data: Path | None) -> float
 
 
 def validation_views(task: Task, statistics: DatasetStatistics, processes: int) -> int:
-    """Returns the number of validation views that a process keeps in memory (`train.loop.validation_set`)."""
+    """Returns the number of validation views of a process (`train.validation.ValidationSet`)."""
     wanted, views = task.optimiser.validation_views, statistics.views
     if task.batches.validation_by == "view":
         of_an_object = max(1, round(VIEWS_ASIDE * wanted)) if wanted else len(views_aside(views, 0, 0))

@@ -113,7 +113,7 @@ def _rows(measured: bool) -> list[tuple[str, Any]]:
         ("  of an object", lambda n: f"{_bytes(n['record_bytes'])}, {'measured' if measured else 'estimated'}"),
         (
             "validation in a process",
-            lambda n: f"{n['validation_views']:,} views, {_bytes(n['validation_bytes'])} of host memory",
+            lambda n: f"{n['validation_views']:,} views, {_bytes(n['validation_bytes'])}",
         ),
     ]
 

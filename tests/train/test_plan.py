@@ -16,10 +16,11 @@ from eval.settings import PRESETS, TINY
 from eval.stages import tasks
 from train.costs import bytes_of, flop_of, memory_of, views_like
 from train.devices import Layout, check_batch
-from train.loop import check_launch, check_training, identity_of, validation_set
+from train.loop import check_launch, check_training, identity_of
 from train.optimiser import OptimiserConfig
 from train.plan import NetworkPlan, bytes_of_a_record, notes_on, planned_statistics
 from train.step import abstract_state, initial_state, train_step_of
+from train.validation import ValidationSet
 
 
 def size(tree) -> int:
@@ -41,7 +42,7 @@ def test_a_plan_says_what_training_does(network, data):
     assert (plan.state_bytes, plan.weights_bytes) == (size(state), size(state.parameters))
     objects = statistics.objects_of(["train"])  # 4 views of each, 2 in a batch of 16
     assert (plan.batch_objects, plan.epoch_steps, plan.steps) == (8, -(-objects * 2 // 8), -(-objects * 2 // 8) * 2)
-    kept = validation_set(task, data, statistics, 1)
+    kept = ValidationSet(task, data, statistics, 1)
     assert plan.validation_views == sum((weights > 0).sum() for _, weights in kept)
     [(arrays, weights)] = kept
     assert plan.validation_bytes * len(weights) == size(arrays) * plan.validation_views

@@ -20,11 +20,12 @@ from data_pipeline.dataset.statistics import DatasetStatistics
 from data_pipeline.errors import DataError
 from data_pipeline.progress import console, progress_bar
 from train.checkpoints import Checkpoints, drop_damaged
-from train.loop import Lead, steps_of_an_epoch, validation_set, weighted_means
+from train.loop import Lead, steps_of_an_epoch, weighted_means
 from train.many.members import Member, SweepTask, Together, task_of
 from train.many.trainers import TRAINERS, Way, way_for
 from train.optimiser import OptimiserConfig
 from train.preemption import Preempted, Preemption
+from train.validation import ValidationSet
 
 
 def train_members(
@@ -123,9 +124,9 @@ def _validation(
     Every member is evaluated on the whole of a batch.
     """
     drawn_by = members if own else members[:1]
-    sets = [validation_set(task_of(task, member), data, statistics, devices=1) for member in drawn_by]
+    sets = [ValidationSet(task_of(task, member), data, statistics, devices=1) for member in drawn_by]
     if not own:
-        return sets[0]
+        return list(sets[0])
     batches = zip(*sets, strict=True)
     return [
         ({name: np.stack([one[name] for one, _ in of_all]) for name in of_all[0][0]}, of_all[0][1])

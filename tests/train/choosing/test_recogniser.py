@@ -29,9 +29,10 @@ from train.choosing.looks import see_changed, see_rotated
 from train.choosing.stages import Stages, check_learned
 from train.devices import Layout, check_batch, device_mesh
 from train.kept import summary_of
-from train.loop import fit, load_best, steps_of_an_epoch, validation_set
+from train.loop import fit, load_best, steps_of_an_epoch
 from train.step import part_of
 from train.tasks.recogniser import RecogniserTask
+from train.validation import ValidationSet
 
 
 def on_device(batches) -> list[dict[str, jax.Array]]:
@@ -160,7 +161,7 @@ def test_parts_of_a_batch_and_shares_of_devices_hold_whole_objects(turned):
     check_batch(task.name, optimiser, layout, task.group)
     with pytest.raises(DataError, match="16 views, 4 of an object, cannot be cut into 8 parts of whole objects"):
         check_batch(task.name, replace(optimiser, parts=8), layout, task.group)
-    for batch, weights in validation_set(task, turned, statistics, devices=8):
+    for batch, weights in ValidationSet(task, turned, statistics, devices=8):
         shares = batch["label"].reshape(8, -1, task.optimiser.validation_views)
         assert (shares == shares[..., :1]).all()
         assert len(weights) == len(batch["label"])

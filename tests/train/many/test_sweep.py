@@ -28,11 +28,12 @@ from tests.train.scaling_worker import SETTINGS
 from train.choosing.stages import Stages
 from train.devices import device_mesh
 from train.kept import summary_of
-from train.loop import fit, load_best, validate, validation_set
+from train.loop import fit, load_best, validate
 from train.many.members import Member, Together, by_configurations, task_of
 from train.many.sweep import SweepConfig, best_of, draw_members, sweep
 from train.preemption import Preempted
 from train.step import TrainState, evaluate_step_of, initial_state
+from train.validation import ValidationSet
 
 SWEEP = SweepConfig(members=4, learning_rate=(1e-5, 3e-4))
 """Low rates: what rounding does to a rectified unit grows with the rate."""
@@ -75,7 +76,7 @@ def test_members_end_as_separate_runs_do(every, out, tmp_path):
     _, parameters, rest = nnx.split(network, nnx.Param, ...)
     state = TrainState(state.step, parameters, rest, state.moments, state.sums)
     mesh = device_mesh()
-    validation = validation_set(task, out / "data", statistics, mesh.shape["data"])
+    validation = ValidationSet(task, out / "data", statistics, mesh.shape["data"])
     found = validate(jax.jit(evaluate_step_of(task, structure)), state, validation, mesh)
     assert found["loss"] == pytest.approx(best.loss, rel=1e-5)
     summary = fit(task_of(task, best), out / "data", statistics, tmp_path / "sweep" / "network")  # a finished run
