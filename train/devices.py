@@ -15,6 +15,7 @@ from typing import Any
 
 import jax
 import numpy as np
+from jax.experimental import multihost_utils
 from jax.sharding import AbstractMesh, Mesh, NamedSharding, PartitionSpec
 
 from data_pipeline.errors import DataError
@@ -72,6 +73,39 @@ def unresolved_name() -> str:
 def is_first() -> bool:
     """Returns whether this process is the one that writes files and messages for all."""
     return jax.process_index() == 0
+
+
+def local_mesh() -> Mesh:
+    """Returns the mesh of this process's own devices, for work that processes share out by objects."""
+    return Mesh(np.array(jax.local_devices()).reshape(-1, 1), (DATA, MODEL))
+
+
+def own_share(count: int) -> np.ndarray:
+    """Returns which of so many things are this process's, (share,): every n-th. Some process may have none."""
+    return np.arange(count)[jax.process_index() :: jax.process_count()]
+
+
+def from_all(own: np.ndarray, count: int) -> np.ndarray:
+    """Returns what all processes have made together, (count, …), from what each has made of its `own_share`, (share, …)."""
+    processes = jax.process_count()
+    if processes == 1:
+        return own
+    most = -(-count // processes)
+    padded = np.zeros((most, *own.shape[1:]), own.dtype)
+    padded[: len(own)] = own
+    every = np.asarray(multihost_utils.process_allgather(padded))  # (processes, most, …)
+    return every.swapaxes(0, 1).reshape(-1, *own.shape[1:])[:count]
+
+
+def agreed(value: bool) -> bool:
+    """Returns what the first process says, to all of them."""
+    return value if jax.process_count() == 1 else bool(multihost_utils.broadcast_one_to_all(np.array(value)))
+
+
+def wait_for_all(name: str) -> None:
+    """Waits until every process is here; `name` is of the place."""
+    if jax.process_count() > 1:
+        multihost_utils.sync_global_devices(name)
 
 
 @dataclass(frozen=True)
@@ -201,6 +235,11 @@ def place_batch(mesh: Mesh, batch: Any) -> Any:
     """Returns a batch spread over all devices, assembled from the parts that the processes hold."""
     split = NamedSharding(mesh, PartitionSpec(DATA))
     return jax.tree.map(lambda part: jax.make_array_from_process_local_data(split, part), batch)
+
+
+def place_on(mesh: Mesh, batch: Any) -> Any:
+    """Returns a batch that this process holds, spread over its own devices, a `local_mesh`."""
+    return jax.device_put(batch, NamedSharding(mesh, PartitionSpec(DATA)))
 
 
 def summed_over(mesh: Mesh, function: Callable) -> Callable:

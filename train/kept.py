@@ -31,7 +31,7 @@ from data_pipeline.files import (
 )
 from data_pipeline.progress import console
 from train.checkpoints import Checkpoints, damage_of, drop_damaged
-from train.devices import is_first
+from train.devices import agreed, is_first, wait_for_all
 
 Network = TypeVar("Network", bound=nnx.Module)
 Result = TypeVar("Result")
@@ -52,21 +52,29 @@ def kept(
 ) -> Result:
     """Returns the result stored in `path`; computes and stores it first if it is missing, damaged or not current.
 
-    The result is always loaded from the file, so that a first run and a later one return the same.
+    The result is always loaded from the file, so that a first run and a later one return the same. Of several processes, which
+    all call this, the first one decides and stores; all compute, since they may share that work.
 
     Raises:
         Unreadable: if `path` is a folder.
     """
     if path.is_dir():
         raise Unreadable(path, "it is a folder", "remove it, and the same command goes on")
+    stored = None
     if path.exists():
         try:
             stored = load(path)
-            if is_current(stored):
-                return stored
+            if not is_current(stored):
+                stored = None
         except Exception as error:  # the content of a damaged file decides which
             console.print(f"{path} cannot be read ({why(error)}), so it is made again", markup=False)
-    save(path, compute())
+            stored = None
+    if agreed(stored is not None):
+        return load(path) if stored is None else stored
+    result = compute()
+    if is_first():
+        save(path, result)
+    wait_for_all(f"kept {path.name}")
     return load(path)
 
 
@@ -106,6 +114,8 @@ def keep_beside(path: Path, content: bytes) -> None:
             console.print(f"{path} is not as it was written, so it is made again", markup=False)
         elif path.read_bytes() == content:
             return
+    if not is_first():
+        return
     keep_checks(path.parent, {path.name: check_of(content)})
     write_bytes(path, content)
 

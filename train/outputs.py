@@ -15,7 +15,7 @@ import numpy as np
 from data_pipeline.dataset.batches import evaluation_batches
 from data_pipeline.dataset.builder import open_split
 from data_pipeline.progress import progress_bar
-from train.devices import device_mesh, parameter_sharding, place, place_batch
+from train.devices import from_all, local_mesh, own_share, parameter_sharding, place, place_on
 from train.finite import check_outputs
 from train.step import Batch, Task
 
@@ -48,6 +48,8 @@ def network_outputs(
 ) -> np.ndarray:
     """Returns an output of a network for every view of every object of a split, (objects, views, numbers).
 
+    Several processes share the objects, and each returns all.
+
     Args:
         data: folder of the data set.
         ask: computes the output of a batch; by default, what the network returns for the task's inputs.
@@ -57,11 +59,12 @@ def network_outputs(
         Diverged: if an output is infinite or NaN.
     """
     structure, state = nnx.split(network)
-    mesh = device_mesh()
+    mesh = local_mesh()
     state = place(state, parameter_sharding(mesh, state))
     chosen = np.arange(len(open_split(data, split))) if chosen is None else chosen
-    objects = len(chosen)
-    batches = evaluation_batches(data, split, points=task.batches.points, images=task.batches.images, chosen=chosen)
+    own = chosen[own_share(len(chosen))]
+    objects, given = len(own), own if len(own) else chosen[:1]
+    batches = evaluation_batches(data, split, points=task.batches.points, images=task.batches.images, chosen=given)
     with progress_bar("objects") as bar:
         line = bar.add_task(f"Evaluating {task.name} on {split} objects", total=objects, note="")
         out = []
@@ -69,8 +72,8 @@ def network_outputs(
             filled = [*chunk, *chunk[:1] * (mesh.size - len(chunk))]
             batch = {name: np.concatenate([one[name] for one in filled]) for name in filled[0]}
             # Fetched only after the loop, so that the next objects are read while the devices compute.
-            out.append(_outputs_of_batch(task, structure, state, place_batch(mesh, batch), ask))
+            out.append(_outputs_of_batch(task, structure, state, place_on(mesh, batch), ask))
             bar.advance(line, len(chunk))
     found = np.concatenate([np.asarray(part) for part in out])
-    found = found.reshape(len(out) * mesh.size, -1, found.shape[-1])[:objects]
+    found = from_all(found.reshape(len(out) * mesh.size, -1, found.shape[-1])[:objects], len(chosen))
     return check_outputs(found, task.name, f"{split} objects")

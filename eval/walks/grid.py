@@ -168,7 +168,7 @@ def run_grid(
             return Results(*found, views[:, :, :1].astype(small))
 
         at_once = max(1, min(256, _WALKS_AT_ONCE // (starts * rung.draws)))
-        at_once = min(at_once, -(-objects // jax.device_count()))
+        at_once = min(at_once, -(-objects // jax.local_device_count()))
         chunked = partial(jax.lax.map, of_object, batch_size=at_once)
         found = over_objects(chunked, (keys, tables), at_once)
         return jax.tree.map(lambda leaf: jnp.moveaxis(leaf, 0, 1), found)

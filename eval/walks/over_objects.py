@@ -1,4 +1,4 @@
-"""Distribution of objects over all devices; each runs the same program on its part, without communication."""
+"""Distribution of objects over all devices of this process; each runs the same program on its part, without communication."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ def over_objects(function: Callable[[Any], Any], arguments: Any, multiple: int =
         arguments: a tree of arrays.
         multiple: each device receives a multiple of this number of objects; the first object is repeated as padding.
     """
-    devices = jax.devices()
+    devices = jax.local_devices()
     objects = jax.tree.leaves(arguments)[0].shape[0]
     padding = -objects % (multiple * len(devices))
     padded = jax.tree.map(lambda leaf: jnp.concatenate([leaf, leaf[:1].repeat(padding, 0)]), arguments)

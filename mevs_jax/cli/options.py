@@ -69,6 +69,9 @@ class WithPolicies(Options):
 class EvalOptions(WithSeeds, WithPolicies):
     """Options of `mevs eval`."""
 
+    distributed: Annotated[tyro.conf.FlagCreatePairsOff[bool], _arg("")] = False
+    """this is one of several processes that share the objects (docs/scaling.md)"""
+
 
 @dataclass(frozen=True)
 class WithWeights(WithSeed):

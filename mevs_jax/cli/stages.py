@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager, redirect_stdout
 from typing import TYPE_CHECKING
 
 from mevs_jax.cli.parsing import Invocation, keep_settings
@@ -55,25 +58,36 @@ def data(call: Invocation) -> None:
     print(f"Data set: {counts} objects of {len(statistics.classes)} classes, {statistics.views} views each")
 
 
-def train(call: Invocation) -> None:
-    """The networks, with other processes if there are any."""
-    from contextlib import ExitStack
-
+@contextmanager
+def _with_others(call: Invocation) -> Iterator[None]:
+    """Joins the other processes of a `--distributed` command. One of them speaks, and holds the lock of the run directory."""
     from data_pipeline.lock import locked
     from data_pipeline.progress import console
     from eval import stages
-    from train.devices import device_mesh, is_first, join_processes
+    from train.devices import is_first, join_processes
+
+    if not call.options.distributed:
+        yield
+        return
+    join_processes()  # before anything is computed
+    if not is_first():
+        console.quiet = True
+        with open(os.devnull, "w") as nowhere, redirect_stdout(nowhere):
+            yield
+        return
+    stages.check_output(call.out)
+    with locked(call.out, " ".join(["mevs", *call.arguments])):
+        keep_settings(call)
+        yield
+
+
+def train(call: Invocation) -> None:
+    """The networks, with other processes if there are any."""
+    from train.devices import device_mesh
     from train.tasks.classifier import starting_weights
 
     classifier = call.settings.classifier
-    with ExitStack() as held:
-        if call.options.distributed:
-            join_processes()  # before anything is computed
-            console.quiet = not is_first()
-            if is_first():
-                stages.check_output(call.out)
-                held.enter_context(locked(call.out, " ".join(["mevs", *call.arguments])))
-                keep_settings(call)
+    with _with_others(call):
         start = starting_weights(call.options.pretrained, classifier.network, classifier.encoder)
         _train(call, start, device_mesh(call.options.model_devices))
 
@@ -95,6 +109,12 @@ def sweep(call: Invocation) -> None:
         there, settings = sweeping.adopt(call.settings, call.out)
         save_run(call.out, call.preset, settings, call.arguments)
         print(f"The run has it now: {there}")
+
+
+def evaluate_with_others(call: Invocation) -> None:
+    """`mevs eval`: the metrics, with other processes if there are any."""
+    with _with_others(call):
+        evaluate(call)
 
 
 def evaluate(call: Invocation) -> None:
