@@ -6,7 +6,7 @@ of all seeds are trained as one job, and walked as one program. `seeds.json` and
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -22,7 +22,7 @@ from eval.numbers.trainings import csv_over_trainings, rows_over_trainings, walk
 from eval.run_file import save_run
 from eval.settings import Settings
 from train.chance import warn_of_chance
-from train.devices import device_mesh
+from train.devices import device_mesh, is_first, wait_for_all
 from train.kept import keep_beside, kept_json, made_by
 from train.many.seeds import check_networks, train_seeds
 from train.optimiser import OptimiserConfig
@@ -59,7 +59,7 @@ def make_folders(settings: Settings, preset: str, out: Path, arguments: Sequence
     for number in range(1, settings.seeds):
         folder = seed_folder(out, number)
         folder.mkdir(parents=True, exist_ok=True)
-        if not (folder / "data").exists():
+        if not (folder / "data").is_symlink():
             (folder / "data").symlink_to(Path("..") / ".." / "data", target_is_directory=True)
         save_run(folder, preset, seed_settings(settings, number), list(arguments))
 
@@ -70,6 +70,7 @@ def train(
     start: StartingWeights | None = None,
     mesh: jax.sharding.Mesh | None = None,
     at_once: int = 0,
+    begin: Callable[[], None] = lambda: None,
 ) -> None:
     """Trains both networks from all seeds, once all are checked.
 
@@ -79,7 +80,10 @@ def train(
         start: initial weights of the classifiers; random if None.
         mesh: devices to train on; all if None.
         at_once: largest number of seeds that are trained together, which bounds memory; 0: all.
+        begin: called by the first process once nothing was found that forbids the training.
     """
+    if at_once < 0:
+        raise DataError(f"--seeds-at-once {at_once} is below 0; 0 is for all seeds")
     statistics, numbers = load_statistics(out / "data"), range(settings.seeds)
     size, mesh = at_once or settings.seeds, mesh or device_mesh()
     parts = [slice(first, first + size) for first in range(0, settings.seeds, size)]
@@ -92,6 +96,9 @@ def train(
         networks.append((tasks, name, folders, work, weights))
         for part in parts:
             check_networks(tasks[part], statistics, folders[part], work, weights, mesh)
+    if is_first():
+        begin()
+    wait_for_all("seeds")
     for tasks, name, folders, work, weights in networks:
         option, summaries = f"--{name}.optimiser.learning-rate", []
         for part in parts:
@@ -108,6 +115,10 @@ def train(
 def evaluate(settings: Settings, out: Path) -> dict[str, Any]:
     """Evaluates the run of every seed, and all together; returns what `seeds.json` holds."""
     runs = [seed_folder(out, number) for number in range(settings.seeds)]
+    if missing := [run for run in runs if not (run / "classifier").is_dir()]:
+        raise DataError(
+            f"no networks in {missing[0]}; train those of all seeds with: mevs train --seeds {settings.seeds} --out {out}"
+        )
     for number, run in enumerate(runs):
         stages.evaluate(seed_settings(settings, number), run)
     statistics = load_statistics(out / "data")

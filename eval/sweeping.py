@@ -68,10 +68,10 @@ def _with_hyperparameters(settings: Settings, task: dict[str, Any]) -> Settings:
     """The settings with the hyper-parameters in a network's `config.json`."""
     name, chosen = settings.sweep.network, {key: task["optimiser"][key] for key in ("learning_rate", "weight_decay")}
     seeds = {key: task["optimiser"][key] for key in ("seed", "data_seed")}
-    if name == "recogniser":  # its seeds are those of the study
+    if name == "recogniser":  # its seed is that of the study
         recogniser = settings.learned.recogniser
         recogniser = replace(recogniser, optimiser=replace(recogniser.optimiser, **chosen))
-        return replace(settings, learned=replace(settings.learned, recogniser=recogniser, seed=seeds["seed"]))
+        return replace(settings, learned=replace(settings.learned, recogniser=recogniser))
     strength = task["augmentation"]["strength"]
     if name == "classifier":
         classifier = settings.classifier

@@ -49,7 +49,7 @@ REAL = Path(__file__).resolve().parents[2] / "shared"
 
 LONG = (
     "tests/cli/test_cli.py",
-    "tests/train/test_sweep.py",
+    "tests/train/many/test_sweep.py",
     "tests/eval/thesis/test_thesis.py",
     "tests/train/test_training.py",
     "tests/mevs_jax/rendering/test_soft.py",

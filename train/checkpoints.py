@@ -44,6 +44,11 @@ def _steps(slot: Path) -> list[Path] | None:
     return [path for path in slot.iterdir() if path.name.isdigit()] if slot.is_dir() else None
 
 
+def has_save(slot: Path) -> bool:
+    """Returns whether the folder of a slot holds a save."""
+    return bool(_steps(slot))
+
+
 def damage_of(slot: Path) -> str | None:
     """Returns what is damaged in the save that the folder of a slot holds; None if it is sound by its checks or has none."""
     if not slot.exists():

@@ -30,7 +30,7 @@ from data_pipeline.files import (
     write_npz,
 )
 from data_pipeline.progress import console
-from train.checkpoints import Checkpoints, damage_of, drop_damaged
+from train.checkpoints import Checkpoints, damage_of, drop_damaged, has_save
 from train.devices import agreed, is_first, wait_for_all
 
 Network = TypeVar("Network", bound=nnx.Module)
@@ -224,7 +224,7 @@ def goes_on_with(folder: Path, identity: dict[str, Any]) -> dict[str, tuple[Any,
         is_longer = where in longer and isinstance(before, int) and before < now
         if not is_longer and (done or where not in ("task.optimiser.parts", "task.optimiser.compute")):
             return {}
-    return found if (folder / "latest").is_dir() else {}
+    return found if has_save(folder / "latest") else {}
 
 
 def _other(folder: Path, holds: str, was: Any, identity: dict[str, Any]) -> DataError:

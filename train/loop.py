@@ -337,6 +337,13 @@ class _Training:
         )
 
 
+def _begin(folder: Path, identity: dict[str, Any]) -> None:
+    """Says in the folder what is trained there from now on."""
+    if is_first():
+        (folder / "summary.json").unlink(missing_ok=True)
+        keep_json(folder / "config.json", identity)
+
+
 def fit(
     task: Task,
     data: Path,
@@ -375,9 +382,8 @@ def fit(
     check_training(task, statistics, Layout.of_mesh(mesh))
     if changed:
         console.print(f"{task.name}: goes on with other settings than it began with ({in_words(changed)})")
-    if is_first():
-        (folder / "summary.json").unlink(missing_ok=True)
-        keep_json(folder / "config.json", identity)
+    else:
+        _begin(folder, identity)
     drop_damaged(folder)
     training, config = _Training(task, data, statistics, folder, start, mesh, rate_option), task.optimiser
     with Checkpoints(folder) as checkpoints, progress_bar("views") as bar, Preemption() as preemption:
@@ -394,6 +400,9 @@ def fit(
         while not training.is_finished:
             started = time.perf_counter()
             means = training.train_epoch(batches, checkpoints, preemption, advance)
+            if changed:  # what was there stays as it was until an epoch was trained with these
+                _begin(folder, identity)
+                changed = {}
             checked = training.finish_epoch(started, means, checkpoints, log)
             note = ", ".join(f"{name} {value:.4f}" for name, value in checked.items())
             bar.update(line, note=f"val {note}")
@@ -403,6 +412,8 @@ def fit(
             if preemption.asked:
                 raise Preempted(f"{task.name} was asked to end after step {training.step}")
     log.close()
+    if changed:  # it was long enough already
+        _begin(folder, identity)
     summary = training.summary(start)
     if is_first():
         keep_checks(folder, {"metrics.jsonl": check_of_file(folder / "metrics.jsonl")})

@@ -68,7 +68,8 @@ def made_with_other_settings(config: DataConfig, folder: Path) -> dict[str, tupl
         was = read_json(folder / "config.json")
     except (FileNotFoundError, Unreadable):
         return {}
-    return differences(was, as_read(identity_of(config, folder)), "dataset", shared=True)
+    later = {"up": "auto", "split": "", "more": []}  # which are left out at their defaults
+    return differences(later | was, later | as_read(identity_of(config, folder)), "dataset", shared=True)
 
 
 def check_same_data(config: DataConfig, folder: Path) -> None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections import Counter
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -21,25 +21,52 @@ def open_objects(config: DataConfig) -> ObjectSource:
     Raises:
         DataError: if a source is not usable or given twice, or `config.archive` is set for another kind of source.
     """
-    first = _open_first(config)
     if not config.more:
-        return first
-    every = (config.source, *config.more)
-    if twice := [data for data, times in Counter(every).items() if times > 1]:
-        raise DataError(f"{twice[0]} is given twice, as --data or in --dataset.more; leave one out")
-    return together([first, *(_open_first(_alone(config, data)) for data in config.more)])
+        return _open_first(config)
+    _check_apart((config.source, *config.more))
+    return together([_open_first(_alone(config, data), keep_splits=True) for data in (config.source, *config.more)])
+
+
+def _check_apart(every: Sequence[str]) -> None:
+    """Raises DataError if two sources are the same, or one lies in another: an object would be there twice.
+
+    Copies of objects under other names are not noticed.
+    """
+    if {"modelnet10", "modelnet40"} <= set(every):
+        raise DataError("modelnet40 holds the objects of modelnet10; leave one of them out")
+    named = {"furniture10", *ARCHIVES}
+    paths = [Path(data).expanduser().resolve() if data not in named else Path(data) for data in every]
+    for index, path in enumerate(paths):
+        for number, other in enumerate(paths):
+            if number != index and (path == other or other in path.parents):
+                raise DataError(
+                    f"{every[max(index, number)]} is given twice, as --data or in --dataset.more, or lies in another of them; "
+                    "leave one out"
+                )
 
 
 def _alone(config: DataConfig, data: str) -> DataConfig:
-    """Returns the settings of one of the further sources; options for files of meshes are for those alone, lists for `--data`."""
+    """Returns the settings of one of several sources. Options for files of meshes are for those alone, lists and archives for
+    `--data`."""
     of_meshes = data not in ARCHIVES and data != "furniture10" and not data.lower().endswith(".npz")
     listed = config.split.lower().endswith((".json", ".csv"))
-    alone = replace(config, source=data, archive="", more=(), split="" if listed else config.split)
-    return alone if of_meshes else replace(alone, up="auto", split="")
+    first = data == config.source
+    return replace(
+        config,
+        source=data,
+        more=(),
+        archive=config.archive if first else "",
+        up=config.up if of_meshes else "auto",
+        split=config.split if of_meshes and (first or not listed) else "",
+    )
 
 
-def _open_first(config: DataConfig) -> ObjectSource:
-    """Returns the source of objects. Official archives are downloaded, unless `config.archive` names a local file."""
+def _open_first(config: DataConfig, keep_splits: bool = False) -> ObjectSource:
+    """Returns the source of objects. Official archives are downloaded, unless `config.archive` names a local file.
+
+    Args:
+        keep_splits: whether `config.split` is for meshes without folders of splits alone.
+    """
     official = ARCHIVES.get(config.source)
     if official is None:
         if config.archive:
@@ -51,6 +78,7 @@ def _open_first(config: DataConfig) -> ObjectSource:
             up=config.up,
             split=config.split,
             seed=config.seed,
+            keep_splits=keep_splits,
         )
     if config.archive:
         path = local(official, Path(config.archive).expanduser().resolve())

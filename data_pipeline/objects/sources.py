@@ -45,12 +45,14 @@ class Reading:
         up: which axis of the files is up.
         split: empty for folders of splits, a share of training objects, or the path of a list.
         seed: seed of the choice by share.
+        keep_splits: whether `split` is for files without folders of splits alone.
         all_tested: whether no object is for training: those for testing are taken if the folders name a split, else all.
     """
 
     up: Up = "auto"
     split: str = ""
     seed: int = 0
+    keep_splits: bool = False
     all_tested: bool = False
 
 
@@ -103,7 +105,7 @@ def _arranged(listing: Listing, name: str, where: str, reading: Reading) -> Obje
     notes: tuple[str, ...] = ()
     if reading.all_tested:
         placed, notes = _all_tested(placed)
-    elif reading.split:
+    elif reading.split and not (reading.keep_splits and with_splits):
         placed = divide(placed, reading.split, reading.seed, where)
     elif not with_splits:
         folders = {one.class_name for one in placed if one.class_name}
@@ -232,14 +234,21 @@ def objects_to_test(data: str, up: Up = "auto") -> ObjectSource:
 
 
 def open_source(
-    data: str, *, train_per_class: int, test_per_class: int, up: Up = "auto", split: str = "", seed: int = 0
+    data: str,
+    *,
+    train_per_class: int,
+    test_per_class: int,
+    up: Up = "auto",
+    split: str = "",
+    seed: int = 0,
+    keep_splits: bool = False,
 ) -> ObjectSource:
     """Returns the source for `data`: `furniture10`, or the path of a folder, a .zip or an .npz.
 
     Raises:
         DataError: if the file does not exist or is not usable as a data set.
     """
-    path, reading = Path(os.path.expanduser(data)), Reading(up, split, seed)
+    path, reading = Path(os.path.expanduser(data)), Reading(up, split, seed, keep_splits)
     if (split or up != "auto") and (data == "furniture10" or path.suffix.lower() == ".npz"):
         raise DataError(f"--dataset.split and --dataset.up go with a folder or zip of meshes, not with {data}")
     if data == "furniture10":
@@ -274,12 +283,23 @@ def together(sources: Sequence[ObjectSource]) -> ObjectSource:
     first, classes = sources[0], list(sources[0].classes)
     entries, left_out = list(first.entries), {split: dict(reasons) for split, reasons in first.left_out.items()}
     notes, said, prefixes = list(first.notes), list(first.said), {first.name}
+    names = {entry.name for entry in entries} | {name for reasons in left_out.values() for name in reasons}
     for source in sources[1:]:
-        number = next(number for number in itertools.count(1) if _numbered(source.name, number) not in prefixes)
-        prefix = _numbered(source.name, number)
+        own = [entry.name for entry in source.entries] + [name for of in source.left_out.values() for name in of]
+        prefix = next(
+            prefix
+            for number in itertools.count(1)
+            if (prefix := _numbered(source.name, number)) not in prefixes
+            and not names & {f"{prefix}/{name}" for name in own}
+        )
         prefixes.add(prefix)
-        known = {plain_class(name): label for label, name in enumerate(classes)}
-        classes += [name for name in source.classes if plain_class(name) not in known]
+        names |= {f"{prefix}/{name}" for name in own}
+        for name in source.classes:
+            known = {plain_class(one): one for one in classes}
+            if (same := known.get(plain_class(name))) is None:
+                classes.append(name)
+            elif same != name:
+                notes.append(f"{prefix}: class {name} was taken as {same}")
         label_of = {plain_class(name): label for label, name in enumerate(classes)}
         entries += [
             replace(entry, name=f"{prefix}/{entry.name}", label=label_of[plain_class(source.classes[entry.label])])

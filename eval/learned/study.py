@@ -342,6 +342,9 @@ def seeds_together(
         }
         for name, policy in first["policies"].items()
     }
+    same = {key: first[key] for key in ("views", "trying_starts")}
+    if len(seeds) < 2:  # one training says nothing of others
+        return same | {"policies": policies} | compared(each, method)
     every = {name: np.stack([seed[name].right for seed in seeds], axis=1) for name in policies}
     for name, policy in policies.items():
         policy["over_both"] = interval_of_both(every[name]).tolist()
@@ -354,8 +357,7 @@ def seeds_together(
         for base in BASELINES
         if base in every
     }
-    same = {key: first[key] for key in ("views", "trying_starts")} | {"against_over_both": over_both}
-    return same | {"policies": policies} | compared(each, method)
+    return same | {"against_over_both": over_both} | {"policies": policies} | compared(each, method)
 
 
 def novel_classes(

@@ -38,11 +38,17 @@ def interval_of_both(values: Float[np.ndarray, "*cells trainings objects"]) -> F
     """95 % intervals of means for other objects *and* other trainings, of values of the same objects in every training.
 
     The variance of the mean has two parts: the variance of the objects' means over trainings, divided by the number of objects;
-    and that of the trainings' means over objects, divided by the number of trainings. The result is a t interval with
-    Satterthwaite's degrees of freedom. A bootstrap that resamples both is too narrow for a few trainings: three of them resampled
-    have two thirds of their variance, and it does not know how uncertain a variance of three numbers is (a test compares both).
+    and that of the trainings' means over objects, divided by the number of trainings. What is special to one object in one
+    training counts in both, so that the interval is rather too wide than too narrow. It is a t interval with Satterthwaite's
+    degrees of freedom. A bootstrap that resamples both is too narrow for a few trainings: three of them resampled have two thirds
+    of their variance, and it does not know how uncertain a variance of three numbers is (a test compares both).
+
+    Raises:
+        ValueError: for fewer than two trainings or objects.
     """
     *_, trainings, objects = values.shape
+    if min(trainings, objects) < 2:
+        raise ValueError(f"an interval over both needs two trainings and two objects, got {trainings} and {objects}")
     mean = values.mean(axis=(-2, -1))
     parts = (
         (values.mean(axis=-2).var(axis=-1, ddof=1) / objects, objects - 1),

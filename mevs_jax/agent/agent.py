@@ -105,13 +105,15 @@ class Agent:
         With an unknown yaw another program runs, which is compiled too if the policy can be used then.
         """
         camera = self.system.description.camera
-        pose = pose_towards(np.array([0.6, 0.0, 0.8]), np.zeros(3), camera.distance, np.array([0.0, 0.0, 1.0]))
-        depth = np.full((camera.resolution, camera.resolution), camera.distance - 0.5, np.float32)
+        radius = 1.0 if self.distance is None else min(1.0, 0.5 * self.distance)
+        away = radius * camera.distance
+        pose = pose_towards(np.array([0.6, 0.0, 0.8]), np.zeros(3), away, np.array([0.0, 0.0, 1.0]))
+        depth = np.full((camera.resolution, camera.resolution), away - 0.5 * radius, np.float32)
         kept = self._object, self.history, self._resets, self.key
         try:
             for yaw in (0.0, None):
                 try:
-                    self.reset(center=(0, 0, 0), radius=1.0, yaw=yaw)
+                    self.reset(center=(0, 0, 0), radius=radius, yaw=yaw)
                 except ValueError:
                     continue
                 self.decide(reachable=[0])  # before the first view, since afterwards it may be sure

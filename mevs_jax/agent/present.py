@@ -130,6 +130,7 @@ class Present:
         for view, one in zip(views[:-1], poses[:-1], strict=True):
             again.memory, _ = self.programs.see(system.parts, again.memory, view.depth, one, again.known_radius)
         history.depths[:], history.poses[:] = [view.depth for view in views[:-1]], poses[:-1]
+        history.options["reset"] |= {"center": center.tolist(), "radius": float(radius)}
         return again, views[-1]
 
 

@@ -181,11 +181,20 @@ def _check_no_resnet(arguments: list[str], encoder: str) -> None:
             )
 
 
+def keep_adopted(call: Invocation, settings: Settings) -> None:
+    """Makes settings those of the run, in its `run.json`, also where the command only tries them."""
+    from eval.run_file import save_run
+
+    save_run(call.out, call.preset, settings, call.arguments)
+
+
 def keep_settings(call: Invocation) -> None:
     """Makes the command's own settings those of the run, in its `run.json`; all others stay as they are there by now."""
     from eval.run_file import load_run, save_run
 
     run = load_run(call.out)
+    if getattr(call.options, "adopt", False) and run is not None:
+        return  # `keep_adopted` has written them
     if run is None:
         save_run(call.out, call.preset, call.settings, call.arguments)
     else:

@@ -5,9 +5,10 @@ from __future__ import annotations
 import os
 from collections.abc import Iterator
 from contextlib import contextmanager, redirect_stdout
+from functools import partial
 from typing import TYPE_CHECKING
 
-from mevs_jax.cli.parsing import Invocation, keep_settings
+from mevs_jax.cli.parsing import Invocation, keep_adopted, keep_settings
 
 if TYPE_CHECKING:
     from jax.sharding import Mesh
@@ -45,8 +46,8 @@ def _train(call: Invocation, start: StartingWeights | None, mesh: Mesh | None = 
     if call.settings.seeds == 1:
         stages.train(call.settings, call.out, start, mesh)
         return
-    seeds.make_folders(call.settings, call.preset, call.out, call.arguments)
-    seeds.train(call.settings, call.out, start, mesh, call.options.seeds_at_once)
+    begin = partial(seeds.make_folders, call.settings, call.preset, call.out, call.arguments)
+    seeds.train(call.settings, call.out, start, mesh, call.options.seeds_at_once, begin)
 
 
 def data(call: Invocation) -> None:
@@ -95,7 +96,6 @@ def train(call: Invocation) -> None:
 def sweep(call: Invocation) -> None:
     """A sweep over one network's hyperparameters."""
     from eval import sweeping
-    from eval.run_file import save_run
     from train.many.sweep import best_of
 
     folder, members = sweeping.train_sweep(call.settings, call.out)
@@ -107,7 +107,7 @@ def sweep(call: Invocation) -> None:
     print(f"All of them: {folder / 'members.md'}; the best network: {folder / 'network'}")
     if call.options.adopt:
         there, settings = sweeping.adopt(call.settings, call.out)
-        save_run(call.out, call.preset, settings, call.arguments)
+        keep_adopted(call, settings)
         print(f"The run has it now: {there}")
 
 

@@ -27,11 +27,15 @@ def look(options: LookOptions) -> None:
         check_drawing(options.draw)
     source = options.mesh or options.depth
     assert source is not None
+    if options.metres < 0 or (options.metres and options.depth is not None):
+        raise Unusable("--metres is the metres in one unit of a --mesh, 0.001 for millimetres; images are in metres")
     mesh = read_mesh(options.mesh, options.up) if options.mesh is not None else None
     stored = read_arrays(options.depth) if options.depth is not None else None
     with suppress(OSError):  # without a place to keep programs in, they are compiled again
         keep_compiled()
     system = load_system(options.system)
+    if options.metres and system.description.size is None:
+        raise Unusable(f"{options.system} does not use sizes; leave out --metres")
     given = {name: getattr(options, name) for name in ("policy", "stop", "max_views", "unknown")}
     try:
         if mesh is not None:

@@ -7,6 +7,7 @@ import json
 import os
 import shutil
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import pytest
@@ -21,8 +22,7 @@ SETTINGS = replace(TINY, seeds=2)
 
 def run(settings: Settings, out: Path) -> dict:
     save_run(out, "tiny", settings, [])
-    seeds.make_folders(settings, "tiny", out, [])
-    seeds.train(settings, out)
+    seeds.train(settings, out, begin=partial(seeds.make_folders, settings, "tiny", out, []))
     return seeds.evaluate(settings, out)
 
 

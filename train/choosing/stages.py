@@ -23,7 +23,7 @@ from jaxtyping import Array, Float
 from data_pipeline.capture.viewpoints import is_file
 from data_pipeline.dataset.batches import fold_of
 from data_pipeline.dataset.builder import DataConfig, open_split, prepare
-from data_pipeline.dataset.statistics import DatasetStatistics, load_statistics
+from data_pipeline.dataset.statistics import SUMMARY, DatasetStatistics, load_statistics
 from data_pipeline.errors import DataError
 from data_pipeline.progress import console
 from mevs_jax.beliefs import CalibratedFusion
@@ -208,8 +208,14 @@ class Stages:
         """Makes the data set of views from turned directions."""
         capture = replace(self.dataset.capture, turned=True)
         prepare(replace(self.dataset, capture=capture), self.turned)
-        if size := used_size(self.config.recogniser.size, _SIZE):
-            check_sizes(size, open_split(self.turned, "train"), _SIZE)
+        for data in (self.turned, self.out / "data"):
+            self._check_sizes(data)
+
+    def _check_sizes(self, data: Path) -> None:
+        """Raises `DataError` if the recogniser uses sizes, and the objects of a data set have none that it can use."""
+        size = used_size(self.config.recogniser.size, _SIZE)
+        if size and (data / SUMMARY).exists():
+            check_sizes(size, open_split(data, "train"), _SIZE)
 
     @cached_property
     def statistics(self) -> DatasetStatistics:
@@ -274,6 +280,7 @@ class Stages:
             ask: computes the features of a batch; by default `see`, or `see_rotated` for turned objects.
         """
         task, folder, classes = self.task(fold), self.recogniser_folder(fold), len(self.statistics.classes)
+        self._check_sizes(data)
         if ask is None:
             ask = see if self.upright is None else see_rotated(tuple(map(tuple, self.statistics.viewpoints)))
         seen = kept_array(

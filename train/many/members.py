@@ -184,16 +184,17 @@ def export_member(task: Task, of: Together, index: int, statistics: DatasetStati
         "best_loss": member.loss,
         "best_epoch": member.best_epoch,
         "best": member.best,
-        "seconds": of.seconds,
+        "seconds": of.seconds / len(of.members),
         "steps": member.epochs * steps,
         "start": "random weights",
         "stopped_early": member.epochs < task.optimiser.epochs,
+        **({"encoder": encoder} if (encoder := getattr(task, "encoder", None)) else {}),
     }
+    keep_json(out / "config.json", identity_of(task, statistics))
     with Checkpoints(out) as checkpoints:
         checkpoints.save("best", step, state, summary)
     lines = [entry | {"step": entry["epoch"] * steps} for entry in of.histories[index]]
     write_text(out / "metrics.jsonl", "".join(json.dumps(line) + "\n" for line in lines))
     keep_checks(out, {"metrics.jsonl": check_of_file(out / "metrics.jsonl")})
-    keep_json(out / "config.json", identity_of(task, statistics))
     keep_json(out / "summary.json", summary)
     return summary

@@ -11,9 +11,11 @@ import jax
 from jax.sharding import Mesh
 
 from data_pipeline.dataset.statistics import DatasetStatistics
-from data_pipeline.errors import Diverged
-from data_pipeline.files import as_read, keep_json, read_json
-from train.devices import Layout, device_mesh
+from data_pipeline.errors import Diverged, Unreadable
+from data_pipeline.files import keep_json, read_json
+from data_pipeline.progress import console
+from train.checkpoints import has_save
+from train.devices import Layout, device_mesh, is_first
 from train.kept import check_config, finished
 from train.loop import check_training, fit, identity_of
 from train.many.members import SweepTask, export_member, member_of
@@ -28,6 +30,16 @@ def number_together(networks: int, mesh: Mesh, start: StartingWeights | None) ->
     return together if together > 1 else 0
 
 
+def _interrupted(work: Path, identities: Sequence[dict[str, Any]]) -> list[int] | None:
+    """Returns which networks an interrupted training in `work` trains together; None if there is none of these networks alone."""
+    try:
+        stored = read_json(work / "config.json")["networks"]
+    except (FileNotFoundError, Unreadable, KeyError, TypeError):
+        return None
+    found = [index for index, identity in enumerate(identities) if identity in stored]
+    return found if has_save(work / "latest") and len(found) == len(stored) else None
+
+
 def check_networks(
     tasks: Sequence[SweepTask],
     statistics: DatasetStatistics,
@@ -37,9 +49,10 @@ def check_networks(
     mesh: Mesh,
 ) -> None:
     """Raises `DataError` if `train_seeds` would: folders hold something else, or batches cannot be shared."""
-    for task, folder in zip(tasks, folders, strict=True):
-        check_config(folder, identity_of(task, statistics, start), "a network trained")
-    if (work / "config.json").exists():  # begun together
+    identities = [identity_of(task, statistics, start) for task in tasks]
+    for folder, identity in zip(folders, identities, strict=True):
+        check_config(folder, identity, "a network trained")
+    if _interrupted(work, identities):
         return
     waiting = sum(not (folder / "summary.json").exists() for folder in folders)
     if together := number_together(waiting, mesh, start):
@@ -61,7 +74,8 @@ def train_seeds(
     """Trains networks that differ in their seeds alone; returns their summaries, as `train.loop.fit` would.
 
     As many as the devices share equally are trained together; the others, and all that begin from given weights or are trained by
-    several processes, one after the other by all devices. Those that are finished are not trained again.
+    several processes, one after the other by all devices. Those that are finished are not trained again. An interrupted training
+    of some of them together goes on, on as many devices as share them equally; that of other networks is given up.
 
     Args:
         tasks: one for each seed.
@@ -79,44 +93,44 @@ def train_seeds(
         Diverged: if a network diverged; the others are finished then.
     """
     mesh = mesh or device_mesh()
-    for task, folder in zip(tasks, folders, strict=True):
-        check_config(folder, identity_of(task, statistics, start), "a network trained")
+    identities = [identity_of(task, statistics, start) for task in tasks]
+    for folder, identity in zip(folders, identities, strict=True):
+        check_config(folder, identity, "a network trained")
     missing = [index for index, folder in enumerate(folders) if finished(folder) is None]
-    begun = [index for index in missing if (folders[index] / "latest").exists()]  # alone, by `fit`
-    fresh = [index for index in missing if index not in begun]
+    fresh = [index for index in missing if not has_save(folders[index] / "latest")]  # those are trained alone, by `fit`
     together = fresh[: number_together(len(fresh), mesh, start)]
-    if (work / "config.json").exists():  # of an interrupted training, some of whose networks may be finished
-        stored = read_json(work / "config.json")["networks"]
-        together = [index for index, task in enumerate(tasks) if as_read(identity_of(task, statistics)) in stored]
+    if missing and (begun := _interrupted(work, identities)) is not None and jax.process_count() == 1:
+        together = begun
+    elif missing and work.exists() and is_first():
+        if has_save(work / "latest"):
+            console.print(f"{work} holds an interrupted training of other networks, which is given up", markup=False)
+        shutil.rmtree(work)
     if len(together) > 1:
-        _together(
-            [tasks[index] for index in together],
-            data,
-            statistics,
-            [folders[i] for i in together],
-            work,
-            mesh,
-            rate_option,
-        )
+        of_these = [tasks[index] for index in together], [folders[index] for index in together]
+        _together(*of_these, data, statistics, work, shared_equally(mesh, len(together)), rate_option)
     return [
         fit(task, data, statistics, folder, start, mesh, rate_option)
         for task, folder in zip(tasks, folders, strict=True)
     ]
 
 
+def shared_equally(mesh: Mesh, networks: int) -> Mesh:
+    """Returns the mesh of the largest number of devices that share so many networks equally."""
+    count = max(count for count in range(1, mesh.size + 1) if networks % count == 0)
+    return mesh if count == mesh.size else Mesh(mesh.devices.reshape(-1)[:count].reshape(-1, 1), mesh.axis_names)
+
+
 def _together(
     tasks: Sequence[SweepTask],
+    folders: Sequence[Path],
     data: Path,
     statistics: DatasetStatistics,
-    folders: Sequence[Path],
     work: Path,
     mesh: Mesh,
     rate_option: str,
 ) -> None:
     members = [member_of(task) for task in tasks]
-    identity = as_read([identity_of(task, statistics) for task in tasks])
-    check_config(work, {"networks": identity}, "networks trained")
-    keep_json(work / "config.json", {"networks": identity})
+    keep_json(work / "config.json", {"networks": [identity_of(task, statistics) for task in tasks]})
     of = train_members(tasks[0], members, data, statistics, work, mesh, f"{len(tasks)} seeds")
     for index, (task, folder) in enumerate(zip(tasks, folders, strict=True)):
         if not of.members[index].diverged and finished(folder) is None:
@@ -124,7 +138,7 @@ def _together(
     lost = [task.optimiser.seed for task, member in zip(tasks, of.members, strict=True) if member.diverged]
     if lost:
         raise Diverged(
-            f"the {tasks[0].name} diverged from seed {', '.join(map(str, lost))}; to train it again, lower {rate_option} "
-            f"({tasks[0].optimiser.learning_rate:g} in this run), and delete {work} or choose another --out"
+            f"the {tasks[0].name} diverged from seed {', '.join(map(str, lost))}; to train again, choose another --out and lower "
+            f"{rate_option} ({tasks[0].optimiser.learning_rate:g} in this run)"
         )
     shutil.rmtree(work)

@@ -55,7 +55,7 @@ class SweepConfig:
     """successive halving: after 1/8, 1/4 and 1/2 of the epochs only the better half of the configurations goes on"""
     same_start: bool = False
     """give all drawn configurations the network's seed; else configuration i has that seed + i, and so other initial weights and
-    random draws. Those of a grid or list, and of several seeds, have the same seeds"""
+    random draws. Those of a grid or list, of several seeds, and of the recogniser have the same seeds"""
     seed: int = 0
     """seed of the drawn configurations"""
 
@@ -75,7 +75,8 @@ def draw_members(config: SweepConfig, task: SweepTask) -> list[Member]:
     configurations = drawn_of(config, task) if given is None else given
     members = []
     for index, values in enumerate(configurations):
-        start = first + (index if given is None and config.seeds == 1 and not config.same_start else 0)
+        own = given is None and config.seeds == 1 and not config.same_start and not isinstance(task, RecogniserTask)
+        start = first + index * own
         members += [replace(base, **{**values, "seed": start + number}) for number in range(config.seeds)]  # type: ignore[arg-type]
     return members
 
@@ -213,6 +214,9 @@ def sweep(
     title = f"Sweep of {len(members)}"
     of = train_members(task, members, data, statistics, folder, mesh, title, halving=config.halving)
     best = best_of(of.members)
+    if isinstance(task, RecogniserTask):  # a study's recogniser has the study's seed
+        own = (best.learning_rate, best.weight_decay, best.dropout, best.augmentation)
+        best = by_configurations(of.members)[own][0]
     index = of.members.index(best)
     if best.best is None or best.diverged:
         low, high = (end(member.learning_rate for member in members) for end in (min, max))

@@ -52,8 +52,8 @@ def check_sizes(config: SizeConfig, objects: Any, option: str) -> None:
     """
     if "radius" not in (examples := [objects[at] for at in range(min(len(objects), 32))])[0]:
         raise DataError(
-            f"this data set was made by a version that did not store radii, so that {option}.metres cannot be used; choose "
-            "another --out"
+            f"a data set of this run was made by a version that did not store radii, so that {option}.metres cannot be used; "
+            "choose another --out"
         )
     known, radius = SizeInput(), float(np.median([example["radius"] for example in examples])) * config.metres
     if not known.smallest <= radius <= known.largest:

@@ -17,6 +17,7 @@ from data_pipeline.dataset.builder import DataConfig, open_objects, open_split, 
 from data_pipeline.dataset.config import check_same_data
 from data_pipeline.dataset.statistics import load_statistics, report_left_out
 from data_pipeline.errors import DamagedMesh, DataError
+from data_pipeline.objects.names import plain_class
 from tests.data_pipeline.objects.making import box, glb, members, off, write, zipped
 
 CAPTURE = CaptureConfig(views=3, resolution=16)
@@ -213,3 +214,47 @@ def test_several_sources_are_one_data_set(tmp_path, capsys):
         check_same_data(replace(config, more=more[:1]), tmp_path / "data")
     with pytest.raises(DataError, match=r"is given twice, as --data or in --dataset\.more; leave one out"):
         open_objects(replace(config, more=(str(first),)))
+
+
+def test_sources_that_share_objects_are_refused(tmp_path):
+    root = write(tmp_path / "set", members(("mug", "rack")))
+    for other in (f"{root}/", str(root / "mug"), str(tmp_path / "set" / ".." / "set"), str(tmp_path)):
+        with pytest.raises(
+            DataError, match="is given twice, as --data or in --dataset.more, or lies in another of them"
+        ):
+            open_objects(DataConfig(source=str(root), more=(other,)))
+    with pytest.raises(DataError, match="modelnet40 holds the objects of modelnet10"):
+        open_objects(DataConfig(source="modelnet10", more=("modelnet40",)))
+
+
+def test_several_sources_keep_their_splits_and_their_names_apart(tmp_path):
+    """A share is for the source without splits; names that would be the same get a number; two spellings are one class."""
+    first = write(tmp_path / "one", members(("mug", "rack"), "set/"))
+    flat = {
+        name.replace("/train/", "/").replace("/test/", "/"): content
+        for name, content in members(("mug", "Racks")).items()
+    }
+    second = write(
+        tmp_path / "two" / "set",
+        flat | {name.replace("Racks", "rack") + "2.off": c for name, c in flat.items() if "Racks" in name},
+    )
+    config = DataConfig(
+        source=str(first), more=(str(second), "furniture10"), split="0.5", train_per_class=2, test_per_class=1
+    )
+    source = open_objects(config)
+    names = [entry.name for entry in source.entries]
+    assert len(set(names)) == len(names)
+    alone = open_objects(DataConfig(source=str(first)))
+    assert source.entries[: len(alone.entries)] == alone.entries  # their split is not divided anew
+    assert source.classes[:2] == ("mug", "rack")
+    assert len({plain_class(name) for name in source.classes}) == len(source.classes)
+    assert any("class Racks was taken as rack" in note for note in source.notes)
+    assert {entry.split for entry in source.entries if entry.name.startswith("set")} == {"train", "test"}
+
+
+def test_further_sources_of_a_data_set_are_compared(tmp_path):
+    first, second = (write(tmp_path / name, members(("mug", "rack"))) for name in ("one", "two"))
+    config = DataConfig(source=str(first), more=(str(second),), capture=CAPTURE)
+    prepare(replace(config, more=()), tmp_path / "data")
+    with pytest.raises(DataError, match=r"dataset\.more \[\], not"):
+        check_same_data(config, tmp_path / "data")

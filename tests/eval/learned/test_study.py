@@ -54,6 +54,9 @@ def test_what_looking_was_worth_is_learned_and_the_study_says_so(adding):
         costs=True,
     )
     after = {name: result["after_views"] for name, result in found["policies"].items()}
+    alone = seeds_together([found], [each], "learned")  # which says nothing of other trainings
+    assert "against_over_both" not in alone
+    assert "over_both" not in alone["policies"]["learned"]
     same = seeds_together([found, found], [each, each], "learned")
     close = partial(np.testing.assert_allclose, atol=1e-6)
     jax.tree.map(close, same["against"], found["against"])  # the mean of two that are alike

@@ -108,3 +108,8 @@ def test_intervals_over_objects_and_trainings_cover_what_they_promise():
 
 def test_intervals_of_equal_values_have_no_width():
     np.testing.assert_array_equal(interval_of_both(np.full((2, 3, 5), 0.5)), np.full((2, 2), 0.5))
+
+
+def test_intervals_over_one_training_are_refused():
+    with pytest.raises(ValueError, match="needs two trainings and two objects, got 1 and 5"):
+        interval_of_both(np.zeros((2, 1, 5)))

@@ -442,3 +442,9 @@ def test_size_is_told_unless_it_is_not_true():
     assert np.abs(small - unknown).max() > 1e-4
     far = mevs_jax.look(sized, 1000 * cube, faces, stop=2.0, max_views=1, metres=0.001)
     np.testing.assert_allclose(far.beliefs[0].probabilities, large, atol=1e-5)
+
+
+def test_an_agent_for_near_objects_is_warm_too(classifier):
+    near = classifier.agent("random", stop=2.0, distance=0.3, max_views=6)
+    near.warm_up()
+    assert near._programs[True]._see._cache_size() > 0

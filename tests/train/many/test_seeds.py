@@ -26,7 +26,7 @@ from train.devices import device_mesh
 from train.kept import config_of, summary_of
 from train.loop import fit, load_best
 from train.many.members import Member, member_of, task_of
-from train.many.seeds import train_seeds
+from train.many.seeds import shared_equally, train_seeds
 from train.many.trainers import TRAINERS
 from train.tasks.recogniser import RecogniserTask
 
@@ -146,6 +146,41 @@ def test_a_seed_that_diverges_is_named_and_the_others_are_kept(data, tmp_path, m
         train_seeds(each, data, statistics, folders, tmp_path / "work", rate_option="--rate")
     assert (folders[0] / "summary.json").exists()
     assert not folders[1].exists()
+
+
+@pytest.mark.slow
+def test_what_others_left_is_given_up_and_a_member_is_not_lengthened(data, tmp_path, monkeypatch, capsys):
+    """An interrupted training of more seeds; then fewer. A member's optimiser is not kept, so that it cannot go on."""
+    statistics, each = load_statistics(data), of_seeds(data, "entropy", seeds=(0, 1, 2))
+    folders, real = [tmp_path / str(number) for number in range(3)], train.many.training.train_batches
+    monkeypatch.setattr(
+        train.many.training,
+        "train_batches",
+        lambda *given, first_step=0: _until(real(*given, first_step=first_step), 5 if first_step == 0 else 0),
+    )
+    with pytest.raises(KeyboardInterrupt):
+        train_seeds(each, data, statistics, folders, tmp_path / "work")
+    monkeypatch.undo()
+    capsys.readouterr()
+    train_seeds(each[:2], data, statistics, folders[:2], tmp_path / "work")
+    assert "of other networks, which is given up" in " ".join(capsys.readouterr().err.split())
+    optimiser = replace(each[0].optimiser, schedule="constant")
+    longer = replace(each[0], optimiser=replace(optimiser, epochs=3))
+    folder = tmp_path / "constant"
+    constant = [
+        replace(each[0], optimiser=optimiser),
+        replace(each[1], optimiser=replace(optimiser, seed=1, data_seed=1)),
+    ]
+    train_seeds(constant, data, statistics, [folder, tmp_path / "other"], tmp_path / "work")
+    with pytest.raises(DataError, match="other settings"):
+        fit(longer, data, statistics, folder)
+    assert (folder / "summary.json").exists()
+
+
+def test_as_many_devices_as_share_the_networks_train_them():
+    for networks, devices, expected in ((4, 8, 4), (6, 4, 3), (8, 8, 8), (5, 4, 1), (3, 1, 1)):
+        mesh = jax.sharding.Mesh(np.array([jax.devices()[0]] * devices, object).reshape(-1, 1), ("data", "model"))
+        assert shared_equally(mesh, networks).size == expected
 
 
 def test_a_run_with_other_settings_is_refused(data, tmp_path):
