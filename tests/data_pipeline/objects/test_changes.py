@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+from collections import Counter
 from dataclasses import asdict, replace
 from pathlib import Path
 
@@ -182,6 +183,57 @@ def test_the_farthest_camera_still_stores_depth():
 def test_several_sources_are_one_data_set(tmp_path, capsys):
     """Classes of one name are one, names of objects stay unique, splits stay as they are, and every file is counted."""
     first = write(tmp_path / "one" / "set", members(("mug", "night_stand")))
+    second = write(
+        tmp_path / "two" / "set", members(("Night Stands", "rack"), "in/") | {"in/rack/train/bad.off": b"OFF"}
+    )
+    (tmp_path / "three.zip").write_bytes(zipped(members(("MUG", "rack"))))
+    more = (str(second), str(tmp_path / "three.zip"))
+    config = DataConfig(source=str(first), more=more, capture=CAPTURE, skip_damaged=True)
+    source = open_objects(config)
+    assert source.classes == ("mug", "night_stand", "rack")
+    names = [entry.name for entry in source.entries]
+    assert len(set(names)) == len(names) == len(members(("a", "b"))) * 3 + 1
+    alone = open_objects(DataConfig(source=str(first)))
+    assert source.entries[: len(alone.entries)] == alone.entries
+    labels = {entry.name: source.classes[entry.label] for entry in source.entries}
+    assert labels["set 2/Night Stands/train/Night Stands_0.off"] == "night_stand"
+    assert labels["three/MUG/test/MUG_2.off"] == "mug"
+    splits = Counter((entry.name.split("/")[0], entry.split) for entry in source.entries)
+    assert splits["set 2", "test"] == splits["three", "test"]
+    statistics = prepare(config, tmp_path / "data")
+    assert statistics.source == "set + set + three"
+    (left_out,) = (reasons for reasons in statistics.left_out.values() if reasons)
+    assert list(left_out) == ["set 2/rack/train/bad.off"]
+    assert len(extents(tmp_path / "data")) == len(source.entries) - 1
+    capsys.readouterr()
+    (tmp_path / "three.zip").write_bytes(zipped(members(("MUG", "rack")) | {"MUG/test/new.off": off(*box())}))
+    assert prepare(config, tmp_path / "data") == statistics
+    said = " ".join(capsys.readouterr().err.split())
+    assert f"(1 new, such as {tmp_path / 'three.zip'}: MUG/test/new.off)" in said
+    with pytest.raises(DataError, match=r"dataset\.more"):
+        check_same_data(replace(config, more=more[:1]), tmp_path / "data")
+    with pytest.raises(DataError, match=r"is given twice, as --data or in --dataset\.more, or lies in"):
+        open_objects(replace(config, more=(str(first),)))
+
+
+def test_sources_that_share_objects_are_refused(tmp_path):
+    root = write(tmp_path / "set", members(("mug", "rack")))
+    for other in (f"{root}/", str(root / "mug"), str(tmp_path / "set" / ".." / "set"), str(tmp_path)):
+        with pytest.raises(
+            DataError, match=r"is given twice, as --data or in --dataset\.more, or lies in another of them"
+        ):
+            open_objects(DataConfig(source=str(root), more=(other,)))
+    with pytest.raises(DataError, match="modelnet40 holds the objects of modelnet10"):
+        open_objects(DataConfig(source="modelnet10", more=("modelnet40",)))
+
+
+def test_several_sources_keep_their_splits_and_their_names_apart(tmp_path):
+    """A share is for the source without splits; names that would be the same get a number; two spellings are one class."""
+    first = write(tmp_path / "one", members(("mug", "rack"), "set/"))
+    flat = {
+        name.replace("/train/", "/").replace("/test/", "/"): content
+        for name, content in members(("mug", "Racks")).items()
+    }
     racks = {name.replace("Racks", "rack") + "2.off": mesh for name, mesh in flat.items() if "Racks" in name}
     second = write(tmp_path / "two" / "set", flat | racks)
     config = DataConfig(
