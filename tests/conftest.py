@@ -124,6 +124,20 @@ def turned(tmp_path_factory) -> Path:
 
 
 @pytest.fixture(scope="session")
+def otherwise_tested(tmp_path_factory) -> Path:
+    """As `data`, but with other test objects, and another number of them in each class; for reading only."""
+    from data_pipeline.dataset.builder import prepare
+    from eval.settings import TINY
+    from tests.reference.leaks import other_test_objects
+
+    def make(folder: Path) -> None:
+        with other_test_objects():
+            prepare(TINY.dataset, folder)
+
+    return made_once(tmp_path_factory, "otherwise_tested", make)
+
+
+@pytest.fixture(scope="session")
 def whole(tmp_path_factory) -> Path:
     """One run of the preset `tiny` by the command line, never interrupted, for reading only."""
 

@@ -62,7 +62,7 @@ class Signal:
 
     def threshold_for(self, accuracy: float) -> float | None:
         """The least of about a hundred thresholds that reaches this accuracy, or None."""
-        for threshold in [*np.unique(np.quantile(self.value, np.linspace(0, 1, 101))), self.value.max() + 1]:
+        for threshold in [*np.unique(np.quantile(self.value, np.linspace(0, 1, 101))), float(self.value.max()) + 1]:
             if self.accuracy(threshold) >= accuracy:
                 return float(threshold)
         return None
@@ -111,8 +111,8 @@ def compare_rules(
 class WalkRecord:
     """A policy's walks on validation and on test objects, with fused beliefs and calibrated confidences along them."""
 
-    views: Sequence[Int[np.ndarray, "objects walks steps"]]
-    beliefs: Sequence[Float[np.ndarray, "objects walks steps classes"]]
+    views: Sequence[Int[np.ndarray, "_objects _walks steps"]]
+    beliefs: Sequence[Float[np.ndarray, "_objects _walks steps classes"]]
     confidence: Sequence[Signal]
 
 

@@ -70,7 +70,7 @@ def _refit(beliefs: Array, labels: Array) -> Float[Array, " steps"]:
 
 
 def walk_metrics(
-    beliefs: Sequence[Float[AnyArray, "objects walks steps classes"]], labels: Sequence[Int[AnyArray, " objects"]]
+    beliefs: Sequence[Float[AnyArray, "_objects _walks steps classes"]], labels: Sequence[Int[AnyArray, " _objects"]]
 ) -> tuple[dict[str, Any], list[Signal], Float[np.ndarray, "steps objects"]]:
     """Metrics of one policy.
 
@@ -227,14 +227,15 @@ def study(
         learners: trained view policies; the first is the method, the others are compared with it.
         max_views: length of a walk.
         draws: walks of random policies from each start view.
-        oracle_views: length of the oracles' walks.
+        oracle_views: length of the oracles' walks, at most `max_views`.
         fitting_starts: temperatures are fitted on walks from every n-th start view.
         costs: whether to add the metrics of stopping and of movement cost.
         others: whether to evaluate the other policies and random sets as well.
     """
     points, labels = test.features.directions[0], test.features.labels
     shared = fusion.posed and bool(jnp.allclose(test.features.directions, points, atol=1e-4))
-    max_views, oracle_views = min(max_views, len(points)), min(oracle_views, len(points))
+    max_views = min(max_views, len(points))
+    oracle_views = min(oracle_views, max_views)
     knowledge = learn(fusion, validation.features, max_views) if shared else None
     apart = max(1, len(points) // _TRYING_STARTS)
     some_starts = np.arange(0, len(points), apart)

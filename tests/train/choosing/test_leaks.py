@@ -1,0 +1,96 @@
+"""Calibrated fusions and view policies are learned without test objects."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from eval.settings import TINY
+from tests.reference.leaks import CHANGES, check_fitted, check_tested
+from tests.reference.made_up_study import STUDIED, Study
+from train.choosing.stages import VARIANTS
+
+FUSIONS = {
+    "posed": {},
+    "unposed": {"posed": False},
+    "summed": {"summed": True},
+    "of a part": {"fold": 1},
+}
+LEARNED = tuple(name for name, variant in VARIANTS.items() if not variant.network)
+"""Variants that have networks of their own."""
+
+
+@pytest.fixture(scope="module")
+def studies(tmp_path_factory) -> dict:
+    """By what is changed about test objects: the study, its fusions and its policies."""
+    found = {}
+    for change in (None, *CHANGES):
+        with pytest.MonkeyPatch.context() as patch:
+            study = Study(change, tmp_path_factory.mktemp("stages"), patch, TINY.learned)
+            stages = study.stages
+            stages.prepare()
+            stages.train_recogniser()
+            policies = {name: stages.policy(name) for name in LEARNED}
+            policies["without classes"] = stages.policy(without=(0, 2))
+            fusions = {name: stages.fusion(**which) for name, which in FUSIONS.items()}
+            asked = list(study.asked)
+            test = stages.features("turned_test", stages.turned, "test")
+            found[change] = study, asked, fusions, policies, stages.prior, test
+    return found
+
+
+def test_test_objects_are_not_asked_for(studies):
+    _, asked, *_ = studies[None]
+    assert {split for _, split, _ in asked} == {"train", "val"}
+    assert {network for _, _, network in asked} > {"recogniser", "recogniser without part 1 of 2"}
+
+
+@pytest.mark.parametrize("change", CHANGES)
+def test_fusions_are_calibrated_on_validation_objects(change, studies):
+    """Temperatures of sets of views and of single views, for objects of known and unknown pose; and what they subtract."""
+    one, other = (studies[which][2] for which in (None, change))
+    check_fitted(one, other)
+    for fusion in one.values():
+        assert np.unique(fusion.temperatures).size > 3
+        assert fusion.single != 1
+
+
+@pytest.mark.parametrize("change", CHANGES)
+def test_the_prior_is_of_training_objects(change, studies):
+    assert studies[None][0].stages.prior.shape == (3,)
+    check_fitted(*(studies[which][4] for which in (None, change)))
+
+
+def test_the_prior_counts_training_objects(tmp_path, monkeypatch):
+    uneven = {"train": {"a": 1, "b": 2, "c": 5}, "val": {"a": 3, "b": 1, "c": 1}, "test": {"a": 9, "b": 1, "c": 1}}
+    stages = Study(None, tmp_path, monkeypatch, TINY.learned).stages
+    stages.statistics = replace(STUDIED, counts=uneven)
+    np.testing.assert_allclose(jnp.exp(stages.prior), np.array([1, 2, 5]) / 8, rtol=1e-6)
+
+
+@pytest.mark.parametrize("change", CHANGES)
+def test_view_policies_learn_from_other_objects(change, studies):
+    """Everything that their training is given: features, logits, labels, directions, clouds, and fusions."""
+    one, other = (studies[which][0].fitted_on for which in (None, change))
+    assert len(one) == len(LEARNED) + 1
+    check_fitted(one, other)
+    check_fitted(*(studies[which][3] for which in (None, change)))
+
+
+def test_policies_that_are_trained_without_classes_see_no_object_of_these(studies):
+    """Those classes are new to them when they are tested on them."""
+    name, (parts, check) = studies[None][0].fitted_on[-1]
+    assert name == "view policy (learned)"
+    assert check is None
+    for _, data in parts:
+        assert set(np.asarray(data.labels).tolist()) == {1}
+
+
+@pytest.mark.parametrize("change", CHANGES)
+def test_test_objects_are_others(change, studies):
+    one, other = (studies[which][5] for which in (None, change))
+    names = {"labels": ("labels",), "outputs": ("features", "logits")}[change]
+    check_tested(*({name: getattr(test, name) for name in names} for test in (one, other)))
