@@ -413,7 +413,8 @@ def _interval_of_gap(mine: np.ndarray, random: np.ndarray, oracle: np.ndarray) -
     for step in range(1, min(len(oracle), 1 + _GAP)):
         gain, gap = (np.asarray(_resampled(one[step] - random[step])) for one in (mine, oracle))
         clear = np.quantile(gap, 0.025) > 0
-        found.append(np.quantile(gain / gap, (0.025, 0.975)).tolist() if clear else None)
+        shares = gain[gap > 0] / gap[gap > 0]
+        found.append(np.quantile(shares, (0.025, 0.975)).tolist() if clear else None)
     return found
 
 

@@ -14,12 +14,13 @@ from data_pipeline.dataset.statistics import load_statistics
 from eval.settings import TINY
 from eval.stages import tasks
 from tests.reference.leaks import check_fitted, check_tested
-from train.loop import class_weights_of, fit, load_best, steps_of_an_epoch, validation_set
+from train.loop import fit, load_best, steps_of_an_epoch
+from train.many.sweep import SweepConfig, sweep
 from train.optimiser import OptimiserConfig
 from train.outputs import network_outputs
-from train.sweep import SweepConfig, sweep
 from train.tasks.classifier import ClassifierTask
 from train.tasks.recogniser import RecogniserTask
+from train.validation import ValidationSet, class_weights_of
 
 BRIEF = OptimiserConfig(epochs=4, batch_size=16, views_per_object=2, learning_rate=3e-2, schedule="cosine")
 SETTINGS = replace(TINY, classifier=replace(TINY.classifier, optimiser=BRIEF))
@@ -64,7 +65,7 @@ def test_what_networks_are_validated_on_is_the_same(name, data, otherwise_tested
         found.append(
             {
                 "task": repr(task),
-                "views": validation_set(task, folder, statistics, 1),
+                "views": list(ValidationSet(task, folder, statistics, 1)),
                 "classes": class_weights_of(task, statistics),
                 "steps": steps_of_an_epoch(task, statistics),
             }
