@@ -29,7 +29,9 @@ def without_costs(monkeypatch):
     monkeypatch.setattr(train.plan, "flop_of", lambda *_: 1.0)
 
 
-@pytest.mark.parametrize("preset", ["tiny", "small", "thesis"])
+@pytest.mark.parametrize(
+    "preset", ["tiny", *(pytest.param(preset, marks=pytest.mark.slow) for preset in ("small", "thesis"))]
+)
 def test_a_pod_and_a_million_objects_are_planned_from_any_machine(preset, at_once, tmp_path):
     found = at_once("train", "--preset", preset, *POD, *LARGE, *MILLION, "--json", "--out", tmp_path / "run")
     assert (found.returncode, found.stderr) == (0, "")

@@ -175,6 +175,7 @@ def test_a_finished_run_may_be_lengthened(data, tmp_path, capsys):
         fit(falling, data, statistics, tmp_path / "lengthened")
 
 
+@pytest.mark.slow
 def test_an_interrupted_run_may_go_on_in_parts_and_half_precision(data, tmp_path, monkeypatch):
     statistics = load_statistics(data)
     task = tasks(SETTINGS, statistics)[1]

@@ -56,6 +56,7 @@ def test_many_processes_have_equally_many_batches(data, monkeypatch):
         assert sum(seen) == statistics.objects_of(["val"]) * statistics.views
 
 
+@pytest.mark.slow
 def test_training_is_the_same_with_views_that_are_read_again(data, tmp_path, monkeypatch):
     statistics = load_statistics(data)
     task = tasks(TINY, statistics)[1]

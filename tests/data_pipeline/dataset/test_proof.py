@@ -112,7 +112,7 @@ def test_a_data_set_whose_source_is_gone_or_changed_is_named(damaged, tmp_path, 
         prepare(CONFIG, damaged)
     monkeypatch.undo()
     (damaged / proof.SOURCE_STATE).write_text('{"a": "1"}')
-    monkeypatch.setattr(builder, "_state", lambda config: {"a": "2"})
+    monkeypatch.setattr(builder, "state_of", lambda config: {"a": "2"})
     with pytest.raises(DataError, match=r"has changed since \(1 changed, such as a\); restore either"):
         prepare(CONFIG, damaged)
     assert (damaged / SUMMARY).exists()

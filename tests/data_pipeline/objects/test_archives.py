@@ -15,7 +15,7 @@ import pytest
 import trimesh
 
 from data_pipeline.capture.casting import CaptureConfig
-from data_pipeline.dataset import builder
+from data_pipeline.dataset import origin
 from data_pipeline.dataset.builder import DataConfig, open_split, prepare
 from data_pipeline.dataset.statistics import load_statistics
 from data_pipeline.errors import DataError
@@ -100,7 +100,7 @@ def test_without_a_network_the_way_out_is_named(tmp_path):
 def test_a_data_set_is_made_from_the_archive(served, made_archive, tmp_path, monkeypatch, capsys):
     """By download and by `--archive`: the same objects, the empty one named, Apple's folders not looked at."""
     monkeypatch.setitem(ARCHIVES, "modelnet10", served[0])
-    monkeypatch.setattr(builder, "download_folder", lambda: tmp_path / "downloads")
+    monkeypatch.setattr(origin, "download_folder", lambda: tmp_path / "downloads")
     config = DataConfig(source="modelnet10", capture=CaptureConfig(views=3, resolution=16))
     by_download = prepare(config, tmp_path / "a")
     by_file = prepare(replace(config, archive=str(made_archive)), tmp_path / "b")

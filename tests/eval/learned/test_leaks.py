@@ -38,6 +38,8 @@ TRUTH = ("oracle_entropy", "belief_oracle", "label_oracle")
 WITH_COST = "with_cost"
 """Name of the walks with a movement cost, which are on test objects alone."""
 
+pytestmark = pytest.mark.slow
+
 
 @dataclass
 class Measured:

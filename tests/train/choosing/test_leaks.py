@@ -22,6 +22,8 @@ FUSIONS = {
 LEARNED = tuple(name for name, variant in VARIANTS.items() if not variant.network)
 """Variants that have networks of their own."""
 
+pytestmark = pytest.mark.slow
+
 
 @pytest.fixture(scope="module")
 def studies(tmp_path_factory) -> dict:

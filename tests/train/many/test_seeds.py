@@ -70,6 +70,7 @@ def test_every_seed_ends_as_it_does_alone(name, request, tmp_path):
             np.testing.assert_allclose(weights, expected, rtol=1e-5, atol=1e-6, err_msg=jax.tree_util.keystr(place))
 
 
+@pytest.mark.slow
 def test_both_ways_of_training_members_take_the_same_steps(data):
     """Twenty steps of two members, each on its own batches; the second stops half way."""
     each = of_seeds(data, "entropy")
@@ -95,6 +96,7 @@ def test_both_ways_of_training_members_take_the_same_steps(data):
         np.testing.assert_allclose(mine[0], theirs[0], rtol=1e-4, atol=step if np.ndim(mine[0]) < 2 else 0.1 * step)
 
 
+@pytest.mark.slow
 def test_an_interrupted_training_of_seeds_goes_on(data, tmp_path, monkeypatch):
     """Interrupted after the first epoch, and once more while the networks are written."""
     statistics, each = load_statistics(data), of_seeds(data, "entropy", seeds=(0, 1))

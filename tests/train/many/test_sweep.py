@@ -55,7 +55,8 @@ def task_named(name: str, out: Path):
     return tasks(settings, load_statistics(out / "data"))[("classifier", "entropy").index(name)]
 
 
-@pytest.mark.parametrize("every", [False, pytest.param(True, marks=pytest.mark.slow)], ids=["one", "all"])
+@pytest.mark.slow
+@pytest.mark.parametrize("every", [False, True], ids=["one", "all"])
 def test_members_end_as_separate_runs_do(every, out, tmp_path):
     """Some stop early, and are left alone while others continue; the first to stop, or all."""
     statistics, task = load_statistics(out / "data"), task_named("entropy", out)
