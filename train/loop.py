@@ -7,11 +7,9 @@ are then, and ends with the same weights: batches and random keys depend only on
 
 from __future__ import annotations
 
-import json
 import time
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
-from contextlib import suppress
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -32,7 +30,7 @@ from data_pipeline.dataset.batches import (
 from data_pipeline.dataset.statistics import DatasetStatistics
 from data_pipeline.differences import differences, in_words
 from data_pipeline.errors import DataError, Diverged
-from data_pipeline.files import as_read, check_of_file, keep_checks, keep_json, write_text
+from data_pipeline.files import as_read, check_of_file, keep_checks, keep_json
 from data_pipeline.progress import console, progress_bar
 from train.checkpoints import Checkpoints, drop_damaged
 from train.devices import (
@@ -48,6 +46,7 @@ from train.devices import (
 )
 from train.finite import all_finite, not_finite
 from train.kept import check_config, config_of, content_of, finished, goes_on_with
+from train.log import MetricsLog
 from train.optimiser import learning_rate
 from train.preemption import Preempted, Preemption
 from train.starting_weights import StartingWeights
@@ -88,47 +87,6 @@ def validate(evaluate_step: Callable, state: TrainState, batches: Iterable, mesh
     """Returns the mean of every metric over the validation views of all processes."""
     found = [evaluate_step(state.parameters, state.statistics, *place_batch(mesh, batch)) for batch in batches]
     return {name: float(mean) for name, mean in weighted_means(found).items()}
-
-
-def read_log(path: Path) -> list[dict[str, float]]:
-    """Returns the readable lines of a `metrics.jsonl`; none if there is no such file."""
-    found = []
-    for line in path.read_text(errors="replace").splitlines() if path.is_file() else []:
-        with suppress(ValueError):
-            content = json.loads(line)
-            if isinstance(content, dict) and "step" in content and "epoch" in content:
-                found.append(content)
-    return found
-
-
-class MetricsLog:
-    """Writes metrics as JSON lines and for TensorBoard, from the first process only.
-
-    On resuming, lines logged after the checkpoint are removed.
-    """
-
-    def __init__(self, folder: Path, step: int):
-        self._writes = is_first()
-        if not self._writes:
-            return
-        self._path = folder / "metrics.jsonl"
-        kept = [line for line in read_log(self._path) if line["step"] <= step]
-        write_text(self._path, "".join(json.dumps(line) + "\n" for line in kept))
-        from tensorboardX import SummaryWriter  # imported late: it imports PyTorch if that is installed
-
-        self._board = SummaryWriter(str(folder / "tensorboard"), purge_step=step + 1)
-
-    def write(self, step: int, metrics: dict[str, float]) -> None:
-        if not self._writes:
-            return
-        with self._path.open("a") as file:
-            file.write(json.dumps({"step": step, **metrics}) + "\n")
-        for name, value in metrics.items():
-            self._board.add_scalar(name, value, step)
-
-    def close(self) -> None:
-        if self._writes:
-            self._board.close()
 
 
 def identity_of(task: Task, statistics: DatasetStatistics, start: StartingWeights | None = None) -> dict[str, Any]:

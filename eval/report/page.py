@@ -33,7 +33,7 @@ from eval.report.policies import (
 from eval.report.seeds import seeds_section
 from mevs_jax.viewpoints import local_maxima
 from train.chance import Chance
-from train.loop import read_log
+from train.log import read_log
 
 _SPLITS = {"train": "training", "val": "validation", "test": "test", "other": "no split"}
 """Where the source had objects that were left out."""
