@@ -152,6 +152,7 @@ def test_a_finished_run_is_not_repeated_nor_mixed(trained, data):
         fit(other, data, statistics, trained / "classifier")
 
 
+@pytest.mark.slow
 def test_a_finished_run_may_be_lengthened(data, tmp_path, capsys):
     """More epochs at a constant rate, where more patience is needed too; the result is that of one long run."""
     statistics = load_statistics(data)

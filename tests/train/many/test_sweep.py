@@ -280,6 +280,7 @@ def test_the_recogniser_is_swept_too(turned, data, tmp_path):
     assert summary_of(there)["best_loss"] == best_of(members).loss
 
 
+@pytest.mark.slow
 def test_the_command_leaves_table_plot_and_network(out):
     settings = replace(SETTINGS, sweep=SWEEP)
     folder, members = train_sweep(settings, out)
