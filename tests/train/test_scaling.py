@@ -44,9 +44,10 @@ def work(**asked) -> subprocess.CompletedProcess:
 
 @pytest.mark.parametrize(
     ("devices", "networks", "steps"),
-    [(4, 1, 10), pytest.param(8, 2, 50, marks=pytest.mark.slow)],
+    [(4, 1, 10), (8, 2, 50)],
     ids=["4 devices", "8 devices"],
 )
+@pytest.mark.slow
 def test_steps_on_many_devices_equal_those_on_one(data, devices, networks, steps):
     """Dropout and augmentation on; PointNet++ or both networks, and PointNet++ with its weights split in two as well.
 
