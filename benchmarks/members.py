@@ -1,8 +1,9 @@
 """Four networks trained together, at once and in turn, compared with four separate runs: ratio of the times.
 
 `python benchmarks/members.py` trains each network of the `small` preset, and PointNet++ of the `tiny` one, from four seeds on the
-built-in objects. *From nothing*: with compilation, to the end of the epoch. *Steps*: alone, once compiled. A ratio above 1 means
-that training together is faster. `--devices 8` instead lists how eight simulated devices talk to each other in a step.
+built-in objects, and four view policies on features drawn at random. *From nothing*: with compilation, to the end of the epoch.
+*Steps*: alone, once compiled. A ratio above 1 means that training together is faster. `--devices 8` instead lists how eight
+simulated devices talk to each other in a step.
 """
 
 from __future__ import annotations
@@ -22,7 +23,9 @@ from typing import Any
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 import jax
+import jax.numpy as jnp
 import numpy as np
+from flax import nnx
 
 from data_pipeline.dataset.batches import train_batches
 from data_pipeline.dataset.builder import prepare
@@ -30,6 +33,12 @@ from data_pipeline.dataset.statistics import load_statistics
 from data_pipeline.files import write_json
 from eval.settings import SMALL, TINY, Settings
 from eval.stages import tasks
+from mevs_jax import fibonacci_sphere
+from mevs_jax.beliefs import CalibratedFusion
+from mevs_jax.models.set_fusion import SetFusion
+from train.choosing import averaged
+from train.choosing.features import Features
+from train.choosing.policy import Lesson, train_policies
 from train.devices import device_mesh
 from train.loop import fit, steps_of_an_epoch
 from train.many.members import SweepTask, member_of
@@ -98,6 +107,33 @@ def compare(task: SweepTask, data: Path, out: Path) -> dict[str, Any]:
     return found | {f"step {way}": float(np.median(taken)) for way, taken in steps.items()}
 
 
+def compare_policies(objects: int = 200, features: int = 128) -> dict[str, Any]:
+    """Times in seconds of four view policies of the learned study, which learn from features that are drawn at random."""
+    config = replace(SMALL.learned.policy, rounds=1, epochs=2)
+    random, directions = np.random.default_rng(0), np.stack([fibonacci_sphere(40)] * objects)
+    structure, weights = nnx.split(SetFusion(features, 10, width=64, heads=4, blocks=1, dropout=0.0, rngs=nnx.Rngs(0)))
+    fusion = CalibratedFusion(structure, weights, jnp.zeros(10), jnp.ones(8), jnp.float32(1))
+
+    def seen() -> Features:
+        arrays = random.normal(size=(objects, 40, features)), random.normal(size=(objects, 40, 10)), directions
+        some, logits, points = (jnp.asarray(array, jnp.float32) for array in arrays)
+        return Features(some, logits, jnp.asarray(random.integers(0, 10, objects), jnp.int32), points)
+
+    lessons = [Lesson(seed, [(fusion, seen())], None, f"policy {seed}") for seed in range(SEEDS)]
+    found: dict[str, Any] = {"separate": seconds_of(lambda: [train_policies(config, [lesson]) for lesson in lessons])}
+    chosen = averaged.way_for
+    for way in WAYS:
+        averaged.way_for = partial(_always, way)
+        found[way] = seconds_of(partial(train_policies, config, lessons))
+    averaged.way_for = chosen
+    return found
+
+
+def _always(way: Way, mesh: Any) -> Way:
+    del mesh
+    return way
+
+
 def _step(trainer: Trainer, training: np.ndarray, batch: dict[str, np.ndarray]) -> None:
     jax.block_until_ready(trainer.train(training, batch))
 
@@ -127,6 +163,7 @@ def main() -> None:
                 )
             return
         rows = {name: compare(task, data, Path(folder) / name) for name, task in networks(data).items()}
+    rows["view policy, small"] = compare_policies()
     print(f"\n{SEEDS} seeds, {platform.machine()}, JAX {jax.__version__}")
     print(
         f"{'network':20}{'separate':>11}{'in turn':>11}{'ratio':>8}{'at once':>11}{'ratio':>8}{'step: in turn / at once':>26}"
@@ -135,7 +172,7 @@ def main() -> None:
         print(
             f"{name:20}{row['separate']:>9.1f} s{row['in turn']:>9.1f} s{row['separate'] / row['in turn']:>8.2f}"
             f"{row['at once']:>9.1f} s{row['separate'] / row['at once']:>8.2f}"
-            f"{row['step at once'] / row['step in turn']:>26.2f}"
+            f"{row['step at once'] / row['step in turn'] if 'step in turn' in row else np.nan:>26.2f}"
         )
     write_json(Path(__file__).parent / "results" / "members.json", rows)
 

@@ -14,6 +14,7 @@ from typing import Any
 import jax
 
 from data_pipeline.dataset.statistics import load_statistics
+from data_pipeline.distributed import is_first, wait_for_all
 from data_pipeline.errors import DataError
 from data_pipeline.progress import console
 from eval import stages
@@ -22,7 +23,7 @@ from eval.numbers.trainings import csv_over_trainings, rows_over_trainings, walk
 from eval.run_file import save_run
 from eval.settings import Settings
 from train.chance import warn_of_chance
-from train.devices import device_mesh, is_first, wait_for_all
+from train.devices import device_mesh
 from train.kept import keep_beside, kept_json, made_by
 from train.many.seeds import check_networks, train_seeds
 from train.optimiser import OptimiserConfig
@@ -90,19 +91,21 @@ def train(
     seeds = [stages.trainings(seed_settings(settings, number), statistics, start) for number in numbers]
     networks = []
     for same in zip(*seeds, strict=True):
-        _, name, weights = same[0]
+        name, weights = same[0][1], [weights for _, _, weights in same]
         tasks: list[Any] = [task for task, _, _ in same]
         folders, work = [seed_folder(out, number) / name for number in numbers], out / "seeds" / f"{name}_together"
         networks.append((tasks, name, folders, work, weights))
         for part in parts:
-            check_networks(tasks[part], statistics, folders[part], work, weights, mesh)
+            check_networks(tasks[part], statistics, folders[part], work, weights[part], mesh)
     if is_first():
         begin()
     wait_for_all("seeds")
     for tasks, name, folders, work, weights in networks:
         option, summaries = f"--{name}.optimiser.learning-rate", []
         for part in parts:
-            summaries += train_seeds(tasks[part], out / "data", statistics, folders[part], work, weights, mesh, option)
+            summaries += train_seeds(
+                tasks[part], out / "data", statistics, folders[part], work, weights[part], mesh, option
+            )
         for number, summary in enumerate(summaries):
             best = ", ".join(f"{key} {value:.4f}" for key, value in summary["best"].items())
             console.print(

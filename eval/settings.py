@@ -15,7 +15,8 @@ from eval.walks.live import LiveConfig
 from mevs_jax.models import Abstraction
 from train.choosing.features import SetFusionConfig
 from train.choosing.policy import PolicyConfig
-from train.choosing.stages import ABLATIONS, LearnedConfig
+from train.choosing.stages import LearnedConfig
+from train.choosing.variants import ABLATIONS
 from train.many.sweep import SweepConfig
 from train.optimiser import OptimiserConfig
 from train.tasks.classifier import ClassifierConfig, ResNetConfig

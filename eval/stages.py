@@ -6,6 +6,7 @@ also holds `classifier_by_view/` if the validation of the published code is comp
 
 from __future__ import annotations
 
+import re
 import tempfile
 from dataclasses import asdict, replace
 from pathlib import Path
@@ -18,13 +19,14 @@ import numpy as np
 from data_pipeline.dataset.builder import open_objects, prepare
 from data_pipeline.dataset.config import check_same_data
 from data_pipeline.dataset.statistics import SUMMARY, DatasetStatistics, load_statistics, report_left_out
+from data_pipeline.distributed import is_first
 from data_pipeline.errors import DataError, Diverged, Unreadable
 from data_pipeline.files import check_of_file, keep_json, read_json, write_json
 from data_pipeline.objects.sources import load_object
 from data_pipeline.progress import console
 from eval.checks.agent import compare_walks, latency, recognised, stopping
 from eval.consistency import check_classifier, check_evaluated_with, check_made_with
-from eval.learned.measure import measure, together, train_all
+from eval.learned.measure import APART, measure, together
 from eval.learned.page import write_learned_page
 from eval.learned.system import make_learned_system
 from eval.numbers.policies import csv_of
@@ -44,7 +46,7 @@ from eval.walks.own_policies import OwnPolicy, load_policies, own_rungs
 from mevs_jax.policies.registry import policy_named
 from mevs_jax.trained import load as load_system
 from train.chance import warn_of_chance
-from train.choosing.stages import Stages, check_learned, train_recognisers
+from train.choosing.stages import Stages, check_learned, train_recognisers, trained_policies
 from train.devices import Layout, check_batch, device_mesh
 from train.finite import check_results, place_not_finite
 from train.kept import keep_beside, kept, kept_json, made_by, summary_of
@@ -57,7 +59,12 @@ from train.tasks.entropy import EntropyTask
 
 
 def check_output(out: Path) -> None:
-    """Raises `DataError` if the directory `out` is not writable."""
+    """Raises `DataError` if the directory `out` is not writable, or an address of object storage."""
+    if len(out.parts) > 1 and re.fullmatch(r"[a-z][a-z0-9+.-]+:", out.parts[0]):  # `Path` has made one slash of two
+        raise DataError(
+            f"--out {out.parts[0]}//{'/'.join(out.parts[1:])} is an address, and a run needs a folder whose files can be renamed "
+            f"and locked; mount that storage, and give the folder"
+        )
     try:
         out.mkdir(parents=True, exist_ok=True)
         with tempfile.NamedTemporaryFile(prefix=".probe.", dir=out):
@@ -303,7 +310,7 @@ def make_system(settings: Settings, out: Path) -> Path:
 
 def learn_to_choose(settings: Settings, out: Path) -> Path:
     """Trains and evaluates learned fusion and learned view selection; returns the path of the page."""
-    config, found = settings.learned, []
+    config = settings.learned
     check_learned(config, settings.dataset.capture.views)
     check_same_data(settings.dataset, out / "data")
     seeds = [
@@ -312,15 +319,17 @@ def learn_to_choose(settings: Settings, out: Path) -> Path:
     ]
     seeds[0].prepare()
     train_recognisers(seeds)
-    for stages in seeds:
-        train_all(stages)
-        found.append(measure(stages))
+    trained_policies([stages.policy_job() for stages in seeds])
+    for part in range(APART):
+        trained_policies([stages.policy_job(aside=(part, APART)) for stages in seeds])
+    found = [measure(stages) for stages in seeds]
     metrics = {"seeds": found, "together": together(seeds, found), "settings": asdict(config)}
     check_results(metrics, "the metrics of the learned study")
-    keep_json(out / "learned" / "metrics.json", metrics)
-    make_learned_system(seeds[0], found[0])
     page = out / "learned" / "index.html"
-    write_learned_page(metrics, load_statistics(out / "data"), page)
+    if is_first():
+        keep_json(out / "learned" / "metrics.json", metrics)
+        write_learned_page(metrics, load_statistics(out / "data"), page)
+    make_learned_system(seeds[0], found[0])
     return page
 
 

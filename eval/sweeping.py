@@ -12,6 +12,7 @@ import jax
 
 from data_pipeline.dataset.config import check_same_data
 from data_pipeline.dataset.statistics import load_statistics
+from data_pipeline.distributed import is_first, wait_for_all
 from data_pipeline.errors import DataError
 from eval import stages
 from eval.report.sweep import write_sweep_report
@@ -36,7 +37,8 @@ def train_sweep(settings: Settings, out: Path, mesh: jax.sharding.Mesh | None = 
         task = stages.tasks(settings, statistics)[("classifier", "entropy").index(name)]
     folder = out / "sweep" / name
     members = sweep(task, data, statistics, folder, settings.sweep, mesh)
-    write_sweep_report(members, folder)
+    if is_first():
+        write_sweep_report(members, folder)
     return folder, members
 
 
@@ -53,15 +55,22 @@ def adopt(settings: Settings, out: Path) -> tuple[Path, Settings]:
     made, there = out / "sweep" / name / "network", out / name
     if name == "recogniser":
         there = Stages(settings.learned, settings.dataset, out, settings.learned.seed).recogniser_folder()
-    if not there.exists():
-        there.parent.mkdir(parents=True, exist_ok=True)
-        copy = Path(tempfile.mkdtemp(prefix=f".{there.name}.", dir=there.parent))
-        shutil.copytree(made, copy, dirs_exist_ok=True)
-        copy.chmod(0o755)
-        copy.rename(there)
+    exists = there.exists()
+    wait_for_all("the best is adopted")
+    if not exists:
+        if is_first():
+            _copy(made, there)
     elif config_of(there) != config_of(made):
         raise DataError(f"{there} holds another network; delete it, and the same command takes the best of the sweep")
     return there, _with_hyperparameters(settings, config_of(made)["task"])
+
+
+def _copy(made: Path, there: Path) -> None:
+    there.parent.mkdir(parents=True, exist_ok=True)
+    copy = Path(tempfile.mkdtemp(prefix=f".{there.name}.", dir=there.parent))
+    shutil.copytree(made, copy, dirs_exist_ok=True)
+    copy.chmod(0o755)
+    copy.rename(there)
 
 
 def _with_hyperparameters(settings: Settings, task: dict[str, Any]) -> Settings:

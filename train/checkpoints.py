@@ -16,10 +16,10 @@ from typing import Any
 import jax
 import orbax.checkpoint as ocp
 
+from data_pipeline.distributed import is_first, is_lost_process
 from data_pipeline.errors import DataError, Unreadable, reason_of
 from data_pipeline.files import check_of_file, damage_in, files_in, keep_checks
 from data_pipeline.progress import console
-from train.devices import is_first, is_lost_process
 from train.preemption import interrupts_held
 
 for _name in (

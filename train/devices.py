@@ -7,8 +7,6 @@ their last axis. The compiler derives the rest.
 from __future__ import annotations
 
 import math
-import os
-import socket
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
@@ -26,86 +24,9 @@ _SMALLEST_SPLIT = 2**12
 """Weights smaller than this are copied to every device."""
 
 
-def join_processes() -> None:
-    """Joins this process to the others of a multi-process training; must be called before JAX computes anything.
-
-    On Slurm, Open MPI, Kubernetes and Cloud TPUs, JAX finds the other processes. Elsewhere, environment variables name them:
-    JAX_COORDINATOR_ADDRESS (host:port of process 0), JAX_NUM_PROCESSES and JAX_PROCESS_ID.
-
-    Raises:
-        DataError: if the other processes cannot be found or reached, or cannot reach this one.
-    """
-    numbers = {}
-    try:
-        for argument, name in (("num_processes", "JAX_NUM_PROCESSES"), ("process_id", "JAX_PROCESS_ID")):
-            if name in os.environ:
-                numbers[argument] = int(os.environ[name])
-        jax.distributed.initialize(**numbers, heartbeat_timeout_seconds=30)  # type: ignore[arg-type]
-    except (ValueError, RuntimeError) as error:
-        raise DataError(
-            f"--distributed cannot join the other processes ({str(error).splitlines()[0]}); outside Slurm, Open MPI, Kubernetes "
-            f"and Cloud TPUs set JAX_COORDINATOR_ADDRESS=host:port, JAX_NUM_PROCESSES and JAX_PROCESS_ID for each"
-        ) from error
-    try:
-        jax.devices()
-    except RuntimeError as error:
-        if "gloo" not in str(error) or not (name := unresolved_name()):
-            raise
-        raise DataError(
-            f"--distributed on CPUs needs the name of this machine to have an address, and {name} has none; add a line to "
-            f"/etc/hosts: its address, then {name}"
-        ) from error
-
-
-def unresolved_name() -> str:
-    """Returns the name of this machine if it has no address, else an empty string.
-
-    Processes that train on CPUs find each other by these names (JAX's Gloo collectives).
-    """
-    name = socket.gethostname()
-    try:
-        socket.getaddrinfo(name, None)
-    except OSError:
-        return name
-    return ""
-
-
-def is_first() -> bool:
-    """Returns whether this process is the one that writes files and messages for all."""
-    return jax.process_index() == 0
-
-
 def local_mesh() -> Mesh:
     """Returns the mesh of this process's own devices, for work that processes share out by objects."""
     return Mesh(np.array(jax.local_devices()).reshape(-1, 1), (DATA, MODEL))
-
-
-def own_share(count: int) -> np.ndarray:
-    """Returns which of so many things are this process's, (share,): every n-th. Some process may have none."""
-    return np.arange(count)[jax.process_index() :: jax.process_count()]
-
-
-def from_all(own: np.ndarray, count: int) -> np.ndarray:
-    """Returns what all processes have made together, (count, …), from what each has made of its `own_share`, (share, …)."""
-    processes = jax.process_count()
-    if processes == 1:
-        return own
-    most = -(-count // processes)
-    padded = np.zeros((most, *own.shape[1:]), own.dtype)
-    padded[: len(own)] = own
-    every = np.asarray(multihost_utils.process_allgather(padded))  # (processes, most, …)
-    return every.swapaxes(0, 1).reshape(-1, *own.shape[1:])[:count]
-
-
-def agreed(value: bool) -> bool:
-    """Returns what the first process says, to all of them."""
-    return value if jax.process_count() == 1 else bool(multihost_utils.broadcast_one_to_all(np.array(value)))
-
-
-def wait_for_all(name: str) -> None:
-    """Waits until every process is here; `name` is of the place."""
-    if jax.process_count() > 1:
-        multihost_utils.sync_global_devices(name)
 
 
 @dataclass(frozen=True)
@@ -221,7 +142,7 @@ def parameter_sharding(mesh: Mesh | AbstractMesh, tree: Any) -> Any:
 def place(tree: Any, sharding: Any) -> Any:
     """Distributes arrays that every process holds completely; `sharding` is a tree like `tree`."""
 
-    def put(leaf: jax.Array, where: NamedSharding) -> jax.Array:
+    def put(leaf: jax.Array | np.ndarray, where: NamedSharding) -> jax.Array:
         if jax.dtypes.issubdtype(leaf.dtype, jax.dtypes.prng_key):  # of a network that draws its own dropout
             data = put(jax.random.key_data(leaf), NamedSharding(where.mesh, PartitionSpec()))
             return jax.random.wrap_key_data(data, impl=jax.random.key_impl(leaf))
@@ -235,6 +156,17 @@ def place_batch(mesh: Mesh, batch: Any) -> Any:
     """Returns a batch spread over all devices, assembled from the parts that the processes hold."""
     split = NamedSharding(mesh, PartitionSpec(DATA))
     return jax.tree.map(lambda part: jax.make_array_from_process_local_data(split, part), batch)
+
+
+def on_host(tree: Any) -> Any:
+    """Returns arrays that are spread over the devices of all processes, whole, on the host of each process."""
+
+    def fetch(leaf: jax.Array) -> np.ndarray:
+        if leaf.is_fully_addressable or leaf.is_fully_replicated:
+            return np.asarray(leaf)
+        return np.asarray(multihost_utils.process_allgather(leaf, tiled=True))
+
+    return jax.tree.map(fetch, tree)
 
 
 def place_on(mesh: Mesh, batch: Any) -> Any:
@@ -253,15 +185,3 @@ def summed_over(mesh: Mesh, function: Callable) -> Callable:
 
     whole, split = PartitionSpec(), PartitionSpec(DATA)
     return jax.shard_map(own, mesh=mesh, in_specs=(whole, whole, split, split), out_specs=whole, check_vma=False)
-
-
-_LOST = ("gloo", "coordination service", "heartbeat", "connection closed by peer", "connection reset", "nccl")
-
-
-def is_lost_process(error: BaseException) -> bool:
-    """Returns whether an error of JAX's runtime means that another process of this training has ended or is unreachable."""
-    chain, link = [], error
-    while link is not None and link not in chain:
-        chain.append(link)
-        link = link.__cause__ or link.__context__  # type: ignore[assignment]
-    return jax.process_count() > 1 and any(sign in str(link).lower() for link in chain for sign in _LOST)

@@ -11,10 +11,12 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 import flax.nnx as nnx
+import jax
 import numpy as np
 
 from data_pipeline.dataset.statistics import DatasetStatistics
 from data_pipeline.differences import differences, in_words
+from data_pipeline.distributed import agreed, is_first, wait_for_all
 from data_pipeline.errors import DataError, Unreadable, reason_of
 from data_pipeline.files import (
     as_read,
@@ -31,7 +33,7 @@ from data_pipeline.files import (
 )
 from data_pipeline.progress import console
 from train.checkpoints import Checkpoints, damage_of, drop_damaged, has_save
-from train.devices import agreed, is_first, wait_for_all
+from train.devices import device_mesh, parameter_sharding, place
 
 Network = TypeVar("Network", bound=nnx.Module)
 Result = TypeVar("Result")
@@ -141,12 +143,14 @@ def trained_once(
 ) -> Network:
     """Returns the network stored in `folder`; trains and stores it first unless it was stored under `identity`.
 
+    Of several processes all train it, as they would alone, and share what `train` shares out; the first one's is stored.
+
     Args:
         like: a network of the same structure, into which stored weights are loaded; shapes are enough (`nnx.eval_shape`).
         train: returns the network and what `summary.json` holds about it.
     """
     path, identity = folder / "summary.json", as_read(identity)
-    current = _is_stored(path, identity)
+    current = is_stored(folder, identity)
     drop_damaged(folder, "so the network is trained again")
     with Checkpoints(folder) as checkpoints:
         if current:
@@ -160,10 +164,22 @@ def trained_once(
                 nnx.update(like, restored[0])
                 return like
         network, summary = train()
-        path.unlink(missing_ok=True)  # so that new weights never lie beside the old identity
-        checkpoints.save("best", checkpoints.latest_step("best") + 1, nnx.state(network, nnx.Param), {})
-    keep_json(path, {"identity": identity, **summary})
+        weights, mesh = nnx.state(network, nnx.Param), device_mesh()
+        if is_first():
+            path.unlink(missing_ok=True)  # so that new weights never lie beside the old identity
+        wait_for_all("a network is trained")
+        whole = place(weights, parameter_sharding(mesh, weights)) if jax.process_count() > 1 else weights
+        checkpoints.save("best", checkpoints.latest_step("best") + 1, whole, {})
+    if is_first():
+        keep_json(path, {"identity": identity, **summary})
+    wait_for_all("a network is stored")
     return network
+
+
+def is_stored(folder: Path, identity: dict[str, Any]) -> bool:
+    """Returns whether `trained_once` has stored a network under this identity; the same in all processes."""
+    path, identity = folder / "summary.json", as_read(identity)
+    return agreed(_is_stored(path, identity))
 
 
 def _is_stored(path: Path, identity: Any) -> bool:

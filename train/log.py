@@ -6,8 +6,8 @@ import json
 from contextlib import suppress
 from pathlib import Path
 
+from data_pipeline.distributed import is_first
 from data_pipeline.files import write_text
-from train.devices import is_first
 
 
 def read_log(path: Path) -> list[dict[str, float]]:

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import time
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -29,28 +29,19 @@ from data_pipeline.dataset.batches import (
 )
 from data_pipeline.dataset.statistics import DatasetStatistics
 from data_pipeline.differences import differences, in_words
+from data_pipeline.distributed import is_first
 from data_pipeline.errors import DataError, Diverged
 from data_pipeline.files import as_read, check_of_file, keep_checks, keep_json
 from data_pipeline.progress import console, progress_bar
 from train.checkpoints import Checkpoints, drop_damaged
-from train.devices import (
-    DATA,
-    Layout,
-    check_batch,
-    device_mesh,
-    is_first,
-    parameter_sharding,
-    place,
-    place_batch,
-    summed_over,
-)
+from train.devices import DATA, Layout, check_batch, device_mesh, parameter_sharding, place, place_batch, summed_over
 from train.finite import all_finite, not_finite
 from train.kept import check_config, config_of, content_of, finished, goes_on_with
 from train.log import MetricsLog
 from train.optimiser import learning_rate
 from train.preemption import Preempted, Preemption
 from train.starting_weights import StartingWeights
-from train.step import Metrics, Task, TrainState, abstract_state, evaluate_step_of, initial_state, train_step_of
+from train.step import Task, TrainState, abstract_state, evaluate_step_of, initial_state, train_step_of
 from train.validation import ValidationSet
 
 
@@ -77,7 +68,7 @@ def steps_of_an_epoch(task: Task, statistics: DatasetStatistics) -> int:
     return steps_per_epoch(objects * (config.epoch_views or statistics.views) // config.views_per_object, task.batches)
 
 
-def weighted_means(found: list[Metrics]) -> dict[str, Any]:
+def weighted_means(found: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     """Returns the mean of every metric from the sums that `evaluate_step_of` returns for each batch."""
     sums = {name: np.sum([part[name] for part in found], axis=0, dtype=np.float64) for name in found[0]}
     return {name: total / sums["views"] for name, total in sums.items() if name != "views"}

@@ -14,8 +14,9 @@ import numpy as np
 
 from data_pipeline.dataset.batches import evaluation_batches
 from data_pipeline.dataset.builder import open_split
+from data_pipeline.distributed import from_all, own_share
 from data_pipeline.progress import progress_bar
-from train.devices import from_all, local_mesh, own_share, parameter_sharding, place, place_on
+from train.devices import local_mesh, parameter_sharding, place, place_on
 from train.finite import check_outputs
 from train.step import Batch, Task
 

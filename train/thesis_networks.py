@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
@@ -9,7 +10,8 @@ from typing import Literal
 from data_pipeline.dataset.statistics import DatasetStatistics, load_statistics
 from data_pipeline.files import read_json
 from train.chance import warn_of_chance
-from train.loop import fit, load_best
+from train.loop import load_best
+from train.many.seeds import train_seeds
 from train.optimiser import OptimiserConfig
 from train.starting_weights import StartingWeights, weights_from_network
 from train.tasks.classifier import ClassifierConfig, ClassifierTask, ResNetConfig, starting_weights
@@ -141,36 +143,73 @@ def entropy_task(frame: Frame, entropy: EntropyConfig, statistics: DatasetStatis
     return replace(task, name=f"PointNet++ ({statistics.views} views, {frame} frame)")
 
 
+@dataclass(frozen=True)
+class ThesisSettings:
+    """The settings of the networks of one seed."""
+
+    classifier: ClassifierConfig
+    entropy: EntropyConfig
+    thesis: ThesisConfig
+
+    def shifted(self, number: int) -> ThesisSettings:
+        """Returns the settings of seed number `number`, counted from these."""
+
+        def of(config: OptimiserConfig) -> OptimiserConfig:
+            return replace(config, seed=config.seed + number, data_seed=config.data_seed + number)
+
+        thesis = self.thesis
+        return ThesisSettings(
+            replace(self.classifier, optimiser=of(self.classifier.optimiser)),
+            replace(self.entropy, optimiser=of(self.entropy.optimiser)),
+            replace(
+                thesis,
+                resnet18=of(thesis.resnet18),
+                resnet34=of(thesis.resnet34),
+                fine_tuning=of(thesis.fine_tuning),
+            ),
+        )
+
+
 def train_thesis(
-    folder: ThesisFolder,
-    classifier: ClassifierConfig,
-    entropy: EntropyConfig,
-    thesis: ThesisConfig,
-    first: dict[str, StartingWeights | None],
+    folders: Sequence[ThesisFolder], settings: Sequence[ThesisSettings], first: dict[str, StartingWeights | None]
 ) -> None:
-    """Trains all eight networks, skipping those that are finished; `first` is the result of `first_weights`."""
+    """Trains all eight networks of every seed, skipping those that are finished; those of all seeds are one job.
+
+    Args:
+        folders: of each seed; all have the data sets of the first.
+        settings: of each seed.
+        first: the result of `first_weights`.
+    """
     for backbone in BACKBONES:
-        statistics = folder.statistics(backbone.views)
-        task = backbone_task(backbone, classifier, thesis, statistics)
-        start = _weights_before(backbone, folder, classifier, thesis) if backbone.start else first[backbone.name]
+        statistics, data = folders[0].statistics(backbone.views), folders[0].data(backbone.views)
+        tasks = [backbone_task(backbone, own.classifier, own.thesis, statistics) for own in settings]
+        starts = [
+            _weights_before(backbone, folder, own) if backbone.start else first[backbone.name]
+            for folder, own in zip(folders, settings, strict=True)
+        ]
         option = f"--thesis.{'fine-tuning' if backbone.start else f'resnet{backbone.depth}'}.learning-rate"
-        trained = folder.backbone(backbone.name)
-        summary = fit(task, folder.data(backbone.views), statistics, trained, start, rate_option=option)
-        warn_of_chance(task, summary, statistics)
+        trained = [folder.backbone(backbone.name) for folder in folders]
+        work = folders[0].out / "seeds" / f"{backbone.name}_together"
+        summaries = train_seeds(tasks, data, statistics, trained, work, starts, rate_option=option)
+        for task, summary in zip(tasks, summaries, strict=True):
+            warn_of_chance(task, summary, statistics)
     for views in VIEWS:
-        statistics = folder.statistics(views)
+        statistics, data = folders[0].statistics(views), folders[0].data(views)
         for frame in FRAMES:
-            predict = entropy_task(frame, entropy, statistics)
-            option = "--entropy.optimiser.learning-rate"
-            fit(predict, folder.data(views), statistics, folder.entropy(views, frame), rate_option=option)
+            train_seeds(
+                [entropy_task(frame, own.entropy, statistics) for own in settings],
+                data,
+                statistics,
+                [folder.entropy(views, frame) for folder in folders],
+                folders[0].out / "seeds" / f"entropy_{views}_{frame}_together",
+                rate_option="--entropy.optimiser.learning-rate",
+            )
 
 
-def _weights_before(
-    backbone: Backbone, folder: ThesisFolder, classifier: ClassifierConfig, thesis: ThesisConfig
-) -> StartingWeights:
+def _weights_before(backbone: Backbone, folder: ThesisFolder, settings: ThesisSettings) -> StartingWeights:
     """Returns the weights of the backbone that this one starts from."""
     before = next(other for other in BACKBONES if other.name == backbone.start)
-    task = backbone_task(before, classifier, thesis, folder.statistics(before.views))
+    task = backbone_task(before, settings.classifier, settings.thesis, folder.statistics(before.views))
     trained = folder.backbone(before.name)
     loss = read_json(trained / "summary.json")["best_loss"]
     return weights_from_network(load_best(task, trained), f"{before.title}, validation loss {loss:.6f}")

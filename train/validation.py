@@ -46,13 +46,21 @@ class ValidationSet:
         data: folder of the data set.
         statistics: those of the data set.
         devices: devices, of all processes together, that share a batch.
+        whole: whether this process's part is all of the views, as where processes train networks of their own.
         most_kept: bytes that are kept in memory; if there are more, they are read again each time.
     """
 
     def __init__(
-        self, task: Task, data: Path, statistics: DatasetStatistics, devices: int, most_kept: int = MOST_KEPT
+        self,
+        task: Task,
+        data: Path,
+        statistics: DatasetStatistics,
+        devices: int,
+        most_kept: int = MOST_KEPT,
+        *,
+        whole: bool = False,
     ) -> None:
-        index, processes = jax.process_index(), jax.process_count()
+        index, processes = (0, 1) if whole else (jax.process_index(), jax.process_count())
         objects = statistics.objects_of(validation_splits(task.batches))
         self._task, self._data, self._counts = task, data, index < objects
         self._part = slice(index, None, processes) if self._counts else slice(1)

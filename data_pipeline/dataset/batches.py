@@ -225,13 +225,18 @@ def steps_per_epoch(objects: int, config: ViewBatches) -> int:
     return -(-objects // objects_per_batch(config))
 
 
-def train_batches(folder: Path, config: ViewBatches, *, first_step: int = 0) -> Iterator[dict[str, np.ndarray]]:
+def train_batches(
+    folder: Path, config: ViewBatches, *, first_step: int = 0, whole: bool = False
+) -> Iterator[dict[str, np.ndarray]]:
     """Returns an endless iterator over this process's part of each batch from step `first_step` on, prefetched by threads.
+
+    Args:
+        whole: whether this process's part is all of a batch, as where processes train networks of their own.
 
     Raises:
         ValueError: if the objects of a batch cannot be divided equally among the processes.
     """
-    processes = jax.process_count()
+    index, processes = (0, 1) if whole else (jax.process_index(), jax.process_count())
     per_batch = objects_per_batch(config)
     if per_batch % processes:
         raise ValueError(
@@ -241,7 +246,7 @@ def train_batches(folder: Path, config: ViewBatches, *, first_step: int = 0) -> 
     objects = _training_objects(folder, config)
     stream = grain.MapDataset.source(objects).seed(config.seed).shuffle().repeat().random_map(_DrawViews(config))
     # The parts of all processes, concatenated, are the batch that a single process would read.
-    parts = stream.batch(per_batch // processes, batch_fn=_join)[jax.process_index() :: processes]
+    parts = stream.batch(per_batch // processes, batch_fn=_join)[index::processes]
     threads = min(16, max(1, (os.cpu_count() or 1) // 2))
     options = grain.ReadOptions(num_threads=threads, prefetch_buffer_size=16)
     return iter(parts[first_step:].to_iter_dataset(options))

@@ -24,7 +24,7 @@ import numpy as np
 
 from data_pipeline.capture.casting import Capture, CaptureConfig, Rig, check_camera, load_capture, rig_for
 from data_pipeline.capture.viewpoints import identified, viewpoints_of
-from data_pipeline.capture.workers import capture_all, capture_entry, capture_path, say_damaged
+from data_pipeline.capture.workers import capture_all, capture_entry, capture_path, left_out_of, say_damaged
 from data_pipeline.dataset.beam import beam_options, capture_by_beam, examples_by_beam
 from data_pipeline.dataset.config import DataConfig as DataConfig
 from data_pipeline.dataset.config import check_viewpoints, identity_of
@@ -44,7 +44,9 @@ from data_pipeline.dataset.statistics import (
     SUMMARY,
     DatasetStatistics,
     StatisticsCollector,
+    load_statistics,
 )
+from data_pipeline.distributed import is_first, own_share, wait_for_all
 from data_pipeline.errors import DataError, reason_of
 from data_pipeline.files import check_of_file, keep_checks, keep_json
 from data_pipeline.objects.changes import changes_between
@@ -328,42 +330,62 @@ def prepare(config: DataConfig, folder: Path, beam: str | None = None) -> Datase
         raise DataError(
             f"--dataset.validation-share {config.validation_share:g} is not at least 0 and below 1; choose another"
         )
-    identity, captures, made_with = identity_of(config, folder), folder / "captures", folder / "config.json"
+    identity = identity_of(config, folder)
     damage = damage_of_settings(folder, identity)
     if (folder / SUMMARY).exists():
         found = found_in(folder, damage)
         if isinstance(found, DatasetStatistics):
-            shutil.rmtree(captures, ignore_errors=True)  # left by a run that was stopped before it removed them
+            if is_first():
+                shutil.rmtree(folder / "captures", ignore_errors=True)  # left by a run that was stopped before
             _say_changes(config, folder)
             return found
         _check_source(config, folder, found)
         console.print(f"{found}, so the data set is made again from {config.source}", markup=False)
-    options = None if beam is None else beam_options(beam)
+    return _made(config, folder, identity, None if beam is None else beam_options(beam))
+
+
+def _made(config: DataConfig, folder: Path, identity: dict[str, Any], beam: Any) -> DatasetStatistics:
+    """Makes the data set and returns its statistics. Several processes share the captures; the first writes the shards."""
+    captures, made_with, shards = folder / "captures", folder / "config.json", folder / SHARDS
+    if not is_first():
+        wait_for_all("the source is there")
     source, state = open_objects(config), state_of(config)
+    if is_first():  # which has downloaded it, if need be
+        wait_for_all("the source is there")
     for sentence in source.said:
         console.print(f"{config.source}: {sentence}", markup=False)
-    folder.mkdir(parents=True, exist_ok=True)
-    keep_json(made_with, identity)
-    if options is None:
-        left_out = capture_all(source.entries, config.capture, captures, skip_damaged=config.skip_damaged)
+    if is_first():
+        folder.mkdir(parents=True, exist_ok=True)
+        keep_json(made_with, identity)
+    wait_for_all("captures begin")
+    if beam is None:
+        left_out = _capture(source.entries, config, captures)
     else:
-        left_out = capture_by_beam(source.entries, config.capture, captures, options, skip_damaged=config.skip_damaged)
+        left_out = capture_by_beam(source.entries, config.capture, captures, beam, skip_damaged=config.skip_damaged)
     split = split_objects(
         [entry for entry in source.entries if entry.name not in left_out], config.validation_share, config.seed
     )
     _check_classes(config, source, split, left_out)
-    reasons = _reasons(source, left_out)
-    shards = folder / SHARDS
-    (folder / SUMMARY).unlink(missing_ok=True)  # of shards that are damaged
-    keep_checks(folder, {made_with.name: check_of_file(made_with)}, only=True)
-    shutil.rmtree(shards, ignore_errors=True)  # incomplete shards of an interrupted run
-    statistics = _write_shards(source, split, reasons, config, captures, shards, options)
-    keep_checks_of_shards(folder)
-    if state is not None:
-        keep_json(folder / SOURCE_STATE, state)
-    keep_json(folder / SUMMARY, statistics.content())
-    shutil.rmtree(captures, ignore_errors=True)
-    return statistics
+    if is_first():
+        (folder / SUMMARY).unlink(missing_ok=True)  # of shards that are damaged
+        keep_checks(folder, {made_with.name: check_of_file(made_with)}, only=True)
+        shutil.rmtree(shards, ignore_errors=True)  # incomplete shards of an interrupted run
+        statistics = _write_shards(source, split, _reasons(source, left_out), config, captures, shards, beam)
+        keep_checks_of_shards(folder)
+        if state is not None:
+            keep_json(folder / SOURCE_STATE, state)
+        keep_json(folder / SUMMARY, statistics.content())
+        shutil.rmtree(captures, ignore_errors=True)
+    wait_for_all("a data set is made")
+    return load_statistics(folder)
+
+
+def _capture(entries: Sequence[ObjectEntry], config: DataConfig, captures: Path) -> dict[str, str]:
+    """Captures all objects, which several processes share; returns the names of those left out, with the reasons."""
+    own = [entries[index] for index in own_share(len(entries))]
+    capture_all(own, config.capture, captures, skip_damaged=config.skip_damaged)
+    wait_for_all("captures end")
+    return left_out_of(entries, captures)
 
 
 def open_split(folder: Path, split: str) -> Any:

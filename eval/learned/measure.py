@@ -20,6 +20,7 @@ from jaxtyping import Array
 from data_pipeline.dataset.builder import open_split
 from data_pipeline.dataset.inputs import depth_and_normals
 from data_pipeline.dataset.statistics import load_statistics
+from data_pipeline.distributed import is_first
 from data_pipeline.files import read_json, write_npz
 from data_pipeline.progress import console
 from eval.learned.stopping import MOVEMENT_COSTS, VIEW_COSTS
@@ -30,20 +31,16 @@ from eval.tables import load_view_tables
 from eval.thesis.results import machine
 from mevs_jax.models import Recogniser
 from mevs_jax.models.view_policy import expected_gain
-from train.choosing.stages import VARIANTS, Stages, lattice_data
+from train.choosing.stages import Aside, Stages, lattice_data
+from train.choosing.variants import VARIANTS
 from train.finite import check_results
 from train.kept import kept_json, made_by
 from train.loop import load_best
 
-_FORM = 6
+_FORM = 7
 """Version of the stored walks; another version makes them stale."""
-
-
-def train_all(stages: Stages) -> None:
-    """Trains the networks of one seed that all measurements need; the others are trained when `measure` needs them."""
-    stages.prepare()
-    stages.train_recogniser()
-    stages.policy("learned")
+APART = 2
+"""Parts of the validation objects; stopping rules are fitted on walks of policies that were trained without their objects."""
 
 
 def measure(stages: Stages) -> dict[str, Any]:
@@ -90,12 +87,16 @@ def together(seeds: Sequence[Stages], found: Sequence[dict[str, Any]]) -> dict[s
     return lattices
 
 
-def learner_of(stages: Stages, name: str) -> Learner:
-    """Returns a variant of the view policy by its name in `VARIANTS`, trained first if it is not yet."""
+def learner_of(stages: Stages, name: str, aside: Aside | None = None) -> Learner:
+    """Returns a variant of the view policy by its name in `VARIANTS`, trained first if it is not yet.
+
+    Args:
+        aside: part of the validation objects that it is not trained on.
+    """
     variant = VARIANTS[name]
     made_as = variant.network or name
     fusion = stages.fusion(posed=variant.posed, summed=True) if variant.summed else None
-    return Learner(name, variant.title, stages.policy(made_as), variant.by, made_as, fusion)
+    return Learner(name, variant.title, stages.policy(made_as, aside=aside), variant.by, made_as, fusion)
 
 
 def _walks(
@@ -127,6 +128,9 @@ def _walks(
 
     def walk() -> dict[str, Any]:
         validation, test = map(objects_of, ("val", "test"))
+        if costs:  # parts of them are told apart by position
+            learned_from = stages.features("turned_val", stages.turned, "val")
+            assert np.array_equal(validation.features.labels, learned_from.labels), "the objects have another order"
         pose = "" if posed else ", unknown yaw"
         objects, count, _ = test.features.logits.shape
         around = ", separate for each object" if data == stages.turned else ""
@@ -143,12 +147,13 @@ def _walks(
             draws=config.draws,
             fitting_starts=config.fitting_starts,
             seed=stages.seed,
-            costs=costs,
+            apart=[learner_of(stages, method, (part, APART)) for part in range(APART)] if costs else (),
             others=not ablations,
         )
         arrays = {f"{name} {key}": value for name, policy in each.items() for key, value in vars(policy).items()}
         check_results(found, f"walks by the recogniser in {stages.recogniser_folder()}")
-        write_npz(path.with_suffix(".npz"), **arrays)
+        if is_first():
+            write_npz(path.with_suffix(".npz"), **arrays)
         return found
 
     identity = {

@@ -7,9 +7,9 @@ objects, and is then used on test objects.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
+from functools import cache, partial
 from typing import Any
 
 import jax
@@ -18,7 +18,8 @@ import numpy as np
 from flax import nnx
 from jaxtyping import Array, Bool, Float, Int
 
-from eval.learned.walks import Contender, Learner, OnLattice, beliefs_of, policy_parameters, walk_all
+from data_pipeline.dataset.batches import fold_of
+from eval.learned.walks import Contender, Learner, OnLattice, beliefs_of, policy_parameters, walk_all, walker
 from eval.numbers.comparison import intervals
 from eval.numbers.confidence import logits_along, stops_at
 from eval.walks.grid import THRESHOLDS
@@ -61,11 +62,17 @@ class Signal:
         return float(np.mean(self.weight * self.stopped(threshold)[0]))
 
     def threshold_for(self, accuracy: float) -> float | None:
-        """The least of about a hundred thresholds that reaches this accuracy, or None."""
-        for threshold in [*np.unique(np.quantile(self.value, np.linspace(0, 1, 101))), float(self.value.max()) + 1]:
-            if self.accuracy(threshold) >= accuracy:
-                return float(threshold)
-        return None
+        """The least of about a hundred thresholds that reaches this accuracy, or None.
+
+        Accuracy by threshold is made monotone first (isotonic regression): among so many, the first that reaches it by chance
+        would promise too much.
+        """
+        from scipy.optimize import isotonic_regression  # imported late: it takes a third of a second
+
+        thresholds = [*np.unique(np.quantile(self.value, np.linspace(0, 1, 101))), float(self.value.max()) + 1]
+        smooth = isotonic_regression([self.accuracy(threshold) for threshold in thresholds]).x
+        reached = np.flatnonzero(smooth >= accuracy)
+        return float(thresholds[reached[0]]) if len(reached) else None
 
 
 def confidences(beliefs: Float[AnyArray, "objects walks steps classes"], labels: Int[AnyArray, " objects"]) -> Signal:
@@ -116,6 +123,19 @@ class WalkRecord:
     confidence: Sequence[Signal]
 
 
+@dataclass(frozen=True)
+class HeldOut:
+    """Signals of stopping rules along walks over validation objects, by policies that were trained without them.
+
+    Attributes:
+        confidence: calibrated confidence.
+        not_paying: minus the expected gain of the next view.
+    """
+
+    confidence: Signal
+    not_paying: Signal
+
+
 def _difference(gain: Float[np.ndarray, " objects"]) -> dict[str, Any]:
     return {"difference": float(gain.mean()), "interval": intervals(gain)}
 
@@ -160,6 +180,12 @@ def _with_cost(given: tuple[tuple[nnx.State, Array], Array], structure: nnx.Grap
     return with_movement(learned_policy(given[0], structure), given[1])
 
 
+@cache
+def _costing(structure: nnx.GraphDef) -> Callable[[Any], Policy]:
+    """Returns the same function for the same structure: walks are compiled once for each function."""
+    return partial(_with_cost, structure=structure)
+
+
 def moving(
     key: Array,
     learner: Learner,
@@ -170,7 +196,7 @@ def moving(
     every: int,
 ) -> list[dict[str, Any]]:
     """Accuracy and distance travelled (radians) after each number of views, by movement cost, from every n-th start view."""
-    policy_of = partial(_with_cost, structure=nnx.graphdef(learner.network))
+    policy_of = _costing(nnx.graphdef(learner.network))
     contender = Contender("with_cost", "", "learned", policy_of, every=every)
     directions, rows = test.features.directions, []
     distances = np.asarray(graph_of(directions[0]).distances)
@@ -196,12 +222,46 @@ def moving(
     return rows
 
 
+def walks_apart(
+    key: Array,
+    apart: Sequence[Learner],
+    fusion: CalibratedFusion,
+    validation: OnLattice,
+    knowledge: Knowledge | None,
+    max_views: int,
+    every: int,
+    temperatures: Float[np.ndarray, " steps"],
+) -> HeldOut:
+    """Walks over validation objects, each by the policy that was trained without it, from every n-th start view.
+
+    Args:
+        apart: the policies; number i was trained without every object j with j mod n = i.
+        temperatures: of the method's confidences, by number of views.
+    """
+    features, graph = validation.features, validation.neighbours
+    part_of = fold_of(len(features.labels), len(apart))
+    steps = min(max_views, features.logits.shape[1])
+    starts = len(range(0, features.logits.shape[1], every))
+    views = np.zeros((len(part_of), starts, steps), np.int32)
+    gains = np.zeros(views.shape, np.float32)
+    beliefs = np.zeros((*views.shape, features.logits.shape[-1]), np.float32)
+    for part, learner in enumerate(apart):
+        own = np.flatnonzero(part_of == part)
+        some, given = features.some(own), policy_parameters(learner, fusion)
+        table, contender = OnLattice(some).table(True), replace(walker(learner), every=every)
+        views[own] = walk_all(key, contender, given, fusion, table, some.directions, knowledge, steps, graph)
+        beliefs[own] = beliefs_of(fusion, some, views[own])
+        gains[own] = best_gains(learner, fusion, some, views[own], beliefs[own])
+    confidence = confidences(beliefs / temperatures[:, None], features.labels)
+    return HeldOut(confidence, replace(confidence, value=-gains))
+
+
 def cost_metrics(
     key: Array,
     learner: Learner,
+    held_out: HeldOut,
     fusion: CalibratedFusion,
-    validation: OnLattice,
-    test: OnLattice,
+    lattices: tuple[OnLattice, OnLattice],
     knowledge: Knowledge | None,
     records: dict[str, WalkRecord],
     max_views: int,
@@ -212,20 +272,26 @@ def cost_metrics(
     The other rules are the thesis's rule and the expected gain of the next view. The thesis's rule: walks by predicted
     entropy (or random ones without a predictor), sums of logits, and a threshold on their uncalibrated confidence. Walks
     with a movement cost begin at every n-th start view.
+
+    Args:
+        held_out: signals along walks over validation objects, by policies that were trained without them.
+        lattices: of validation and of test objects.
     """
+    validation, test = lattices
     walked_by = next(name for name in ("predicted_entropy", "random") if name in records)
     both, method = (validation.features, test.features), records[learner.name]
     thesis = [
         confidences(jax.vmap(jax.vmap(running_sum))(logits_along(jnp.asarray(views), data.logits)), data.labels)
         for data, views in zip(both, records[walked_by].views, strict=True)
     ]
-    gains = [
-        replace(signal, value=-best_gains(learner, fusion, data, views, beliefs))
-        for signal, data, views, beliefs in zip(method.confidence, both, method.views, method.beliefs, strict=True)
-    ]
+    tested = method.confidence[1]
+    gain = -best_gains(learner, fusion, test.features, method.views[1], method.beliefs[1])
+    ours = held_out.confidence, tested
     return {
         "thesis_walks": walked_by,
-        "beside_thesis": compare_rules(thesis, method.confidence),
-        "not_paying": compare_rules(gains, method.confidence, [-cost for cost in VIEW_COSTS]),
+        "beside_thesis": compare_rules(thesis, ours),
+        "not_paying": compare_rules(
+            [held_out.not_paying, replace(tested, value=gain)], ours, [-cost for cost in VIEW_COSTS]
+        ),
         "moving": moving(key, learner, fusion, test, knowledge, max_views, every),
     }

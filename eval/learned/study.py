@@ -16,7 +16,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from data_pipeline.progress import console
-from eval.learned.stopping import Signal, WalkRecord, confidences, cost_metrics
+from eval.learned.stopping import Signal, WalkRecord, confidences, cost_metrics, walks_apart
 from eval.learned.walks import (
     Contender,
     Learner,
@@ -217,7 +217,7 @@ def study(
     oracle_views: int = 4,
     fitting_starts: int = 1,
     seed: int = 0,
-    costs: bool = False,
+    apart: Sequence[Learner] = (),
     others: bool = True,
 ) -> tuple[dict[str, Any], dict[str, ByObject]]:
     """Returns all metrics of one lattice of candidate views, and the results of each policy by object.
@@ -229,7 +229,8 @@ def study(
         draws: walks of random policies from each start view.
         oracle_views: length of the oracles' walks, at most `max_views`.
         fitting_starts: temperatures are fitted on walks from every n-th start view.
-        costs: whether to add the metrics of stopping and of movement cost.
+        apart: the method trained without each part of the validation objects (every n-th); with them, the metrics of stopping and
+            of movement cost are added.
         others: whether to evaluate the other policies and random sets as well.
     """
     points, labels = test.features.directions[0], test.features.labels
@@ -237,8 +238,8 @@ def study(
     max_views = min(max_views, len(points))
     oracle_views = min(oracle_views, max_views)
     knowledge = learn(fusion, validation.features, max_views) if shared else None
-    apart = max(1, len(points) // _TRYING_STARTS)
-    some_starts = np.arange(0, len(points), apart)
+    every_nth = max(1, len(points) // _TRYING_STARTS)
+    some_starts = np.arange(0, len(points), every_nth)
     found: dict[str, Any] = {
         "objects": len(labels),
         "trying_starts": len(some_starts),
@@ -255,7 +256,7 @@ def study(
     fusions = {learner.name: learner.fusion or fusion for learner in learners}
     records: dict[str, WalkRecord] = {}
     entropies = shared and test.predicted_entropy is not None and test.entropy is not None
-    policies = contenders(learners, draws, oracle_views, apart, entropies, shared)
+    policies = contenders(learners, draws, oracle_views, every_nth, entropies, shared)
     for contender in policies if others else [random_walker(draws), *map(walker, learners)]:
         name, own, walks, beliefs = contender.name, fusions.get(contender.name, fusion), [], []
         for split, data in enumerate((validation, test)):
@@ -281,9 +282,11 @@ def study(
         each[name] = ByObject(by_start.mean(axis=1).T, likelihood, from_some.mean(axis=1).T)
         found["policies"][name] = {"title": contender.title, "knows": contender.knows, **metrics}
         console.print(f"{contender.title}: " + " ".join(f"{100 * share:.1f}" for share in metrics["after_views"]))
-    if costs:
+    if apart:
         key, method = jax.random.key(seed), learners[0]
-        found["costs"] = cost_metrics(key, method, fusion, validation, test, knowledge, records, max_views, apart)
+        lattices, scale = (validation, test), np.array(found["policies"][method.name]["temperatures"])
+        held_out = walks_apart(key, apart, fusion, validation, knowledge, max_views, fitting_starts, scale)
+        found["costs"] = cost_metrics(key, method, held_out, fusion, lattices, knowledge, records, max_views, every_nth)
     return found | compared(each, learners[0].name), each
 
 

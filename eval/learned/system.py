@@ -9,6 +9,7 @@ import jax.numpy as jnp
 
 from data_pipeline.dataset.inputs import view_camera
 from data_pipeline.dataset.statistics import load_statistics
+from data_pipeline.distributed import agreed, is_first, wait_for_all
 from eval.learned.study import learn
 from eval.run_file import versions_of
 from eval.system import MADE_WITH, data_of, identity_of, resnet_shape, save_system, stored_system
@@ -58,8 +59,11 @@ def make_learned_system(stages: Stages, found: dict[str, Any]) -> Path:
         [(network / "summary.json").read_text() for network in networks],
         figures,
     )
-    if not stored_system(folder, made):
-        save_system(learned_system(stages, found, figures, made), folder)
+    if not agreed(stored_system(folder, made)):
+        system = learned_system(stages, found, figures, made)
+        if is_first():
+            save_system(system, folder)
+        wait_for_all("a system is stored")
     return folder
 
 

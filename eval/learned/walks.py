@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
+from functools import cache, partial
 from typing import Any
 
 import jax
@@ -96,8 +96,26 @@ def _named(_: Any, name: str) -> Policy:
     return POLICIES[name]
 
 
+# Walks are compiled once for each `policy_of`: it has to be the same object for all seeds, splits and data sets.
+
+
+@cache
+def _policy_named(name: str) -> Callable[[Any], Policy]:
+    return partial(_named, name=name)
+
+
+@cache
+def _policy_learned(structure: nnx.GraphDef, by: By) -> Callable[[Any], Policy]:
+    return partial(learned_policy, structure=structure, by=by)
+
+
+@cache
+def _policy_of_truth(by: str) -> Callable[[Any], Policy]:
+    return partial(_oracle, by=by)
+
+
 def _by_name(name: str, title: str, knows: str, believes: bool = True) -> Contender:
-    return Contender(name, title, knows, partial(_named, name=name), believes)
+    return Contender(name, title, knows, _policy_named(name), believes)
 
 
 def random_walker(draws: int) -> Contender:
@@ -106,7 +124,7 @@ def random_walker(draws: int) -> Contender:
 
 def walker(learner: Learner) -> Contender:
     """The contender of a learner; its parameters are those of `policy_parameters`."""
-    policy_of = partial(learned_policy, structure=nnx.graphdef(learner.network), by=learner.by)
+    policy_of = _policy_learned(nnx.graphdef(learner.network), learner.by)
     return Contender(learner.name, learner.title, "learned", policy_of)
 
 
@@ -209,6 +227,6 @@ def contenders(
     if entropies:
         found.append(_by_name("oracle_entropy", "entropy oracle (thesis)", "truth", believes=False))
     for by, title in (("belief", "label-free oracle"), ("label", "greedy label oracle")):
-        policy_of, name = partial(_oracle, by=by), f"{by}_oracle"
+        policy_of, name = _policy_of_truth(by), f"{by}_oracle"
         found.append(Contender(name, title, "truth", policy_of, True, 1, oracle_views, oracle_starts))
     return found

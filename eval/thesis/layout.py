@@ -24,7 +24,7 @@ class Row:
 
 @dataclass(frozen=True)
 class ThesisTable:
-    """A table of the report; numbers have `digits` decimals, and a sign if `signed`."""
+    """A table of the report; numbers have `digits` decimals, and a sign if `signed`. Number 0: not one of the thesis."""
 
     number: int
     title: str
@@ -33,6 +33,14 @@ class ThesisTable:
     note: str
     digits: int = 2
     signed: bool = False
+
+    @property
+    def heading(self) -> str:
+        return f"Table {self.number}. {self.title}" if self.number else self.title
+
+    @property
+    def remark(self) -> str:
+        return f"{self.note} In parentheses: the thesis." if self.number else self.note
 
 
 @cache

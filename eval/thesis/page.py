@@ -33,9 +33,9 @@ def _table_html(shown: ThesisTable) -> str:
             cells.append(text + (f' <small class="faint">({html.escape(theirs)})</small>' if theirs else ""))
         rows.append(cells)
     return (
-        f'<h3 id="table-{shown.number}">Table {shown.number}. {html.escape(shown.title)}</h3>'
+        f'<h3 id="table-{shown.number}">{html.escape(shown.heading)}</h3>'
         f'<div class="wide">{table(["", *shown.columns], rows)}</div>'
-        f'<p class="note">{html.escape(shown.note)} In parentheses: the thesis.</p>'
+        f'<p class="note">{html.escape(shown.remark)}</p>'
     )
 
 
@@ -49,17 +49,21 @@ def _save_figure(shown: ThesisFigure, inputs: FigureInputs, folder: Path) -> str
     return embedded(files["svg"], "svg", shown.caption, f"Figure {shown.number}")
 
 
-def write_thesis_report(inputs: FigureInputs, lead: str, folder: Path) -> Path:
+def write_thesis_report(inputs: FigureInputs, lead: str, folder: Path, over: ThesisTable | None = None) -> Path:
     """Writes `index.html`, `thesis.md` and `figures/` into `folder`; returns the path of the page.
 
     Args:
         inputs: the results from which tables and figures are made.
         lead: a sentence that describes the run.
         folder: the folder of the report.
+        over: numbers over several trainings, which come first.
     """
     tables = {f"T{shown.number}": shown for shown in all_tables(inputs.results)}
     pictures = {f"F{shown.number}": shown for shown in FIGURES}
     page, text = [], []
+    if over is not None:
+        page.append(f"<h2>Several trainings</h2>{_table_html(over)}")
+        text.append(f"## Several trainings\n\n{markdown(over)}")
     for chapter, names in CHAPTERS:
         page.append(f"<h2>{html.escape(chapter)}</h2>")
         text.append(f"## {chapter}\n")

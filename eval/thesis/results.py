@@ -62,7 +62,11 @@ def single_views(tables: dict[int, LatticeTables]) -> dict[str, dict[str, Any]]:
         out[backbone.name] = {}
         for views, lattice in tables.items():
             right = (lattice.logits[backbone.name].argmax(-1) == lattice.labels[:, None]).mean(axis=1)
-            out[backbone.name][str(views)] = {"accuracy": float(right.mean()), "interval": intervals(right)}
+            out[backbone.name][str(views)] = {
+                "accuracy": float(right.mean()),
+                "interval": intervals(right),
+                "by_object": right.tolist(),
+            }
     return out
 
 
@@ -89,6 +93,7 @@ def entropy_learning(lattice: LatticeTables, statistics: DatasetStatistics) -> d
             frame: {
                 "mse": float(of.mean()),
                 "interval": intervals(of),
+                "by_object": of.tolist(),
                 "explained_variance": 1 - float(of.mean()) / variance,
                 "by_class": _by_class(errors[frame], labels, classes),
             }
@@ -134,6 +139,7 @@ def _gain(policy: Results, base: Results, field: str = "right") -> dict[str, Any
         "interval": intervals(gain),
         "mean": float(gain.mean()),
         "mean_interval": intervals(gain.mean(axis=(0, 1))),
+        "by_object": gain.mean(axis=(0, 1)).tolist(),
         "above_zero": int((gain.mean(axis=-1) > 0).sum()),
     }
 

@@ -17,21 +17,23 @@ from data_pipeline.capture.viewpoints import is_file
 from data_pipeline.dataset.builder import open_objects, prepare
 from data_pipeline.dataset.statistics import report_left_out
 from data_pipeline.errors import DataError
-from data_pipeline.files import read_json
+from data_pipeline.files import keep_json, read_json
 from data_pipeline.objects.reconstruction import why_no_open3d
 from data_pipeline.objects.sources import load_object
 from data_pipeline.progress import console
 from eval.numbers.timing import decision_memory_alone, time_ascent, time_local_maxima, time_predictor
 from eval.rendering.ascent import METHODS
 from eval.report.page import read_history
+from eval.seeds import check_seeds
 from eval.settings import Settings
 from eval.stages import check_evaluation
 from eval.tables import objects_of
 from eval.thesis.figures import FigureInputs
 from eval.thesis.page import write_thesis_report
 from eval.thesis.results import NO_ACCELERATOR, LatticeTables, all_results, machine
+from eval.thesis.seeds import csv_of, folders_of, over_trainings, table_of
 from train.finite import check_results
-from train.kept import kept_array, kept_json, made_by
+from train.kept import keep_beside, kept_array, kept_json, made_by
 from train.loop import load_best
 from train.outputs import network_outputs
 from train.tasks.classifier import ClassifierTask
@@ -44,6 +46,7 @@ from train.thesis_networks import (
     Backbone,
     Frame,
     ThesisFolder,
+    ThesisSettings,
     backbone_task,
     entropy_task,
     first_weights,
@@ -194,8 +197,12 @@ def _training(folder: ThesisFolder, histories: dict[str, list[dict[str, float]]]
     }
 
 
-def evaluate_thesis(settings: Settings, folder: ThesisFolder) -> FigureInputs:
-    """Returns all numbers, as written to `thesis.json`, and the other inputs of the report."""
+def evaluate_thesis(settings: Settings, folder: ThesisFolder, measured: dict[str, Any] | None = None) -> FigureInputs:
+    """Returns all numbers, as written to `thesis.json`, and the other inputs of the report.
+
+    Args:
+        measured: times and memory of networks of the same shapes; measured here if None.
+    """
     statistics = {views: folder.statistics(views) for views in VIEWS}
     histories = {name: read_history(network) for name, network in folder.networks().items()}
     for name, network in folder.networks().items():
@@ -204,9 +211,9 @@ def evaluate_thesis(settings: Settings, folder: ThesisFolder) -> FigureInputs:
                 f"{network / 'metrics.jsonl'} is lost; delete {network}, and the same command trains it again"
             )
     test = {views: lattice_tables(settings, folder, views, "test") for views in VIEWS}
-    measured = measure(settings, folder, test)
+    measured = measured or measure(settings, folder, test)
     made = made_by(statistics[40], *folder.networks().values())
-    identity = [made, asdict(settings.evaluation), measured]
+    identity = [made, asdict(settings.evaluation), measured, "by object"]
 
     def compute() -> dict[str, Any]:
         validation = {views: lattice_tables(settings, folder, views, "val", PIPELINE, ("world",)) for views in VIEWS}
@@ -233,6 +240,7 @@ def reproduce(settings: Settings, preset: str, out: Path, pretrained: tuple[Path
     if is_file(settings.dataset.capture.lattice):
         raise DataError("mevs study thesis has lattices of 10 and 40 views; leave out --dataset.capture.lattice file:…")
     check_evaluation(settings.evaluation)
+    check_seeds(settings)
     thesis = settings.thesis
     if thesis.ascent_runs < 1 or thesis.ascent_starts < 2 or thesis.ascent_resolution < 8:
         raise DataError(
@@ -244,16 +252,34 @@ def reproduce(settings: Settings, preset: str, out: Path, pretrained: tuple[Path
     first = first_weights(settings.classifier, thesis, pretrained)
     folder = ThesisFolder(out)
     make_thesis_data(settings, folder)
-    train_thesis(folder, settings.classifier, settings.entropy, thesis, first)
+    folders, own = folders_of(out, settings.seeds), ThesisSettings(settings.classifier, settings.entropy, thesis)
+    each = [own.shifted(number) for number in range(settings.seeds)]
+    train_thesis(folders, each, first)
     inputs = evaluate_thesis(settings, folder)
+    measured = {name: inputs.results[name] for name in ("machine", "timing", "memory", "ascent")}
+    results, table = [inputs.results], None
+    for of_seed, its in zip(folders[1:], each[1:], strict=True):
+        own_settings = replace(settings, classifier=its.classifier, entropy=its.entropy, thesis=its.thesis)
+        found = evaluate_thesis(own_settings, of_seed, measured)
+        results.append(found.results)
+        write_thesis_report(found, _lead(found, preset), of_seed.out / "report")
+    if len(results) > 1:
+        rows = over_trainings(results)
+        keep_json(out / "seeds.json", {"seeds": settings.seeds, "rows": rows})
+        keep_beside(out / "seeds.csv", csv_of(rows))
+        table = table_of(rows)
+    return write_thesis_report(inputs, _lead(inputs, preset), out / "report", table)
+
+
+def _lead(inputs: FigureInputs, preset: str) -> str:
+    """A sentence that describes a run."""
     results, statistics = inputs.results, inputs.statistics[40]
     ran_on = results["machine"]
     where = f"{ran_on['cores']} CPU cores" if ran_on["device"] == NO_ACCELERATOR else ran_on["device"]
     minutes = sum(results["training_seconds"].values()) / 60
     camera = statistics.camera
-    lead = (
+    return (
         f"{statistics.source}, preset {preset}: views of {camera.resolution}×{camera.resolution} pixels, "
         f"{results['objects']['40']} test objects, {statistics.left_out_count} objects left out, "
         f"{minutes:.0f} minutes of training on {where}. Numbers of this run, with those of the thesis in parentheses."
     )
-    return write_thesis_report(inputs, lead, out / "report")

@@ -415,4 +415,4 @@ def markdown(table: ThesisTable) -> str:
         ]
         rows.append([row.name, *cells])
     shown = markdown_table(["", *table.columns], rows)
-    return f"**Table {table.number}. {table.title}**\n\n{shown}\n\n{table.note} In parentheses: the thesis.\n"
+    return f"**{table.heading}**\n\n{shown}\n\n{table.remark}\n"

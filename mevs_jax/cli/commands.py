@@ -70,7 +70,7 @@ COMMANDS = {
         "run every policy on every test object from every start view",
         "EvalOptions",
         ("evaluation",),
-        "stages:evaluate_with_others",
+        "stages:evaluate",
     ),
     "look": Command(
         "recognise one object by chosen views, with a trained system",

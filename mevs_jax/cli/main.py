@@ -10,7 +10,7 @@ import os
 import select
 import signal
 import sys
-from contextlib import nullcontext
+from contextlib import nullcontext, redirect_stdout
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -75,11 +75,24 @@ def _run(name: str, arguments: list[str]) -> None:
             plan(call)
             return
     if getattr(call.options, "distributed", False):
-        command.load()(call)  # which joins the other processes first; one of them keeps the settings
-        return
+        from data_pipeline.distributed import is_first, join_processes
+
+        join_processes()  # before anything is computed
+        if not is_first():  # which speaks, keeps the settings, and holds the lock of the run directory
+            _run_silently(call, command)
+            return
     check_output(call.out)
     with locked(call.out, " ".join(["mevs", *call.arguments])) if command.locks else nullcontext():
         _run_in(call, command)
+
+
+def _run_silently(call: Invocation, command: Command) -> None:
+    """Runs a command as one of several processes, of which another one speaks."""
+    from data_pipeline.progress import console
+
+    console.quiet = True
+    with open(os.devnull, "w") as nowhere, redirect_stdout(nowhere):
+        command.load()(call)
 
 
 def _run_in(call: Invocation, command: Command) -> None:
@@ -182,7 +195,7 @@ def _say_and_end(error: Exception) -> None:
         platforms = os.environ.get("JAX_PLATFORMS")
         asked = f"JAX_PLATFORMS={platforms} asks for a device" if platforms else "JAX chose a device"
         _fail(f"{asked} that cannot be used here ({reason}); set JAX_PLATFORMS=cpu, or install what the device needs")
-    from train.devices import is_lost_process
+    from data_pipeline.distributed import is_lost_process
     from train.preemption import Preempted
 
     if isinstance(error, Preempted):

@@ -37,7 +37,15 @@ class WithSeed(Options):
 
 
 @dataclass(frozen=True)
-class SweepOptions(WithSeed):
+class WithOthers(Options):
+    """Commands that several processes may run together."""
+
+    distributed: Annotated[tyro.conf.FlagCreatePairsOff[bool], _arg("")] = False
+    """this is one of several processes that share the work (docs/scaling.md)"""
+
+
+@dataclass(frozen=True)
+class SweepOptions(WithSeed, WithOthers):
     """Options of `mevs sweep`."""
 
     grid: Annotated[tuple[str, ...], _arg("NAME=V,V ...")] = ()
@@ -66,11 +74,8 @@ class WithPolicies(Options):
 
 
 @dataclass(frozen=True)
-class EvalOptions(WithSeeds, WithPolicies):
+class EvalOptions(WithSeeds, WithPolicies, WithOthers):
     """Options of `mevs eval`."""
-
-    distributed: Annotated[tyro.conf.FlagCreatePairsOff[bool], _arg("")] = False
-    """this is one of several processes that share the objects (docs/scaling.md)"""
 
 
 @dataclass(frozen=True)
@@ -113,7 +118,7 @@ class StudyOptions(WithViews, WithSeed):
 
 
 @dataclass(frozen=True)
-class LearnedOptions(StudyOptions):
+class LearnedOptions(StudyOptions, WithOthers):
     """Options of `mevs study learned`."""
 
     seeds: Annotated[int | None, _arg("K", "1, or 3 with --preset best")] = None
@@ -121,7 +126,7 @@ class LearnedOptions(StudyOptions):
 
 
 @dataclass(frozen=True)
-class DataOptions(WithViews):
+class DataOptions(WithViews, WithOthers):
     """Options of `mevs data`."""
 
     beam: Annotated[str | None, _arg("OPTIONS")] = None
@@ -140,16 +145,17 @@ class RunOptions(WithViews, WithSeeds, WithWeights, WithEncoder, WithPolicies):
 class ThesisOptions(WithData, WithWeights):
     """Options of `mevs study thesis`."""
 
+    seeds: Annotated[int | None, _arg("K", "1, or that of the run")] = None
+    """train all networks from K seeds, and report the main numbers over the trainings"""
+
 
 @dataclass(frozen=True)
-class TrainOptions(WithSeeds, WithWeights, WithEncoder):
+class TrainOptions(WithSeeds, WithWeights, WithEncoder, WithOthers):
     """Options of `mevs train`."""
 
     seeds_at_once: Annotated[int, _arg("N", "0, all")] = 0
     """train at most N seeds together, which bounds memory"""
 
-    distributed: Annotated[tyro.conf.FlagCreatePairsOff[bool], _arg("")] = False
-    """this is one of several processes that train together (docs/scaling.md)"""
     model_devices: Annotated[int, _arg("N", "1")] = 1
     """devices that share one copy of a network's weights; batches are split over the others"""
     plan: Annotated[tyro.conf.FlagCreatePairsOff[bool], _arg("")] = False

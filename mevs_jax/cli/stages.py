@@ -2,13 +2,10 @@
 
 from __future__ import annotations
 
-import os
-from collections.abc import Iterator
-from contextlib import contextmanager, redirect_stdout
 from functools import partial
 from typing import TYPE_CHECKING
 
-from mevs_jax.cli.parsing import Invocation, keep_adopted, keep_settings
+from mevs_jax.cli.parsing import Invocation, keep_adopted
 
 if TYPE_CHECKING:
     from jax.sharding import Mesh
@@ -52,49 +49,29 @@ def _train(call: Invocation, start: StartingWeights | None, mesh: Mesh | None = 
 
 def data(call: Invocation) -> None:
     """The data set."""
+    from data_pipeline.errors import DataError
     from eval import stages
 
+    if call.options.beam and call.options.distributed:
+        raise DataError("--beam has workers of its own; leave out --distributed")
     statistics = stages.make_data(call.settings, call.out, call.options.beam)
     counts = ", ".join(f"{sum(of.values())} {split}" for split, of in statistics.counts.items())
     print(f"Data set: {counts} objects of {len(statistics.classes)} classes, {statistics.views} views each")
 
 
-@contextmanager
-def _with_others(call: Invocation) -> Iterator[None]:
-    """Joins the other processes of a `--distributed` command. One of them speaks, and holds the lock of the run directory."""
-    from data_pipeline.lock import locked
-    from data_pipeline.progress import console
-    from eval import stages
-    from train.devices import is_first, join_processes
-
-    if not call.options.distributed:
-        yield
-        return
-    join_processes()  # before anything is computed
-    if not is_first():
-        console.quiet = True
-        with open(os.devnull, "w") as nowhere, redirect_stdout(nowhere):
-            yield
-        return
-    stages.check_output(call.out)
-    with locked(call.out, " ".join(["mevs", *call.arguments])):
-        keep_settings(call)
-        yield
-
-
 def train(call: Invocation) -> None:
-    """The networks, with other processes if there are any."""
+    """The networks."""
     from train.devices import device_mesh
     from train.tasks.classifier import starting_weights
 
     classifier = call.settings.classifier
-    with _with_others(call):
-        start = starting_weights(call.options.pretrained, classifier.network, classifier.encoder)
-        _train(call, start, device_mesh(call.options.model_devices))
+    start = starting_weights(call.options.pretrained, classifier.network, classifier.encoder)
+    _train(call, start, device_mesh(call.options.model_devices))
 
 
 def sweep(call: Invocation) -> None:
     """A sweep over one network's hyperparameters."""
+    from data_pipeline.distributed import is_first
     from eval import sweeping
     from train.many.sweep import best_of
 
@@ -107,14 +84,9 @@ def sweep(call: Invocation) -> None:
     print(f"All of them: {folder / 'members.md'}; the best network: {folder / 'network'}")
     if call.options.adopt:
         there, settings = sweeping.adopt(call.settings, call.out)
-        keep_adopted(call, settings)
+        if is_first():
+            keep_adopted(call, settings)
         print(f"The run has it now: {there}")
-
-
-def evaluate_with_others(call: Invocation) -> None:
-    """`mevs eval`: the metrics, with other processes if there are any."""
-    with _with_others(call):
-        evaluate(call)
 
 
 def evaluate(call: Invocation) -> None:

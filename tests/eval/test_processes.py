@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import shutil
 import signal
@@ -14,19 +15,22 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from data_pipeline.distributed import from_all, own_share, unresolved_name
+from data_pipeline.files import files_in
+from mevs_jax import load
 from tests.train.test_scaling import CPU
-from train.devices import from_all, own_share, unresolved_name
+from train.kept import summary_of
 
 
-def start(out: Path, processes: int = 2) -> list[subprocess.Popen]:
-    """`mevs eval` in several processes."""
+def start(*arguments: str, processes: int = 2) -> list[subprocess.Popen]:
+    """A command of `mevs` in several processes."""
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
         port = free.getsockname()[1]
     others = {"JAX_COORDINATOR_ADDRESS": f"127.0.0.1:{port}", "JAX_NUM_PROCESSES": str(processes)}
     return [
         subprocess.Popen(
-            [sys.executable, "-m", "mevs_jax", "eval", "--out", str(out), "--distributed"],
+            [sys.executable, "-m", "mevs_jax", *arguments, "--distributed"],
             stdout=subprocess.PIPE,
             stderr=subprocess.PIPE,
             text=True,
@@ -34,6 +38,38 @@ def start(out: Path, processes: int = 2) -> list[subprocess.Popen]:
         )
         for number in range(processes)
     ]
+
+
+def alone(*arguments: str) -> None:
+    """A command of `mevs` in one process."""
+    done = subprocess.run(
+        [sys.executable, "-m", "mevs_jax", *arguments],
+        capture_output=True,
+        text=True,
+        env=os.environ | CPU,
+        timeout=900,
+    )
+    assert done.returncode == 0, done.stderr
+
+
+def killed_and_finished(made: Path, *arguments: str) -> str:
+    """What the first of two processes prints, once they were started again after one was killed when `made` was there."""
+    processes = start(*arguments)
+    until = time.monotonic() + 300
+    while not made.exists():
+        assert time.monotonic() < until, "nothing is made"
+        assert processes[1].poll() is None, processes[1].communicate()
+        time.sleep(0.02)
+    processes[1].send_signal(signal.SIGKILL)
+    processes[0].communicate(timeout=120)
+    assert processes[0].returncode in (0, 75, -6)
+    return finished(start(*arguments))[0][0]
+
+
+@pytest.fixture(autouse=True)
+def named() -> None:
+    if name := unresolved_name():
+        pytest.skip(f"processes on CPUs cannot reach each other: the name of this machine, {name}, has no address")
 
 
 def finished(processes: list[subprocess.Popen]) -> list[tuple[str, str]]:
@@ -45,21 +81,15 @@ def finished(processes: list[subprocess.Popen]) -> list[tuple[str, str]]:
 @pytest.mark.slow
 def test_two_processes_evaluate_as_one_does(whole, tmp_path):
     """Also once a process was killed, and when all is there already."""
-    if name := unresolved_name():
-        pytest.skip(f"processes on CPUs cannot reach each other: the name of this machine, {name}, has no address")
     out = tmp_path / "run"
     shutil.copytree(whole, out, symlinks=True)
     for made in ("metrics.json", "metrics.csv"):
         (out / made).unlink()
     shutil.rmtree(out / "tables")
-    processes = start(out)
-    until = time.monotonic() + 240
-    while not (out / "tables").exists() and time.monotonic() < until:
-        time.sleep(0.05)
-    processes[1].send_signal(signal.SIGKILL)
-    processes[0].communicate(timeout=120)
-    assert processes[0].returncode in (0, 75, -6)
-    (first, _), (second, told) = finished(start(out))
+    evaluate = ("eval", "--out", str(out))
+    killed_and_finished(out / "tables", *evaluate)
+    (out / "metrics.json").unlink()
+    (first, _), (second, told) = finished(start(*evaluate))
     assert "test objects right" in first
     assert "test objects" not in second  # one speaks for all
     assert "Walking" not in told
@@ -69,8 +99,71 @@ def test_two_processes_evaluate_as_one_does(whole, tmp_path):
         for key in theirs:
             np.testing.assert_array_equal(mine[key], theirs[key])
     times = [path.stat().st_mtime_ns for path in sorted(out.rglob("*.json"))]
-    finished(start(out))
+    finished(start(*evaluate))
     assert [path.stat().st_mtime_ns for path in sorted(out.rglob("*.json"))] == times
+
+
+@pytest.mark.slow
+def test_two_processes_make_the_data_set_that_one_makes(tmp_path):
+    given = ("--preset", "tiny", "--views", "6")
+    alone("data", *given, "--out", str(tmp_path / "one"))
+    one, both = tmp_path / "one" / "data", tmp_path / "both" / "data"
+    said = killed_and_finished(both / "captures", "data", *given, "--out", str(both.parent))
+    assert "\nData set: " in "\n" + said
+    assert files_in(both) == files_in(one)
+    for name in files_in(one):
+        assert (both / name).read_bytes() == (one / name).read_bytes(), name
+
+
+@pytest.mark.slow
+def test_two_processes_sweep_as_two_devices_do(whole, tmp_path):
+    """A grid that is halved; the best of it becomes the run's."""
+    outs = [tmp_path / name for name in ("one", "both")]
+    for out in outs:
+        out.mkdir()
+        (out / "data").symlink_to(whole / "data")
+    given = ("--preset", "tiny", "--grid", "learning-rate=1e-3,1e-4", "--seeds", "2", "--sweep.halving", "--adopt")
+    command = ("sweep", *given, "--entropy.optimiser.epochs", "4", "--out")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setitem(CPU, "JAX_NUM_CPU_DEVICES", "2")
+        alone(*command, str(outs[0]))
+    said = killed_and_finished(outs[1] / "sweep" / "entropy" / "latest" / "1", *command, str(outs[1]))
+    assert "Best of 4" in said
+    one, both = (json.loads((out / "sweep" / "entropy" / "members.json").read_text()) for out in outs)
+    assert [member["dropped"] for member in both] == [member["dropped"] for member in one]
+    for mine, theirs in zip(both, one, strict=True):
+        assert mine["best"] == pytest.approx(theirs["best"], rel=1e-5)
+        assert mine["epochs"] == theirs["epochs"]
+    adopted = [summary_of(out / "entropy") for out in outs]
+    assert adopted[1]["best"] == pytest.approx(adopted[0]["best"], rel=1e-5)
+
+
+@pytest.mark.slow
+def test_two_processes_study_as_one_does(tmp_path):
+    """Two seeds, from the data set to the exported system."""
+    outs = [tmp_path / name for name in ("one", "both")]
+    given = (
+        "study",
+        "learned",
+        "--preset",
+        "tiny",
+        "--seeds",
+        "2",
+        "--learned.recogniser.optimiser.learning-rate",
+        "1e-4",
+    )
+    alone(*given, "--out", str(outs[0]))
+    first = outs[1] / "learned" / "seed_0" / "policies" / "learned" / "summary.json"
+    said = killed_and_finished(first, *given, "--out", str(outs[1]))
+    assert "Report: " in said
+    one, both = (json.loads((out / "learned" / "metrics.json").read_text())["together"] for out in outs)
+    assert one.keys() == both.keys()
+    for views, theirs in one.items():
+        for name, policy in theirs["policies"].items():
+            # A walk turns where two views are as good as each other but for rounding: of few objects, one walk is 0.001.
+            mine = both[views]["policies"][name]["after_views"]
+            np.testing.assert_allclose(mine, policy["after_views"], atol=0.02, err_msg=name)
+    assert load(outs[1] / "learned" / "system").classes == load(outs[0] / "learned" / "system").classes
 
 
 def test_shares_of_processes_are_put_together_in_order(monkeypatch):

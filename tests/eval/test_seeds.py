@@ -26,6 +26,13 @@ def run(settings: Settings, out: Path) -> dict:
     return seeds.evaluate(settings, out)
 
 
+def test_an_address_of_object_storage_is_no_folder(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(DataError, match="--out gs://bucket/run is an address, and a run needs a folder"):
+        stages.check_output(Path("gs://bucket/run"))
+    assert not any(tmp_path.iterdir())
+
+
 @pytest.mark.slow
 def test_the_run_of_a_seed_equals_a_run_from_that_seed_alone(data, tmp_path):
     together, alone = tmp_path / "together", tmp_path / "alone"

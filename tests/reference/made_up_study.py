@@ -93,9 +93,9 @@ class Study:
                 "fit": lambda *given, **named: {},
                 "warn_of_chance": lambda *given: None,
                 "network_outputs": self._outputs,
-                "train_policy": self._trained,
-                "train_by_q_learning": self._trained,
-                "new_policy": lambda *given: nnx.Module(),
+                "train_policies": self._trained,
+                "train_all_by_q_learning": self._trained,
+                "is_stored": lambda folder, identity: False,
                 "trained_once": self._trained_once,
             }.items():
                 if hasattr(module, name):
@@ -104,12 +104,14 @@ class Study:
         (out / "entropy").mkdir(parents=True)
         (out / "entropy" / "summary.json").touch()
 
-    def _trained(self, config: Any, parts: Any, validation: Any, name: str) -> tuple[nnx.Module, list]:
-        given = parts, validation
-        self.fitted_on.append((name, given))
-        fusion, data = parts[0]
+    def _trained(self, config: Any, lessons: Any) -> list[tuple[nnx.Module, list]]:
+        (lesson,) = lessons
+        given = lesson.parts, lesson.validation
+        self.fitted_on.append((lesson.name, given))
+        fusion, data = lesson.parts[0]
         cloud = 0 if data.clouds is None else data.clouds.shape[-1]
-        return filled(untrained_policy(config, data.logits.shape[-1], fusion.posed, cloud), seed_of(given)), []
+        policy = untrained_policy(config, data.logits.shape[-1], fusion.posed, cloud)
+        return [(filled(policy, seed_of(given)), [])]
 
     def _trained_once(self, folder: Path, identity: Any, like: Any, train: Any) -> nnx.Module:
         if folder not in self._policies:

@@ -14,11 +14,11 @@ from pathlib import Path
 import pytest
 
 from data_pipeline.dataset.statistics import load_statistics
+from data_pipeline.distributed import unresolved_name
 from eval.stages import tasks
 from mevs_jax.cli.parsing import parse
 from tests.train.test_scaling import CPU
 from tests.train.test_training import lines
-from train.devices import unresolved_name
 from train.loop import fit
 
 NETWORKS = ("classifier", "entropy")

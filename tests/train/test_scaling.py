@@ -18,11 +18,12 @@ from flax import nnx
 
 from data_pipeline.dataset.batches import train_batches
 from data_pipeline.dataset.statistics import load_statistics
+from data_pipeline.distributed import is_lost_process
 from data_pipeline.errors import DataError
 from eval.stages import tasks
 from tests.train.scaling_worker import SETTINGS
 from tests.train.test_training import lines
-from train.devices import Layout, check_batch, device_mesh, is_lost_process, parameter_sharding
+from train.devices import Layout, check_batch, device_mesh, parameter_sharding
 from train.loop import fit, load_best
 from train.step import Task, initial_state, train_step_of
 

@@ -6,21 +6,29 @@ averaging), after the epoch that is best on validation data.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any, TypeVar
+from typing import Any, Generic, TypeVar
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import optax
 from flax import nnx
+from jax.sharding import PartitionSpec
 from jaxtyping import Array, Float, Int
 
 from data_pipeline.errors import Diverged
+from train.devices import DATA, local_mesh
 from train.finite import all_finite, not_finite
+from train.many.seeds import shared_equally
+from train.many.trainers import way_for
 
 Data = TypeVar("Data")
+Validate = Callable[[nnx.State], dict[str, float]]
+"""Averaged weights to losses by name."""
+Fitted = tuple[nnx.State, list[dict[str, float]]]
+"""Averaged weights of the best epoch, and the losses of every epoch."""
 
 
 @dataclass(frozen=True)
@@ -41,9 +49,7 @@ class AveragedConfig:
     """seed of initial weights, batches and all other random draws"""
 
 
-def mean_losses(
-    losses_of: Callable[[nnx.State, Data], dict[str, Array]], data: Data, size: int
-) -> Callable[[nnx.State], dict[str, float]]:
+def mean_losses(losses_of: Callable[[nnx.State, Data], dict[str, Array]], data: Data, size: int) -> Validate:
     """Returns a `validate` function for `fit_averaged`: weights to their mean losses over the data.
 
     Args:
@@ -62,13 +68,13 @@ def mean_losses(
 
 def fit_averaged(
     config: AveragedConfig,
-    loss_of: Callable[[nnx.State, Data, Array], Float[Array, ""]],
+    loss_of: Callable[..., Float[Array, ""]],
     parameters: nnx.State,
     data: Data,
-    validate: Callable[[nnx.State], dict[str, float]] | None,
+    validate: Validate | None,
     name: str = "network",
     rate_option: str = "the learning rate",
-) -> tuple[nnx.State, list[dict[str, float]]]:
+) -> Fitted:
     """Returns the averaged weights of the best epoch, and the losses of every epoch.
 
     Without epochs, the weights are the given `parameters`.
@@ -84,7 +90,81 @@ def fit_averaged(
     Raises:
         Diverged: if after an epoch a loss or an averaged weight is infinite or NaN.
     """
-    samples = len(jax.tree.leaves(data)[0])
+    one = Fitting(config.seed, parameters, data, validate, name)
+    return fit_together(config, loss_of, [one], rate_option)[0]
+
+
+@dataclass(frozen=True)
+class Fitting(Generic[Data]):
+    """One of several networks that are trained together: what it has of its own.
+
+    Attributes:
+        seed: of its batches.
+        parameters: initial weights.
+        data: samples, of the same number and shapes for all networks.
+        validate: as of `fit_averaged`.
+        name: name of the network, for messages.
+        given: further arguments of its loss, after weights, batch and key.
+    """
+
+    seed: int
+    parameters: nnx.State
+    data: Data
+    validate: Validate | None
+    name: str
+    given: tuple[Any, ...] = ()
+
+
+def fit_together(
+    config: AveragedConfig,
+    loss_of: Callable[..., Float[Array, ""]],
+    each: Sequence[Fitting],
+    rate_option: str = "the learning rate",
+) -> list[Fitted]:
+    """Returns for each network what `fit_averaged` returns; each ends as it does alone.
+
+    On several devices, or an accelerator, an epoch of all networks is one program; on one CPU they take turns.
+
+    Args:
+        config: of all networks; each has a seed of its own.
+        loss_of: weights, a batch, a key and what `Fitting.given` holds to the mean loss.
+        rate_option: the option that sets the learning rate, for messages.
+
+    Raises:
+        Diverged: as `fit_averaged` does, if any of them diverges.
+    """
+    samples = len(jax.tree.leaves(each[0].data)[0])
+    start, epoch = _epoch_of(config, loss_of, samples)
+    finite = jax.jit(all_finite)
+    fixed = [(jax.tree.map(jnp.asarray, one.data), one.given) for one in each]
+    epochs = _Epochs(epoch, [start(one.parameters) for one in each], fixed)
+    best = [one.parameters for one in each]
+    histories: list[list[dict[str, float]]] = [[] for _ in each]
+    least = [float("inf")] * len(each)
+    for number in range(config.epochs):
+        losses = epochs.run([jax.random.fold_in(jax.random.key(one.seed), number) for one in each])
+        for index, one in enumerate(each):
+            mean = epochs.mean_weights(index)
+            found = one.validate(mean) if one.validate else {}
+            histories[index].append({"train": float(losses[index]), **found})
+            bad = [f"loss {which!r} is" for which in not_finite(histories[index][-1])]
+            if bad or not finite(mean):
+                raise Diverged(
+                    f"the {one.name} diverged in epoch {number + 1} of {config.epochs}: its {(bad or ['weights are'])[0]} not "
+                    f"finite; nothing of it is saved; repeat the command with a lower {rate_option} "
+                    f"({config.learning_rate:g} in this run)"
+                )
+            if not one.validate or sum(found.values()) < least[index]:
+                best[index], least[index] = mean, sum(found.values())
+    return list(zip(best, histories, strict=True))
+
+
+_Carry = tuple[Any, Any, Any, Array]
+"""Weights, moments, running mean of the weights, number of steps."""
+
+
+def _epoch_of(config: AveragedConfig, loss_of: Callable[..., Array], samples: int) -> tuple[Callable, Callable]:
+    """Returns what begins a training, and an epoch of it, for one network."""
     batch = min(config.batch_size, samples)
     steps = samples // batch
     total = steps * config.epochs
@@ -93,15 +173,17 @@ def fit_averaged(
         optax.clip_by_global_norm(1.0), optax.adamw(rate, b2=0.98, weight_decay=config.weight_decay)
     )
 
-    Carry = tuple[Any, Any, Any, Array]  # weights, moments, mean of weights, steps
+    def start(parameters: nnx.State) -> _Carry:
+        return parameters, optimiser.init(parameters), parameters, jnp.float32(0)
 
-    @jax.jit
-    def epoch(carry: Carry, data: Data, key: Array) -> tuple[Carry, Array]:
-        def step(carry: Carry, given: tuple[Int[Array, " batch"], Array]) -> tuple[Carry, Array]:
+    def epoch(carry: _Carry, fixed: tuple[Any, tuple], key: Array) -> tuple[_Carry, Array]:
+        data, given = fixed
+
+        def step(carry: _Carry, drawn: tuple[Int[Array, " batch"], Array]) -> tuple[_Carry, Array]:
             parameters, moments, mean, taken = carry
-            index, key = given
+            index, key = drawn
             some = jax.tree.map(lambda leaf: leaf[index], data)
-            loss, gradient = jax.value_and_grad(loss_of)(parameters, some, key)
+            loss, gradient = jax.value_and_grad(loss_of)(parameters, some, key, *given)
             update, moments = optimiser.update(gradient, moments, parameters)
             parameters = optax.apply_updates(parameters, update)
             keep = jnp.minimum(config.averaging, (taken + 1) / (taken + 10))
@@ -113,19 +195,40 @@ def fit_averaged(
         carry, losses = jax.lax.scan(step, carry, (index, jax.random.split(keys, steps)))
         return carry, jnp.mean(losses)
 
-    carry = parameters, optimiser.init(parameters), parameters, jnp.float32(0)
-    best, best_loss, history = parameters, float("inf"), []
-    data, weights_are_finite = jax.tree.map(jnp.asarray, data), jax.jit(all_finite)
-    for number in range(config.epochs):
-        carry, loss = epoch(carry, data, jax.random.fold_in(jax.random.key(config.seed), number))
-        found = validate(carry[2]) if validate else {}
-        history.append({"train": float(loss), **found})
-        bad = [f"loss {which!r} is" for which in not_finite(history[-1])]
-        if bad or not weights_are_finite(carry[2]):
-            raise Diverged(
-                f"the {name} diverged in epoch {number + 1} of {config.epochs}: its {(bad or ['weights are'])[0]} not finite; "
-                f"nothing of it is saved; repeat the command with a lower {rate_option} ({config.learning_rate:g} in this run)"
+    return start, epoch
+
+
+class _Epochs:
+    """Epochs of several networks: in one program that devices share, or one network after the other."""
+
+    def __init__(self, epoch: Callable, carries: list[_Carry], fixed: list[tuple[Any, tuple]]):
+        mesh = shared_equally(local_mesh(), len(carries))
+        self._at_once = len(carries) > 1 and way_for(mesh) == "at once"
+        self._carries: Any = carries
+        self._fixed: Any = fixed
+        self._run = jax.jit(epoch)
+        if self._at_once:
+            self._carries, self._fixed = _stacked(carries), _stacked(fixed)
+            spread = PartitionSpec(DATA)
+            self._run = jax.jit(
+                jax.shard_map(jax.vmap(epoch), mesh=mesh, in_specs=spread, out_specs=spread, check_vma=False)
             )
-        if not validate or sum(found.values()) < best_loss:
-            best, best_loss = carry[2], sum(found.values())
-    return best, history
+
+    def run(self, keys: list[Array]) -> np.ndarray | list[Array]:
+        """One epoch of each; returns their mean losses."""
+        if self._at_once:
+            self._carries, losses = self._run(self._carries, self._fixed, jnp.stack(keys))
+            return np.asarray(losses)
+        done = [self._run(*given) for given in zip(self._carries, self._fixed, keys, strict=True)]
+        self._carries = [carry for carry, _ in done]
+        return [loss for _, loss in done]
+
+    def mean_weights(self, index: int) -> nnx.State:
+        """The averaged weights of a network."""
+        if self._at_once:
+            return jax.tree.map(lambda leaf: leaf[index], self._carries[2])
+        return self._carries[index][2]
+
+
+def _stacked(trees: Sequence[Any]) -> Any:
+    return jax.tree.map(lambda *leaves: jnp.stack(leaves), *trees)

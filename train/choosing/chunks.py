@@ -1,4 +1,7 @@
-"""Applying a compiled program to many objects in chunks of one shape, which limits memory and compiles once."""
+"""Applying a compiled program to many objects in chunks of one shape, which limits memory and compiles once.
+
+Several processes share the chunks. Each chunk is computed as one process alone would compute it, so the results are the same.
+"""
 
 from __future__ import annotations
 
@@ -8,9 +11,11 @@ from typing import Any
 import jax
 import numpy as np
 
+from data_pipeline.distributed import from_all, own_share
+
 
 def in_chunks(function: Callable[[Any], Any], objects: Any, size: int) -> Any:
-    """Returns `function(objects)` as arrays on the host, computed in chunks.
+    """Returns `function(objects)` as arrays on the host, computed in chunks; each process returns all of it.
 
     Args:
         function: maps a tree of arrays with a leading axis of objects to another such tree, each object independently.
@@ -19,8 +24,15 @@ def in_chunks(function: Callable[[Any], Any], objects: Any, size: int) -> Any:
     """
     count = len(jax.tree.leaves(objects)[0])
     size, done = min(size, count), []
-    for first in range(0, count, size):
+    firsts = range(0, count, size)
+    own = own_share(len(firsts))
+    for first in [firsts[number] for number in own] or [0]:  # a process without a chunk still needs shapes
         index = np.resize(np.arange(first, min(first + size, count)), size)
         found = function(jax.tree.map(lambda leaf, index=index: leaf[index], objects))
         done.append(jax.device_get(found))
-    return jax.tree.map(lambda *leaves: np.concatenate(leaves)[:count], *done)
+
+    def joined(*leaves: np.ndarray) -> np.ndarray:
+        every = from_all(np.stack(leaves)[: len(own)], len(firsts))
+        return every.reshape(-1, *every.shape[2:])[:count]
+
+    return jax.tree.map(joined, *done)

@@ -30,13 +30,15 @@ from mevs_jax.policies.learned import learned, looking_ahead
 from mevs_jax.policies.uninformed import random_view
 from mevs_jax.selection import ViewTable, by_attention, select_from_table
 from mevs_jax.viewpoints import ViewGraph
-from train.choosing.averaged import AveragedConfig, fit_averaged, mean_losses
+from train.choosing.averaged import AveragedConfig, Fitting, fit_together, mean_losses
 from train.choosing.chunks import in_chunks
 from train.choosing.features import Features
 
 Tree = TypeVar("Tree")
 Seen = tuple[CalibratedFusion, Features]
 """Features of some objects, and the fusion of the recogniser that computed them."""
+Trained = tuple[ViewPolicy, list[list[dict[str, float]]]]
+"""A policy, and the losses of its training by round and epoch."""
 
 
 @dataclass(frozen=True)
@@ -203,7 +205,8 @@ def choices_along(
     config: PolicyConfig,
 ) -> Choices:
     """Returns every state of some walks with the gain of its candidates, as arrays on the host."""
-    found = in_chunks(partial(_choices_of_some, fusion, config=config), (data, walks, candidates), 16)
+    same = replace(config, seed=0)  # one program for all seeds
+    found = in_chunks(partial(_choices_of_some, fusion, config=same), (data, walks, candidates), 16)
     return jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[3:]), found)
 
 
@@ -269,33 +272,12 @@ def new_policy(config: PolicyConfig, classes: int, posed: bool = True, cloud: in
     )
 
 
-def _fit(
-    config: PolicyConfig, network: ViewPolicy, train: Choices, validation: Choices | None, name: str
-) -> tuple[ViewPolicy, list]:
-    """Returns the trained network of the best epoch, or of the last without validation states, and its losses by epoch."""
-    structure, parameters = nnx.split(network)
-
-    def loss_of(parameters: nnx.State, some: Choices, key: Array) -> Array:
-        del key
-        errors = policy_loss(nnx.merge(structure, parameters), some, config.differences)
-        return sum(errors.values(), jnp.float32(0))
-
-    @jax.jit
-    def check(mean: nnx.State, some: Choices) -> dict[str, Array]:
-        return policy_loss(nnx.merge(structure, mean), some, config.differences)
-
-    validate = None if validation is None else mean_losses(check, validation, 1024)
-    option = "--learned.policy.learning-rate"
-    best, history = fit_averaged(config, loss_of, parameters, train, validate, name, option)
-    return nnx.merge(structure, best), history
-
-
 def train_policy(
     config: PolicyConfig,
     parts: Sequence[Seen],
     validation: Seen | None = None,
     name: str = "view policy",
-) -> tuple[ViewPolicy, list[list[dict[str, float]]]]:
+) -> Trained:
     """Returns the policy after all rounds, and the losses by round and epoch.
 
     Args:
@@ -306,24 +288,98 @@ def train_policy(
     Raises:
         Diverged: if a loss or a weight is infinite or NaN.
     """
-    fusion, data = parts[0]
-    cloud = 0 if data.clouds is None else data.clouds.shape[-1]
-    untrained = partial(new_policy, config, data.logits.shape[-1], fusion.posed, cloud)
-    policy, histories = untrained(), []
-    gathered: list[Choices] = []
-    gathered_for_check: list[Choices] = []
+    return train_policies(config, [Lesson(config.seed, parts, validation, name)])[0]
+
+
+@dataclass(frozen=True)
+class Lesson:
+    """What one of several policies that are trained together learns from.
+
+    Attributes:
+        seed: of its weights, walks and batches.
+        parts, validation, name: as of `train_policy`.
+    """
+
+    seed: int
+    parts: Sequence[Seen]
+    validation: Seen | None
+    name: str
+
+
+def train_policies(config: PolicyConfig, lessons: Sequence[Lesson]) -> list[Trained]:
+    """Returns for each lesson what `train_policy` returns; the policies are trained together (`fit_together`).
+
+    Args:
+        config: of all policies; each lesson has a seed of its own.
+        lessons: all with as many objects, views and parts.
+    """
+    configs = [replace(config, seed=lesson.seed) for lesson in lessons]
+    policies: list[ViewPolicy | None] = [None] * len(lessons)
+    gathered: list[list[Choices]] = [[] for _ in lessons]
+    gathered_for_check: list[list[Choices]] = [[] for _ in lessons]
+    histories: list[list[list[dict[str, float]]]] = [[] for _ in lessons]
     for number in range(config.rounds):
-        guide = policy if number else None
-        gathered += [_gather(seen, guide, config, (number, part)) for part, seen in enumerate(parts)]
-        if validation is not None:
-            gathered_for_check.append(_gather(validation, guide, config, (number, len(parts))))
-        train = _balanced(joined(gathered))
-        check = _balanced(joined(gathered_for_check)) if gathered_for_check else None
-        policy, history = _fit(config, untrained(), train, check, f"{name}, round {number + 1} of {config.rounds},")
-        histories.append(history)
-        last = ", ".join(f"{name} {value:.4f}" for name, value in history[-1].items())
-        console.print(f"Round {number + 1} of {config.rounds}, {len(train.label)} states: {last}")
-    return policy, histories
+        each = []
+        for index, (own, lesson) in enumerate(zip(configs, lessons, strict=True)):
+            guide, parts = policies[index], lesson.parts
+            gathered[index] += [_gather(seen, guide, own, (number, part)) for part, seen in enumerate(parts)]
+            if lesson.validation is not None:
+                gathered_for_check[index].append(_gather(lesson.validation, guide, own, (number, len(parts))))
+            train, check = _balanced(joined(gathered[index])), gathered_for_check[index]
+            each.append((own, lesson, train, _balanced(joined(check)) if check else None))
+        fitted = _fit(config, each, f"round {number + 1} of {config.rounds}")
+        for index, (policy, history) in enumerate(fitted):
+            policies[index] = policy
+            histories[index].append(history)
+            last = ", ".join(f"{name} {value:.4f}" for name, value in history[-1].items())
+            console.print(
+                f"{lessons[index].name}, round {number + 1} of {config.rounds}, {len(each[index][2].label)} states: {last}"
+            )
+    trained = zip(configs, lessons, policies, histories, strict=True)
+    return [(policy or _untrained(own, lesson), history) for own, lesson, policy, history in trained]
+
+
+def _untrained(config: PolicyConfig, lesson: Lesson) -> ViewPolicy:
+    fusion, data = lesson.parts[0]
+    cloud = 0 if data.clouds is None else data.clouds.shape[-1]
+    return new_policy(config, data.logits.shape[-1], fusion.posed, cloud)
+
+
+def _fit(
+    config: PolicyConfig,
+    each: Sequence[tuple[PolicyConfig, Lesson, Choices, Choices | None]],
+    when: str,
+) -> list[tuple[ViewPolicy, list[dict[str, float]]]]:
+    """Returns trained networks of their best epoch, or of the last without validation states, and their losses by epoch.
+
+    Args:
+        each: for each policy its settings, lesson, states to learn from and validation states.
+        when: the round, for messages.
+    """
+    networks = [_untrained(own, lesson) for own, lesson, _, _ in each]
+    structure = nnx.graphdef(networks[0])
+
+    def loss_of(parameters: nnx.State, some: Choices, key: Array) -> Array:
+        del key
+        errors = policy_loss(nnx.merge(structure, parameters), some, config.differences)
+        return sum(errors.values(), jnp.float32(0))
+
+    @jax.jit
+    def check(mean: nnx.State, some: Choices) -> dict[str, Array]:
+        return policy_loss(nnx.merge(structure, mean), some, config.differences)
+
+    fittings = [
+        Fitting(
+            own.seed,
+            nnx.state(network),
+            train,
+            None if validation is None else mean_losses(check, validation, 1024),
+            f"{lesson.name}, {when},",
+        )
+        for network, (own, lesson, train, validation) in zip(networks, each, strict=True)
+    ]
+    fitted = fit_together(config, loss_of, fittings, "--learned.policy.learning-rate")
+    return [(nnx.merge(structure, best), history) for best, history in fitted]
 
 
 def _gather(seen: Seen, guide: ViewPolicy | None, config: PolicyConfig, number: tuple[int, int]) -> Choices:

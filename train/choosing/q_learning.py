@@ -12,8 +12,8 @@ object, and there is a reward at every step instead of only the last.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
-from functools import partial
+from dataclasses import dataclass, replace
+from functools import cache, partial
 from typing import Any
 
 import flax.struct
@@ -27,10 +27,10 @@ from data_pipeline.progress import console
 from mevs_jax.beliefs import CalibratedFusion
 from mevs_jax.models.view_policy import ViewPolicy, utility_of
 from mevs_jax.policies.base import Policy
-from train.choosing.averaged import fit_averaged, mean_losses
+from train.choosing.averaged import Fitted, Fitting, fit_together, mean_losses
 from train.choosing.chunks import in_chunks
 from train.choosing.features import Features
-from train.choosing.policy import PolicyConfig, Seen, joined, learned_policy, new_policy, walk
+from train.choosing.policy import Lesson, PolicyConfig, Seen, Trained, joined, learned_policy, new_policy, walk
 
 
 @dataclass(frozen=True)
@@ -95,7 +95,8 @@ def transitions_along(
     config: QLearningConfig,
 ) -> Transitions:
     """Returns beliefs and rewards along some walks, as arrays on the host."""
-    found = in_chunks(partial(_transitions_of_some, fusion, config=config), (data, walks), 64)
+    same = replace(config, seed=0)  # one program for all seeds
+    found = in_chunks(partial(_transitions_of_some, fusion, config=same), (data, walks), 64)
     return jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:]), found)
 
 
@@ -144,63 +145,91 @@ def exploring(given: tuple[nnx.State, Array], structure: nnx.GraphDef, share: fl
     return scores
 
 
+@cache
+def _exploring(structure: nnx.GraphDef, share: float) -> Callable[..., Policy]:
+    """Returns the same function for the same arguments: walks are compiled once for each function."""
+    return partial(exploring, structure=structure, share=share)
+
+
 def train_by_q_learning(
     config: QLearningConfig,
     parts: Sequence[Seen],
     validation: Seen | None = None,
     name: str = "view policy",
-) -> tuple[ViewPolicy, list[list[dict[str, float]]]]:
+) -> Trained:
     """Returns the network after all rounds, for use with `by="state"`, and the losses by round and epoch.
 
     Arguments are those of `train_policy`.
     """
-    network = new_policy(config, parts[0][1].logits.shape[-1], parts[0][0].posed)
-    structure, weights = nnx.split(network)
-    replay: list[Transitions] = []
-    replay_for_check: list[Transitions] = []
-    histories = []
+    return train_all_by_q_learning(config, [Lesson(config.seed, parts, validation, name)])[0]
+
+
+def train_all_by_q_learning(config: QLearningConfig, lessons: Sequence[Lesson]) -> list[Trained]:
+    """Returns for each lesson what `train_by_q_learning` returns; the networks are trained together, as by `train_policies`."""
+    networks = [
+        new_policy(replace(config, seed=lesson.seed), lesson.parts[0][1].logits.shape[-1], lesson.parts[0][0].posed)
+        for lesson in lessons
+    ]
+    structure, weights = nnx.graphdef(networks[0]), [nnx.state(network) for network in networks]
+    replays: list[list[Transitions]] = [[] for _ in lessons]
+    replays_for_check: list[list[Transitions]] = [[] for _ in lessons]
+    histories: list[list[list[dict[str, float]]]] = [[] for _ in lessons]
     for number in range(config.rounds):
         share = config.exploration if number else 1.0
-        policy_of: Callable[..., Policy] = partial(exploring, structure=structure, share=share)
-        for part, (fusion, data) in enumerate(parts if validation is None else [*parts, validation]):
-            key = jax.random.fold_in(jax.random.fold_in(jax.random.key(config.seed), number), part)
-            given = weights, fusion.single
-            walks = walk(key, fusion, data, policy_of, given, config.most_seen + 1, config.walks)
-            to = replay if part < len(parts) else replay_for_check
-            to.append(transitions_along(fusion, data, walks, config))
-        train, check = joined(replay), joined(replay_for_check) if replay_for_check else None
-        named = f"{name}, round {number + 1} of {config.rounds},"
-        weights, history = _fit(config, structure, weights, number > 0, train, check, named)
-        histories.append(history)
-        console.print(f"Round {number + 1} of {config.rounds}, {len(train.order)} walks: {history[-1]}")
-    return nnx.merge(structure, weights), histories
+        policy_of = _exploring(structure, share)
+        fittings = []
+        for index, lesson in enumerate(lessons):
+            key = jax.random.fold_in(jax.random.key(lesson.seed), number)
+            new, new_for_check = _walked(config, lesson, weights[index], policy_of, key)
+            replays[index] += new
+            replays_for_check[index] += new_for_check
+            train, check = joined(replays[index]), replays_for_check[index]
+            named = f"{lesson.name}, round {number + 1} of {config.rounds},"
+            fittings.append((lesson.seed, weights[index], train, joined(check) if check else None, named))
+        for index, (found, history) in enumerate(_fit(config, structure, number > 0, fittings)):
+            weights[index] = found
+            histories[index].append(history)
+            console.print(f"{fittings[index][-1]} {len(fittings[index][2].order)} walks: {history[-1]}")
+    return [(nnx.merge(structure, own), history) for own, history in zip(weights, histories, strict=True)]
+
+
+def _walked(
+    config: QLearningConfig, lesson: Lesson, weights: nnx.State, policy_of: Callable[..., Policy], key: Array
+) -> tuple[list[Transitions], list[Transitions]]:
+    """Returns what new walks on a lesson's objects tell, by part, and on its validation objects."""
+    found, parts = [], [*lesson.parts] if lesson.validation is None else [*lesson.parts, lesson.validation]
+    for part, (fusion, data) in enumerate(parts):
+        given, own = (weights, fusion.single), jax.random.fold_in(key, part)
+        walks = walk(own, fusion, data, policy_of, given, config.most_seen + 1, config.walks)
+        found.append(transitions_along(fusion, data, walks, config))
+    return found[: len(lesson.parts)], found[len(lesson.parts) :]
 
 
 def _fit(
     config: QLearningConfig,
     structure: nnx.GraphDef,
-    target: nnx.State,
     ahead: bool,
-    train: Transitions,
-    check: Transitions | None,
-    name: str,
-) -> tuple[nnx.State, list[dict[str, float]]]:
-    """Trains from the target's weights; returns the new weights and the losses by epoch.
+    each: Sequence[tuple[int, nnx.State, Transitions, Transitions | None, str]],
+) -> list[Fitted]:
+    """Trains networks from their targets' weights; returns new weights and the losses by epoch.
 
     Args:
         ahead: whether the next state's value counts; not in the first round, where the target is untrained.
-        name: name of the network, for messages.
+        each: for each network its seed, its target's weights, transitions to learn from and for validation, and its name.
     """
     discount = config.discount if ahead else 0.0
 
-    def loss_of(parameters: nnx.State, some: Transitions, key: Array | None = None) -> Array:
+    def loss_of(parameters: nnx.State, some: Transitions, key: Array | None, target: nnx.State) -> Array:
         del key
         network, old = (nnx.merge(structure, weights) for weights in (parameters, target))
         return jnp.mean(temporal_difference(network, old, some, discount) ** 2)
 
     @jax.jit
-    def error(mean: nnx.State, some: Transitions) -> dict[str, Array]:
-        return {"error": loss_of(mean, some)}
+    def error(mean: nnx.State, some: Transitions, target: nnx.State) -> dict[str, Array]:
+        return {"error": loss_of(mean, some, None, target)}
 
-    validate = None if check is None else mean_losses(error, check, 256)
-    return fit_averaged(config, loss_of, target, train, validate, name, "--learned.q-learning.learning-rate")
+    fittings = []
+    for seed, target, train, check, name in each:
+        validate = None if check is None else mean_losses(partial(error, target=target), check, 256)
+        fittings.append(Fitting(seed, target, train, validate, name, (target,)))
+    return fit_together(config, loss_of, fittings, "--learned.q-learning.learning-rate")

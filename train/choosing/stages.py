@@ -9,11 +9,11 @@ Folders within a run's folder: `learned/turned/` (data), `learned/seed_0/` with 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import asdict, dataclass, field, replace
-from functools import cached_property
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass, replace
+from functools import cache, cached_property, partial
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
@@ -33,10 +33,11 @@ from train.chance import warn_of_chance
 from train.choosing.calibrated import calibrated
 from train.choosing.features import Features
 from train.choosing.looks import embed, see, see_changed, see_rotated
-from train.choosing.policy import By, PolicyConfig, Seen, new_policy, train_policy
-from train.choosing.q_learning import QLearningConfig, train_by_q_learning
+from train.choosing.policy import Lesson, PolicyConfig, Seen, Trained, new_policy, train_policies
+from train.choosing.q_learning import QLearningConfig, train_all_by_q_learning
+from train.choosing.variants import ABLATIONS, VARIANTS
 from train.finite import check_outputs
-from train.kept import kept_array, made_by, trained_once
+from train.kept import is_stored, kept_array, made_by, trained_once
 from train.loop import fit, load_best
 from train.many.seeds import train_seeds
 from train.outputs import Ask, network_outputs
@@ -83,56 +84,8 @@ class LearnedConfig:
     seed; 0: no such training and test"""
 
 
-@dataclass(frozen=True)
-class Variant:
-    """A way to train the view policy, or to score candidates with it.
-
-    Attributes:
-        title: title in the report.
-        posed: whether the objects' pose is known.
-        by: how candidates are scored; see `train.choosing.policy.By`.
-        network: name of the variant whose network is used; its own if empty.
-        changed: whether it also learns from mirrored and stretched copies of the objects.
-        learns_from: "validation": validation objects; "parts": training objects in parts, each with the features of a recogniser
-            that was trained without it; "training": training objects, with the features of the recogniser trained on them.
-        cloud: whether it is also given PointNet++'s embedding of every partial cloud.
-        summed: whether beliefs are sums of logits, in training and on its walks.
-        q_learning: whether it is trained by Q-learning, from walks alone.
-        settings: settings that differ from `LearnedConfig.policy`.
-    """
-
-    title: str
-    posed: bool = True
-    by: By = "belief"
-    network: str = ""
-    changed: bool = True
-    learns_from: Literal["validation", "parts", "training"] = "validation"
-    cloud: bool = False
-    summed: bool = False
-    q_learning: bool = False
-    settings: dict[str, Any] = field(default_factory=dict)
-
-
-VARIANTS = {
-    "learned": Variant("view policy"),
-    "learned_unposed": Variant("view policy", posed=False),
-    "learned_and_table": Variant("view policy and table", by="table", network="learned"),
-    "as_it_is": Variant("… by the gain expected in the state, not per class", by="state", network="learned"),
-    "look_ahead": Variant("… two views ahead", by="ahead", network="learned"),
-    "probability": Variant(
-        "… by the rise of the probability, not of its logarithm", settings={"utility": "probability"}
-    ),
-    "random_states": Variant("… trained on random walks alone", settings={"rounds": 1}),
-    "unchanged": Variant("… trained on unchanged objects", changed=False),
-    "crossed": Variant("… trained on training objects, by recognisers without them", learns_from="parts"),
-    "known": Variant("… trained on training objects, by their own recogniser", learns_from="training"),
-    "summed": Variant("… with the sum of logits as fusion", summed=True),
-    "cloud": Variant("… with PointNet++'s embedding of clouds as further input", cloud=True, changed=False),
-    "q_learning": Variant("… Q-learning (as MVSelect)", by="state", q_learning=True),
-}
-"""The method (`learned…`), and the ablations that measure the effect of its parts."""
-
-ABLATIONS = tuple(name for name in VARIANTS if not name.startswith("learned"))
+Aside = tuple[int, int]
+"""Which of how many parts of the validation objects."""
 
 _SIZE = "--learned.recogniser.size"
 _FURTHER_RATE = 0.4
@@ -352,39 +305,22 @@ class Stages:
     def policy_folder(self, name: str = "learned") -> Path:
         return self.folder / "policies" / name
 
-    def policy(self, name: str = "learned", without: tuple[int, ...] = ()) -> ViewPolicy:
-        """Returns the trained view policy of a variant.
+    def policy(self, name: str = "learned", without: tuple[int, ...] = (), aside: Aside | None = None) -> ViewPolicy:
+        """Returns a trained view policy; arguments are those of `policy_job`."""
+        return trained_policies([self.policy_job(name, without, aside)])[0]
+
+    def policy_job(self, name: str = "learned", without: tuple[int, ...] = (), aside: Aside | None = None) -> PolicyJob:
+        """Returns the training of the view policy of a variant, once the recognisers that it learns from are trained.
 
         Args:
             name: name of the variant in `VARIANTS`.
             without: classes whose objects it is not trained on.
+            aside: part of the validation objects that it is not trained on.
         """
         variant = VARIANTS[name]
         config = replace(self.config.policy, seed=self.seed, **variant.settings)
         if variant.q_learning:
             config = replace(self.config.q_learning, seed=self.seed)
-        changed = self.config.changed if variant.changed and variant.learns_from == "validation" else 0
-
-        def train() -> tuple[ViewPolicy, dict[str, Any]]:
-            seen = self.features("turned_val", self.turned, "val")
-            if variant.cloud:
-                seen = replace(seen, clouds=self.clouds(self.turned, "val"))
-            fusion = self.fusion(posed=variant.posed, summed=variant.summed)
-            validation = fusion, seen.without(without)
-            if variant.learns_from == "validation":
-                parts, check = [validation, *((fusion, copy) for copy in self.changed(changed))], None
-            elif variant.learns_from == "parts":
-                parts, check = self.parts(), validation
-            else:
-                parts, check = [(fusion, self.features("turned_train", self.turned, "train"))], validation
-            parts = [(fusion, data.without(without)) for fusion, data in parts]
-            console.print(f"Training the view policy ({name}) on {sum(len(data.labels) for _, data in parts)} objects")
-            if isinstance(config, QLearningConfig):
-                policy, histories = train_by_q_learning(config, parts, check, f"view policy ({name})")
-            else:
-                policy, histories = train_policy(config, parts, check, f"view policy ({name})")
-            return policy, {"rounds": histories}
-
         made = [self.recogniser_folder()]
         if variant.learns_from == "parts":
             for fold in range(self.config.folds):
@@ -394,10 +330,81 @@ class Stages:
         if variant.cloud:
             assert self.entropy is not None
             made, cloud = [*made, self.out / "entropy"], self.entropy.network.global_layers[-1]
+        changed = self.config.changed if variant.changed and variant.learns_from == "validation" else 0
         identity = {"made_by": made_by(self.statistics, *made), "of": asdict(config), "changed": changed}
-        folder = self.policy_folder("_".join(map(str, (name, *(f"without_{label}" for label in without)))))
-        untrained = nnx.eval_shape(lambda: new_policy(config, len(self.statistics.classes), variant.posed, cloud))
-        return trained_once(folder, identity, untrained, train)
+        left_out = [
+            *(f"without_{label}" for label in without),
+            *([] if aside is None else [f"aside_{aside[0]}_of_{aside[1]}"]),
+        ]
+        return PolicyJob(
+            self.policy_folder("_".join((name, *left_out))),
+            identity,
+            nnx.eval_shape(lambda: new_policy(config, len(self.statistics.classes), variant.posed, cloud)),
+            config,
+            partial(self._lesson, name, changed, without, aside),
+        )
+
+    def _lesson(self, name: str, changed: int, without: tuple[int, ...], aside: Aside | None) -> Lesson:
+        """Returns what the view policy of a variant learns from, with so many changed copies of the objects."""
+        variant = VARIANTS[name]
+        seen = self.features("turned_val", self.turned, "val")
+        if variant.cloud:
+            seen = replace(seen, clouds=self.clouds(self.turned, "val"))
+        fusion = self.fusion(posed=variant.posed, summed=variant.summed)
+        validation = fusion, seen.without(without)
+        check = None
+        if variant.learns_from == "validation":
+            parts = [(fusion, seen), *((fusion, copy) for copy in self.changed(changed))]
+            if aside is not None:
+                kept = np.flatnonzero(fold_of(len(seen.labels), aside[1]) != aside[0])
+                parts = [(fusion, data.some(kept)) for fusion, data in parts]
+        elif variant.learns_from == "parts":
+            parts, check = self.parts(), validation
+        else:
+            parts, check = [(fusion, self.features("turned_train", self.turned, "train"))], validation
+        parts = [(fusion, data.without(without)) for fusion, data in parts]
+        objects = sum(len(data.labels) for _, data in parts)
+        console.print(f"The view policy ({name}) of seed {self.seed} learns from {objects} objects")
+        return Lesson(self.seed, parts, check, f"view policy ({name}) of seed {self.seed}")
+
+
+@dataclass(frozen=True)
+class PolicyJob:
+    """The training of one view policy.
+
+    Attributes:
+        folder: where it is stored.
+        identity: what it depends on.
+        untrained: a network of its shape.
+        config: settings of its training.
+        lesson: returns what it learns from.
+    """
+
+    folder: Path
+    identity: dict[str, Any]
+    untrained: ViewPolicy
+    config: PolicyConfig
+    lesson: Callable[[], Lesson]
+
+
+def trained_policies(jobs: Sequence[PolicyJob]) -> list[ViewPolicy]:
+    """Returns the policies of some jobs, which differ in seeds alone; those that are not stored are trained together."""
+    waiting = [job for job in jobs if not is_stored(job.folder, job.identity)]
+
+    def train(some: Sequence[PolicyJob]) -> list[Trained]:
+        config, lessons = some[0].config, [job.lesson() for job in some]
+        if isinstance(config, QLearningConfig):
+            return train_all_by_q_learning(config, lessons)
+        return train_policies(config, lessons)
+
+    together = cache(lambda: train(waiting))
+
+    def made(job: PolicyJob) -> tuple[ViewPolicy, dict[str, Any]]:
+        known = job in waiting  # else it is stored, and cannot be read
+        policy, histories = together()[waiting.index(job)] if known else train([job])[0]
+        return policy, {"rounds": histories}
+
+    return [trained_once(job.folder, job.identity, job.untrained, partial(made, job)) for job in jobs]
 
 
 def train_recognisers(each: Sequence[Stages]) -> None:

@@ -11,12 +11,16 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.sharding import Mesh
 
 from data_pipeline.dataset.statistics import DatasetStatistics
+from data_pipeline.distributed import is_first, wait_for_all
 from data_pipeline.files import check_of_file, keep_checks, keep_json, write_text
 from train.checkpoints import Checkpoints
+from train.devices import parameter_sharding, place
 from train.finite import not_finite
 from train.loop import identity_of
+from train.starting_weights import StartingWeights
 from train.step import Task, initial_state
 from train.tasks.classifier import ClassifierTask
 from train.tasks.entropy import EntropyTask
@@ -164,7 +168,15 @@ class Together:
                 self.members[self.members.index(member)] = replace(member, dropped=True)
 
 
-def export_member(task: Task, of: Together, index: int, statistics: DatasetStatistics, out: Path) -> dict[str, Any]:
+def export_member(
+    task: Task,
+    of: Together,
+    index: int,
+    statistics: DatasetStatistics,
+    out: Path,
+    mesh: Mesh,
+    start: StartingWeights | None = None,
+) -> dict[str, Any]:
     """Writes a trained member in the form in which `train.loop.fit` stores a run; returns its summary.
 
     Args:
@@ -173,6 +185,8 @@ def export_member(task: Task, of: Together, index: int, statistics: DatasetStati
         index: of the member.
         statistics: those of the data set.
         out: folder of the run.
+        mesh: devices of all processes, each of which writes its part.
+        start: weights with which it began; random if None.
     """
     member, steps = of.members[index], of.epoch_steps
     _, state = initial_state(task, member.seed)
@@ -186,13 +200,17 @@ def export_member(task: Task, of: Together, index: int, statistics: DatasetStati
         "best": member.best,
         "seconds": of.seconds / len(of.members),
         "steps": member.epochs * steps,
-        "start": "random weights",
+        "start": start.name if start else "random weights",
         "stopped_early": member.epochs < task.optimiser.epochs,
         **({"encoder": encoder} if (encoder := getattr(task, "encoder", None)) else {}),
     }
-    keep_json(out / "config.json", identity_of(task, statistics))
+    if is_first():
+        keep_json(out / "config.json", identity_of(task, statistics, start))
+    wait_for_all("a member is exported")
     with Checkpoints(out) as checkpoints:
-        checkpoints.save("best", step, state, summary)
+        checkpoints.save("best", step, place(state, parameter_sharding(mesh, state)), summary)
+    if not is_first():
+        return summary
     lines = [entry | {"step": entry["epoch"] * steps} for entry in of.histories[index]]
     write_text(out / "metrics.jsonl", "".join(json.dumps(line) + "\n" for line in lines))
     keep_checks(out, {"metrics.jsonl": check_of_file(out / "metrics.jsonl")})

@@ -11,22 +11,22 @@ import jax
 from jax.sharding import Mesh
 
 from data_pipeline.dataset.statistics import DatasetStatistics
-from data_pipeline.errors import Diverged, Unreadable
+from data_pipeline.distributed import agreed, is_first, wait_for_all
+from data_pipeline.errors import DataError, Diverged, Unreadable
 from data_pipeline.files import keep_json, read_json
 from data_pipeline.progress import console
 from train.checkpoints import has_save
-from train.devices import Layout, device_mesh, is_first
+from train.devices import Layout, device_mesh
 from train.kept import check_config, finished
 from train.loop import check_training, fit, identity_of
 from train.many.members import SweepTask, export_member, member_of
+from train.many.trainers import Starts
 from train.many.training import train_members
-from train.starting_weights import StartingWeights
 
 
-def number_together(networks: int, mesh: Mesh, start: StartingWeights | None) -> int:
+def number_together(networks: int, mesh: Mesh) -> int:
     """Returns how many of so many networks that are not begun yet are trained together; all devices train each of the others."""
-    alone = start is not None or jax.process_count() > 1 or mesh.shape["model"] > 1
-    together = 0 if alone else networks // mesh.size * mesh.size
+    together = 0 if mesh.shape["model"] > 1 else networks // mesh.size * mesh.size
     return together if together > 1 else 0
 
 
@@ -45,17 +45,17 @@ def check_networks(
     statistics: DatasetStatistics,
     folders: Sequence[Path],
     work: Path,
-    start: StartingWeights | None,
+    starts: Starts,
     mesh: Mesh,
 ) -> None:
     """Raises `DataError` if `train_seeds` would: folders hold something else, or batches cannot be shared."""
-    identities = [identity_of(task, statistics, start) for task in tasks]
+    identities = _identities(tasks, statistics, starts)
     for folder, identity in zip(folders, identities, strict=True):
         check_config(folder, identity, "a network trained")
     if _interrupted(work, identities):
         return
     waiting = sum(not (folder / "summary.json").exists() for folder in folders)
-    if together := number_together(waiting, mesh, start):
+    if together := number_together(waiting, mesh):
         check_training(tasks[0], statistics, Layout())  # a batch is that of one device
     if together < waiting:
         check_training(tasks[0], statistics, Layout.of_mesh(mesh))
@@ -67,15 +67,15 @@ def train_seeds(
     statistics: DatasetStatistics,
     folders: Sequence[Path],
     work: Path,
-    start: StartingWeights | None = None,
+    starts: Starts = (),
     mesh: Mesh | None = None,
     rate_option: str = "the learning rate",
 ) -> list[dict[str, Any]]:
     """Trains networks that differ in their seeds alone; returns their summaries, as `train.loop.fit` would.
 
-    As many as the devices share equally are trained together; the others, and all that begin from given weights or are trained by
-    several processes, one after the other by all devices. Those that are finished are not trained again. An interrupted training
-    of some of them together goes on, on as many devices as share them equally; that of other networks is given up.
+    As many as the devices, of all processes, share equally are trained together; the others one after the other by all devices.
+    Those that are finished are not trained again. An interrupted training of some of them together goes on, on as many devices as
+    share them equally; that of other networks is given up.
 
     Args:
         tasks: one for each seed.
@@ -83,7 +83,7 @@ def train_seeds(
         statistics: those of the data set.
         folders: of the runs of the networks.
         work: folder for the checkpoints of what is trained together, which is removed at the end.
-        start: initial weights; random if None.
+        starts: initial weights of each network; random if there are none.
         mesh: devices to train on; all if None.
         rate_option: the option that sets the learning rate, for messages.
 
@@ -93,25 +93,47 @@ def train_seeds(
         Diverged: if a network diverged; the others are finished then.
     """
     mesh = mesh or device_mesh()
-    identities = [identity_of(task, statistics, start) for task in tasks]
+    identities = _identities(tasks, statistics, starts)
     for folder, identity in zip(folders, identities, strict=True):
         check_config(folder, identity, "a network trained")
     missing = [index for index, folder in enumerate(folders) if finished(folder) is None]
     fresh = [index for index in missing if not has_save(folders[index] / "latest")]  # those are trained alone, by `fit`
-    together = fresh[: number_together(len(fresh), mesh, start)]
-    if missing and (begun := _interrupted(work, identities)) is not None and jax.process_count() == 1:
+    together = fresh[: number_together(len(fresh), mesh)]
+    begun = _interrupted(work, identities) if missing else None
+    if begun is not None and jax.process_count() > 1 and len(begun) % mesh.size:
+        raise DataError(
+            f"{work} holds an interrupted training of {len(begun)} networks together, which {mesh.size} devices of "
+            f"{jax.process_count()} processes cannot share equally; use a number that divides them, or delete {work}"
+        )
+    wait_for_all("seeds are looked at")
+    if begun is not None:
         together = begun
     elif missing and work.exists() and is_first():
         if has_save(work / "latest"):
             console.print(f"{work} holds an interrupted training of other networks, which is given up", markup=False)
         shutil.rmtree(work)
+    wait_for_all("seeds begin")
+    every = starts or [None] * len(tasks)
     if len(together) > 1:
-        of_these = [tasks[index] for index in together], [folders[index] for index in together]
-        _together(*of_these, data, statistics, work, shared_equally(mesh, len(together)), rate_option)
+        _together(
+            [tasks[index] for index in together],
+            [folders[index] for index in together],
+            [every[index] for index in together],
+            data,
+            statistics,
+            work,
+            shared_equally(mesh, len(together)),
+            rate_option,
+        )
     return [
         fit(task, data, statistics, folder, start, mesh, rate_option)
-        for task, folder in zip(tasks, folders, strict=True)
+        for task, folder, start in zip(tasks, folders, every, strict=True)
     ]
+
+
+def _identities(tasks: Sequence[SweepTask], statistics: DatasetStatistics, starts: Starts) -> list[dict[str, Any]]:
+    every = starts or [None] * len(tasks)
+    return [identity_of(task, statistics, start) for task, start in zip(tasks, every, strict=True)]
 
 
 def shared_equally(mesh: Mesh, networks: int) -> Mesh:
@@ -123,6 +145,7 @@ def shared_equally(mesh: Mesh, networks: int) -> Mesh:
 def _together(
     tasks: Sequence[SweepTask],
     folders: Sequence[Path],
+    starts: Starts,
     data: Path,
     statistics: DatasetStatistics,
     work: Path,
@@ -130,15 +153,18 @@ def _together(
     rate_option: str,
 ) -> None:
     members = [member_of(task) for task in tasks]
-    keep_json(work / "config.json", {"networks": [identity_of(task, statistics) for task in tasks]})
-    of = train_members(tasks[0], members, data, statistics, work, mesh, f"{len(tasks)} seeds")
-    for index, (task, folder) in enumerate(zip(tasks, folders, strict=True)):
-        if not of.members[index].diverged and finished(folder) is None:
-            export_member(task, of, index, statistics, folder)
+    if is_first():
+        keep_json(work / "config.json", {"networks": _identities(tasks, statistics, starts)})
+    of = train_members(tasks[0], members, data, statistics, work, mesh, f"{len(tasks)} seeds", starts=starts)
+    for index, (task, folder, start) in enumerate(zip(tasks, folders, starts, strict=True)):
+        if not of.members[index].diverged and not agreed(finished(folder) is not None):
+            export_member(task, of, index, statistics, folder, mesh, start)
     lost = [task.optimiser.seed for task, member in zip(tasks, of.members, strict=True) if member.diverged]
     if lost:
         raise Diverged(
             f"the {tasks[0].name} diverged from seed {', '.join(map(str, lost))}; to train again, choose another --out and lower "
             f"{rate_option} ({tasks[0].optimiser.learning_rate:g} in this run)"
         )
-    shutil.rmtree(work)
+    wait_for_all("seeds are written")
+    if is_first():
+        shutil.rmtree(work)

@@ -15,6 +15,7 @@ import numpy as np
 from jax.sharding import Mesh
 
 from data_pipeline.dataset.statistics import DatasetStatistics
+from data_pipeline.distributed import is_first, wait_for_all
 from data_pipeline.errors import DataError, Diverged, Unreadable, reason_of
 from data_pipeline.files import as_read, keep_json, read_json, write_text
 from data_pipeline.progress import console
@@ -210,7 +211,9 @@ def sweep(
     if (made := _finished(folder)) is not None:
         return made
     mesh = mesh or device_mesh()
-    keep_json(folder / "config.json", identity)
+    wait_for_all("a sweep begins")
+    if is_first():
+        keep_json(folder / "config.json", identity)
     title = f"Sweep of {len(members)}"
     of = train_members(task, members, data, statistics, folder, mesh, title, halving=config.halving)
     best = best_of(of.members)
@@ -224,9 +227,11 @@ def sweep(
             f"every member of the sweep in {folder} diverged, with learning rates from {low:.2g} to {high:.2g}, and no "
             f"network is kept; to sweep again, lower --sweep.learning-rate, and delete {folder} or choose another --out"
         )
-    export_member(task_of(task, best), of, index, statistics, folder / "network")
-    write_text(folder / "epochs.csv", csv_of_epochs(of))
-    keep_json(folder / "members.json", [asdict(member) for member in of.members])
+    export_member(task_of(task, best), of, index, statistics, folder / "network", mesh)
+    if is_first():
+        write_text(folder / "epochs.csv", csv_of_epochs(of))
+        keep_json(folder / "members.json", [asdict(member) for member in of.members])
+    wait_for_all("a sweep is written")
     return of.members
 
 

@@ -15,12 +15,12 @@ import jax.numpy as jnp
 import numpy as np
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
-from train.devices import DATA
+from train.devices import DATA, on_host, place, place_batch
 from train.finite import all_finite
 from train.many.members import Member, SweepTask, task_of
+from train.starting_weights import StartingWeights
 from train.step import (
     Hyperparameters,
-    Metrics,
     TrainState,
     abstract_state,
     evaluate_step_of,
@@ -29,6 +29,8 @@ from train.step import (
 )
 
 Way = Literal["at once", "in turn"]
+Starts = Sequence[StartingWeights | None]
+"""Initial weights of each member; random where None, or where there are none."""
 
 
 def way_for(mesh: Mesh) -> Way:
@@ -39,21 +41,34 @@ def way_for(mesh: Mesh) -> Way:
 class Trainer(Protocol):
     """The states of all members, and what changes them."""
 
+    @property
+    def places(self) -> np.ndarray:
+        """The members whose batches, where each has its own, this process gives: a batch has a leading axis of these."""
+
     def __init__(
-        self, task: SweepTask, members: Sequence[Member], mesh: Mesh, epoch_steps: int, own_batches: bool
+        self,
+        task: SweepTask,
+        members: Sequence[Member],
+        mesh: Mesh,
+        epoch_steps: int,
+        own_batches: bool,
+        starts: Starts = (),
     ) -> None: ...
+
+    def begin(self, training: np.ndarray) -> None:
+        """Begins an epoch of those members that are training, which changes `places`."""
 
     def train(self, training: np.ndarray, batch: dict[str, np.ndarray]) -> jax.Array:
         """One step of those members that are training; returns an array to wait for."""
 
     def sums(self) -> dict[str, np.ndarray]:
-        """Sums of the training metrics over this epoch, each (members,)."""
+        """Sums of the training metrics over this epoch, each (members,); those of members that are not training mean nothing."""
 
-    def evaluate(self, batch: dict[str, np.ndarray], weights: np.ndarray) -> Metrics:
-        """Weighted sums of the metrics of a validation batch, each (members,); batches are as in training."""
+    def evaluate(self, batch: dict[str, np.ndarray], weights: np.ndarray) -> dict[str, np.ndarray]:
+        """Weighted sums of the metrics of a validation batch, each (members,), likewise; batches are as in training."""
 
     def finite(self) -> np.ndarray:
-        """Whether all weights of each member are finite, (members,)."""
+        """Whether all weights of each member are finite, (members,), likewise."""
 
     def keep(self, better: np.ndarray) -> None:
         """Keeps the weights of those members that are better than before."""
@@ -69,15 +84,42 @@ def _hyper(task: SweepTask, members: Sequence[Member]) -> Hyperparameters:
     return jax.tree.map(lambda *numbers: np.stack(numbers), *(task_of(task, one).hyperparameters for one in members))
 
 
+def _initial_states(task: SweepTask, members: Sequence[Member], starts: Starts) -> list[TrainState]:
+    """Returns the states with which the members begin when trained alone.
+
+    They are not made by a compiled program, which would round some weights otherwise: after a few hundred steps that is enough to
+    make it another training.
+    """
+    each = starts or [None] * len(members)
+    return [initial_state(task, member.seed, start)[1] for member, start in zip(members, each, strict=True)]
+
+
+def _stacked(*leaves: jax.Array) -> jax.Array | np.ndarray:
+    is_key = jax.dtypes.issubdtype(leaves[0].dtype, jax.dtypes.prng_key)
+    return jnp.stack(leaves) if is_key else np.stack(leaves)
+
+
 class AtOnce:
-    """All members in one program, which the devices share."""
+    """All members in one program, which the devices share, also those of several processes.
+
+    Once half of the members have stopped, the others are moved together, so that no device computes for nothing.
+    """
 
     def __init__(
-        self, task: SweepTask, members: Sequence[Member], mesh: Mesh, epoch_steps: int, own_batches: bool
+        self,
+        task: SweepTask,
+        members: Sequence[Member],
+        mesh: Mesh,
+        epoch_steps: int,
+        own_batches: bool,
+        starts: Starts = (),
     ) -> None:
         structure, _ = abstract_state(task)
-        step, self._mesh = train_step_of(task, structure, epoch_steps), mesh
-        self._hyper = jax.device_put(_hyper(task, members), NamedSharding(mesh, PartitionSpec(DATA)))
+        step, self._mesh, self._own_batches = train_step_of(task, structure, epoch_steps), mesh, own_batches
+        self._slots = np.arange(len(members))  # the member in each place of the program
+        self._count = len(members)
+        self._whole_hyper = _hyper(task, members)
+        self._hyper = self._placed(self._whole_hyper, DATA)
 
         def step_if(training: jax.Array, state: TrainState, batch: Any, hyper: Hyperparameters):
             after, loss = step(state, batch, hyper)
@@ -89,8 +131,22 @@ class AtOnce:
         self._keep = self._over_members(
             lambda better, new, old: jax.tree.map(lambda a, b: jnp.where(better, a, b), new, old), "mmm"
         )
-        self._state = self._over_members(lambda seed: initial_state(task, seed)[1], "m")(self._hyper.seed)
+        self._state = self._placed(jax.tree.map(_stacked, *_initial_states(task, members, starts)), DATA)
         self._best = jax.tree.map(jnp.copy, (self._state.parameters, self._state.statistics))
+        self._all: tuple[Any, Any] | None = None  # of all members, where `_state` and `_best` are of some
+
+        spread = NamedSharding(mesh, PartitionSpec(DATA))
+        self._some_of = jax.jit(lambda tree, rows: jax.tree.map(lambda leaf: leaf[rows], tree), out_shardings=spread)
+        self._put_back = jax.jit(
+            lambda tree, rows, some: jax.tree.map(lambda leaf, own: leaf.at[rows].set(own), tree, some),
+            out_shardings=spread,
+            donate_argnums=0,
+        )
+
+    @property
+    def places(self) -> np.ndarray:
+        own = len(self._slots) // jax.process_count()
+        return self._slots[jax.process_index() * own :][:own]
 
     def _over_members(self, function: Callable, arguments: str, **options: Any) -> Any:
         """Returns `function` mapped over all members.
@@ -104,67 +160,117 @@ class AtOnce:
         shared = jax.shard_map(vmapped, mesh=self._mesh, in_specs=specs, out_specs=PartitionSpec(DATA), check_vma=False)
         return jax.jit(shared, **options)
 
+    def _placed(self, tree: Any, *axes: str) -> Any:
+        """Returns arrays that every process holds whole, on the devices."""
+        sharding = NamedSharding(self._mesh, PartitionSpec(*axes))
+        return place(tree, jax.tree.map(lambda _: sharding, tree))
+
+    def _placed_batch(self, batch: dict[str, np.ndarray]) -> Any:
+        return place_batch(self._mesh, batch) if self._own_batches else self._placed(batch)
+
+    def begin(self, training: np.ndarray) -> None:
+        """Moves the members together that are training, once they need at most half of the places."""
+        needed = -(-int(training.sum()) // self._mesh.size) * self._mesh.size
+        if 2 * needed > len(self._slots):
+            return
+        self._all, order = self.saved(), np.argsort(~training, kind="stable")  # those that are training first
+        self._slots = np.sort(order[:needed])
+        self._state, self._best = self._some_of(self._all, self._slots)
+        self._hyper = self._placed(jax.tree.map(lambda leaf: leaf[self._slots], self._whole_hyper), DATA)
+
+    def _of_all(self, found: jax.Array) -> np.ndarray:
+        """Returns values of the members in the program as values of all, (members,)."""
+        own = on_host(found)
+        values = np.zeros((self._count, *own.shape[1:]), own.dtype)
+        values[self._slots] = own
+        return values
+
     def train(self, training: np.ndarray, batch: dict[str, np.ndarray]) -> jax.Array:
-        self._state, loss = self._train(training, self._state, batch, self._hyper)
+        training = self._placed(training[self._slots], DATA)
+        self._state, loss = self._train(training, self._state, self._placed_batch(batch), self._hyper)
         return loss
 
     def program(self, training: np.ndarray, batch: dict[str, np.ndarray]) -> str:
         """The compiled step as text."""
-        return self._train.lower(training, self._state, batch, self._hyper).compile().as_text()
+        given = self._placed(training, DATA), self._state, self._placed_batch(batch), self._hyper
+        return self._train.lower(*given).compile().as_text()
 
     def sums(self) -> dict[str, np.ndarray]:
-        return {name: np.asarray(sums) for name, sums in self._state.sums.items()}
+        return {name: self._of_all(sums) for name, sums in self._state.sums.items()}
 
-    def evaluate(self, batch: dict[str, np.ndarray], weights: np.ndarray) -> Metrics:
-        return self._evaluate(self._state.parameters, self._state.statistics, batch, weights)
+    def evaluate(self, batch: dict[str, np.ndarray], weights: np.ndarray) -> dict[str, np.ndarray]:
+        given = self._placed_batch(batch), self._placed(weights)
+        found = self._evaluate(self._state.parameters, self._state.statistics, *given)
+        return {name: self._of_all(sums) for name, sums in found.items()}
 
     def finite(self) -> np.ndarray:
-        return np.asarray(self._finite((self._state.parameters, self._state.statistics)))
+        return self._of_all(self._finite((self._state.parameters, self._state.statistics)))
 
     def keep(self, better: np.ndarray) -> None:
+        better = self._placed(better[self._slots], DATA)
         self._best = self._keep(better, (self._state.parameters, self._state.statistics), self._best)
 
     def saved(self) -> tuple[Any, Any]:
-        return self._state, self._best
+        if self._all is None:
+            return self._state, self._best
+        self._all = self._put_back(self._all, self._slots, (self._state, self._best))
+        return self._all
 
     def resume(self, saved: tuple[Any, Any]) -> None:
-        self._state, self._best = saved
+        (self._state, self._best), self._all, self._slots = saved, None, np.arange(self._count)
+        self._hyper = self._placed(self._whole_hyper, DATA)
 
 
 class InTurn:
-    """One compiled step, called for one member after the other."""
+    """One compiled step, called for one member after the other; by one process."""
 
     def __init__(
-        self, task: SweepTask, members: Sequence[Member], mesh: Mesh, epoch_steps: int, own_batches: bool
+        self,
+        task: SweepTask,
+        members: Sequence[Member],
+        mesh: Mesh,
+        epoch_steps: int,
+        own_batches: bool,
+        starts: Starts = (),
     ) -> None:
         del mesh  # of one device
         structure, _ = abstract_state(task)
         self._train = jax.jit(train_step_of(task, structure, epoch_steps), donate_argnums=0)
         self._evaluate, self._is_finite = jax.jit(evaluate_step_of(task, structure)), jax.jit(all_finite)
-        start = jax.jit(lambda seed: initial_state(task, seed)[1])
         self._hyper = [task_of(task, member).hyperparameters for member in members]
-        self._states: list[TrainState] = [start(hyper.seed) for hyper in self._hyper]
+        self._states = _initial_states(task, members, starts)
         self._best = [jax.tree.map(jnp.copy, (state.parameters, state.statistics)) for state in self._states]
-        self._own_batches = own_batches
+        self._own_batches, self._places = own_batches, np.arange(len(members))
+
+    @property
+    def places(self) -> np.ndarray:
+        return self._places
+
+    def begin(self, training: np.ndarray) -> None:
+        self._places = np.flatnonzero(training)
 
     def train(self, training: np.ndarray, batch: dict[str, np.ndarray]) -> jax.Array:
         loss = jnp.zeros(())
-        for index in map(int, np.flatnonzero(training)):
-            self._states[index], loss = self._train(self._states[index], self._own(batch, index), self._hyper[index])
+        for row, index in enumerate(map(int, self.places)):
+            if training[index]:
+                given = self._own(batch, row), self._hyper[index]
+                self._states[index], loss = self._train(self._states[index], *given)
         return loss
 
-    def _own(self, batch: dict[str, np.ndarray], index: int) -> dict[str, np.ndarray]:
-        return {name: array[index] for name, array in batch.items()} if self._own_batches else batch
+    def _own(self, batch: dict[str, np.ndarray], row: int) -> dict[str, np.ndarray]:
+        return {name: array[row] for name, array in batch.items()} if self._own_batches else batch
 
     def sums(self) -> dict[str, np.ndarray]:
         return {name: np.array([float(one.sums[name]) for one in self._states]) for name in self._states[0].sums}
 
-    def evaluate(self, batch: dict[str, np.ndarray], weights: np.ndarray) -> Metrics:
-        found = [
-            self._evaluate(state.parameters, state.statistics, self._own(batch, index), weights)
-            for index, state in enumerate(self._states)
-        ]
-        return {name: jnp.stack([one[name] for one in found]) for name in found[0]}
+    def evaluate(self, batch: dict[str, np.ndarray], weights: np.ndarray) -> dict[str, np.ndarray]:
+        found: dict[str, np.ndarray] = {}
+        for row, index in enumerate(map(int, self.places)):
+            state = self._states[index]
+            own = self._evaluate(state.parameters, state.statistics, self._own(batch, row), weights)
+            for name, value in own.items():
+                found.setdefault(name, np.zeros(len(self._states), np.float32))[index] = float(value)
+        return found
 
     def finite(self) -> np.ndarray:
         return np.array([bool(self._is_finite((state.parameters, state.statistics))) for state in self._states])

@@ -11,7 +11,6 @@ import time
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
-import jax
 import numpy as np
 from jax.sharding import Mesh
 
@@ -20,12 +19,13 @@ from data_pipeline.dataset.statistics import DatasetStatistics
 from data_pipeline.errors import DataError
 from data_pipeline.progress import console, progress_bar
 from train.checkpoints import Checkpoints, drop_damaged
+from train.devices import on_host
 from train.loop import Lead, steps_of_an_epoch, weighted_means
 from train.many.members import Member, SweepTask, Together, task_of
-from train.many.trainers import TRAINERS, Way, way_for
+from train.many.trainers import TRAINERS, Starts, Way, way_for
 from train.optimiser import OptimiserConfig
 from train.preemption import Preempted, Preemption
-from train.validation import ValidationSet
+from train.validation import MOST_KEPT, ValidationSet, WeightedBatch
 
 
 def train_members(
@@ -39,6 +39,7 @@ def train_members(
     way: Way | None = None,
     *,
     halving: bool = False,
+    starts: Starts = (),
 ) -> Together:
     """Trains all members; an interrupted training resumes after its last complete epoch.
 
@@ -51,6 +52,7 @@ def train_members(
         mesh: devices to train on.
         title: for messages.
         way: how steps are computed; by the devices if None.
+        starts: initial weights of each member; random if there are none.
         halving: whether only the better half of the configurations goes on after 1/8, 1/4 and 1/2 of the epochs.
 
     Raises:
@@ -64,8 +66,8 @@ def train_members(
     optimiser, epoch_steps = task.optimiser, steps_of_an_epoch(task, statistics)
     of = Together(list(members), epoch_steps, histories=[[] for _ in members])
     own_batches = len({member.data_seed for member in members}) > 1
-    trainer = TRAINERS[way or way_for(mesh)](task, members, mesh, epoch_steps, own_batches)
-    validation = _validation(task, members, data, statistics, own_batches)
+    trainer = TRAINERS[way or way_for(mesh)](task, members, mesh, epoch_steps, own_batches, starts)
+    batches = _Batches(task, members, data, statistics, own_batches)
     lead = Lead()
     drop_damaged(folder, f"so {title} begins again")
     with Checkpoints(folder) as checkpoints, progress_bar("views") as bar, Preemption() as preemption:
@@ -76,7 +78,7 @@ def train_members(
                 **progress | {"members": [Member(**member) for member in progress["members"]]}, epoch_steps=epoch_steps
             )
             console.print(f"{title}: resuming after epoch {of.epoch}")
-        batches = _batches(task, members, data, of.epoch * epoch_steps, own_batches)
+        batches.first_step = of.epoch * epoch_steps
         views = optimiser.batch_size * (len(members) if own_batches else 1)
         total, done = epoch_steps * optimiser.epochs * views, of.epoch * epoch_steps * views
         line = bar.add_task(f"{title}: {task.name}", total=total, completed=done, note="")
@@ -85,11 +87,13 @@ def train_members(
             if not training.any():
                 break
             started = time.perf_counter()
+            trainer.begin(training)
             for _ in range(epoch_steps):
-                lead.limit(trainer.train(training, next(batches)))
+                lead.limit(trainer.train(training, batches.next(trainer.places)))
                 bar.advance(line, views)
             means = {name: sums / epoch_steps for name, sums in trainer.sums().items()}
-            checked = weighted_means([trainer.evaluate(*batch) for batch in validation])
+            with np.errstate(invalid="ignore"):  # of members that have stopped
+                checked = weighted_means([trainer.evaluate(*given) for given in batches.validation(trainer.places)])
             of.epoch += 1
             trainer.keep(of.after_epoch(training, means, checked, trainer.finite()))
             if halving and of.epoch in {max(1, optimiser.epochs // share) for share in (8, 4, 2)}:
@@ -99,39 +103,53 @@ def train_members(
             _print_epoch(title, of, optimiser)
             if preemption.after(of.epoch):
                 raise Preempted(f"{title} was asked to end after epoch {of.epoch}")
-    of.best = jax.device_get(trainer.saved()[1])
+    of.best = on_host(trainer.saved()[1])
     return of
 
 
-def _batches(
-    task: SweepTask, members: Sequence[Member], data: Path, first_step: int, own: bool
-) -> Iterator[dict[str, np.ndarray]]:
-    """Yields the batch that all members train on, or one for each member, with a leading axis of members."""
-    if not own:
-        shared = task_of(task, members[0])
-        yield from train_batches(data, shared.batches, first_step=first_step)
-    each = [train_batches(data, task_of(task, member).batches, first_step=first_step) for member in members]
-    while True:
-        drawn = [next(batches) for batches in each]
-        yield {name: np.stack([batch[name] for batch in drawn]) for name in drawn[0]}
+class _Batches:
+    """The batches of all members, or one for each with a leading axis of members where they have seeds of their own.
 
-
-def _validation(
-    task: SweepTask, members: Sequence[Member], data: Path, statistics: DatasetStatistics, own: bool
-) -> list[tuple[dict[str, np.ndarray], np.ndarray]]:
-    """Returns the validation batches; with a leading axis of members where their points are drawn from seeds of their own.
-
-    Every member is evaluated on the whole of a batch.
+    Attributes:
+        first_step: step of the first batch.
     """
-    drawn_by = members if own else members[:1]
-    sets = [ValidationSet(task_of(task, member), data, statistics, devices=1) for member in drawn_by]
-    if not own:
-        return list(sets[0])
-    batches = zip(*sets, strict=True)
-    return [
-        ({name: np.stack([one[name] for one, _ in of_all]) for name in of_all[0][0]}, of_all[0][1])
-        for of_all in batches
-    ]
+
+    def __init__(
+        self, task: SweepTask, members: Sequence[Member], data: Path, statistics: DatasetStatistics, own: bool
+    ) -> None:
+        self._tasks, self._data, self._statistics = [task_of(task, member) for member in members], data, statistics
+        self._own, self.first_step = own, 0
+        self._streams: dict[int, Iterator[dict[str, np.ndarray]]] = {}
+        self._sets: dict[int, ValidationSet] = {}
+
+    def next(self, places: np.ndarray) -> dict[str, np.ndarray]:
+        """The next batch of the members in these places."""
+        return self._joined([next(self._stream_of(place)) for place in self._drawn(places)])
+
+    def validation(self, places: np.ndarray) -> Iterator[WeightedBatch]:
+        """The validation views of the members in these places, which have points of their own; each member sees all of them."""
+        sets = [self._set_of(place) for place in self._drawn(places)]
+        for of_all in zip(*sets, strict=True):
+            yield self._joined([batch for batch, _ in of_all]), of_all[0][1]
+
+    def _drawn(self, places: np.ndarray) -> list[int]:
+        return [int(place) for place in places] if self._own else [0]
+
+    def _joined(self, drawn: list[dict[str, np.ndarray]]) -> dict[str, np.ndarray]:
+        return {name: np.stack([batch[name] for batch in drawn]) for name in drawn[0]} if self._own else drawn[0]
+
+    def _stream_of(self, place: int) -> Iterator[dict[str, np.ndarray]]:
+        if place not in self._streams:
+            batches = self._tasks[place].batches
+            self._streams[place] = train_batches(self._data, batches, first_step=self.first_step, whole=True)
+        return self._streams[place]
+
+    def _set_of(self, place: int) -> ValidationSet:
+        if place not in self._sets:
+            kept = MOST_KEPT // (len(self._tasks) if self._own else 1)
+            task = self._tasks[place]
+            self._sets[place] = ValidationSet(task, self._data, self._statistics, 1, kept, whole=True)
+        return self._sets[place]
 
 
 def _print_epoch(title: str, of: Together, optimiser: OptimiserConfig) -> None:

@@ -77,8 +77,9 @@ def measured_with(change: str | None, out: Path) -> Measured:
 
     def study(fusion, learners, validation, test, **rest):
         weights = {learner.name: (nnx.state(learner.network), learner.fusion) for learner in learners}
-        seen.given.append((fusion, weights, vars(validation)))
-        if rest["costs"]:  # on the lattice of the run
+        apart = [nnx.state(learner.network) for learner in rest["apart"]]
+        seen.given.append((fusion, weights, apart, vars(validation)))
+        if apart:  # on the lattice of the run
             return real_study(fusion, learners, validation, test, **rest)
         known, after = (float(data.features.labels.sum() + data.features.logits.sum()) for data in (validation, test))
         found = {"temperatures": [known] * 3, "after_views": [after] * 3}
@@ -120,7 +121,6 @@ def measured_with(change: str | None, out: Path) -> Measured:
         patch.setattr(studying, "walk_all", walk_all)
         patch.setattr(stopping, "walk_all", walk_all)
         patch.setattr(studying, "_refit", refit)
-        measuring.train_all(stages)
         seen.found = measuring.measure(stages)
         figures = figures_of(seen.found, VIEWS)
         seen.system = learned_system(stages, seen.found, figures, "")

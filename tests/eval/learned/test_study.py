@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from flax import nnx
 
-from eval.learned.stopping import Signal, compare_rules
+from eval.learned.stopping import Signal, compare_rules, walks_apart
 from eval.learned.study import fixed_order_scores, novel_classes, seeds_together, study
 from eval.learned.walks import Learner, OnLattice
 from eval.numbers.confidence import stops_at
@@ -51,7 +51,7 @@ def test_what_looking_was_worth_is_learned_and_the_study_says_so(adding):
         max_views=3,
         draws=2,
         oracle_views=3,
-        costs=True,
+        apart=[Learner("learned", "view policy", policy)] * 2,
     )
     after = {name: result["after_views"] for name, result in found["policies"].items()}
     alone = seeds_together([found], [each], "learned")  # which says nothing of other trainings
@@ -133,6 +133,49 @@ def test_rules_are_compared_where_they_are_as_accurate():
     assert (half.accuracy(0.5), weighed.accuracy(0.5)) == (0.5, 1)
 
 
+def test_a_threshold_is_not_the_first_that_reaches_an_accuracy_by_chance():
+    """One walk of each object: accuracy rises with the threshold but for one step that is above it by chance."""
+    steps, objects = 2, 40
+    value = np.tile(np.linspace(0.1, 0.9, objects)[:, None, None], (1, 1, steps))
+    value[..., 1] = 1.0
+    right = np.zeros(value.shape, bool)
+    right[:, :, 1] = True  # whoever looks twice is right
+    right[5, :, 0] = True
+    signal = Signal(value, right, np.ones(objects))
+    lucky = [threshold for threshold in np.unique(value[..., 0]) if signal.accuracy(threshold) >= 0.5]
+    found = signal.threshold_for(0.5)
+    assert found == pytest.approx(lucky[0], abs=0.03)
+    noisy = np.array([0.2, 0.9, 0.3, 0.4, 0.5, 0.95])
+
+    class Given(Signal):
+        def accuracy(self, threshold: float) -> float:
+            return float(noisy[min(int(threshold), 5)])
+
+    numbers = Given(np.arange(6.0).reshape(1, 1, 6), np.ones((1, 1, 6), bool), np.ones(1))
+    assert numbers.threshold_for(0.8) == pytest.approx(5)  # not 1, after which accuracy is lower again
+    assert numbers.threshold_for(2.0) is None
+
+
+def test_stopping_is_fitted_on_walks_of_policies_that_did_not_learn_from_the_object(adding):
+    """Two policies, of which one chooses at once what the other avoids."""
+    data, chosen = OnLattice(telling(21, 2)), []
+    for sign in (1.0, -1.0):
+        policy = some_policy()
+        nnx.update(policy, jax.tree.map(lambda leaf, sign=sign: sign * leaf, nnx.state(policy)))
+        chosen.append(Learner("learned", "", policy))
+    given = jax.random.key(0), adding, data, None, 3, 2, np.ones(3)
+    both = walks_apart(given[0], chosen, *given[1:])
+    each = [walks_apart(given[0], [one], *given[1:]) for one in chosen]
+    for name in ("confidence", "not_paying"):
+        signal = getattr(both, name)
+        for part in range(2):
+            alone = getattr(each[part], name)
+            np.testing.assert_allclose(signal.value[part::2], alone.value[part::2], atol=1e-5)
+            np.testing.assert_array_equal(signal.right[part::2], alone.right[part::2])
+        assert not np.allclose(signal.value[::2], getattr(each[1], name).value[::2])
+    assert both.confidence.value.shape == (21, 3, 3)
+
+
 def test_the_fixed_order_begins_with_the_views_that_tell_most(adding):
     scores = fixed_order_scores(adding, telling(200, 5), 3)
     assert sorted(np.argsort(-scores)[:3].tolist()) == [0, 2, 3]
@@ -150,7 +193,6 @@ def test_a_study_walks_all_policies_from_the_same_starts(adding):
         max_views=2,
         draws=1,
         oracle_views=2,
-        costs=False,
     )
     assert set(found["policies"]) >= {"random", "learned", "farthest", "fixed_order", "label_oracle"}
     after = {name: result["after_views"] for name, result in found["policies"].items()}

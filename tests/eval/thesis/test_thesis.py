@@ -6,7 +6,7 @@ import json
 import re
 import subprocess
 import sys
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 
 import jax.numpy as jnp
@@ -293,10 +293,11 @@ def has_all_tables_and_figures(report: Path) -> None:
 def test_the_stages_make_everything_and_go_on(results, tmp_path, monkeypatch, capfd):
     """With data sets as the command makes them, but networks that are not trained, and outputs that are made up."""
     settings = PRESETS["tiny"]
-    begun, rates, asked = {}, {}, []
+    begun, rates, asked, trained = {}, {}, [], []
 
     def fit(task, data, statistics, folder, start=None, rate_option=""):
         rates[folder.name] = rate_option
+        trained.append(task)
         assert data == tmp_path / f"views{statistics.views}" / "data"
         begun[folder.name] = start.name if start else "random weights"
         summary = {
@@ -322,7 +323,14 @@ def test_the_stages_make_everything_and_go_on(results, tmp_path, monkeypatch, ca
         random = np.random.default_rng(len(asked))
         return random.normal(size=(len(open_split(data, split)), load_statistics(data).views, last)).astype(np.float32)
 
-    monkeypatch.setattr(thesis_networks, "fit", fit)
+    def train_seeds(tasks, data, statistics, folders, work, starts=(), rate_option=""):
+        starts = starts or [None] * len(tasks)
+        return [
+            fit(task, data, statistics, folder, start, rate_option=rate_option)
+            for task, folder, start in zip(tasks, folders, starts, strict=True)
+        ]
+
+    monkeypatch.setattr(thesis_networks, "train_seeds", train_seeds)
     for module in (thesis_networks, thesis_run):
         monkeypatch.setattr(module, "load_best", lambda task, _: untrained(lambda: task.network(nnx.Rngs(0))))
     monkeypatch.setattr(thesis_run, "network_outputs", outputs)
@@ -342,10 +350,38 @@ def test_the_stages_make_everything_and_go_on(results, tmp_path, monkeypatch, ca
     assert (
         len(set(asked)) == len(asked) == 2 * 6 + 2 * 4
     )  # every network on both test splits, those walked with on both others
-    monkeypatch.setattr(thesis_run, "write_thesis_report", lambda inputs, lead, folder: folder / "index.html")
+    shown = []
+
+    def write(inputs, lead, folder, over=None):
+        shown.append((folder.relative_to(tmp_path), over))
+        return folder / "index.html"
+
+    monkeypatch.setattr(thesis_run, "write_thesis_report", write)
     assert thesis_run.reproduce(settings, "tiny", tmp_path) == page
     assert "Walking" not in capfd.readouterr().err
     assert len(asked) == 20
+    # A second training of all networks: the first stays as it is, and numbers are of both.
+    assert thesis_run.reproduce(replace(settings, seeds=2), "tiny", tmp_path) == page
+    assert len(asked) == 40
+    assert {task.optimiser.seed for task in trained} == {0, 1}
+    (second, nothing), (first, over) = shown[1:]
+    assert (str(second), str(first)) == ("seeds/1/report", "report")
+    assert nothing is None
+    markdown(over)
+    rows = json.loads((tmp_path / "seeds.json").read_text())["rows"]
+    assert len(rows) == len(over.rows) == 4 + 8 + 10
+    by_seed = [json.loads((tmp_path / out / "thesis.json").read_text()) for out in (".", "seeds/1")]
+    for row in rows:
+        assert row["over_both"][0] <= row["mean"] <= row["over_both"][1]
+        assert row["mean"] == pytest.approx(np.mean(row["each"]))
+    accuracy = [one["single_views"]["resnet18_depth_40"]["40"]["accuracy"] for one in by_seed]
+    (row,) = (
+        row for row in rows if row["name"] == "ResNet-18 (40 views/object, depth): accuracy of single views, 40 views"
+    )
+    assert row["each"] == pytest.approx(accuracy)
+    gain = [one["pipeline"]["40"]["gain"]["oracle"]["mean"] for one in by_seed]
+    assert gain[0] != gain[1]
+    assert [row["each"] for row in rows if row["table"] == "12"][-1] == pytest.approx(gain)
 
 
 def meshes_of(folder: Path, classes: tuple[str, ...]) -> Path:

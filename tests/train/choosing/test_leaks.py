@@ -11,7 +11,7 @@ import pytest
 from eval.settings import TINY
 from tests.reference.leaks import CHANGES, check_fitted, check_tested
 from tests.reference.made_up_study import STUDIED, Study
-from train.choosing.stages import VARIANTS
+from train.choosing.variants import VARIANTS
 
 FUSIONS = {
     "posed": {},
@@ -85,7 +85,7 @@ def test_view_policies_learn_from_other_objects(change, studies):
 def test_policies_that_are_trained_without_classes_see_no_object_of_these(studies):
     """Those classes are new to them when they are tested on them."""
     name, (parts, check) = studies[None][0].fitted_on[-1]
-    assert name == "view policy (learned)"
+    assert name == "view policy (learned) of seed 0"
     assert check is None
     for _, data in parts:
         assert set(np.asarray(data.labels).tolist()) == {1}

