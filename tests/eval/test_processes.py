@@ -15,6 +15,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from data_pipeline.dataset.builder import open_split
 from data_pipeline.distributed import from_all, own_share, unresolved_name
 from data_pipeline.files import files_in
 from mevs_jax import load
@@ -112,7 +113,13 @@ def test_two_processes_make_the_data_set_that_one_makes(tmp_path):
     assert "\nData set: " in "\n" + said
     assert files_in(both) == files_in(one)
     for name in files_in(one):
-        assert (both / name).read_bytes() == (one / name).read_bytes(), name
+        if "array_record" not in name:
+            assert (both / name).read_bytes() == (one / name).read_bytes(), name
+    for split in ("train", "val", "test"):  # compressed shards differ from one writing to the next
+        for mine, expected in zip(open_split(both, split), open_split(one, split), strict=True):
+            assert mine.keys() == expected.keys()
+            for key in expected:
+                np.testing.assert_array_equal(mine[key], expected[key], err_msg=key)
 
 
 @pytest.mark.slow
