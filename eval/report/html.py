@@ -154,7 +154,10 @@ def table(header: Sequence[str], rows: Sequence[Sequence[str]], label: str = "")
         label: what the table is about, for those who do not see it; the first headings by default.
     """
     head = "".join(f'<th scope="col">{html.escape(cell)}</th>' if cell else "<td></td>" for cell in header)
-    body = "".join(f"<tr>{_cells(row, len(header))}</tr>" for row in rows)
+    body = "".join(
+        ("</tbody><tbody>" if number and len(row) == 1 else "") + f"<tr>{_cells(row, len(header))}</tr>"
+        for number, row in enumerate(rows)
+    )
     shown = f"<table><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table>"
     label = label or "; ".join(cell for cell in header if cell)[:90]
     return scrolling(shown, f"Table: {label}", "table")

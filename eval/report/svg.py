@@ -50,6 +50,7 @@ def inline(content: str, alt: str) -> str:
     body = re.sub(r"<metadata>.*?</metadata>|<!--.*?-->", "", body, flags=re.DOTALL)
     body = re.sub(r"<text [^>]*>|<[a-z][^>]*>", _coloured, body)
     body = re.sub(r"font: ([^;\"]*?)([\d.]+px)[^;\"]*", _font, body)
+    body = re.sub(r"font-family: [^;\"]*;? ?", "", body)
     body = re.sub(r">\s+<", "><", body)
     return (
         f'<svg role="img" aria-label="{html.escape(alt)}" viewBox="{box}" style="--w:{width:.0f}px">'
