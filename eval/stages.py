@@ -415,9 +415,9 @@ def report(settings: Settings, preset: str, out: Path) -> Path:
     check_evaluated_with(settings, found, out)
     networks = {"classifier": out / "classifier", "entropy predictor": out / "entropy"}
     of_networks = [folder / name for folder in networks.values() for name in ("summary.json", "metrics.jsonl")]
-    data, tables = out / "data", out / "tables" / "test.npz"
+    data, tables = out / "data", [out / "tables" / f"{split}.npz" for split in ("test", "val")]
     over_seeds = out / "seeds.json"
-    made_of = (metrics, active, over_seeds, data / SUMMARY, tables, *of_networks)
+    made_of = (metrics, active, over_seeds, data / SUMMARY, *tables, *of_networks)
 
     def described() -> list[Any]:
         return [preset, plain(settings), *(path.is_file() and check_of_file(path) for path in made_of)]
@@ -429,6 +429,7 @@ def report(settings: Settings, preset: str, out: Path) -> Path:
         statistics=statistics,
         metrics=found,
         tables=_tables(settings, out, statistics, "test"),
+        validation=_tables(settings, out, statistics, "val"),
         data=data,
         histories={name: read_history(folder) for name, folder in networks.items()},
         summaries={name: summary_of(folder) for name, folder in networks.items()},

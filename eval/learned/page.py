@@ -13,6 +13,7 @@ from data_pipeline.files import write_text
 from eval.learned.study import BASELINES
 from eval.report import figures
 from eval.report.html import (
+    MARKS,
     ReportInputs,
     difference,
     document,
@@ -78,7 +79,7 @@ def _against(found: dict[str, Any], bases: tuple[str, ...] = BASELINES) -> str:
     for base in bases:
         if base not in found["policies"]:
             continue
-        rows.append([f'<b class="note">Difference from “{html.escape(found["policies"][base]["title"])}”</b>'])
+        rows.append([f"Difference from “{html.escape(found['policies'][base]['title'])}”"])
         for name, policy in found["policies"].items():
             if name not in found["against"][base] or policy["knows"] in ("nothing", "truth"):
                 continue
@@ -91,8 +92,8 @@ def _against(found: dict[str, Any], bases: tuple[str, ...] = BASELINES) -> str:
     header = [f"{step + 1} views{unit}" for unit in ("", ", nat/100") for step in steps]
     return table(["next view chosen by", *header], rows) + (
         "<p class='note'>Left: differences in accuracy, in percentage points. Right: differences in the log-probability of "
-        "the true class, in hundredths of a nat; they resolve smaller differences. With 95 % intervals over objects; grey if "
-        "the interval contains zero.</p>"
+        "the true class, in hundredths of a nat; they resolve smaller differences. With 95 % intervals over objects. "
+        f"{MARKS}</p>"
     )
 
 
@@ -222,8 +223,21 @@ def _lead(metrics: dict[str, Any], views: str) -> str:
     return (
         f'<p class="lead">Accuracy after two views is {percent(method[1])} % if the policy chooses the second and '
         f"{percent(random[1])} % if it is random: {_gain_of_two(gains)} points.{with_table} "
-        f"Accuracy from one view is {percent(random[0])} %, and {percent(single)} % from its logits without the fusion; from all "
-        f"{first['random_sets'][-1]['views']} views it is {percent(every)} % fused and {percent(summed)} % summed.{trainings}</p>"
+        f"Accuracy from one view is {percent(random[0])} %, and {percent(single)} % from its logits without the fusion; from "
+        f"all "
+        f"{first['random_sets'][-1]['views']} views it is {percent(every)} % fused and {percent(summed)} % "
+        f"summed.{trainings}</p>"
+        "<p>A <dfn>view</dfn> is one depth image of the object from one of the candidate directions. A <dfn>policy</dfn> "
+        "chooses the "
+        "next view from those seen so far. The <dfn>fusion</dfn> is a network that makes one belief about the class from all "
+        "views seen; "
+        "the thesis adds the logits of single views instead. The <dfn>view policy</dfn> is a network that predicts the gain of "
+        "every "
+        "candidate. <dfn>Calibration error</dfn> (ECE) is the mean distance between confidence and accuracy, over bins of "
+        "confidence. A "
+        "<dfn>nat</dfn> is the unit of natural logarithms of probabilities; <dfn>risk</dfn> is 1 − confidence. An "
+        "<dfn>oracle</dfn> knows "
+        "what a robot cannot know.</p>"
         f'<p class="note">Over {first["objects"]} test objects and every start view. All policies use the same fusion, '
         "objects and "
         f"start views. Everything is fitted or chosen on {first['validation_objects']} validation objects. The views of these "
@@ -347,7 +361,8 @@ def _seeds(metrics: dict[str, Any], views: str) -> str:
         + _ladder(metrics["together"][views])
         + _against(metrics["together"][views])
         + f"<p>Calibration error (%) of the view policy after 1 to {len(errors)} views, mean over the seeds: "
-        + f"{', '.join(map(percent, errors))}.</p><p>Each seed, with intervals over objects; rows of means have t intervals over "
+        + f"{', '.join(map(percent, errors))}.</p><p>Each seed, with intervals over objects; rows of means have t intervals "
+        f"over "
         + "objects and trainings:</p>"
         + table(["next view chosen by", "seed", "1 view", "2", "3", "4"], rows)
         + table(["view policy minus", "seed", "2 views", "3", "4"], gains)
@@ -360,6 +375,17 @@ def active_section(inputs: ReportInputs) -> str:
         return ""
     views, found = next(iter(inputs.learned["seeds"][0]["lattices"].items()))
     return "<h2>Learned fusion and view selection</h2>" + _lead(inputs.learned, views) + _ladder(found)
+
+
+def _alt_of_curves(curves: dict[str, Any]) -> str:
+    """Says what the curves of accuracy show."""
+    parts = [
+        f"{policy['title']} {percent(policy['after_views'][0])} % after one view, {percent(policy['after_views'][-1])} % after "
+        f"{len(policy['after_views'])}"
+        for name, policy in curves.items()
+        if name in ("random", "fixed_order", METHOD)
+    ]
+    return f"Curves of accuracy by number of views: {'; '.join(parts)}. The table has all numbers."
 
 
 def write_learned_page(metrics: dict[str, Any], statistics: DatasetStatistics, path: Path) -> None:
@@ -376,6 +402,7 @@ def write_learned_page(metrics: dict[str, Any], statistics: DatasetStatistics, p
             image(
                 figures.accuracy_of_choices(curves, titles, found["random_sets"][-1]["learned"]["accuracy"]),
                 "Accuracy by number of views, over all start views; bands: 95 % intervals over objects.",
+                _alt_of_curves(curves),
             )
         )
         parts.append(_against(found))
@@ -392,5 +419,13 @@ def write_learned_page(metrics: dict[str, Any], statistics: DatasetStatistics, p
                 + _seeds(metrics, views)
             )
     left_out = f"<p>{statistics.left_out_count} objects without a surface were left out.</p>"
+    left_out += (
+        "<h2>What to do next</h2><p><code>RUN</code> stands for the folder of this run; this page is "
+        "<code>learned/index.html</code> "
+        "in it.</p><ol><li><p>Recognise a mesh of your own with these networks, and look at the walk in a browser:</p>"
+        "<pre><code>mevs look --system RUN/learned/system --mesh FILE --view</code></pre></li>"
+        "<li><p>Train from other seeds, to know whether the results hold for other trainings:</p>"
+        "<pre><code>mevs study learned --out RUN --learned.seeds 3</code></pre></li></ol>"
+    )
     title = f"Learned view selection: {html.escape(statistics.source)}"
     write_text(path, document(title, "".join(parts) + left_out))

@@ -12,8 +12,9 @@ matplotlib.use("Agg")
 import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.figure import Figure
+from matplotlib.patches import Ellipse
 
-from eval.projections import longitude_latitude
+from eval.projections import equal_area
 
 COLOURS = {
     "random": "#6b7280",
@@ -33,16 +34,28 @@ KNOWS_COLOURS = {
     "rendering": "#7c3aed",
     "truth": "#d97706",
 }
+KNOWS_MARKS = {"nothing": "o", "networks": "s", "others": "^", "learned": "D", "rendering": "v", "truth": "P"}
+"""Markers by what a policy uses, so that figures can be read without colours."""
+INK = "#111827"
+_LINES = ("o-", "s--", "^-.", "v:", "D-", "P--", "X-.", "h:", "<-", ">--", "*-.")
+"""Markers and lines of policies, in order: they differ without colours."""
+_WIDTH = 4.8
+"""Inches of a figure that is read on a small screen without scrolling."""
 
 plt.rcParams.update(
     {
         "figure.dpi": 110,
-        "font.size": 9,
+        "font.size": 10,
+        "text.color": INK,
+        "axes.labelcolor": INK,
+        "axes.edgecolor": INK,
+        "xtick.color": INK,
+        "ytick.color": INK,
         "axes.spines.top": False,
         "axes.spines.right": False,
-        "axes.titlesize": 10,
+        "axes.titlesize": 11,
         "axes.titleweight": "bold",
-        "svg.fonttype": "path",
+        "svg.fonttype": "none",
         "svg.hashsalt": "mevs",
     }
 )
@@ -60,62 +73,64 @@ def accuracy_after_views(
     policies: dict[str, dict[str, Any]], titles: dict[str, str], all_views: float, own: Sequence[str] = ()
 ) -> Figure:
     """Accuracy after each number of views, over all start views, with 95 % bands over objects; `own` are drawn as well."""
-    figure, axis = plt.subplots(figsize=(7.2, 4.2), layout="constrained")
-    for name, colour in _colours(own).items():
+    figure, axis = plt.subplots(figsize=(_WIDTH, 4.6), layout="constrained")
+    for line, (name, colour) in zip(itertools.cycle(_LINES), _colours(own).items(), strict=False):
         values = 100 * np.array(policies[name]["after_views"])
         low, high = 100 * np.array(policies[name]["after_views_interval"]).T
         steps = np.arange(1, len(values) + 1)
-        axis.plot(steps, values, "o-", color=colour, label=titles[name], markersize=3.5)
+        axis.plot(steps, values, line, color=colour, label=titles[name], markersize=4)
         axis.fill_between(steps, low, high, color=colour, alpha=0.06, linewidth=0)
-    axis.axhline(100 * all_views, color="#111827", linestyle=":", linewidth=1, label="all views summed")
+    axis.axhline(100 * all_views, color=INK, linestyle=(0, (1, 2)), linewidth=1, label="all views summed")
     axis.set(xlabel="number of views", ylabel="test accuracy (%)", title="Accuracy by number of views")
-    axis.legend(frameon=False, fontsize=8, loc="lower right")
+    _legend_below(figure)
     return figure
+
+
+def _legend_below(figure: Figure) -> None:
+    """Puts the legend of all axes under the figure, in two columns where the labels are short."""
+    handles, labels = figure.axes[0].get_legend_handles_labels()
+    columns = 2 if max(map(len, labels)) < 29 else 1
+    figure.legend(handles, labels, frameon=False, fontsize=9, ncols=columns, loc="outside lower left", handlelength=3)
 
 
 def accuracy_of_choices(policies: dict[str, dict[str, Any]], titles: dict[str, str], all_views: float) -> Figure:
     """Accuracy after each number of views, coloured by what each policy knows, with 95 % bands over objects."""
-    figure, axis = plt.subplots(figsize=(7.2, 4.6), layout="constrained")
-    lines = {known: itertools.cycle(("o-", "s--", "^:", "v-.", "D-")) for known in KNOWS_COLOURS}
-    for name, policy in policies.items():
+    figure, axis = plt.subplots(figsize=(_WIDTH, 5.2), layout="constrained")
+    for line, (name, policy) in zip(itertools.cycle(_LINES), policies.items(), strict=False):
         values, (low, high) = 100 * np.array(policy["after_views"]), 100 * np.array(policy["interval"]).T
         steps, colour = np.arange(1, len(values) + 1), KNOWS_COLOURS[policy["knows"]]
-        axis.plot(steps, values, next(lines[policy["knows"]]), color=colour, label=titles[name], markersize=3.5)
+        axis.plot(steps, values, line, color=colour, label=titles[name], markersize=4)
         axis.fill_between(steps, low, high, color=colour, alpha=0.05, linewidth=0)
-    axis.axhline(100 * all_views, color="#111827", linestyle=":", linewidth=1, label="all views fused")
+    axis.axhline(100 * all_views, color=INK, linestyle=(0, (1, 2)), linewidth=1, label="all views fused")
     axis.set(xlabel="number of views", ylabel="test accuracy (%)", title="Accuracy by number of views")
     axis.set_xticks(range(1, 1 + max(len(policy["after_views"]) for policy in policies.values())))
-    axis.legend(frameon=False, fontsize=8, loc="lower right")
+    _legend_below(figure)
     return figure
 
 
 def ladder_gains(
-    against: dict[str, dict[str, Any]], ladder: Sequence[dict[str, str]], views: Sequence[int], exclude: Sequence[str]
+    against: dict[str, dict[str, Any]], ladder: Sequence[dict[str, str]], count: int, exclude: Sequence[str]
 ) -> Figure:
-    """Gain over random in percentage points with paired 95 % intervals, a panel for each number of views.
+    """Gain over random after `count` views in percentage points, with paired 95 % intervals.
 
-    Markers are hollow where the interval contains zero.
+    Markers are hollow where the interval contains zero; their form and colour tell what a policy uses.
     """
     rungs = [rung for rung in ladder if rung["policy"] in against and rung["policy"] not in exclude]
-    figure, axes = plt.subplots(
-        1, len(views), figsize=(8.4, 0.34 * len(rungs) + 1.1), sharey=True, layout="constrained", squeeze=False
-    )
-    for axis, count in zip(axes[0], views, strict=True):
-        for row, rung in enumerate(rungs):
-            result = against[rung["policy"]]
-            gain = 100 * result["after_views_difference"][count - 1]
-            low, high = (100 * end for end in result["after_views_interval"][count - 1])
-            colour = KNOWS_COLOURS[rung["knows"]]
-            axis.plot([low, high], [row, row], color=colour, linewidth=1.5)
-            axis.plot(
-                gain, row, "o", color=colour, markersize=5, markerfacecolor="white" if low <= 0 <= high else colour
-            )
-        axis.axvline(0, color="#111827", linewidth=1)
-        axis.set(xlabel="gain over random (percentage points)", title=f"After {count} views")
-        axis.grid(axis="x", color="#e5e7eb", linewidth=0.6)
-        axis.set_axisbelow(True)
-    axes[0][0].set_yticks(range(len(rungs)), [rung["title"].lstrip("— ") for rung in rungs])
-    axes[0][0].invert_yaxis()
+    figure, axis = plt.subplots(figsize=(_WIDTH, 0.3 * len(rungs) + 1.0), layout="constrained")
+    for row, rung in enumerate(rungs):
+        result = against[rung["policy"]]
+        gain = 100 * result["after_views_difference"][count - 1]
+        low, high = (100 * end for end in result["after_views_interval"][count - 1])
+        colour = KNOWS_COLOURS[rung["knows"]]
+        face = "white" if low <= 0 <= high else colour
+        axis.plot([low, high], [row, row], color=colour, linewidth=1.5)
+        axis.plot(gain, row, KNOWS_MARKS[rung["knows"]], color=colour, markersize=6, markerfacecolor=face)
+    axis.axvline(0, color=INK, linewidth=1)
+    axis.set(xlabel="gain over random (percentage points)", title=f"After {count} views")
+    axis.grid(axis="x", color="#e5e7eb", linewidth=0.6)
+    axis.set_axisbelow(True)
+    axis.set_yticks(range(len(rungs)), [rung["title"].lstrip("— ") for rung in rungs])
+    axis.invert_yaxis()
     return figure
 
 
@@ -125,54 +140,60 @@ def accuracy_by_distance(
     movement: dict[str, list[dict[str, Any]]],
     own: Sequence[str] = (),
 ) -> Figure:
-    """Accuracy against the distance that the camera travelled; the fainter lines have a movement cost."""
-    figure, axis = plt.subplots(figsize=(7.2, 4.2), layout="constrained")
-    for name, colour in _colours(own).items():
+    """Accuracy against the distance that the camera travelled; the thin lines have a movement cost."""
+    figure, axis = plt.subplots(figsize=(_WIDTH, 4.6), layout="constrained")
+    for line, (name, colour) in zip(itertools.cycle(_LINES), _colours(own).items(), strict=False):
         if name == "belief_oracle":
             continue
         distance, values = np.degrees(policies[name]["travelled"]), 100 * np.array(policies[name]["after_views"])
-        axis.plot(distance, values, "o-", color=colour, label=titles[name], markersize=3.5)
+        axis.plot(distance, values, line, color=colour, label=titles[name], markersize=4)
     for name, runs in movement.items():
         with_cost = [run for run in runs if run["cost"] > 0]
-        for alpha, run in zip(np.linspace(0.7, 0.3, len(with_cost)), with_cost, strict=True):
+        for run in with_cost:
             distance, values = np.degrees(run["travelled"]), 100 * np.array(run["after_views"])
-            axis.plot(distance, values, "-", color=COLOURS[name], alpha=alpha, linewidth=1)
-            axis.annotate(f"{run['cost']:g}", (distance[-1], values[-1]), fontsize=6, color=COLOURS[name], alpha=alpha)
+            axis.plot(distance, values, "-", color=COLOURS[name], linewidth=0.8)
+            if run in (with_cost[0], with_cost[-1]):
+                axis.annotate(f"{run['cost']:g}", (distance[-1], values[-1]), fontsize=8, color=COLOURS[name])
     axis.set(xlabel="distance travelled (°)", ylabel="test accuracy (%)", title="Accuracy by distance travelled")
-    axis.legend(frameon=False, fontsize=8, loc="lower right")
+    _legend_below(figure)
     return figure
 
 
 def calibration_by_views(readings: dict[str, dict[str, Any]], titles: dict[str, str]) -> Figure:
     """Expected calibration error after each number of views, a line for each way to compute the confidence."""
-    figure, axis = plt.subplots(figsize=(8.2, 3.0), layout="constrained")
-    for name, colour in zip(readings, ("#d97706", "#0d9488", "#9333ea", "#dc2626", "#6b7280"), strict=True):
+    figure, axis = plt.subplots(figsize=(_WIDTH, 3.8), layout="constrained")
+    colours = ("#d97706", "#0d9488", "#9333ea", "#dc2626", "#6b7280")
+    for name, colour, line in zip(readings, colours, _LINES[: len(colours)], strict=True):
         values = 100 * np.array(readings[name]["ece"])
-        axis.plot(np.arange(1, len(values) + 1), values, "o-", color=colour, label=titles[name], markersize=3.5)
+        axis.plot(np.arange(1, len(values) + 1), values, line, color=colour, label=titles[name], markersize=4)
     axis.set(xlabel="number of views", ylabel="expected calibration error (%)", title="Calibration error", ylim=0)
-    figure.legend(frameon=False, fontsize=8, loc="outside right center")
+    _legend_below(figure)
     return figure
 
 
 def reliability_curves(readings: dict[str, dict[str, Any]], titles: dict[str, str], views: Sequence[int]) -> Figure:
     """Accuracy against confidence in bins, a panel for each number of views; larger dots hold more of the predictions."""
     names = [name for name in readings if "reliability" in readings[name]]
+    rows = -(-len(views) // 2)
     figure, axes = plt.subplots(
-        1, len(views), figsize=(2.5 * len(views), 2.9), sharey=True, layout="constrained", squeeze=False
+        rows, min(2, len(views)), figsize=(_WIDTH, 2.5 * rows + 0.5), sharey=True, layout="constrained", squeeze=False
     )
-    for axis, count in zip(axes[0], views, strict=True):
+    for axis in axes.flat[len(views) :]:
+        axis.axis("off")
+    for axis, count in zip(axes.flat, views, strict=False):
         axis.plot([0, 100], [0, 100], color="#9ca3af", linewidth=1, linestyle=":")
-        for name, colour in zip(names, ("#d97706", "#dc2626"), strict=True):
+        for name, colour, line, marker in zip(names, ("#d97706", "#dc2626"), "-:", "os", strict=True):
             confidence, accuracy, share = np.array(readings[name]["reliability"])[:, count - 1]
             there = share > 0
-            axis.plot(100 * confidence[there], 100 * accuracy[there], "-", color=colour, linewidth=1)
-            axis.scatter(
-                100 * confidence[there], 100 * accuracy[there], 4 + 120 * share[there], color=colour, label=titles[name]
-            )
-        axis.set(xlabel="confidence (%)", title=f"{count} view{'s' if count > 1 else ''}", xlim=(0, 102), ylim=(0, 102))
-    axes[0][0].set_ylabel("accuracy (%)")
+            x, y, size = 100 * confidence[there], 100 * accuracy[there], 4 + 120 * share[there]
+            axis.plot(x, y, line, color=colour, linewidth=1)
+            face = colour if marker == "o" else "none"
+            axis.scatter(x, y, size, marker=marker, facecolors=face, edgecolors=colour, label=titles[name])
+        axis.set(xlabel="confidence (%)", title=f"{count} view{'s' if count > 1 else ''}", xlim=(0, 108), ylim=(0, 108))
+    for row in axes:
+        row[0].set_ylabel("accuracy (%)")
     handles, labels = axes[0][0].get_legend_handles_labels()
-    figure.legend(handles, labels, frameon=False, fontsize=8, ncols=2, loc="outside lower center", markerscale=0.5)
+    figure.legend(handles, labels, frameon=False, fontsize=9, ncols=2, loc="outside lower center", markerscale=0.5)
     return figure
 
 
@@ -183,20 +204,22 @@ def difference_grid(
     max_views: Sequence[int],
     title: str,
 ) -> Figure:
-    """The thesis's Table 7 as a figure: gain over random in points by MV and CT, bold where the interval excludes 0."""
+    """The thesis's Table 7 as a figure: gain over random in points by MV and CT, marked ▲ or ▼ where the interval excludes 0."""
     values = 100 * np.array(difference)
     largest = max(0.5, np.abs(values).max())
-    figure, axis = plt.subplots(figsize=(5.4, 3.6), layout="constrained")
+    figure, axis = plt.subplots(figsize=(_WIDTH, 3.4), layout="constrained")
     axis.imshow(values, cmap="RdBu", vmin=-largest, vmax=largest, aspect="auto")
     for (row, column), value in np.ndenumerate(values):
+        low, high = intervals[row][column]
+        mark = "▲" if low > 0 else "▼" if high < 0 else ""
         axis.text(
             column,
             row,
-            f"{value:+.1f}".replace("-", "−") if abs(value) >= 0.05 else "0.0",
+            mark + (f"{value:+.1f}".replace("-", "−") if abs(value) >= 0.05 else "0.0"),
             ha="center",
             va="center",
-            fontsize=8,
-            fontweight="normal" if intervals[row][column][0] <= 0 <= intervals[row][column][1] else "bold",
+            fontsize=9,
+            fontweight="bold" if mark else "normal",
             color="white" if abs(value) > 0.65 * largest else "black",
         )
     axis.set_xticks(range(len(thresholds)), [f"{ct:g}" for ct in thresholds])
@@ -209,7 +232,7 @@ def difference_grid(
 def confusions(matrices: dict[str, np.ndarray], classes: Sequence[str]) -> Figure:
     """Confusion matrices in percent of the true class, a panel for each policy."""
     figure, axes = plt.subplots(
-        1, len(matrices), figsize=(4.6 * len(matrices), 4.4), layout="constrained", sharey=True, squeeze=False
+        1, len(matrices), figsize=(_WIDTH * len(matrices), 4.6), layout="constrained", sharey=True, squeeze=False
     )
     for axis, (title, matrix) in zip(axes[0], matrices.items(), strict=True):
         share = 100 * matrix / np.maximum(matrix.sum(axis=1, keepdims=True), 1e-9)
@@ -222,7 +245,7 @@ def confusions(matrices: dict[str, np.ndarray], classes: Sequence[str]) -> Figur
                     f"{value:.0f}",
                     ha="center",
                     va="center",
-                    fontsize=7,
+                    fontsize=8,
                     color="white" if value > 60 else "black",
                 )
         axis.set_xticks(range(len(classes)), classes, rotation=60, ha="right")
@@ -258,9 +281,11 @@ def entropy_errors(entropy: dict[str, Any]) -> Figure:
             entropy[name],
             color=colour,
             xerr=[[max(0, entropy[name] - low)], [max(0, high - entropy[name])]],
+            ecolor=INK,
             capsize=3,
         )
-        axis.text(high, position, f"  {entropy[name]:.4f}", va="center")
+        at, beside = (high, position), (5, 0)
+        axis.annotate(f"{entropy[name]:.4f}", at, beside, textcoords="offset points", va="center")
     axis.set_yticks(range(len(rows)), [label for label, _, _ in rows])
     axis.set(xlabel="mean squared error on test objects", title="Predicting depth entropy")
     axis.margins(x=0.2)
@@ -276,63 +301,53 @@ def view_map(
     title: str,
     limits: tuple[float, float],
 ) -> Figure:
-    """Viewpoints by longitude and latitude, coloured by entropy, with rings around local maxima (thesis Figs. 7 and 11)."""
-    longitude, latitude = longitude_latitude(points)
-    figure, axis = plt.subplots(figsize=(4.8, 2.8), layout="constrained")
+    """Viewpoints on an equal-area map: the lighter and larger, the higher the entropy; rings around local maxima.
+
+    As in Figs. 7 and 11 of the thesis, whose Mercator maps enlarge what is near the poles.
+    """
+    x, y = equal_area(points)
+    figure, axis = plt.subplots(figsize=(_WIDTH, 2.7), layout="constrained")
+    axis.add_patch(Ellipse((0, 0), 4 * np.sqrt(2), 2 * np.sqrt(2), facecolor="none", edgecolor=INK, linewidth=0.8))
+    for degrees in (-60, -30, 0, 30, 60):
+        around, up = np.radians(np.linspace(-179.9, 179.9, 49)), np.radians(degrees)
+        circle = [np.cos(up) * np.cos(around), np.cos(up) * np.sin(around), np.full_like(around, np.sin(up))]
+        line = equal_area(np.stack(circle, axis=-1))
+        axis.plot(*line, color="#d1d5db", linewidth=0.6, linestyle=":", zorder=0)
+        axis.annotate(
+            f"{degrees}°".replace("-", "−"),
+            (line[0][0], line[1][0]),
+            (-3, 0),
+            ha="right",
+            va="center",
+            textcoords="offset points",
+            fontsize=8,
+        )
     for i, j in np.argwhere(np.triu(neighbours)):
-        if abs(longitude[i] - longitude[j]) < 180:
-            axis.plot(longitude[[i, j]], latitude[[i, j]], color="#d1d5db", linewidth=0.7, zorder=1)
-    dots = axis.scatter(longitude, latitude, c=weights, s=70, cmap="viridis", vmin=limits[0], vmax=limits[1], zorder=2)
-    axis.scatter(
-        longitude[maxima], latitude[maxima], s=150, facecolors="none", edgecolors="#dc2626", linewidths=1.5, zorder=3
-    )
-    figure.colorbar(dots, ax=axis, label="normalised entropy")
-    axis.set(xlabel="longitude (°)", ylabel="latitude (°)", title=title)
+        if abs(x[i] - x[j]) < 2:  # else the edge crosses the border of the map
+            axis.plot(x[[i, j]], y[[i, j]], color="#d1d5db", linewidth=0.7, zorder=1)
+    share = np.clip((weights - limits[0]) / max(limits[1] - limits[0], 1e-9), 0, 1)
+    colours = {"c": weights, "cmap": "viridis", "vmin": limits[0], "vmax": limits[1], "edgecolors": INK}
+    dots = axis.scatter(x, y, s=15 + 75 * share, linewidths=0.6, zorder=2, **colours)
+    axis.scatter(x[maxima], y[maxima], s=170, facecolors="none", edgecolors="#dc2626", linewidths=1.5, zorder=3)
+    figure.colorbar(dots, ax=axis, label="normalised entropy", shrink=0.8)
+    axis.set_title(title)
+    axis.set_aspect("equal")
+    axis.axis("off")
     return figure
 
 
-def contact_sheet(images: np.ndarray, labels: Sequence[str]) -> Figure:
-    """Images (rows, columns, height, width) uint8 as one sheet, with a label for each row."""
-    rows, columns, height, width = images.shape
-    sheet = images.transpose(0, 2, 1, 3).reshape(rows * height, columns * width)
-    figure, axis = plt.subplots(figsize=(8, 8 * rows / columns), layout="constrained")
-    axis.imshow(sheet, cmap="gray", vmin=0, vmax=255)
-    axis.set_yticks(height * (np.arange(rows) + 0.5), labels)
-    axis.set_xticks([])
-    axis.tick_params(length=0)
-    axis.spines[:].set_visible(False)
-    return figure
-
-
-def episode_strip(images: Sequence[np.ndarray], captions: Sequence[str], title: str) -> Figure:
-    """The views of one walk in order, with a caption under each."""
-    figure, axes = plt.subplots(1, len(images), figsize=(1.7 * len(images), 2.3), layout="constrained", squeeze=False)
-    for axis, image, caption in zip(axes[0], images, captions, strict=True):
-        axis.imshow(image, cmap="gray", vmin=0, vmax=255)
-        axis.set_xlabel(caption, fontsize=8)
-        axis.set(xticks=[], yticks=[])
-        axis.spines[:].set_visible(False)
-    figure.suptitle(title, fontsize=10, fontweight="bold")
-    return figure
-
-
-def losses(histories: dict[str, list[dict[str, float]]]) -> Figure:
-    """Training and validation loss by epoch, a panel for each network."""
-    figure, axes = plt.subplots(
-        1, len(histories), figsize=(4.4 * len(histories), 2.8), layout="constrained", squeeze=False
-    )
-    for axis, (name, history) in zip(axes[0], histories.items(), strict=True):
-        epochs = [entry["epoch"] for entry in history]
-        axis.plot(
-            epochs, [entry["train/loss"] for entry in history], "o-", color="#9ca3af", markersize=3, label="training"
-        )
-        axis.plot(
-            epochs, [entry["val/loss"] for entry in history], "o-", color="#2563eb", markersize=3, label="validation"
-        )
-        axis.set(xlabel="epoch", ylabel="loss", title=name)
-        if len(epochs) > 1 and max(entry["train/loss"] for entry in history) > 5 * min(
-            entry["val/loss"] for entry in history
-        ):
-            axis.set_yscale("log")
-        axis.legend(frameon=False)
+def losses(name: str, history: list[dict[str, float]]) -> Figure:
+    """Training and validation loss of a network by epoch."""
+    figure, axis = plt.subplots(figsize=(_WIDTH, 2.8), layout="constrained")
+    epochs, found = [entry["epoch"] for entry in history], {}
+    for part, line, colour, title in (
+        ("train", "s--", "#6b7280", "training"),
+        ("val", "o-", "#2563eb", "validation"),
+    ):
+        found[part] = [entry[f"{part}/loss"] for entry in history]
+        axis.plot(epochs, found[part], line, color=colour, markersize=4, label=title)
+    axis.set(xlabel="epoch", ylabel="loss", title=name)
+    if len(epochs) > 1 and max(found["train"]) > 5 * min(found["val"]):
+        axis.set_yscale("log")
+    axis.legend(frameon=False)
     return figure

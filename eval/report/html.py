@@ -5,6 +5,7 @@ from __future__ import annotations
 import base64
 import html
 import io
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import groupby
@@ -12,26 +13,22 @@ from pathlib import Path
 from typing import Any
 
 import matplotlib.pyplot as plt
+import numpy as np
 from matplotlib.figure import Figure
 
 from data_pipeline.dataset.statistics import DatasetStatistics
+from eval.report.svg import inline
 from eval.tables import ViewTables
 from eval.walks.ladder import KNOWS, Knows
 
-STYLE = """
-body{font:15px/1.55 system-ui,sans-serif;color:#111827;max-width:60rem;margin:2rem auto;padding:0 1rem}
-h1{font-size:1.7rem;margin-bottom:.2rem}h2{margin-top:2.4rem;
-border-bottom:1px solid #e5e7eb;padding-bottom:.2rem}
-table{border-collapse:collapse;margin:1rem 0;font-variant-numeric:tabular-nums}th,td{padding:.25rem .6rem;text-align:right}
-th{border-bottom:2px solid #d1d5db;font-weight:600}td{border-bottom:1px solid #f3f4f6}
-th:first-child,td:first-child{text-align:left}td[colspan]{padding-top:.9rem}
-.lead{font-size:1.1rem}.note{color:#6b7280;font-size:.9rem}.faint{color:#9ca3af}
-.warning{border-left:4px solid #d97706;background:#fffbeb;padding:.6rem .9rem}
-.figures{display:flex;flex-wrap:wrap;gap:1rem}.figures figure{flex:1 1 45%;margin:0}small{white-space:nowrap}
-figure{margin:1rem 0}figcaption{color:#6b7280;font-size:.85rem}img{max-width:100%;height:auto}
-code{background:#f3f4f6;padding:.1rem .3rem}
-details{margin:1rem 0}summary{cursor:pointer}.wide{overflow-x:auto}.wide td,.wide th{white-space:nowrap}
-"""
+STYLE = Path(__file__).with_name("page.css").read_text()
+SCRIPT = Path(__file__).with_name("page.js").read_text()
+MARKS = (
+    "<b class='up'>▲ bold</b>: above zero, the whole interval is; <b class='down'>▼ bold</b>: below zero, the whole interval "
+    "is; "
+    "without a mark: the interval contains zero."
+)
+"""Explains the marks of `difference`, which do not need colour."""
 
 
 @dataclass(frozen=True)
@@ -50,6 +47,8 @@ class ReportInputs:
     """metrics of `mevs study learned`, if it was run"""
     seeds: dict[str, Any] | None = None
     """metrics over several trainings, if there are any"""
+    validation: ViewTables | None = None
+    """tables of the validation objects, whose statistics policies know; without them, no single walks are shown"""
 
 
 def drawn(figure: Figure, kind: str) -> bytes:
@@ -59,28 +58,83 @@ def drawn(figure: Figure, kind: str) -> bytes:
     return buffer.getvalue()
 
 
-def embedded(content: bytes, kind: str, caption: str, name: str = "") -> str:
-    """HTML of an embedded image; a name such as "Figure 5" starts the caption and becomes a link target."""
-    mime = "svg+xml" if kind == "svg" else kind
+def embedded(content: bytes, kind: str, caption: str, name: str = "", alt: str = "") -> str:
+    """HTML of an embedded image; a name such as "Figure 5" starts the caption and becomes a link target.
+
+    Args:
+        content: of the file.
+        kind: `svg`, which becomes part of the page, or `png`.
+        caption: below the image.
+        name: of the figure.
+        alt: says what is seen, for those who do not see it; the caption by default.
+    """
     anchor = f' id="{name.lower().replace(" ", "-")}"' if name else ""
     label = f"<b>{html.escape(name)}.</b> " if name else ""
+    if kind == "svg":
+        shown = scrolling(inline(content.decode(), alt or caption), f"Figure: {name or caption}", "figure")
+    else:
+        shown = f'<img alt="{html.escape(alt or caption)}" src="{data_url(content, kind)}">'
+    return f"<figure{anchor}>{shown}<figcaption>{label}{html.escape(caption)}</figcaption></figure>"
+
+
+def data_url(content: bytes, kind: str = "png") -> str:
+    """A file as an address that holds it."""
+    return f"data:image/{kind};base64,{base64.b64encode(content).decode()}"
+
+
+def image(figure: Figure, caption: str, alt: str, kind: str = "svg") -> str:
+    """HTML of a figure, which is closed.
+
+    Args:
+        figure: to be drawn.
+        caption: how it is read, below it.
+        alt: says what is seen in it, for those who do not see it.
+        kind: `svg` or `png`.
+    """
+    content = drawn(figure, kind)
+    plt.close(figure)
+    return embedded(content, kind, caption, alt=alt)
+
+
+def picture(pixels: np.ndarray) -> bytes:
+    """A grey image (height, width) uint8 as the content of a PNG file."""
+    from PIL import Image
+
+    buffer = io.BytesIO()
+    Image.fromarray(pixels).save(buffer, "png", optimize=True)
+    return buffer.getvalue()
+
+
+def scrolling(content: str, label: str, what: str) -> str:
+    """HTML that scrolls sideways where it is wider than the page, and says so there."""
     return (
-        f'<figure{anchor}><img alt="{html.escape(caption)}" src="data:image/{mime};base64,{base64.b64encode(content).decode()}">'
-        f"<figcaption>{label}{html.escape(caption)}</figcaption></figure>"
+        f'<div class="scroll" tabindex="0" role="group" aria-label="{html.escape(label)}">'
+        f'<p class="hint" aria-hidden="true">↔ This {what} scrolls sideways.</p>{content}</div>'
     )
 
 
-def image(figure: Figure, caption: str, kind: str = "svg") -> str:
-    content = drawn(figure, kind)
-    plt.close(figure)
-    return embedded(content, kind, caption)
-
-
 def document(title: str, body: str) -> str:
-    """A complete HTML page that needs no other file."""
+    """A complete HTML page that needs no other file, with links to its sections.
+
+    Args:
+        title: HTML, without tags.
+        body: HTML, whose sections begin with `<h2>`.
+    """
+    links: list[str] = []
+
+    def anchored(found: re.Match[str]) -> str:
+        name = re.sub(r"[^a-z0-9]+", "-", html.unescape(found.group(1)).lower()).strip("-")
+        links.append(f'<li><a href="#{name}">{found.group(1)}</a></li>')
+        return f'<h2 id="{name}">{found.group(1)}</h2>'
+
+    content = re.sub(r"<h2>(.*?)</h2>", anchored, body)
+    contents = f'<nav aria-label="Contents"><ul>{"".join(links)}</ul></nav>' if len(links) > 2 else ""
     return (
-        f'<!doctype html><html lang="en"><meta charset="utf-8"><meta name="viewport" content="width=device-width">'
-        f"<title>{title}</title><style>{STYLE}</style><h1>{title}</h1>{body}</html>\n"
+        '<!doctype html><html lang="en"><head><meta charset="utf-8">'
+        '<meta name="viewport" content="width=device-width, initial-scale=1">'
+        f"<title>{title}</title><style>{STYLE}</style></head><body>"
+        f'<a class="skip" href="#content">To the content</a><header><h1>{title}</h1>{contents}</header>'
+        f'<main id="content">{content}</main><script>{SCRIPT}</script></body></html>\n'
     )
 
 
@@ -91,23 +145,35 @@ def warning(sentence: str | None) -> str:
     return f'<p class="warning" role="alert"><b>Warning:</b> {html.escape(sentence)}.</p>'
 
 
-def table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    """An HTML table. Cells are HTML, headings are plain text; a row of one cell spans the table."""
-    head = "".join(f"<th>{html.escape(cell)}</th>" for cell in header)
+def table(header: Sequence[str], rows: Sequence[Sequence[str]], label: str = "") -> str:
+    """An HTML table, which scrolls sideways in a narrow window.
+
+    Args:
+        header: headings in plain text.
+        rows: cells in HTML; the first of a row names it, and a row of one cell spans the table.
+        label: what the table is about, for those who do not see it; the first headings by default.
+    """
+    head = "".join(f'<th scope="col">{html.escape(cell)}</th>' if cell else "<td></td>" for cell in header)
     body = "".join(
-        "<tr>"
-        + "".join(f"<td colspan={len(header)}>{cell}</td>" if len(row) == 1 else f"<td>{cell}</td>" for cell in row)
-        + "</tr>"
-        for row in rows
+        ("</tbody><tbody>" if number and len(row) == 1 else "") + f"<tr>{_cells(row, len(header))}</tr>"
+        for number, row in enumerate(rows)
     )
-    return f"<table><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table>"
+    shown = f"<table><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table>"
+    label = label or "; ".join(cell for cell in header if cell)[:90]
+    return scrolling(shown, f"Table: {label}", "table")
+
+
+def _cells(row: Sequence[str], columns: int) -> str:
+    if len(row) == 1:
+        return f'<th scope="rowgroup" colspan="{columns}">{row[0]}</th>'
+    return f'<th scope="row">{row[0]}</th>' + "".join(f"<td>{cell}</td>" for cell in row[1:])
 
 
 def rows_by_knowledge(rows: Sequence[tuple[Knows, Sequence[str]]]) -> list[Sequence[str]]:
     """Table rows, with a heading row before each change in what the policies know."""
     out: list[Sequence[str]] = []
     for knows, group in groupby(rows, key=lambda row: row[0]):
-        out.append([f'<b class="note">Uses {html.escape(KNOWS[knows])}</b>'])
+        out.append([f"Uses {html.escape(KNOWS[knows])}"])
         out.extend(row for _, row in group)
     return out
 
@@ -126,8 +192,15 @@ def span(interval: Sequence[float]) -> str:
     return f"{100 * interval[0]:.1f}–{100 * interval[1]:.1f}"
 
 
+def mark(interval: Sequence[float]) -> str:
+    """▲ for an interval above zero, ▼ for one below zero, and nothing for one that contains zero."""
+    return "▲" if interval[0] > 0 else "▼" if interval[1] < 0 else ""
+
+
 def difference(value: float, interval: Sequence[float], digits: int = 1) -> str:
-    """A difference of shares in percentage points with its interval, grey if the interval contains zero."""
+    """A difference of shares in percentage points with its interval, marked as `MARKS` explains."""
     low, high = (signed(end, digits) for end in interval)
-    text = f"{signed(value, digits)} <small>[{low}, {high}]</small>"
-    return f'<span class="faint">{text}</span>' if interval[0] <= 0 <= interval[1] else text
+    text, found = signed(value, digits), mark(interval)
+    if found:
+        text = f'<b class="{"up" if found == "▲" else "down"}">{found} {text}</b>'
+    return f"{text} <small>[{low}, {high}]</small>"

@@ -19,17 +19,12 @@ from data_pipeline.files import damage_in, short_hash, write_text
 from data_pipeline.progress import console
 from eval.learned.page import active_section
 from eval.report import figures
-from eval.report.html import ReportInputs, document, image, percent, table, warning
-from eval.report.policies import (
-    ascent_section,
-    compatibility_section,
-    confidence_section,
-    draws,
-    grid_section,
-    ladder_section,
-    lead,
-    movement_section,
-)
+from eval.report.confidence import confidence_section
+from eval.report.grid import compatibility_section, grid_section
+from eval.report.html import SCRIPT, STYLE, ReportInputs, data_url, document, image, percent, picture, table, warning
+from eval.report.next_steps import next_section
+from eval.report.policies import ascent_section, draws, ladder_section, lead, movement_section
+from eval.report.scenes import VIEWER, scenes_section
 from eval.report.seeds import seeds_section
 from mevs_jax.viewpoints import local_maxima
 from train.chance import Chance
@@ -52,12 +47,6 @@ def _data_section(inputs: ReportInputs) -> str:
         pairs = statistics.neighbours
         near = "" if pairs is None else f", {len(pairs)} pairs of neighbours"
         lattice = f"directions from a file{near}, content {html.escape(camera.lattice.removeprefix(FILE))}"
-    source = open_split(inputs.data, "test")
-    chosen: dict[int, int] = {}
-    for index, label in enumerate(inputs.tables.labels):
-        chosen.setdefault(int(label), index)
-    views = np.linspace(0, statistics.views - 1, min(10, statistics.views)).round().astype(int)
-    sheet = np.stack([source[chosen[label]]["image"][views] for label in sorted(chosen)])
     left_out = [
         f"<li><code>{html.escape(name)}</code>: {html.escape(why)}</li>"
         for by_name in statistics.left_out.values()
@@ -78,18 +67,35 @@ def _data_section(inputs: ReportInputs) -> str:
             if left_out
             else ""
         )
-        + image(
-            figures.contact_sheet(sheet, [statistics.classes[label] for label in sorted(chosen)]),
-            f"One test object of each class from {len(views)} of the {statistics.views} viewpoints.",
-            "png",
-        )
+        + _contact_sheet(inputs)
         + image(
             figures.entropy_histogram(
                 statistics.entropy_histograms["train"], statistics.entropy_mean, statistics.entropy_std
             ),
             "The thesis reports a mean of 0.329 and a standard deviation of 0.156 (Fig. 9).",
+            f"Histogram of the depth entropies of all training views, divided by the largest: mean "
+            f"{statistics.entropy_mean:.2f}, "
+            f"standard deviation {statistics.entropy_std:.2f}.",
         )
     )
+
+
+def _contact_sheet(inputs: ReportInputs) -> str:
+    """A test object of each class from some viewpoints, a row of pictures for each class."""
+    statistics, source = inputs.statistics, open_split(inputs.data, "test")
+    chosen: dict[int, int] = {}
+    for index, label in enumerate(inputs.tables.labels):
+        chosen.setdefault(int(label), index)
+    views = np.linspace(0, statistics.views - 1, min(10, statistics.views)).round().astype(int)
+    rows = []
+    for label in sorted(chosen):
+        images, name = source[chosen[label]]["image"][views], html.escape(statistics.classes[label])
+        strip = data_url(picture(np.concatenate(list(images), axis=1)))
+        rows.append([name, f'<img class="strip" alt="{len(views)} shaded views of a {name}" src="{strip}">'])
+    shown = table(
+        ["class", f"views {', '.join(map(str, views))}"], rows, "a test object of each class from some viewpoints"
+    )
+    return f"<p>One test object of each class from {len(views)} of the {statistics.views} viewpoints:</p>{shown}"
 
 
 def _entropy_section(inputs: ReportInputs) -> str:
@@ -100,30 +106,36 @@ def _entropy_section(inputs: ReportInputs) -> str:
     true, predicted = tables.entropy[example], tables.predicted_entropy[example, 0]
     limits = (float(min(true.min(), predicted.min())), float(max(true.max(), predicted.max())))
     maps = [
-        figures.view_map(
-            np.asarray(graph.points),
-            np.asarray(graph.neighbours),
-            weights,
-            np.asarray(local_maxima(jnp.asarray(weights), graph.neighbours)),
-            title,
-            limits,
+        image(
+            figures.view_map(
+                np.asarray(graph.points), np.asarray(graph.neighbours), weights, np.asarray(peaks), title, limits
+            ),
+            f"{tables.names[example]}, an object of median error, on an equal-area map of the directions around it. Larger and "
+            "lighter: higher entropy. Red rings: local maxima, views above all their neighbours.",
+            f"Map of the {title} entropies of {len(weights)} views, from {weights.min():.2f} to {weights.max():.2f}; the "
+            f"highest "
+            f"is view {int(weights.argmax())}. Local maxima: views {', '.join(map(str, np.flatnonzero(peaks)))}.",
         )
         for weights, title in ((true, "true"), (predicted, "predicted after view 0"))
+        for peaks in (local_maxima(jnp.asarray(weights), graph.neighbours),)
     ]
     low, high = entropy["better_than_mean_map"]
     verdict = "is better" if low > 0 else "is not better"
     rows = [[html.escape(name), f"{value:.4f}"] for name, value in entropy["by_class"].items() if value is not None]
     return (
-        f"<h2>Predicting depth entropy</h2><p>From one partial cloud, PointNet++ predicts the normalised entropy of every view "
+        f"<h2>Predicting depth entropy</h2><p>A <dfn>partial cloud</dfn> is what one view shows of the surface, as points. "
+        f"From one partial cloud, the network PointNet++ predicts the normalised entropy of every view "
         f"with a mean squared error of {entropy['pointnet2']:.4f} "
         f"({100 * (entropy['explained_variance'] or 0):.0f} % of the variance explained). It {verdict} than the mean map, which "
         f"receives no view (difference in error {low:+.4f} to {high:+.4f}). The class-mean map is given the true class.</p>"
-        + image(figures.entropy_errors(entropy), "Test objects, every view as input; 95 % intervals over objects.")
-        + '<div class="figures">'
-        + "".join(
-            image(m, f"{tables.names[example]}, an object of median error. Red rings: local maxima.") for m in maps
+        + image(
+            figures.entropy_errors(entropy),
+            "Test objects, every view as input; 95 % intervals over objects. A shorter bar is better.",
+            f"Bars of the mean squared error: PointNet++ {entropy['pointnet2']:.4f}, mean map {entropy['mean_map']:.4f}, "
+            f"class-mean map {entropy['class_mean_map']:.4f}.",
         )
-        + f"</div><details><summary>Error by class</summary>{table(['class', 'MSE'], rows)}</details>"
+        + f'<div class="figures">{"".join(maps)}</div>'
+        + f"<details><summary>Error by class</summary>{table(['class', 'MSE'], rows)}</details>"
     )
 
 
@@ -151,9 +163,22 @@ def _training_section(inputs: ReportInputs) -> str:
     return (
         "<h2>Training</h2>"
         + table(["network", "best epoch", "epochs", "best validation loss", "time"], rows)
-        + image(figures.losses(inputs.histories), "Validation objects are never trained on.")
+        + f'<div class="figures">{"".join(_losses(*named) for named in inputs.histories.items())}</div>'
         + f"<p>Accuracy on single views: {percent(min(by_view))} % at the worst viewpoint, {percent(max(by_view))} % at the "
         f"best; class accuracy {percent(inputs.metrics['single_view']['class_accuracy'])} %.</p>"
+    )
+
+
+def _losses(name: str, history: list[dict[str, float]]) -> str:
+    parts = [
+        f"{title} loss from {history[0][key]:.3f} to {history[-1][key]:.3f}"
+        for key, title in (("train/loss", "training"), ("val/loss", "validation"))
+        if history
+    ]
+    return image(
+        figures.losses(name, history),
+        "Loss by epoch, one pass over the training objects. Validation objects are never trained on.",
+        f"Curves of the {name}'s loss over {len(history)} epochs: {', '.join(parts)}.",
     )
 
 
@@ -191,6 +216,7 @@ def _chance_notice(inputs: ReportInputs) -> str:
 _SECTIONS = (
     _chance_notice,
     lead,
+    scenes_section,
     ladder_section,
     seeds_section,
     ascent_section,
@@ -203,13 +229,14 @@ _SECTIONS = (
     _training_section,
     _data_section,
     _methods_section,
+    next_section,
 )
 
 
 def _mark(described: Any, content: str) -> str:
     """Returns the last line of a page: hashes of what it was made from, with the versions of the packages, and of itself."""
     versions = [version(package) for package in ("mevs-jax", "jax", "matplotlib")]
-    made_of = json.dumps([described, versions], sort_keys=True, default=str)
+    made_of = json.dumps([described, versions, STYLE, SCRIPT, VIEWER], sort_keys=True, default=str)
     hashes = [short_hash(text.encode()) for text in (made_of, content)]
     return f"<!-- made of {hashes[0]}, content {hashes[1]} -->\n"
 

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from eval.report.html import ReportInputs, difference, percent, rows_by_knowledge, table
+from eval.report.html import MARKS, ReportInputs, difference, percent, rows_by_knowledge, table
 
 _STEPS = (2, 3, 4, 6, 9)
 
@@ -31,7 +31,8 @@ def seeds_section(inputs: ReportInputs) -> str:
         "which change initial weights, augmentation and batches. All walk around the same objects. Mean accuracy (%) after the "
         "given number of views. Below it the difference from random in percentage points, with its 95 % interval over objects, "
         "for these trainings alone; and below that with its interval over objects and trainings, a t interval. A policy differs "
-        "from random where the latter excludes zero. All other sections are about the first training.</p>"
+        "from random where the latter excludes zero. "
+        f"{MARKS} All other sections are about the first training.</p>"
         + table(["next view chosen by", *(f"{step} views" for step in steps)], rows_by_knowledge(rows))
         + f"<p class='note'>Accuracy on single views: mean {percent(single.mean())} %, from {percent(single.min())} to "
         f"{percent(single.max())} %. Every training has a run of its own in <code>seeds/</code>; all numbers are in "

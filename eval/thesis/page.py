@@ -30,11 +30,11 @@ def _table_html(shown: ThesisTable) -> str:
         cells = [html.escape(row.name)]
         for ours, bold, theirs in shown_cells(row, shown):
             text = f"<b>{html.escape(ours)}</b>" if bold else html.escape(ours)
-            cells.append(text + (f' <small class="faint">({html.escape(theirs)})</small>' if theirs else ""))
+            cells.append(text + (f' <small class="note">({html.escape(theirs)})</small>' if theirs else ""))
         rows.append(cells)
     return (
         f'<h3 id="table-{shown.number}">{html.escape(shown.heading)}</h3>'
-        f'<div class="wide">{table(["", *shown.columns], rows)}</div>'
+        f"{table(['', *shown.columns], rows, shown.heading)}"
         f'<p class="note">{html.escape(shown.remark)}</p>'
     )
 

@@ -338,15 +338,18 @@ class Agent:
             )
             if index < 0:
                 reason = "nothing reachable" if of.belief is None or of.belief.known else "unknown object"
-        elapsed = 1e3 * (time.perf_counter() - begun)
+        elapsed, event = 1e3 * (time.perf_counter() - begun), {"call": "decide"}
         if reason:
             step = Step(None, None, -1, float("nan"), True, reason, elapsed)
         else:
+            event["gains"] = [float(gain) if np.isfinite(gain) else None for gain in gains[:number]]
+            if candidates is not None:
+                event["directions"] = np.asarray(where.directions)[:number].tolist()
             chosen = poses[int(index)]
             away = chosen[:3, 3] - of.center
             direction = away / np.linalg.norm(away)
             step = Step(chosen, direction, int(index), float(gains[index]), False, "", elapsed)
-        self.history.events.append({"call": "decide", "step": plain(step)})
+        self.history.events.append(event | {"step": plain(step)})
         return step
 
     def _reason(self) -> Reason:

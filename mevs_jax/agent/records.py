@@ -76,7 +76,8 @@ class History:
     Attributes:
         system: name of the system.
         options: of the agent and of `reset`.
-        events: one dictionary for each call, in order: `observe`, `decide` or `mark_failed`, with its result.
+        events: one dictionary for each call, in order: `observe`, `decide` or `mark_failed`, with its result; of `decide`, also
+            the expected `gains` of all candidates, and their `directions` in the object's frame if they were given.
         depths: (views, side, side) the images that the networks received, in radii.
         poses: (views, 4, 4) their poses in the object's frame.
     """

@@ -201,6 +201,8 @@ class LookOptions:
     """draw the walk into this image, .png or .svg"""
     save: Annotated[Path | None, _arg("FILE")] = None
     """save the walk's history, which can be repeated, into this .npz"""
+    view: Annotated[tyro.conf.FlagCreatePairsOff[bool], _arg("")] = False
+    """show the walk in a browser, in 3-D, until Ctrl-C (needs the extra `view`)"""
 
 
 @dataclass(frozen=True)

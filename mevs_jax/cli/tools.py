@@ -25,6 +25,8 @@ def look(options: LookOptions) -> None:
         raise Unusable("mevs look needs an object: --mesh FILE or --depth FILE, one of them")
     if options.draw is not None:
         check_drawing(options.draw)
+    if options.view and importlib.util.find_spec("viser") is None:
+        raise Unusable("--view needs viser: pip install 'mevs-jax[view]', or pip install viser")
     source = options.mesh or options.depth
     assert source is not None
     if options.metres < 0 or (options.metres and options.depth is not None):
@@ -54,6 +56,12 @@ def look(options: LookOptions) -> None:
             from mevs_jax.agent.drawing import draw_walk
 
             draw_walk(walk, system, options.draw, source.name)
+        if options.view:
+            from mevs_jax.agent.viewing import view
+
+            server = view(walk.history, system)
+            print(f"Viewer: http://127.0.0.1:{server.get_port()} (Ctrl-C ends it)", flush=True)
+            server.sleep_forever()
     except OSError as error:
         raise Unusable(
             f"cannot write {error.filename or 'the results'} ({error.strerror}); choose another file"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib.util
 import inspect
 import json
 import re
@@ -14,7 +15,7 @@ import pytest
 import mevs_jax
 from data_pipeline.objects.furniture import furniture
 from eval.checks.scenes import CONDITIONS
-from mevs_jax.agent import load_history
+from mevs_jax.agent import load_history, viewing
 from mevs_jax.cli.options import RealityOptions
 from mevs_jax.trained import load, save
 from tests.cli.conftest import mevs, refused
@@ -86,6 +87,31 @@ def test_recorded_images_are_looked_at(system, frames, at_once):
     assert lines[0] == "frames.npz"
     assert lines[-1].endswith("after 6 views (budget)")
     assert sorted(int(line.split(":")[0].split()[1]) for line in lines[1:-1]) == list(range(6))
+
+
+def test_a_walk_is_viewed_in_a_browser(system, chair, at_once, monkeypatch):
+    served = []
+
+    class Server:
+        def get_port(self):
+            return 8080
+
+        def sleep_forever(self):
+            served.append("waited")
+
+    found = importlib.util.find_spec
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name: object() if name == "viser" else found(name))
+    monkeypatch.setattr(viewing, "view", lambda history, system: served.append(history.views) or Server())
+    result = at_once("look", "--system", system, "--mesh", chair, "--view", "--max-views", 2, "--stop", 2)
+    assert result.returncode == 0
+    assert served == [2, "waited"]
+    assert result.stdout.splitlines()[-1] == "Viewer: http://127.0.0.1:8080 (Ctrl-C ends it)"
+
+
+def test_a_viewer_needs_viser(system, chair, refuses, monkeypatch):
+    found = importlib.util.find_spec
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None if name == "viser" else found(name))
+    assert "pip install 'mevs-jax[view]'" in refuses("look", "--system", system, "--mesh", chair, "--view")
 
 
 def test_what_cannot_be_looked_at_is_one_sentence(system, chair, frames, refuses, tmp_path):

@@ -1,0 +1,10 @@
+// Marks tables and figures that are wider than the window, so that they say that they scroll.
+(() => {
+  "use strict";
+  document.documentElement.classList.add("scripted");
+  const boxes = [...document.querySelectorAll(".scroll")];
+  const look = () => boxes.forEach((box) => box.classList.toggle("overflows", box.scrollWidth > box.clientWidth + 1));
+  look();
+  addEventListener("resize", look);
+  document.querySelectorAll("details").forEach((fold) => fold.addEventListener("toggle", look));
+})();
