@@ -23,8 +23,8 @@ print(f"{len(system.viewpoints)} candidate views, depth images of {side}×{side}
 # `stop`. For a mesh of your own: `read_mesh("chair.obj")` from `data_pipeline.objects.recipes`.
 
 # %%
-desk = furniture("desk", 2)
-walk = mevs_jax.look(system, desk.vertices, desk.faces, policy="information_gain", stop=0.95)
+table = furniture("table", 900)
+walk = mevs_jax.look(system, table.vertices, table.faces, policy="information_gain", stop=0.95)
 print(walk)
 
 # %% [markdown]
@@ -61,9 +61,9 @@ print(f"expected gain: {gains.min():.3f} to {gains.max():.3f} nats; the best is 
 # %%
 figure = plt.figure(figsize=(5.6, 5), layout="constrained")
 space = figure.add_subplot(projection="3d")
-corners = desk.vertices - (desk.vertices.min(axis=0) + desk.vertices.max(axis=0)) / 2
+corners = table.vertices - (table.vertices.min(axis=0) + table.vertices.max(axis=0)) / 2
 corners = 0.6 * corners / np.linalg.norm(corners, axis=1).max()
-space.plot_trisurf(*corners.T, triangles=desk.faces, color="#e8ddcf", edgecolor="#8a7b66", linewidth=0.1)
+space.plot_trisurf(*corners.T, triangles=table.faces, color="#e8ddcf", edgecolor="#8a7b66", linewidth=0.1)
 points = space.scatter(*system.viewpoints.T, c=gains, cmap="Oranges", s=45, edgecolor="grey", depthshade=False)
 space.plot(*system.viewpoints[list(walk.views)].T, color="#c1440e", marker="o", markersize=9)
 for number, view in enumerate(walk.views, 1):
