@@ -1,0 +1,65 @@
+"""The notebooks hold the code of the scripts beside them, have outputs, and their scripts run."""
+
+from __future__ import annotations
+
+import base64
+import json
+import re
+from typing import Any
+
+import pytest
+
+from examples.notebooks.execute import HERE, SCRIPTS, cells_of, run_cell
+
+LARGEST = 300_000
+
+
+def stored(name: str) -> dict[str, Any]:
+    return json.loads((HERE / f"{name}.ipynb").read_text())
+
+
+def test_every_script_is_listed():
+    assert {path.stem for path in HERE.glob("*.py")} == {*SCRIPTS, "execute"}
+    assert {path.stem for path in HERE.glob("*.ipynb")} == {*SCRIPTS}
+
+
+@pytest.mark.parametrize("name", SCRIPTS)
+def test_a_notebook_holds_the_code_of_its_script(name):
+    cells = [(cell["cell_type"], "".join(cell["source"])) for cell in stored(name)["cells"]]
+    script = cells_of((HERE / f"{name}.py").read_text())
+    assert cells == script, f"run `python -m examples.notebooks.execute {name}`"
+
+
+@pytest.mark.parametrize("name", SCRIPTS)
+def test_a_notebook_has_outputs_and_pictures_and_is_small(name):
+    assert (HERE / f"{name}.ipynb").stat().st_size < LARGEST
+    outputs = [output for cell in stored(name)["cells"] for output in cell.get("outputs", [])]
+    pictures = [output["data"]["image/png"] for output in outputs if output["output_type"] == "display_data"]
+    assert len(pictures) >= 2
+    assert all(base64.b64decode(picture).startswith(b"\x89PNG") for picture in pictures)
+    assert any(output["output_type"] == "stream" for output in outputs)
+
+
+@pytest.mark.parametrize("name", SCRIPTS)
+def test_links_of_a_notebook_lead_somewhere(name):
+    text = "\n".join(source for kind, source in cells_of((HERE / f"{name}.py").read_text()) if kind == "markdown")
+    for target in re.findall(r"\]\(([^)\s]+)\)", text):
+        assert (HERE / target).resolve().exists(), target
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", SCRIPTS)
+def test_a_notebook_runs_and_prints_as_stored(name, fully_compiled):
+    """Every cell runs. Words of what it prints are those of the notebook; digits may differ between machines."""
+    import matplotlib
+
+    matplotlib.use("Agg")
+    names: dict[str, Any] = {"__name__": "__main__"}
+    for number, cell in enumerate(stored(name)["cells"]):
+        if cell["cell_type"] == "code":
+            outputs = run_cell("".join(cell["source"]), names, f"{name}, cell {number}")
+            assert [words(output) for output in outputs] == [words(output) for output in cell["outputs"]]
+
+
+def words(output: dict[str, Any]) -> list[str]:
+    return re.findall(r"[A-Za-z]{3,}", "".join(output["text"])) if output["output_type"] == "stream" else ["picture"]
