@@ -326,8 +326,19 @@ def view_map(
         if abs(x[i] - x[j]) < 2:  # else the edge crosses the border of the map
             axis.plot(x[[i, j]], y[[i, j]], color="#d1d5db", linewidth=0.7, zorder=1)
     share = np.clip((weights - limits[0]) / max(limits[1] - limits[0], 1e-9), 0, 1)
-    colours = {"c": weights, "cmap": "viridis", "vmin": limits[0], "vmax": limits[1], "edgecolors": INK}
-    dots = axis.scatter(x, y, s=15 + 75 * share, linewidths=0.6, zorder=2, **colours)
+    low, high = limits
+    dots = axis.scatter(
+        x,
+        y,
+        s=15 + 75 * share,
+        c=weights,
+        cmap="viridis",
+        vmin=low,
+        vmax=high,
+        edgecolors=INK,
+        linewidths=0.6,
+        zorder=2,
+    )
     axis.scatter(x[maxima], y[maxima], s=170, facecolors="none", edgecolors="#dc2626", linewidths=1.5, zorder=3)
     figure.colorbar(dots, ax=axis, label="normalised entropy", shrink=0.8)
     axis.set_title(title)

@@ -46,7 +46,7 @@ def scenes_section(inputs: ReportInputs) -> str:
     if inputs.validation is None:
         return ""
     walks = walks_of(inputs.tables, inputs.validation, inputs.statistics.graph, inputs.metrics)
-    source, shown, scenes = open_split(inputs.data, "test"), [], []
+    source, shown, scenes = open_split(inputs.data, "test"), list[str](), list[dict]()
     for index, kind in walks.chosen().items():
         example = source[index]
         scenes.append(_scene(inputs, walks, index, kind, example))

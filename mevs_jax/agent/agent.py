@@ -338,7 +338,8 @@ class Agent:
             )
             if index < 0:
                 reason = "nothing reachable" if of.belief is None or of.belief.known else "unknown object"
-        elapsed, event = 1e3 * (time.perf_counter() - begun), {"call": "decide"}
+        elapsed = 1e3 * (time.perf_counter() - begun)
+        event: dict[str, Any] = {"call": "decide"}
         if reason:
             step = Step(None, None, -1, float("nan"), True, reason, elapsed)
         else:
