@@ -34,14 +34,14 @@ def observe_all(triangles):
     return depth, jax.vmap(system.observe)(depth, poses)
 
 
-observed, labels = [], []
+observed, classes = [], []
 for label, name in enumerate(system.classes):
     for seed in range(900, 905):
         piece = furniture(name, seed)
         observed.append(observe_all(pad_triangles(unit_triangles(piece.vertices, piece.faces)))[1])
-        labels.append(label)
+        classes.append(label)
 observations = jax.tree.map(lambda *each: jnp.stack(each), *observed)
-labels = jnp.array(labels)
+labels = jnp.array(classes)
 print("logits:", observations.logits.shape, "(objects, views, classes)")
 
 # %%

@@ -136,6 +136,19 @@ def test_links_lead_somewhere():
                 assert anchor in {anchor_of(heading) for heading in headings}, f"{page.name}: {target}"
 
 
+def tables_of(text: str) -> list[list[str]]:
+    """The tables of a page, each a list of lines."""
+    outside = re.sub(r"```.*?```", "", text, flags=re.DOTALL)
+    return [block.strip().splitlines() for block in re.findall(r"(?:^\|.*\n?)+", outside, re.MULTILINE)]
+
+
+def test_rows_of_a_table_have_as_many_cells_as_its_header():
+    for page in [*PAGES, ROOT / "CONTRIBUTING.md"]:
+        for header, *rows in tables_of(page.read_text()):
+            cells = header.count("|")
+            assert [row for row in rows if row.count("|") != cells] == [], f"{page.name}: {header}"
+
+
 def anchor_of(heading: str) -> str:
     """The anchor that GitHub gives a heading."""
     return re.sub(r"[^\w\- ]", "", heading.lower()).strip().replace(" ", "-")
