@@ -1,13 +1,15 @@
-"""Commands in the documentation exist with their options, blocks of Python run, and links lead somewhere."""
+"""Commands in the documentation exist with their options, blocks of Python run, links lead somewhere, tables are whole."""
 
 from __future__ import annotations
 
+import json
 import re
 import shlex
 from pathlib import Path
 
 import numpy as np
 import pytest
+import yaml
 
 import mevs_jax
 from data_pipeline.capture.casting import default_caster
@@ -120,6 +122,15 @@ def test_documented_python_runs(page, whole, tmp_path, monkeypatch):
     world = world_of(page, whole)
     for number, block in enumerate(re.findall(r"```python\n(.*?)```", path.read_text(), re.DOTALL)):
         exec(compile(block, f"{page}, block {number}", "exec"), world)
+
+
+def test_documented_json_and_yaml_can_be_read():
+    found = {"json": 0, "yaml": 0}
+    for page in PAGES:
+        for language, block in re.findall(r"```(json|yaml)\n(.*?)```", page.read_text(), re.DOTALL):
+            found[language] += 1
+            assert json.loads(block) if language == "json" else list(yaml.safe_load_all(block))
+    assert min(found.values()) > 0
 
 
 def test_links_lead_somewhere():
