@@ -111,9 +111,10 @@ for name, found in results.items():
 
 # %%
 figure, axis = plt.subplots(figsize=(6, 3.6), layout="constrained")
-for name, found in results.items():
-    highlight = name == "two_likeliest"
-    axis.plot(range(1, 5), 100 * found.mean(axis=0), "o-", lw=3 if highlight else 1.4, label=name)
+shades = ("#6b7785", "#9aa5b1", "#1b2a41", "#7a9e9f", "#e0a458", "#c1440e")
+for (name, found), shade, line in zip(results.items(), shades, ("-", ":", "-.", "--", "--", "-"), strict=True):
+    width = 3 if name == "two_likeliest" else 1.6
+    axis.plot(range(1, 5), 100 * found.mean(axis=0), marker="o", ls=line, lw=width, color=shade, label=name)
 axis.set(xlabel="views", ylabel="accuracy, %", xticks=range(1, 5), title="50 objects, every start view")
 axis.grid(axis="y", alpha=0.3)
 axis.legend(fontsize=8)
