@@ -41,7 +41,7 @@ def test_the_citation_names_this_version_and_its_date():
 @pytest.mark.parametrize("file", ["mevs_interfaces/package.xml", "mevs_ros/package.xml", "mevs_ros/setup.py"])
 def test_the_packages_for_ros_have_this_version(file):
     text = (ROOT / "examples" / "ros2" / file).read_text()
-    named = re.search(r'(?:<version>|version=")([\d.]+)', text)
+    named = re.search(r'(?:<version>|^ *version=")([\d.]+)', text, re.MULTILINE)
     assert named is not None
     assert named[1] == RELEASED
 
