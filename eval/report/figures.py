@@ -86,6 +86,12 @@ def accuracy_after_views(
     return figure
 
 
+def ink_on(colour: Sequence[float]) -> str:
+    """Black or white, whichever has the higher contrast to a colour (r, g, b, …) in [0, 1]; it is 4.5 at least."""
+    linear = [c / 12.92 if c <= 0.04045 else ((c + 0.055) / 1.055) ** 2.4 for c in colour[:3]]
+    return "white" if np.dot(linear, (0.2126, 0.7152, 0.0722)) < 0.179 else "black"
+
+
 def _legend_below(figure: Figure) -> None:
     """Puts the legend of all axes under the figure, in two columns where the labels are short."""
     handles, labels = figure.axes[0].get_legend_handles_labels()
@@ -208,7 +214,7 @@ def difference_grid(
     values = 100 * np.array(difference)
     largest = max(0.5, np.abs(values).max())
     figure, axis = plt.subplots(figsize=(_WIDTH, 3.4), layout="constrained")
-    axis.imshow(values, cmap="RdBu", vmin=-largest, vmax=largest, aspect="auto")
+    cells = axis.imshow(values, cmap="RdBu", vmin=-largest, vmax=largest, aspect="auto")
     for (row, column), value in np.ndenumerate(values):
         low, high = intervals[row][column]
         mark = "▲" if low > 0 else "▼" if high < 0 else ""
@@ -220,7 +226,7 @@ def difference_grid(
             va="center",
             fontsize=9,
             fontweight="bold" if mark else "normal",
-            color="white" if abs(value) > 0.65 * largest else "black",
+            color=ink_on(cells.to_rgba(value)),
         )
     axis.set_xticks(range(len(thresholds)), [f"{ct:g}" for ct in thresholds])
     axis.set_yticks(range(len(max_views)), [str(mv) for mv in max_views])
@@ -236,18 +242,11 @@ def confusions(matrices: dict[str, np.ndarray], classes: Sequence[str]) -> Figur
     )
     for axis, (title, matrix) in zip(axes[0], matrices.items(), strict=True):
         share = 100 * matrix / np.maximum(matrix.sum(axis=1, keepdims=True), 1e-9)
-        axis.imshow(share, cmap="Blues", vmin=0, vmax=100)
+        cells = axis.imshow(share, cmap="Blues", vmin=0, vmax=100)
         for (row, column), value in np.ndenumerate(share):
             if value >= 0.5:
-                axis.text(
-                    column,
-                    row,
-                    f"{value:.0f}",
-                    ha="center",
-                    va="center",
-                    fontsize=8,
-                    color="white" if value > 60 else "black",
-                )
+                colour = ink_on(cells.to_rgba(value))
+                axis.text(column, row, f"{value:.0f}", ha="center", va="center", fontsize=8, color=colour)
         axis.set_xticks(range(len(classes)), classes, rotation=60, ha="right")
         axis.set_yticks(range(len(classes)), classes)
         axis.set(xlabel="predicted", title=title)
@@ -327,10 +326,11 @@ def view_map(
             axis.plot(x[[i, j]], y[[i, j]], color="#d1d5db", linewidth=0.7, zorder=1)
     share = np.clip((weights - limits[0]) / max(limits[1] - limits[0], 1e-9), 0, 1)
     low, high = limits
+    smaller = min(1.0, 60 / len(points))  # many views do not cover each other
     dots = axis.scatter(
         x,
         y,
-        s=15 + 75 * share,
+        s=smaller * (15 + 75 * share),
         c=weights,
         cmap="viridis",
         vmin=low,
@@ -339,7 +339,9 @@ def view_map(
         linewidths=0.6,
         zorder=2,
     )
-    axis.scatter(x[maxima], y[maxima], s=170, facecolors="none", edgecolors="#dc2626", linewidths=1.5, zorder=3)
+    axis.scatter(
+        x[maxima], y[maxima], s=smaller * 170, facecolors="none", edgecolors="#dc2626", linewidths=1.5, zorder=3
+    )
     figure.colorbar(dots, ax=axis, label="normalised entropy", shrink=0.8)
     axis.set_title(title)
     axis.set_aspect("equal")

@@ -7,8 +7,11 @@ import html
 import numpy as np
 
 from eval.report import figures
-from eval.report.html import MARKS, ReportInputs, difference, image, percent, signed, span, table
+from eval.report.html import MANY_CLASSES, MARKS, ReportInputs, difference, image, percent, signed, span, table
 from eval.report.policies import titles_of
+
+_PAIRS = 20
+"""Pairs of classes in a table of confusions."""
 
 
 def grid_section(inputs: ReportInputs) -> str:
@@ -63,9 +66,14 @@ def grid_section(inputs: ReportInputs) -> str:
 
 
 def _confusions(inputs: ReportInputs, names: tuple[str, ...]) -> str:
-    """Confusion matrices of some policies, in one cell of the grid."""
+    """Confusion matrices of some policies, in one cell of the grid; tables of what is confused if the classes are many."""
     metrics, classes, shown = inputs.metrics, inputs.statistics.classes, []
     headline, titles = metrics["headline"], titles_of(metrics)
+    if len(classes) > MANY_CLASSES:
+        return "".join(
+            _most_confused(titles[name], np.array(metrics["policies"][name]["headline_confusion"]), classes, headline)
+            for name in names
+        )
     for name in names:
         matrix = np.array(metrics["policies"][name]["headline_confusion"])
         wrong = matrix * (1 - np.eye(len(classes)))
@@ -79,6 +87,25 @@ def _confusions(inputs: ReportInputs, names: tuple[str, ...]) -> str:
             )
         )
     return f'<div class="figures">{"".join(shown)}</div>'
+
+
+def _most_confused(title: str, matrix: np.ndarray, classes: list[str], cell: dict[str, float]) -> str:
+    """A table of the pairs of classes that are confused most often."""
+    share = matrix / np.maximum(matrix.sum(axis=1, keepdims=True), 1e-9)
+    wrong = share * (1 - np.eye(len(classes)))
+    order = np.argsort(-wrong, axis=None, kind="stable")[:_PAIRS]
+    pairs = [
+        (true, said) for true, said in zip(*np.unravel_index(order, wrong.shape), strict=True) if wrong[true, said]
+    ]
+    rows = [
+        [html.escape(classes[true]), html.escape(classes[said]), percent(wrong[true, said])] for true, said in pairs
+    ]
+    right = np.trace(matrix) / max(matrix.sum(), 1e-9)
+    return (
+        f"<p>{html.escape(title)}, CT {cell['threshold']}, MV {cell['max_views']}: {percent(right)} % of the "
+        f" answers are right. The {len(rows)} most frequent confusions of {len(classes)} classes:</p>"
+        + table(["true class", "taken for", "% of the true class"], rows, f"confusions of {title}")
+    )
 
 
 def compatibility_section(inputs: ReportInputs) -> str:

@@ -29,6 +29,8 @@ MARKS = (
     "without a mark: the interval contains zero."
 )
 """Explains the marks of `difference`, which do not need colour."""
+MANY_CLASSES = 25
+"""Beyond so many classes, matrices and pictures of all of them cannot be read: the page has excerpts, and folds tables."""
 
 
 @dataclass(frozen=True)
