@@ -64,20 +64,21 @@ def lead(inputs: ReportInputs) -> str:
         sentences.append(f"At two views, {called} is {verdict}.")
     return (
         f'<p class="lead">{" ".join(sentences)}</p>'
-        "<p>A <dfn>view</dfn> is one depth image of the object, from one of the "
-        f"{metrics['views']} candidate directions around it. A <dfn>policy</dfn> is a rule that chooses the next view from what "
-        "was seen so far. The classifier gives one number for each class and view, the <dfn>logits</dfn>; the logits of all views "
-        "seen are added, and the class with the largest sum is the answer. The sums give a probability for each class, the "
-        "<dfn>belief</dfn>. The <dfn>depth entropy</dfn> of a view says how varied its depths are; <i>the thesis</i> (Learning "
-        "Optimal View Selection for Multi-View Object Representation, which this program reimplements) prefers views where it is "
-        "high, and predicts it by the network PointNet++. <dfn>Expected information gain</dfn> is how much surer the belief is "
-        "expected to become by a view, in <dfn>nats</dfn>: a choice between two equally likely classes has 0.69 nats. An "
+        f"<p>A <dfn>view</dfn> is one depth image of the object, from one of the {metrics['views']} candidate directions "
+        "around it. A <dfn>policy</dfn> is a rule that chooses the next view from what was seen so far. The classifier gives "
+        "one number for each class and view, the <dfn>logits</dfn>; the logits of all views seen are added, and the class "
+        "with the largest sum is the answer. The sums give a probability for each class, the <dfn>belief</dfn>. The "
+        "<dfn>depth entropy</dfn> of a view says how varied its depths are; <i>the thesis</i> (Learning Optimal View "
+        "Selection for Multi-View Object Representation, which this program reimplements) prefers views where it is high, and "
+        "predicts it by the network PointNet++. <dfn>Expected information gain</dfn> is how much surer the belief is expected "
+        "to become by a view, in <dfn>nats</dfn>: a choice between two equally likely classes has 0.69 nats. An "
         "<dfn>oracle</dfn> is a policy that knows something about the object that a robot cannot know.</p>"
         f'<p class="note">Over {metrics["objects"]} test objects and {metrics["starts"]} start views of each: every walk begins '
-        "at another view. All policies have the same objects, start views and logits. <dfn>Validation objects</dfn> are neither "
-        "trained on nor tested on; the best epoch of a training and all that is fitted later is chosen on them. A <dfn>95 % "
-        "interval</dfn> is computed by drawing the test objects again, with repetition, many times: in 95 % of the draws the "
-        "value lies inside. Two policies are called distinguishable if the 95 % interval of their difference, paired by object, excludes zero.</p>"
+        "at another view. All policies have the same objects, start views and logits. <dfn>Validation objects</dfn> are "
+        "neither trained on nor tested on; the best epoch of a training and all that is fitted later is chosen on them. A "
+        "<dfn>95 % interval</dfn> is computed by drawing the test objects again, with repetition, many times: in 95 % of the "
+        "draws the value lies inside. Two policies are called distinguishable if the 95 % interval of their difference, "
+        "paired by object, excludes zero.</p>"
     )
 
 
