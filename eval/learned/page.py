@@ -15,6 +15,7 @@ from eval.report import figures
 from eval.report.html import (
     MARKS,
     ReportInputs,
+    commands,
     difference,
     document,
     image,
@@ -388,6 +389,27 @@ def _alt_of_curves(curves: dict[str, Any]) -> str:
     return f"Curves of accuracy by number of views: {'; '.join(parts)}. The table has all numbers."
 
 
+def _next(metrics: dict[str, Any]) -> str:
+    """The end of the page: commands that continue this run."""
+    steps = [
+        (
+            "Recognise a mesh of your own with these networks, and look at the walk in a browser:",
+            "mevs look --system RUN/learned/system --mesh FILE --view",
+        )
+    ]
+    if len(metrics["seeds"]) < 2:
+        steps.append(
+            (
+                "Train from other seeds, to know whether the results hold for other trainings:",
+                "mevs study learned --out RUN --seeds 3",
+            )
+        )
+    return (
+        "<h2>What to do next</h2><p><code>RUN</code> stands for the folder of this run; this page is "
+        f"<code>learned/index.html</code> in it.</p>{commands(steps)}"
+    )
+
+
 def write_learned_page(metrics: dict[str, Any], statistics: DatasetStatistics, path: Path) -> None:
     """Writes the page, which needs no other file. Numbers are of the first seed unless the page states otherwise."""
     single = fmean(next(iter(seed["lattices"].values()))["single_view"] for seed in metrics["seeds"])
@@ -418,14 +440,6 @@ def write_learned_page(metrics: dict[str, Any], statistics: DatasetStatistics, p
                 + _novel(metrics, statistics.classes)
                 + _seeds(metrics, views)
             )
-    left_out = f"<p>{statistics.left_out_count} objects without a surface were left out.</p>"
-    left_out += (
-        "<h2>What to do next</h2><p><code>RUN</code> stands for the folder of this run; this page is "
-        "<code>learned/index.html</code> "
-        "in it.</p><ol><li><p>Recognise a mesh of your own with these networks, and look at the walk in a browser:</p>"
-        "<pre><code>mevs look --system RUN/learned/system --mesh FILE --view</code></pre></li>"
-        "<li><p>Train from other seeds, to know whether the results hold for other trainings:</p>"
-        "<pre><code>mevs study learned --out RUN --learned.seeds 3</code></pre></li></ol>"
-    )
+    parts.append(f"<p>{statistics.left_out_count} objects without a surface were left out.</p>{_next(metrics)}")
     title = f"Learned view selection: {html.escape(statistics.source)}"
-    write_text(path, document(title, "".join(parts) + left_out))
+    write_text(path, document(title, "".join(parts)))

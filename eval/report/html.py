@@ -130,14 +130,24 @@ def document(title: str, body: str) -> str:
         return f'<h2 id="{name}">{found.group(1)}</h2>'
 
     content = re.sub(r"<h2>(.*?)</h2>", anchored, body)
+    size = len(STYLE) + len(SCRIPT) + len(content.encode())
     contents = f'<nav aria-label="Contents"><ul>{"".join(links)}</ul></nav>' if len(links) > 2 else ""
     return (
         '<!doctype html><html lang="en"><head><meta charset="utf-8">'
         '<meta name="viewport" content="width=device-width, initial-scale=1">'
-        f"<title>{title}</title><style>{STYLE}</style></head><body>"
+        f'<title>{title}</title><link rel="icon" href="data:,"><style>{STYLE}</style></head><body>'
         f'<a class="skip" href="#content">To the content</a><header><h1>{title}</h1>{contents}</header>'
-        f'<main id="content">{content}</main><script>{SCRIPT}</script></body></html>\n'
+        f'<main id="content">{content}</main><footer><p class="note">This page needs no other file and no network; it has '
+        f"{size / 1e6:.1f} MB.</p></footer><script>{SCRIPT}</script></body></html>\n"
     )
+
+
+def commands(steps: Sequence[tuple[str, str]]) -> str:
+    """A list of sentences in plain text, each with the command that it is about."""
+    items = (
+        f"<li><p>{html.escape(said)}</p><pre><code>{html.escape(command)}</code></pre></li>" for said, command in steps
+    )
+    return f"<ol>{''.join(items)}</ol>"
 
 
 def warning(sentence: str | None) -> str:

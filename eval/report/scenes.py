@@ -137,7 +137,7 @@ def _controls(steps: int, views: int) -> str:
 <div><p class="note" id="how">To turn the scene, drag it with the mouse, or with a finger that starts sideways (up and down
 scrolls the page), or press the arrow keys. To zoom, press + or −, pinch, or use the wheel after a click. The larger a candidate
 view, the higher its expected gain. The candidates are drawn nearer to the object than they are, and the surface is shown by the
-points that all {views} views together see.</p>
+points that the {views} views together see.</p>
 <ul class="legend">{legend}</ul></div></div>
 </div>"""
 
