@@ -80,6 +80,24 @@ def test_a_server_shows_the_history(system, history):
         server.stop()
 
 
+@pytest.mark.slow
+def test_a_person_goes_through_the_views(system, history, opened):
+    """In Chromium, by the keys; nothing is loaded from elsewhere."""
+    pytest.importorskip("viser", reason="viser is not installed: pip install '.[view]'")
+    server = view(history, system, port=8261)
+    try:
+        shown = opened(f"http://127.0.0.1:{server.get_port()}/", 1200)
+        for step in (1, 2, 3):
+            shown.page.get_by_text(f"After {step} of 3 views").wait_for()
+            assert shown.page.locator("progress").count() == min(5, len(system.classes))
+            shown.page.get_by_role("slider").last.press("ArrowRight")
+        assert "budget" in shown.page.get_by_text("The end").inner_text()
+        assert shown.page.locator("canvas").is_visible()
+        assert shown.wrong == []
+    finally:
+        server.stop()
+
+
 def test_a_history_without_views_is_refused(system):
     pytest.importorskip("viser", reason="viser is not installed: pip install '.[view]'")
     with pytest.raises(ValueError, match="no views"):
