@@ -223,26 +223,20 @@ def _lead(metrics: dict[str, Any], views: str) -> str:
     )
     return (
         f'<p class="lead">Accuracy after two views is {percent(method[1])} % if the policy chooses the second and '
-        f"{percent(random[1])} % if it is random: {_gain_of_two(gains)} points.{with_table} "
-        f"Accuracy from one view is {percent(random[0])} %, and {percent(single)} % from its logits without the fusion; from "
-        f"all "
+        f"{percent(random[1])} % if it is random: {_gain_of_two(gains)} points.{with_table} Accuracy from one view is "
+        f"{percent(random[0])} %, and {percent(single)} % from its logits without the fusion; from all "
         f"{first['random_sets'][-1]['views']} views it is {percent(every)} % fused and {percent(summed)} % "
-        f"summed.{trainings}</p>"
-        "<p>A <dfn>view</dfn> is one depth image of the object from one of the candidate directions. A <dfn>policy</dfn> "
-        "chooses the "
-        "next view from those seen so far. The <dfn>fusion</dfn> is a network that makes one belief about the class from all "
-        "views seen; "
-        "the thesis adds the logits of single views instead. The <dfn>view policy</dfn> is a network that predicts the gain of "
-        "every "
-        "candidate. <dfn>Calibration error</dfn> (ECE) is the mean distance between confidence and accuracy, over bins of "
-        "confidence. A "
-        "<dfn>nat</dfn> is the unit of natural logarithms of probabilities; <dfn>risk</dfn> is 1 − confidence. An "
-        "<dfn>oracle</dfn> knows "
-        "what a robot cannot know.</p>"
+        f"summed.{trainings}</p><p>A <dfn>view</dfn> is one depth image of the object from one of the candidate directions. A "
+        "<dfn>policy</dfn> chooses the next view from those seen so far. The <dfn>fusion</dfn> is a network that makes one "
+        "<dfn>belief</dfn>, a probability for each class, from all views seen. <i>The thesis</i> (Learning Optimal View "
+        "Selection for Multi-View Object Representation) adds the <dfn>logits</dfn> instead, a classifier's numbers for each "
+        "class. The <dfn>view policy</dfn> is a network that predicts the gain of every candidate. <dfn>Calibration "
+        "error</dfn> (ECE) is the mean distance between confidence and accuracy, over bins of confidence. A <dfn>nat</dfn> is "
+        "the unit of natural logarithms of probabilities; <dfn>risk</dfn> is 1 − confidence. An <dfn>oracle</dfn> knows what "
+        "a robot cannot know.</p>"
         f'<p class="note">Over {first["objects"]} test objects and every start view. All policies use the same fusion, '
-        "objects and "
-        f"start views. Everything is fitted or chosen on {first['validation_objects']} validation objects. The views of these "
-        "lattices are not in the training data, which has other directions around other objects.</p>"
+        f"objects and start views. Everything is fitted or chosen on {first['validation_objects']} validation objects. The "
+        "views of these lattices are not in the training data, which has other directions around other objects.</p>"
     )
 
 
@@ -273,12 +267,9 @@ def _rotated(metrics: dict[str, Any]) -> str:
     ((_, found),) = metrics["seeds"][0]["rotated"].items()
     every = found["random_sets"][-1]
     return (
-        "<h2>Any rotation</h2>"
-        "<p>Objects are turned by an unknown rotation about any axis. The recognisers were trained for some further epochs on "
-        "objects rotated in the same way. "
-        f"All {every['views']} views fused: {percent(every['learned']['accuracy'])} %.</p>"
-        + _ladder(found)
-        + _against(found)
+        "<h2>Any rotation</h2><p>Objects are turned by an unknown rotation about any axis. The recognisers were trained for "
+        f"some further epochs on objects rotated in the same way. All {every['views']} views fused: "
+        f"{percent(every['learned']['accuracy'])} %.</p>" + _ladder(found) + _against(found)
     )
 
 

@@ -20,9 +20,8 @@ def grid_section(inputs: ReportInputs) -> str:
     shown = ("predicted_entropy", "oracle_entropy", "information_gain")
     parts = [
         "<h2>The thesis's grid</h2><p>A walk stops when its confidence reaches a <dfn>confidence threshold</dfn> (CT, "
-        "columns), or "
-        "at a <dfn>limit on views</dfn> (MV, rows). The confidence here is the thesis's, which is not calibrated. Each "
-        "interval is for its own cell, and neighbouring cells share their walks: if a policy did not differ "
+        "columns), or at a <dfn>limit on views</dfn> (MV, rows). The confidence here is the thesis's, which is not "
+        "calibrated. Each interval is for its own cell, and neighbouring cells share their walks: if a policy did not differ "
         "from random, about one cell in twenty would be marked all the same.</p>",
         '<div class="figures">',
     ]
@@ -39,8 +38,8 @@ def grid_section(inputs: ReportInputs) -> str:
                 ),
                 f"Percentage points (thesis Tables 7 and 12). ▲ and ▼: the 95 % interval excludes zero, in "
                 f"{((low > 0) | (high < 0)).sum()} of {low.size} cells.",
-                f"Grid of gains of {titles[name]} over random, from "
-                f"{signed(np.min(against[name]['difference']))} to {signed(np.max(against[name]['difference']))} points; "
+                f"Grid of gains of {titles[name]} over random, from {signed(np.min(against[name]['difference']))} to "
+                f"{signed(np.max(against[name]['difference']))} points; "
                 f"{(low > 0).sum()} cells are marked as better, {(high < 0).sum()} as worse.",
             )
         )
@@ -153,10 +152,9 @@ def compatibility_section(inputs: ReportInputs) -> str:
             f"validated by object, {percent(theirs['validation'])} % and {percent(theirs['test'])} % by view.</p>"
         )
     return (
-        "<h2>Differences between the thesis and its published code</h2><p>Gain of the PointNet++ policy over random in the grid "
-        "above, in percentage points: first as the thesis's text describes it, then with one change at a time, and last with "
-        "all "
-        f"changes of the published code. {MARKS} The use of all clouds is not part of the published code.</p>"
+        "<h2>Differences between the thesis and its published code</h2><p>Gain of the PointNet++ policy over random in the "
+        "grid above, in percentage points: first as the thesis's text describes it, then with one change at a time, and last "
+        f"with all changes of the published code. {MARKS} The use of all clouds is not part of the published code.</p>"
         + table(["switch", "mean of the grid", "cells above zero", *(f"CT 0.99, MV {mv}" for mv in limits)], rows)
         + note
     )

@@ -25,8 +25,7 @@ STYLE = Path(__file__).with_name("page.css").read_text()
 SCRIPT = Path(__file__).with_name("page.js").read_text()
 MARKS = (
     "<b class='up'>▲ bold</b>: above zero, the whole interval is; <b class='down'>▼ bold</b>: below zero, the whole interval "
-    "is; "
-    "without a mark: the interval contains zero."
+    "is; without a mark: the interval contains zero."
 )
 """Explains the marks of `difference`, which do not need colour."""
 MANY_CLASSES = 25

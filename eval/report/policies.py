@@ -50,8 +50,7 @@ def lead(inputs: ReportInputs) -> str:
     single, policies = metrics["single_view"], metrics["policies"]
     sentences = [
         f"The classifier names the object from one view with an accuracy of {percent(single['accuracy'])} %, from two random "
-        f"views with "
-        f"{percent(policies['random']['after_views'][1])} %, and from all {metrics['views']} with "
+        f"views with {percent(policies['random']['after_views'][1])} %, and from all {metrics['views']} with "
         f"{percent(single['all_views'])} %."
     ]
     for name, called in (
@@ -186,9 +185,8 @@ def ladder_section(inputs: ReportInputs) -> str:
     return (
         "<h2>Accuracy by policy</h2><p>Accuracy (%) after exactly the given number of views. Below it: the difference from "
         f"random in percentage points with its 95 % interval. {MARKS} Each interval is for its own cell: of twenty differences "
-        f"that "
-        "do not exist, one would be expected to be marked. "
-        f"<dfn>Area</dfn>: mean accuracy over 1 to {len(policies['random']['after_views'])} views.{reach_note}</p>"
+        "that do not exist, one would be expected to be marked. <dfn>Area</dfn>: mean accuracy over 1 to "
+        f"{len(policies['random']['after_views'])} views.{reach_note}</p>"
         + table(header, rows_by_knowledge(rows))
         + f"<p class='note'>Random selection without repetition is computed as an exact expectation up to {exact} views"
         + (
@@ -242,8 +240,7 @@ def ascent_section(inputs: ReportInputs) -> str:
         f"{settings['starts']} start views then maximises the objective, rendered at "
         f"{settings['resolution']}×{settings['resolution']} pixels. The distinct optima are visited in the order of their "
         "values. Accuracy (%) after the given number of views; below it the difference from random, and below that from the "
-        "thesis's predicted entropy, both with 95 % intervals. "
-        f"{MARKS}</p>"
+        f"thesis's predicted entropy, both with 95 % intervals. {MARKS}</p>"
         + table(["next view chosen by", *(f"{step} views" for step in steps)], rows_by_knowledge(rows))
         + f"<p class='note'>{found['objects']} test objects, every start view. {found['views_without_surface']} of "
         f"{found['views']:,} views show too little for a surface; the choice after such a view is arbitrary.</p>"
@@ -280,8 +277,7 @@ def movement_section(inputs: ReportInputs) -> str:
     ]
     return (
         "<h2>Accuracy by distance travelled</h2><p>The camera moves on a sphere around the object. A distance is the angle "
-        "along "
-        "the shortest way (a great circle). Policies with a <dfn>movement cost</dfn> choose the view with the largest "
+        "along the shortest way (a great circle). Policies with a <dfn>movement cost</dfn> choose the view with the largest "
         "score − cost × distance in radians (57° are one radian), so they prefer near views.</p>"
         + image(
             figures.accuracy_by_distance(
