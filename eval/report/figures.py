@@ -237,8 +237,9 @@ def difference_grid(
 
 def confusions(matrices: dict[str, np.ndarray], classes: Sequence[str]) -> Figure:
     """Confusion matrices in percent of the true class, a panel for each policy."""
+    width = max(_WIDTH, 0.28 * len(classes) + 1.6)
     figure, axes = plt.subplots(
-        1, len(matrices), figsize=(_WIDTH * len(matrices), 4.6), layout="constrained", sharey=True, squeeze=False
+        1, len(matrices), figsize=(width * len(matrices), width), layout="constrained", sharey=True, squeeze=False
     )
     for axis, (title, matrix) in zip(axes[0], matrices.items(), strict=True):
         share = 100 * matrix / np.maximum(matrix.sum(axis=1, keepdims=True), 1e-9)
