@@ -12,7 +12,7 @@ from mevs_jax.viewpoints import local_maxima
 from train.thesis_networks import BACKBONES, FRAMES
 
 
-def _extremes(values: Sequence[float], names: Sequence[str], form: str = "{:.0f}") -> str:
+def _extremes(values: Sequence[float] | np.ndarray, names: Sequence[str], form: str = "{:.0f}") -> str:
     """The lowest and the highest value, with their names."""
     low, high = int(np.argmin(values)), int(np.argmax(values))
     return f"from {form.format(values[low])} ({names[low]}) to {form.format(values[high])} ({names[high]})"

@@ -102,12 +102,9 @@ def entropy_distribution(inputs: FigureInputs) -> Figure:
     figure, train = plt.subplots(figsize=(6.4, 3.2), layout="constrained")
     test = train.twinx()
     edges = np.linspace(0, 1, 51)
-    for axis, split, style in (
-        (train, "train", {"color": "#93c5fd", "fill": True}),
-        (test, "test", {"color": "#d97706", "linewidth": 1.8}),
-    ):
+    for axis, split, colour in ((train, "train", "#93c5fd"), (test, "test", "#d97706")):
         counts = statistics.entropy_histograms[split]
-        axis.stairs(counts, edges, label=split, **style)
+        axis.stairs(counts, edges, label=split, color=colour, fill=split == "train", linewidth=1.8)
         axis.set_ylabel(f"{split} views ({'filled' if split == 'train' else 'line'})")
         axis.set_ylim(0, 1.05 * max(counts))
     test.spines.right.set_visible(True)

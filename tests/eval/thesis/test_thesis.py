@@ -24,9 +24,10 @@ from data_pipeline.files import write_json
 from data_pipeline.objects.furniture import CLASSES, furniture
 from eval.numbers.timing import decision_memory, milliseconds, time_local_maxima
 from eval.settings import PRESETS
+from eval.thesis.alts import ALTS
 from eval.thesis.figures import FIGURES
 from eval.thesis.layout import thesis_numbers
-from eval.thesis.page import CHAPTERS
+from eval.thesis.page import CHAPTERS, _table_html
 from eval.thesis.results import LatticeTables, best_cells
 from eval.thesis.tables import all_tables, markdown
 from eval.walks.grid import THRESHOLDS, Results
@@ -161,6 +162,30 @@ def test_every_figure_but_the_captures_is_drawn(inputs):
     wanted = {f"F{n}" for n in (*range(5, 12), *range(17, 26))} | {f"T{n}" for n in range(1, 16)}
     assert {name for _, names in CHAPTERS for name in names} == wanted
     assert {f"F{shown.number}" for shown in FIGURES} == {name for name in wanted if name.startswith("F")}
+
+
+def test_every_figure_is_told_in_words(inputs):
+    said = {shown.number: ALTS[shown.number](inputs) for shown in FIGURES}
+    assert said.keys() == ALTS.keys()
+    assert all(text.endswith(".") and len(text) > 50 for text in said.values())
+    assert len(set(said.values())) == len(said)
+    accuracies = 100 * np.mean(inputs.results["pipeline"]["10"]["policies"]["random"]["accuracy"], axis=0)
+    assert f"Random: {accuracies.min():.1f} to {accuracies.max():.1f} %" in said["20"]
+    entropies = inputs.tables[40].entropy[0]
+    assert f"to {entropies.max():.2f} (view {entropies.argmax()})" in said["7"]
+    assert "training loss from 1.0000 to 0.3333" in said["17"]
+
+
+def test_gains_are_marked_without_bold_print_or_colour(results):
+    """Where the interval excludes zero, and nowhere else."""
+    table = next(shown for shown in all_tables(results) if shown.number == 7)
+    page = _table_html(table)
+    gain = results["pipeline"]["10"]["gain"]["text"]
+    for mark, ends in (("▲", [low > 0 for row in gain["interval"] for low, _ in row]),
+                       ("▼", [high < 0 for row in gain["interval"] for _, high in row])):  # fmt: skip
+        assert page.count(f"<b>{mark} ") == sum(ends)
+    for mark, text in re.findall(r"<b>(.) (.)", page):
+        assert (mark, text) in {("▲", "+"), ("▼", "−")}
 
 
 def test_networks_are_trained_as_the_thesis_says(statistics):
