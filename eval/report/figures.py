@@ -13,6 +13,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.patches import Ellipse
+from matplotlib.ticker import LogLocator, MaxNLocator, NullFormatter
 
 from eval.projections import equal_area
 
@@ -39,7 +40,7 @@ KNOWS_MARKS = {"nothing": "o", "networks": "s", "others": "^", "learned": "D", "
 INK = "#111827"
 _LINES = ("o-", "s--", "^-.", "v:", "D-", "P--", "X-.", "h:", "<-", ">--", "*-.")
 """Markers and lines of policies, in order: they differ without colours."""
-_WIDTH = 4.8
+_WIDTH = 4.2
 """Inches of a figure that is read on a small screen without scrolling."""
 
 plt.rcParams.update(
@@ -73,7 +74,7 @@ def accuracy_after_views(
     policies: dict[str, dict[str, Any]], titles: dict[str, str], all_views: float, own: Sequence[str] = ()
 ) -> Figure:
     """Accuracy after each number of views, over all start views, with 95 % bands over objects; `own` are drawn as well."""
-    figure, axis = plt.subplots(figsize=(_WIDTH, 4.6), layout="constrained")
+    figure, axis = plt.subplots(figsize=(_WIDTH, 3.2), layout="constrained")
     for line, (name, colour) in zip(itertools.cycle(_LINES), _colours(own).items(), strict=False):
         values = 100 * np.array(policies[name]["after_views"])
         low, high = 100 * np.array(policies[name]["after_views_interval"]).T
@@ -82,6 +83,7 @@ def accuracy_after_views(
         axis.fill_between(steps, low, high, color=colour, alpha=0.06, linewidth=0)
     axis.axhline(100 * all_views, color=INK, linestyle=(0, (1, 2)), linewidth=1, label="all views summed")
     axis.set(xlabel="number of views", ylabel="test accuracy (%)", title="Accuracy by number of views")
+    axis.xaxis.set_major_locator(MaxNLocator(10, integer=True))
     _legend_below(figure)
     return figure
 
@@ -93,15 +95,16 @@ def ink_on(colour: Sequence[float] | np.ndarray) -> str:
 
 
 def _legend_below(figure: Figure) -> None:
-    """Puts the legend of all axes under the figure, in two columns where the labels are short."""
+    """Puts the legend under the axes of a figure, which becomes higher by it; in two columns where the labels are short."""
     handles, labels = figure.axes[0].get_legend_handles_labels()
-    columns = 2 if max(map(len, labels)) < 29 else 1
+    columns = 2 if max(map(len, labels)) < 21 else 1
+    figure.set_figheight(figure.get_figheight() + 0.19 * -(-len(labels) // columns))
     figure.legend(handles, labels, frameon=False, fontsize=9, ncols=columns, loc="outside lower left", handlelength=3)
 
 
 def accuracy_of_choices(policies: dict[str, dict[str, Any]], titles: dict[str, str], all_views: float) -> Figure:
     """Accuracy after each number of views, coloured by what each policy knows, with 95 % bands over objects."""
-    figure, axis = plt.subplots(figsize=(_WIDTH, 5.2), layout="constrained")
+    figure, axis = plt.subplots(figsize=(_WIDTH, 3.4), layout="constrained")
     for line, (name, policy) in zip(itertools.cycle(_LINES), policies.items(), strict=False):
         values, (low, high) = 100 * np.array(policy["after_views"]), 100 * np.array(policy["interval"]).T
         steps, colour = np.arange(1, len(values) + 1), KNOWS_COLOURS[policy["knows"]]
@@ -109,7 +112,7 @@ def accuracy_of_choices(policies: dict[str, dict[str, Any]], titles: dict[str, s
         axis.fill_between(steps, low, high, color=colour, alpha=0.05, linewidth=0)
     axis.axhline(100 * all_views, color=INK, linestyle=(0, (1, 2)), linewidth=1, label="all views fused")
     axis.set(xlabel="number of views", ylabel="test accuracy (%)", title="Accuracy by number of views")
-    axis.set_xticks(range(1, 1 + max(len(policy["after_views"]) for policy in policies.values())))
+    axis.xaxis.set_major_locator(MaxNLocator(10, integer=True))
     _legend_below(figure)
     return figure
 
@@ -132,7 +135,7 @@ def ladder_gains(
         axis.plot([low, high], [row, row], color=colour, linewidth=1.5)
         axis.plot(gain, row, KNOWS_MARKS[rung["knows"]], color=colour, markersize=6, markerfacecolor=face)
     axis.axvline(0, color=INK, linewidth=1)
-    axis.set(xlabel="gain over random (percentage points)", title=f"After {count} views")
+    axis.set(xlabel="gain over random (points)", title=f"After {count} views")
     axis.grid(axis="x", color="#e5e7eb", linewidth=0.6)
     axis.set_axisbelow(True)
     axis.set_yticks(range(len(rungs)), [rung["title"].lstrip("— ") for rung in rungs])
@@ -147,17 +150,19 @@ def accuracy_by_distance(
     own: Sequence[str] = (),
 ) -> Figure:
     """Accuracy against the distance that the camera travelled; the thin lines have a movement cost."""
-    figure, axis = plt.subplots(figsize=(_WIDTH, 4.6), layout="constrained")
+    styles: dict[str, str] = {}
+    figure, axis = plt.subplots(figsize=(_WIDTH, 3.2), layout="constrained")
     for line, (name, colour) in zip(itertools.cycle(_LINES), _colours(own).items(), strict=False):
         if name == "belief_oracle":
             continue
         distance, values = np.degrees(policies[name]["travelled"]), 100 * np.array(policies[name]["after_views"])
         axis.plot(distance, values, line, color=colour, label=titles[name], markersize=4)
+        styles[name] = line[1:]
     for name, runs in movement.items():
         with_cost = [run for run in runs if run["cost"] > 0]
         for run in with_cost:
             distance, values = np.degrees(run["travelled"]), 100 * np.array(run["after_views"])
-            axis.plot(distance, values, "-", color=COLOURS[name], linewidth=0.8)
+            axis.plot(distance, values, styles[name], color=COLOURS[name], linewidth=0.9)
             if run in (with_cost[0], with_cost[-1]):
                 axis.annotate(f"{run['cost']:g}", (distance[-1], values[-1]), fontsize=8, color=COLOURS[name])
     axis.set(xlabel="distance travelled (°)", ylabel="test accuracy (%)", title="Accuracy by distance travelled")
@@ -167,12 +172,13 @@ def accuracy_by_distance(
 
 def calibration_by_views(readings: dict[str, dict[str, Any]], titles: dict[str, str]) -> Figure:
     """Expected calibration error after each number of views, a line for each way to compute the confidence."""
-    figure, axis = plt.subplots(figsize=(_WIDTH, 3.8), layout="constrained")
+    figure, axis = plt.subplots(figsize=(_WIDTH, 2.6), layout="constrained")
     colours = ("#d97706", "#0d9488", "#9333ea", "#dc2626", "#6b7280")
     for name, colour, line in zip(readings, colours, _LINES[: len(colours)], strict=True):
         values = 100 * np.array(readings[name]["ece"])
         axis.plot(np.arange(1, len(values) + 1), values, line, color=colour, label=titles[name], markersize=4)
     axis.set(xlabel="number of views", ylabel="expected calibration error (%)", title="Calibration error", ylim=0)
+    axis.xaxis.set_major_locator(MaxNLocator(10, integer=True))
     _legend_below(figure)
     return figure
 
@@ -199,7 +205,7 @@ def reliability_curves(readings: dict[str, dict[str, Any]], titles: dict[str, st
     for row in axes:
         row[0].set_ylabel("accuracy (%)")
     handles, labels = axes[0][0].get_legend_handles_labels()
-    figure.legend(handles, labels, frameon=False, fontsize=9, ncols=2, loc="outside lower center", markerscale=0.5)
+    figure.legend(handles, labels, frameon=False, fontsize=9, loc="outside lower left", markerscale=0.5)
     return figure
 
 
@@ -257,12 +263,12 @@ def confusions(matrices: dict[str, np.ndarray], classes: Sequence[str]) -> Figur
 
 def entropy_histogram(counts: Sequence[int], mean: float, std: float) -> Figure:
     """Normalised depth entropies of the training views."""
-    figure, axis = plt.subplots(figsize=(4.6, 2.8), layout="constrained")
+    figure, axis = plt.subplots(figsize=(_WIDTH, 2.8), layout="constrained")
     edges = np.linspace(0, 1, len(counts) + 1)
     axis.bar(edges[:-1], counts, width=np.diff(edges), align="edge", color="#93c5fd")
     axis.axvline(mean, color="#1d4ed8", label=f"mean {mean:.3f}, sd {std:.3f}")
     axis.set(xlabel="normalised depth entropy", ylabel="views", title="Depth entropies (training)")
-    axis.legend(frameon=False)
+    _legend_below(figure)
     return figure
 
 
@@ -273,7 +279,7 @@ def entropy_errors(entropy: dict[str, Any]) -> Figure:
         ("class-mean map\n(given the class)", "class_mean_map", "#d1d5db"),
         ("PointNet++", "pointnet2", "#2563eb"),
     ]
-    figure, axis = plt.subplots(figsize=(4.6, 2.6), layout="constrained")
+    figure, axis = plt.subplots(figsize=(_WIDTH, 2.6), layout="constrained")
     for position, (_, name, colour) in enumerate(rows):
         low, high = entropy[f"{name}_interval"]
         axis.barh(
@@ -281,6 +287,8 @@ def entropy_errors(entropy: dict[str, Any]) -> Figure:
             entropy[name],
             color=colour,
             xerr=[[max(0, entropy[name] - low)], [max(0, high - entropy[name])]],
+            edgecolor=INK,
+            linewidth=0.8,
             ecolor=INK,
             capsize=3,
         )
@@ -361,7 +369,11 @@ def losses(name: str, history: list[dict[str, float]]) -> Figure:
         found[part] = [entry[f"{part}/loss"] for entry in history]
         axis.plot(epochs, found[part], line, color=colour, markersize=4, label=title)
     axis.set(xlabel="epoch", ylabel="loss", title=name)
+    axis.xaxis.set_major_locator(MaxNLocator(10, integer=True))
     if len(epochs) > 1 and max(found["train"]) > 5 * min(found["val"]):
         axis.set_yscale("log")
+        axis.yaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
+        axis.yaxis.set_major_formatter("{x:g}")
+        axis.yaxis.set_minor_formatter(NullFormatter())
     axis.legend(frameon=False)
     return figure

@@ -24,8 +24,8 @@ from eval.walks.ladder import KNOWS, Knows
 STYLE = Path(__file__).with_name("page.css").read_text()
 SCRIPT = Path(__file__).with_name("page.js").read_text()
 MARKS = (
-    "<b class='up'>▲ bold</b>: above zero, the whole interval is; <b class='down'>▼ bold</b>: below zero, the whole interval "
-    "is; without a mark: the interval contains zero."
+    "<b class='up'>▲ bold</b>: the whole interval is above zero; <b class='down'>▼ bold</b>: the whole interval is below zero; "
+    "no mark: it contains zero."
 )
 """Explains the marks of `difference`, which do not need colour."""
 MANY_CLASSES = 25
@@ -176,7 +176,7 @@ def table(header: Sequence[str], rows: Sequence[Sequence[str]], label: str = "")
 
 def _cells(row: Sequence[str], columns: int) -> str:
     if len(row) == 1:
-        return f'<th scope="rowgroup" colspan="{columns}">{row[0]}</th>'
+        return f'<th scope="rowgroup" colspan="{columns}"><span class="group">{row[0]}</span></th>'
     return f'<th scope="row">{row[0]}</th>' + "".join(f"<td>{cell}</td>" for cell in row[1:])
 
 

@@ -283,8 +283,8 @@ def movement_section(inputs: ReportInputs) -> str:
             figures.accuracy_by_distance(
                 metrics["policies"], titles, metrics["movement"], [rung["policy"] for rung in _own(metrics)]
             ),
-            "Markers: after 1, 2, 3, … views. Thin lines: the same policy with movement costs; the smallest and the "
-            "largest are printed at the ends.",
+            "Markers: after 1, 2, 3, … views. Thin lines, of the same style: a policy with movement costs; the smallest and "
+            "the largest are printed at the ends.",
             f"Curves of accuracy by degrees travelled. {' '.join(_distances(metrics, titles, last[0]))}",
         )
         + f"<details><summary>After {last[0]} views, by movement cost</summary>"

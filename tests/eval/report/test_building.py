@@ -102,7 +102,7 @@ def test_a_table_has_headings_for_rows_and_columns():
     shown = table(["policy", "1 < 2"], [["<b>Uses nothing</b>"], ["random", "3"], ["group"], ["b", "4"]], "a table")
     assert shown.count("<tbody>") == 2
     assert '<th scope="col">1 &lt; 2</th>' in shown
-    assert '<th scope="rowgroup" colspan="2"><b>Uses nothing</b></th>' in shown
+    assert '<th scope="rowgroup" colspan="2"><span class="group"><b>Uses nothing</b></span></th>' in shown
     assert '<th scope="row">random</th><td>3</td>' in shown
     assert 'tabindex="0" role="group" aria-label="Table: a table"' in shown
 
