@@ -8,7 +8,7 @@
   const data = JSON.parse($("scenes").textContent), sections = [...document.querySelectorAll("#walks .walk")];
   if (!data.scenes.length) return;
   const RADIUS = 1.45, DISTANCE = 6, SHADES = 24, START = { azimuth: 0.7, elevation: 0.4, zoom: 1 };
-  const SIZES = [0.55, 1, 1.6]; // of points in cells of the grid: not seen yet, seen before, new
+  const SIZES = [0.45, 0.8, 1.6]; // of points in cells of the grid: not seen yet, seen before, new
   const SMALLER = Math.max(0.55, Math.min(1, Math.sqrt(60 / data.directions.length))); // many candidates are drawn smaller
   const eye = { ...START };
   let scene, step = 1, colours = {}, waiting = false;
@@ -91,7 +91,11 @@
     pen.setLineDash([]);
   };
   // The way between two directions, in pieces, so that each is drawn before or behind the object.
-  const arc = (a, b) => Array.from({ length: 17 }, (_, i) => times(unit(sum(times(a, 1 - i / 16 + 1e-4), b, i / 16)), RADIUS));
+  const arc = (a, b) => {
+    const cosine = Math.max(-1, Math.min(1, dot(a, b))), angle = Math.acos(cosine), opposite = Math.abs(cosine) > 0.9999;
+    const side = unit(opposite ? cross(a, Math.abs(a[2]) > 0.9 ? [1, 0, 0] : [0, 0, 1]) : sum(b, a, -cosine));
+    return Array.from({ length: 25 }, (_, i) => (i / 24) * angle).map((t) => times(sum(times(a, Math.cos(t)), side, Math.sin(t)), RADIUS));
+  };
   const pieces = (f, path, front, style, width, dash) => {
     for (let i = 1; i < path.length; i++) {
       if (dot(sum(path[i - 1], path[i]), f.towards) >= 0 === front) line(f, [path[i - 1], path[i]], style, width, dash);

@@ -181,7 +181,13 @@ def _quaternion(rotation: Float[np.ndarray, "3 3"]) -> Float[np.ndarray, " 4"]:
 
 def _way(start: Float[np.ndarray, " 3"], end: Float[np.ndarray, " 3"], steps: int = 17) -> Float[np.ndarray, "steps 3"]:
     """Points on the shortest way around the object from one camera to another."""
+    away, last = np.linalg.norm(start), np.linalg.norm(end)
+    first, other = start / away, end / last
+    cosine = np.clip(first @ other, -1, 1)
+    aside = other - cosine * first
+    if np.linalg.norm(aside) < 1e-3:  # opposite: any way is the shortest
+        aside = np.cross(first, np.eye(3)[np.abs(first).argmin()])
     share = np.linspace(0, 1, steps)[:, None]
-    points = (1 - share) * start + share * end
-    distance = (1 - share) * np.linalg.norm(start) + share * np.linalg.norm(end)
-    return distance * points / np.maximum(np.linalg.norm(points, axis=1, keepdims=True), 1e-6)
+    angle = share * np.arccos(cosine)
+    points = np.cos(angle) * first + np.sin(angle) * aside / np.linalg.norm(aside)
+    return ((1 - share) * away + share * last) * points

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from mevs_jax.agent import load_history
-from mevs_jax.agent.viewing import after, clouds_of, view
+from mevs_jax.agent.viewing import _way, after, clouds_of, view
 from tests.mevs_jax.trained import making
 
 
@@ -57,6 +57,19 @@ def test_views_show_points_of_the_ball(system, history):
     for points, pose in zip(clouds, history.poses, strict=True):
         assert (points @ pose[:3, 3] > 0).mean() > 0.95  # of the side that faces the camera
     assert np.median(radius) < 1.0
+
+
+@pytest.mark.parametrize("end", [(0, 3, 0), (-2, 0, 0), (2, 0, 0), (-2, 0.01, 0.02)])
+def test_the_way_is_evenly_around_the_object(end):
+    start = np.array([2.0, 0, 0])
+    way = _way(start, np.array(end, float))
+    np.testing.assert_allclose(way[[0, -1]], [start, end], atol=1e-2)
+    radius, steps = (
+        np.linalg.norm(way, axis=1),
+        np.linalg.norm(np.diff(way / np.linalg.norm(way, axis=1)[:, None], axis=0), axis=1),
+    )
+    np.testing.assert_allclose(radius, np.linspace(2, np.linalg.norm(end), len(way)))
+    np.testing.assert_allclose(steps, steps.mean(), atol=1e-6)
 
 
 def test_a_server_shows_the_history(system, history):
