@@ -11,6 +11,7 @@ import matplotlib
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt
 import numpy as np
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import Ellipse
 from matplotlib.ticker import LogLocator, MaxNLocator, NullFormatter
@@ -92,6 +93,14 @@ def ink_on(colour: Sequence[float] | np.ndarray) -> str:
     """Black or white, whichever has the higher contrast to a colour (r, g, b, …) in [0, 1]; it is 4.5 at least."""
     linear = [c / 12.92 if c <= 0.04045 else ((c + 0.055) / 1.055) ** 2.4 for c in colour[:3]]
     return "white" if np.dot(linear, (0.2126, 0.7152, 0.0722)) < 0.179 else "black"
+
+
+def logarithmic(axis: Axes) -> None:
+    """Makes the ordinate logarithmic, with plain numbers at its ticks."""
+    axis.set_yscale("log")
+    axis.yaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
+    axis.yaxis.set_major_formatter("{x:g}")
+    axis.yaxis.set_minor_formatter(NullFormatter())
 
 
 def _legend_below(figure: Figure) -> None:
@@ -371,9 +380,6 @@ def losses(name: str, history: list[dict[str, float]]) -> Figure:
     axis.set(xlabel="epoch", ylabel="loss", title=name)
     axis.xaxis.set_major_locator(MaxNLocator(10, integer=True))
     if len(epochs) > 1 and max(found["train"]) > 5 * min(found["val"]):
-        axis.set_yscale("log")
-        axis.yaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
-        axis.yaxis.set_major_formatter("{x:g}")
-        axis.yaxis.set_minor_formatter(NullFormatter())
+        logarithmic(axis)
     axis.legend(frameon=False)
     return figure

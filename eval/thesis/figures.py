@@ -282,27 +282,28 @@ def _losses(axis: Axes, history: list[dict[str, float]], colour: str, label: str
 
 
 def entropy_losses(inputs: FigureInputs) -> Figure:
-    figure, axes = plt.subplots(2, 1, figsize=(4.8, 6.2), layout="constrained")
+    figure, axes = plt.subplots(2, 1, figsize=(4.2, 5.6), layout="constrained")
     styles: dict[Frame, tuple[str, str]] = {"world": ("#2563eb", "o"), "camera": ("#d97706", "s")}
     for axis, views, letter in zip(axes, inputs.statistics, "ab", strict=True):
         for frame in FRAMES:
             colour, marker = styles[frame]
             _losses(axis, inputs.histories[f"entropy_{views}_{frame}"], colour, f"{frame} frame, ", marker)
-        axis.set(xlabel="epoch", ylabel="mean squared error", yscale="log", title=f"({letter}) {views} views")
+        axis.set(xlabel="epoch", ylabel="mean squared error", title=f"({letter}) {views} views")
+        figures.logarithmic(axis)
         axis.xaxis.set_major_locator(MaxNLocator(integer=True))
-        axis.legend(frameon=False, fontsize=8)
+        axis.legend(frameon=False, fontsize=9)
     return figure
 
 
 def backbone_losses(indices: Sequence[int]) -> Callable[[FigureInputs], Figure]:
     def draw(inputs: FigureInputs) -> Figure:
-        figure, axes = plt.subplots(2, 1, figsize=(4.8, 6.2), layout="constrained", sharey=True)
+        figure, axes = plt.subplots(2, 1, figsize=(4.2, 5.6), layout="constrained", sharey=True)
         for axis, index, letter in zip(axes, indices, "ab", strict=True):
             backbone = BACKBONES[index]
             _losses(axis, inputs.histories[backbone.name], "#2563eb", "")
             axis.set(xlabel="epoch", ylabel="cross entropy", title=f"({letter}) {backbone.title}")
             axis.xaxis.set_major_locator(MaxNLocator(integer=True))
-            axis.legend(frameon=False, fontsize=8)
+            axis.legend(frameon=False, fontsize=9)
         axes[0].set_ylim(bottom=0)
         return figure
 
@@ -368,7 +369,7 @@ def confusion_difference(inputs: FigureInputs) -> Figure:
         if abs(value) >= 0.05:
             colour = figures.ink_on(cells.to_rgba(value))
             text = f"{value:+.1f}".replace("-", "−")
-            axis.text(column, row, text, ha="center", va="center", fontsize=7, color=colour)
+            axis.text(column, row, text, ha="center", va="center", fontsize=8, color=colour)
     axis.set_xticks(range(len(classes)), classes, rotation=60, ha="right")
     axis.set_yticks(range(len(classes)), classes)
     axis.set(xlabel="predicted", ylabel="true", title="PointNet++ minus random (points)")

@@ -69,7 +69,7 @@ def _table_html(shown: ThesisTable) -> str:
     for row in shown.rows:
         cells = [html.escape(row.name)]
         for ours, bold, theirs in shown_cells(row, shown):
-            text = f"<b>{_mark(ours)} {html.escape(ours)}</b>" if bold else html.escape(ours)
+            text = f"<b class='up'>{_mark(ours)} {html.escape(ours)}</b>" if bold else html.escape(ours)
             cells.append(text + (f' <small class="note">({html.escape(theirs)})</small>' if theirs else ""))
         rows.append(cells)
     return (

@@ -183,8 +183,8 @@ def test_gains_are_marked_without_bold_print_or_colour(results):
     gain = results["pipeline"]["10"]["gain"]["text"]
     for mark, ends in (("▲", [low > 0 for row in gain["interval"] for low, _ in row]),
                        ("▼", [high < 0 for row in gain["interval"] for _, high in row])):  # fmt: skip
-        assert page.count(f"<b>{mark} ") == sum(ends)
-    for mark, text in re.findall(r"<b>(.) (.)", page):
+        assert page.count(f"<b class='up'>{mark} ") == sum(ends)
+    for mark, text in re.findall(r"<b class='up'>(.) (.)", page):
         assert (mark, text) in {("▲", "+"), ("▼", "−")}
 
 
