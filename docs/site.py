@@ -66,7 +66,10 @@ def on_page_markdown(markdown: str, page: Any, **_: Any) -> str:
 _STYLE = """<style>
 .md-typeset p a, .md-typeset li a, .md-typeset td a { text-decoration: underline }
 .md-typeset .headerlink { text-decoration: none }
-[data-md-color-scheme=default] { --md-code-hl-comment-color: #626262; --md-code-hl-variable-color: #626262 }
+[data-md-color-scheme=default] {
+  --md-code-hl-comment-color: #626262; --md-code-hl-variable-color: #626262; --md-code-hl-operator-color: #626262;
+  --md-code-hl-punctuation-color: #626262; --md-code-hl-generic-color: #626262;
+}
 [data-md-color-scheme=slate][data-md-color-primary] {
   --md-code-hl-number-color: #f08a7d; --md-code-hl-constant-color: #a99bea; --md-typeset-a-color: #7ba1e6;
 }
