@@ -165,7 +165,8 @@ def browser() -> Iterator[Any]:
     program = next((program for program in programs if program), None)
     if program is None:
         pytest.skip("there is no Chromium here: apt-get install chromium")
-    drawing = ["--use-angle=swiftshader", "--enable-unsafe-swiftshader"]  # WebGL without a graphics card
+    # WebGL without a graphics card, and the same pixels whenever the same is drawn.
+    drawing = ["--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--disable-accelerated-2d-canvas"]
     with playwright.sync_playwright() as started:
         opened = started.chromium.launch(executable_path=program, args=["--no-sandbox", *drawing])
         yield opened

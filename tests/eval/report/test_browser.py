@@ -35,6 +35,7 @@ def test_the_scene_is_drawn_and_turns(whole, opened):
         "const d = c.getContext('2d').getImageData(0, 0, c.width, c.height).data, found = new Set();"
         "for (let i = 0; i < d.length; i += 4) found.add((d[i] << 16) | (d[i + 1] << 8) | d[i + 2]); return found.size }"
     ) > 20  # fmt: skip
+    page.locator("#scene").scroll_into_view_if_needed()
     box = page.locator("#scene").bounding_box()
     middle = box["x"] + box["width"] / 2, box["y"] + box["height"] / 2
     page.mouse.move(*middle)
@@ -110,7 +111,7 @@ def test_the_slider_goes_through_the_views(whole, opened):
 @pytest.mark.parametrize("width", [1200, 390])
 def test_without_scripts_all_walks_are_read(whole, opened, width):
     page = opened(whole / "report" / "index.html", width, java_script_enabled=False).page
-    assert page.get_by_text("The 3-D scene needs JavaScript").is_visible()
+    assert page.locator("noscript .warning").is_visible()
     assert not page.locator("#viewer").is_visible()
     assert page.locator(".walk").count() == page.locator(".walk:visible").count() > 0
     assert page.locator(".walk img").first.is_visible()
