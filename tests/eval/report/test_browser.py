@@ -117,6 +117,30 @@ def test_without_scripts_all_walks_are_read(whole, opened, width):
     assert page.locator(".walk img").first.is_visible()
 
 
+def test_all_walks_are_printed(whole, opened):
+    page = opened(whole / "report" / "index.html", 1200).page
+    assert page.locator(".walk").count() > page.locator(".walk:visible").count() == 1
+    page.emulate_media(media="print")
+    assert page.locator(".walk").count() == page.locator(".walk:visible").count()
+    assert not page.locator(".controls").first.is_visible()
+
+
+def test_nothing_moves_by_itself(whole, opened):
+    page = opened(whole / "report" / "index.html", 1200).page
+    assert page.evaluate("document.getAnimations().length") == 0
+    style = page.locator("style").first.text_content()
+    assert not [word for word in ("transition", "animation", "scroll-behavior") if word in style]
+
+
+def test_the_tab_key_stops_only_where_something_is_done(whole, opened):
+    """Tables and figures that fit are no stops; those that scroll are, and say so."""
+    for width in (1200, 390):
+        page = opened(whole / "report" / "index.html", width).page
+        for box in page.locator("main > .scroll, main > figure .scroll").all():
+            wider = box.evaluate("(box) => box.scrollWidth > box.clientWidth + 1")
+            assert (box.get_attribute("tabindex") == "0") == wider == box.locator(".hint").is_visible()
+
+
 @pytest.fixture(scope="module")
 def site() -> Iterator[str]:
     """The address of the documentation, which a server of this process shows."""
