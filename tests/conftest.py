@@ -13,6 +13,7 @@ import tempfile
 from collections.abc import Callable, Iterator
 from importlib.metadata import version
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -152,6 +153,40 @@ def whole(tmp_path_factory) -> Path:
         assert "Report:" in result.stdout
 
     return made_once(tmp_path_factory, "whole", make)
+
+
+@pytest.fixture(scope="session")
+def browser() -> Iterator[Any]:
+    """Chromium, without a window; skipped where it, or what drives it, is not installed."""
+    playwright = pytest.importorskip(
+        "playwright.sync_api", reason="playwright is not installed: pip install '.[browser]'"
+    )
+    programs = map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))
+    program = next((program for program in programs if program), None)
+    if program is None:
+        pytest.skip("there is no Chromium here: apt-get install chromium")
+    # WebGL without a graphics card, and the same pixels whenever the same is drawn.
+    drawing = ["--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--disable-accelerated-2d-canvas"]
+    with playwright.sync_playwright() as started:
+        opened = started.chromium.launch(executable_path=program, args=["--no-sandbox", *drawing])
+        yield opened
+        opened.close()
+
+
+@pytest.fixture
+def opened(browser) -> Iterator[Callable[..., Any]]:
+    """A function that opens pages, as `tests.reference.browser.Opened`."""
+    from tests.reference.browser import Opened
+
+    pages: list[Opened] = []
+
+    def open_page(address: Path | str, width: int, scheme: str = "light", **options: Any) -> Opened:
+        pages.append(Opened(browser, address, width, scheme, **options))
+        return pages[-1]
+
+    yield open_page
+    for page in pages:
+        page.context.close()
 
 
 @pytest.fixture(scope="session")

@@ -15,6 +15,7 @@ from eval.report import figures
 from eval.report.html import (
     MARKS,
     ReportInputs,
+    commands,
     difference,
     document,
     image,
@@ -222,26 +223,20 @@ def _lead(metrics: dict[str, Any], views: str) -> str:
     )
     return (
         f'<p class="lead">Accuracy after two views is {percent(method[1])} % if the policy chooses the second and '
-        f"{percent(random[1])} % if it is random: {_gain_of_two(gains)} points.{with_table} "
-        f"Accuracy from one view is {percent(random[0])} %, and {percent(single)} % from its logits without the fusion; from "
-        f"all "
+        f"{percent(random[1])} % if it is random: {_gain_of_two(gains)} points.{with_table} Accuracy from one view is "
+        f"{percent(random[0])} %, and {percent(single)} % from its logits without the fusion; from all "
         f"{first['random_sets'][-1]['views']} views it is {percent(every)} % fused and {percent(summed)} % "
-        f"summed.{trainings}</p>"
-        "<p>A <dfn>view</dfn> is one depth image of the object from one of the candidate directions. A <dfn>policy</dfn> "
-        "chooses the "
-        "next view from those seen so far. The <dfn>fusion</dfn> is a network that makes one belief about the class from all "
-        "views seen; "
-        "the thesis adds the logits of single views instead. The <dfn>view policy</dfn> is a network that predicts the gain of "
-        "every "
-        "candidate. <dfn>Calibration error</dfn> (ECE) is the mean distance between confidence and accuracy, over bins of "
-        "confidence. A "
-        "<dfn>nat</dfn> is the unit of natural logarithms of probabilities; <dfn>risk</dfn> is 1 − confidence. An "
-        "<dfn>oracle</dfn> knows "
-        "what a robot cannot know.</p>"
+        f"summed.{trainings}</p><p>A <dfn>view</dfn> is one depth image of the object from one of the candidate directions. A "
+        "<dfn>policy</dfn> chooses the next view from those seen so far. The <dfn>fusion</dfn> is a network that makes one "
+        "<dfn>belief</dfn>, a probability for each class, from all views seen. <i>The thesis</i> (Learning Optimal View "
+        "Selection for Multi-View Object Representation) adds the <dfn>logits</dfn> instead, a classifier's numbers for each "
+        "class. The <dfn>view policy</dfn> is a network that predicts the gain of every candidate. <dfn>Calibration "
+        "error</dfn> (ECE) is the mean distance between confidence and accuracy, over bins of confidence. A <dfn>nat</dfn> is "
+        "the unit of natural logarithms of probabilities; <dfn>risk</dfn> is 1 − confidence. An <dfn>oracle</dfn> knows what "
+        "a robot cannot know.</p>"
         f'<p class="note">Over {first["objects"]} test objects and every start view. All policies use the same fusion, '
-        "objects and "
-        f"start views. Everything is fitted or chosen on {first['validation_objects']} validation objects. The views of these "
-        "lattices are not in the training data, which has other directions around other objects.</p>"
+        f"objects and start views. Everything is fitted or chosen on {first['validation_objects']} validation objects. The "
+        "views of these lattices are not in the training data, which has other directions around other objects.</p>"
     )
 
 
@@ -272,12 +267,9 @@ def _rotated(metrics: dict[str, Any]) -> str:
     ((_, found),) = metrics["seeds"][0]["rotated"].items()
     every = found["random_sets"][-1]
     return (
-        "<h2>Any rotation</h2>"
-        "<p>Objects are turned by an unknown rotation about any axis. The recognisers were trained for some further epochs on "
-        "objects rotated in the same way. "
-        f"All {every['views']} views fused: {percent(every['learned']['accuracy'])} %.</p>"
-        + _ladder(found)
-        + _against(found)
+        "<h2>Any rotation</h2><p>Objects are turned by an unknown rotation about any axis. The recognisers were trained for "
+        f"some further epochs on objects rotated in the same way. All {every['views']} views fused: "
+        f"{percent(every['learned']['accuracy'])} %.</p>" + _ladder(found) + _against(found)
     )
 
 
@@ -388,6 +380,27 @@ def _alt_of_curves(curves: dict[str, Any]) -> str:
     return f"Curves of accuracy by number of views: {'; '.join(parts)}. The table has all numbers."
 
 
+def _next(metrics: dict[str, Any]) -> str:
+    """The end of the page: commands that continue this run."""
+    steps = [
+        (
+            "Recognise a mesh of your own with these networks, and look at the walk in a browser:",
+            "mevs look --system RUN/learned/system --mesh FILE --view",
+        )
+    ]
+    if len(metrics["seeds"]) < 2:
+        steps.append(
+            (
+                "Train from other seeds, to know whether the results hold for other trainings:",
+                "mevs study learned --out RUN --seeds 3",
+            )
+        )
+    return (
+        "<h2>What to do next</h2><p><code>RUN</code> stands for the folder of this run; this page is "
+        f"<code>learned/index.html</code> in it.</p>{commands(steps)}"
+    )
+
+
 def write_learned_page(metrics: dict[str, Any], statistics: DatasetStatistics, path: Path) -> None:
     """Writes the page, which needs no other file. Numbers are of the first seed unless the page states otherwise."""
     single = fmean(next(iter(seed["lattices"].values()))["single_view"] for seed in metrics["seeds"])
@@ -418,14 +431,6 @@ def write_learned_page(metrics: dict[str, Any], statistics: DatasetStatistics, p
                 + _novel(metrics, statistics.classes)
                 + _seeds(metrics, views)
             )
-    left_out = f"<p>{statistics.left_out_count} objects without a surface were left out.</p>"
-    left_out += (
-        "<h2>What to do next</h2><p><code>RUN</code> stands for the folder of this run; this page is "
-        "<code>learned/index.html</code> "
-        "in it.</p><ol><li><p>Recognise a mesh of your own with these networks, and look at the walk in a browser:</p>"
-        "<pre><code>mevs look --system RUN/learned/system --mesh FILE --view</code></pre></li>"
-        "<li><p>Train from other seeds, to know whether the results hold for other trainings:</p>"
-        "<pre><code>mevs study learned --out RUN --learned.seeds 3</code></pre></li></ol>"
-    )
+    parts.append(f"<p>{statistics.left_out_count} objects without a surface were left out.</p>{_next(metrics)}")
     title = f"Learned view selection: {html.escape(statistics.source)}"
-    write_text(path, document(title, "".join(parts) + left_out))
+    write_text(path, document(title, "".join(parts)))

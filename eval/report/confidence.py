@@ -45,12 +45,10 @@ def confidence_section(inputs: ReportInputs) -> str:
     return (
         f"<h2>Confidence and calibration</h2><p>Walks by {html.escape(titles[name])}. The <dfn>confidence</dfn> is the "
         "probability of the most likely class, by the softmax of the fused logits. It is <dfn>calibrated</dfn> if predictions "
-        "with "
-        "a confidence of 80 %, say, are right in 80 % of the cases. Adding logits treats the views of one "
-        "object as independent, so confidence exceeds accuracy. A <dfn>temperature</dfn> for each number of views, a number by "
-        "which the logits are "
-        "divided, fitted on validation walks, corrects this and changes no prediction; only the mean of probabilities can "
-        "change one.</p>"
+        "with a confidence of 80 %, say, are right in 80 % of the cases. Adding logits treats the views of one object as "
+        "independent, so confidence exceeds accuracy. A <dfn>temperature</dfn> for each number of views, a number by which "
+        "the logits are divided, fitted on validation walks, corrects this and changes no prediction; only the mean of "
+        "probabilities can change one.</p>"
         + image(
             figures.calibration_by_views(readings, READINGS),
             "Expected calibration error (ECE): the mean distance between confidence and accuracy over 15 bins of confidence; "
@@ -63,8 +61,7 @@ def confidence_section(inputs: ReportInputs) -> str:
         )
         + table(header, rows)
         + "<p class='note'>After the given number of views: ECE and accuracy in %; negative log-likelihood (NLL) in nats, the "
-        "mean of "
-        "−log of the probability given to the true class. Lower is better for both.</p>"
+        "mean of −log of the probability given to the true class. Lower is better for both.</p>"
         + image(
             figures.reliability_curves(readings, READINGS, steps),
             "On the dotted diagonal, confidence equals accuracy; below it, the answers are less often right than they claim. "
@@ -77,8 +74,7 @@ def confidence_section(inputs: ReportInputs) -> str:
             "lines), each beside the diagonal.",
         )
         + "<p>Stopping as soon as the <dfn>risk</dfn>, 1 − confidence, is at most the requested risk. Columns except views in "
-        "%; "
-        "<b>▲ bold</b>: the error exceeds the requested risk by its 95 % interval.</p>"
+        "%; <b>▲ bold</b>: the error exceeds the requested risk by its 95 % interval.</p>"
         + table(
             ["requested risk", *(f"{part}, summed" for part in parts), *(f"{part}, calibrated" for part in parts)],
             stops,

@@ -11,8 +11,10 @@ import matplotlib
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt
 import numpy as np
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import Ellipse
+from matplotlib.ticker import LogLocator, MaxNLocator, NullFormatter
 
 from eval.projections import equal_area
 
@@ -39,7 +41,7 @@ KNOWS_MARKS = {"nothing": "o", "networks": "s", "others": "^", "learned": "D", "
 INK = "#111827"
 _LINES = ("o-", "s--", "^-.", "v:", "D-", "P--", "X-.", "h:", "<-", ">--", "*-.")
 """Markers and lines of policies, in order: they differ without colours."""
-_WIDTH = 4.8
+_WIDTH = 4.2
 """Inches of a figure that is read on a small screen without scrolling."""
 
 plt.rcParams.update(
@@ -73,7 +75,7 @@ def accuracy_after_views(
     policies: dict[str, dict[str, Any]], titles: dict[str, str], all_views: float, own: Sequence[str] = ()
 ) -> Figure:
     """Accuracy after each number of views, over all start views, with 95 % bands over objects; `own` are drawn as well."""
-    figure, axis = plt.subplots(figsize=(_WIDTH, 4.6), layout="constrained")
+    figure, axis = plt.subplots(figsize=(_WIDTH, 3.2), layout="constrained")
     for line, (name, colour) in zip(itertools.cycle(_LINES), _colours(own).items(), strict=False):
         values = 100 * np.array(policies[name]["after_views"])
         low, high = 100 * np.array(policies[name]["after_views_interval"]).T
@@ -82,20 +84,36 @@ def accuracy_after_views(
         axis.fill_between(steps, low, high, color=colour, alpha=0.06, linewidth=0)
     axis.axhline(100 * all_views, color=INK, linestyle=(0, (1, 2)), linewidth=1, label="all views summed")
     axis.set(xlabel="number of views", ylabel="test accuracy (%)", title="Accuracy by number of views")
+    axis.xaxis.set_major_locator(MaxNLocator(10, integer=True))
     _legend_below(figure)
     return figure
 
 
+def ink_on(colour: Sequence[float] | np.ndarray) -> str:
+    """Black or white, whichever has the higher contrast to a colour (r, g, b, …) in [0, 1]; it is 4.5 at least."""
+    linear = [c / 12.92 if c <= 0.04045 else ((c + 0.055) / 1.055) ** 2.4 for c in colour[:3]]
+    return "white" if np.dot(linear, (0.2126, 0.7152, 0.0722)) < 0.179 else "black"
+
+
+def logarithmic(axis: Axes) -> None:
+    """Makes the ordinate logarithmic, with plain numbers at its ticks."""
+    axis.set_yscale("log")
+    axis.yaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
+    axis.yaxis.set_major_formatter("{x:g}")
+    axis.yaxis.set_minor_formatter(NullFormatter())
+
+
 def _legend_below(figure: Figure) -> None:
-    """Puts the legend of all axes under the figure, in two columns where the labels are short."""
+    """Puts the legend under the axes of a figure, which becomes higher by it; in two columns where the labels are short."""
     handles, labels = figure.axes[0].get_legend_handles_labels()
-    columns = 2 if max(map(len, labels)) < 29 else 1
+    columns = 2 if max(map(len, labels)) < 21 else 1
+    figure.set_figheight(figure.get_figheight() + 0.19 * -(-len(labels) // columns))
     figure.legend(handles, labels, frameon=False, fontsize=9, ncols=columns, loc="outside lower left", handlelength=3)
 
 
 def accuracy_of_choices(policies: dict[str, dict[str, Any]], titles: dict[str, str], all_views: float) -> Figure:
     """Accuracy after each number of views, coloured by what each policy knows, with 95 % bands over objects."""
-    figure, axis = plt.subplots(figsize=(_WIDTH, 5.2), layout="constrained")
+    figure, axis = plt.subplots(figsize=(_WIDTH, 3.4), layout="constrained")
     for line, (name, policy) in zip(itertools.cycle(_LINES), policies.items(), strict=False):
         values, (low, high) = 100 * np.array(policy["after_views"]), 100 * np.array(policy["interval"]).T
         steps, colour = np.arange(1, len(values) + 1), KNOWS_COLOURS[policy["knows"]]
@@ -103,7 +121,7 @@ def accuracy_of_choices(policies: dict[str, dict[str, Any]], titles: dict[str, s
         axis.fill_between(steps, low, high, color=colour, alpha=0.05, linewidth=0)
     axis.axhline(100 * all_views, color=INK, linestyle=(0, (1, 2)), linewidth=1, label="all views fused")
     axis.set(xlabel="number of views", ylabel="test accuracy (%)", title="Accuracy by number of views")
-    axis.set_xticks(range(1, 1 + max(len(policy["after_views"]) for policy in policies.values())))
+    axis.xaxis.set_major_locator(MaxNLocator(10, integer=True))
     _legend_below(figure)
     return figure
 
@@ -126,7 +144,7 @@ def ladder_gains(
         axis.plot([low, high], [row, row], color=colour, linewidth=1.5)
         axis.plot(gain, row, KNOWS_MARKS[rung["knows"]], color=colour, markersize=6, markerfacecolor=face)
     axis.axvline(0, color=INK, linewidth=1)
-    axis.set(xlabel="gain over random (percentage points)", title=f"After {count} views")
+    axis.set(xlabel="gain over random (points)", title=f"After {count} views")
     axis.grid(axis="x", color="#e5e7eb", linewidth=0.6)
     axis.set_axisbelow(True)
     axis.set_yticks(range(len(rungs)), [rung["title"].lstrip("— ") for rung in rungs])
@@ -141,17 +159,19 @@ def accuracy_by_distance(
     own: Sequence[str] = (),
 ) -> Figure:
     """Accuracy against the distance that the camera travelled; the thin lines have a movement cost."""
-    figure, axis = plt.subplots(figsize=(_WIDTH, 4.6), layout="constrained")
+    styles: dict[str, str] = {}
+    figure, axis = plt.subplots(figsize=(_WIDTH, 3.2), layout="constrained")
     for line, (name, colour) in zip(itertools.cycle(_LINES), _colours(own).items(), strict=False):
         if name == "belief_oracle":
             continue
         distance, values = np.degrees(policies[name]["travelled"]), 100 * np.array(policies[name]["after_views"])
         axis.plot(distance, values, line, color=colour, label=titles[name], markersize=4)
+        styles[name] = line[1:]
     for name, runs in movement.items():
         with_cost = [run for run in runs if run["cost"] > 0]
         for run in with_cost:
             distance, values = np.degrees(run["travelled"]), 100 * np.array(run["after_views"])
-            axis.plot(distance, values, "-", color=COLOURS[name], linewidth=0.8)
+            axis.plot(distance, values, styles[name], color=COLOURS[name], linewidth=0.9)
             if run in (with_cost[0], with_cost[-1]):
                 axis.annotate(f"{run['cost']:g}", (distance[-1], values[-1]), fontsize=8, color=COLOURS[name])
     axis.set(xlabel="distance travelled (°)", ylabel="test accuracy (%)", title="Accuracy by distance travelled")
@@ -161,12 +181,13 @@ def accuracy_by_distance(
 
 def calibration_by_views(readings: dict[str, dict[str, Any]], titles: dict[str, str]) -> Figure:
     """Expected calibration error after each number of views, a line for each way to compute the confidence."""
-    figure, axis = plt.subplots(figsize=(_WIDTH, 3.8), layout="constrained")
+    figure, axis = plt.subplots(figsize=(_WIDTH, 2.6), layout="constrained")
     colours = ("#d97706", "#0d9488", "#9333ea", "#dc2626", "#6b7280")
     for name, colour, line in zip(readings, colours, _LINES[: len(colours)], strict=True):
         values = 100 * np.array(readings[name]["ece"])
         axis.plot(np.arange(1, len(values) + 1), values, line, color=colour, label=titles[name], markersize=4)
     axis.set(xlabel="number of views", ylabel="expected calibration error (%)", title="Calibration error", ylim=0)
+    axis.xaxis.set_major_locator(MaxNLocator(10, integer=True))
     _legend_below(figure)
     return figure
 
@@ -193,7 +214,7 @@ def reliability_curves(readings: dict[str, dict[str, Any]], titles: dict[str, st
     for row in axes:
         row[0].set_ylabel("accuracy (%)")
     handles, labels = axes[0][0].get_legend_handles_labels()
-    figure.legend(handles, labels, frameon=False, fontsize=9, ncols=2, loc="outside lower center", markerscale=0.5)
+    figure.legend(handles, labels, frameon=False, fontsize=9, loc="outside lower left", markerscale=0.5)
     return figure
 
 
@@ -208,7 +229,7 @@ def difference_grid(
     values = 100 * np.array(difference)
     largest = max(0.5, np.abs(values).max())
     figure, axis = plt.subplots(figsize=(_WIDTH, 3.4), layout="constrained")
-    axis.imshow(values, cmap="RdBu", vmin=-largest, vmax=largest, aspect="auto")
+    cells = axis.imshow(values, cmap="RdBu", vmin=-largest, vmax=largest, aspect="auto")
     for (row, column), value in np.ndenumerate(values):
         low, high = intervals[row][column]
         mark = "▲" if low > 0 else "▼" if high < 0 else ""
@@ -220,7 +241,7 @@ def difference_grid(
             va="center",
             fontsize=9,
             fontweight="bold" if mark else "normal",
-            color="white" if abs(value) > 0.65 * largest else "black",
+            color=ink_on(cells.to_rgba(value)),
         )
     axis.set_xticks(range(len(thresholds)), [f"{ct:g}" for ct in thresholds])
     axis.set_yticks(range(len(max_views)), [str(mv) for mv in max_views])
@@ -231,23 +252,17 @@ def difference_grid(
 
 def confusions(matrices: dict[str, np.ndarray], classes: Sequence[str]) -> Figure:
     """Confusion matrices in percent of the true class, a panel for each policy."""
+    width = max(_WIDTH, 0.28 * len(classes) + 1.6)
     figure, axes = plt.subplots(
-        1, len(matrices), figsize=(_WIDTH * len(matrices), 4.6), layout="constrained", sharey=True, squeeze=False
+        1, len(matrices), figsize=(width * len(matrices), width), layout="constrained", sharey=True, squeeze=False
     )
     for axis, (title, matrix) in zip(axes[0], matrices.items(), strict=True):
         share = 100 * matrix / np.maximum(matrix.sum(axis=1, keepdims=True), 1e-9)
-        axis.imshow(share, cmap="Blues", vmin=0, vmax=100)
+        cells = axis.imshow(share, cmap="Blues", vmin=0, vmax=100)
         for (row, column), value in np.ndenumerate(share):
             if value >= 0.5:
-                axis.text(
-                    column,
-                    row,
-                    f"{value:.0f}",
-                    ha="center",
-                    va="center",
-                    fontsize=8,
-                    color="white" if value > 60 else "black",
-                )
+                colour = ink_on(cells.to_rgba(value))
+                axis.text(column, row, f"{value:.0f}", ha="center", va="center", fontsize=8, color=colour)
         axis.set_xticks(range(len(classes)), classes, rotation=60, ha="right")
         axis.set_yticks(range(len(classes)), classes)
         axis.set(xlabel="predicted", title=title)
@@ -257,12 +272,12 @@ def confusions(matrices: dict[str, np.ndarray], classes: Sequence[str]) -> Figur
 
 def entropy_histogram(counts: Sequence[int], mean: float, std: float) -> Figure:
     """Normalised depth entropies of the training views."""
-    figure, axis = plt.subplots(figsize=(4.6, 2.8), layout="constrained")
+    figure, axis = plt.subplots(figsize=(_WIDTH, 2.8), layout="constrained")
     edges = np.linspace(0, 1, len(counts) + 1)
     axis.bar(edges[:-1], counts, width=np.diff(edges), align="edge", color="#93c5fd")
     axis.axvline(mean, color="#1d4ed8", label=f"mean {mean:.3f}, sd {std:.3f}")
     axis.set(xlabel="normalised depth entropy", ylabel="views", title="Depth entropies (training)")
-    axis.legend(frameon=False)
+    _legend_below(figure)
     return figure
 
 
@@ -273,7 +288,7 @@ def entropy_errors(entropy: dict[str, Any]) -> Figure:
         ("class-mean map\n(given the class)", "class_mean_map", "#d1d5db"),
         ("PointNet++", "pointnet2", "#2563eb"),
     ]
-    figure, axis = plt.subplots(figsize=(4.6, 2.6), layout="constrained")
+    figure, axis = plt.subplots(figsize=(_WIDTH, 2.6), layout="constrained")
     for position, (_, name, colour) in enumerate(rows):
         low, high = entropy[f"{name}_interval"]
         axis.barh(
@@ -281,6 +296,8 @@ def entropy_errors(entropy: dict[str, Any]) -> Figure:
             entropy[name],
             color=colour,
             xerr=[[max(0, entropy[name] - low)], [max(0, high - entropy[name])]],
+            edgecolor=INK,
+            linewidth=0.8,
             ecolor=INK,
             capsize=3,
         )
@@ -327,10 +344,11 @@ def view_map(
             axis.plot(x[[i, j]], y[[i, j]], color="#d1d5db", linewidth=0.7, zorder=1)
     share = np.clip((weights - limits[0]) / max(limits[1] - limits[0], 1e-9), 0, 1)
     low, high = limits
+    smaller = min(1.0, 60 / len(points))  # many views do not cover each other
     dots = axis.scatter(
         x,
         y,
-        s=15 + 75 * share,
+        s=smaller * (15 + 75 * share),
         c=weights,
         cmap="viridis",
         vmin=low,
@@ -339,7 +357,9 @@ def view_map(
         linewidths=0.6,
         zorder=2,
     )
-    axis.scatter(x[maxima], y[maxima], s=170, facecolors="none", edgecolors="#dc2626", linewidths=1.5, zorder=3)
+    axis.scatter(
+        x[maxima], y[maxima], s=smaller * 170, facecolors="none", edgecolors="#dc2626", linewidths=1.5, zorder=3
+    )
     figure.colorbar(dots, ax=axis, label="normalised entropy", shrink=0.8)
     axis.set_title(title)
     axis.set_aspect("equal")
@@ -358,7 +378,8 @@ def losses(name: str, history: list[dict[str, float]]) -> Figure:
         found[part] = [entry[f"{part}/loss"] for entry in history]
         axis.plot(epochs, found[part], line, color=colour, markersize=4, label=title)
     axis.set(xlabel="epoch", ylabel="loss", title=name)
+    axis.xaxis.set_major_locator(MaxNLocator(10, integer=True))
     if len(epochs) > 1 and max(found["train"]) > 5 * min(found["val"]):
-        axis.set_yscale("log")
+        logarithmic(axis)
     axis.legend(frameon=False)
     return figure

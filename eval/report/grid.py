@@ -7,8 +7,11 @@ import html
 import numpy as np
 
 from eval.report import figures
-from eval.report.html import MARKS, ReportInputs, difference, image, percent, signed, span, table
+from eval.report.html import MANY_CLASSES, MARKS, ReportInputs, difference, image, percent, signed, span, table
 from eval.report.policies import titles_of
+
+_PAIRS = 20
+"""Pairs of classes in a table of confusions."""
 
 
 def grid_section(inputs: ReportInputs) -> str:
@@ -17,9 +20,8 @@ def grid_section(inputs: ReportInputs) -> str:
     shown = ("predicted_entropy", "oracle_entropy", "information_gain")
     parts = [
         "<h2>The thesis's grid</h2><p>A walk stops when its confidence reaches a <dfn>confidence threshold</dfn> (CT, "
-        "columns), or "
-        "at a <dfn>limit on views</dfn> (MV, rows). The confidence here is the thesis's, which is not calibrated. Each "
-        "interval is for its own cell, and neighbouring cells share their walks: if a policy did not differ "
+        "columns), or at a <dfn>limit on views</dfn> (MV, rows). The confidence here is the thesis's, which is not "
+        "calibrated. Each interval is for its own cell, and neighbouring cells share their walks: if a policy did not differ "
         "from random, about one cell in twenty would be marked all the same.</p>",
         '<div class="figures">',
     ]
@@ -36,8 +38,8 @@ def grid_section(inputs: ReportInputs) -> str:
                 ),
                 f"Percentage points (thesis Tables 7 and 12). ▲ and ▼: the 95 % interval excludes zero, in "
                 f"{((low > 0) | (high < 0)).sum()} of {low.size} cells.",
-                f"Grid of gains of {titles[name]} over random, from "
-                f"{signed(np.min(against[name]['difference']))} to {signed(np.max(against[name]['difference']))} points; "
+                f"Grid of gains of {titles[name]} over random, from {signed(np.min(against[name]['difference']))} to "
+                f"{signed(np.max(against[name]['difference']))} points; "
                 f"{(low > 0).sum()} cells are marked as better, {(high < 0).sum()} as worse.",
             )
         )
@@ -63,9 +65,14 @@ def grid_section(inputs: ReportInputs) -> str:
 
 
 def _confusions(inputs: ReportInputs, names: tuple[str, ...]) -> str:
-    """Confusion matrices of some policies, in one cell of the grid."""
+    """Confusion matrices of some policies, in one cell of the grid; tables of what is confused if the classes are many."""
     metrics, classes, shown = inputs.metrics, inputs.statistics.classes, []
     headline, titles = metrics["headline"], titles_of(metrics)
+    if len(classes) > MANY_CLASSES:
+        return "".join(
+            _most_confused(titles[name], np.array(metrics["policies"][name]["headline_confusion"]), classes, headline)
+            for name in names
+        )
     for name in names:
         matrix = np.array(metrics["policies"][name]["headline_confusion"])
         wrong = matrix * (1 - np.eye(len(classes)))
@@ -79,6 +86,25 @@ def _confusions(inputs: ReportInputs, names: tuple[str, ...]) -> str:
             )
         )
     return f'<div class="figures">{"".join(shown)}</div>'
+
+
+def _most_confused(title: str, matrix: np.ndarray, classes: list[str], cell: dict[str, float]) -> str:
+    """A table of the pairs of classes that are confused most often."""
+    share = matrix / np.maximum(matrix.sum(axis=1, keepdims=True), 1e-9)
+    wrong = share * (1 - np.eye(len(classes)))
+    order = np.argsort(-wrong, axis=None, kind="stable")[:_PAIRS]
+    pairs = [
+        (true, said) for true, said in zip(*np.unravel_index(order, wrong.shape), strict=True) if wrong[true, said]
+    ]
+    rows = [
+        [html.escape(classes[true]), html.escape(classes[said]), percent(wrong[true, said])] for true, said in pairs
+    ]
+    right = np.trace(matrix) / max(matrix.sum(), 1e-9)
+    return (
+        f"<p>{html.escape(title)}, CT {cell['threshold']}, MV {cell['max_views']}: {percent(right)} % of the "
+        f" answers are right. The {len(rows)} most frequent confusions of {len(classes)} classes:</p>"
+        + table(["true class", "taken for", "% of the true class"], rows, f"confusions of {title}")
+    )
 
 
 def compatibility_section(inputs: ReportInputs) -> str:
@@ -126,10 +152,9 @@ def compatibility_section(inputs: ReportInputs) -> str:
             f"validated by object, {percent(theirs['validation'])} % and {percent(theirs['test'])} % by view.</p>"
         )
     return (
-        "<h2>Differences between the thesis and its published code</h2><p>Gain of the PointNet++ policy over random in the grid "
-        "above, in percentage points: first as the thesis's text describes it, then with one change at a time, and last with "
-        "all "
-        f"changes of the published code. {MARKS} The use of all clouds is not part of the published code.</p>"
+        "<h2>Differences between the thesis and its published code</h2><p>Gain of the PointNet++ policy over random in the "
+        "grid above, in percentage points: first as the thesis's text describes it, then with one change at a time, and last "
+        f"with all changes of the published code. {MARKS} The use of all clouds is not part of the published code.</p>"
         + table(["switch", "mean of the grid", "cells above zero", *(f"CT 0.99, MV {mv}" for mv in limits)], rows)
         + note
     )

@@ -24,11 +24,12 @@ from eval.walks.ladder import KNOWS, Knows
 STYLE = Path(__file__).with_name("page.css").read_text()
 SCRIPT = Path(__file__).with_name("page.js").read_text()
 MARKS = (
-    "<b class='up'>▲ bold</b>: above zero, the whole interval is; <b class='down'>▼ bold</b>: below zero, the whole interval "
-    "is; "
-    "without a mark: the interval contains zero."
+    "<b class='up'>▲ bold</b>: the whole interval is above zero; <b class='down'>▼ bold</b>: the whole interval is below zero; "
+    "no mark: it contains zero."
 )
 """Explains the marks of `difference`, which do not need colour."""
+MANY_CLASSES = 25
+"""Beyond so many classes, matrices and pictures of all of them cannot be read: the page has excerpts, and folds tables."""
 
 
 @dataclass(frozen=True)
@@ -128,14 +129,24 @@ def document(title: str, body: str) -> str:
         return f'<h2 id="{name}">{found.group(1)}</h2>'
 
     content = re.sub(r"<h2>(.*?)</h2>", anchored, body)
+    size = len(STYLE) + len(SCRIPT) + len(content.encode())
     contents = f'<nav aria-label="Contents"><ul>{"".join(links)}</ul></nav>' if len(links) > 2 else ""
     return (
         '<!doctype html><html lang="en"><head><meta charset="utf-8">'
         '<meta name="viewport" content="width=device-width, initial-scale=1">'
-        f"<title>{title}</title><style>{STYLE}</style></head><body>"
+        f'<title>{title}</title><link rel="icon" href="data:,"><style>{STYLE}</style></head><body>'
         f'<a class="skip" href="#content">To the content</a><header><h1>{title}</h1>{contents}</header>'
-        f'<main id="content">{content}</main><script>{SCRIPT}</script></body></html>\n'
+        f'<main id="content">{content}</main><footer><p class="note">This page needs no other file and no network; it has '
+        f"{size / 1e6:.1f} MB.</p></footer><script>{SCRIPT}</script></body></html>\n"
     )
+
+
+def commands(steps: Sequence[tuple[str, str]]) -> str:
+    """A list of sentences in plain text, each with the command that it is about."""
+    items = (
+        f"<li><p>{html.escape(said)}</p><pre><code>{html.escape(command)}</code></pre></li>" for said, command in steps
+    )
+    return f"<ol>{''.join(items)}</ol>"
 
 
 def warning(sentence: str | None) -> str:
@@ -165,7 +176,7 @@ def table(header: Sequence[str], rows: Sequence[Sequence[str]], label: str = "")
 
 def _cells(row: Sequence[str], columns: int) -> str:
     if len(row) == 1:
-        return f'<th scope="rowgroup" colspan="{columns}">{row[0]}</th>'
+        return f'<th scope="rowgroup" colspan="{columns}"><span class="group">{row[0]}</span></th>'
     return f'<th scope="row">{row[0]}</th>' + "".join(f"<td>{cell}</td>" for cell in row[1:])
 
 

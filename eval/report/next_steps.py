@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import html
-
-from eval.report.html import ReportInputs
+from eval.report.html import ReportInputs, commands
 from train.chance import Chance
 
 RUN = "RUN"
@@ -13,13 +11,10 @@ RUN = "RUN"
 
 def next_section(inputs: ReportInputs) -> str:
     """Commands that continue this run, each with what it gives; those that were run already are left out."""
-    steps = [
-        (f"<p>{sentence}</p><pre><code>{html.escape(command)}</code></pre>") for sentence, command in _steps(inputs)
-    ]
     return (
         f"<h2>What to do next</h2><p><code>{RUN}</code> stands for the folder of this run, in which "
         "<code>report/index.html</code> is this page. Each command continues from what the run holds.</p>"
-        f"<ol>{''.join(f'<li>{step}</li>' for step in steps)}</ol>"
+        f"{commands(_steps(inputs))}"
     )
 
 

@@ -21,7 +21,19 @@ from eval.learned.page import active_section
 from eval.report import figures
 from eval.report.confidence import confidence_section
 from eval.report.grid import compatibility_section, grid_section
-from eval.report.html import SCRIPT, STYLE, ReportInputs, data_url, document, image, percent, picture, table, warning
+from eval.report.html import (
+    MANY_CLASSES,
+    SCRIPT,
+    STYLE,
+    ReportInputs,
+    data_url,
+    document,
+    image,
+    percent,
+    picture,
+    table,
+    warning,
+)
 from eval.report.next_steps import next_section
 from eval.report.policies import ascent_section, draws, ladder_section, lead, movement_section
 from eval.report.scenes import VIEWER, scenes_section
@@ -52,14 +64,17 @@ def _data_section(inputs: ReportInputs) -> str:
         for by_name in statistics.left_out.values()
         for name, why in by_name.items()
     ]
+    counts = table(
+        ["class", "train", "val", "test"], [["<b>all</b>", *totals], *rows], "number of objects in each class"
+    )
+    if len(rows) > MANY_CLASSES:
+        counts = f"<details><summary>Objects in each of the {len(rows)} classes</summary>{counts}</details>"
     return (
         f"<h2>Data</h2><p>{html.escape(statistics.source)}: {statistics.views} views of each object ({lattice}), "
-        f"{camera.resolution}×{camera.resolution} pixels, "
-        f"{camera.field_of_view:g}° field of view from {camera.distance:g} radii away. "
-        f"Points seen per view: {statistics.points_mean:,.0f} ± "
-        f"{statistics.points_std:,.0f}. "
-        f"Entropies are divided by the largest of the training split, {statistics.entropy_max:.2f} bits.</p>"
-        + table(["class", "train", "val", "test"], [*rows, ["<b>all</b>", *totals]])
+        f"{camera.resolution}×{camera.resolution} pixels, {camera.field_of_view:g}° field of view from {camera.distance:g} "
+        f"radii away. Points seen per view: {statistics.points_mean:,.0f} ± {statistics.points_std:,.0f}. Entropies are "
+        f"divided by the largest of the training split, {statistics.entropy_max:.2f} bits.</p>"
+        + counts
         + f"<p>{statistics.left_out_count} objects were left out "
         + f"({', '.join(f'{len(names)} of {_SPLITS[split]}' for split, names in statistics.left_out.items())}).</p>"
         + (
@@ -88,14 +103,15 @@ def _contact_sheet(inputs: ReportInputs) -> str:
         chosen.setdefault(int(label), index)
     views = np.linspace(0, statistics.views - 1, min(10, statistics.views)).round().astype(int)
     rows = []
-    for label in sorted(chosen):
+    for label in sorted(chosen)[:MANY_CLASSES]:
         images, name = source[chosen[label]]["image"][views], html.escape(statistics.classes[label])
         strip = data_url(picture(np.concatenate(list(images), axis=1)))
         rows.append([name, f'<img class="strip" alt="{len(views)} shaded views of a {name}" src="{strip}">'])
     shown = table(
         ["class", f"views {', '.join(map(str, views))}"], rows, "a test object of each class from some viewpoints"
     )
-    return f"<p>One test object of each class from {len(views)} of the {statistics.views} viewpoints:</p>{shown}"
+    which = f"each of the first {MANY_CLASSES} classes" if len(chosen) > MANY_CLASSES else "each class"
+    return f"<p>One test object of {which} from {len(views)} of the {statistics.views} viewpoints:</p>{shown}"
 
 
 def _entropy_section(inputs: ReportInputs) -> str:
@@ -123,11 +139,11 @@ def _entropy_section(inputs: ReportInputs) -> str:
     verdict = "is better" if low > 0 else "is not better"
     rows = [[html.escape(name), f"{value:.4f}"] for name, value in entropy["by_class"].items() if value is not None]
     return (
-        f"<h2>Predicting depth entropy</h2><p>A <dfn>partial cloud</dfn> is what one view shows of the surface, as points. "
-        f"From one partial cloud, the network PointNet++ predicts the normalised entropy of every view "
-        f"with a mean squared error of {entropy['pointnet2']:.4f} "
-        f"({100 * (entropy['explained_variance'] or 0):.0f} % of the variance explained). It {verdict} than the mean map, which "
-        f"receives no view (difference in error {low:+.4f} to {high:+.4f}). The class-mean map is given the true class.</p>"
+        "<h2>Predicting depth entropy</h2><p>A <dfn>partial cloud</dfn> is what one view shows of the surface, as points. "
+        "From one partial cloud, the network PointNet++ predicts the normalised entropy of every view with a mean squared "
+        f"error of {entropy['pointnet2']:.4f} ({100 * (entropy['explained_variance'] or 0):.0f} % of the variance explained). "
+        f"It {verdict} than the mean map, which receives no view (difference in error {low:+.4f} to {high:+.4f}). The "
+        "class-mean map is given the true class.</p>"
         + image(
             figures.entropy_errors(entropy),
             "Test objects, every view as input; 95 % intervals over objects. A shorter bar is better.",

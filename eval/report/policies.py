@@ -50,8 +50,7 @@ def lead(inputs: ReportInputs) -> str:
     single, policies = metrics["single_view"], metrics["policies"]
     sentences = [
         f"The classifier names the object from one view with an accuracy of {percent(single['accuracy'])} %, from two random "
-        f"views with "
-        f"{percent(policies['random']['after_views'][1])} %, and from all {metrics['views']} with "
+        f"views with {percent(policies['random']['after_views'][1])} %, and from all {metrics['views']} with "
         f"{percent(single['all_views'])} %."
     ]
     for name, called in (
@@ -64,22 +63,21 @@ def lead(inputs: ReportInputs) -> str:
         sentences.append(f"At two views, {called} is {verdict}.")
     return (
         f'<p class="lead">{" ".join(sentences)}</p>'
-        "<p>A <dfn>view</dfn> is one depth image of the object, from one of the "
-        f"{metrics['views']} candidate directions around it. A <dfn>policy</dfn> is a rule that chooses the next view from what "
-        "was seen so far. The classifier gives one number for each class and view, the <dfn>logits</dfn>; the logits of all "
-        "views "
-        "seen are added, and the class with the largest sum is the answer. The <dfn>depth entropy</dfn> of a view says how "
-        "varied "
-        "its depths are; the thesis prefers views where it is high. <dfn>Expected information gain</dfn> is how much surer the "
-        "belief is expected to become by a view, in <dfn>nats</dfn>: a choice between two equally likely classes has 0.69 "
-        "nats. An "
+        f"<p>A <dfn>view</dfn> is one depth image of the object, from one of the {metrics['views']} candidate directions "
+        "around it. A <dfn>policy</dfn> is a rule that chooses the next view from what was seen so far. The classifier gives "
+        "one number for each class and view, the <dfn>logits</dfn>; the logits of all views seen are added, and the class "
+        "with the largest sum is the answer. The sums give a probability for each class, the <dfn>belief</dfn>. The "
+        "<dfn>depth entropy</dfn> of a view says how varied its depths are; <i>the thesis</i> (Learning Optimal View "
+        "Selection for Multi-View Object Representation, which this program reimplements) prefers views where it is high, and "
+        "predicts it by the network PointNet++. <dfn>Expected information gain</dfn> is how much surer the belief is expected "
+        "to become by a view, in <dfn>nats</dfn>: a choice between two equally likely classes has 0.69 nats. An "
         "<dfn>oracle</dfn> is a policy that knows something about the object that a robot cannot know.</p>"
-        f'<p class="note">Over {metrics["objects"]} test objects and {metrics["starts"]} start views of each: every walk '
-        f"begins at "
-        "another view. All policies have the same objects, start views and logits. A <dfn>95 % interval</dfn> is computed by "
-        "drawing the test objects again, with repetition, many times: in 95 % of the draws the value lies inside. Two policies "
-        "are "
-        "called distinguishable if the 95 % interval of their difference, paired by object, excludes zero.</p>"
+        f'<p class="note">Over {metrics["objects"]} test objects and {metrics["starts"]} start views of each: every walk begins '
+        "at another view. All policies have the same objects, start views and logits. <dfn>Validation objects</dfn> are "
+        "neither trained on nor tested on; the best epoch of a training and all that is fitted later is chosen on them. A "
+        "<dfn>95 % interval</dfn> is computed by drawing the test objects again, with repetition, many times: in 95 % of the "
+        "draws the value lies inside. Two policies are called distinguishable if the 95 % interval of their difference, "
+        "paired by object, excludes zero.</p>"
     )
 
 
@@ -187,9 +185,8 @@ def ladder_section(inputs: ReportInputs) -> str:
     return (
         "<h2>Accuracy by policy</h2><p>Accuracy (%) after exactly the given number of views. Below it: the difference from "
         f"random in percentage points with its 95 % interval. {MARKS} Each interval is for its own cell: of twenty differences "
-        f"that "
-        "do not exist, one would be expected to be marked. "
-        f"<dfn>Area</dfn>: mean accuracy over 1 to {len(policies['random']['after_views'])} views.{reach_note}</p>"
+        "that do not exist, one would be expected to be marked. <dfn>Area</dfn>: mean accuracy over 1 to "
+        f"{len(policies['random']['after_views'])} views.{reach_note}</p>"
         + table(header, rows_by_knowledge(rows))
         + f"<p class='note'>Random selection without repetition is computed as an exact expectation up to {exact} views"
         + (
@@ -243,8 +240,7 @@ def ascent_section(inputs: ReportInputs) -> str:
         f"{settings['starts']} start views then maximises the objective, rendered at "
         f"{settings['resolution']}×{settings['resolution']} pixels. The distinct optima are visited in the order of their "
         "values. Accuracy (%) after the given number of views; below it the difference from random, and below that from the "
-        "thesis's predicted entropy, both with 95 % intervals. "
-        f"{MARKS}</p>"
+        f"thesis's predicted entropy, both with 95 % intervals. {MARKS}</p>"
         + table(["next view chosen by", *(f"{step} views" for step in steps)], rows_by_knowledge(rows))
         + f"<p class='note'>{found['objects']} test objects, every start view. {found['views_without_surface']} of "
         f"{found['views']:,} views show too little for a surface; the choice after such a view is arbitrary.</p>"
@@ -281,15 +277,14 @@ def movement_section(inputs: ReportInputs) -> str:
     ]
     return (
         "<h2>Accuracy by distance travelled</h2><p>The camera moves on a sphere around the object. A distance is the angle "
-        "along "
-        "the shortest way (a great circle). Policies with a <dfn>movement cost</dfn> choose the view with the largest "
+        "along the shortest way (a great circle). Policies with a <dfn>movement cost</dfn> choose the view with the largest "
         "score − cost × distance in radians (57° are one radian), so they prefer near views.</p>"
         + image(
             figures.accuracy_by_distance(
                 metrics["policies"], titles, metrics["movement"], [rung["policy"] for rung in _own(metrics)]
             ),
-            "Markers: after 1, 2, 3, … views. Thin lines: the same policy with movement costs; the smallest and the "
-            "largest are printed at the ends.",
+            "Markers: after 1, 2, 3, … views. Thin lines, of the same style: a policy with movement costs; the smallest and "
+            "the largest are printed at the ends.",
             f"Curves of accuracy by degrees travelled. {' '.join(_distances(metrics, titles, last[0]))}",
         )
         + f"<details><summary>After {last[0]} views, by movement cost</summary>"

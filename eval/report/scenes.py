@@ -24,6 +24,7 @@ VIEWER = Path(__file__).with_name("viewer.js").read_text()
 _BARS = 5
 _SCALE = 20_000
 """Steps of a stored coordinate in a radius; two bytes hold 1.6 radii."""
+_POINTS = '<rect x="{0}" y="{0}" width="{1}" height="{1}" fill="var(--{2})" stroke="none"/>'
 _MARKS = (
     ('<circle cx="12" cy="12" r="4" fill="var(--gain-low)"/>', 'lowest expected gain, <span id="lowest"></span>'),
     ('<circle cx="12" cy="12" r="9" fill="var(--gain-high)"/>', 'highest expected gain, <span id="highest"></span>'),
@@ -37,6 +38,9 @@ _MARKS = (
         "the view that is chosen next",
     ),
     ('<path d="M6 6L18 18M6 18L18 6"/>', "a view that cannot be reached"),
+    (_POINTS.format(6, 12, "new"), "points of the surface, new with this view"),
+    (_POINTS.format(8, 8, "seen"), "points seen before"),
+    (_POINTS.format(10, 4, "unseen"), "points not seen yet"),
 )
 """The legend: drawings in a square of 24, and what they mean."""
 
@@ -57,10 +61,12 @@ def scenes_section(inputs: ReportInputs) -> str:
         "reachable": inputs.metrics["reachable"],
         "scenes": scenes,
     }
-    stored = json.dumps(data, separators=(",", ":"), ensure_ascii=False).replace("</", "<\\/")
+    stored = json.dumps(data, separators=(",", ":"), ensure_ascii=False).replace(
+        "<", "\\u003c"
+    )  # no tag ends the script
     return (
         f"<h2>Objects, and the views chosen around them</h2>{_text(inputs, walks)}"
-        f'<div id="walks">{_controls(walks.views.shape[1])}{"".join(shown)}</div>'
+        f'<div id="walks">{_controls(walks.views.shape[1], inputs.statistics.views)}{"".join(shown)}</div>'
         f'<script type="application/json" id="scenes">{stored}</script><script>{VIEWER}</script>'
     )
 
@@ -73,25 +79,30 @@ def _text(inputs: ReportInputs, walks: Walks) -> str:
     images = inputs.settings["classifier"]["images"]
     received = "the depths of the same view" if images == "depth" else "the same image"
     return (
-        f"<p>A walk around an object, of {walks.views.shape[1]} views at most, by the policy “expected information gain”: it "
-        f"goes to "
-        "the view whose expected gain is highest. The gain is negative if the view would rather make the belief less sure. The "
-        "first view is given. The pictures are shaded for the reader; the "
-        "classifier "
-        f"receives {received}. Probabilities are calibrated by the temperatures that were fitted on validation objects.</p>"
-        f"<p class='note'>How the objects were chosen: every test object is walked around once, the first from view 0, the "
-        f"second "
-        f"from view 1, and so on. Of {len(walks.labels)} walks: {counts}. The first {OF_EACH} objects of each of the first "
-        f"four kinds "
-        "are shown, where there are any, those of a class that is not shown yet first. Failures are therefore more frequent "
-        "here than "
-        "they are.</p><noscript><p class='warning'>The 3-D scene needs JavaScript, which is off or not supported here. The "
-        "pictures "
-        "and beliefs of all walks follow.</p></noscript>"
+        f"<p>A <dfn>walk</dfn> is a series of views around one object, here of {walks.views.shape[1]}. The first view is given; "
+        "then the policy “expected information gain” goes to the view whose expected gain is highest. The gain is negative if "
+        "the view would rather make the belief less sure. The pictures are shaded for the reader; the classifier receives "
+        f"{received}. The probabilities are <dfn>calibrated</dfn>: the sums of logits are divided by numbers that were fitted on "
+        "validation objects, so that answers given with 80 %, say, are right in 80 % of the cases.</p>"
+        "<p class='note'>How the objects were chosen: every test object is walked around once, the first from view 0, the "
+        f"second from view 1, and so on. Of {len(walks.labels)} walks: {counts}. {_which(walks)}</p>"
+        "<noscript><p class='warning'>The 3-D scene needs JavaScript, which is off or not supported here. The pictures and "
+        "beliefs of all walks follow.</p></noscript>"
     )
 
 
-def _controls(steps: int) -> str:
+def _which(walks: Walks) -> str:
+    """Says which of the walks are shown."""
+    shown = (
+        f"The first {OF_EACH} objects of each of the first four kinds are shown, where there are any; objects of a class that is "
+        "not shown yet come first."
+    )
+    if walks.right[:, -1].all():
+        return f"{shown} No walk ends with a wrong answer, so there is no failure to show."
+    return f"{shown} Failures are therefore more frequent here than among all walks."
+
+
+def _controls(steps: int, views: int) -> str:
     """The scene with its controls, which `viewer.js` shows and fills."""
     turns = "".join(
         f'<button type="button" data-do="{key}" aria-label="{label}">{sign}</button>'
@@ -123,9 +134,10 @@ def _controls(steps: int) -> str:
 <div class="now"><img id="picture" alt=""><p id="said" aria-live="polite"></p>
 <p id="bars-title"><b>Belief: the most likely classes</b></p>
 <ol class="bars" id="bars" aria-labelledby="bars-title"></ol></div>
-<div><p class="note" id="how">Drag with mouse or finger, or press the arrow keys, to turn the scene. To zoom, press + or −, pinch,
-or use the wheel after a click. Points of the surface: orange and large, new with this view; blue and large, seen before; grey and
-small, not seen yet. The candidate views are drawn nearer to the object than they are.</p>
+<div><p class="note" id="how">To turn the scene, drag it with the mouse, or with a finger that starts sideways (up and down
+scrolls the page), or press the arrow keys. To zoom, press + or −, pinch, or use the wheel after a click. The larger a candidate
+view, the higher its expected gain. The candidates are drawn nearer to the object than they are, and the surface is shown by the
+points that the {views} views together see.</p>
 <ul class="legend">{legend}</ul></div></div>
 </div>"""
 

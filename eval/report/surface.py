@@ -20,6 +20,8 @@ MOST_POINTS = 4000
 _FINEST, _COARSER = 0.025, 1.12
 """Side of the finest grid in radii, and the factor from one grid to the next."""
 _MOST_PIXELS = 400_000
+_MOST_VIEWS = 64
+"""Views that a surface is made of: more add nothing to a grid as coarse as this one."""
 _TOLERANCE = 0.06
 """Difference of depth in radii up to which a point is what a pixel shows."""
 
@@ -40,14 +42,15 @@ class Surface:
 
 
 def surface_of(example: dict[str, Any], config: CaptureConfig) -> Surface:
-    """Returns the union of the partial clouds of all views of an object, thinned to at most `MOST_POINTS` points.
+    """Returns the union of the partial clouds of an object's views, thinned to at most `MOST_POINTS` points.
 
     Args:
         example: of the data set, with `depth` and `pose`.
         config: of its camera.
     """
-    camera = view_camera(config)
-    points, normals, hit = map(np.asarray, _clouds(example["depth"], example["pose"], camera))
+    camera, views = view_camera(config), len(example["depth"])
+    some = np.unique(np.linspace(0, views - 1, min(views, _MOST_VIEWS)).round().astype(int))
+    points, normals, hit = map(np.asarray, _clouds(example["depth"][some], example["pose"][some], camera))
     points, normals = points[hit], normals[hit]
     every = -(-len(points) // _MOST_PIXELS)
     points, normals, spacing = points[::every], normals[::every], _FINEST

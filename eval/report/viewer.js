@@ -8,6 +8,8 @@
   const data = JSON.parse($("scenes").textContent), sections = [...document.querySelectorAll("#walks .walk")];
   if (!data.scenes.length) return;
   const RADIUS = 1.45, DISTANCE = 6, SHADES = 24, START = { azimuth: 0.7, elevation: 0.4, zoom: 1 };
+  const SIZES = [0.45, 0.8, 1.6]; // of points in cells of the grid: not seen yet, seen before, new
+  const SMALLER = Math.max(0.55, Math.min(1, Math.sqrt(60 / data.directions.length))); // many candidates are drawn smaller
   const eye = { ...START };
   let scene, step = 1, colours = {}, waiting = false;
 
@@ -69,7 +71,7 @@
     for (const i of order) {
       const first = cloud.first[i], state = first === 0 || first > step ? 0 : first === step ? 2 : 1;
       const p = project(f, at(cloud.points, i)), shade = Math.max(0, dot(at(cloud.normals, i), light));
-      const side = scene.spacing * p.near * (state ? 1.5 : 0.6);
+      const side = scene.spacing * p.near * SIZES[state];
       pen.fillStyle = colours.shades[state][Math.round(shade * (SHADES - 1))];
       pen.fillRect(p.x - side / 2, p.y - side / 2, side, side);
     }
@@ -89,7 +91,11 @@
     pen.setLineDash([]);
   };
   // The way between two directions, in pieces, so that each is drawn before or behind the object.
-  const arc = (a, b) => Array.from({ length: 17 }, (_, i) => times(unit(sum(times(a, 1 - i / 16 + 1e-4), b, i / 16)), RADIUS));
+  const arc = (a, b) => {
+    const cosine = Math.max(-1, Math.min(1, dot(a, b))), angle = Math.acos(cosine), opposite = Math.abs(cosine) > 0.9999;
+    const side = unit(opposite ? cross(a, Math.abs(a[2]) > 0.9 ? [1, 0, 0] : [0, 0, 1]) : sum(b, a, -cosine));
+    return Array.from({ length: 25 }, (_, i) => (i / 24) * angle).map((t) => times(sum(times(a, Math.cos(t)), side, Math.sin(t)), RADIUS));
+  };
   const pieces = (f, path, front, style, width, dash) => {
     for (let i = 1; i < path.length; i++) {
       if (dot(sum(path[i - 1], path[i]), f.towards) >= 0 === front) line(f, [path[i - 1], path[i]], style, width, dash);
@@ -139,13 +145,14 @@
       } else if (!data.reachable[p.i]) {
         for (const s of [-1, 1]) {
           pen.beginPath();
-          pen.moveTo(p.x - 5, p.y - 5 * s);
-          pen.lineTo(p.x + 5, p.y + 5 * s);
+          pen.moveTo(p.x - 5 * SMALLER, p.y - 5 * s * SMALLER);
+          pen.lineTo(p.x + 5 * SMALLER, p.y + 5 * s * SMALLER);
           pen.strokeStyle = css(colours.note);
+          pen.lineWidth = 1.5;
           pen.stroke();
         }
       } else {
-        const share = now.high > now.low ? (now.gains[p.i] - now.low) / (now.high - now.low) : 0.5, radius = 3.5 + 6.5 * share;
+        const share = now.high > now.low ? (now.gains[p.i] - now.low) / (now.high - now.low) : 0.5, radius = SMALLER * (3.5 + 6.5 * share);
         disc(p, radius, mixed(colours["gain-low"], colours["gain-high"], share));
         if (p.i === now.following) disc(p, radius + 4, null, 2, [4, 3]);
       }
@@ -202,6 +209,7 @@
   const show = (wanted) => {
     step = Math.max(1, Math.min(scene.stops.length, wanted));
     $("step").value = step;
+    $("step").setAttribute("aria-valuetext", `${step} of ${scene.stops.length}`);
     tell();
     redraw();
   };

@@ -54,7 +54,7 @@ class Walks:
         saved = ~right[:, 0] & right[:, 1:].all(axis=1) & (steps > 1)
         return {
             "wrong after one view, right from the second on": saved,
-            f"still wrong after {steps} views": ~right[:, 0] & ~right[:, -1],
+            f"wrong after one view and after {steps}": ~right[:, 0] & ~right[:, -1],
             f"right after one view, wrong after {steps}": right[:, 0] & ~right[:, -1],
             "right from the first view on": right.all(axis=1),
             "corrected later, or changing in between": right[:, -1] & ~right.all(axis=1) & ~saved,
@@ -63,10 +63,11 @@ class Walks:
     def chosen(self) -> dict[int, str]:
         """The objects that are shown, with the kind of their walk: the first `OF_EACH` of every kind but the last.
 
-        Objects of a class that is not shown yet come first.
+        Objects of a class that is not shown yet come first. Those of the last kind are shown if there are no others.
         """
         chosen: dict[int, str] = {}
-        for kind, members in list(self.kinds().items())[:-1]:
+        *kinds, last = self.kinds().items()
+        for kind, members in kinds if any(members.any() for _, members in kinds) else [last]:
             for _ in range(OF_EACH):
                 left = [index for index in np.flatnonzero(members).tolist() if index not in chosen]
                 shown = {int(self.labels[index]) for index in chosen}

@@ -22,6 +22,7 @@ from eval.thesis.results import LatticeTables
 from mevs_jax.viewpoints import ViewGraph, local_maxima
 from train.thesis_networks import BACKBONES, FRAMES, Frame, ThesisFolder
 
+_MEDIAN = {"color": figures.INK, "linewidth": 2}
 _RING: dict[str, Any] = {"facecolors": "none", "edgecolors": "#dc2626", "linewidths": 1.6}
 
 
@@ -67,7 +68,7 @@ def class_distribution(inputs: FigureInputs) -> Figure:
     figure, axis = plt.subplots(figsize=(7.2, 3.4), layout="constrained")
     at = np.arange(len(train))
     axis.bar(at - 0.2, train, 0.4, color="#2563eb", label="training (and validation)")
-    axis.bar(at + 0.2, test, 0.4, color="#f59e0b", label="test")
+    axis.bar(at + 0.2, test, 0.4, color="#d97706", label="test", hatch="///", edgecolor=figures.INK, linewidth=0)
     axis.set_xticks(at, statistics.classes, rotation=40, ha="right")
     axis.set(ylabel="objects")
     views = axis.twinx()
@@ -85,7 +86,7 @@ def points_per_view(inputs: FigureInputs) -> Figure:
         for name, (low, first, middle, third, high) in zip(statistics.classes, statistics.points_by_class, strict=True)
     ]
     figure, axis = plt.subplots(figsize=(7.2, 3.2), layout="constrained")
-    axis.bxp(boxes, showfliers=False, patch_artist=True, boxprops={"facecolor": "#bfdbfe"})
+    axis.bxp(boxes, showfliers=False, patch_artist=True, boxprops={"facecolor": "#93c5fd"}, medianprops=_MEDIAN)
     axis.axhline(statistics.points_mean, color="#1d4ed8", linewidth=1, linestyle=":")
     axis.tick_params(axis="x", rotation=40)
     pixels = statistics.camera.resolution**2
@@ -101,10 +102,10 @@ def entropy_distribution(inputs: FigureInputs) -> Figure:
     figure, train = plt.subplots(figsize=(6.4, 3.2), layout="constrained")
     test = train.twinx()
     edges = np.linspace(0, 1, 51)
-    for axis, split, colour in ((train, "train", "#2563eb"), (test, "test", "#f59e0b")):
+    for axis, split, colour in ((train, "train", "#93c5fd"), (test, "test", "#d97706")):
         counts = statistics.entropy_histograms[split]
-        axis.stairs(counts, edges, fill=True, color=colour, alpha=0.45, label=split)
-        axis.set_ylabel(f"{split} views", color=colour)
+        axis.stairs(counts, edges, label=split, color=colour, fill=split == "train", linewidth=1.8)
+        axis.set_ylabel(f"{split} views ({'filled' if split == 'train' else 'line'})")
         axis.set_ylim(0, 1.05 * max(counts))
     test.spines.right.set_visible(True)
     train.set(
@@ -122,6 +123,8 @@ def _sphere(axis: Any, points: np.ndarray) -> None:
     longitude, latitude = np.mgrid[0 : 2 * np.pi : 30j, -np.pi / 2 : np.pi / 2 : 16j]
     x, y, z = np.cos(latitude) * np.cos(longitude), np.cos(latitude) * np.sin(longitude), np.sin(latitude)
     axis.plot_wireframe(0.97 * x, 0.97 * y, 0.97 * z, color="#e5e7eb", linewidth=0.4)
+    for side in (axis.xaxis, axis.yaxis, axis.zaxis):
+        side.set_pane_color((1, 1, 1, 0))  # the page's ground is seen through
     axis.set_box_aspect((1, 1, 1), zoom=0.88)
     axis.set(xlim=(-1, 1), ylim=(-1, 1), zlim=(-1, 1), xlabel="x", ylabel="y", zlabel="z")
     axis.set(xticks=[-1, 0, 1], yticks=[-1, 0, 1], zticks=[-1, 0, 1])
@@ -171,9 +174,9 @@ def _map(axis: Axes, points: np.ndarray, **colour: Any) -> Any:
     parallels = np.array([-80, -60, -30, 0, 30, 60, 80])
     axis.set_yticks(mercator_ordinate(parallels), [f"{p}°".replace("-", "−") for p in parallels])
     axis.set(xlim=(-185, 185), xticks=[-180, -90, 0, 90, 180], xlabel="longitude (°)", ylabel="latitude")
-    axis.grid(color="#f3f4f6", linewidth=0.7)
+    axis.grid(color="#e5e7eb", linewidth=0.7)
     axis.set_axisbelow(True)
-    return axis.scatter(longitude, height, s=90, zorder=3, **colour)
+    return axis.scatter(longitude, height, s=130, zorder=3, **colour)
 
 
 def _map_edges(axis: Axes, points: np.ndarray, neighbours: np.ndarray) -> None:
@@ -191,10 +194,10 @@ def _map_edges(axis: Axes, points: np.ndarray, neighbours: np.ndarray) -> None:
 
 def mercator_order_and_entropies(inputs: FigureInputs) -> Figure:
     points, weights = np.array(inputs.statistics[40].viewpoints), inputs.tables[40].entropy[inputs.example]
-    figure, (order, entropies) = plt.subplots(1, 2, figsize=(10, 3.9), layout="constrained")
+    figure, (order, entropies) = plt.subplots(2, 1, figsize=(6.4, 8), layout="constrained")
     _map(order, points, color="#bfdbfe")
     for number, (x, y) in enumerate(zip(*mercator(points), strict=True)):
-        order.annotate(str(number), (x, y), ha="center", va="center", fontsize=6.5, zorder=4)
+        order.annotate(str(number), (x, y), ha="center", va="center", fontsize=8, zorder=4, color="black")
     order.set_title("(a) canonical order")
     dots = _map(entropies, points, c=weights, cmap="viridis", vmin=0, vmax=1)
     entropies.set_title(f"(b) {inputs.tables[40].names[inputs.example]}")
@@ -206,14 +209,14 @@ def graph_with_maxima(inputs: FigureInputs) -> Figure:
     graph = inputs.graph(40)
     points, weights = np.asarray(graph.points), inputs.tables[40].entropy[inputs.example]
     maxima = np.asarray(local_maxima(jnp.asarray(weights), graph.neighbours))
-    figure, axes = plt.subplots(1, 2, figsize=(10, 3.9), layout="constrained")
+    figure, axes = plt.subplots(2, 1, figsize=(6.4, 8), layout="constrained")
     for axis in axes:
         _map_edges(axis, points, np.asarray(graph.neighbours))
     _map(axes[0], points, color="#bfdbfe")
     axes[0].set_title("(a) neighbours")
     dots = _map(axes[1], points, c=weights, cmap="viridis", vmin=0, vmax=1)
     longitude, height = mercator(points)
-    axes[1].scatter(longitude[maxima], height[maxima], s=190, zorder=4, **_RING)
+    axes[1].scatter(longitude[maxima], height[maxima], s=240, zorder=4, **_RING)
     axes[1].set_title(f"(b) {maxima.sum()} local maxima")
     figure.colorbar(dots, ax=axes[1], label="normalised depth entropy")
     return figure
@@ -242,7 +245,7 @@ def example_graph(inputs: FigureInputs) -> Figure:
     axis.scatter(x[maxima], y[maxima], s=300, zorder=3, **_RING)
     for name, place, weight in zip(names, zip(x, y, strict=True), weights, strict=True):
         axis.annotate(f"{weight:g}", place, (0, 10), textcoords="offset points", ha="center", fontsize=8)
-        axis.annotate(name, place, ha="center", va="center", fontsize=8, fontweight="bold")
+        axis.annotate(name, place, ha="center", va="center", fontsize=8, fontweight="bold", color="black")
     axis.set_axis_off()
     axis.margins(0.08, 0.2)
     return figure
@@ -270,41 +273,37 @@ def best_and_worst_depths(inputs: FigureInputs) -> Figure:
 # ---------------------------------------------------------------------------------------------------------- losses, 17–19
 
 
-def _losses(axis: Axes, history: list[dict[str, float]], colour: str, label: str) -> None:
+def _losses(axis: Axes, history: list[dict[str, float]], colour: str, label: str, marker: str = "o") -> None:
+    """Training losses by dashed lines, validation losses by solid ones; `marker` differs between networks."""
     epochs = [entry["epoch"] for entry in history]
-    axis.plot(
-        epochs,
-        [e["train/loss"] for e in history],
-        "o--",
-        color=colour,
-        alpha=0.55,
-        markersize=3,
-        label=f"{label}training",
-    )
-    axis.plot(epochs, [e["val/loss"] for e in history], "o-", color=colour, markersize=3, label=f"{label}validation")
+    for key, line, called in (("train/loss", "--", "training"), ("val/loss", "-", "validation")):
+        losses = [entry[key] for entry in history]
+        axis.plot(epochs, losses, marker + line, color=colour, markersize=4, label=f"{label}{called}")
 
 
 def entropy_losses(inputs: FigureInputs) -> Figure:
-    figure, axes = plt.subplots(1, 2, figsize=(8.6, 3.2), layout="constrained")
-    colours: dict[Frame, str] = {"world": "#2563eb", "camera": "#d97706"}
+    figure, axes = plt.subplots(2, 1, figsize=(4.2, 5.6), layout="constrained")
+    styles: dict[Frame, tuple[str, str]] = {"world": ("#2563eb", "o"), "camera": ("#d97706", "s")}
     for axis, views, letter in zip(axes, inputs.statistics, "ab", strict=True):
         for frame in FRAMES:
-            _losses(axis, inputs.histories[f"entropy_{views}_{frame}"], colours[frame], f"{frame} frame, ")
-        axis.set(xlabel="epoch", ylabel="mean squared error", yscale="log", title=f"({letter}) {views} views")
+            colour, marker = styles[frame]
+            _losses(axis, inputs.histories[f"entropy_{views}_{frame}"], colour, f"{frame} frame, ", marker)
+        axis.set(xlabel="epoch", ylabel="mean squared error", title=f"({letter}) {views} views")
+        figures.logarithmic(axis)
         axis.xaxis.set_major_locator(MaxNLocator(integer=True))
-        axis.legend(frameon=False, fontsize=8)
+        axis.legend(frameon=False, fontsize=9)
     return figure
 
 
 def backbone_losses(indices: Sequence[int]) -> Callable[[FigureInputs], Figure]:
     def draw(inputs: FigureInputs) -> Figure:
-        figure, axes = plt.subplots(1, 2, figsize=(8.6, 3.2), layout="constrained", sharey=True)
+        figure, axes = plt.subplots(2, 1, figsize=(4.2, 5.6), layout="constrained", sharey=True)
         for axis, index, letter in zip(axes, indices, "ab", strict=True):
             backbone = BACKBONES[index]
             _losses(axis, inputs.histories[backbone.name], "#2563eb", "")
             axis.set(xlabel="epoch", ylabel="cross entropy", title=f"({letter}) {backbone.title}")
             axis.xaxis.set_major_locator(MaxNLocator(integer=True))
-            axis.legend(frameon=False, fontsize=8)
+            axis.legend(frameon=False, fontsize=9)
         axes[0].set_ylim(bottom=0)
         return figure
 
@@ -327,10 +326,15 @@ def accuracy_grid(views: int) -> Callable[[FigureInputs], Figure]:
             x = np.arange(len(thresholds)) + offset
             for column, at in enumerate(x):
                 before, after = random[row, column], predicted[row, column]
-                axis.plot([at, at], [before, after], color="#16a34a" if after > before else "#dc2626", linewidth=1.2)
+                colour, line = ("#059669", "-") if after > before else ("#dc2626", ":")
+                axis.plot([at, at], [before, after], line, color=colour, linewidth=1.5)
             last = row == len(limits) - 1
-            for values, colour, name in ((random, "#6b7280", "random"), (predicted, "#2563eb", "PointNet++")):
-                axis.scatter(x, values[row], color=colour, alpha=alpha, s=18, zorder=3, label=name if last else None)
+            for values, colour, marker, name in (
+                (random, "#6b7280", "o", "random"),
+                (predicted, "#2563eb", "s", "PointNet++"),
+            ):
+                shown = {"color": colour, "marker": marker, "alpha": alpha, "label": name if last else None}
+                axis.scatter(x, values[row], s=18, zorder=3, **shown)
         axis.set_xticks(range(len(thresholds)), [f"{ct:g}" for ct in thresholds])
         axis.set(
             xlabel=f"confidence threshold (for each, left to right: limit of {limits[0]} to {limits[-1]} views)",
@@ -360,17 +364,19 @@ def confusion_difference(inputs: FigureInputs) -> Figure:
     gain = predicted - random
     largest = max(1.0, np.abs(gain).max())
     figure, axis = plt.subplots(figsize=(5.4, 4.8), layout="constrained")
-    axis.imshow(gain, cmap="RdBu", vmin=-largest, vmax=largest)
+    cells = axis.imshow(gain, cmap="RdBu", vmin=-largest, vmax=largest)
     for (row, column), value in np.ndenumerate(gain):
         if abs(value) >= 0.05:
-            colour = "white" if abs(value) > 0.65 * largest else "black"
+            colour = figures.ink_on(cells.to_rgba(value))
             text = f"{value:+.1f}".replace("-", "−")
-            axis.text(column, row, text, ha="center", va="center", fontsize=7, color=colour)
+            axis.text(column, row, text, ha="center", va="center", fontsize=8, color=colour)
     axis.set_xticks(range(len(classes)), classes, rotation=60, ha="right")
     axis.set_yticks(range(len(classes)), classes)
     axis.set(xlabel="predicted", ylabel="true", title="PointNet++ minus random (points)")
     return figure
 
+
+_LINES = "Solid, green lines: PointNet++ is above random; dotted, red lines: below."
 
 FIGURES = (
     ThesisFigure(
@@ -382,7 +388,8 @@ FIGURES = (
     ThesisFigure(
         "7",
         mercator_order_and_entropies,
-        "The 40 viewpoints in the Mercator projection: their order, and the depth entropies of one test object.",
+        "The 40 viewpoints: their order, and the depth entropies of one test object. The Mercator projection, which the thesis "
+        "uses, enlarges what is near the poles.",
     ),
     ThesisFigure("8", points_per_view, "Points per view by class: median, quartiles, 5th and 95th percentiles."),
     ThesisFigure("9", entropy_distribution, "Depth entropies of all views by split; each split has its own scale."),
@@ -403,7 +410,7 @@ FIGURES = (
         "18", backbone_losses((0, 1)), "ResNet-18 on images: training on 10 views, and fine-tuning on 40 views."
     ),
     ThesisFigure("19", backbone_losses((2, 3)), "ResNet-18 on depth, initialised from images, and ResNet-34 on depth."),
-    ThesisFigure("20", accuracy_grid(10), "Table 10 as a figure. Green: PointNet++ above random; red: below."),
+    ThesisFigure("20", accuracy_grid(10), "Table 10 as a figure. " + _LINES),
     ThesisFigure("21", example_graph, "The thesis's example graph, with local maxima E, D, C and I."),
     ThesisFigure(
         "22", best_and_worst_depths, "Depth images of one test object from the views of highest and lowest entropy."
@@ -414,5 +421,5 @@ FIGURES = (
         "Confusion matrices in % of the true class: 10 views, CT 0.99, MV 4, ResNet-18 on images.",
     ),
     ThesisFigure("24", confusion_difference, "Difference between the two confusion matrices of Figure 23."),
-    ThesisFigure("25", accuracy_grid(40), "Table 11 as a figure. Green: PointNet++ above random; red: below."),
+    ThesisFigure("25", accuracy_grid(40), "Table 11 as a figure. " + _LINES),
 )

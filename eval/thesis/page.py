@@ -8,7 +8,8 @@ from pathlib import Path
 import matplotlib.pyplot as plt
 
 from data_pipeline.files import write_bytes, write_text
-from eval.report.html import document, drawn, embedded, table
+from eval.report.html import commands, document, drawn, embedded, table
+from eval.thesis.alts import ALTS
 from eval.thesis.figures import FIGURES, FigureInputs, ThesisFigure
 from eval.thesis.layout import ThesisTable
 from eval.thesis.tables import all_tables, markdown, shown_cells
@@ -23,13 +24,52 @@ CHAPTERS = (
 )
 """Tables and figures in the order of the thesis."""
 
+_TERMS = (
+    "<p><i>The thesis</i> is Learning Optimal View Selection for Multi-View Object Representation. A <dfn>view</dfn> is one "
+    "depth image of an object, from one of 10 or 40 directions around it. A classifier, the <dfn>backbone</dfn>, gives one "
+    "number for each class and view, the <dfn>logits</dfn>; those of all views seen are added. A <dfn>policy</dfn> chooses "
+    "the next view: <dfn>random</dfn>, or <dfn>PointNet++</dfn> (pcd), a network that predicts the depth entropies of all "
+    "views from the points of one; the local maxima of its prediction are visited. The <dfn>depth entropy</dfn> of a view "
+    "says how varied its depths are. The <dfn>oracle</dfn> is given the true entropies. A walk stops when its confidence "
+    "reaches a <dfn>confidence threshold</dfn> (CT), or at a <dfn>limit on views</dfn> (MV). Points are percentage points. A "
+    "<dfn>95 % interval</dfn> is computed by drawing the test objects again, with repetition. <b>▲</b> and <b>▼</b>: the "
+    "interval of a gain is above, or below, zero.</p>"
+)
+
+
+def _next(over: ThesisTable | None) -> str:
+    """The end of the page: commands that continue this run."""
+    steps = [
+        (
+            "Compare all policies of the project on the same data, with a 3-D view of single objects:",
+            "mevs run --data DATA --out OTHER",
+        ),
+        (
+            "See what each change of the thesis's published code does to its gain:",
+            "mevs study published-code --out OTHER",
+        ),
+    ]
+    if over is None:
+        steps.insert(
+            0,
+            (
+                "The intervals are for these networks alone. To know whether the results hold for other trainings:",
+                "mevs study thesis --out RUN --seeds 3",
+            ),
+        )
+    return (
+        "<h2>What to do next</h2><p><code>RUN</code> stands for the folder of this run, in which <code>report/index.html</code> "
+        "is this page. Beside it, <code>thesis.md</code> has the same tables, and <code>figures/</code> has every figure.</p>"
+        f"{commands(steps)}"
+    )
+
 
 def _table_html(shown: ThesisTable) -> str:
     rows = []
     for row in shown.rows:
         cells = [html.escape(row.name)]
         for ours, bold, theirs in shown_cells(row, shown):
-            text = f"<b>{html.escape(ours)}</b>" if bold else html.escape(ours)
+            text = f"<b class='up'>{_mark(ours)} {html.escape(ours)}</b>" if bold else html.escape(ours)
             cells.append(text + (f' <small class="note">({html.escape(theirs)})</small>' if theirs else ""))
         rows.append(cells)
     return (
@@ -39,6 +79,11 @@ def _table_html(shown: ThesisTable) -> str:
     )
 
 
+def _mark(gain: str) -> str:
+    """The mark of a gain whose interval excludes zero; it does not need bold print or colour."""
+    return "▼" if gain.startswith("−") else "▲"
+
+
 def _save_figure(shown: ThesisFigure, inputs: FigureInputs, folder: Path) -> str:
     """Draws a figure, saves it as PNG and SVG, and returns its HTML."""
     figure = shown.draw(inputs)
@@ -46,7 +91,7 @@ def _save_figure(shown: ThesisFigure, inputs: FigureInputs, folder: Path) -> str
     plt.close(figure)
     for kind, content in files.items():
         write_bytes(folder / f"figure_{int(shown.number):02d}.{kind}", content)
-    return embedded(files["svg"], "svg", shown.caption, f"Figure {shown.number}")
+    return embedded(files["svg"], "svg", shown.caption, f"Figure {shown.number}", ALTS[shown.number](inputs))
 
 
 def write_thesis_report(inputs: FigureInputs, lead: str, folder: Path, over: ThesisTable | None = None) -> Path:
@@ -81,5 +126,5 @@ def write_thesis_report(inputs: FigureInputs, lead: str, folder: Path, over: The
     title = "Reproduction of the thesis"
     write_text(folder / "thesis.md", f"# {title}\n\n{lead}\n\n" + "\n".join(text))
     path = folder / "index.html"
-    write_text(path, document(title, f'<p class="lead">{html.escape(lead)}</p>' + "".join(page)))
+    write_text(path, document(title, f'<p class="lead">{html.escape(lead)}</p>{_TERMS}{"".join(page)}{_next(over)}'))
     return path

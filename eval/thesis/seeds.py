@@ -94,7 +94,7 @@ def table_of(rows: Sequence[dict[str, Any]]) -> ThesisTable:
     def text(row: dict[str, Any], values: Sequence[float]) -> str:
         error, signed = row["table"] == "4", "+" if row["table"] in ("7", "12") else ""
         digits = f"{signed}.5f" if error else f"{signed}.2f"
-        return ", ".join(f"{value * (1 if error else 100):{digits}}" for value in values)
+        return ", ".join(f"{value * (1 if error else 100):{digits}}" for value in values).replace("-", "−")
 
     return ThesisTable(
         0,

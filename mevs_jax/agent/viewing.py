@@ -22,13 +22,17 @@ _LOW, _HIGH, _UNKNOWN = np.array([219, 231, 245]), np.array([8, 48, 107]), (150,
 """Colours: of the lowest and the highest expected gain, and of candidates whose gain is not known."""
 _SMALLEST, _LARGEST = 0.02, 0.06
 _SHOWN = 5
+_LEGEND = (
+    "Spheres are candidate views: the larger and darker, the higher the expected gain; small and grey, not known. Large orange "
+    "points are new with this view, small blue ones were seen before. Red: the cameras and their way."
+)
 
 
 def view(history: History, system: TrainedSystem, *, host: str = "127.0.0.1", port: int = 8080) -> viser.ViserServer:
     """Serves a 3-D scene of a history, with a slider over the views; the unit is the object's radius.
 
-    Every view shows its points, orange in the step in which they are new and blue later. Candidates are darker and larger, the
-    higher their expected gain is; grey where the system has no table to compute it from.
+    Every view shows its points, large and orange in the step in which they are new, smaller and blue later. Candidates are
+    darker and larger, the higher their expected gain is; grey where the system has no table to compute it from.
 
     Args:
         history: of an agent, as `Walk.history`, or from `mevs_jax.agent.load_history`.
@@ -95,9 +99,9 @@ def _add_views(server: viser.ViserServer, history: History, system: TrainedSyste
     camera, size = system.description.camera, 1.2 / max(1, len(history.depths[0]))
     angle = math.radians(camera.field_of_view)
     for number, (points, pose) in enumerate(zip(clouds_of(history, system), history.poses, strict=True), 1):
-        for name, colour in (("new", _NEW), ("seen", _SEEN)):
+        for name, colour, larger in (("new", _NEW, 2.4), ("seen", _SEEN, 1.2)):
             server.scene.add_point_cloud(
-                f"/{name}/{number}", points.astype(np.float32), colour, point_size=2 * size, point_shape="circle"
+                f"/{name}/{number}", points.astype(np.float32), colour, point_size=larger * size, point_shape="circle"
             )
         depth = history.depths[number - 1]
         grey = np.where(depth > 0, np.clip(255 * (camera.distance + 1 - depth) / 2, 0, 255), 0).astype(np.uint8)
@@ -157,14 +161,15 @@ def _belief(history: History, system: TrainedSystem, step: int) -> str:
     probabilities = np.asarray(history.beliefs[step - 1]["probabilities"])
     bars = "".join(
         f"<div>{html.escape(system.classes[label])} {100 * probabilities[label]:.1f} %<br>"
-        f'<progress style="width:100%" value="{probabilities[label]:.4f}" max="1"></progress></div>'
+        f'<progress style="width:100%" value="{probabilities[label]:.4f}" max="1" '
+        f'aria-label="probability of {html.escape(system.classes[label])}"></progress></div>'
         for label in np.argsort(-probabilities, kind="stable")[:_SHOWN]
     )
     found = after(history, step).get("step")
     said = "" if found is None else f"The end: {found['reason']}." if found["done"] else f"Next: view {found['index']}"
     if found is not None and found["expected_gain"] is not None:
         said += f", expected gain {found['expected_gain']:.3f} nats."
-    return f'<div style="padding:0 1em"><b>After {step} of {history.views} views</b>{bars}<p>{said}</p></div>'
+    return f'<div style="padding:0 1em"><b>After {step} of {history.views} views</b>{bars}<p>{said}</p><p>{_LEGEND}</p></div>'
 
 
 def _quaternion(rotation: Float[np.ndarray, "3 3"]) -> Float[np.ndarray, " 4"]:
@@ -176,7 +181,13 @@ def _quaternion(rotation: Float[np.ndarray, "3 3"]) -> Float[np.ndarray, " 4"]:
 
 def _way(start: Float[np.ndarray, " 3"], end: Float[np.ndarray, " 3"], steps: int = 17) -> Float[np.ndarray, "steps 3"]:
     """Points on the shortest way around the object from one camera to another."""
+    away, last = np.linalg.norm(start), np.linalg.norm(end)
+    first, other = start / away, end / last
+    cosine = np.clip(first @ other, -1, 1)
+    aside = other - cosine * first
+    if np.linalg.norm(aside) < 1e-3:  # opposite: any way is the shortest
+        aside = np.cross(first, np.eye(3)[np.abs(first).argmin()])
     share = np.linspace(0, 1, steps)[:, None]
-    points = (1 - share) * start + share * end
-    distance = (1 - share) * np.linalg.norm(start) + share * np.linalg.norm(end)
-    return distance * points / np.maximum(np.linalg.norm(points, axis=1, keepdims=True), 1e-6)
+    angle = share * np.arccos(cosine)
+    points = np.cos(angle) * first + np.sin(angle) * aside / np.linalg.norm(aside)
+    return ((1 - share) * away + share * last) * points

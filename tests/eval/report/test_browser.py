@@ -5,92 +5,25 @@ Needs the extra `browser` and the program `chromium` (Debian's package has this 
 
 from __future__ import annotations
 
-import shutil
+import threading
 from collections.abc import Iterator
+from functools import partial
+from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
-from typing import Any
 
 import pytest
 
+from tests.reference.browser import WAYS
+
 pytestmark = pytest.mark.slow
 SITE = Path(__file__).resolve().parents[3] / "site"
-WAYS = [(1200, "light"), (1200, "dark"), (390, "light"), (390, "dark")]
-
-
-@pytest.fixture(scope="module")
-def browser() -> Iterator[Any]:
-    playwright = pytest.importorskip(
-        "playwright.sync_api", reason="playwright is not installed: pip install '.[browser]'"
-    )
-    programs = map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))
-    program = next((program for program in programs if program), None)
-    if program is None:
-        pytest.skip("there is no Chromium here: apt-get install chromium")
-    with playwright.sync_playwright() as started:
-        opened = started.chromium.launch(executable_path=program, args=["--no-sandbox"])
-        yield opened
-        opened.close()
-
-
-class Opened:
-    """A page of files, with all that went wrong in it."""
-
-    def __init__(self, browser: Any, path: Path, width: int, scheme: str = "light", **options: Any):
-        self.context = browser.new_context(viewport={"width": width, "height": 900}, color_scheme=scheme, **options)
-        self.page, self.wrong = self.context.new_page(), []
-        self.page.on("console", lambda said: said.type in ("error", "warning") and self.wrong.append(said.text))
-        self.page.on("pageerror", lambda error: self.wrong.append(str(error)))
-        self.page.on("request", lambda request: self._check(request.url, path))
-        self.page.goto(path.resolve().as_uri())
-
-    def _check(self, url: str, path: Path) -> None:
-        folder = path.resolve().parent.as_uri()
-        if not url.startswith(("data:", "blob:")) and not url.startswith(folder):
-            self.wrong.append(f"asks for {url}")
-
-    def picture(self) -> str:
-        self.page.evaluate("() => new Promise((done) => requestAnimationFrame(() => requestAnimationFrame(done)))")
-        return self.page.evaluate("document.getElementById('scene').toDataURL()")
-
-    def overflow(self) -> int:
-        return self.page.evaluate("document.documentElement.scrollWidth - document.documentElement.clientWidth")
-
-    def faults(self) -> list[str]:
-        """What axe-core finds, if it is serious."""
-        axe = pytest.importorskip(
-            "axe_playwright_python.sync_playwright", reason="axe-core is not installed: '.[browser]'"
-        )
-        self.page.evaluate("document.querySelectorAll('main details').forEach((fold) => (fold.open = true))")
-        found = axe.Axe().run(self.page).response["violations"]
-        return [
-            f"{fault['id']}: {node['html'][:120]}"
-            for fault in found
-            if fault["impact"] in ("serious", "critical")
-            for node in fault["nodes"]
-        ]
-
-
-@pytest.fixture
-def opened(browser) -> Iterator[Any]:
-    pages: list[Opened] = []
-
-    def open_page(path: Path, width: int, scheme: str = "light", **options: Any) -> Opened:
-        pages.append(Opened(browser, path, width, scheme, **options))
-        return pages[-1]
-
-    yield open_page
-    for page in pages:
-        page.context.close()
 
 
 @pytest.mark.parametrize(("width", "scheme"), WAYS)
 def test_the_report_is_sound(whole, opened, width, scheme):
     page = opened(whole / "report" / "index.html", width, scheme)
     assert page.page.locator("#viewer").is_visible()
-    assert page.overflow() <= 0
-    assert page.faults() == []
-    assert page.overflow() <= 0  # with all that was folded
-    assert page.wrong == []
+    page.is_sound()
 
 
 def test_the_scene_is_drawn_and_turns(whole, opened):
@@ -102,6 +35,7 @@ def test_the_scene_is_drawn_and_turns(whole, opened):
         "const d = c.getContext('2d').getImageData(0, 0, c.width, c.height).data, found = new Set();"
         "for (let i = 0; i < d.length; i += 4) found.add((d[i] << 16) | (d[i + 1] << 8) | d[i + 2]); return found.size }"
     ) > 20  # fmt: skip
+    page.locator("#scene").scroll_into_view_if_needed()
     box = page.locator("#scene").bounding_box()
     middle = box["x"] + box["width"] / 2, box["y"] + box["height"] / 2
     page.mouse.move(*middle)
@@ -177,18 +111,61 @@ def test_the_slider_goes_through_the_views(whole, opened):
 @pytest.mark.parametrize("width", [1200, 390])
 def test_without_scripts_all_walks_are_read(whole, opened, width):
     page = opened(whole / "report" / "index.html", width, java_script_enabled=False).page
-    assert page.get_by_text("The 3-D scene needs JavaScript").is_visible()
+    assert page.locator("noscript .warning").is_visible()
     assert not page.locator("#viewer").is_visible()
     assert page.locator(".walk").count() == page.locator(".walk:visible").count() > 0
     assert page.locator(".walk img").first.is_visible()
 
 
-@pytest.mark.parametrize(("width", "scheme"), WAYS)
-def test_the_documentation_is_sound(opened, width, scheme):
+def test_all_walks_are_printed(whole, opened):
+    page = opened(whole / "report" / "index.html", 1200).page
+    assert page.locator(".walk").count() > page.locator(".walk:visible").count() == 1
+    page.emulate_media(media="print")
+    assert page.locator(".walk").count() == page.locator(".walk:visible").count()
+    assert not page.locator(".controls").first.is_visible()
+
+
+def test_nothing_moves_by_itself(whole, opened):
+    page = opened(whole / "report" / "index.html", 1200).page
+    assert page.evaluate("document.getAnimations().length") == 0
+    style = page.locator("style").first.text_content()
+    assert not [word for word in ("transition", "animation", "scroll-behavior") if word in style]
+
+
+def test_the_tab_key_stops_only_where_something_is_done(whole, opened):
+    """Tables and figures that fit are no stops; those that scroll are, and say so."""
+    for width in (1200, 390):
+        page = opened(whole / "report" / "index.html", width).page
+        for box in page.locator("main > .scroll, main > figure .scroll").all():
+            wider = box.evaluate("(box) => box.scrollWidth > box.clientWidth + 1")
+            assert (box.get_attribute("tabindex") == "0") == wider == box.locator(".hint").is_visible()
+
+
+@pytest.fixture(scope="module")
+def site() -> Iterator[str]:
+    """The address of the documentation, which a server of this process shows."""
     if not (SITE / "index.html").exists():
         pytest.skip("the documentation is not built: make docs")
+
+    class Quiet(SimpleHTTPRequestHandler):
+        def log_message(self, *_: object) -> None:
+            pass
+
+    with ThreadingHTTPServer(("127.0.0.1", 0), partial(Quiet, directory=str(SITE))) as server:
+        threading.Thread(target=server.serve_forever, daemon=True).start()
+        yield f"http://127.0.0.1:{server.server_port}"
+        server.shutdown()
+
+
+@pytest.mark.parametrize(("width", "scheme"), [WAYS[0], WAYS[-1]])
+def test_the_documentation_is_sound(site, opened, width, scheme):
+    page, faults = opened(f"{site}/index.html", width, scheme), {}
     for path in sorted(SITE.glob("**/index.html")):
-        page = opened(path, width, scheme)
-        assert page.overflow() <= 0, path
-        assert page.faults() == [], path
-        page.context.close()
+        name = path.relative_to(SITE).as_posix()
+        page.page.goto(f"{site}/{name}")
+        page.unfold()
+        found = [*page.wrong, *page.faults(), *[f"{page.overflow()} pixels too wide"] * (page.overflow() > 0)]
+        page.wrong.clear()
+        if found:
+            faults[name] = found
+    assert faults == {}

@@ -11,7 +11,8 @@ import pytest
 
 from eval.projections import equal_area
 from eval.report import figures
-from eval.report.html import STYLE, difference, document, drawn, embedded, table
+from eval.report.grid import _most_confused
+from eval.report.html import MANY_CLASSES, STYLE, commands, difference, document, drawn, embedded, table
 from eval.report.svg import _VARIABLES, inline
 
 
@@ -101,9 +102,36 @@ def test_a_table_has_headings_for_rows_and_columns():
     shown = table(["policy", "1 < 2"], [["<b>Uses nothing</b>"], ["random", "3"], ["group"], ["b", "4"]], "a table")
     assert shown.count("<tbody>") == 2
     assert '<th scope="col">1 &lt; 2</th>' in shown
-    assert '<th scope="rowgroup" colspan="2"><b>Uses nothing</b></th>' in shown
+    assert '<th scope="rowgroup" colspan="2"><span class="group"><b>Uses nothing</b></span></th>' in shown
     assert '<th scope="row">random</th><td>3</td>' in shown
     assert 'tabindex="0" role="group" aria-label="Table: a table"' in shown
+
+
+def test_ink_on_a_cell_has_a_contrast_of_4_5():
+    for cmap in ("RdBu", "Blues"):
+        for colour in plt.get_cmap(cmap)(np.linspace(0, 1, 200)):
+            cell = "#" + "".join(f"{round(255 * c):02x}" for c in colour[:3])
+            ink = {"black": "#000000", "white": "#ffffff"}[figures.ink_on(colour)]
+            assert contrast(ink, cell) >= 4.5
+
+
+def test_confusions_of_many_classes_are_a_table():
+    classes = [f"class {number}" for number in range(MANY_CLASSES + 1)]
+    matrix = 10 * np.eye(len(classes))
+    matrix[3, 7], matrix[5, 2] = 30, 10
+    shown = _most_confused("random", matrix, classes, {"threshold": 0.99, "max_views": 4})
+    cells = re.findall(r'<th scope="row">(.*?)</th><td>(.*?)</td><td>(.*?)</td>', shown)
+    assert cells == [("class 3", "class 7", "75.0"), ("class 5", "class 2", "50.0")]
+
+
+def test_steps_are_listed_with_their_commands():
+    assert commands([("Do <this>:", "mevs a --b 'c'")]) == (
+        "<ol><li><p>Do &lt;this&gt;:</p><pre><code>mevs a --b &#x27;c&#x27;</code></pre></li></ol>"
+    )
+
+
+def test_a_document_says_its_size():
+    assert "it has 2.0 MB" in document("T", "<p>" + 2_000_000 * "a" + "</p>")
 
 
 def test_a_document_links_to_its_sections():

@@ -14,7 +14,7 @@ import pytest
 
 from data_pipeline.capture.casting import CaptureConfig
 from eval.numbers.study import Setting
-from eval.report.scenes import nats
+from eval.report.scenes import _which, nats
 from eval.report.surface import MOST_POINTS, seen_by, surface_of
 from eval.report.walks import OF_EACH, Walks, walks_of
 from eval.walks.grid import GridConfig
@@ -88,7 +88,16 @@ def test_the_first_objects_of_each_kind_are_shown():
         kinds.setdefault(kind, []).append(index)
     assert list(kinds.values()) == [[0, 2], [6], [4], [1, 5]]  # object 3 is of the class of 0, which is shown already
     assert all(len(members) <= OF_EACH for members in kinds.values())
-    assert [kind.split()[0] for kind in kinds] == ["wrong", "still", "right", "right"]
+    assert [kind.split()[0] for kind in kinds] == ["wrong", "wrong", "right", "right"]
+
+
+def test_some_walk_is_always_shown():
+    """Also where no walk is of a kind that is shown first."""
+    assert list(walks_with([[0, 0, 1], [1, 0, 1], [0, 1, 0]]).chosen()) == [2]
+    corrected = walks_with([[0, 0, 1], [1, 0, 1], [1, 0, 1]])
+    assert list(corrected.chosen()) == [0, 1]
+    assert "no failure to show" in _which(corrected)
+    assert "more frequent" in _which(walks_with([[0, 0, 1], [0, 1, 0]]))
 
 
 def ball(radius: float, views: int = 12, side: int = 48) -> tuple[dict, CaptureConfig]:

@@ -10,6 +10,7 @@ from dataclasses import asdict, replace
 from pathlib import Path
 
 import jax.numpy as jnp
+import matplotlib.pyplot as plt
 import numpy as np
 import pytest
 from flax import nnx
@@ -18,25 +19,24 @@ from matplotlib.figure import Figure
 import eval.thesis.run as thesis_run
 import train.thesis_networks as thesis_networks
 from data_pipeline.dataset.builder import open_split
-from data_pipeline.dataset.statistics import DatasetStatistics, load_statistics
+from data_pipeline.dataset.statistics import load_statistics
 from data_pipeline.files import write_json
 from data_pipeline.objects.furniture import CLASSES, furniture
 from eval.numbers.timing import decision_memory, milliseconds, time_local_maxima
 from eval.settings import PRESETS
-from eval.thesis.figures import FIGURES, FigureInputs
+from eval.thesis.alts import ALTS
+from eval.thesis.figures import FIGURES
 from eval.thesis.layout import thesis_numbers
-from eval.thesis.page import CHAPTERS
-from eval.thesis.results import LatticeTables, all_results, best_cells, machine
+from eval.thesis.page import CHAPTERS, _table_html
+from eval.thesis.results import LatticeTables, best_cells
 from eval.thesis.tables import all_tables, markdown
-from eval.walks.grid import THRESHOLDS, GridConfig, Results
+from eval.walks.grid import THRESHOLDS, Results
 from mevs_jax.viewpoints import ViewGraph, fibonacci_sphere
+from tests.reference.made_up_thesis import OBJECTS
 from tests.reference.policies import maxima_first
 from tests.reference.weights import untrained
 from train.tasks.entropy import EntropyTask
-from train.thesis_networks import BACKBONES, FRAMES, PIPELINE, VIEWS, ThesisFolder, backbone_task, entropy_task
-
-OBJECTS = 10
-
+from train.thesis_networks import BACKBONES, FRAMES, PIPELINE, backbone_task, entropy_task
 
 # ------------------------------------------------------------------------------------------------------ the printed numbers
 
@@ -64,73 +64,6 @@ def test_the_thesiss_own_tables_agree_with_each_other():
 
 
 # ----------------------------------------------------------------------------------------------------- from made-up networks
-
-
-def made_up_lattice(views: int, seed: int) -> LatticeTables:
-    random = np.random.default_rng(seed)
-    labels = (np.arange(OBJECTS) % len(CLASSES)).astype(np.int32)
-    logits = {}
-    for backbone in BACKBONES:
-        noise = random.normal(size=(OBJECTS, views, len(CLASSES)))
-        logits[backbone.name] = (noise + 1.5 * np.eye(len(CLASSES))[labels][:, None]).astype(np.float32)
-    entropy = random.uniform(0.1, 0.9, (OBJECTS, views)).astype(np.float32)
-    predicted_entropy = {
-        frame: (entropy[:, None] + spread * random.normal(size=(OBJECTS, views, views))).astype(np.float32)
-        for frame, spread in (("world", 0.05), ("camera", 0.2))
-    }
-    return LatticeTables([f"o{i}" for i in range(OBJECTS)], labels, entropy, logits, predicted_entropy)
-
-
-@pytest.fixture(scope="module")
-def lattices() -> dict[int, LatticeTables]:
-    return {views: made_up_lattice(views, views) for views in VIEWS}
-
-
-@pytest.fixture(scope="module")
-def statistics(lattices) -> dict[int, DatasetStatistics]:
-    return {
-        views: DatasetStatistics(
-            classes=list(CLASSES),
-            counts={split: dict.fromkeys(CLASSES, 8) for split in ("train", "val", "test")},
-            left_out={"train": {}, "test": {}},
-            entropy_max=4.0,
-            entropy_mean=0.5,
-            entropy_std=0.1,
-            entropy_histograms={split: list(range(50)) for split in ("train", "val", "test")},
-            mean_map=lattice.entropy.mean(axis=0).tolist(),
-            class_mean_maps=[lattice.entropy[lattice.labels == c].mean(axis=0).tolist() for c in range(len(CLASSES))],
-            points_mean=100.0,
-            points_std=5.0,
-            points_by_class=[[80.0, 90.0, 100.0, 110.0, 120.0]] * len(CLASSES),
-            viewpoints=fibonacci_sphere(views).tolist(),
-            capture={"resolution": 32, "views": views},
-            source="made up",
-        )
-        for views, lattice in lattices.items()
-    }
-
-
-@pytest.fixture(scope="module")
-def results(lattices, statistics) -> dict:
-    validation = {views: made_up_lattice(views, 100 + views) for views in VIEWS}
-    found = all_results(lattices, validation, statistics, GridConfig(draws=2))
-    losses = {"train_loss": 0.4, "val_loss": 0.5, "epochs": 3, "best_epoch": 2, "start": "random weights"}
-    by_class = {name: [3.0, 0.5] for name in (*CLASSES, "all")}
-    timing = {"by_class": by_class, "local_maxima": {"alone": 0.1, "batched": 0.001}}
-    memory = {"planned": 80.0, "device_peak": None}
-    ascent = {
-        "seconds": {name: [2.0, 0.25] for name in (*CLASSES, "all")},
-        "memory": {"planned": 5.0, "device_peak": None},
-    }
-    found |= {
-        "backbones": {backbone.name: losses for backbone in BACKBONES},
-        "machine": machine(),
-        "timing": {"runs": 50, "10": timing, "40": timing},
-        "memory": {"ResNet-18 + Random view selection": memory},
-        "ascent": {"runs": 3, "starts": 8, "resolution": 64, "mesh": ascent, "volume": ascent},
-        "left_out": {"10": {}, "40": {}},
-    }
-    return json.loads(json.dumps(found))
 
 
 def cell_by_hand(lattice: LatticeTables, views: int, policy: str, row: int, column: int) -> float:
@@ -218,19 +151,41 @@ def test_entropy_errors_are_by_class_and_beside_what_looks_at_nothing(lattices, 
     assert found["mean_map"]["sofa"][0] == pytest.approx(by_hand, rel=1e-5)
 
 
-def test_every_figure_but_the_captures_is_drawn(lattices, statistics, results, tmp_path):
-    history = [{"epoch": e, "train/loss": 1 / e, "val/loss": 1.2 / e} for e in (1, 2, 3)]
-    names = [backbone.name for backbone in BACKBONES] + [f"entropy_{v}_{frame}" for v in VIEWS for frame in FRAMES]
-    inputs = FigureInputs(ThesisFolder(tmp_path), results, statistics, lattices, dict.fromkeys(names, history), 0)
+def test_every_figure_but_the_captures_is_drawn(inputs):
     for shown in FIGURES:
         if shown.number == "22":  # of stored captures; drawn by the whole command below
             continue
         figure = shown.draw(inputs)
         assert isinstance(figure, Figure)
         figure.canvas.draw()
+        plt.close(figure)
     wanted = {f"F{n}" for n in (*range(5, 12), *range(17, 26))} | {f"T{n}" for n in range(1, 16)}
     assert {name for _, names in CHAPTERS for name in names} == wanted
     assert {f"F{shown.number}" for shown in FIGURES} == {name for name in wanted if name.startswith("F")}
+
+
+def test_every_figure_is_told_in_words(inputs):
+    said = {shown.number: ALTS[shown.number](inputs) for shown in FIGURES}
+    assert said.keys() == ALTS.keys()
+    assert all(text.endswith(".") and len(text) > 50 for text in said.values())
+    assert len(set(said.values())) == len(said)
+    accuracies = 100 * np.mean(inputs.results["pipeline"]["10"]["policies"]["random"]["accuracy"], axis=0)
+    assert f"Random: {accuracies.min():.1f} to {accuracies.max():.1f} %" in said["20"]
+    entropies = inputs.tables[40].entropy[0]
+    assert f"to {entropies.max():.2f} (view {entropies.argmax()})" in said["7"]
+    assert "training loss from 1.0000 to 0.3333" in said["17"]
+
+
+def test_gains_are_marked_without_bold_print_or_colour(results):
+    """Where the interval excludes zero, and nowhere else."""
+    table = next(shown for shown in all_tables(results) if shown.number == 7)
+    page = _table_html(table)
+    gain = results["pipeline"]["10"]["gain"]["text"]
+    for mark, ends in (("▲", [low > 0 for row in gain["interval"] for low, _ in row]),
+                       ("▼", [high < 0 for row in gain["interval"] for _, high in row])):  # fmt: skip
+        assert page.count(f"<b class='up'>{mark} ") == sum(ends)
+    for mark, text in re.findall(r"<b class='up'>(.) (.)", page):
+        assert (mark, text) in {("▲", "+"), ("▼", "−")}
 
 
 def test_networks_are_trained_as_the_thesis_says(statistics):

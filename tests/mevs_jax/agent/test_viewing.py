@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from mevs_jax.agent import load_history
-from mevs_jax.agent.viewing import after, clouds_of, view
+from mevs_jax.agent.viewing import _way, after, clouds_of, view
 from tests.mevs_jax.trained import making
 
 
@@ -59,6 +59,19 @@ def test_views_show_points_of_the_ball(system, history):
     assert np.median(radius) < 1.0
 
 
+@pytest.mark.parametrize("end", [(0, 3, 0), (-2, 0, 0), (2, 0, 0), (-2, 0.01, 0.02)])
+def test_the_way_is_evenly_around_the_object(end):
+    start = np.array([2.0, 0, 0])
+    way = _way(start, np.array(end, float))
+    np.testing.assert_allclose(way[[0, -1]], [start, end], atol=1e-2)
+    radius, steps = (
+        np.linalg.norm(way, axis=1),
+        np.linalg.norm(np.diff(way / np.linalg.norm(way, axis=1)[:, None], axis=0), axis=1),
+    )
+    np.testing.assert_allclose(radius, np.linspace(2, np.linalg.norm(end), len(way)))
+    np.testing.assert_allclose(steps, steps.mean(), atol=1e-6)
+
+
 def test_a_server_shows_the_history(system, history):
     pytest.importorskip("viser", reason="viser is not installed: pip install '.[view]'")
     server = view(history, system, port=8237)
@@ -76,6 +89,24 @@ def test_a_server_shows_the_history(system, history):
 
         assert (shown("new"), shown("seen"), shown("cameras"), shown("ways")) == ([1], [], [1], [])
         assert candidates() == len(system.viewpoints) - 1
+    finally:
+        server.stop()
+
+
+@pytest.mark.slow
+def test_a_person_goes_through_the_views(system, history, opened):
+    """In Chromium, by the keys; nothing is loaded from elsewhere."""
+    pytest.importorskip("viser", reason="viser is not installed: pip install '.[view]'")
+    server = view(history, system, port=8261)
+    try:
+        shown = opened(f"http://127.0.0.1:{server.get_port()}/", 1200)
+        for step in (1, 2, 3):
+            shown.page.get_by_text(f"After {step} of 3 views").wait_for()
+            assert shown.page.locator("progress").count() == min(5, len(system.classes))
+            shown.page.get_by_role("slider").last.press("ArrowRight")
+        assert "budget" in shown.page.get_by_text("The end").inner_text()
+        assert shown.page.locator("canvas[data-engine]").is_visible()
+        assert [said for said in shown.wrong if "deprecated" not in said] == []  # of three.js
     finally:
         server.stop()
 

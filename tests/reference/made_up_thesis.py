@@ -1,0 +1,77 @@
+"""Outputs of the thesis's networks that are made up, and what follows from them."""
+
+from __future__ import annotations
+
+import json
+from typing import Any
+
+import numpy as np
+
+from data_pipeline.dataset.statistics import DatasetStatistics
+from data_pipeline.objects.furniture import CLASSES
+from eval.thesis.results import LatticeTables, all_results, machine
+from eval.walks.grid import GridConfig
+from mevs_jax.viewpoints import fibonacci_sphere
+from train.thesis_networks import BACKBONES, VIEWS
+
+OBJECTS = 10
+
+
+def made_up_lattice(views: int, seed: int) -> LatticeTables:
+    random = np.random.default_rng(seed)
+    labels = (np.arange(OBJECTS) % len(CLASSES)).astype(np.int32)
+    logits = {}
+    for backbone in BACKBONES:
+        noise = random.normal(size=(OBJECTS, views, len(CLASSES)))
+        logits[backbone.name] = (noise + 1.5 * np.eye(len(CLASSES))[labels][:, None]).astype(np.float32)
+    entropy = random.uniform(0.1, 0.9, (OBJECTS, views)).astype(np.float32)
+    predicted_entropy = {
+        frame: (entropy[:, None] + spread * random.normal(size=(OBJECTS, views, views))).astype(np.float32)
+        for frame, spread in (("world", 0.05), ("camera", 0.2))
+    }
+    return LatticeTables([f"o{i}" for i in range(OBJECTS)], labels, entropy, logits, predicted_entropy)
+
+
+def made_up_statistics(lattices: dict[int, LatticeTables]) -> dict[int, DatasetStatistics]:
+    return {
+        views: DatasetStatistics(
+            classes=list(CLASSES),
+            counts={split: dict.fromkeys(CLASSES, 8) for split in ("train", "val", "test")},
+            left_out={"train": {}, "test": {}},
+            entropy_max=4.0,
+            entropy_mean=0.5,
+            entropy_std=0.1,
+            entropy_histograms={split: list(range(50)) for split in ("train", "val", "test")},
+            mean_map=lattice.entropy.mean(axis=0).tolist(),
+            class_mean_maps=[lattice.entropy[lattice.labels == c].mean(axis=0).tolist() for c in range(len(CLASSES))],
+            points_mean=100.0,
+            points_std=5.0,
+            points_by_class=[[80.0, 90.0, 100.0, 110.0, 120.0]] * len(CLASSES),
+            viewpoints=fibonacci_sphere(views).tolist(),
+            capture={"resolution": 32, "views": views},
+            source="made up",
+        )
+        for views, lattice in lattices.items()
+    }
+
+
+def made_up_results(lattices: dict[int, LatticeTables], statistics: dict[int, DatasetStatistics]) -> dict[str, Any]:
+    validation = {views: made_up_lattice(views, 100 + views) for views in VIEWS}
+    found = all_results(lattices, validation, statistics, GridConfig(draws=2))
+    losses = {"train_loss": 0.4, "val_loss": 0.5, "epochs": 3, "best_epoch": 2, "start": "random weights"}
+    by_class = {name: [3.0, 0.5] for name in (*CLASSES, "all")}
+    timing = {"by_class": by_class, "local_maxima": {"alone": 0.1, "batched": 0.001}}
+    memory = {"planned": 80.0, "device_peak": None}
+    ascent = {
+        "seconds": {name: [2.0, 0.25] for name in (*CLASSES, "all")},
+        "memory": {"planned": 5.0, "device_peak": None},
+    }
+    found |= {
+        "backbones": {backbone.name: losses for backbone in BACKBONES},
+        "machine": machine(),
+        "timing": {"runs": 50, "10": timing, "40": timing},
+        "memory": {"ResNet-18 + Random view selection": memory},
+        "ascent": {"runs": 3, "starts": 8, "resolution": 64, "mesh": ascent, "volume": ascent},
+        "left_out": {"10": {}, "40": {}},
+    }
+    return json.loads(json.dumps(found))
