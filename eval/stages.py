@@ -26,7 +26,7 @@ from data_pipeline.objects.sources import load_object
 from data_pipeline.progress import console
 from eval.checks.agent import compare_walks, latency, recognised, stopping
 from eval.consistency import check_classifier, check_evaluated_with, check_made_with
-from eval.learned.measure import APART, measure, together
+from eval.learned.measure import APART, check_parts, measure, together
 from eval.learned.page import write_learned_page
 from eval.learned.system import make_learned_system
 from eval.numbers.policies import csv_of
@@ -313,6 +313,7 @@ def learn_to_choose(settings: Settings, out: Path) -> Path:
     config = settings.learned
     check_learned(config, settings.dataset.capture.views)
     check_same_data(settings.dataset, out / "data")
+    check_parts(load_statistics(out / "data"))
     seeds = [
         Stages(config, settings.dataset, out, seed, settings.entropy)
         for seed in range(config.seed, config.seed + config.seeds)

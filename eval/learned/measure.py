@@ -19,8 +19,9 @@ from jaxtyping import Array
 
 from data_pipeline.dataset.builder import open_split
 from data_pipeline.dataset.inputs import depth_and_normals
-from data_pipeline.dataset.statistics import load_statistics
+from data_pipeline.dataset.statistics import DatasetStatistics, load_statistics
 from data_pipeline.distributed import is_first
+from data_pipeline.errors import DataError
 from data_pipeline.files import read_json, write_npz
 from data_pipeline.progress import console
 from eval.learned.stopping import MOVEMENT_COSTS, VIEW_COSTS
@@ -41,6 +42,15 @@ _FORM = 7
 """Version of the stored walks; another version makes them stale."""
 APART = 2
 """Parts of the validation objects; stopping rules are fitted on walks of policies that were trained without their objects."""
+
+
+def check_parts(statistics: DatasetStatistics) -> None:
+    """Raises `DataError` if there are too few validation objects to fit stopping rules on."""
+    if (count := statistics.objects_of(("val",))) < APART:
+        raise DataError(
+            f"mevs study learned fits stopping rules on {APART} parts of the validation objects, and the data set has {count}; "
+            f"raise --dataset.validation-share, or give more objects"
+        )
 
 
 def measure(stages: Stages) -> dict[str, Any]:

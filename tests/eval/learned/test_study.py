@@ -11,11 +11,14 @@ import numpy as np
 import pytest
 from flax import nnx
 
+from data_pipeline.errors import DataError
+from eval.learned.measure import check_parts
 from eval.learned.stopping import Signal, compare_rules, walks_apart
 from eval.learned.study import fixed_order_scores, novel_classes, seeds_together, study
 from eval.learned.walks import Learner, OnLattice
 from eval.numbers.confidence import stops_at
 from tests.reference.choosing import VIEWS, by_state, some_policy, telling
+from tests.reference.made_up_study import STUDIED
 from train.choosing.policy import (
     PolicyConfig,
     train_policy,
@@ -202,3 +205,10 @@ def test_a_study_walks_all_policies_from_the_same_starts(adding):
     assert after["random"][0] == pytest.approx(alone.mean(), abs=1e-6)
     assert after["label_oracle"][1] >= max(after["random"][1], after["learned"][1]) - 1e-6
     assert set(found["against"]["random"]) == set(each) - {"random", "label_oracle", "belief_oracle"}
+
+
+def test_too_few_validation_objects_are_refused():
+    check_parts(STUDIED)
+    counts = STUDIED.counts | {"val": {"a": 1, "b": 0, "c": 0}}
+    with pytest.raises(DataError, match="2 parts of the validation objects, and the data set has 1"):
+        check_parts(replace(STUDIED, counts=counts))
