@@ -14,12 +14,9 @@ ratio.
 
 from __future__ import annotations
 
-import importlib.util
-import platform
 import sys
-import time
 from collections.abc import Callable
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from functools import partial
 from importlib import import_module
 from pathlib import Path
@@ -34,6 +31,18 @@ import optax
 from flax import nnx
 from scipy.spatial import cKDTree
 
+from benchmarks.comparing import (
+    HEADER,
+    Row,
+    compare,
+    finished,
+    installed,
+    machine_name,
+    peer_device,
+    row_cells,
+    slower_than_before,
+    take_turns,
+)
 from data_pipeline.files import read_json, write_json, write_text
 from eval.numbers.timing import time_local_maxima
 from mevs_jax import (
@@ -51,88 +60,7 @@ from tests.reference.weights import made_up_weights
 
 RESULTS = Path(__file__).parent / "results" / "points.json"
 CLOUDS, POINTS, CENTRES, RADIUS, SAMPLES = 16, 4096, 512, 0.2, 64
-GUARD = 3.0
-HEADER = ("what", "ours", "peer", "theirs", "ratio", "")
 DECISION_HEADER = ("points", "clouds", "p50, ms", "p99, ms", "ms a cloud", "memory, MB")
-
-
-@dataclass
-class Row:
-    """An operation timed together with one peer.
-
-    Attributes:
-        what, peer: names of the operation and of the peer.
-        ours, theirs: lower quartile, median and upper quartile, in milliseconds.
-        ratio: their time divided by ours.
-        note: differences between the two results.
-    """
-
-    what: str
-    peer: str
-    ours: list[float]
-    theirs: list[float]
-    ratio: float
-    note: str = ""
-
-
-def take_turns(calls: list[Callable[[], Any]], rounds: int) -> np.ndarray:
-    """Times in milliseconds (calls, rounds); each round runs every call once, after a warm-up."""
-    for call in calls:
-        jax.block_until_ready(call())
-    taken = np.empty((len(calls), rounds))
-    for turn in range(rounds):
-        for number, call in enumerate(calls):
-            start = time.perf_counter()
-            jax.block_until_ready(call())
-            taken[number, turn] = 1000 * (time.perf_counter() - start)
-    return taken
-
-
-def compare(
-    what: str,
-    ours: Callable,
-    peers: dict[str, Callable],
-    rounds: int,
-    notes: dict[str, str] | None = None,
-    turns: bool = True,
-) -> list[Row]:
-    calls = [ours, *peers.values()]
-    taken = take_turns(calls, rounds) if turns else np.concatenate([take_turns([call], rounds) for call in calls])
-    quartiles = np.quantile(taken, [0.25, 0.5, 0.75], axis=1).T
-    rows = [
-        Row(what, peer, list(quartiles[0]), list(theirs), theirs[1] / quartiles[0, 1], (notes or {}).get(peer, ""))
-        for peer, theirs in zip(peers, quartiles[1:], strict=True)
-    ]
-    for row in rows:
-        print(markdown_row(row_cells(row)), flush=True)
-    return rows
-
-
-def installed(name: str) -> bool:
-    found = importlib.util.find_spec(name) is not None
-    if not found:
-        print(f"(without {name}, which is not installed)")
-    return found
-
-
-def peer_device() -> str:
-    """Device of PyTorch: the GPU if JAX uses one and PyTorch can, otherwise the CPU."""
-    import torch
-
-    return "cuda" if jax.default_backend() == "gpu" and torch.cuda.is_available() else "cpu"
-
-
-def finished(call: Callable[[], Any]) -> Callable[[], Any]:
-    """Wraps a PyTorch call so that it returns after its device has finished."""
-    import torch
-
-    def until_done() -> Any:
-        out = call()
-        if peer_device() == "cuda":
-            torch.cuda.synchronize()
-        return out
-
-    return until_done
 
 
 def partial_clouds() -> np.ndarray:
@@ -369,26 +297,10 @@ def decision_cells(row: dict[str, float]) -> list[str]:
     ]
 
 
-def row_cells(row: Row) -> list[str]:
-    ours, theirs = (f"{m:.3g} ({low:.3g}–{high:.3g})" for low, m, high in (row.ours, row.theirs))
-    return [row.what, ours, row.peer, theirs, f"{row.ratio:.3g}", row.note]
-
-
-def slower_than_before(rows: list[Row], before: dict[str, Any]) -> list[str]:
-    """Messages about ratios below a third of the stored ones; only rows that exist in both are compared."""
-    stored = {(row["what"], row["peer"]): row["ratio"] for row in before["rows"]}
-    known = [(row, stored[row.what, row.peer]) for row in rows if (row.what, row.peer) in stored]
-    return [
-        f"{row.what}: {row.ratio:.2g} times as fast as {row.peer}, stored {ratio:.2g}"
-        for row, ratio in known
-        if row.ratio < ratio / GUARD
-    ]
-
-
 def main() -> None:
     guard = sys.argv[1:] == ["--guard"]
     rounds = 3 if guard else 15
-    machine = f"{platform.processor() or platform.machine()}, {jax.devices()[0].device_kind}, JAX {jax.__version__}"
+    machine = machine_name()
     print(f"Measured on: {machine}. Milliseconds: median (quartiles).\n")
     print(markdown_table(HEADER, []))
     torch_peer: Any = import_module("benchmarks.torch_peer") if installed("torch") else None

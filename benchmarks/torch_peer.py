@@ -7,9 +7,14 @@ convolutions. It has the layers, names and weights of the reference network (`te
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from functools import partial
+
+import numpy as np
 import torch
 
 from tests.reference import torch_networks
+from tests.reference.weights import made_up_weights
 
 
 def farthest_point_sample(points: torch.Tensor, k: int) -> torch.Tensor:
@@ -58,3 +63,50 @@ class Abstraction(torch_networks.Abstraction):
 
 def pointnet2(views: int) -> torch_networks.PointNet2:
     return torch_networks.PointNet2(views, Abstraction)
+
+
+def _resnet18() -> torch_networks.ResNet:
+    network = torch_networks.ResNet(18)
+    shapes = {name: tuple(value.shape) for name, value in network.state_dict().items()}
+    network.load_state_dict({name: torch.from_numpy(value) for name, value in made_up_weights(shapes).items()})
+    return network
+
+
+def resnet18_weights() -> dict[str, np.ndarray]:
+    """The weights with which the peers below begin."""
+    return {name: value.numpy() for name, value in _resnet18().state_dict().items()}
+
+
+def resnet18(
+    images: np.ndarray, labels: np.ndarray, dtype: str, device: str
+) -> dict[str, tuple[Callable[[], torch.Tensor], Callable[[], torch.Tensor]]]:
+    """Forward pass and training step of ResNet-18 in PyTorch's two layouts.
+
+    Args:
+        images: (batch, height, width, 3) float32.
+        labels: class of each image.
+        dtype: `bfloat16` computes with automatic mixed precision.
+        device: where to.
+    """
+    found: dict[str, tuple[Callable[[], torch.Tensor], Callable[[], torch.Tensor]]] = {}
+    for name, layout in (("PyTorch", torch.contiguous_format), ("PyTorch, channels-last", torch.channels_last)):
+        network = _resnet18().to(device).to(memory_format=layout)
+        shown = torch.from_numpy(images).permute(0, 3, 1, 2).to(device).contiguous(memory_format=layout)
+        wanted = torch.from_numpy(labels).to(device)
+        adam = torch.optim.Adam(network.parameters(), 1e-5)
+        precision = partial(torch.autocast, device, torch.bfloat16, enabled=dtype == "bfloat16")
+
+        def forward(network=network, shown=shown, precision=precision) -> torch.Tensor:
+            with torch.no_grad(), precision():
+                return network.eval()(shown)
+
+        def step(network=network, shown=shown, wanted=wanted, adam=adam, precision=precision) -> torch.Tensor:
+            adam.zero_grad()
+            with precision():
+                loss = torch.nn.functional.cross_entropy(network.train()(shown), wanted)
+            loss.backward()
+            adam.step()
+            return loss
+
+        found[name] = forward, step
+    return found

@@ -8,6 +8,8 @@ from __future__ import annotations
 
 import os
 import socket
+import sys
+import threading
 
 import jax
 import numpy as np
@@ -25,6 +27,7 @@ def join_processes() -> None:
     Raises:
         DataError: if the other processes cannot be found or reached, or cannot reach this one.
     """
+    global _joined
     numbers = {}
     try:
         for argument, name in (("num_processes", "JAX_NUM_PROCESSES"), ("process_id", "JAX_PROCESS_ID")):
@@ -36,6 +39,7 @@ def join_processes() -> None:
             f"--distributed cannot join the other processes ({str(error).splitlines()[0]}); outside Slurm, Open MPI, Kubernetes "
             f"and Cloud TPUs set JAX_COORDINATOR_ADDRESS=host:port, JAX_NUM_PROCESSES and JAX_PROCESS_ID for each"
         ) from error
+    _joined = True
     try:
         jax.devices()
     except RuntimeError as error:
@@ -45,6 +49,29 @@ def join_processes() -> None:
             f"--distributed on CPUs needs the name of this machine to have an address, and {name} has none; add a line to "
             f"/etc/hosts: its address, then {name}"
         ) from error
+
+
+_joined = False
+_SECONDS_TO_LEAVE = 10
+"""How long a process that ends with an error waits for others that end with the same one."""
+
+
+def leave(code: int) -> None:
+    """Ends this process with an exit code if it has joined others, which may wait for it in vain.
+
+    Python's own way out waits minutes for the others, and then ends with another code.
+    """
+    if not _joined:
+        return
+    sys.stdout.flush()
+    sys.stderr.flush()
+    latest = threading.Timer(_SECONDS_TO_LEAVE, os._exit, (code,))
+    latest.daemon = True
+    latest.start()
+    try:
+        jax.distributed.shutdown()  # returns once all are here
+    finally:
+        os._exit(code)
 
 
 def unresolved_name() -> str:

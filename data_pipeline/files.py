@@ -82,6 +82,12 @@ def _to_disk(path: Path) -> None:
             os.close(folder)
 
 
+PARTIAL = ".partial"
+"""How the names of files end that are being written."""
+_OWN = os.urandom(3).hex()
+"""Tells processes of several machines or containers apart, whose numbers may be the same."""
+
+
 def write_bytes(path: Path, content: bytes, durable: bool = True) -> None:
     """Writes a file atomically and makes its folder if needed.
 
@@ -92,7 +98,7 @@ def write_bytes(path: Path, content: bytes, durable: bool = True) -> None:
     Raises:
         DataError: if the file cannot be written, for example because the disk is full.
     """
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.partial")
+    temporary = path.with_name(f".{path.name}.{os.getpid()}_{_OWN}{PARTIAL}")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         with temporary.open("wb") as file:

@@ -12,7 +12,7 @@ import jax
 
 from data_pipeline.dataset.config import check_same_data
 from data_pipeline.dataset.statistics import load_statistics
-from data_pipeline.distributed import is_first, wait_for_all
+from data_pipeline.distributed import agreed, is_first
 from data_pipeline.errors import DataError
 from eval import stages
 from eval.report.sweep import write_sweep_report
@@ -55,8 +55,9 @@ def adopt(settings: Settings, out: Path) -> tuple[Path, Settings]:
     made, there = out / "sweep" / name / "network", out / name
     if name == "recogniser":
         there = Stages(settings.learned, settings.dataset, out, settings.learned.seed).recogniser_folder()
-    exists = there.exists()
-    wait_for_all("the best is adopted")
+    if not made.exists():
+        raise DataError(f"{made} is gone; delete {made.parent}, and the same command sweeps again")
+    exists = agreed(there.exists())
     if not exists:
         if is_first():
             _copy(made, there)

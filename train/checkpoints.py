@@ -16,7 +16,7 @@ from typing import Any
 import jax
 import orbax.checkpoint as ocp
 
-from data_pipeline.distributed import is_first, is_lost_process
+from data_pipeline.distributed import is_first, is_lost_process, wait_for_all
 from data_pipeline.errors import DataError, Unreadable, reason_of
 from data_pipeline.files import check_of_file, damage_in, files_in, keep_checks
 from data_pipeline.progress import console
@@ -182,8 +182,10 @@ class Checkpoints:
 
     def drop(self, slot: str) -> None:
         """Removes what a slot holds."""
-        shutil.rmtree(self._folder / slot, ignore_errors=True)
-        (self._folder / slot).mkdir()
+        if is_first():
+            shutil.rmtree(self._folder / slot, ignore_errors=True)
+        wait_for_all("a save is dropped")
+        (self._folder / slot).mkdir(exist_ok=True)
         self._slots[slot].reload()
 
     def latest_step(self, slot: str) -> int:

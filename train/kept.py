@@ -13,6 +13,7 @@ from typing import Any, TypeVar
 import flax.nnx as nnx
 import jax
 import numpy as np
+from jax.experimental import multihost_utils
 
 from data_pipeline.dataset.statistics import DatasetStatistics
 from data_pipeline.differences import differences, in_words
@@ -164,6 +165,8 @@ def trained_once(
                 nnx.update(like, restored[0])
                 return like
         network, summary = train()
+        if jax.process_count() > 1:  # machines of other kinds may round otherwise
+            nnx.update(network, multihost_utils.broadcast_one_to_all(nnx.state(network, nnx.Param)))
         weights, mesh = nnx.state(network, nnx.Param), device_mesh()
         if is_first():
             path.unlink(missing_ok=True)  # so that new weights never lie beside the old identity
@@ -275,6 +278,8 @@ def finished(folder: Path) -> dict[str, Any] | None:
             if set(summary) >= _IN_A_SUMMARY:
                 return summary
             damage = f"{path} cannot be read (its content has another form)"
+        except FileNotFoundError:  # another process has removed it
+            return None
         except (Unreadable, TypeError) as error:
             damage = f"{path} cannot be read ({why(error)})"
     if path.is_dir():

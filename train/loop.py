@@ -203,7 +203,7 @@ class _Training:
             self.step += 1
             self._lead.limit(loss)
             bar()
-            if preemption.after(self.step) and self.step < end:
+            if preemption.after_step() and self.step < end:
                 self.progress["seconds"] += time.perf_counter() - started
                 self._check({f"sum of the training {k}": float(total) for k, total in self.state.sums.items()})
                 checkpoints.save("latest", self.step, self.state, self.progress)

@@ -41,6 +41,9 @@ class Preempted(Exception):
 class Preemption:
     """Context manager that notices SIGTERM. Several processes agree on the step after which they all stop."""
 
+    _steps = 0
+    """Steps of all trainings of this process. JAX agrees on one that is larger than any so far."""
+
     def __init__(self) -> None:
         self.asked = False
         # Only the main thread receives signals; with several processes, JAX handles SIGTERM.
@@ -58,8 +61,9 @@ class Preemption:
     def _on_signal(self, number: int, frame: FrameType | None) -> None:
         self.asked = True
 
-    def after(self, step: int) -> bool:
+    def after_step(self) -> bool:
         """Returns whether to stop after this step; every process must call it for every step."""
+        Preemption._steps += 1
         if jax.process_count() > 1:
-            self.asked = multihost_utils.reached_preemption_sync_point(step) or self.asked
+            self.asked = multihost_utils.reached_preemption_sync_point(Preemption._steps) or self.asked
         return self.asked

@@ -10,7 +10,8 @@ from typing import Literal
 from data_pipeline.dataset.statistics import DatasetStatistics, load_statistics
 from data_pipeline.files import read_json
 from train.chance import warn_of_chance
-from train.loop import load_best
+from train.devices import Layout, device_mesh
+from train.loop import check_training, load_best
 from train.many.seeds import train_seeds
 from train.optimiser import OptimiserConfig
 from train.starting_weights import StartingWeights, weights_from_network
@@ -180,6 +181,7 @@ def train_thesis(
         settings: of each seed.
         first: the result of `first_weights`.
     """
+    _check_all(folders[0], settings[0])
     for backbone in BACKBONES:
         statistics, data = folders[0].statistics(backbone.views), folders[0].data(backbone.views)
         tasks = [backbone_task(backbone, own.classifier, own.thesis, statistics) for own in settings]
@@ -204,6 +206,21 @@ def train_thesis(
                 folders[0].out / "seeds" / f"entropy_{views}_{frame}_together",
                 rate_option="--entropy.optimiser.learning-rate",
             )
+
+
+def _check_all(folder: ThesisFolder, settings: ThesisSettings) -> None:
+    """Raises `DataError` if a network that is missing cannot be trained by these devices, before the first is trained."""
+    layout = Layout.of_mesh(device_mesh())
+    for backbone in BACKBONES:
+        if not (folder.backbone(backbone.name) / "summary.json").exists():
+            statistics = folder.statistics(backbone.views)
+            task = backbone_task(backbone, settings.classifier, settings.thesis, statistics)
+            check_training(task, statistics, layout)
+    for views in VIEWS:
+        statistics = folder.statistics(views)
+        for frame in FRAMES:
+            if not (folder.entropy(views, frame) / "summary.json").exists():
+                check_training(entropy_task(frame, settings.entropy, statistics), statistics, layout)
 
 
 def _weights_before(backbone: Backbone, folder: ThesisFolder, settings: ThesisSettings) -> StartingWeights:

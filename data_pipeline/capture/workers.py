@@ -13,7 +13,7 @@ from pathlib import Path
 from data_pipeline.capture.casting import Capture, CaptureConfig, Rig, capture, rig_for, save_capture
 from data_pipeline.capture.visualizer import capture_with_visualizer
 from data_pipeline.errors import DamagedMesh, EmptyMesh
-from data_pipeline.files import npz_of, write_text
+from data_pipeline.files import PARTIAL, npz_of, write_text
 from data_pipeline.objects.mesh import Mesh, ObjectEntry
 from data_pipeline.objects.sources import load_object
 from data_pipeline.processes import shared, usable_cpus
@@ -71,7 +71,9 @@ def capture_entry(entry: ObjectEntry, rig: Rig, folder: Path, backend: str, skip
 def still_to_capture(entries: Sequence[ObjectEntry], folder: Path) -> list[ObjectEntry]:
     """Returns the objects that are neither captured nor left out yet, and makes `folder` if needed."""
     folder.mkdir(parents=True, exist_ok=True)
-    present = {path.name for path in folder.iterdir() if path.stat().st_size}
+    # A file that another process is writing may be gone by the time that one asks for its size.
+    found = [path for path in folder.iterdir() if not path.name.endswith(PARTIAL)]
+    present = {path.name for path in found if path.stat().st_size}
     paths = (capture_path, _left_out_path)
     return [entry for entry in entries if not any(path(folder, entry).name in present for path in paths)]
 

@@ -46,7 +46,7 @@ from data_pipeline.dataset.statistics import (
     StatisticsCollector,
     load_statistics,
 )
-from data_pipeline.distributed import is_first, own_share, wait_for_all
+from data_pipeline.distributed import agreed, is_first, own_share, wait_for_all
 from data_pipeline.errors import DataError, reason_of
 from data_pipeline.files import check_of_file, keep_checks, keep_json
 from data_pipeline.objects.changes import changes_between
@@ -332,7 +332,7 @@ def prepare(config: DataConfig, folder: Path, beam: str | None = None) -> Datase
         )
     identity = identity_of(config, folder)
     damage = damage_of_settings(folder, identity)
-    if (folder / SUMMARY).exists():
+    if agreed((folder / SUMMARY).exists()):
         found = found_in(folder, damage)
         if isinstance(found, DatasetStatistics):
             if is_first():

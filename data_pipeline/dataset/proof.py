@@ -14,6 +14,7 @@ from typing import Any, SupportsIndex
 
 from data_pipeline.dataset.statistics import SPLITS, SUMMARY, DatasetStatistics, load_statistics
 from data_pipeline.differences import differences, in_words
+from data_pipeline.distributed import is_first
 from data_pipeline.errors import DataError, Unreadable, reason_of
 from data_pipeline.files import (
     as_read,
@@ -160,7 +161,8 @@ def damage_of_settings(folder: Path, identity: dict[str, Any]) -> str | None:
         damage = f"{path} cannot be read ({error.reason})"
     if not differs and was_written(path, identity):
         console.print(f"{damage}, so it is written again", markup=False)
-        keep_json(path, identity)
+        if is_first():
+            keep_json(path, identity)
         return None
     if not differs and path.name not in checks_in(folder):
         return damage

@@ -56,7 +56,7 @@ def measure(stages: Stages) -> dict[str, Any]:
         return _walks(stages, f"lattice_{views}", data, **given)
 
     found = {"lattices": {str(views): on_lattice(views) for views in (own, *config.lattices)}}
-    if stages.seed:
+    if stages.seed != config.seed:
         return found
     found["decision"] = _decision(stages)
     found["unposed"] = {str(own): on_lattice(own, posed=False)}

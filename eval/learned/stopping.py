@@ -71,7 +71,7 @@ class Signal:
 
         thresholds = [*np.unique(np.quantile(self.value, np.linspace(0, 1, 101))), float(self.value.max()) + 1]
         smooth = isotonic_regression([self.accuracy(threshold) for threshold in thresholds]).x
-        reached = np.flatnonzero(smooth >= accuracy)
+        reached = np.flatnonzero(smooth >= accuracy - 1e-9)  # pooled means are rounded
         return float(thresholds[reached[0]]) if len(reached) else None
 
 
@@ -235,7 +235,8 @@ def walks_apart(
     """Walks over validation objects, each by the policy that was trained without it, from every n-th start view.
 
     Args:
-        apart: the policies; number i was trained without every object j with j mod n = i.
+        apart: the policies; number i was trained without every object j with j mod n = i. The fusion and its temperatures
+            are of all validation objects.
         temperatures: of the method's confidences, by number of views.
     """
     features, graph = validation.features, validation.neighbours

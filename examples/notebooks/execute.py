@@ -19,7 +19,7 @@ from typing import Any
 
 HERE = Path(__file__).parent
 SCRIPTS = ("look_at_one_object", "write_a_policy", "thesis_main_table")
-DOTS_PER_INCH = 72
+DOTS_PER_INCH = 96
 
 Cell = tuple[str, str]
 """Kind (`markdown` or `code`) and source."""

@@ -5,6 +5,8 @@
 # believes. The system `furniture10` comes with the package. Nothing is trained here.
 
 # %%
+from itertools import pairwise
+
 import matplotlib.pyplot as plt
 import numpy as np
 
@@ -48,7 +50,8 @@ for column, (depth, belief) in enumerate(zip(walk.history.depths, walk.beliefs, 
 # ## What the agent expects of every view
 #
 # An agent is the same loop for a robot: `observe_view` takes an image, `decide` returns the next pose. After the first view,
-# we ask it for each candidate view how much it would gain, in nats (*expected information gain*).
+# we ask it for each candidate view how much it would gain, in nats (*expected information gain*). The view that it has seen
+# already cannot be chosen again, and has no gain (NaN).
 
 # %%
 agent = system.agent(policy="information_gain", stop=0.95)
@@ -56,19 +59,23 @@ agent.reset(center=(0, 0, 0), radius=1.0, yaw=0.0)
 belief = agent.observe_view(walk.history.depths[0], walk.history.poses[0])
 gains = np.array([agent.decide(reachable=[view]).expected_gain for view in range(len(system.viewpoints))])
 print(f"after the first view: {belief.name}, {100 * belief.confidence:.0f} %")
-print(f"expected gain: {gains.min():.3f} to {gains.max():.3f} nats; the best is view {gains.argmax()}")
+print(f"expected gain: {np.nanmin(gains):.3f} to {np.nanmax(gains):.3f} nats; the best is view {np.nanargmax(gains)}")
 
 # %%
-figure = plt.figure(figsize=(5.6, 5), layout="constrained")
-space = figure.add_subplot(projection="3d")
+figure = plt.figure(figsize=(6.4, 4.8), layout="constrained")
+space = figure.add_subplot(projection="3d", computed_zorder=False)
 corners = table.vertices - (table.vertices.min(axis=0) + table.vertices.max(axis=0)) / 2
 corners = 0.6 * corners / np.linalg.norm(corners, axis=1).max()
 space.plot_trisurf(*corners.T, triangles=table.faces, color="#e8ddcf", edgecolor="#8a7b66", linewidth=0.1)
 points = space.scatter(*system.viewpoints.T, c=gains, cmap="Oranges", s=45, edgecolor="grey", depthshade=False)
-space.plot(*system.viewpoints[list(walk.views)].T, color="#c1440e", marker="o", markersize=9)
+for start, end in pairwise(system.viewpoints[list(walk.views)]):
+    share = np.linspace(0, 1, 30)[:, None]
+    way = (1 - share) * start + share * end
+    space.plot(*(way / np.linalg.norm(way, axis=1, keepdims=True)).T, color="#c1440e")
+space.scatter(*system.viewpoints[list(walk.views)].T, s=190, color="#c1440e", depthshade=False)
 for number, view in enumerate(walk.views, 1):
-    space.text(*(1.12 * system.viewpoints[view]), f"{number}", weight="bold")
-space.set_box_aspect((1, 1, 1))
+    space.text(*system.viewpoints[view], f"{number}", color="white", weight="bold", ha="center", va="center")
+space.set_box_aspect((1, 1, 1), zoom=1.45)
 space.set_axis_off()
 space.set_title("candidate cameras and the walk")
 figure.colorbar(points, ax=space, shrink=0.6, label="expected gain after view 1, nats")

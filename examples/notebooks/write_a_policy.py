@@ -34,14 +34,14 @@ def observe_all(triangles):
     return depth, jax.vmap(system.observe)(depth, poses)
 
 
-observed, labels = [], []
+observed, classes = [], []
 for label, name in enumerate(system.classes):
     for seed in range(900, 905):
         piece = furniture(name, seed)
         observed.append(observe_all(pad_triangles(unit_triangles(piece.vertices, piece.faces)))[1])
-        labels.append(label)
+        classes.append(label)
 observations = jax.tree.map(lambda *each: jnp.stack(each), *observed)
-labels = jnp.array(labels)
+labels = jnp.array(classes)
 print("logits:", observations.logits.shape, "(objects, views, classes)")
 
 # %%
@@ -111,9 +111,10 @@ for name, found in results.items():
 
 # %%
 figure, axis = plt.subplots(figsize=(6, 3.6), layout="constrained")
-for name, found in results.items():
-    highlight = name == "two_likeliest"
-    axis.plot(range(1, 5), 100 * found.mean(axis=0), "o-", lw=3 if highlight else 1.4, label=name)
+shades = ("#6b7785", "#9aa5b1", "#1b2a41", "#7a9e9f", "#e0a458", "#c1440e")
+for (name, found), shade, line in zip(results.items(), shades, ("-", ":", "-.", "--", "--", "-"), strict=True):
+    width = 3 if name == "two_likeliest" else 1.6
+    axis.plot(range(1, 5), 100 * found.mean(axis=0), marker="o", ls=line, lw=width, color=shade, label=name)
 axis.set(xlabel="views", ylabel="accuracy, %", xticks=range(1, 5), title="50 objects, every start view")
 axis.grid(axis="y", alpha=0.3)
 axis.legend(fontsize=8)

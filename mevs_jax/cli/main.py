@@ -26,6 +26,8 @@ _HELP = ("-h", "--help")
 
 def _fail(message: str, code: int = 2) -> None:
     print(f"mevs: {message}", file=sys.stderr)
+    if (distributed := sys.modules.get("data_pipeline.distributed")) is not None:
+        distributed.leave(code)
     sys.exit(code)
 
 

@@ -1,13 +1,15 @@
-"""Commands in the documentation exist with their options, blocks of Python run, and links lead somewhere."""
+"""Commands in the documentation exist with their options, blocks of Python run, links lead somewhere, tables are whole."""
 
 from __future__ import annotations
 
+import json
 import re
 import shlex
 from pathlib import Path
 
 import numpy as np
 import pytest
+import yaml
 
 import mevs_jax
 from data_pipeline.capture.casting import default_caster
@@ -122,6 +124,15 @@ def test_documented_python_runs(page, whole, tmp_path, monkeypatch):
         exec(compile(block, f"{page}, block {number}", "exec"), world)
 
 
+def test_documented_json_and_yaml_can_be_read():
+    found = {"json": 0, "yaml": 0}
+    for page in PAGES:
+        for language, block in re.findall(r"```(json|yaml)\n(.*?)```", page.read_text(), re.DOTALL):
+            found[language] += 1
+            assert json.loads(block) if language == "json" else list(yaml.safe_load_all(block))
+    assert min(found.values()) > 0
+
+
 def test_links_lead_somewhere():
     for page in [*PAGES, ROOT / "CHANGELOG.md", ROOT / "CONTRIBUTING.md", *ROOT.glob("examples/**/README.md")]:
         text = re.sub(r"```.*?```", "", page.read_text(), flags=re.DOTALL)
@@ -134,6 +145,19 @@ def test_links_lead_somewhere():
             if anchor:
                 headings = re.findall(r"^#+ (.*)$", there.read_text(), re.MULTILINE)
                 assert anchor in {anchor_of(heading) for heading in headings}, f"{page.name}: {target}"
+
+
+def tables_of(text: str) -> list[list[str]]:
+    """The tables of a page, each a list of lines."""
+    outside = re.sub(r"```.*?```", "", text, flags=re.DOTALL)
+    return [block.strip().splitlines() for block in re.findall(r"(?:^\|.*\n?)+", outside, re.MULTILINE)]
+
+
+def test_rows_of_a_table_have_as_many_cells_as_its_header():
+    for page in [*PAGES, ROOT / "CONTRIBUTING.md"]:
+        for header, *rows in tables_of(page.read_text()):
+            cells = header.count("|")
+            assert [row for row in rows if row.count("|") != cells] == [], f"{page.name}: {header}"
 
 
 def anchor_of(heading: str) -> str:

@@ -37,7 +37,9 @@ def test_a_notebook_has_outputs_and_pictures_and_is_small(name):
     pictures = [output["data"]["image/png"] for output in outputs if output["output_type"] == "display_data"]
     assert len(pictures) >= 2
     assert all(base64.b64decode(picture).startswith(b"\x89PNG") for picture in pictures)
-    assert any(output["output_type"] == "stream" for output in outputs)
+    printed = "".join("".join(output["text"]) for output in outputs if output["output_type"] == "stream")
+    assert printed
+    assert not re.search(r"\b(nan|inf)\b", printed)
 
 
 @pytest.mark.parametrize("name", SCRIPTS)

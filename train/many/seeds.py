@@ -52,13 +52,31 @@ def check_networks(
     identities = _identities(tasks, statistics, starts)
     for folder, identity in zip(folders, identities, strict=True):
         check_config(folder, identity, "a network trained")
-    if _interrupted(work, identities):
-        return
-    waiting = sum(not (folder / "summary.json").exists() for folder in folders)
-    if together := number_together(waiting, mesh):
+    missing = [index for index, folder in enumerate(folders) if not (folder / "summary.json").exists()]
+    together = _together_of(missing, folders, work, identities, mesh)
+    if together:
         check_training(tasks[0], statistics, Layout())  # a batch is that of one device
-    if together < waiting:
+    if set(missing) - set(together):
         check_training(tasks[0], statistics, Layout.of_mesh(mesh))
+
+
+def _together_of(
+    missing: Sequence[int], folders: Sequence[Path], work: Path, identities: Sequence[dict[str, Any]], mesh: Mesh
+) -> list[int]:
+    """Returns which of the networks that are missing are trained together: those of an interrupted training, or the most."""
+    if not missing:
+        return []
+    if (begun := _interrupted(work, identities)) is None:
+        fresh = [
+            index for index in missing if not has_save(folders[index] / "latest")
+        ]  # others are trained alone, by `fit`
+        return fresh[: number_together(len(fresh), mesh)]
+    if jax.process_count() > 1 and len(begun) % mesh.size:
+        raise DataError(
+            f"{work} holds an interrupted training of {len(begun)} networks together, which {mesh.size} devices of "
+            f"{jax.process_count()} processes cannot share equally; use a number that divides them, or delete {work}"
+        )
+    return begun
 
 
 def train_seeds(
@@ -97,18 +115,10 @@ def train_seeds(
     for folder, identity in zip(folders, identities, strict=True):
         check_config(folder, identity, "a network trained")
     missing = [index for index, folder in enumerate(folders) if finished(folder) is None]
-    fresh = [index for index in missing if not has_save(folders[index] / "latest")]  # those are trained alone, by `fit`
-    together = fresh[: number_together(len(fresh), mesh)]
-    begun = _interrupted(work, identities) if missing else None
-    if begun is not None and jax.process_count() > 1 and len(begun) % mesh.size:
-        raise DataError(
-            f"{work} holds an interrupted training of {len(begun)} networks together, which {mesh.size} devices of "
-            f"{jax.process_count()} processes cannot share equally; use a number that divides them, or delete {work}"
-        )
+    together = _together_of(missing, folders, work, identities, mesh)
+    goes_on = bool(missing) and _interrupted(work, identities) is not None
     wait_for_all("seeds are looked at")
-    if begun is not None:
-        together = begun
-    elif missing and work.exists() and is_first():
+    if missing and not goes_on and work.exists() and is_first():
         if has_save(work / "latest"):
             console.print(f"{work} holds an interrupted training of other networks, which is given up", markup=False)
         shutil.rmtree(work)

@@ -15,7 +15,7 @@ import numpy as np
 from jax.sharding import Mesh
 
 from data_pipeline.dataset.statistics import DatasetStatistics
-from data_pipeline.distributed import is_first, wait_for_all
+from data_pipeline.distributed import agreed, is_first, wait_for_all
 from data_pipeline.errors import DataError, Diverged, Unreadable, reason_of
 from data_pipeline.files import as_read, keep_json, read_json, write_text
 from data_pipeline.progress import console
@@ -205,9 +205,9 @@ def sweep(
         Preempted: after SIGTERM, at the end of an epoch.
         Diverged: if every member diverged.
     """
-    identity = as_read({"task": content_of(task), "sweep": _identity(config), "data": statistics.fingerprint})
-    check_config(folder, identity, "a sweep made")
     members = draw_members(config, task)
+    identity = as_read({"task": content_of(task), "sweep": _identity(config, task), "data": statistics.fingerprint})
+    check_config(folder, identity, "a sweep made")
     if (made := _finished(folder)) is not None:
         return made
     mesh = mesh or device_mesh()
@@ -246,11 +246,12 @@ def csv_of_epochs(of: Together) -> str:
     return text.getvalue()
 
 
-def _identity(config: SweepConfig) -> dict[str, Any]:
+def _identity(config: SweepConfig, task: SweepTask) -> dict[str, Any]:
     """What a sweep's `config.json` holds of its settings; what was added since version 0.1 and is off is left out."""
     later = ("grid", "list", "seeds", "halving")
     default = asdict(SweepConfig())
-    return {name: value for name, value in asdict(config).items() if name not in later or value != default[name]}
+    found = {name: value for name, value in asdict(config).items() if name not in later or value != default[name]}
+    return found | ({"list": list_of(Path(config.list), task)} if config.list else {})
 
 
 def best_of(members: Sequence[Member]) -> Member:
@@ -263,7 +264,7 @@ def best_of(members: Sequence[Member]) -> Member:
 def _finished(folder: Path) -> list[Member] | None:
     """Returns the members of a finished sweep; None if it has to go on, or `members.json` is damaged."""
     path = folder / "members.json"
-    if not path.exists():
+    if not agreed(path.exists()):
         return None
     try:
         return [Member(**member) for member in read_json(path)]

@@ -78,7 +78,6 @@ def train_members(
                 **progress | {"members": [Member(**member) for member in progress["members"]]}, epoch_steps=epoch_steps
             )
             console.print(f"{title}: resuming after epoch {of.epoch}")
-        batches.first_step = of.epoch * epoch_steps
         views = optimiser.batch_size * (len(members) if own_batches else 1)
         total, done = epoch_steps * optimiser.epochs * views, of.epoch * epoch_steps * views
         line = bar.add_task(f"{title}: {task.name}", total=total, completed=done, note="")
@@ -88,6 +87,7 @@ def train_members(
                 break
             started = time.perf_counter()
             trainer.begin(training)
+            batches.begin(trainer.places, of.epoch * epoch_steps)
             for _ in range(epoch_steps):
                 lead.limit(trainer.train(training, batches.next(trainer.places)))
                 bar.advance(line, views)
@@ -101,26 +101,29 @@ def train_members(
             of.seconds += time.perf_counter() - started
             checkpoints.save("latest", of.epoch, trainer.saved(), of.progress())
             _print_epoch(title, of, optimiser)
-            if preemption.after(of.epoch):
+            if preemption.after_step():
                 raise Preempted(f"{title} was asked to end after epoch {of.epoch}")
     of.best = on_host(trainer.saved()[1])
     return of
 
 
 class _Batches:
-    """The batches of all members, or one for each with a leading axis of members where they have seeds of their own.
-
-    Attributes:
-        first_step: step of the first batch.
-    """
+    """The batches of all members, or one for each with a leading axis of members where they have seeds of their own."""
 
     def __init__(
         self, task: SweepTask, members: Sequence[Member], data: Path, statistics: DatasetStatistics, own: bool
     ) -> None:
         self._tasks, self._data, self._statistics = [task_of(task, member) for member in members], data, statistics
-        self._own, self.first_step = own, 0
+        self._own, self._first_step = own, 0
         self._streams: dict[int, Iterator[dict[str, np.ndarray]]] = {}
         self._sets: dict[int, ValidationSet] = {}
+
+    def begin(self, places: np.ndarray, step: int) -> None:
+        """Begins an epoch, whose first step this is, of the members in these places; others may train elsewhere from now on."""
+        self._first_step, drawn = step, self._drawn(places)
+        for of_places in (self._streams, self._sets):
+            for place in set(of_places) - set(drawn):
+                del of_places[place]
 
     def next(self, places: np.ndarray) -> dict[str, np.ndarray]:
         """The next batch of the members in these places."""
@@ -141,7 +144,7 @@ class _Batches:
     def _stream_of(self, place: int) -> Iterator[dict[str, np.ndarray]]:
         if place not in self._streams:
             batches = self._tasks[place].batches
-            self._streams[place] = train_batches(self._data, batches, first_step=self.first_step, whole=True)
+            self._streams[place] = train_batches(self._data, batches, first_step=self._first_step, whole=True)
         return self._streams[place]
 
     def _set_of(self, place: int) -> ValidationSet:

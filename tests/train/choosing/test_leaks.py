@@ -4,10 +4,15 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
+import eval.learned.stopping as stopping
+from eval.learned.measure import APART
+from eval.learned.stopping import walks_apart
+from eval.learned.walks import Learner, OnLattice
 from eval.settings import TINY
 from tests.reference.leaks import CHANGES, check_fitted, check_tested
 from tests.reference.made_up_study import STUDIED, Study
@@ -89,6 +94,39 @@ def test_policies_that_are_trained_without_classes_see_no_object_of_these(studie
     assert check is None
     for _, data in parts:
         assert set(np.asarray(data.labels).tolist()) == {1}
+
+
+def test_held_out_policies_walk_objects_that_they_did_not_learn_from(tmp_path, monkeypatch):
+    """Stopping rules are fitted on these walks; neither an object nor an augmented copy of it may be on both sides."""
+    study = Study(None, tmp_path, monkeypatch, replace(TINY.learned, changed=2))
+    stages, walked = study.stages, []
+    stages.prepare()
+    stages.train_recogniser()
+    seen = stages.features("turned_val", stages.turned, "val")
+    copies = stages.changed(2)
+
+    def walk(key, contender, given, fusion, table, directions, knowledge, steps, graph):
+        walked.append(numbers_of(seen.logits, table.logits))
+        return np.zeros((len(table.logits), 1, steps), np.int32)
+
+    monkeypatch.setattr(stopping, "walk_all", walk)
+    monkeypatch.setattr(stopping, "best_gains", lambda *given: np.zeros(given[3].shape))
+    apart = [Learner("learned", "", stages.policy(aside=(part, APART))) for part in range(APART)]
+    lessons = [parts for name, (parts, _) in study.fitted_on][-APART:]
+    walks_apart(jax.random.key(0), apart, stages.fusion(), OnLattice(seen), None, 3, 1, np.ones(3))
+    assert sorted(set().union(*walked)) == list(range(len(seen.labels)))
+    for parts, own in zip(lessons, walked, strict=True):
+        assert len(parts) == 3
+        for whole, (_, data) in zip((seen, *copies), parts, strict=True):
+            learned = numbers_of(whole.logits, data.logits)
+            assert not learned & own
+            assert learned | own == set(range(len(seen.labels)))
+
+
+def numbers_of(whole: jnp.ndarray, some: jnp.ndarray) -> set[int]:
+    """Which objects these are, by their logits."""
+    places = {np.asarray(row).tobytes(): number for number, row in enumerate(whole)}
+    return {places[np.asarray(row).tobytes()] for row in some}
 
 
 @pytest.mark.parametrize("change", CHANGES)
