@@ -252,7 +252,7 @@ def difference_grid(
 
 def confusions(matrices: dict[str, np.ndarray], classes: Sequence[str]) -> Figure:
     """Confusion matrices in percent of the true class, a panel for each policy."""
-    width = max(_WIDTH, 0.28 * len(classes) + 1.6)
+    width = max(_WIDTH, 0.28 * len(classes) + 1.4)
     figure, axes = plt.subplots(
         1, len(matrices), figsize=(width * len(matrices), width), layout="constrained", sharey=True, squeeze=False
     )

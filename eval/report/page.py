@@ -137,12 +137,14 @@ def _entropy_section(inputs: ReportInputs) -> str:
     ]
     low, high = entropy["better_than_mean_map"]
     verdict = "is better" if low > 0 else "is not better"
+    gain = f"{low:+.4f} to {high:+.4f}".replace("-", "−")
+    explained = f"{100 * (entropy['explained_variance'] or 0):.0f}".replace("-", "−")
     rows = [[html.escape(name), f"{value:.4f}"] for name, value in entropy["by_class"].items() if value is not None]
     return (
         "<h2>Predicting depth entropy</h2><p>A <dfn>partial cloud</dfn> is what one view shows of the surface, as points. "
         "From one partial cloud, the network PointNet++ predicts the normalised entropy of every view with a mean squared "
-        f"error of {entropy['pointnet2']:.4f} ({100 * (entropy['explained_variance'] or 0):.0f} % of the variance explained). "
-        f"It {verdict} than the mean map, which receives no view (difference in error {low:+.4f} to {high:+.4f}). The "
+        f"error of {entropy['pointnet2']:.4f} ({explained} % of the variance explained). "
+        f"It {verdict} than the mean map, which receives no view (difference in error {gain}). The "
         "class-mean map is given the true class.</p>"
         + image(
             figures.entropy_errors(entropy),

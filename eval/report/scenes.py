@@ -132,7 +132,7 @@ def _controls(steps: int, views: int) -> str:
 <canvas id="scene" tabindex="0" role="img" aria-label="3-D scene" aria-describedby="how"></canvas>
 <div class="turn">{turns}</div></div>
 <div class="now"><img id="picture" alt=""><p id="said" aria-live="polite"></p>
-<p id="bars-title"><b>Belief: the most likely classes</b></p>
+<p id="bars-title"><b>Belief: the most likely classes, and the true one</b></p>
 <ol class="bars" id="bars" aria-labelledby="bars-title"></ol></div>
 <div><p class="note" id="how">To turn the scene, drag it with the mouse, or with a finger that starts sideways (up and down
 scrolls the page), or press the arrow keys. To zoom, press + or −, pinch, or use the wheel after a click. The larger a candidate
@@ -153,7 +153,9 @@ def _scene(inputs: ReportInputs, walks: Walks, index: int, kind: str, example: d
     stops = []
     for step, view in enumerate(views.tolist()):
         probabilities = walks.probabilities[index, step]
-        best = np.argsort(-probabilities, kind="stable")[:_BARS]
+        best = np.argsort(-probabilities, kind="stable")[:_BARS].tolist()
+        if walks.labels[index] not in best:  # the true class is always shown, last
+            best.append(int(walks.labels[index]))
         gains = np.round(walks.gains[index, step], 3).astype(float)
         stops.append(
             {

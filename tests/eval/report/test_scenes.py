@@ -162,6 +162,7 @@ def test_the_page_holds_what_the_viewer_draws(whole):
         assert first.max() <= len(scene["stops"])
         assert (first == 1).mean() > 0.05
         assert len({stop["view"] for stop in scene["stops"]}) == len(scene["stops"])
+        assert all(scene["truth"] in dict(stop["bars"]) for stop in scene["stops"])
         assert all(len(stop["gains"]) == views for stop in scene["stops"])
     assert "<noscript>" in page
     assert all("alt=" in tag for tag in re.findall(r"<img[^>]*>", page))
