@@ -313,12 +313,12 @@ def learn_to_choose(settings: Settings, out: Path) -> Path:
     config = settings.learned
     check_learned(config, settings.dataset.capture.views)
     check_same_data(settings.dataset, out / "data")
-    check_parts(load_statistics(out / "data"))
     seeds = [
         Stages(config, settings.dataset, out, seed, settings.entropy)
         for seed in range(config.seed, config.seed + config.seeds)
     ]
     seeds[0].prepare()
+    check_parts(seeds[0].statistics)
     train_recognisers(seeds)
     trained_policies([stages.policy_job() for stages in seeds])
     for part in range(APART):

@@ -162,6 +162,7 @@ def test_two_processes_study_as_one_does(tmp_path):
         "--learned.recogniser.optimiser.learning-rate",
         "1e-4",
     )
+    given += ("--learned.ablations", "look_ahead", "--learned.novel", "0", "--learned.rotation-epochs", "0")
     alone(*given, "--out", str(outs[0]))
     first = outs[1] / "learned" / "seed_0" / "policies" / "learned" / "summary.json"
     said = killed_and_finished(first, *given, "--out", str(outs[1]))
