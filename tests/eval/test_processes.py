@@ -178,25 +178,22 @@ def test_two_processes_study_as_one_does(tmp_path):
 
 @pytest.mark.slow
 def test_two_processes_train_seeds_as_two_devices_do(whole, tmp_path):
-    """Four seeds, of which some stop before others, so that those that go on move to other devices."""
+    """A seed for each process."""
     outs = [tmp_path / name for name in ("one", "both")]
     for out in outs:
         out.mkdir()
         (out / "data").symlink_to(whole / "data")
-    given = ("--seeds", "4", "--entropy.optimiser.epochs", "8", "--entropy.optimiser.patience", "1")
-    rates = ("--classifier.optimiser.epochs", "1", "--entropy.optimiser.learning-rate", "3e-3")
-    command = ("train", "--preset", "tiny", *given, *rates, "--out")
+    epochs = ("--classifier.optimiser.epochs", "1", "--entropy.optimiser.epochs", "2")
+    command = ("train", "--preset", "tiny", "--seeds", "2", *epochs, "--out")
     with pytest.MonkeyPatch.context() as patch:
         patch.setitem(CPU, "JAX_NUM_CPU_DEVICES", "2")
         alone(*command, str(outs[0]))
     finished(start(*command, str(outs[1])))
-    lengths = []
-    for folder in ("entropy", *(f"seeds/{number}/entropy" for number in (1, 2, 3))):
+    for folder in ("entropy", "seeds/1/entropy"):
         one, both = (lines(out / folder) for out in outs)
-        lengths.append(len(one))
+        assert len(one) == 2
         for mine, theirs in zip(both, one, strict=True):
-            assert mine["val_loss"] == pytest.approx(theirs["val_loss"], rel=1e-4)
-    assert sorted(lengths)[1] < max(lengths)  # half of the places were free before the end
+            assert mine["val/loss"] == pytest.approx(theirs["val/loss"], rel=1e-4)
 
 
 @pytest.mark.slow

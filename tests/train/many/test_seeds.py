@@ -28,6 +28,7 @@ from train.loop import fit, load_best
 from train.many.members import Member, member_of, task_of
 from train.many.seeds import shared_equally, train_seeds
 from train.many.trainers import TRAINERS
+from train.many.training import _Batches
 from train.tasks.recogniser import RecogniserTask
 
 ROOT = Path(__file__).resolve().parents[3]
@@ -71,6 +72,21 @@ def test_every_seed_ends_as_it_does_alone(name, request, tmp_path):
             np.testing.assert_array_equal(weights, expected, err_msg=jax.tree_util.keystr(place))
         elif "['key']['bias']" not in jax.tree_util.keystr(place):  # of attention: no gradient but rounding
             np.testing.assert_allclose(weights, expected, rtol=1e-5, atol=1e-6, err_msg=jax.tree_util.keystr(place))
+
+
+def test_a_member_draws_the_batches_of_its_epoch_wherever_it_trains(data):
+    """Members move to other processes once others have stopped."""
+    each = of_seeds(data, "entropy")
+    batches = _Batches(each[0], [member_of(task) for task in each], data, load_statistics(data), own=True)
+    batches.begin(np.array([0]), 0)
+    for _ in range(2):
+        batches.next(np.array([0]))
+    batches.begin(np.array([0, 1]), 2)
+    drawn = batches.next(np.array([0, 1]))
+    for place, task in enumerate(each):
+        expected = next(train_batches(data, task.batches, first_step=2))
+        for name, values in expected.items():
+            np.testing.assert_array_equal(drawn[name][place], values, err_msg=name)
 
 
 @pytest.mark.slow
