@@ -15,7 +15,10 @@ import pytest
 
 from tests.reference.browser import WAYS
 
-pytestmark = pytest.mark.slow
+pytestmark = [
+    pytest.mark.slow,
+    pytest.mark.usefixtures("browser"),
+]  # first, so that nothing is made where it is not there
 SITE = Path(__file__).resolve().parents[3] / "site"
 
 
