@@ -9,6 +9,7 @@ from __future__ import annotations
 import sys
 from itertools import pairwise
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -135,7 +136,7 @@ def build(kind: str) -> nn.Module:
     return {"resnet18": lambda: ResNet(18), "resnet34": lambda: ResNet(34), "pointnet2": lambda: PointNet2(40)}[kind]()
 
 
-def run(kind: str) -> dict[str, np.ndarray | dict[str, np.ndarray]]:
+def run(kind: str) -> dict[str, Any]:
     """Outputs in evaluation mode, and in double precision gradients of the mean squared output in training mode."""
     network = build(kind)
     shapes = {name: tuple(value.shape) for name, value in network.state_dict().items()}
@@ -160,7 +161,7 @@ def fingerprint(array: np.ndarray) -> np.ndarray:
 
 
 def write_golden() -> None:
-    stored = {}
+    stored: dict[str, Any] = {}
     for kind in ("resnet18", "resnet34", "pointnet2"):
         result = run(kind)
         names = sorted(result["gradients"])
