@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 import math
 import re
@@ -338,7 +339,8 @@ def test_an_end_within_an_epoch_saves_nothing_that_is_not_finite(data, tmp_path,
     statistics = load_statistics(data)
     task = tasks(SETTINGS, statistics)[0]
     task = replace(task, optimiser=replace(task.optimiser, learning_rate=1e30, schedule="constant"))
-    monkeypatch.setattr(train.loop.Preemption, "after", lambda _, step: step == 3)
+    steps = itertools.count(1)
+    monkeypatch.setattr(train.loop.Preemption, "after_step", lambda _: next(steps) == 3)
     with pytest.raises(Diverged, match="diverged in epoch 1, by step 3"):
         fit(task, data, statistics, tmp_path)
     assert not list((tmp_path / "latest").iterdir())

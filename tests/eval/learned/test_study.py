@@ -159,6 +159,7 @@ def test_a_threshold_is_not_the_first_that_reaches_an_accuracy_by_chance():
     assert numbers.threshold_for(2.0) is None
 
 
+@pytest.mark.slow
 def test_stopping_is_fitted_on_walks_of_policies_that_did_not_learn_from_the_object(adding):
     """Two policies, of which one chooses at once what the other avoids."""
     data, chosen = OnLattice(telling(21, 2)), []

@@ -19,7 +19,8 @@ WAYS = {
 }
 
 
-@pytest.mark.parametrize("way", ["in turn", pytest.param("at once", marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("way", ["in turn", "at once"])
 @pytest.mark.parametrize("together", WAYS, ids=["gains", "q_learning"])
 def test_policies_that_are_trained_together_end_as_alone(together, way, monkeypatch):
     """With other objects, other walks, and validation objects for one half."""
