@@ -28,6 +28,7 @@ lint: $(READY)
 
 bench: $(READY)  ## what is fast, beside its peers, in one run
 	$(BIN)/python benchmarks/points.py
+	$(BIN)/python benchmarks/images.py
 	$(BIN)/python benchmarks/capture.py
 	$(BIN)/python benchmarks/evaluation.py
 	$(BIN)/python benchmarks/members.py
