@@ -53,7 +53,7 @@ from tests.reference import numpy_rules
 
 RESULTS = Path(__file__).parent / "results"
 HEADER = ("what", "value", "unit", "target", "")
-TYPES = (jnp.float32, jnp.bfloat16)
+TYPES = (jnp.dtype(jnp.float32), jnp.dtype(jnp.bfloat16))
 
 
 @dataclass
@@ -184,7 +184,7 @@ def forward_of(network: nnx.Module) -> Callable[[jax.Array], jax.Array]:
 
 def pointnet(sizes: Sizes) -> Iterator[Row]:
     for dtype in TYPES:
-        name = jnp.dtype(dtype).name
+        name = dtype.name
         network = PointNet2(views=VIEWS, dropout=0.0, rngs=nnx.Rngs(0), dtype=dtype)
         forward = forward_of(network)
         few = clouds_of(4, 4096)
@@ -196,7 +196,7 @@ def pointnet(sizes: Sizes) -> Iterator[Row]:
                 taken, note = milliseconds(partial(jax.jit(forward), clouds), sizes.rounds)
                 yield Row(what, taken, "ms", "≤ 1.0", f"{note}; {difference:.0e} apart from the CPU")
             else:
-                target = "≥ 20,000" if dtype == jnp.bfloat16 else ""
+                target = "≥ 20,000" if dtype == jnp.dtype(jnp.bfloat16) else ""
                 yield rate(what, partial(jax.jit(forward), clouds), count, "clouds", sizes, target)
         count = min(sizes.clouds, 64)
         clouds, wanted = jnp.asarray(clouds_of(count, 4096)), jnp.zeros((count, VIEWS))
@@ -211,7 +211,7 @@ def pointnet(sizes: Sizes) -> Iterator[Row]:
 def resnet(sizes: Sizes) -> Iterator[Row]:
     random = np.random.default_rng(0)
     for dtype in TYPES:
-        name = jnp.dtype(dtype).name
+        name = dtype.name
         network = ResNet(rngs=nnx.Rngs(0), dtype=dtype)
         forward = forward_of(network)
         for side, count in sizes.images.items():

@@ -333,8 +333,8 @@ def accuracy_grid(views: int) -> Callable[[FigureInputs], Figure]:
                 (random, "#6b7280", "o", "random"),
                 (predicted, "#2563eb", "s", "PointNet++"),
             ):
-                shown = {"color": colour, "marker": marker, "alpha": alpha, "label": name if last else None}
-                axis.scatter(x, values[row], s=18, zorder=3, **shown)
+                label = name if last else None
+                axis.scatter(x, values[row], s=18, color=colour, marker=marker, alpha=alpha, label=label, zorder=3)
         axis.set_xticks(range(len(thresholds)), [f"{ct:g}" for ct in thresholds])
         axis.set(
             xlabel=f"confidence threshold (for each, left to right: limit of {limits[0]} to {limits[-1]} views)",
