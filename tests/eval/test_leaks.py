@@ -63,6 +63,8 @@ BY_VIEW = tables_of(2, telling=5)
 """View tables of the test objects by the classifier that is validated by view."""
 STATISTICS = replace(some_statistics(some_tables()), capture={"resolution": 32, "views": VIEWS})
 
+pytestmark = pytest.mark.slow
+
 
 @dataclass
 class Run:

@@ -94,9 +94,8 @@ def test_two_processes_train_as_one_does(networks, run, whole):
                 assert mine[key] == pytest.approx(theirs[key], rel=1e-5, abs=1e-7), key
 
 
-@pytest.mark.parametrize(
-    "again", [False, pytest.param(True, marks=pytest.mark.slow)], ids=["lost", "lost and told to end"]
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("again", [False, True], ids=["lost", "lost and told to end"])
 def test_a_lost_process_ends_the_others_and_the_run_goes_on(run, again):
     out = run("lost")
     long = ("--classifier.optimiser.epochs", "500", "--classifier.optimiser.patience", "500")

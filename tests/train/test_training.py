@@ -91,7 +91,8 @@ def test_training_learns(trained):
     assert list((trained / "classifier" / "tensorboard").iterdir())
 
 
-@pytest.mark.parametrize("name", ["classifier", pytest.param("entropy", marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["classifier", "entropy"])
 def test_a_stopped_run_ends_as_if_it_had_not_been(name, trained, data, tmp_path, monkeypatch):
     statistics = load_statistics(data)
     task = dict(zip(("classifier", "entropy"), tasks(SETTINGS, statistics), strict=True))[name]

@@ -186,6 +186,7 @@ def test_the_fixed_order_begins_with_the_views_that_tell_most(adding):
     assert sorted(scores.tolist()) == list(range(1, VIEWS + 1))
 
 
+@pytest.mark.slow
 def test_a_study_walks_all_policies_from_the_same_starts(adding):
     """With a view policy of arbitrary weights: what holds whatever was learned."""
     data = telling(40, 3)

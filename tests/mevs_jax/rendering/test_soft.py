@@ -411,7 +411,8 @@ def test_a_surface_is_reconstructed_through_what_was_seen():
         reconstruct(cloud[:5], cloud[:5], 500)
 
 
-@pytest.mark.parametrize("method", ["volume", pytest.param("mesh", marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("method", ["volume", "mesh"])
 def test_the_command_climbs_and_draws(method, tmp_path):
     from PIL import Image
 
