@@ -25,12 +25,11 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 import jax
 import jax.numpy as jnp
 import numpy as np
-import optax
 from flax import nnx
 
 from benchmarks import members
 from benchmarks.capture import depths, wobbly_ball
-from benchmarks.comparing import machine_name, take_turns
+from benchmarks.comparing import classification_loss, forward_of, machine_name, take_turns, training_step
 from benchmarks.evaluation import BACKBONES, CLASSES, RUNGS, VIEWS, made_up_tables
 from data_pipeline.capture.casting import CaptureConfig, capture, rig_for
 from data_pipeline.dataset.builder import prepare
@@ -157,31 +156,6 @@ def _equal(right: bool) -> str:
     return "equal to the plain rule's" if right else "DIFFER from the plain rule's"
 
 
-def training_step(network: nnx.Module, loss_of: Callable[..., jax.Array]) -> Callable[..., Any]:
-    """A compiled step of Adam on the inputs that it is called with; weights stay where they began."""
-    structure, parameters, *rest = nnx.split(network, nnx.Param, ...)
-    others = rest[0]
-    adam = optax.adam(1e-5)
-    moments = adam.init(parameters)
-
-    @jax.jit
-    def step(parameters, others, moments, *inputs):
-        def loss(parameters):
-            network = nnx.merge(structure, parameters, others, copy=True)
-            return loss_of(network, *inputs), nnx.state(network, nnx.Not(nnx.Param))
-
-        (value, others), gradients = jax.value_and_grad(loss, has_aux=True)(parameters)
-        updates, moments = adam.update(gradients, moments)
-        return optax.apply_updates(parameters, updates), others, moments, value
-
-    return lambda *inputs: step(parameters, others, moments, *inputs)
-
-
-def forward_of(network: nnx.Module) -> Callable[[jax.Array], jax.Array]:
-    structure, state = nnx.split(network)
-    return lambda inputs: nnx.merge(structure, state, copy=True)(inputs)
-
-
 def pointnet(sizes: Sizes) -> Iterator[Row]:
     for dtype in TYPES:
         name = dtype.name
@@ -221,12 +195,8 @@ def resnet(sizes: Sizes) -> Iterator[Row]:
             what = f"{count} images of {side}×{side}, {name}"
             row = rate(f"ResNet-18 forward, {what}", partial(jax.jit(forward), shown), count, "images", sizes)
             yield replace(row, note=f"{row.note}; {difference:.0e} apart from the CPU")
-            step = training_step(network, _classified)
+            step = training_step(network, classification_loss)
             yield rate(f"ResNet-18 training step, {what}", partial(step, shown, labels), count, "images", sizes)
-
-
-def _classified(network: ResNet, images: jax.Array, labels: jax.Array) -> jax.Array:
-    return jnp.mean(optax.softmax_cross_entropy_with_integer_labels(network(images, train=True), labels))
 
 
 def rendering(sizes: Sizes) -> Iterator[Row]:

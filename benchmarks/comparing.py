@@ -4,14 +4,20 @@ from __future__ import annotations
 
 import importlib.util
 import platform
+import sys
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
+import optax
+from flax import nnx
 
+from data_pipeline.files import read_json
 from mevs_jax.markdown import markdown_row
 
 GUARD = 3.0
@@ -111,6 +117,43 @@ def slower_than_before(rows: list[Row], before: dict[str, Any]) -> list[str]:
         for row, ratio in known
         if row.ratio < ratio / GUARD
     ]
+
+
+def end_by_guard(rows: list[Row], stored: Path) -> None:
+    """Ends the program, with exit code 1 and messages if a ratio is below a third of the stored one."""
+    slower = slower_than_before(rows, read_json(stored))
+    for sentence in slower:
+        print(f"slower than before: {sentence}", file=sys.stderr)
+    sys.exit(bool(slower))
+
+
+def training_step(network: nnx.Module, loss_of: Callable[..., jax.Array]) -> Callable[..., Any]:
+    """A compiled step of Adam on the inputs that it is called with; weights stay where they began."""
+    structure, parameters, *rest = nnx.split(network, nnx.Param, ...)
+    others = rest[0]
+    adam = optax.adam(1e-5)
+    moments = adam.init(parameters)
+
+    @jax.jit
+    def step(parameters, others, moments, *inputs):
+        def loss(parameters):
+            network = nnx.merge(structure, parameters, others, copy=True)
+            return loss_of(network, *inputs), nnx.state(network, nnx.Not(nnx.Param))
+
+        (value, others), gradients = jax.value_and_grad(loss, has_aux=True)(parameters)
+        updates, moments = adam.update(gradients, moments)
+        return optax.apply_updates(parameters, updates), others, moments, value
+
+    return lambda *inputs: step(parameters, others, moments, *inputs)
+
+
+def forward_of(network: nnx.Module) -> Callable[[jax.Array], jax.Array]:
+    structure, state = nnx.split(network)
+    return lambda inputs: nnx.merge(structure, state, copy=True)(inputs)
+
+
+def classification_loss(network: Callable[..., jax.Array], images: jax.Array, labels: jax.Array) -> jax.Array:
+    return jnp.mean(optax.softmax_cross_entropy_with_integer_labels(network(images, train=True), labels))
 
 
 def machine_name() -> str:

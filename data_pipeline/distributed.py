@@ -27,7 +27,6 @@ def join_processes() -> None:
     Raises:
         DataError: if the other processes cannot be found or reached, or cannot reach this one.
     """
-    global _joined
     numbers = {}
     try:
         for argument, name in (("num_processes", "JAX_NUM_PROCESSES"), ("process_id", "JAX_PROCESS_ID")):
@@ -39,7 +38,6 @@ def join_processes() -> None:
             f"--distributed cannot join the other processes ({str(error).splitlines()[0]}); outside Slurm, Open MPI, Kubernetes "
             f"and Cloud TPUs set JAX_COORDINATOR_ADDRESS=host:port, JAX_NUM_PROCESSES and JAX_PROCESS_ID for each"
         ) from error
-    _joined = True
     try:
         jax.devices()
     except RuntimeError as error:
@@ -51,7 +49,6 @@ def join_processes() -> None:
         ) from error
 
 
-_joined = False
 _SECONDS_TO_LEAVE = 10
 """How long a process that ends with an error waits for others that end with the same one."""
 
@@ -61,7 +58,7 @@ def leave(code: int) -> None:
 
     Python's own way out waits minutes for the others, and then ends with another code.
     """
-    if not _joined:
+    if not jax.distributed.is_initialized():
         return
     sys.stdout.flush()
     sys.stderr.flush()

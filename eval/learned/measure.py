@@ -138,7 +138,7 @@ def _walks(
 
     def walk() -> dict[str, Any]:
         validation, test = map(objects_of, ("val", "test"))
-        if costs:  # parts of them are told apart by position
+        if costs:  # their parts are identified by position
             learned_from = stages.features("turned_val", stages.turned, "val")
             assert np.array_equal(validation.features.labels, learned_from.labels), "the objects have another order"
         pose = "" if posed else ", unknown yaw"

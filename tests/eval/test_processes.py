@@ -125,18 +125,28 @@ def test_two_processes_make_the_data_set_that_one_makes(tmp_path):
                 np.testing.assert_array_equal(mine[key], expected[key], err_msg=key)
 
 
-@pytest.mark.slow
-def test_two_processes_sweep_as_two_devices_do(whole, tmp_path):
-    """A grid that is halved; the best of it becomes the run's."""
-    outs = [tmp_path / name for name in ("one", "both")]
-    for out in outs:
+@pytest.fixture
+def outs(whole, tmp_path) -> list[Path]:
+    """Two run directories with the same data set: for one process, and for both."""
+    found = [tmp_path / name for name in ("one", "both")]
+    for out in found:
         out.mkdir()
         (out / "data").symlink_to(whole / "data")
-    given = ("--preset", "tiny", "--grid", "learning-rate=1e-3,1e-4", "--seeds", "2", "--sweep.halving", "--adopt")
-    command = ("sweep", *given, "--entropy.optimiser.epochs", "4", "--out")
+    return found
+
+
+def alone_on_two_devices(*arguments: str) -> None:
     with pytest.MonkeyPatch.context() as patch:
         patch.setitem(CPU, "JAX_NUM_CPU_DEVICES", "2")
-        alone(*command, str(outs[0]))
+        alone(*arguments)
+
+
+@pytest.mark.slow
+def test_two_processes_sweep_as_two_devices_do(outs):
+    """A grid that is halved; the best of it becomes the run's."""
+    given = ("--preset", "tiny", "--grid", "learning-rate=1e-3,1e-4", "--seeds", "2", "--sweep.halving", "--adopt")
+    command = ("sweep", *given, "--entropy.optimiser.epochs", "4", "--out")
+    alone_on_two_devices(*command, str(outs[0]))
     said = killed_and_finished(outs[1] / "sweep" / "entropy" / "latest" / "1", *command, str(outs[1]))
     assert "Best of 4" in said
     one, both = (json.loads((out / "sweep" / "entropy" / "members.json").read_text()) for out in outs)
@@ -178,17 +188,11 @@ def test_two_processes_study_as_one_does(tmp_path):
 
 
 @pytest.mark.slow
-def test_two_processes_train_seeds_as_two_devices_do(whole, tmp_path):
+def test_two_processes_train_seeds_as_two_devices_do(outs):
     """A seed for each process."""
-    outs = [tmp_path / name for name in ("one", "both")]
-    for out in outs:
-        out.mkdir()
-        (out / "data").symlink_to(whole / "data")
     epochs = ("--classifier.optimiser.epochs", "1", "--entropy.optimiser.epochs", "2")
     command = ("train", "--preset", "tiny", "--seeds", "2", *epochs, "--out")
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setitem(CPU, "JAX_NUM_CPU_DEVICES", "2")
-        alone(*command, str(outs[0]))
+    alone_on_two_devices(*command, str(outs[0]))
     finished(start(*command, str(outs[1])))
     for folder in ("entropy", "seeds/1/entropy"):
         one, both = (lines(out / folder) for out in outs)

@@ -21,7 +21,7 @@ from eval.tables import ViewTables, compute_view_tables
 from tests.reference.choosing import CLASSES, fusion_of, some_features
 from tests.reference.weights import untrained
 from train.chance import Chance, warn_of_chance, wilson_interval
-from train.choosing.averaged import AveragedConfig, fit_averaged
+from train.choosing.averaged import AveragedConfig, Fitting, fit_together
 from train.choosing.calibrated import calibrated
 from train.choosing.policy import PolicyConfig, train_policy
 from train.choosing.q_learning import QLearningConfig, train_by_q_learning
@@ -62,16 +62,20 @@ def test_averaged_weights_are_never_untrained_nor_infinite(worth, validates):
         return jnp.sum(weights["a"] ** 2) * jnp.mean(some)
 
     checks = (lambda weights: {"check": float(loss_of(weights, data, None))}) if validates else None
-    assert len(fit_averaged(config, loss_of, weights, data, checks)[1]) == 3
+
+    def fit(weights, data, checks, rate_option="the learning rate"):
+        return fit_together(config, loss_of, [Fitting(0, weights, data, checks, "part")], rate_option)[0]
+
+    assert len(fit(weights, data, checks)[1]) == 3
     with pytest.raises(
         Diverged, match=r"the part diverged in epoch 1 of 3: its loss 'train' is not finite; .* lower --a.rate \(0.001"
     ):
-        fit_averaged(config, loss_of, weights, data.at[3].set(worth), checks, "part", "--a.rate")
+        fit(weights, data.at[3].set(worth), checks, "--a.rate")
     if validates:
         with pytest.raises(Diverged, match="its loss 'check' is not finite"):
-            fit_averaged(config, loss_of, weights, data, lambda _: {"check": float(worth)})
+            fit(weights, data, lambda _: {"check": float(worth)})
     with pytest.raises(Diverged, match="its weights are not finite"):  # of a weight that the loss does not depend on
-        fit_averaged(config, loss_of, nnx.State({"a": jnp.ones(3), "b": jnp.full(2, worth)}), data, checks)
+        fit(nnx.State({"a": jnp.ones(3), "b": jnp.full(2, worth)}), data, checks)
 
 
 @pytest.mark.parametrize("train", [train_policy, pytest.param(train_by_q_learning, marks=pytest.mark.slow)])

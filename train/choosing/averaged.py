@@ -33,7 +33,7 @@ Fitted = tuple[nnx.State, list[dict[str, float]]]
 
 @dataclass(frozen=True)
 class AveragedConfig:
-    """Settings of `fit_averaged`."""
+    """Settings of `fit_together`."""
 
     epochs: int = 10
     """passes over the samples"""
@@ -50,7 +50,7 @@ class AveragedConfig:
 
 
 def mean_losses(losses_of: Callable[[nnx.State, Data], dict[str, Array]], data: Data, size: int) -> Validate:
-    """Returns a `validate` function for `fit_averaged`: weights to their mean losses over the data.
+    """Returns a `validate` function for a `Fitting`: weights to their mean losses over the data.
 
     Args:
         losses_of: weights and samples to mean losses by name.
@@ -66,34 +66,6 @@ def mean_losses(losses_of: Callable[[nnx.State, Data], dict[str, Array]], data: 
     return validate
 
 
-def fit_averaged(
-    config: AveragedConfig,
-    loss_of: Callable[..., Float[Array, ""]],
-    parameters: nnx.State,
-    data: Data,
-    validate: Validate | None,
-    name: str = "network",
-    rate_option: str = "the learning rate",
-) -> Fitted:
-    """Returns the averaged weights of the best epoch, and the losses of every epoch.
-
-    Without epochs, the weights are the given `parameters`.
-
-    Args:
-        loss_of: weights, a batch and a key to the mean loss.
-        parameters: initial weights.
-        data: a tree of arrays with a leading axis of samples.
-        validate: averaged weights to losses, the sum of which decides which epoch is best; if None, the last epoch is taken.
-        name: name of the network, for messages.
-        rate_option: the option that sets the learning rate, for messages.
-
-    Raises:
-        Diverged: if after an epoch a loss or an averaged weight is infinite or NaN.
-    """
-    one = Fitting(config.seed, parameters, data, validate, name)
-    return fit_together(config, loss_of, [one], rate_option)[0]
-
-
 @dataclass(frozen=True)
 class Fitting(Generic[Data]):
     """One of several networks that are trained together: what it has of its own.
@@ -102,7 +74,7 @@ class Fitting(Generic[Data]):
         seed: of its batches.
         parameters: initial weights.
         data: samples, of the same number and shapes for all networks.
-        validate: as of `fit_averaged`.
+        validate: averaged weights to losses, the sum of which decides which epoch is best; if None, the last epoch is taken.
         name: name of the network, for messages.
         given: further arguments of its loss, after weights, batch and key.
     """
@@ -121,8 +93,9 @@ def fit_together(
     each: Sequence[Fitting],
     rate_option: str = "the learning rate",
 ) -> list[Fitted]:
-    """Returns for each network what `fit_averaged` returns; each ends as it does alone.
+    """Returns for each network the averaged weights of its best epoch, and its losses of every epoch; each ends as it does alone.
 
+    Without epochs, the weights are the initial ones.
     On several devices, or an accelerator, an epoch of all networks is one program; on one CPU they take turns.
 
     Args:
@@ -131,7 +104,7 @@ def fit_together(
         rate_option: the option that sets the learning rate, for messages.
 
     Raises:
-        Diverged: as `fit_averaged` does, if any of them diverges.
+        Diverged: if after an epoch a loss or an averaged weight of any network is infinite or NaN.
     """
     samples = len(jax.tree.leaves(each[0].data)[0])
     start, epoch = _epoch_of(config, loss_of, samples)

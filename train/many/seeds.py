@@ -53,7 +53,8 @@ def check_networks(
     for folder, identity in zip(folders, identities, strict=True):
         check_config(folder, identity, "a network trained")
     missing = [index for index, folder in enumerate(folders) if not (folder / "summary.json").exists()]
-    together = _together_of(missing, folders, work, identities, mesh)
+    begun = _interrupted(work, identities) if missing else None
+    together = _together_of(missing, begun, folders, work, mesh)
     if together:
         check_training(tasks[0], statistics, Layout())  # a batch is that of one device
     if set(missing) - set(together):
@@ -61,15 +62,11 @@ def check_networks(
 
 
 def _together_of(
-    missing: Sequence[int], folders: Sequence[Path], work: Path, identities: Sequence[dict[str, Any]], mesh: Mesh
+    missing: Sequence[int], begun: list[int] | None, folders: Sequence[Path], work: Path, mesh: Mesh
 ) -> list[int]:
-    """Returns which of the networks that are missing are trained together: those of an interrupted training, or the most."""
-    if not missing:
-        return []
-    if (begun := _interrupted(work, identities)) is None:
-        fresh = [
-            index for index in missing if not has_save(folders[index] / "latest")
-        ]  # others are trained alone, by `fit`
+    """Returns which of the networks that are missing are trained together: those `begun` together, or the most."""
+    if begun is None:
+        fresh = [index for index in missing if not has_save(folders[index] / "latest")]  # `fit` trains others alone
         return fresh[: number_together(len(fresh), mesh)]
     if jax.process_count() > 1 and len(begun) % mesh.size:
         raise DataError(
@@ -115,10 +112,10 @@ def train_seeds(
     for folder, identity in zip(folders, identities, strict=True):
         check_config(folder, identity, "a network trained")
     missing = [index for index, folder in enumerate(folders) if finished(folder) is None]
-    together = _together_of(missing, folders, work, identities, mesh)
-    goes_on = bool(missing) and _interrupted(work, identities) is not None
+    begun = _interrupted(work, identities) if missing else None
+    together = _together_of(missing, begun, folders, work, mesh)
     wait_for_all("seeds are looked at")
-    if missing and not goes_on and work.exists() and is_first():
+    if missing and begun is None and work.exists() and is_first():
         if has_save(work / "latest"):
             console.print(f"{work} holds an interrupted training of other networks, which is given up", markup=False)
         shutil.rmtree(work)

@@ -11,7 +11,7 @@ from flax import nnx
 
 from eval.learned.study import random_sets_study
 from mevs_jax.models.set_fusion import SetFusion
-from train.choosing.averaged import AveragedConfig, fit_averaged
+from train.choosing.averaged import AveragedConfig, Fitting, fit_together
 from train.choosing.calibrated import calibrated
 from train.choosing.features import Features, SetFusionConfig, new_fusion, random_sets, sets_of_size
 
@@ -56,7 +56,7 @@ def trained(train: Features) -> SetFusion:
         return jnp.mean(optax.softmax_cross_entropy_with_integer_labels(logits, some.labels))
 
     config = AveragedConfig(epochs=25, batch_size=64, learning_rate=3e-3, weight_decay=0.05)
-    weights, history = fit_averaged(config, loss_of, parameters, train, None)
+    ((weights, history),) = fit_together(config, loss_of, [Fitting(0, parameters, train, None, "fusion")])
     assert len(history) == 25
     return nnx.merge(structure, weights)
 
