@@ -250,7 +250,11 @@ def several_seeds(sizes: Sizes) -> Iterator[Row]:
             found = members.compare(tasks[name], data, Path(folder) / name)
             ratio, steps = found["step in turn"] / found["step at once"], found["step at once"]
             yield Row(
-                f"four seeds of {name}: time of a step in turn, divided by that at once", ratio, "×", "", f"{1000 * steps:.3g} ms"
+                f"four seeds of {name}: time of a step in turn, divided by that at once",
+                ratio,
+                "×",
+                "",
+                f"{1000 * steps:.3g} ms",
             )
 
 
