@@ -8,6 +8,7 @@ import sys
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -128,23 +129,32 @@ def end_by_guard(rows: list[Row], stored: Path) -> None:
 
 
 def training_step(network: nnx.Module, loss_of: Callable[..., jax.Array]) -> Callable[..., Any]:
-    """A compiled step of Adam on the inputs that it is called with; weights stay where they began."""
+    """A compiled step of Adam on the inputs that it is called with. Every call goes on from the last, in the same memory."""
     structure, parameters, *rest = nnx.split(network, nnx.Param, ...)
     others = rest[0]
     adam = optax.adam(1e-5)
     moments = adam.init(parameters)
 
-    @jax.jit
-    def step(parameters, others, moments, *inputs):
+    @partial(jax.jit, donate_argnums=0)
+    def step(state, *inputs):
+        parameters, others, moments = state
+
         def loss(parameters):
             network = nnx.merge(structure, parameters, others, copy=True)
             return loss_of(network, *inputs), nnx.state(network, nnx.Not(nnx.Param))
 
         (value, others), gradients = jax.value_and_grad(loss, has_aux=True)(parameters)
         updates, moments = adam.update(gradients, moments)
-        return optax.apply_updates(parameters, updates), others, moments, value
+        return (optax.apply_updates(parameters, updates), others, moments), value
 
-    return lambda *inputs: step(parameters, others, moments, *inputs)
+    state = jax.tree.map(jnp.copy, (parameters, others, moments))
+
+    def call(*inputs):
+        nonlocal state
+        state, value = step(state, *inputs)
+        return value
+
+    return call
 
 
 def forward_of(network: nnx.Module) -> Callable[[jax.Array], jax.Array]:

@@ -157,22 +157,26 @@ def views_after(
     """
     side, distance = images.shape[1], camera.distance
     pinhole = Camera(jnp.eye(4), math.radians(camera.field_of_view), side)
-    rays = pixel_directions(pinhole)
+    rays = jnp.moveaxis(pixel_directions(pinhole), -1, 0)
     undo = jnp.linalg.inv(change)
 
+    # One array for each coordinate: XLA is slow where the last axis has three elements.
     def of_view(image: Array, pose: Array) -> tuple[Array, Array]:
         position = change @ pose[:3, 3]
         scale = distance / jnp.linalg.norm(position)
         back = pose[:3, :3].T @ undo @ look_at_origin(position)[:3, :3]  # maps directions to the old camera's frame
-        old = rays @ back.T
-        pixel = jnp.floor(old[..., :2] / old[..., 2:] * pinhole.focal_length + side / 2).astype(jnp.int32)
-        inside = jnp.all((pixel >= 0) & (pixel < side), axis=-1)
-        pixel = jnp.clip(pixel, 0, side - 1)
-        sampled = jnp.where(inside[..., None], image[pixel[..., 1], pixel[..., 0]], 0.0)
-        depth = scale * (distance + 1 - 2 * sampled[..., 0]) / old[..., 2]
-        nearness = jnp.where(sampled[..., 0] > 0, (distance + 1 - depth) / 2, 0.0)
-        normals = sampled[..., 1:] @ back  # normals transform by the inverse transpose
-        normals = normals / jnp.maximum(jnp.linalg.norm(normals, axis=-1, keepdims=True), 1e-12)
-        return jnp.concatenate([nearness[..., None], normals], axis=-1), position / jnp.linalg.norm(position)
+        x, y, z = (sum(factor * ray for factor, ray in zip(row, rays, strict=True)) for row in back)
+        row, column = (jnp.floor(part / z * pinhole.focal_length + side / 2).astype(jnp.int32) for part in (y, x))
+        inside = (row >= 0) & (row < side) & (column >= 0) & (column < side)
+        pixel = jnp.clip(row, 0, side - 1) * side + jnp.clip(column, 0, side - 1)
+        sampled = image.reshape(-1, 4).at[pixel].get(mode="promise_in_bounds")
+        near, *normal = (jnp.where(inside, part, 0.0) for part in jnp.moveaxis(sampled, -1, 0))
+        depth = scale * (distance + 1 - 2 * near) / z
+        nearness = jnp.where(near > 0, (distance + 1 - depth) / 2, 0.0)
+        # Normals transform by the inverse transpose.
+        normal = [sum(factor * part for factor, part in zip(column, normal, strict=True)) for column in back.T]
+        length = jnp.maximum(jnp.sqrt(sum(jnp.square(part) for part in normal)), 1e-12)
+        seen = jnp.stack([nearness, *(part / length for part in normal)], axis=-1)
+        return seen, position / jnp.linalg.norm(position)
 
     return jax.vmap(of_view)(images, poses)

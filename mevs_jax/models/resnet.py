@@ -17,79 +17,10 @@ from jaxtyping import Array, Float
 from mevs_jax.arrays import AnyArray
 from mevs_jax.models.batch_norm import BatchNorm
 from mevs_jax.models.calling import TrainedByCall
+from mevs_jax.models.convolution import Convolution, pool
 
 _BLOCKS = {10: (1, 1, 1, 1), 18: (2, 2, 2, 2), 34: (3, 4, 6, 3)}
 _IMAGENET_MEAN, _IMAGENET_STD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
-
-
-def _patches(x: Float[Array, "batch height width inputs"], size: int, stride: int) -> Float[Array, "places patch"]:
-    """The inputs of a square kernel at each of its places, one place per row."""
-    pad = size // 2
-    rows, columns = (-(-extent // stride) for extent in x.shape[1:3])
-    x = jnp.pad(x, ((0, 0), (pad, pad), (pad, pad), (0, 0)))
-    shifted = [
-        x[:, i : i + (rows - 1) * stride + 1 : stride, j : j + (columns - 1) * stride + 1 : stride]
-        for i in range(size)
-        for j in range(size)
-    ]
-    return jnp.concatenate(shifted, axis=-1).reshape(x.shape[0] * rows * columns, -1)
-
-
-def _convolve(x: Array, kernel: Array, stride: int) -> Array:
-    """Convolution with zero padding of half the kernel's size."""
-    pad = kernel.shape[0] // 2
-    return jax.lax.conv_general_dilated(
-        x, kernel, (stride, stride), [(pad, pad)] * 2, dimension_numbers=("NHWC", "HWIO", "NHWC")
-    )
-
-
-@partial(jax.custom_vjp, nondiff_argnums=(2,))
-def _convolve_on_cpu(x: Array, kernel: Array, stride: int) -> Array:
-    """`_convolve` with the gradient of the weights as one matrix product."""
-    return _convolve(x, kernel, stride)
-
-
-def _forwards(x: Array, kernel: Array, stride: int) -> tuple[Array, tuple[Array, Array]]:
-    return _convolve(x, kernel, stride), (x, kernel)
-
-
-def _backwards(stride: int, residuals: tuple[Array, Array], cotangent: Array) -> tuple[Array, Array]:
-    x, kernel = residuals
-    (of_x,) = jax.vjp(lambda x: _convolve(x, kernel, stride), x)[1](cotangent)
-    rows = cotangent.reshape(-1, cotangent.shape[-1])
-    of_kernel = jnp.matmul(_patches(x, kernel.shape[0], stride).T, rows, preferred_element_type=jnp.float32)
-    return of_x, of_kernel.reshape(kernel.shape).astype(kernel.dtype)
-
-
-_convolve_on_cpu.defvjp(_forwards, _backwards)
-
-
-class Convolution(nnx.Module):
-    """Square convolution without bias, padded by half its size, with torchvision's initial weights.
-
-    On CPU, XLA's convolution of small maps is slow (2×2 by 192 channels: 14 ms, as one matrix product 1.5 ms; backward
-    likewise). On CPU, maps of at most 8×8 outputs are therefore computed as a matrix product over gathered patches; for larger
-    maps, only the gradient of the weights is. The sums are the same, in a different order.
-    """
-
-    def __init__(self, inputs: int, outputs: int, size: int, stride: int, *, rngs: nnx.Rngs):
-        initial = nnx.initializers.variance_scaling(2.0, "fan_out", "normal")
-        self.kernel = nnx.Param(initial(rngs.params(), (size, size, inputs, outputs)))
-        self.size, self.stride = size, stride
-
-    def __call__(
-        self, x: Float[Array, "batch height width inputs"], factor: Float[Array, " outputs"] | None = None
-    ) -> Float[Array, "batch rows columns outputs"]:
-        """The convolution of `x`; each output channel is multiplied by its `factor`, if given, by scaling the weights."""
-        kernel, stride = self.kernel[...], self.stride
-        kernel = (kernel if factor is None else kernel * factor).astype(x.dtype)
-        if jax.default_backend() != "cpu":
-            return _convolve(x, kernel, stride)
-        rows, columns = (-(-extent // stride) for extent in x.shape[1:3])
-        if rows * columns > 64:
-            return _convolve_on_cpu(x, kernel, stride)
-        flat = _patches(x, self.size, stride)
-        return (flat @ kernel.reshape(flat.shape[1], -1)).reshape(x.shape[0], rows, columns, -1)
 
 
 def _normalised(convolution: Convolution, norm: BatchNorm, x: Array, *, train: bool, momentum: float | Array) -> Array:
@@ -222,7 +153,7 @@ class ResNet(TrainedByCall):
             x = jax.nn.relu(self.norm(self.convolution(x), train=train, momentum=momentum))
         else:
             x = jax.nn.relu(_normalised(self.convolution, self.norm, x, train=train, momentum=momentum))
-            x = nnx.max_pool(x, (3, 3), strides=(2, 2), padding=((1, 1), (1, 1)))
+            x = pool(x)
         for block in self.blocks:
             x = block(x, train=train, momentum=momentum)
         return jnp.mean(x, axis=(1, 2), dtype=exact).reshape(*batch, -1)
