@@ -7,10 +7,13 @@ from __future__ import annotations
 
 import gc
 import os
+import platform
 import select
 import signal
 import sys
+import zlib
 from contextlib import nullcontext, redirect_stdout
+from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -22,6 +25,8 @@ if TYPE_CHECKING:
     from mevs_jax.cli.parsing import Invocation
 
 _HELP = ("-h", "--help")
+_COMPILED_BYTES = 2**30
+"""Size of the cache of compiled programs."""
 
 
 def _fail(message: str, code: int = 2) -> None:
@@ -169,6 +174,35 @@ def _begin_with_large_pages() -> None:
     os.execv(sys.executable, [sys.executable, *sys.orig_argv[1:]])
 
 
+def _keep_compiled() -> None:
+    """Lets JAX keep what it compiles in the user's cache folder, so that a second job does not compile it again.
+
+    The folder is of one kind of CPU, since XLA's programs for one may not run on another where a home is shared. JAX deletes what
+    was used least recently beyond a gigabyte. Variables that the user has set are left as they are.
+    """
+    if not _is_a_program() or "JAX_COMPILATION_CACHE_DIR" in os.environ or find_spec("filelock") is None:
+        return
+    try:
+        root = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
+        folder = root / "mevs_jax" / "compiled" / f"{platform.machine()}-{_kind_of_cpu():08x}"
+        folder.mkdir(parents=True, exist_ok=True)
+    except (OSError, RuntimeError):  # no home, or none that can be written to
+        return
+    if os.access(folder, os.W_OK):
+        os.environ["JAX_COMPILATION_CACHE_DIR"] = str(folder)
+        os.environ.setdefault("JAX_COMPILATION_CACHE_MAX_SIZE", str(_COMPILED_BYTES))
+        os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0.2")
+
+
+def _kind_of_cpu() -> int:
+    """A number that differs where the CPU has other instructions."""
+    try:
+        lines = Path("/proc/cpuinfo").read_text().splitlines()
+    except OSError:
+        return zlib.crc32(platform.processor().encode())
+    return zlib.crc32("".join(sorted({line for line in lines if line.lower().startswith(("flags", "features"))})).encode())
+
+
 def _say_and_end(error: Exception) -> None:
     """Ends the program for an error that a person can act on; returns for any other."""
     if isinstance(error, ModuleNotFoundError) and error.name and not _is_ours(error.name):
@@ -285,6 +319,7 @@ def _main(arguments: list[str]) -> None:
 
         show_options(name)
     _begin_with_large_pages()
+    _keep_compiled()
     if note:
         print(f"mevs: {note}", file=sys.stderr)
     if COMMANDS[name].needs_study:

@@ -357,6 +357,38 @@ def test_jobs_begin_again_with_large_pages(monkeypatch):
     assert begun == [(sys.executable, [sys.executable, "-m", "mevs_jax", "run", "--views", "10"])] * 2
 
 
+@pytest.mark.parametrize("program", ["/somewhere/bin/mevs", "/usr/bin/notebook"])
+def test_programs_keep_what_they_compile(program, tmp_path, monkeypatch):
+    """In the user's cache folder, within bounds; not where `main` is called from another program, nor if the user says otherwise."""
+    monkeypatch.setattr(sys, "argv", [program])
+    for name in ("DIR", "MAX_SIZE"):
+        monkeypatch.setenv(f"JAX_COMPILATION_CACHE_{name}", "")  # so that it is as before after the test
+        monkeypatch.delenv(f"JAX_COMPILATION_CACHE_{name}")
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    cli._keep_compiled()
+    if "notebook" in program:
+        assert "JAX_COMPILATION_CACHE_DIR" not in os.environ and not list(tmp_path.iterdir())
+        return
+    folder = Path(os.environ["JAX_COMPILATION_CACHE_DIR"])
+    assert folder.is_dir() and folder.is_relative_to(tmp_path / "cache" / "mevs_jax" / "compiled")
+    assert int(os.environ["JAX_COMPILATION_CACHE_MAX_SIZE"]) == 2**30
+    monkeypatch.setenv("JAX_COMPILATION_CACHE_DIR", "/of/the/user")
+    cli._keep_compiled()
+    assert os.environ["JAX_COMPILATION_CACHE_DIR"] == "/of/the/user"
+    monkeypatch.delenv("JAX_COMPILATION_CACHE_DIR")
+    (tmp_path / "file").touch()
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "file"))
+    cli._keep_compiled()
+    assert "JAX_COMPILATION_CACHE_DIR" not in os.environ
+
+
+def test_another_kind_of_cpu_has_a_folder_of_its_own(monkeypatch):
+    here = cli._kind_of_cpu()
+    assert here == cli._kind_of_cpu()
+    monkeypatch.setattr(Path, "read_text", lambda path: "processor : 0\nflags : fpu sse2\n")
+    assert cli._kind_of_cpu() != here
+
+
 @pytest.mark.parametrize(
     ("error", "code", "said"),
     [
