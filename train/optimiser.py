@@ -70,15 +70,16 @@ def descent(config: OptimiserConfig) -> optax.GradientTransformation:
     """
     if config.method == "adam":
         return optax.scale_by_adam()
-    # Optax's Muon without steps of Newton–Schulz returns the momentum of each matrix, which is made orthogonal here. It multiplies
-    # by −learning_rate. The rate is applied later, since it may differ between members of a sweep; −1 leaves the direction as it is.
-    momentum = muon(
-        -1.0, ns_steps=0, muon_weight_dimension_numbers=lambda weights: jax.tree.map(_as_matrix, weights)
-    )
+    # Optax's Muon without steps of Newton–Schulz returns the momentum of each matrix, which is made orthogonal here. It
+    # multiplies by −learning_rate. The rate is applied later, since it may differ between members of a sweep; a rate of −1
+    # leaves the direction as it is.
+    momentum = muon(-1.0, ns_steps=0, muon_weight_dimension_numbers=lambda weights: jax.tree.map(_as_matrix, weights))
 
-    def update(gradients, state, weights=None):
+    def update(gradients: optax.Updates, state: optax.OptState, weights: optax.Params | None = None):
         directions, state = momentum.update(gradients, state, weights)
-        return jax.tree.map(lambda direction: _orthogonal(direction) if _as_matrix(direction) else direction, directions), state
+        return jax.tree.map(
+            lambda direction: _orthogonal(direction) if _as_matrix(direction) else direction, directions
+        ), state
 
     return optax.GradientTransformation(momentum.init, update)
 

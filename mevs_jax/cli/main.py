@@ -200,7 +200,9 @@ def _kind_of_cpu() -> int:
         lines = Path("/proc/cpuinfo").read_text().splitlines()
     except OSError:
         return zlib.crc32(platform.processor().encode())
-    return zlib.crc32("".join(sorted({line for line in lines if line.lower().startswith(("flags", "features"))})).encode())
+    return zlib.crc32(
+        "".join(sorted({line for line in lines if line.lower().startswith(("flags", "features"))})).encode()
+    )
 
 
 def _say_and_end(error: Exception) -> None:

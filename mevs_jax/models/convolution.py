@@ -166,21 +166,28 @@ def _of_kernel(x: Array, cotangent: Array, size: int, stride: int) -> Float[Arra
     inputs, outputs = x.shape[-1], cotangent.shape[-1]
 
     def of(images: Array, cotangents: Array) -> Array:
-        patches = _patches(images, size, stride)
-        return jnp.matmul(patches.T, cotangents.reshape(-1, outputs), preferred_element_type=jnp.float32)
+        patches, exact = _patches(images, size, stride), jnp.promote_types(x.dtype, jnp.float32)
+        return jnp.matmul(patches.T, cotangents.reshape(-1, outputs), preferred_element_type=exact)
 
     total = _sum_over_parts(of, x, cotangent, cotangent[0, ..., 0].size * size * size * inputs * x.dtype.itemsize)
     return total.reshape(size, size, inputs, outputs)
 
 
 def _sum_over_parts(of: Callable[[Array, Array], Any], x: Array, cotangent: Array, bytes_of_one: int) -> Any:
-    """Sum of a function over parts of the batch, of as many images as the cache holds at `bytes_of_one` for each."""
+    """Sum of a function over parts of the batch, of as many images as the cache holds at `bytes_of_one` for each.
+
+    The batch is one part where several devices share it, since each would wait for the images of the others.
+    """
+    if jax.device_count() > 1:
+        return of(x, cotangent)
     fitting = min(max(1, _CACHED // bytes_of_one), len(x))
     count = next(count for count in range(fitting, 0, -1) if len(x) % count == 0)
     parts = tuple(array.reshape(-1, count, *array.shape[1:]) for array in (x, cotangent))
     if len(parts[0]) == 1:
         return of(x, cotangent)
-    nothing = jax.tree.map(lambda shape: jnp.zeros(shape.shape, shape.dtype), jax.eval_shape(of, parts[0][0], parts[1][0]))
+    nothing = jax.tree.map(
+        lambda shape: jnp.zeros(shape.shape, shape.dtype), jax.eval_shape(of, parts[0][0], parts[1][0])
+    )
     return jax.lax.scan(lambda total, part: (jax.tree.map(jnp.add, total, of(*part)), None), nothing, parts)[0]
 
 
@@ -263,7 +270,7 @@ def pool(x: Float[Array, "batch height width channels"]) -> Float[Array, "batch 
     """Maxima of 3×3 at every second row and column, padded by one. Among equal values, the first in the order of rows and
     columns receives the gradient, as in PyTorch.
 
-    XLA's gradient of a maximum takes 32 ms on CPU for 64 maps of 32×32 by 64, this one 4.
+    On CPU, XLA takes 32 ms for 64 maps of 32×32 by 64 with their gradient, this way 5.
     """
     if jax.default_backend() != "cpu":
         return nnx.max_pool(x, (3, 3), strides=(2, 2), padding=((1, 1), (1, 1)))

@@ -359,7 +359,7 @@ def test_jobs_begin_again_with_large_pages(monkeypatch):
 
 @pytest.mark.parametrize("program", ["/somewhere/bin/mevs", "/usr/bin/notebook"])
 def test_programs_keep_what_they_compile(program, tmp_path, monkeypatch):
-    """In the user's cache folder, within bounds; not where `main` is called from another program, nor if the user says otherwise."""
+    """In the user's cache folder, within bounds; not where another program calls `main`, nor if the user says otherwise."""
     monkeypatch.setattr(sys, "argv", [program])
     for name in ("DIR", "MAX_SIZE"):
         monkeypatch.setenv(f"JAX_COMPILATION_CACHE_{name}", "")  # so that it is as before after the test
@@ -367,10 +367,12 @@ def test_programs_keep_what_they_compile(program, tmp_path, monkeypatch):
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
     cli._keep_compiled()
     if "notebook" in program:
-        assert "JAX_COMPILATION_CACHE_DIR" not in os.environ and not list(tmp_path.iterdir())
+        assert "JAX_COMPILATION_CACHE_DIR" not in os.environ
+        assert not list(tmp_path.iterdir())
         return
     folder = Path(os.environ["JAX_COMPILATION_CACHE_DIR"])
-    assert folder.is_dir() and folder.is_relative_to(tmp_path / "cache" / "mevs_jax" / "compiled")
+    assert folder.is_dir()
+    assert folder.is_relative_to(tmp_path / "cache" / "mevs_jax" / "compiled")
     assert int(os.environ["JAX_COMPILATION_CACHE_MAX_SIZE"]) == 2**30
     monkeypatch.setenv("JAX_COMPILATION_CACHE_DIR", "/of/the/user")
     cli._keep_compiled()

@@ -18,6 +18,7 @@ import numpy as np
 import optax
 import pytest
 from flax import nnx
+from optax.contrib import muon
 
 import train.loop
 from data_pipeline.dataset.statistics import load_statistics
@@ -27,7 +28,7 @@ from eval.stages import tasks
 from train.checkpoints import Checkpoints
 from train.kept import config_of
 from train.loop import fit, load_best
-from train.optimiser import OptimiserConfig, descent, learning_rate
+from train.optimiser import OptimiserConfig, _as_matrix, descent, learning_rate
 from train.preemption import Preempted
 from train.starting_weights import weights_from_network
 from train.step import abstract_state, samples_before
@@ -68,8 +69,8 @@ def test_muon_steps_are_as_long_in_all_directions_of_a_matrix(random):
     shapes = {"kernel": (3, 3, 8, 32), "matrix": (40, 24), "head": (40, 10), "bias": (24,)}
     gradients = {name: jnp.asarray(random.normal(size=shape), jnp.float32) for name, shape in shapes.items()}
     weights = jax.tree.map(jnp.ones_like, gradients)
-    muon, nadam = descent(OptimiserConfig(method="muon")), optax.scale_by_adam(nesterov=True)
-    found, expected = (method.update(gradients, method.init(weights), weights)[0] for method in (muon, nadam))
+    of_muon, nadam = descent(OptimiserConfig(method="muon")), optax.scale_by_adam(nesterov=True)
+    found, expected = (method.update(gradients, method.init(weights), weights)[0] for method in (of_muon, nadam))
     for name in ("head", "bias"):
         np.testing.assert_allclose(found[name], expected[name], rtol=1e-5)
     for name, rows in (("kernel", 72), ("matrix", 40)):
@@ -79,6 +80,28 @@ def test_muon_steps_are_as_long_in_all_directions_of_a_matrix(random):
         assert (np.diag(along) > 0.6).all()  # Newton and Schulz's five steps come near 1, not closer
         assert (np.diag(along) < 1.3).all()
         np.testing.assert_allclose(along - np.diag(np.diag(along)), 0, atol=0.02)
+
+
+def test_muon_steps_are_those_of_optax(random):
+    """Also where a matrix is wide, and where its singular values are far apart."""
+    shapes = {"tall": (3, 3, 8, 32), "wide": (40, 90), "bias": (24,)}
+    weights = {name: jnp.zeros(shape) for name, shape in shapes.items()}
+    ours = descent(OptimiserConfig(method="muon"))
+    theirs = muon(-1.0, consistent_rms=0.2, muon_weight_dimension_numbers=lambda tree: jax.tree.map(_as_matrix, tree))
+    states = ours.init(weights), theirs.init(weights)
+    assert jax.tree.structure(states[0]) == jax.tree.structure(states[1])
+    for _ in range(3):
+        spread = np.logspace(0, -4, 24)
+        gradients = {
+            name: jnp.asarray(random.normal(size=shape) * np.resize(spread, shape[-1]), jnp.float32)
+            for name, shape in shapes.items()
+        }
+        (found, mine), (expected, other) = (
+            method.update(gradients, state, weights) for method, state in zip((ours, theirs), states, strict=True)
+        )
+        states = mine, other
+        for name in shapes:
+            np.testing.assert_allclose(found[name], expected[name], atol=1e-3)
 
 
 def test_training_learns(trained):

@@ -172,19 +172,6 @@ def test_one_input_equals_a_batch_of_one():
     assert one.shape == (10,)
 
 
-def test_small_maps_as_matrix_product_equal_the_convolution(monkeypatch):
-    from mevs_jax.models.resnet import Convolution
-
-    for size, stride in ((3, 1), (3, 2), (1, 2), (7, 2)):
-        layer = Convolution(5, 6, size, stride, rngs=nnx.Rngs(0))
-        x = jax.random.normal(jax.random.key(1), (2, 7, 7, 5))
-        by_product = outputs(layer, x)
-        with monkeypatch.context() as patched:
-            patched.setattr(jax, "default_backend", lambda: "gpu")
-            by_convolution = outputs(layer, x)
-        np.testing.assert_allclose(by_product, by_convolution, atol=1e-5)
-
-
 def test_batch_norm_in_training_updates_with_the_momentum_given():
     norm = BatchNorm(3)
     x = jax.random.normal(jax.random.key(0), (50, 3)) * 2 + 1

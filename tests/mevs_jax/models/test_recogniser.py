@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -47,17 +46,3 @@ def test_patches_take_images_that_they_fill():
     kernel[5, 0] = 1  # row 1, column 1 of a piece
     network.convolution.layer.kernel[...] = jnp.asarray(kernel)
     np.testing.assert_array_equal(network.convolution(jnp.asarray(image))[0, :, :, 0], image[0, 1::4, 1::4, 0])
-
-
-@pytest.mark.parametrize(("size", "stride"), [(7, 2), (3, 1), (3, 2), (1, 2)])
-def test_gradients_of_convolutions_are_those_of_jax(size, stride, random):
-    from mevs_jax.models.resnet import _convolve, _convolve_on_cpu
-
-    x = jnp.asarray(random.normal(size=(2, 20, 24, 3)), jnp.float32)
-    kernel = jnp.asarray(random.normal(size=(size, size, 3, 5)), jnp.float32)
-    found, expected = (
-        jax.grad(lambda x, kernel, f=f: jnp.sum(jnp.sin(f(x, kernel, stride))), argnums=(0, 1))(x, kernel)
-        for f in (_convolve_on_cpu, _convolve)
-    )
-    for mine, theirs in zip(found, expected, strict=True):
-        np.testing.assert_allclose(mine, theirs, rtol=1e-4, atol=1e-4)

@@ -1,0 +1,98 @@
+"""Every way in which a convolution is computed on CPU against XLA's own, and the pooling against XLA's and a plain loop."""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from flax import nnx
+
+from mevs_jax.models import convolution
+from mevs_jax.models.convolution import Convolution, convolve, pool
+
+WAYS = {
+    "product": convolution._product,
+    "taps": convolution._tap_by_tap,
+    "patches": convolution._convolve_on_cpu,
+    "tiles": lambda x, kernel, stride: convolution._tiled(x, kernel),
+}
+MAPS = [(1, 1), (2, 2), (3, 5), (9, 8)]
+
+
+def both(f, *arrays):
+    """A result and the gradients of a sum that depends on each of its values differently."""
+    out, of_inputs = jax.vjp(f, *arrays)
+    weights = jnp.asarray(np.random.default_rng(1).normal(size=out.shape), out.dtype)
+    return out, *of_inputs(weights)
+
+
+@pytest.mark.parametrize("way", WAYS)
+@pytest.mark.parametrize(("size", "stride"), [(1, 1), (1, 2), (3, 1), (3, 2), (7, 2)])
+def test_every_way_is_the_convolution_of_xla(way, size, stride, random, monkeypatch):
+    if way == "tiles" and (size, stride) != (3, 1):
+        pytest.skip("Winograd's tiles are of 3×3 kernels without stride")
+    monkeypatch.setattr(convolution, "_CACHED", 500)  # so that gradients are sums over parts of the batch
+    for height, width in MAPS:
+        x = jnp.asarray(random.normal(size=(6, height, width, 3)), jnp.float32)
+        kernel = jnp.asarray(random.normal(size=(size, size, 3, 5)), jnp.float32)
+        found = both(lambda x, kernel: WAYS[way](x, kernel, stride), x, kernel)
+        expected = both(lambda x, kernel: convolution._convolve(x, kernel, stride), x, kernel)
+        for mine, theirs in zip(found, expected, strict=True):
+            np.testing.assert_allclose(mine, theirs, rtol=1e-4, atol=1e-4)
+
+
+@pytest.mark.parametrize(
+    ("way", "batch", "side", "channels", "size", "stride"),
+    [
+        ("_product", 4, 4, 8, 3, 1),
+        ("_product", 4, 16, 8, 1, 2),
+        ("_convolve_on_cpu", 4, 16, 8, 3, 1),
+        ("_convolve_on_cpu", 64, 64, 64, 7, 2),
+        ("_convolve_on_cpu", 256, 16, 32, 3, 1),
+        ("_tap_by_tap", 256, 2, 256, 3, 1),
+        ("_tap_by_tap", 256, 16, 64, 3, 2),
+        ("_tiled", 256, 8, 64, 3, 1),
+    ],
+)
+def test_the_way_depends_on_the_shapes(way, batch, side, channels, size, stride, monkeypatch):
+    taken = []
+    for name in ("_product", "_convolve_on_cpu", "_tap_by_tap", "_tiled"):
+        monkeypatch.setattr(convolution, name, lambda x, *_, name=name: taken.append(name) or x)
+    shapes = jax.ShapeDtypeStruct((batch, side, side, channels), jnp.float32), (size, size, channels, channels)
+    jax.eval_shape(lambda x: convolve(x, jnp.zeros(shapes[1]), stride), shapes[0])
+    assert taken == [way]
+
+
+def test_a_layer_is_the_same_on_an_accelerator(monkeypatch):
+    layer = Convolution(5, 6, 3, 2, rngs=nnx.Rngs(0))
+    x = jax.random.normal(jax.random.key(1), (2, 7, 7, 5))
+    here = layer(x)
+    monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
+    np.testing.assert_allclose(here, layer(x), atol=1e-5)
+
+
+@pytest.mark.parametrize("equal", [False, True])
+def test_pooling_gives_its_gradient_to_the_first_maximum(equal, random, monkeypatch):
+    for height, width in [*MAPS, (5, 8), (8, 7)]:
+        x = random.normal(size=(2, height, width, 3)).astype(np.float32)
+        x = np.round(x) if equal else x
+        found = both(pool, jnp.asarray(x))
+        with monkeypatch.context() as patched:
+            patched.setattr(jax, "default_backend", lambda: "gpu")
+            expected = both(pool, jnp.asarray(x))
+        np.testing.assert_array_equal(found[0], expected[0])
+        np.testing.assert_allclose(found[1], expected[1], atol=1e-5)
+        np.testing.assert_allclose(found[1], first_of_each_window(x, found[0].shape), atol=1e-5)
+
+
+def first_of_each_window(x: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
+    """The gradient of `both`, window by window."""
+    weights = np.random.default_rng(1).normal(size=shape).astype(np.float32)
+    padded = np.pad(x, ((0, 0), (1, 1), (1, 1), (0, 0)), constant_values=-np.inf)
+    gradient = np.zeros_like(padded)
+    for image, row, column, channel in np.ndindex(shape):
+        window = padded[image, 2 * row : 2 * row + 3, 2 * column : 2 * column + 3, channel]
+        down, right = divmod(int(np.argmax(window)), window.shape[1])
+        gradient[image, 2 * row + down, 2 * column + right, channel] += weights[image, row, column, channel]
+    return gradient[:, 1:-1, 1:-1]
