@@ -26,6 +26,7 @@ lint: $(READY)
 	$(BIN)/ruff check .
 	$(BIN)/mypy
 
+bench: export GLIBC_TUNABLES = glibc.malloc.hugetlb=1  # large pages, as `mevs` asks for them; peers have them, too
 bench: $(READY)  ## what is fast, beside its peers, in one run
 	$(BIN)/python benchmarks/points.py
 	$(BIN)/python benchmarks/images.py

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import jax
 import jax.numpy as jnp
 from jax.scipy.spatial.transform import Rotation
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
 from data_pipeline.capture.casting import CaptureConfig
 from mevs_jax.cameras import Camera, look_at_origin, pixel_directions
@@ -106,10 +106,15 @@ def augment_image(
     if config.shift:
         pad = config.shift
         padded = jnp.pad(image, ((pad, pad), (pad, pad), (0, 0)))
-        drawn = strength * (jax.random.randint(shift, (2,), 0, 2 * pad + 1) - pad)
-        row, column = pad + jnp.round(drawn).astype(jnp.int32)
+        row, column = pad + random_shift(shift, pad, strength)
         image = jax.lax.dynamic_slice(padded, (row, column, 0), image.shape)
     return image
+
+
+def random_shift(key: Array, largest: int, strength: float | Array = 1.0) -> Int[Array, " 2"]:
+    """Returns a number of rows and one of columns, each of at most `largest` times `strength` in size."""
+    drawn = strength * (jax.random.randint(key, (2,), 0, 2 * largest + 1) - largest)
+    return jnp.round(drawn).astype(jnp.int32)
 
 
 @dataclass(frozen=True)
@@ -141,6 +146,7 @@ def views_after(
     images: Float[Array, "views height width 4"],
     poses: Float[Array, "views 4 4"],
     camera: CaptureConfig,
+    shifts: Int[Array, "views 2"] | None = None,
 ) -> tuple[Float[Array, "views height width 4"], Float[Array, "views 3"]]:
     """Returns views of an object whose points are multiplied by a matrix A, and the directions of the new cameras.
 
@@ -154,20 +160,24 @@ def views_after(
         images: views as `data_pipeline.dataset.inputs.depth_and_normals` returns them.
         poses: poses of the cameras that took the views.
         camera: settings of the capture.
+        shifts: numbers of rows and columns by which each image is moved afterwards, up and to the left; none by default.
     """
     side, distance = images.shape[1], camera.distance
     pinhole = Camera(jnp.eye(4), math.radians(camera.field_of_view), side)
     rays = jnp.moveaxis(pixel_directions(pinhole), -1, 0)
     undo = jnp.linalg.inv(change)
+    shifts = jnp.zeros((len(images), 2), jnp.int32) if shifts is None else shifts
 
     # One array for each coordinate: XLA is slow where the last axis has three elements.
-    def of_view(image: Array, pose: Array) -> tuple[Array, Array]:
+    def of_view(image: Array, pose: Array, shift: Array) -> tuple[Array, Array]:
         position = change @ pose[:3, 3]
         scale = distance / jnp.linalg.norm(position)
         back = pose[:3, :3].T @ undo @ look_at_origin(position)[:3, :3]  # maps directions to the old camera's frame
-        x, y, z = (sum(factor * ray for factor, ray in zip(row, rays, strict=True)) for row in back)
+        moved = rays + jnp.stack([shift[1], shift[0], 0])[:, None, None] / pinhole.focal_length
+        kept = (jnp.arange(side) + shift[:, None] >= 0) & (jnp.arange(side) + shift[:, None] < side)
+        x, y, z = (sum(factor * ray for factor, ray in zip(row, moved, strict=True)) for row in back)
         row, column = (jnp.floor(part / z * pinhole.focal_length + side / 2).astype(jnp.int32) for part in (y, x))
-        inside = (row >= 0) & (row < side) & (column >= 0) & (column < side)
+        inside = (row >= 0) & (row < side) & (column >= 0) & (column < side) & kept[0][:, None] & kept[1]
         pixel = jnp.clip(row, 0, side - 1) * side + jnp.clip(column, 0, side - 1)
         sampled = image.reshape(-1, 4).at[pixel].get(mode="promise_in_bounds")
         near, *normal = (jnp.where(inside, part, 0.0) for part in jnp.moveaxis(sampled, -1, 0))
@@ -179,4 +189,4 @@ def views_after(
         seen = jnp.stack([nearness, *(part / length for part in normal)], axis=-1)
         return seen, position / jnp.linalg.norm(position)
 
-    return jax.vmap(of_view)(images, poses)
+    return jax.vmap(of_view)(images, poses, shifts)

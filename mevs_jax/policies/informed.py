@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
@@ -22,15 +21,14 @@ def information_gain(key: Array, state: SelectionState, scene: Scene) -> Float[A
     and Brown (2002) and Wu et al. (3D ShapeNets, 2015), with a table in place of a generative model.
     """
     del key
-    expected = required(scene.knowledge, "Scene.knowledge").expected_logits
-    after = _belief_entropy(state.belief + expected)  # (classes, views)
-    return _belief_entropy(state.belief) - jax.nn.softmax(state.belief) @ after
-
-
-def _belief_entropy(belief: Float[Array, "*batch classes"]) -> Float[Array, "*batch"]:
-    """Entropy of softmax(belief) in nats."""
-    # H = log Σ exp(b) − Σ p b needs one exponential per class.
-    shifted = belief - jnp.max(belief, axis=-1, keepdims=True)
-    weight = jnp.exp(shifted)
-    total = jnp.sum(weight, axis=-1)
-    return jnp.log(total) - jnp.sum(weight * shifted, axis=-1) / total
+    expected = required(scene.knowledge, "Scene.knowledge").expected_logits  # (classes, views, classes)
+    # The softmax of belief + M is ∝ exp(belief) · exp(M). So its entropy, log Σ w − Σ w log w / Σ w for weights w, needs no
+    # exponential for each walk, only products with the same matrices for all walks. The limit keeps Σ w above zero.
+    shifted = jnp.maximum(expected - jnp.max(expected, axis=-1, keepdims=True), -80.0)
+    weights, belief = jnp.exp(shifted), state.belief - jnp.max(state.belief)
+    likelihood = jnp.exp(belief)
+    total = weights @ likelihood
+    after = jnp.log(total) - (weights @ (likelihood * belief) + (weights * shifted) @ likelihood) / total
+    own = jnp.sum(likelihood)
+    before = jnp.log(own) - likelihood @ belief / own
+    return before - likelihood / own @ after

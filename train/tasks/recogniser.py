@@ -15,13 +15,7 @@ import optax
 from flax import nnx
 
 from data_pipeline.capture.casting import CaptureConfig
-from data_pipeline.dataset.augment import (
-    ImageAugmentation,
-    ViewAugmentation,
-    augment_image,
-    object_changes,
-    views_after,
-)
+from data_pipeline.dataset.augment import ViewAugmentation, object_changes, random_shift, views_after
 from data_pipeline.dataset.batches import ViewBatches
 from data_pipeline.dataset.inputs import depth_and_normals, view_camera
 from data_pipeline.dataset.reality import RealityAugmentation, realistic_views, used_reality
@@ -165,10 +159,8 @@ class RecogniserTask:
         images, poses = by_object(inputs), by_object(poses)
         labels = batch["label"].reshape(images.shape[:2])[:, 0]
         changes = object_changes(change, len(images), self.augmentation)
-        images, directions = jax.vmap(partial(views_after, camera=self.camera))(changes, images, poses)
-        shift = ImageAugmentation(mirror=False, shift=self.shift)
-        moves = jax.random.split(move, images.shape[:2])
-        images = jax.vmap(jax.vmap(partial(augment_image, config=shift)))(moves, images)
+        shifts = jax.vmap(jax.vmap(partial(random_shift, largest=self.shift)))(jax.random.split(move, images.shape[:2]))
+        images, directions = jax.vmap(partial(views_after, camera=self.camera))(changes, images, poses, shifts)
         present = random_sets(sets, len(images), images.shape[1], images.shape[1])
         radii = self.radii(batch)
         if self.size and radii is not None:

@@ -56,6 +56,16 @@ def test_views_of_an_object_as_it_is_stay_as_they_are():
     np.testing.assert_allclose(ways, DIRECTIONS, atol=1e-6)
 
 
+def test_shifted_views_are_moved_and_filled_with_background():
+    images, poses = (jnp.asarray(array) for array in seen_from(lopsided(), DIRECTIONS))
+    shifts = np.array([[3, -2], [0, 5], [-47, 0]])
+    found, _ = views_after(jnp.eye(3), images, poses, CAMERA, jnp.asarray(shifts))
+    for view, (down, right) in enumerate(shifts):
+        padded = np.pad(np.asarray(images[view]), ((48, 48), (48, 48), (0, 0)))
+        expected = padded[48 + down : 96 + down, 48 + right : 96 + right]
+        np.testing.assert_allclose(found[view], expected, atol=1e-5)
+
+
 MIRROR, TURN = np.diag([-1.0, 1.0, 1.0]), Rotation.from_rotvec([0.4, -0.9, 0.5]).as_matrix()
 
 
