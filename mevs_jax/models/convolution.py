@@ -50,9 +50,9 @@ def convolve(
     """
     if jax.default_backend() != "cpu":
         return _convolve(x, kernel, stride)
-    size = kernel.shape[0]
+    size, images = kernel.shape[0], x.shape[0]
     places = -(-x.shape[1] // stride) * -(-x.shape[2] // stride)
-    if 2 * len(x) * places * kernel.size >= _MUCH:
+    if isinstance(images, int) and 2 * images * places * kernel.size >= _MUCH:  # it is a symbol while a program is exported
         wide = min(kernel.shape[2:]) >= _TILED_CHANNELS and x.dtype == jnp.float32
         if size == 3 and stride == 1 and places > _TINY_MAP and wide:
             return _tiled(x, kernel)
