@@ -52,7 +52,8 @@ def convolve(
         return _convolve(x, kernel, stride)
     size, images = kernel.shape[0], x.shape[0]
     places = -(-x.shape[1] // stride) * -(-x.shape[2] // stride)
-    if isinstance(images, int) and 2 * images * places * kernel.size >= _MUCH:  # it is a symbol while a program is exported
+    # While a program is exported, the number of images is a symbol.
+    if isinstance(images, int) and 2 * images * places * kernel.size >= _MUCH:
         wide = min(kernel.shape[2:]) >= _TILED_CHANNELS and x.dtype == jnp.float32
         if size == 3 and stride == 1 and places > _TINY_MAP and wide:
             return _tiled(x, kernel)
