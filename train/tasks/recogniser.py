@@ -160,7 +160,7 @@ class RecogniserTask:
         labels = batch["label"].reshape(images.shape[:2])[:, 0]
         changes = object_changes(change, len(images), self.augmentation)
         shifts = jax.vmap(jax.vmap(partial(random_shift, largest=self.shift)))(jax.random.split(move, images.shape[:2]))
-        images, directions = jax.vmap(partial(views_after, camera=self.camera))(changes, images, poses, shifts)
+        images, directions = jax.vmap(partial(views_after, camera=self.camera))(changes, images, poses, shifts=shifts)
         present = random_sets(sets, len(images), images.shape[1], images.shape[1])
         radii = self.radii(batch)
         if self.size and radii is not None:
