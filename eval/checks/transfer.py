@@ -11,7 +11,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Int
-from scipy.stats import rankdata
 
 from data_pipeline.capture.casting import Rig, capture
 from data_pipeline.dataset.inputs import metric_depth
@@ -275,5 +274,7 @@ def strangers(
 
 def auroc(scores: np.ndarray, positive: np.ndarray) -> float:
     """Probability that a positive has a higher score than a negative; equal scores count half."""
+    from scipy.stats import rankdata  # late, since it takes a quarter of a second
+
     ranks, count = rankdata(scores), int(positive.sum())
     return float((ranks[positive].sum() - count * (count + 1) / 2) / (count * (len(scores) - count)))

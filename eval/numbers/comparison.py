@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
-from scipy import stats
+from scipy.special import stdtrit
 
 from eval.walks.grid import Results
 from mevs_jax.metrics import bootstrap_interval, bootstrap_means
@@ -57,7 +57,7 @@ def interval_of_both(values: Float[np.ndarray, "*cells trainings objects"]) -> F
     variance = sum(part for part, _ in parts)
     with np.errstate(divide="ignore", invalid="ignore"):
         freedom = variance**2 / sum(part**2 / degrees for part, degrees in parts)
-    half = np.where(variance > 0, stats.t.ppf(0.975, np.nan_to_num(freedom, nan=1.0)), 0) * np.sqrt(variance)
+    half = np.where(variance > 0, stdtrit(np.nan_to_num(freedom, nan=1.0), 0.975), 0) * np.sqrt(variance)
     return np.stack([mean - half, mean + half], axis=-1)
 
 
