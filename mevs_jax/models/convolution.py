@@ -222,10 +222,14 @@ def _tiles(x: Array) -> list[list[Array]]:
     return [[part.reshape(-1, x.shape[-1]) for part in row] for row in _in_both(_OF_INPUTS, parts)]
 
 
-def _from_tiles(x: Array, kernels: list[list[Array]]) -> Array:
-    """The outputs of `_tiled`, from transformed kernels, each (inputs, outputs)."""
+def _from_tiles(x: Array, kernels: list[list[Array]], axis: int) -> Array:
+    """The outputs of `_tiled`, from transformed kernels, whose `axis` (0 or 1) is that of the channels of `x`."""
     batch, height, width, _ = x.shape
-    products = [jnp.matmul(jnp.stack(tiles), jnp.stack(row)) for tiles, row in zip(_tiles(x), kernels, strict=True)]
+    over = ((2,), (1 + axis,)), ((0,), (0,))
+    products = [
+        jax.lax.dot_general(jnp.stack(tiles), jnp.stack(row), over)
+        for tiles, row in zip(_tiles(x), kernels, strict=True)
+    ]
     outputs = _in_both(_OF_PRODUCTS, [list(row) for row in products])
     shape = batch, -(-height // 2), -(-width // 2), outputs[0][0].shape[-1]
     out = jnp.stack([jnp.stack([part.reshape(shape) for part in row], 3) for row in outputs], 2)
@@ -238,7 +242,7 @@ def _tiled(x: Array, kernel: Array) -> Array:
 
     Rounding errors are a few times those of the sum itself, some 1e-6 of the largest output.
     """
-    return _from_tiles(x, _in_both(_OF_KERNEL, [[kernel[i, j] for j in range(3)] for i in range(3)]))
+    return _from_tiles(x, _in_both(_OF_KERNEL, [[kernel[i, j] for j in range(3)] for i in range(3)]), 0)
 
 
 def _tiled_forwards(x: Array, kernel: Array) -> tuple[Array, tuple[Array, Array]]:
@@ -248,7 +252,7 @@ def _tiled_forwards(x: Array, kernel: Array) -> tuple[Array, tuple[Array, Array]
 def _tiled_backwards(residuals: tuple[Array, Array], cotangent: Array) -> tuple[Array, Array]:
     x, kernel = residuals
     flipped = _in_both(_OF_KERNEL, [[kernel[2 - i, 2 - j] for j in range(3)] for i in range(3)])
-    of_x = _from_tiles(cotangent, [[part.T for part in row] for row in flipped])
+    of_x = _from_tiles(cotangent, flipped, 1)
     of_kernels = _sum_over_parts(_of_transformed, x, cotangent, x[0].size * x.dtype.itemsize)
     of_kernel = _in_both(tuple(zip(*_OF_KERNEL, strict=True)), [list(row) for row in of_kernels])
     return of_x, jnp.stack([jnp.stack(row) for row in of_kernel])
