@@ -284,23 +284,17 @@ def pool(x: Float[Array, "batch height width channels"]) -> Float[Array, "batch 
     return _pool_along(_pool_along(x, 2), 1)
 
 
-def _before(x: Array, axis: int, fill: float) -> Array:
-    """`x` moved by one along an axis."""
-    kept = jax.lax.slice_in_dim(x, 0, x.shape[axis] - 1, axis=axis)
-    return jnp.pad(kept, [(int(axis == place), 0) for place in range(x.ndim)], constant_values=fill)
-
-
-def _after(x: Array, axis: int, fill: float) -> Array:
-    """`x` moved by one along an axis, the other way."""
-    kept = jax.lax.slice_in_dim(x, 1, None, axis=axis)
-    return jnp.pad(kept, [(0, int(axis == place)) for place in range(x.ndim)], constant_values=fill)
+def _moved(x: Array, axis: int, by: int, fill: float) -> Array:
+    """`x` moved along an axis by 1, or back by −1."""
+    fill_of = jnp.asarray(fill, x.dtype)
+    return jax.lax.pad(x, fill_of, [(by, -by, 0) if place == axis else (0, 0, 0) for place in range(x.ndim)])
 
 
 def _window(x: Array, axis: int) -> tuple[Array, Array, Array]:
     """The three values of each window along an axis: the one before a pair, and the pair."""
     pairs = x.reshape(*x.shape[:axis], -1, 2, *x.shape[axis + 1 :])
     first, second = (jax.lax.index_in_dim(pairs, which, axis + 1, keepdims=False) for which in (0, 1))
-    return _before(second, axis, -jnp.inf), first, second
+    return _moved(second, axis, 1, -jnp.inf), first, second
 
 
 @partial(jax.custom_vjp, nondiff_argnums=(1,))
@@ -320,7 +314,7 @@ def _pool_backwards(axis: int, residuals: tuple[Array, Array], cotangent: Array)
     before, first, second = _window(x, axis)
     of_first = jnp.where((before < out) & (first == out), cotangent, 0)
     of_second = jnp.where((before < out) & (first < out), cotangent, 0)
-    of_second += jnp.where(second == _after(out, axis, jnp.inf), _after(cotangent, axis, 0), 0)
+    of_second += jnp.where(second == _moved(out, axis, -1, jnp.inf), _moved(cotangent, axis, -1, 0), 0)
     return (jnp.stack([of_first, of_second], axis + 1).reshape(x.shape),)
 
 
