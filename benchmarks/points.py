@@ -86,8 +86,28 @@ def share_equal(a: np.ndarray, b: np.ndarray) -> float:
     return float(np.mean(np.asarray(a) == np.asarray(b)))
 
 
+def farthest_points(cloud: np.ndarray, centres: int, name: str, rounds: int) -> list[Row]:
+    chosen = np.asarray(farthest_point_sample(cloud, centres))
+    peers: dict[str, Callable] = {"NumPy loop": lambda: numpy_rules.farthest_point_sample(cloud, centres)}
+    notes = {}
+    if installed("fpsample"):
+        import fpsample
+
+        peers["fpsample, plain"] = lambda: fpsample.fps_sampling(cloud, centres, start_idx=0)
+        peers["fpsample, buckets"] = lambda: fpsample.bucket_fps_kdline_sampling(cloud, centres, h=5, start_idx=0)
+        for peer in ("fpsample, plain", "fpsample, buckets"):
+            notes[peer] = f"{share_equal(peers[peer](), chosen):.1%} of indices equal"
+    if installed("open3d"):
+        import open3d
+
+        theirs = open3d.geometry.PointCloud(open3d.utility.Vector3dVector(cloud))
+        peers["Open3D"] = lambda: theirs.farthest_point_down_sample(centres)
+    np.testing.assert_array_equal(peers["NumPy loop"](), chosen)
+    return compare(name, lambda: farthest_point_sample(cloud, centres), peers, rounds, notes)
+
+
 def point_operations(clouds: np.ndarray, torch_peer: Any, rounds: int) -> list[Row]:
-    sample = jax.jit(lambda cloud: farthest_point_sample(cloud, CENTRES))
+    sample = partial(farthest_point_sample, k=CENTRES)
     sample_all = jax.jit(lambda clouds: jax.lax.map(sample, clouds, batch_size=4))
     query = jax.jit(lambda cloud, centres: ball_query(cloud, centres, RADIUS, SAMPLES))
     query_all = jax.jit(jax.vmap(query))
@@ -95,23 +115,8 @@ def point_operations(clouds: np.ndarray, torch_peer: Any, rounds: int) -> list[R
     chosen = np.asarray(sample_all(clouds))
     centres = np.take_along_axis(clouds, chosen[..., None], axis=1)
     neighbours = np.asarray(query_all(clouds, centres))
-
-    one: dict[str, Callable] = {"NumPy loop": lambda: numpy_rules.farthest_point_sample(cloud, CENTRES)}
-    notes = {}
-    if installed("fpsample"):
-        import fpsample
-
-        one["fpsample, plain"] = lambda: fpsample.fps_sampling(cloud, CENTRES, start_idx=0)
-        one["fpsample, buckets"] = lambda: fpsample.bucket_fps_kdline_sampling(cloud, CENTRES, h=5, start_idx=0)
-        for name in ("fpsample, plain", "fpsample, buckets"):
-            notes[name] = f"{share_equal(one[name](), chosen[0]):.1%} of indices equal"
-    if installed("open3d"):
-        import open3d
-
-        theirs = open3d.geometry.PointCloud(open3d.utility.Vector3dVector(cloud))
-        one["Open3D"] = lambda: theirs.farthest_point_down_sample(CENTRES)
-    np.testing.assert_array_equal(one["NumPy loop"](), chosen[0])
-    rows = compare("farthest points, one cloud", lambda: sample(cloud), one, rounds, notes)
+    rows = farthest_points(cloud, CENTRES, "farthest points, one cloud", rounds)
+    rows += farthest_points(clouds[:4].reshape(-1, 3), 1024, "farthest points, one cloud of 16,384", rounds)
 
     tree = "SciPy's k-d tree"
     search: dict[str, Callable] = {tree: lambda: first_within(cKDTree(cloud), centres[0])}

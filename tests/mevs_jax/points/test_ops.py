@@ -67,6 +67,15 @@ def test_indices_at_the_thesis_sizes(points, random):
     np.testing.assert_array_equal(groups, numpy_rules.ball_query(cloud, cloud[chosen[:40]], 0.2, 64))
 
 
+@pytest.mark.parametrize("points", [1, 2, 31, 63, 65, 1023, 9000])
+def test_every_size_of_a_cloud_that_is_known(points, random):
+    cloud = clouds_of("random", random, 1, points)[0]
+    expected = numpy_rules.farthest_point_sample(cloud, min(points + 2, 70))
+    np.testing.assert_array_equal(farthest_point_sample(cloud, len(expected)), expected)
+    inside = jax.jit(lambda shift: farthest_point_sample(cloud, len(expected)) + shift)  # known while another is traced
+    np.testing.assert_array_equal(inside(1), expected + 1)
+
+
 def test_no_neighbour_gives_point_zero():
     points = np.ones((40, 3), np.float32)
     np.testing.assert_array_equal(query(points, np.zeros((2, 3), np.float32), 0.5, 5), np.zeros((2, 5)))
