@@ -45,14 +45,19 @@ class Row:
 
 
 def take_turns(calls: list[Callable[[], Any]], rounds: int) -> np.ndarray:
-    """Times in milliseconds (calls, rounds); each round runs every call once, after a warm-up."""
+    """Times in milliseconds (calls, rounds); each round runs every call once, after a warm-up.
+
+    The order changes from round to round: the threads of some libraries go on spinning for a while after a call, which slows down
+    the next one.
+    """
+    random = np.random.default_rng(0)
     for call in calls:
         jax.block_until_ready(call())
     taken = np.empty((len(calls), rounds))
     for turn in range(rounds):
-        for number, call in enumerate(calls):
+        for number in random.permutation(len(calls)):
             start = time.perf_counter()
-            jax.block_until_ready(call())
+            jax.block_until_ready(calls[number]())
             taken[number, turn] = 1000 * (time.perf_counter() - start)
     return taken
 
