@@ -27,13 +27,12 @@ from data_pipeline.progress import console
 from eval.checks.agent import compare_walks, latency, recognised, stopping
 from eval.consistency import check_classifier, check_evaluated_with, check_made_with
 from eval.learned.measure import APART, check_parts, measure, together
-from eval.learned.page import write_learned_page
 from eval.learned.system import make_learned_system
 from eval.numbers.policies import csv_of
 from eval.numbers.study import reachable_views, run_study
 from eval.rendering.policies import ascend_objects, ascent_study, load_ascent_scores
+from eval.report.current import is_current, read_history
 from eval.report.html import ReportInputs
-from eval.report.page import is_current, read_history, write_report
 from eval.run_file import plain
 from eval.settings import Settings
 from eval.system import USABLE, classifier_system, figures_of, identity_of, save_system, stored_system
@@ -205,8 +204,8 @@ def policies_of(settings: Settings, statistics: DatasetStatistics) -> tuple[OwnP
     Raises:
         DataError: if one cannot be used.
     """
-    own = load_policies(settings.policies)
-    own_rungs(own, statistics.graph, len(statistics.classes), 1)
+    if own := load_policies(settings.policies):
+        own_rungs(own, statistics.graph, len(statistics.classes), 1)
     return own
 
 
@@ -215,6 +214,7 @@ def evaluate(settings: Settings, out: Path) -> dict[str, Any]:
     statistics = load_statistics(out / "data")
     check_made_with(settings, out)
     own = policies_of(settings, statistics)
+    climbed = load_ascent_scores(out, statistics, settings.rendering)
     by_view_made = None
     if (out / BY_VIEW / "summary.json").exists():
         by_view_made = made_by(statistics, out / BY_VIEW, out / "entropy")
@@ -222,13 +222,9 @@ def evaluate(settings: Settings, out: Path) -> dict[str, Any]:
         "evaluation": asdict(settings.evaluation),
         "made_by": made_by(statistics, out / "classifier", out / "entropy"),
         "by_view": by_view_made,
-        "climbed": None,
+        "climbed": None if climbed is None else asdict(settings.rendering),
+        **({"policies": [policy.identity for policy in own]} if own else {}),
     }
-    if own:
-        identity["policies"] = [policy.identity for policy in own]
-    climbed = load_ascent_scores(out, statistics, settings.rendering)
-    if climbed is not None:
-        identity["climbed"] = asdict(settings.rendering)
     check_evaluation(settings.evaluation)
 
     def compute() -> dict[str, Any]:
@@ -328,6 +324,8 @@ def learn_to_choose(settings: Settings, out: Path) -> Path:
     check_results(metrics, "the metrics of the learned study")
     page = out / "learned" / "index.html"
     if is_first():
+        from eval.learned.page import write_learned_page
+
         keep_json(out / "learned" / "metrics.json", metrics)
         write_learned_page(metrics, load_statistics(out / "data"), page)
     make_learned_system(seeds[0], found[0])
@@ -425,6 +423,8 @@ def report(settings: Settings, preset: str, out: Path) -> Path:
 
     if is_current(page, described()):
         return page
+    from eval.report.page import write_report
+
     statistics = load_statistics(data)
     inputs = ReportInputs(
         statistics=statistics,

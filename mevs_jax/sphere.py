@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 from jaxtyping import Float
-from scipy.spatial import cKDTree
 
 from mevs_jax.arrays import AnyArray, AnyVector
 from mevs_jax.source_view import upright
@@ -57,6 +56,8 @@ def estimate_sphere(points: AnyArray, *, up: AnyVector = (0.0, 0.0, 1.0)) -> tup
 
 def _without_outliers(cloud: np.ndarray) -> np.ndarray:
     """Returns the points (kept, 3) that have neighbours close by."""
+    from scipy.spatial import cKDTree
+
     if len(cloud) > _MOST_POINTS:
         cloud = np.random.default_rng(0).permutation(cloud)[:_MOST_POINTS]
     nearest = min(_NEIGHBOURS, len(cloud) - 1)

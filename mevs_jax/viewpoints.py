@@ -15,7 +15,6 @@ import flax.struct
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
-from scipy.spatial import ConvexHull
 
 from mevs_jax.arrays import AnyArray
 
@@ -159,6 +158,8 @@ def hull_edges(points: Float[np.ndarray, "views 3"], widest: float = np.inf) -> 
         points: not all in one plane.
         widest: faces whose offset, minus their distance from the origin, is not below this are left out.
     """
+    from scipy.spatial import ConvexHull
+
     hull, near = ConvexHull(points), np.zeros((len(points), len(points)), bool)
     for a, b, c in hull.simplices[hull.equations[:, 3] < widest]:
         near[[a, b, c], [b, c, a]] = near[[b, c, a], [a, b, c]] = True

@@ -14,7 +14,6 @@ from types import TracebackType
 from typing import Any
 
 import jax
-import orbax.checkpoint as ocp
 
 from data_pipeline.distributed import is_first, is_lost_process, wait_for_all
 from data_pipeline.errors import DataError, Unreadable, reason_of
@@ -92,6 +91,8 @@ class Checkpoints:
     """Two slots, `latest` and `best`, each holding one state (a tree of arrays) and its progress (plain numbers)."""
 
     def __init__(self, folder: Path):
+        import orbax.checkpoint as ocp
+
         self._folder, self._unchecked = folder, set[str]()
         options = ocp.CheckpointManagerOptions(
             max_to_keep=1, create=True, enable_async_checkpointing=True, cleanup_tmp_directories=True
@@ -103,6 +104,8 @@ class Checkpoints:
     @interrupts_held()
     def save(self, slot: str, step: int, state: Any, progress: dict[str, Any]) -> None:
         """Starts to save into a slot; does nothing if the slot already holds this step."""
+        import orbax.checkpoint as ocp
+
         manager = self._slots[slot]
         if manager.latest_step() == step:
             return
@@ -131,6 +134,8 @@ class Checkpoints:
         Raises:
             Unreadable: if the save is damaged, or holds a state of another structure.
         """
+        import orbax.checkpoint as ocp
+
         manager = self._slots[slot]
         manager.wait_until_finished()  # a save may still be under way
         step = manager.latest_step()

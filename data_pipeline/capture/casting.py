@@ -20,7 +20,6 @@ from pathlib import Path
 from typing import Literal, Protocol, runtime_checkable
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from data_pipeline.errors import DataError
 from data_pipeline.files import npz_bytes, write_bytes
@@ -88,6 +87,8 @@ class Rig:
         """
         if not self.turned:
             return self.poses
+        from scipy.spatial.transform import Rotation
+
         turn = Rotation.from_quat(np.random.default_rng(zlib.crc32(name.encode())).normal(size=4)).as_matrix()
         position = self.poses[:, :3, 3] @ turn.T
         forward = -position / np.linalg.norm(position, axis=1, keepdims=True)

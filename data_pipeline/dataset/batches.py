@@ -13,10 +13,10 @@ from __future__ import annotations
 import os
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any, Literal
 
-import grain
 import jax
 import numpy as np
 
@@ -103,16 +103,10 @@ def views_of_example(
     return out
 
 
-class _DrawViews(grain.transforms.RandomMap):
+def _draw_views(element: dict[str, Any], rng: np.random.Generator, config: ViewBatches) -> dict[str, np.ndarray]:
     """Draws `views_per_object` of the views of an object that may be used for training."""
-
-    def __init__(self, config: ViewBatches):
-        self.config = config
-
-    def random_map(self, element: dict[str, Any], rng: np.random.Generator) -> dict[str, np.ndarray]:
-        config = self.config
-        views = rng.choice(element["trainable"], config.views_per_object, replace=False)
-        return views_of_example(element, views, points=config.points, images=config.images, random=rng)
+    views = rng.choice(element["trainable"], config.views_per_object, replace=False)
+    return views_of_example(element, views, points=config.points, images=config.images, random=rng)
 
 
 def fold_of(objects: int, folds: int) -> np.ndarray:
@@ -242,9 +236,17 @@ def train_batches(
         raise ValueError(
             f"{per_batch} objects per batch cannot be shared by {processes} processes; choose another batch size"
         )
+    import grain
+
     # The order is drawn anew for every epoch, and a batch may contain objects of two successive epochs.
     objects = _training_objects(folder, config)
-    stream = grain.MapDataset.source(objects).seed(config.seed).shuffle().repeat().random_map(_DrawViews(config))
+    stream = (
+        grain.MapDataset.source(objects)
+        .seed(config.seed)
+        .shuffle()
+        .repeat()
+        .random_map(partial(_draw_views, config=config))
+    )
     # The parts of all processes, concatenated, are the batch that a single process would read.
     parts = stream.batch(per_batch // processes, batch_fn=_join)[index::processes]
     threads = min(16, max(1, (os.cpu_count() or 1) // 2))

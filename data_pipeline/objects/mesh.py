@@ -10,6 +10,19 @@ import numpy as np
 from data_pipeline.errors import DamagedMesh, EmptyMesh
 from data_pipeline.objects.checks import check_indices
 
+MODELNET10_CLASSES = (
+    "bathtub",
+    "bed",
+    "chair",
+    "desk",
+    "dresser",
+    "monitor",
+    "night_stand",
+    "sofa",
+    "table",
+    "toilet",
+)
+"""The classes of ModelNet10, which furniture10 has too."""
 SOURCE_SPLITS = ("train", "test")
 
 LARGEST_COORDINATE = 1e30

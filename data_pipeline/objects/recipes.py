@@ -10,7 +10,6 @@ import numpy as np
 
 from data_pipeline.errors import DamagedMesh
 from data_pipeline.objects.formats import MESH_SUFFIXES, Up, parse_mesh
-from data_pipeline.objects.furniture import furniture
 from data_pipeline.objects.names import shown
 
 LARGEST_FILE = 2 << 30
@@ -25,6 +24,8 @@ class FurniturePiece:
     seed: int
 
     def load(self) -> tuple[np.ndarray, np.ndarray]:
+        from data_pipeline.objects.furniture import furniture
+
         piece = furniture(self.class_name, self.seed)
         return piece.vertices, piece.faces
 

@@ -19,7 +19,6 @@ from data_pipeline.errors import DataError, EmptyMesh
 from data_pipeline.objects.archives import list_zip
 from data_pipeline.objects.folders import list_folder
 from data_pipeline.objects.formats import AXIS_DECLARED, MESH_SUFFIXES, Up
-from data_pipeline.objects.furniture import CLASSES as FURNITURE_CLASSES
 from data_pipeline.objects.layout import (
     SPLIT_FOLDERS,
     Found,
@@ -30,7 +29,7 @@ from data_pipeline.objects.layout import (
     names_of,
     without_copies,
 )
-from data_pipeline.objects.mesh import SOURCE_SPLITS, Mesh, ObjectEntry, ObjectSource, normalise
+from data_pipeline.objects.mesh import MODELNET10_CLASSES, SOURCE_SPLITS, Mesh, ObjectEntry, ObjectSource, normalise
 from data_pipeline.objects.names import is_ignored, plain_class, say_ignored, shown
 from data_pipeline.objects.recipes import FurniturePiece, MeshFile
 from data_pipeline.objects.splits import divide
@@ -78,13 +77,13 @@ def furniture10(train_per_class: int, test_per_class: int) -> ObjectSource:
             f"furniture10 needs at least 2 training pieces and 1 test piece per class, got {train_per_class} and {test_per_class}"
         )
     entries = []
-    for label, name in enumerate(FURNITURE_CLASSES):
+    for label, name in enumerate(MODELNET10_CLASSES):
         for split, count, first in (("train", train_per_class, 0), ("test", test_per_class, 1_000_000)):
             for seed in range(first, first + count):
                 entries.append(
                     ObjectEntry(f"{name}_{split}_{seed - first:04d}", label, split, FurniturePiece(name, seed))
                 )
-    return ObjectSource("furniture10", FURNITURE_CLASSES, tuple(entries))
+    return ObjectSource("furniture10", MODELNET10_CLASSES, tuple(entries))
 
 
 def _arranged(listing: Listing, name: str, where: str, reading: Reading) -> ObjectSource:

@@ -12,8 +12,7 @@ from typing import Any
 import numpy as np
 
 from data_pipeline.errors import DataError, EmptyMesh, reason_of
-from data_pipeline.objects.furniture import CLASSES as FURNITURE_CLASSES
-from data_pipeline.objects.mesh import SOURCE_SPLITS, ObjectEntry, ObjectSource
+from data_pipeline.objects.mesh import MODELNET10_CLASSES, SOURCE_SPLITS, ObjectEntry, ObjectSource
 from data_pipeline.objects.names import shown
 
 FEWEST_VOXELS = 5
@@ -30,7 +29,7 @@ LARGEST_LABELS = 64 << 20
 
 _BYTES_PER_PART = 16 << 20
 
-VOXEL_CLASSES = FURNITURE_CLASSES
+VOXEL_CLASSES = MODELNET10_CLASSES
 """Class names of an archive of ten classes, in alphabetical order, as its labels are."""
 
 

@@ -11,7 +11,6 @@ from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from data_pipeline.capture.casting import Cast, default_caster
 from data_pipeline.objects.mesh import Mesh
@@ -73,6 +72,8 @@ def random_shot(random: np.random.Generator, distance: float, size: tuple[int, i
     radius, center = random.uniform(0.05, 0.5), random.uniform(-2, 2, 3)
     closest = min(distance, 2.0)
     focal = random.uniform(0.7, 0.9) * min(width, height) / 2 / math.tan(math.asin(1 / closest))
+    from scipy.spatial.transform import Rotation
+
     stretch = random.uniform(0.9, 1.1)
     K = np.array([[focal * stretch, 0, width / 2], [0, focal / stretch**0.5, height / 2], [0, 0, 1.0]])
     K[:2, 2] += random.uniform(-0.04, 0.04, 2) * (width, height) - 0.5

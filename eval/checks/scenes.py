@@ -14,8 +14,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
-from scipy import ndimage
-from scipy.spatial.transform import Rotation
 
 from data_pipeline.capture.casting import default_caster
 from data_pipeline.capture.sensor import Kind, SensorConfig, sense
@@ -144,6 +142,8 @@ def views_in(
         camera: of the networks' images.
         seed: of everything that is drawn: it is the same for all views of the object.
     """
+    from scipy.spatial.transform import Rotation
+
     random = np.random.default_rng(seed)
     offset, factor = np.zeros(3), 1.0
     if condition.sphere:
@@ -208,6 +208,8 @@ def _wider(mask: np.ndarray, pixels: int) -> np.ndarray:
     """A mask that is so many pixels wider than the truth."""
     if not pixels:
         return mask
+    from scipy import ndimage
+
     change = ndimage.binary_dilation if pixels > 0 else ndimage.binary_erosion
     return change(mask, iterations=abs(pixels))
 

@@ -11,7 +11,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
-from scipy.special import stdtrit
 
 from eval.walks.grid import Results
 from mevs_jax.metrics import bootstrap_interval, bootstrap_means
@@ -46,6 +45,8 @@ def interval_of_both(values: Float[np.ndarray, "*cells trainings objects"]) -> F
     Raises:
         ValueError: for fewer than two trainings or objects.
     """
+    from scipy.special import stdtrit
+
     *_, trainings, objects = values.shape
     if min(trainings, objects) < 2:
         raise ValueError(f"an interval over both needs two trainings and two objects, got {trainings} and {objects}")

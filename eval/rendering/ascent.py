@@ -14,13 +14,8 @@ from typing import Any, Literal
 
 import jax
 import jax.numpy as jnp
-import matplotlib
-
-matplotlib.use("Agg")
-import matplotlib.pyplot as plt
 import numpy as np
 from jaxtyping import Array, Float
-from matplotlib.animation import FuncAnimation, PillowWriter
 
 from data_pipeline.dataset.builder import DataConfig, open_objects
 from data_pipeline.errors import DataError, EmptyMesh
@@ -177,6 +172,10 @@ def ascend_on(data: DataConfig, config: AscentConfig, out: Path) -> tuple[str, P
 
 def animation(method: Method, thing: Any, found: Ascent, resolution: int, frames_a_second: int = 8) -> bytes:
     """Returns a GIF: the images along the best path, and all paths on a map of the objective."""
+    import matplotlib.pyplot as plt
+    from matplotlib.animation import FuncAnimation, PillowWriter
+
+    plt.switch_backend("Agg")
     longitude, latitude = np.meshgrid(np.linspace(-180, 180, 49), np.linspace(-90, 90, 25))
     along, up = np.radians(longitude), np.radians(latitude)
     directions = np.stack([np.cos(up) * np.cos(along), np.cos(up) * np.sin(along), np.sin(up)], axis=-1)

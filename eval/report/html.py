@@ -10,16 +10,17 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import groupby
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-import matplotlib.pyplot as plt
 import numpy as np
-from matplotlib.figure import Figure
 
 from data_pipeline.dataset.statistics import DatasetStatistics
 from eval.report.svg import inline
 from eval.tables import ViewTables
 from eval.walks.ladder import KNOWS, Knows
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 STYLE = Path(__file__).with_name("page.css").read_text()
 SCRIPT = Path(__file__).with_name("page.js").read_text()
@@ -93,6 +94,8 @@ def image(figure: Figure, caption: str, alt: str, kind: str = "svg") -> str:
         kind: `svg` or `png`.
     """
     content = drawn(figure, kind)
+    import matplotlib.pyplot as plt
+
     plt.close(figure)
     return embedded(content, kind, caption, alt=alt)
 

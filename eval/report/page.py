@@ -5,7 +5,6 @@ from __future__ import annotations
 import html
 import json
 import platform
-from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
@@ -15,16 +14,14 @@ import numpy as np
 
 from data_pipeline.capture.viewpoints import FILE, is_file
 from data_pipeline.dataset.builder import open_split
-from data_pipeline.files import damage_in, short_hash, write_text
-from data_pipeline.progress import console
+from data_pipeline.files import write_text
 from eval.learned.page import active_section
 from eval.report import figures
 from eval.report.confidence import confidence_section
+from eval.report.current import mark
 from eval.report.grid import compatibility_section, grid_section
 from eval.report.html import (
     MANY_CLASSES,
-    SCRIPT,
-    STYLE,
     ReportInputs,
     data_url,
     document,
@@ -36,11 +33,10 @@ from eval.report.html import (
 )
 from eval.report.next_steps import next_section
 from eval.report.policies import ascent_section, draws, ladder_section, lead, movement_section
-from eval.report.scenes import VIEWER, scenes_section
+from eval.report.scenes import scenes_section
 from eval.report.seeds import seeds_section
 from mevs_jax.viewpoints import local_maxima
 from train.chance import Chance
-from train.log import read_log
 
 _SPLITS = {"train": "training", "val": "validation", "test": "test", "other": "no split"}
 """Where the source had objects that were left out."""
@@ -214,17 +210,6 @@ def _methods_section(inputs: ReportInputs) -> str:
     )
 
 
-def read_history(folder: Path) -> list[dict[str, float]]:
-    """Returns the losses of a training by epoch. Of a damaged file, those lines that can be read, after a sentence."""
-    found = [line for line in read_log(folder / "metrics.jsonl") if {"train/loss", "val/loss"} <= line.keys()]
-    if (damage := damage_in(folder, ["metrics.jsonl"])) is not None or not found:
-        console.print(
-            f"{damage or folder / 'metrics.jsonl'}: the curves of training show the {len(found)} epochs that can be read",
-            markup=False,
-        )
-    return found
-
-
 def _chance_notice(inputs: ReportInputs) -> str:
     """A notice if the classifier's accuracy on single views of test objects is not above chance."""
     chance = Chance.of(inputs.metrics["single_view"]["accuracy"], inputs.statistics, ["test"])
@@ -251,27 +236,6 @@ _SECTIONS = (
 )
 
 
-def _mark(described: Any, content: str) -> str:
-    """Returns the last line of a page: hashes of what it was made from, with the versions of the packages, and of itself."""
-    versions = [version(package) for package in ("mevs-jax", "jax", "matplotlib")]
-    made_of = json.dumps([described, versions, STYLE, SCRIPT, VIEWER], sort_keys=True, default=str)
-    hashes = [short_hash(text.encode()) for text in (made_of, content)]
-    return f"<!-- made of {hashes[0]}, content {hashes[1]} -->\n"
-
-
-def is_current(path: Path, described: Any) -> bool:
-    """Returns whether a report was made from this, and is as it was written.
-
-    Args:
-        described: what `write_report` was given.
-    """
-    try:
-        content, line = path.read_bytes().decode().rsplit("\n", 2)[:2]
-    except (OSError, ValueError):
-        return False
-    return line + "\n" == _mark(described, content + "\n")
-
-
 def write_report(inputs: ReportInputs, path: Path, described: Any = None) -> None:
     """Writes the report as one page that needs no other file.
 
@@ -281,4 +245,4 @@ def write_report(inputs: ReportInputs, path: Path, described: Any = None) -> Non
     body = "".join(section(inputs) for section in _SECTIONS)
     title = f"Next-best-view selection: {html.escape(inputs.statistics.source)}"
     content = document(title, body)
-    write_text(path, content + _mark(described, content))
+    write_text(path, content + mark(described, content))

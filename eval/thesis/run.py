@@ -23,7 +23,7 @@ from data_pipeline.objects.sources import load_object
 from data_pipeline.progress import console
 from eval.numbers.timing import decision_memory_alone, time_ascent, time_local_maxima, time_predictor
 from eval.rendering.ascent import METHODS
-from eval.report.page import read_history
+from eval.report.current import read_history
 from eval.seeds import check_seeds
 from eval.settings import Settings
 from eval.stages import check_evaluation

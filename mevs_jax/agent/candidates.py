@@ -5,7 +5,6 @@ from __future__ import annotations
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
-from scipy.spatial import QhullError
 
 from mevs_jax.agent.core import SAME, Candidates
 from mevs_jax.trained.system import TrainedSystem
@@ -64,6 +63,8 @@ def _neighbours(points: np.ndarray, distances: np.ndarray) -> np.ndarray:
     number = len(points)
     if number <= 4:
         return ~np.eye(number, dtype=bool)
+    from scipy.spatial import QhullError
+
     try:
         neighbours = hull_edges(points)
     except QhullError:  # all in one plane

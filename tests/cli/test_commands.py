@@ -173,11 +173,12 @@ def test_all_settings_are_shown_when_they_are_asked_for(at_once):
 
 
 def test_help_and_the_library_are_there_at_once():
-    """Nothing heavy is imported for them: neither JAX nor, for the commands, tyro."""
+    """Nothing heavy is imported for them: neither JAX nor, for the commands, tyro. A run that is finished needs no plots."""
     for code, heavy in (
         ("import mevs_jax", "jax"),
         ("import mevs_jax.cli.main", "tyro"),
         ("import mevs_jax.cli.parsing", "jax"),
+        *(("import eval.stages", heavy) for heavy in ("matplotlib", "scipy.spatial", "trimesh", "grain", "orbax")),
     ):
         asked = f"{code}; import sys; sys.exit({heavy!r} in sys.modules)"
         assert subprocess.run([sys.executable, "-c", asked]).returncode == 0, code

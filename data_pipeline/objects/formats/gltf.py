@@ -17,7 +17,6 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from data_pipeline.errors import DamagedMesh, DataError, kind_and_reason_of
 from data_pipeline.objects.checks import check_indices
@@ -340,6 +339,8 @@ def _transform(translation: np.ndarray, rotation: np.ndarray, scale: np.ndarray)
     """Returns matrices (n, 4, 4) that scale, then rotate by a quaternion (x, y, z, w), then move."""
     if not all(math.isfinite(part.sum()) for part in (translation, rotation, scale)):
         raise ValueError("a transform is not finite")
+    from scipy.spatial.transform import Rotation
+
     found = np.tile(np.eye(4), (len(translation), 1, 1))
     found[:, :3, :3] = Rotation.from_quat(rotation).as_matrix() * scale[:, None, :]
     found[:, :3, 3] = translation

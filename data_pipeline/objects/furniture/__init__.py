@@ -22,10 +22,11 @@ from data_pipeline.objects.furniture.monitors import MONITORS
 from data_pipeline.objects.furniture.seats import CHAIRS, SOFAS
 from data_pipeline.objects.furniture.solids import Parts, Random, Solid, joined
 from data_pipeline.objects.furniture.tables import DESKS, TABLES
+from data_pipeline.objects.mesh import MODELNET10_CLASSES
 
 __all__ = ["CLASSES", "VARIANTS", "furniture", "joined"]
 
-CLASSES = ("bathtub", "bed", "chair", "desk", "dresser", "monitor", "night_stand", "sofa", "table", "toilet")
+CLASSES = MODELNET10_CLASSES
 
 VARIANTS: dict[str, tuple[Callable[[Random], Parts], ...]] = {
     "bathtub": BATHTUBS,
