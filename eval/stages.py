@@ -31,7 +31,7 @@ from eval.learned.system import make_learned_system
 from eval.numbers.policies import csv_of
 from eval.numbers.study import reachable_views, run_study
 from eval.rendering.policies import ascend_objects, ascent_study, load_ascent_scores
-from eval.report.current import is_current, read_history
+from eval.report.current import is_current
 from eval.report.html import ReportInputs
 from eval.run_file import plain
 from eval.settings import Settings
@@ -49,6 +49,7 @@ from train.choosing.stages import Stages, check_learned, train_recognisers, trai
 from train.devices import Layout, check_batch, device_mesh
 from train.finite import check_results, place_not_finite
 from train.kept import keep_beside, kept, kept_json, made_by, summary_of
+from train.log import read_history
 from train.loop import check_launch, fit, load_best
 from train.plan import plan_of, planned_statistics
 from train.starting_weights import StartingWeights
@@ -324,7 +325,7 @@ def learn_to_choose(settings: Settings, out: Path) -> Path:
     check_results(metrics, "the metrics of the learned study")
     page = out / "learned" / "index.html"
     if is_first():
-        from eval.learned.page import write_learned_page
+        from eval.learned.page import write_learned_page  # imported late: it needs plots
 
         keep_json(out / "learned" / "metrics.json", metrics)
         write_learned_page(metrics, load_statistics(out / "data"), page)
@@ -423,7 +424,7 @@ def report(settings: Settings, preset: str, out: Path) -> Path:
 
     if is_current(page, described()):
         return page
-    from eval.report.page import write_report
+    from eval.report.page import write_report  # imported late: it needs plots
 
     statistics = load_statistics(data)
     inputs = ReportInputs(

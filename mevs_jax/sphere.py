@@ -56,7 +56,7 @@ def estimate_sphere(points: AnyArray, *, up: AnyVector = (0.0, 0.0, 1.0)) -> tup
 
 def _without_outliers(cloud: np.ndarray) -> np.ndarray:
     """Returns the points (kept, 3) that have neighbours close by."""
-    from scipy.spatial import cKDTree
+    from scipy.spatial import cKDTree  # imported late, as elsewhere: SciPy takes a fifth of a second
 
     if len(cloud) > _MOST_POINTS:
         cloud = np.random.default_rng(0).permutation(cloud)[:_MOST_POINTS]

@@ -158,7 +158,7 @@ def hull_edges(points: Float[np.ndarray, "views 3"], widest: float = np.inf) -> 
         points: not all in one plane.
         widest: faces whose offset, minus their distance from the origin, is not below this are left out.
     """
-    from scipy.spatial import ConvexHull
+    from scipy.spatial import ConvexHull  # imported late: SciPy takes a fifth of a second
 
     hull, near = ConvexHull(points), np.zeros((len(points), len(points)), bool)
     for a, b, c in hull.simplices[hull.equations[:, 3] < widest]:

@@ -91,9 +91,9 @@ class Checkpoints:
     """Two slots, `latest` and `best`, each holding one state (a tree of arrays) and its progress (plain numbers)."""
 
     def __init__(self, folder: Path):
-        import orbax.checkpoint as ocp
+        import orbax.checkpoint as ocp  # imported late: it takes a tenth of a second
 
-        self._folder, self._unchecked = folder, set[str]()
+        self._folder, self._unchecked, self._ocp = folder, set[str](), ocp
         options = ocp.CheckpointManagerOptions(
             max_to_keep=1, create=True, enable_async_checkpointing=True, cleanup_tmp_directories=True
         )
@@ -104,15 +104,13 @@ class Checkpoints:
     @interrupts_held()
     def save(self, slot: str, step: int, state: Any, progress: dict[str, Any]) -> None:
         """Starts to save into a slot; does nothing if the slot already holds this step."""
-        import orbax.checkpoint as ocp
-
-        manager = self._slots[slot]
+        manager, args = self._slots[slot], self._ocp.args
         if manager.latest_step() == step:
             return
         self._finish()  # `best` must be complete before a `latest` that refers to it
         manager.save(
             step,
-            args=ocp.args.Composite(state=ocp.args.StandardSave(state), progress=ocp.args.JsonSave(deepcopy(progress))),
+            args=args.Composite(state=args.StandardSave(state), progress=args.JsonSave(deepcopy(progress))),
         )
         self._unchecked.add(slot)
 
@@ -134,9 +132,7 @@ class Checkpoints:
         Raises:
             Unreadable: if the save is damaged, or holds a state of another structure.
         """
-        import orbax.checkpoint as ocp
-
-        manager = self._slots[slot]
+        manager, ocp = self._slots[slot], self._ocp
         manager.wait_until_finished()  # a save may still be under way
         step = manager.latest_step()
         if step is None:

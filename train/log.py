@@ -7,7 +7,8 @@ from contextlib import suppress
 from pathlib import Path
 
 from data_pipeline.distributed import is_first
-from data_pipeline.files import write_text
+from data_pipeline.files import damage_in, write_text
+from data_pipeline.progress import console
 
 
 def read_log(path: Path) -> list[dict[str, float]]:
@@ -49,3 +50,14 @@ class MetricsLog:
     def close(self) -> None:
         if self._writes:
             self._board.close()
+
+
+def read_history(folder: Path) -> list[dict[str, float]]:
+    """Returns the losses of a training by epoch. Of a damaged file, those lines that can be read, after a sentence."""
+    found = [line for line in read_log(folder / "metrics.jsonl") if {"train/loss", "val/loss"} <= line.keys()]
+    if (damage := damage_in(folder, ["metrics.jsonl"])) is not None or not found:
+        console.print(
+            f"{damage or folder / 'metrics.jsonl'}: the curves of training show the {len(found)} epochs that can be read",
+            markup=False,
+        )
+    return found

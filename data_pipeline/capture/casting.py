@@ -87,7 +87,7 @@ class Rig:
         """
         if not self.turned:
             return self.poses
-        from scipy.spatial.transform import Rotation
+        from scipy.spatial.transform import Rotation  # imported late: it takes a fifth of a second
 
         turn = Rotation.from_quat(np.random.default_rng(zlib.crc32(name.encode())).normal(size=4)).as_matrix()
         position = self.poses[:, :3, 3] @ turn.T

@@ -236,7 +236,7 @@ def train_batches(
         raise ValueError(
             f"{per_batch} objects per batch cannot be shared by {processes} processes; choose another batch size"
         )
-    import grain
+    import grain  # imported late: it takes a sixth of a second
 
     # The order is drawn anew for every epoch, and a batch may contain objects of two successive epochs.
     objects = _training_objects(folder, config)

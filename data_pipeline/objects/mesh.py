@@ -22,7 +22,7 @@ MODELNET10_CLASSES = (
     "table",
     "toilet",
 )
-"""The classes of ModelNet10, which furniture10 has too."""
+"""The classes of ModelNet10 and of furniture10, in alphabetical order, which is the order of labels."""
 SOURCE_SPLITS = ("train", "test")
 
 LARGEST_COORDINATE = 1e30

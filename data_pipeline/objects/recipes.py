@@ -24,7 +24,7 @@ class FurniturePiece:
     seed: int
 
     def load(self) -> tuple[np.ndarray, np.ndarray]:
-        from data_pipeline.objects.furniture import furniture
+        from data_pipeline.objects.furniture import furniture  # imported late: it needs trimesh
 
         piece = furniture(self.class_name, self.seed)
         return piece.vertices, piece.faces

@@ -29,9 +29,6 @@ LARGEST_LABELS = 64 << 20
 
 _BYTES_PER_PART = 16 << 20
 
-VOXEL_CLASSES = MODELNET10_CLASSES
-"""Class names of an archive of ten classes, in alphabetical order, as its labels are."""
-
 
 @dataclass(frozen=True)
 class VoxelGrid:
@@ -190,7 +187,7 @@ def _classes(labels: dict[str, np.ndarray], named: tuple[str, ...] | None, where
         raise DataError(f"{where} has one class only; add objects of at least one other class")
     if named is not None:
         return named
-    return VOXEL_CLASSES if count == len(VOXEL_CLASSES) else tuple(f"class_{i}" for i in range(count))
+    return MODELNET10_CLASSES if count == len(MODELNET10_CLASSES) else tuple(f"class_{i}" for i in range(count))
 
 
 def _grids(archive: zipfile.ZipFile, info: zipfile.ZipInfo, count: int, where: str) -> Iterator[VoxelGrid]:

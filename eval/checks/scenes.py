@@ -142,7 +142,7 @@ def views_in(
         camera: of the networks' images.
         seed: of everything that is drawn: it is the same for all views of the object.
     """
-    from scipy.spatial.transform import Rotation
+    from scipy.spatial.transform import Rotation  # imported late: it takes a fifth of a second
 
     random = np.random.default_rng(seed)
     offset, factor = np.zeros(3), 1.0

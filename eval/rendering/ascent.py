@@ -172,10 +172,13 @@ def ascend_on(data: DataConfig, config: AscentConfig, out: Path) -> tuple[str, P
 
 def animation(method: Method, thing: Any, found: Ascent, resolution: int, frames_a_second: int = 8) -> bytes:
     """Returns a GIF: the images along the best path, and all paths on a map of the objective."""
-    import matplotlib.pyplot as plt
-    from matplotlib.animation import FuncAnimation, PillowWriter
+    from matplotlib.animation import (  # imported late: matplotlib takes a quarter of a second
+        FuncAnimation,
+        PillowWriter,
+    )
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
 
-    plt.switch_backend("Agg")
     longitude, latitude = np.meshgrid(np.linspace(-180, 180, 49), np.linspace(-90, 90, 25))
     along, up = np.radians(longitude), np.radians(latitude)
     directions = np.stack([np.cos(up) * np.cos(along), np.cos(up) * np.sin(along), np.sin(up)], axis=-1)
@@ -187,7 +190,9 @@ def animation(method: Method, thing: Any, found: Ascent, resolution: int, frames
     degrees = longitude_latitude(paths)
     poses = cameras_at(paths[best]).pose
 
-    figure, (view, sphere) = plt.subplots(1, 2, figsize=(8.4, 3.6), width_ratios=(1, 1.7), layout="constrained")
+    figure = Figure(figsize=(8.4, 3.6), layout="constrained")
+    FigureCanvasAgg(figure)
+    view, sphere = figure.subplots(1, 2, width_ratios=(1, 1.7))
     view.axis("off")
     picture = view.imshow(np.asarray(draw(thing, poses[0])), cmap="viridis_r")
     title = view.set_title("")
@@ -212,5 +217,4 @@ def animation(method: Method, thing: Any, found: Ascent, resolution: int, frames
         path = Path(folder) / "ascent.gif"
         moving.save(path, writer=PillowWriter(fps=frames_a_second))
         content = path.read_bytes()
-    plt.close(figure)
     return content

@@ -1,4 +1,7 @@
-"""Whether the report of a run is the one that its results give, without drawing it: this module imports no plots."""
+"""Whether a written report still matches the results of its run.
+
+This module imports no matplotlib, so that a finished run is checked quickly.
+"""
 
 from __future__ import annotations
 
@@ -7,11 +10,9 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
-from data_pipeline.files import damage_in, short_hash
-from data_pipeline.progress import console
+from data_pipeline.files import short_hash
 from eval.report.html import SCRIPT, STYLE
 from eval.report.scenes import VIEWER
-from train.log import read_log
 
 
 def mark(described: Any, content: str) -> str:
@@ -33,14 +34,3 @@ def is_current(path: Path, described: Any) -> bool:
     except (OSError, ValueError):
         return False
     return line + "\n" == mark(described, content + "\n")
-
-
-def read_history(folder: Path) -> list[dict[str, float]]:
-    """Returns the losses of a training by epoch. Of a damaged file, those lines that can be read, after a sentence."""
-    found = [line for line in read_log(folder / "metrics.jsonl") if {"train/loss", "val/loss"} <= line.keys()]
-    if (damage := damage_in(folder, ["metrics.jsonl"])) is not None or not found:
-        console.print(
-            f"{damage or folder / 'metrics.jsonl'}: the curves of training show the {len(found)} epochs that can be read",
-            markup=False,
-        )
-    return found

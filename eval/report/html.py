@@ -94,7 +94,7 @@ def image(figure: Figure, caption: str, alt: str, kind: str = "svg") -> str:
         kind: `svg` or `png`.
     """
     content = drawn(figure, kind)
-    import matplotlib.pyplot as plt
+    import matplotlib.pyplot as plt  # imported late: it takes a quarter of a second
 
     plt.close(figure)
     return embedded(content, kind, caption, alt=alt)

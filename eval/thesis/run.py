@@ -23,7 +23,6 @@ from data_pipeline.objects.sources import load_object
 from data_pipeline.progress import console
 from eval.numbers.timing import decision_memory_alone, time_ascent, time_local_maxima, time_predictor
 from eval.rendering.ascent import METHODS
-from eval.report.current import read_history
 from eval.seeds import check_seeds
 from eval.settings import Settings
 from eval.stages import check_evaluation
@@ -34,6 +33,7 @@ from eval.thesis.results import NO_ACCELERATOR, LatticeTables, all_results, mach
 from eval.thesis.seeds import csv_of, folders_of, over_trainings, table_of
 from train.finite import check_results
 from train.kept import keep_beside, kept_array, kept_json, made_by
+from train.log import read_history
 from train.loop import load_best
 from train.outputs import network_outputs
 from train.tasks.classifier import ClassifierTask

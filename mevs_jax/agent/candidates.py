@@ -63,7 +63,7 @@ def _neighbours(points: np.ndarray, distances: np.ndarray) -> np.ndarray:
     number = len(points)
     if number <= 4:
         return ~np.eye(number, dtype=bool)
-    from scipy.spatial import QhullError
+    from scipy.spatial import QhullError  # imported late: SciPy takes a fifth of a second
 
     try:
         neighbours = hull_edges(points)

@@ -285,7 +285,8 @@ class PointNet2(TrainedByCall):
         points, features = clouds[..., :3], clouds[..., 3:].astype(self.dtype or clouds.dtype)
         for level, perceptron in zip(self.levels, self.perceptrons, strict=True):
             sample = partial(farthest_point_sample, k=level.centres)
-            chosen = _map(sample, points, at_once=4) if jax.default_backend() == "cpu" else jax.vmap(sample)(points)
+            at_once = 4 if points.shape[1] <= 8192 else 1  # four larger clouds leave the cache
+            chosen = _map(sample, points, at_once) if jax.default_backend() == "cpu" else jax.vmap(sample)(points)
             centres = jnp.take_along_axis(points, chosen[..., None], axis=1)
             abstract = partial(_abstract, level=level, layers=perceptron.folded())
             features = _map(lambda cloud, abstract=abstract: abstract(*cloud), (points, features, centres))

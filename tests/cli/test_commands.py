@@ -173,15 +173,27 @@ def test_all_settings_are_shown_when_they_are_asked_for(at_once):
 
 
 def test_help_and_the_library_are_there_at_once():
-    """Nothing heavy is imported for them: neither JAX nor, for the commands, tyro. A run that is finished needs no plots."""
+    """Nothing heavy is imported for them: neither JAX nor, for the commands, tyro."""
     for code, heavy in (
         ("import mevs_jax", "jax"),
         ("import mevs_jax.cli.main", "tyro"),
         ("import mevs_jax.cli.parsing", "jax"),
-        *(("import eval.stages", heavy) for heavy in ("matplotlib", "scipy.spatial", "trimesh", "grain", "orbax")),
     ):
         asked = f"{code}; import sys; sys.exit({heavy!r} in sys.modules)"
         assert subprocess.run([sys.executable, "-c", asked]).returncode == 0, code
+
+
+def test_a_finished_run_imports_neither_plots_nor_meshes(whole):
+    asked = (
+        "import sys; from mevs_jax.cli.main import main\n"
+        "try: main()\n"
+        "except SystemExit as end: assert not end.code, end.code\n"
+        "print('heavy:', *{'matplotlib', 'scipy.spatial', 'trimesh', 'grain', 'orbax'} & sys.modules.keys())"
+    )
+    call = [sys.executable, "-c", asked, "run", "--out", str(whole)]
+    done = subprocess.run(call, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.splitlines()[-1] == "heavy:"
 
 
 def test_a_run_keeps_its_settings(whole, tmp_path, monkeypatch, capsys):

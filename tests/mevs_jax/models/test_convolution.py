@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from itertools import cycle
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -33,9 +35,11 @@ def both(f, *arrays):
 @pytest.mark.parametrize(("way", "size", "stride"), CASES)
 def test_every_way_is_the_convolution_of_xla(way, size, stride, random, monkeypatch):
     monkeypatch.setattr(convolution, "_CACHED", 500)  # so that gradients are sums over parts of the batch
-    for height, width in MAPS:
-        x = jnp.asarray(random.normal(size=(6, height, width, 3)), jnp.float32)
-        kernel = jnp.asarray(random.normal(size=(size, size, 3, 5)), jnp.float32)
+    for (height, width), channels in zip(
+        MAPS, cycle((3, 9)), strict=False
+    ):  # patches of few channels are gathered otherwise
+        x = jnp.asarray(random.normal(size=(6, height, width, channels)), jnp.float32)
+        kernel = jnp.asarray(random.normal(size=(size, size, channels, 5)), jnp.float32)
         found = both(lambda x, kernel: WAYS[way](x, kernel, stride), x, kernel)
         expected = both(lambda x, kernel: convolution._convolve(x, kernel, stride), x, kernel)
         for mine, theirs in zip(found, expected, strict=True):

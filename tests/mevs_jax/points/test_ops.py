@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from jax.sharding import AbstractDevice, AbstractMesh
+from jax.sharding import AbstractDevice, AbstractMesh, PartitionSpec
 
 from mevs_jax import ball_query, farthest_point_sample
 from mevs_jax.points import kernels as point_kernels
@@ -67,13 +67,33 @@ def test_indices_at_the_thesis_sizes(points, random):
     np.testing.assert_array_equal(groups, numpy_rules.ball_query(cloud, cloud[chosen[:40]], 0.2, 64))
 
 
-@pytest.mark.parametrize("points", [1, 2, 31, 63, 65, 1023, 9000])
-def test_every_size_of_a_cloud_that_is_known(points, random):
+@pytest.mark.parametrize(
+    ("points", "k"),
+    [(1, 1), (1, 3), (2, 4), (31, 33), (63, 1), (64, 65), (65, 66), (1023, 67), (8192, 20), (8193, 21), (9000, 22)],
+)
+def test_a_cloud_that_is_not_traced(points, k, random):
     cloud = clouds_of("random", random, 1, points)[0]
-    expected = numpy_rules.farthest_point_sample(cloud, min(points + 2, 70))
-    np.testing.assert_array_equal(farthest_point_sample(cloud, len(expected)), expected)
-    inside = jax.jit(lambda shift: farthest_point_sample(cloud, len(expected)) + shift)  # known while another is traced
-    np.testing.assert_array_equal(inside(1), expected + 1)
+    expected = numpy_rules.farthest_point_sample(cloud, k)
+    np.testing.assert_array_equal(farthest_point_sample(cloud, k), expected)
+
+    def inside(shift):
+        return farthest_point_sample(cloud, k) + shift
+
+    assert {str(equation.primitive) for equation in jax.make_jaxpr(inside)(1).eqns} <= {"add", "convert_element_type"}
+    np.testing.assert_array_equal(jax.vmap(inside)(jnp.arange(2))[1], expected + 1)
+
+
+def test_a_cloud_that_is_not_traced_where_it_cannot_be_compiled_by_itself(random):
+    cloud = clouds_of("random", random, 1, 40)[0]
+    expected = numpy_rules.farthest_point_sample(cloud, 5)
+    mesh = jax.make_mesh((1,), ("a",))
+    shared = jax.shard_map(
+        lambda shift: farthest_point_sample(cloud, 5) + shift,
+        mesh=mesh,
+        in_specs=PartitionSpec(),
+        out_specs=PartitionSpec(),
+    )
+    np.testing.assert_array_equal(shared(jnp.int32(1)), expected + 1)
 
 
 def test_no_neighbour_gives_point_zero():
