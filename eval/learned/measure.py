@@ -30,6 +30,7 @@ from eval.learned.walks import Learner, OnLattice
 from eval.numbers.timing import milliseconds
 from eval.tables import load_view_tables
 from eval.thesis.results import machine
+from eval.walks.knowledge import class_view_table
 from mevs_jax.models import Recogniser
 from mevs_jax.models.view_policy import expected_gain
 from train.choosing.stages import Aside, Stages, lattice_data
@@ -38,7 +39,7 @@ from train.finite import check_results
 from train.kept import kept_json, made_by
 from train.loop import load_best
 
-_FORM = 7
+_FORM = 8
 """Version of the stored walks; another version makes them stale."""
 APART = 2
 """Parts of the validation objects; stopping rules are fitted on walks of policies that were trained without their objects."""
@@ -159,6 +160,7 @@ def _walks(
             seed=stages.seed,
             apart=[learner_of(stages, method, (part, APART)) for part in range(APART)] if costs else (),
             others=not ablations,
+            training_table=_training_table(stages, views, data) if shared and not ablations else None,
         )
         arrays = {f"{name} {key}": value for name, policy in each.items() for key, value in vars(policy).items()}
         check_results(found, f"walks by the recogniser in {stages.recogniser_folder()}")
@@ -200,6 +202,7 @@ def _novel(stages: Stages) -> dict[str, Any]:
     policies = [(pair, stages.policy(without=pair)) for pair in pairs]
     identity = {
         "made_by": made_by(load_statistics(data), stages.recogniser_folder()),
+        "form": _FORM,
         "policy": read_json(stages.policy_folder() / "summary.json")["identity"],
         "walks": [pairs, stages.config.max_views, stages.config.draws],
     }
@@ -216,9 +219,16 @@ def _novel(stages: Stages) -> dict[str, Any]:
             stages.config.draws,
             stages.seed,
             load_statistics(data).neighbours,
+            _training_table(stages, f"lattice_{views}", data),
         )
 
     return kept_json(stages.folder / "walks_novel.json", identity, walk)
+
+
+def _training_table(stages: Stages, views: str, data: Path) -> Array:
+    """The class × view table of the objects that the recogniser was trained on, by their views in the data set."""
+    training = stages.features(f"{views}_train", data, "train")
+    return class_view_table(jax.nn.log_softmax(training.logits / stages.fusion().single, axis=-1), training.labels)
 
 
 def _decision(stages: Stages) -> dict[str, Any]:

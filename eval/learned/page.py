@@ -293,6 +293,7 @@ def _novel(metrics: dict[str, Any], classes: list[str]) -> str:
     for name, title in (
         ("trained_without", "trained without these classes"),
         ("trained_with", "trained with all classes"),
+        ("training_table", "information gain by a table of training objects"),
     ):
         gain = found["gain"][name]
         rows.append([title, *(difference(gain["difference"][step], gain["interval"][step]) for step in steps)])
@@ -307,7 +308,8 @@ def _novel(metrics: dict[str, Any], classes: list[str]) -> str:
     return (
         "<h2>Classes left out of policy training</h2>"
         f"<p>Gain over random in percentage points on the {found['objects']} test objects of pairs of classes that a policy was "
-        "trained without. Encoder and fusion were trained on all classes.</p>"
+        "trained without. Encoder and fusion were trained on all classes. The table holds what the recogniser says of the "
+        "objects it was trained on, by class and view; no policy was trained for it.</p>"
         + table(["policy", *(f"{step + 1} views" for step in steps)], rows)
         + table(["classes", "objects", "random, 2 views", "trained without these", "trained with all"], each)
     )

@@ -18,10 +18,12 @@ from jaxtyping import Array, Float, Int
 from data_pipeline.progress import console
 from eval.learned.stopping import Signal, WalkRecord, confidences, cost_metrics, walks_apart
 from eval.learned.walks import (
+    BY_TRAINING,
     Contender,
     Learner,
     OnLattice,
     beliefs_of,
+    by_training_table,
     contenders,
     policy_parameters,
     random_walker,
@@ -219,6 +221,7 @@ def study(
     seed: int = 0,
     apart: Sequence[Learner] = (),
     others: bool = True,
+    training_table: Float[Array, "classes views classes"] | None = None,
 ) -> tuple[dict[str, Any], dict[str, ByObject]]:
     """Returns all metrics of one lattice of candidate views, and the results of each policy by object.
 
@@ -232,6 +235,7 @@ def study(
         apart: the method trained without each part of the validation objects (every n-th); with them, the metrics of stopping and
             of movement cost are added.
         others: whether to evaluate the other policies and random sets as well.
+        training_table: class × view table of the objects that the recogniser was trained on, if it is to be compared.
     """
     points, labels = test.features.directions[0], test.features.labels
     shared = fusion.posed and bool(jnp.allclose(test.features.directions, points, atol=1e-4))
@@ -256,7 +260,10 @@ def study(
     fusions = {learner.name: learner.fusion or fusion for learner in learners}
     records: dict[str, WalkRecord] = {}
     entropies = shared and test.predicted_entropy is not None and test.entropy is not None
-    policies = contenders(learners, draws, oracle_views, every_nth, entropies, shared)
+    training = None
+    if knowledge is not None and training_table is not None:
+        training = replace(knowledge, expected_logits=training_table)
+    policies = contenders(learners, draws, oracle_views, every_nth, entropies, shared, training is not None)
     for contender in policies if others else [random_walker(draws), *map(walker, learners)]:
         name, own, walks, beliefs = contender.name, fusions.get(contender.name, fusion), [], []
         for split, data in enumerate((validation, test)):
@@ -268,7 +275,7 @@ def study(
                 own,
                 data.table(contender.believes),
                 data.features.directions,
-                knowledge,
+                training if name == BY_TRAINING else knowledge,
                 contender.max_views or max_views,
                 data.neighbours,
             )
@@ -373,24 +380,34 @@ def novel_classes(
     draws: int,
     seed: int = 0,
     neighbours: list[list[int]] | None = None,
+    training_table: Float[Array, "classes views classes"] | None = None,
 ) -> dict[str, Any]:
     """Results of policies on classes that they were trained without, with random selection and a fully trained policy.
+
+    A table of training objects, which the recogniser knows, needs no policy that was trained: it is evaluated on all classes.
 
     Args:
         policies: pairs of the classes that a policy was trained without, and the policy.
         whole: the policy that was trained on all classes.
         neighbours: as for `walk_all`.
+        training_table: as for `study`.
     """
     after: dict[str, list[np.ndarray]] = {"random": [], "trained_without": [], "trained_with": []}
+    knowledge = None
+    if training_table is not None:
+        after["training_table"] = []
+        knowledge = Knowledge(jnp.zeros(training_table.shape[1]), training_table)
     rows = []
     for classes, policy in policies:
         some = test.some(np.flatnonzero(np.isin(test.labels, classes)))
         learners = Learner("trained_without", "", policy), Learner("trained_with", "", whole)
         walkers: list[tuple[Contender, Any]] = [(random_walker(draws), None)]
         walkers += [(walker(one), policy_parameters(one, fusion)) for one in learners]
+        if knowledge:
+            walkers.append((replace(by_training_table(), name="training_table"), None))
         for contender, given in walkers:
             table, key = OnLattice(some).table(contender.believes), jax.random.key(seed)
-            views = walk_all(key, contender, given, fusion, table, some.directions, None, max_views, neighbours)
+            views = walk_all(key, contender, given, fusion, table, some.directions, knowledge, max_views, neighbours)
             right = beliefs_of(fusion, some, views).argmax(axis=-1) == np.asarray(some.labels)[:, None, None]
             after[contender.name].append(right.mean(axis=1).T)
         row = {"classes": list(classes), "objects": len(some.labels)}

@@ -205,8 +205,24 @@ def beliefs_of(
     return in_chunks(partial(_beliefs_of_some, fusion), (data, views), max(1, 1024 // views.shape[1]))
 
 
+BY_TRAINING = "information_gain_of_training"
+"""Information gain by a table of the objects that the recogniser was trained on."""
+
+
+def by_training_table() -> Contender:
+    return replace(
+        _by_name("information_gain", "information gain by a table of training objects", "others"), name=BY_TRAINING
+    )
+
+
 def contenders(
-    learners: Sequence[Learner], draws: int, oracle_views: int, oracle_starts: int, entropies: bool, shared: bool
+    learners: Sequence[Learner],
+    draws: int,
+    oracle_views: int,
+    oracle_starts: int,
+    entropies: bool,
+    shared: bool,
+    training: bool = False,
 ) -> list[Contender]:
     """All policies of the study, in the order of the tables.
 
@@ -216,6 +232,7 @@ def contenders(
         oracle_views, oracle_starts: oracles take this many views, from every n-th start view.
         entropies: whether predicted and true depth entropies are known.
         shared: whether all objects have the same candidate views in a known pose; only then do policies know about single views.
+        training: whether there is a table of training objects.
     """
     found = [random_walker(draws), _by_name("farthest", "farthest from those seen", "nothing", believes=False)]
     if entropies:
@@ -223,6 +240,8 @@ def contenders(
     if shared:
         found.append(_by_name("fixed_order", "best fixed order", "others", believes=False))
         found.append(_by_name("information_gain", "information gain by a table", "others"))
+    if training:
+        found.append(by_training_table())
     found += map(walker, learners)
     if entropies:
         found.append(_by_name("oracle_entropy", "entropy oracle (thesis)", "truth", believes=False))
