@@ -23,6 +23,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int, UInt32
 
 from mevs_jax.arrays import AnyArray
+from mevs_jax.points import farthest
 from mevs_jax.points import kernels as point_kernels
 from mevs_jax.points.bits import WORD, bits_until, set_bits
 from mevs_jax.points.distances import square, squared_distance
@@ -85,14 +86,20 @@ def _farthest(points: Float[AnyArray, "points 3"], k: int) -> Int[Array, " {k}"]
         return jax.lax.platform_dependent(
             points,
             cuda=partial(point_kernels.farthest_point_sample, k=k),
-            default=partial(_farthest_of_array, k=k),
+            default=partial(farthest.sample, k=k),
         )
-    return _farthest_of_array(points, k)
+    return farthest.sample(points, k)
+
+
+def _farthest_of_known(points: Float[AnyArray, "points 3"], k: int) -> Int[Array, " {k}"]:
+    points = jnp.asarray(points)
+    large = points.shape[0] >= farthest.LARGE and k >= 64
+    return farthest.sample_large(points, k) if large else farthest.sample(points, k)
 
 
 # A concrete cloud is compiled as a program of its own, which may have its own options: vectors of 512 bits instead of the 256
 # that XLA prefers. For 16,384 points this takes 2.7 ms instead of 3.9.
-_farthest_on_cpu = jax.jit(_farthest, static_argnums=1, compiler_options={"xla_cpu_prefer_vector_width": 512})
+_farthest_on_cpu = jax.jit(_farthest_of_known, static_argnums=1, compiler_options={"xla_cpu_prefer_vector_width": 512})
 
 
 def _check_cloud(name: str, points: AnyArray) -> None:
@@ -101,42 +108,6 @@ def _check_cloud(name: str, points: AnyArray) -> None:
         raise ValueError(f"{name} takes one cloud (points, 3), got shape {points.shape}: use jax.vmap for several")
     if not len(points):
         raise ValueError(f"{name} needs at least one point")
-
-
-def _farthest_of_array(points: Float[Array, "points 3"], k: int) -> Int[Array, " {k}"]:
-    """`farthest_point_sample` as an array program."""
-    # On CPU, XLA vectorises operations along columns, but neither argmax nor a maximum over a whole array. So the points are
-    # arranged in a grid, consecutive points below each other. The maxima of its columns give the column of the farthest point,
-    # then its row. The search among these maxima is not vectorised, so columns are few; their numbers are measured.
-    count = points.shape[0]
-    rows = max(1, count // (32 if count <= 8192 else 64))
-    padded = jnp.pad(points, ((0, -count % rows), (0, 0)))
-    x, y, z = (padded[:, axis].reshape(-1, rows).T for axis in range(3))
-    columns = x.shape[1]
-    index = jnp.arange(rows * columns).reshape(columns, rows).T
-
-    def step(i: Array, carry: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
-        chosen, nearest, last = carry
-        here = padded[last]
-        nearest = jnp.minimum(nearest, squared_distance(x - here[0], y - here[1], z - here[2]))
-        # Every value is above -2. Without this bound, XLA merges the two maxima into one, which it does not vectorise.
-        best = jnp.maximum(jnp.max(nearest, axis=0), -2.0)
-        farthest = jnp.max(best)
-        column = _first_equal(best, farthest)
-        row = _first_equal(jax.lax.dynamic_index_in_dim(nearest, column, 1, keepdims=False), farthest)
-        last = jnp.minimum(column * rows + row, count - 1)
-        return chosen.at[i].set(last), nearest, last
-
-    chosen = jnp.zeros(k, jnp.int32)
-    nearest = jnp.where(index < count, jnp.array(jnp.inf, points.dtype), -1)
-    # Four steps in an iteration of the loop take a tenth less time.
-    return jax.lax.fori_loop(1, k, step, (chosen, nearest, jnp.int32(0)), unroll=4)[0]
-
-
-def _first_equal(values: Float[Array, " n"], value: Float[Array, ""]) -> Int[Array, ""]:
-    """The smallest index at which `values` equals `value`, or the last index if it never does."""
-    index = jnp.arange(values.shape[0], dtype=jnp.int32)
-    return jnp.min(jnp.where(values == value, index, index[-1]))
 
 
 def ball_query(

@@ -11,6 +11,7 @@ import pytest
 from jax.sharding import AbstractDevice, AbstractMesh, PartitionSpec
 
 from mevs_jax import ball_query, farthest_point_sample
+from mevs_jax.points import farthest
 from mevs_jax.points import kernels as point_kernels
 from tests.reference import numpy_rules
 
@@ -69,7 +70,20 @@ def test_indices_at_the_thesis_sizes(points, random):
 
 @pytest.mark.parametrize(
     ("points", "k"),
-    [(1, 1), (1, 3), (2, 4), (31, 33), (63, 1), (64, 65), (65, 66), (1023, 67), (8192, 20), (8193, 21), (9000, 22)],
+    [
+        (1, 1),
+        (1, 3),
+        (2, 4),
+        (31, 33),
+        (63, 1),
+        (64, 65),
+        (65, 66),
+        (1023, 67),
+        (8191, 64),
+        (8192, 64),
+        (8193, 130),
+        (9000, 22),
+    ],
 )
 def test_a_cloud_that_is_not_traced(points, k, random):
     cloud = clouds_of("random", random, 1, points)[0]
@@ -81,6 +95,22 @@ def test_a_cloud_that_is_not_traced(points, k, random):
 
     assert {str(equation.primitive) for equation in jax.make_jaxpr(inside)(1).eqns} <= {"add", "convert_element_type"}
     np.testing.assert_array_equal(jax.vmap(inside)(jnp.arange(2))[1], expected + 1)
+
+
+@pytest.mark.parametrize("kind", ["random", "duplicates", "lattice", "one_point", "line", "sphere", "not finite"])
+@pytest.mark.parametrize(("points", "k"), [(300, 64), (257, 90), (128, 8)])
+def test_points_that_are_too_near_are_left_out_without_a_difference(kind, points, k, random):
+    cloud = clouds_of(kind, random, 1, points)[0]
+    if kind == "line":  # distances fall faster than estimated, or more slowly
+        cloud[:] = cloud[:, :1] ** 3
+    if kind == "sphere":
+        cloud /= np.linalg.norm(cloud, axis=1, keepdims=True)
+    if kind == "not finite":
+        cloud[40] = np.nan
+    found = jax.jit(farthest.sample_large, static_argnums=1)(cloud, k)
+    np.testing.assert_array_equal(found, jax.jit(farthest.sample, static_argnums=1)(cloud, k))
+    if np.isfinite(cloud).all():
+        np.testing.assert_array_equal(found, numpy_rules.farthest_point_sample(cloud, k))
 
 
 def test_a_cloud_that_is_not_traced_where_it_cannot_be_compiled_by_itself(random):
