@@ -98,7 +98,9 @@ def test_a_cloud_that_is_not_traced(points, k, random):
 
 
 @pytest.mark.parametrize("kind", ["random", "duplicates", "lattice", "one_point", "line", "sphere", "not finite"])
-@pytest.mark.parametrize(("points", "k"), [(300, 64), (257, 90), (128, 8)])
+@pytest.mark.parametrize(
+    ("points", "k"), [(300, 64), *(pytest.param(*size, marks=pytest.mark.slow) for size in ((257, 90), (128, 8)))]
+)
 def test_points_that_are_too_near_are_left_out_without_a_difference(kind, points, k, random):
     cloud = clouds_of(kind, random, 1, points)[0]
     if kind == "line":  # distances fall faster than estimated, or more slowly
