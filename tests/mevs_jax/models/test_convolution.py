@@ -21,7 +21,12 @@ WAYS = {
 }
 SHAPES = [(1, 1), (1, 2), (3, 1), (3, 2), (7, 2)]
 """Sizes and strides of kernels; tiles are of 3×3 kernels without stride."""
-CASES = [(way, *shape) for way in WAYS for shape in SHAPES if way != "tiles" or shape == (3, 1)]
+CASES = [
+    pytest.param(way, *shape, marks=[pytest.mark.slow] * (shape == (7, 2) and way != "patches"))
+    for way in WAYS
+    for shape in SHAPES
+    if way != "tiles" or shape == (3, 1)
+]
 MAPS = [(1, 1), (2, 2), (3, 5), (9, 8), (20, 24)]
 
 
