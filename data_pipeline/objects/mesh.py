@@ -10,18 +10,7 @@ import numpy as np
 from data_pipeline.errors import DamagedMesh, EmptyMesh
 from data_pipeline.objects.checks import check_indices
 
-MODELNET10_CLASSES = (
-    "bathtub",
-    "bed",
-    "chair",
-    "desk",
-    "dresser",
-    "monitor",
-    "night_stand",
-    "sofa",
-    "table",
-    "toilet",
-)
+MODELNET10_CLASSES = ("bathtub", "bed", "chair", "desk", "dresser", "monitor", "night_stand", "sofa", "table", "toilet")
 """The classes of ModelNet10 and of furniture10, in alphabetical order, which is the order of labels."""
 SOURCE_SPLITS = ("train", "test")
 

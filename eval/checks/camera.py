@@ -68,12 +68,12 @@ def random_shot(random: np.random.Generator, distance: float, size: tuple[int, i
         distance: from the object's centre, in radii, above 1.
         size: width and height in pixels; by default one of `SIZES`.
     """
+    from scipy.spatial.transform import Rotation  # imported late: it takes a fifth of a second
+
     width, height = size or SIZES[random.integers(len(SIZES))]
     radius, center = random.uniform(0.05, 0.5), random.uniform(-2, 2, 3)
     closest = min(distance, 2.0)
     focal = random.uniform(0.7, 0.9) * min(width, height) / 2 / math.tan(math.asin(1 / closest))
-    from scipy.spatial.transform import Rotation  # imported late: it takes a fifth of a second
-
     stretch = random.uniform(0.9, 1.1)
     K = np.array([[focal * stretch, 0, width / 2], [0, focal / stretch**0.5, height / 2], [0, 0, 1.0]])
     K[:2, 2] += random.uniform(-0.04, 0.04, 2) * (width, height) - 0.5

@@ -208,7 +208,7 @@ def _wider(mask: np.ndarray, pixels: int) -> np.ndarray:
     """A mask that is so many pixels wider than the truth."""
     if not pixels:
         return mask
-    from scipy import ndimage
+    from scipy import ndimage  # imported late: it takes a tenth of a second
 
     change = ndimage.binary_dilation if pixels > 0 else ndimage.binary_erosion
     return change(mask, iterations=abs(pixels))

@@ -11,6 +11,7 @@ from typing import Any
 from data_pipeline.dataset.statistics import DatasetStatistics
 from data_pipeline.files import write_text
 from eval.learned.study import BASELINES
+from eval.learned.walks import BY_TRAINING, by_training_table
 from eval.report import figures
 from eval.report.html import (
     MARKS,
@@ -293,7 +294,7 @@ def _novel(metrics: dict[str, Any], classes: list[str]) -> str:
     for name, title in (
         ("trained_without", "trained without these classes"),
         ("trained_with", "trained with all classes"),
-        ("training_table", "information gain by a table of training objects"),
+        (BY_TRAINING, by_training_table().title),
     ):
         gain = found["gain"][name]
         rows.append([title, *(difference(gain["difference"][step], gain["interval"][step]) for step in steps)])

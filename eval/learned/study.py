@@ -395,7 +395,7 @@ def novel_classes(
     after: dict[str, list[np.ndarray]] = {"random": [], "trained_without": [], "trained_with": []}
     knowledge = None
     if training_table is not None:
-        after["training_table"] = []
+        after[BY_TRAINING] = []
         knowledge = Knowledge(jnp.zeros(training_table.shape[1]), training_table)
     rows = []
     for classes, policy in policies:
@@ -404,7 +404,7 @@ def novel_classes(
         walkers: list[tuple[Contender, Any]] = [(random_walker(draws), None)]
         walkers += [(walker(one), policy_parameters(one, fusion)) for one in learners]
         if knowledge:
-            walkers.append((replace(by_training_table(), name="training_table"), None))
+            walkers.append((by_training_table(), None))
         for contender, given in walkers:
             table, key = OnLattice(some).table(contender.believes), jax.random.key(seed)
             views = walk_all(key, contender, given, fusion, table, some.directions, knowledge, max_views, neighbours)

@@ -23,6 +23,7 @@ from mevs_jax.arrays import AnyArray
 from mevs_jax.models.batch_norm import BatchNorm
 from mevs_jax.models.calling import TrainedByCall
 from mevs_jax.models.product import product
+from mevs_jax.points.farthest import LARGE
 from mevs_jax.points.ops import ball_query, farthest_point_sample
 
 
@@ -285,7 +286,7 @@ class PointNet2(TrainedByCall):
         points, features = clouds[..., :3], clouds[..., 3:].astype(self.dtype or clouds.dtype)
         for level, perceptron in zip(self.levels, self.perceptrons, strict=True):
             sample = partial(farthest_point_sample, k=level.centres)
-            at_once = 4 if points.shape[1] <= 8192 else 1  # four larger clouds leave the cache
+            at_once = 4 if points.shape[1] <= LARGE else 1  # four larger clouds leave the cache
             chosen = _map(sample, points, at_once) if jax.default_backend() == "cpu" else jax.vmap(sample)(points)
             centres = jnp.take_along_axis(points, chosen[..., None], axis=1)
             abstract = partial(_abstract, level=level, layers=perceptron.folded())

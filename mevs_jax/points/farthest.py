@@ -11,7 +11,8 @@ from jaxtyping import Array, Bool, Float, Int
 from mevs_jax.points.distances import squared_distance
 
 LARGE = 8192
-"""From this number of points on, points that are too near to be chosen are worth leaving out (`sample_large`)."""
+"""About as many points of a cloud, with their distances, stay in a core's cache. Beyond it the grid has more columns, clouds are
+sampled one by one, and points that are too near to be chosen are worth leaving out (`sample_large`)."""
 
 
 def sample(points: Float[Array, "points 3"], k: int) -> Int[Array, " {k}"]:

@@ -72,10 +72,8 @@ def farthest_point_sample(points: Float[AnyArray, "points 3"], k: int) -> Int[Ar
     try:
         with jax.ensure_compile_time_eval():
             return _farthest_on_cpu(points, k)
-    except (
-        ValueError,
-        RuntimeError,
-    ):  # an option that XLA does not know, or that JAX refuses here, as in some shard_maps
+    except (ValueError, RuntimeError):
+        # XLA does not know the option, or JAX refuses options here, as in a shard_map that is not compiled.
         return _farthest(points, k)
 
 

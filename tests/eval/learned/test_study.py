@@ -110,7 +110,7 @@ def test_what_looking_was_worth_is_learned_and_the_study_says_so(adding):
     table = class_view_table(parts[0][1].logits, parts[0][1].labels)
     pairs = [((0, 2), policy), ((1, 3), policy)]
     without = novel_classes(adding, pairs, policy, test, max_views=3, draws=2, training_table=table)
-    by_table = without["gain"].pop("training_table")["difference"]
+    by_table = without["gain"].pop("information_gain_of_training")["difference"]
     np.testing.assert_allclose(
         by_table[1:], (np.array(after["information_gain_of_training"]) - after["random"])[1:], atol=0.03
     )

@@ -40,9 +40,8 @@ def both(f, *arrays):
 @pytest.mark.parametrize(("way", "size", "stride"), CASES)
 def test_every_way_is_the_convolution_of_xla(way, size, stride, random, monkeypatch):
     monkeypatch.setattr(convolution, "_CACHED", 500)  # so that gradients are sums over parts of the batch
-    for (height, width), channels in zip(
-        MAPS, cycle((3, 9)), strict=False
-    ):  # patches of few channels are gathered otherwise
+    few_and_many = cycle((3, 9))  # channels: patches of few are gathered otherwise
+    for (height, width), channels in zip(MAPS, few_and_many, strict=False):
         x = jnp.asarray(random.normal(size=(6, height, width, channels)), jnp.float32)
         kernel = jnp.asarray(random.normal(size=(size, size, channels, 5)), jnp.float32)
         found = both(lambda x, kernel: WAYS[way](x, kernel, stride), x, kernel)
