@@ -198,8 +198,9 @@ def test_viewpoints_of_a_file_are_those_of_the_whole_run(whole, tmp_path, at_onc
     monkeypatch.chdir("/")
     (tmp_path / "six.json").unlink()  # a data set that is made does not need it
     ended(at_once("eval", "--out", out))
+    evaluated = len(graphs)
     ended(at_once("report", "--out", out))
-    assert len(graphs) >= 4
+    assert 0 < evaluated < len(graphs), "the evaluation and the report each use the graph"
     assert all(neighbours == sorted([min(pair), max(pair)] for pair in ring) for neighbours in graphs)
     page = (out / "report" / "index.html").read_text()
     assert "directions from a file, 6 pairs of neighbours, content " in page
