@@ -13,9 +13,9 @@ from eval.rendering.policies import RenderingConfig
 from eval.walks.grid import GridConfig
 from eval.walks.live import LiveConfig
 from mevs_jax.models import Abstraction
+from train.choosing.config import LearnedConfig
 from train.choosing.features import SetFusionConfig
 from train.choosing.policy import PolicyConfig
-from train.choosing.stages import LearnedConfig
 from train.choosing.variants import ABLATIONS
 from train.many.sweep import SweepConfig
 from train.optimiser import OptimiserConfig

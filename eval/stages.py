@@ -45,7 +45,8 @@ from eval.walks.own_policies import OwnPolicy, load_policies, own_rungs
 from mevs_jax.policies.registry import policy_named
 from mevs_jax.trained import load as load_system
 from train.chance import warn_of_chance
-from train.choosing.stages import Stages, check_learned, train_recognisers, trained_policies
+from train.choosing.config import check_learned
+from train.choosing.stages import Stages, train_recognisers, trained_policies
 from train.devices import Layout, check_batch, device_mesh
 from train.finite import check_results, place_not_finite
 from train.kept import keep_beside, kept, kept_json, made_by, summary_of

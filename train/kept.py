@@ -43,7 +43,7 @@ Result = TypeVar("Result")
 def content_of(task: Any) -> dict[str, Any]:
     """Returns a task as JSON keeps it; what was added since version 0.1 and is off is left out, as it was then."""
     content = as_read(asdict(task))
-    return {name: value for name, value in content.items() if value or name not in ("reality", "size")}
+    return {name: value for name, value in content.items() if value or name not in ("reality", "size", "azimuths")}
 
 
 def kept(

@@ -25,7 +25,7 @@ from data_pipeline.errors import DataError
 from data_pipeline.objects.mesh import Mesh
 from data_pipeline.progress import progress_bar
 from eval.checks.camera import Pair, pairs, summary
-from eval.checks.walks import Walker, beliefs_along
+from eval.checks.walks import Walker, as_table, beliefs_along
 from eval.numbers.comparison import intervals
 from eval.numbers.confidence import stopping as by_risk
 from eval.tables import ViewTables
@@ -109,7 +109,7 @@ def table_of(system: TrainedSystem, depth: Float[np.ndarray, "views side side"],
     """What the system's networks compute from every view of one object."""
     seen = [system.observe(depth[view], poses[view]) for view in range(len(depth))]
     stacked = jax.tree.map(lambda *leaves: jnp.stack(leaves), *seen)
-    return ViewTable(stacked.logits, stacked.predicted_entropy, None, jnp.int32(0), features=stacked.features)
+    return as_table(stacked, jnp.int32(0))
 
 
 def compare_walks(

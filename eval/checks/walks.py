@@ -72,7 +72,13 @@ class Observer:
             labels: of the objects; −1 for one of no known class.
         """
         found = jax.tree.map(lambda *leaves: jnp.stack(leaves), *self._seen)
-        return ViewTable(found.logits, found.predicted_entropy, None, jnp.asarray(labels), features=found.features)
+        return as_table(found, jnp.asarray(labels))
+
+
+def as_table(found: Observation, label: Int[Array, "*objects"]) -> ViewTable:
+    """The view table of what networks found in every view, of one object or several."""
+    features, azimuths = found.features, found.azimuth
+    return ViewTable(found.logits, found.predicted_entropy, None, label, features=features, azimuths=azimuths)
 
 
 def beliefs_along(
@@ -148,11 +154,12 @@ class Walker:
         system, graph = self.system, self.system.graph
         fuse, run = system.fuse(parts, posed), system.policy(policy, parts, posed)
         calibrated_as = system.calibrated_as(policy, posed)
+        knowledge = parts.knowledge if posed else parts.knowledge_by_yaw(graph.points)
         pairs = jnp.repeat(firsts, draws), jnp.tile(jnp.arange(draws), len(firsts))
 
         def around(item: tuple[Array, ViewTable]) -> tuple[Array, Array, Array]:
             number, table = item
-            scene = table.scene(graph, parts.knowledge if posed else None, can_reach)
+            scene = table.scene(graph, knowledge, can_reach)
 
             def from_view(first: Array, draw: Array) -> tuple[Array, Array, Array]:
                 own = jax.random.fold_in(jax.random.fold_in(key, number), first * draws + draw)

@@ -26,11 +26,10 @@ from data_pipeline.files import read_json, write_npz
 from data_pipeline.progress import console
 from eval.learned.stopping import MOVEMENT_COSTS, VIEW_COSTS
 from eval.learned.study import ByObject, novel_classes, seeds_together, study
-from eval.learned.walks import Learner, OnLattice
+from eval.learned.walks import Learner, OnLattice, azimuths_of
 from eval.numbers.timing import milliseconds
 from eval.tables import load_view_tables
 from eval.thesis.results import machine
-from eval.walks.knowledge import class_view_table
 from mevs_jax.models import Recogniser
 from mevs_jax.models.view_policy import expected_gain
 from train.choosing.stages import Aside, Stages, lattice_data
@@ -39,7 +38,7 @@ from train.finite import check_results
 from train.kept import kept_json, made_by
 from train.loop import load_best
 
-_FORM = 8
+_FORM = 9
 """Version of the stored walks; another version makes them stale."""
 APART = 2
 """Parts of the validation objects; stopping rules are fitted on walks of policies that were trained without their objects."""
@@ -118,8 +117,7 @@ def _walks(
     `views` names the data set in the files of features and walks.
     """
     config, method = stages.config, "learned" if posed else "learned_unposed"
-    shared = posed and data != stages.turned
-    names = [method, *ablations, *["learned_and_table"] * (shared and not ablations)]
+    names = [method, *ablations, *["learned_and_table"] * (posed and not ablations)]
     if "cloud" in names and not stages.has_clouds:
         console.print(
             f"The ablation with PointNet++ embeddings is left out; train PointNet++ with: mevs train --out {stages.out}"
@@ -130,12 +128,15 @@ def _walks(
     costs = posed and not ablations and data == stages.out / "data"
     kind = ("" if posed else "_unposed") + ("_ablations" if ablations else "")
     path = stages.folder / f"walks_{views}{kind}.json"
+    upright = stages.upright is None
+    head = stages.azimuth_head() if upright and not posed else None
 
     def objects_of(split: str) -> OnLattice:
         features = stages.features(f"{views}_{split}", data, split)
         if "cloud" in names:
             features = replace(features, clouds=stages.clouds(data, split))
-        return OnLattice(features, *_entropies(stages.out, data, split), load_statistics(data).neighbours)
+        azimuths = None if head is None else azimuths_of(head, features)
+        return OnLattice(features, *_entropies(stages.out, data, split), load_statistics(data).neighbours, azimuths)
 
     def walk() -> dict[str, Any]:
         validation, test = map(objects_of, ("val", "test"))
@@ -160,7 +161,7 @@ def _walks(
             seed=stages.seed,
             apart=[learner_of(stages, method, (part, APART)) for part in range(APART)] if costs else (),
             others=not ablations,
-            training_table=_training_table(stages, views, data) if shared and not ablations else None,
+            expected=stages.expected_views() if upright else None,
         )
         arrays = {f"{name} {key}": value for name, policy in each.items() for key, value in vars(policy).items()}
         check_results(found, f"walks by the recogniser in {stages.recogniser_folder()}")
@@ -219,16 +220,10 @@ def _novel(stages: Stages) -> dict[str, Any]:
             stages.config.draws,
             stages.seed,
             load_statistics(data).neighbours,
-            _training_table(stages, f"lattice_{views}", data),
+            stages.expected_views(),
         )
 
     return kept_json(stages.folder / "walks_novel.json", identity, walk)
-
-
-def _training_table(stages: Stages, views: str, data: Path) -> Array:
-    """The class × view table of the objects that the recogniser was trained on, by their views in the data set."""
-    training = stages.features(f"{views}_train", data, "train")
-    return class_view_table(jax.nn.log_softmax(training.logits / stages.fusion().single, axis=-1), training.labels)
 
 
 def _decision(stages: Stages) -> dict[str, Any]:

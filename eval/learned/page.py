@@ -11,7 +11,7 @@ from typing import Any
 from data_pipeline.dataset.statistics import DatasetStatistics
 from data_pipeline.files import write_text
 from eval.learned.study import BASELINES
-from eval.learned.walks import BY_TRAINING, by_training_table
+from eval.learned.walks import by_expected_views
 from eval.report import figures
 from eval.report.html import (
     MARKS,
@@ -210,13 +210,14 @@ def _lead(metrics: dict[str, Any], views: str) -> str:
     """The main results, as means over all seeds."""
     each, together = [seed["lattices"][views] for seed in metrics["seeds"]], metrics["together"][views]
     method, random = (together["policies"][name]["after_views"] for name in (METHOD, "random"))
-    gains, first, with_table = together["against"]["random"], each[0], ""
-    if "learned_and_table" in gains:
-        known = together["policies"]["learned_and_table"]["after_views"]
-        with_table = (
-            f" Combined with a table of mean logits by class and view, the policy reaches {percent(known[1])} %: "
-            f"{_gain_of_two(gains, 'learned_and_table')}."
-        )
+    gains, first, others = together["against"]["random"], each[0], ""
+    for name, title in (
+        ("information_gain", "Information gain by expected views"),
+        ("learned_and_table", "The mean of both"),
+    ):
+        if name in gains:
+            known = together["policies"][name]["after_views"]
+            others += f" {title} reaches {percent(known[1])} %: {_gain_of_two(gains, name)}."
     single = fmean(found["single_view"] for found in each)
     every, summed = (fmean(found["random_sets"][-1][name]["accuracy"] for found in each) for name in ("learned", "sum"))
     trainings = f" Means of {len(each)} seeds; the numbers below are of the first seed unless stated otherwise." * (
@@ -224,15 +225,17 @@ def _lead(metrics: dict[str, Any], views: str) -> str:
     )
     return (
         f'<p class="lead">Accuracy after two views is {percent(method[1])} % if the policy chooses the second and '
-        f"{percent(random[1])} % if it is random: {_gain_of_two(gains)} points.{with_table} Accuracy from one view is "
+        f"{percent(random[1])} % if it is random: {_gain_of_two(gains)} points.{others} Accuracy from one view is "
         f"{percent(random[0])} %, and {percent(single)} % from its logits without the fusion; from all "
         f"{first['random_sets'][-1]['views']} views it is {percent(every)} % fused and {percent(summed)} % "
         f"summed.{trainings}</p><p>A <dfn>view</dfn> is one depth image of the object from one of the candidate directions. A "
         "<dfn>policy</dfn> chooses the next view from those seen so far. The <dfn>fusion</dfn> is a network that makes one "
         "<dfn>belief</dfn>, a probability for each class, from all views seen. <i>The thesis</i> (Learning Optimal View "
         "Selection for Multi-View Object Representation) adds the <dfn>logits</dfn> instead, a classifier's numbers for each "
-        "class. The <dfn>view policy</dfn> is a network that predicts the gain of every candidate. <dfn>Calibration "
-        "error</dfn> (ECE) is the mean distance between confidence and accuracy, over bins of confidence. A <dfn>nat</dfn> is "
+        "class. The <dfn>view policy</dfn> is a network that predicts the gain of every candidate. <dfn>Expected views</dfn> are "
+        "what the recogniser says on average of its own training objects, by class and as a function of the direction; from "
+        "them the expected information gain of every candidate follows without a further network. <dfn>Calibration error"
+        "</dfn> (ECE) is the mean distance between confidence and accuracy, over bins of confidence. A <dfn>nat</dfn> is "
         "the unit of natural logarithms of probabilities; <dfn>risk</dfn> is 1 − confidence. An <dfn>oracle</dfn> knows what "
         "a robot cannot know.</p>"
         f'<p class="note">Over {first["objects"]} test objects and every start view. All policies use the same fusion, '
@@ -245,7 +248,12 @@ def _unposed(metrics: dict[str, Any]) -> str:
     """Results for objects of unknown yaw, compared with a known pose from the same start views."""
     (views, unposed), *_ = metrics["seeds"][0]["unposed"].items()
     posed = metrics["seeds"][0]["lattices"][views]["policies"]
-    rows = []
+    gains, by_yaw, rows = unposed["against"]["random"], "", []
+    if "information_gain" in gains:
+        by_yaw = (
+            " For each class, the azimuth of every view in the object's frame is estimated. Expected views are averaged over the "
+            f"yaw, weighted by its probability: {_gain_of_two(gains, 'information_gain')} points."
+        )
     for name, policy in unposed["policies"].items():
         if policy["knows"] != "truth":
             for title, found in ((policy["title"], policy), ("… pose known", posed[name])):
@@ -254,9 +262,7 @@ def _unposed(metrics: dict[str, Any]) -> str:
     return (
         "<h2>Unknown yaw</h2>"
         "<p>Objects are turned about the vertical by an unknown angle; fusion and policy receive directions relative to the "
-        "first view only. After two views the policy's gain over random is "
-        f"{_gain_of_two(unposed['against']['random'])} points. Knowledge about single views of the lattice, such as the best "
-        "fixed order, cannot be used here.</p>"
+        f"first view only. After two views the policy's gain over random is {_gain_of_two(gains)} points.{by_yaw}</p>"
         + table(["next view chosen by", *(str(step + 1) for step in range(len(rows[0]) - 1))], rows)
     )
 
@@ -294,7 +300,8 @@ def _novel(metrics: dict[str, Any], classes: list[str]) -> str:
     for name, title in (
         ("trained_without", "trained without these classes"),
         ("trained_with", "trained with all classes"),
-        (BY_TRAINING, by_training_table().title),
+        ("information_gain", by_expected_views().title),
+        ("information_gain_without", "… without expected views of these classes"),
     ):
         gain = found["gain"][name]
         rows.append([title, *(difference(gain["difference"][step], gain["interval"][step]) for step in steps)])
@@ -309,8 +316,8 @@ def _novel(metrics: dict[str, Any], classes: list[str]) -> str:
     return (
         "<h2>Classes left out of policy training</h2>"
         f"<p>Gain over random in percentage points on the {found['objects']} test objects of pairs of classes that a policy was "
-        "trained without. Encoder and fusion were trained on all classes. The table holds what the recogniser says of the "
-        "objects it was trained on, by class and view; no policy was trained for it.</p>"
+        "trained without. Encoder and fusion were trained on all classes. Expected views are those of the objects that the "
+        "recogniser was trained on; no policy was trained for them.</p>"
         + table(["policy", *(f"{step + 1} views" for step in steps)], rows)
         + table(["classes", "objects", "random, 2 views", "trained without these", "trained with all"], each)
     )

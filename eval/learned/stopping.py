@@ -19,7 +19,7 @@ from flax import nnx
 from jaxtyping import Array, Bool, Float, Int
 
 from data_pipeline.dataset.batches import fold_of
-from eval.learned.walks import Contender, Learner, OnLattice, beliefs_of, policy_parameters, walk_all, walker
+from eval.learned.walks import Contender, Known, Learner, OnLattice, beliefs_of, policy_parameters, walk_all, walker
 from eval.numbers.comparison import intervals
 from eval.numbers.confidence import logits_along, stops_at
 from eval.walks.grid import THRESHOLDS
@@ -27,7 +27,7 @@ from mevs_jax.arrays import AnyArray
 from mevs_jax.beliefs import CalibratedFusion, running_sum
 from mevs_jax.calibration import class_weights
 from mevs_jax.models.view_policy import expected_gain
-from mevs_jax.policies.base import Knowledge, Policy, with_movement
+from mevs_jax.policies.base import Policy, with_movement
 from train.choosing.chunks import in_chunks
 from train.choosing.features import Features
 from train.choosing.policy import graph_of, learned_policy
@@ -191,7 +191,7 @@ def moving(
     learner: Learner,
     fusion: CalibratedFusion,
     test: OnLattice,
-    knowledge: Knowledge | None,
+    knowledge: Known,
     max_views: int,
     every: int,
 ) -> list[dict[str, Any]]:
@@ -227,7 +227,7 @@ def walks_apart(
     apart: Sequence[Learner],
     fusion: CalibratedFusion,
     validation: OnLattice,
-    knowledge: Knowledge | None,
+    knowledge: Known,
     max_views: int,
     every: int,
     temperatures: Float[np.ndarray, " steps"],
@@ -263,7 +263,7 @@ def cost_metrics(
     held_out: HeldOut,
     fusion: CalibratedFusion,
     lattices: tuple[OnLattice, OnLattice],
-    knowledge: Knowledge | None,
+    knowledge: Known,
     records: dict[str, WalkRecord],
     max_views: int,
     every: int,

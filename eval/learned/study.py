@@ -18,12 +18,12 @@ from jaxtyping import Array, Float, Int
 from data_pipeline.progress import console
 from eval.learned.stopping import Signal, WalkRecord, confidences, cost_metrics, walks_apart
 from eval.learned.walks import (
-    BY_TRAINING,
     Contender,
+    Known,
     Learner,
     OnLattice,
     beliefs_of,
-    by_training_table,
+    by_expected_views,
     contenders,
     policy_parameters,
     random_walker,
@@ -32,7 +32,6 @@ from eval.learned.walks import (
 )
 from eval.numbers.comparison import interval_of_both, intervals
 from eval.numbers.confidence import stopping
-from eval.walks.knowledge import class_view_table
 from mevs_jax.arrays import AnyArray
 from mevs_jax.beliefs import CalibratedFusion
 from mevs_jax.calibration import (
@@ -44,6 +43,7 @@ from mevs_jax.calibration import (
 )
 from mevs_jax.metrics import bootstrap_means
 from mevs_jax.models import ViewPolicy
+from mevs_jax.models.expected_views import ExpectedViews
 from mevs_jax.policies.base import Knowledge
 from train.choosing.calibrated import beliefs_of_sets
 from train.choosing.features import Features, sets_of_size
@@ -156,10 +156,10 @@ def fixed_order_scores(
     return scores
 
 
-def learn(fusion: CalibratedFusion, data: Features, most: int) -> Knowledge:
-    """The knowledge of `fixed_order` and `information_gain`, from validation objects on the lattice."""
-    logits = jax.nn.log_softmax(data.logits / fusion.single, axis=-1)
-    return Knowledge(jnp.asarray(fixed_order_scores(fusion, data, most)), class_view_table(logits, data.labels))
+def learn(fusion: CalibratedFusion, data: Features, expected: ExpectedViews | None, most: int) -> Knowledge:
+    """What policies know about the views of a lattice: their best fixed order, of validation objects, and expected views."""
+    order = jnp.asarray(fixed_order_scores(fusion, data, most))
+    return Knowledge(order, None if expected is None else expected.at(data.directions[0]))
 
 
 BASELINES = ("random", "farthest", "fixed_order")
@@ -221,7 +221,7 @@ def study(
     seed: int = 0,
     apart: Sequence[Learner] = (),
     others: bool = True,
-    training_table: Float[Array, "classes views classes"] | None = None,
+    expected: ExpectedViews | None = None,
 ) -> tuple[dict[str, Any], dict[str, ByObject]]:
     """Returns all metrics of one lattice of candidate views, and the results of each policy by object.
 
@@ -235,13 +235,19 @@ def study(
         apart: the method trained without each part of the validation objects (every n-th); with them, the metrics of stopping and
             of movement cost are added.
         others: whether to evaluate the other policies and random sets as well.
-        training_table: class × view table of the objects that the recogniser was trained on, if it is to be compared.
+        expected: what the recogniser is expected to say of each class from every direction; for an unknown pose, used if the
+            azimuths of views are known.
     """
     points, labels = test.features.directions[0], test.features.labels
     shared = fusion.posed and bool(jnp.allclose(test.features.directions, points, atol=1e-4))
     max_views = min(max_views, len(points))
     oracle_views = min(oracle_views, max_views)
-    knowledge = learn(fusion, validation.features, max_views) if shared else None
+    known = expected if fusion.posed or validation.azimuths is not None else None
+    knowledge: Known = known
+    if shared:
+        knowledge = learn(fusion, validation.features, known, max_views)
+    elif known is not None and validation.azimuths is not None:
+        knowledge = Knowledge(by_yaw=known.by_yaw(points, validation.azimuths.shape[-1]))
     every_nth = max(1, len(points) // _TRYING_STARTS)
     some_starts = np.arange(0, len(points), every_nth)
     found: dict[str, Any] = {
@@ -260,10 +266,8 @@ def study(
     fusions = {learner.name: learner.fusion or fusion for learner in learners}
     records: dict[str, WalkRecord] = {}
     entropies = shared and test.predicted_entropy is not None and test.entropy is not None
-    training = None
-    if knowledge is not None and training_table is not None:
-        training = replace(knowledge, expected_logits=training_table)
-    policies = contenders(learners, draws, oracle_views, every_nth, entropies, shared, training is not None)
+    flags = {"entropies": entropies, "shared": shared, "expected": known is not None, "posed": fusion.posed}
+    policies = contenders(learners, draws, oracle_views, every_nth, **flags)
     for contender in policies if others else [random_walker(draws), *map(walker, learners)]:
         name, own, walks, beliefs = contender.name, fusions.get(contender.name, fusion), [], []
         for split, data in enumerate((validation, test)):
@@ -275,7 +279,7 @@ def study(
                 own,
                 data.table(contender.believes),
                 data.features.directions,
-                training if name == BY_TRAINING else knowledge,
+                knowledge,
                 contender.max_views or max_views,
                 data.neighbours,
             )
@@ -380,32 +384,33 @@ def novel_classes(
     draws: int,
     seed: int = 0,
     neighbours: list[list[int]] | None = None,
-    training_table: Float[Array, "classes views classes"] | None = None,
+    expected: ExpectedViews | None = None,
 ) -> dict[str, Any]:
     """Results of policies on classes that they were trained without, with random selection and a fully trained policy.
 
-    A table of training objects, which the recogniser knows, needs no policy that was trained: it is evaluated on all classes.
+    Expected views need no policy that was trained. They are evaluated for all classes, and without those of the classes left out,
+    as if these were not known to give any evidence.
 
     Args:
         policies: pairs of the classes that a policy was trained without, and the policy.
         whole: the policy that was trained on all classes.
         neighbours: as for `walk_all`.
-        training_table: as for `study`.
+        expected: as for `study`.
     """
     after: dict[str, list[np.ndarray]] = {"random": [], "trained_without": [], "trained_with": []}
-    knowledge = None
-    if training_table is not None:
-        after[BY_TRAINING] = []
-        knowledge = Knowledge(jnp.zeros(training_table.shape[1]), training_table)
+    if expected is not None:
+        after |= {"information_gain": [], "information_gain_without": []}
     rows = []
     for classes, policy in policies:
         some = test.some(np.flatnonzero(np.isin(test.labels, classes)))
         learners = Learner("trained_without", "", policy), Learner("trained_with", "", whole)
-        walkers: list[tuple[Contender, Any]] = [(random_walker(draws), None)]
-        walkers += [(walker(one), policy_parameters(one, fusion)) for one in learners]
-        if knowledge:
-            walkers.append((by_training_table(), None))
-        for contender, given in walkers:
+        walkers: list[tuple[Contender, Any, Known]] = [(random_walker(draws), None, None)]
+        walkers += [(walker(one), policy_parameters(one, fusion), None) for one in learners]
+        if expected is not None:
+            some_unknown = ExpectedViews(expected.coefficients.at[jnp.array(classes)].set(0.0))
+            walkers.append((by_expected_views(), None, expected))
+            walkers.append((replace(by_expected_views(), name="information_gain_without"), None, some_unknown))
+        for contender, given, knowledge in walkers:
             table, key = OnLattice(some).table(contender.believes), jax.random.key(seed)
             views = walk_all(key, contender, given, fusion, table, some.directions, knowledge, max_views, neighbours)
             right = beliefs_of(fusion, some, views).argmax(axis=-1) == np.asarray(some.labels)[:, None, None]

@@ -14,9 +14,10 @@ from eval.learned.study import learn
 from eval.run_file import versions_of
 from eval.system import MADE_WITH, data_of, identity_of, resnet_shape, save_system, stored_system
 from mevs_jax.models import Recogniser, ViewPolicy
-from mevs_jax.models.shapes import SetFusionShape, ViewPolicyShape
+from mevs_jax.models.shapes import AzimuthShape, SetFusionShape, ViewPolicyShape
 from mevs_jax.trained import Description, ImageInput, Network, Parts, TrainedSystem, fit_strangeness
 from mevs_jax.trained.description import FORM
+from mevs_jax.trained.system import BY_YAW
 from train.choosing.stages import Stages, lattice_data
 from train.kept import made_by
 from train.loop import load_best
@@ -80,14 +81,18 @@ def learned_system(stages: Stages, found: dict[str, Any], figures: dict[str, Any
     data = lattice_data(stages.dataset, stages.out, views)
     recogniser = load_best(stages.task(), stages.recogniser_folder())
     assert isinstance(recogniser, Recogniser)
-    validation = stages.features(f"lattice_{views}_val", data, "val")
+    validation, expected = stages.features(f"lattice_{views}_val", data, "val"), stages.expected_views()
     graph = load_statistics(data).graph
     fusions = {"posed": stages.fusion(), "unposed": stages.fusion(posed=False)}
     policies = {name: stages.policy(name) for name in POLICIES}
     walks = found["lattices"][str(views)]["policies"]
     temperatures = {name: of["temperatures"] for name, of in walks.items() if name in figures["after_views"]}
+    by_yaw = recogniser.azimuth is not None
     if "unposed" in found:
-        temperatures["learned_unposed"] = found["unposed"][str(views)]["policies"]["learned"]["temperatures"]
+        unposed = found["unposed"][str(views)]["policies"]
+        temperatures["learned_unposed"] = unposed["learned"]["temperatures"]
+        if by_yaw:
+            temperatures[BY_YAW] = unposed["information_gain"]["temperatures"]
     shape = config.recogniser.fusion
     description = Description(
         form=FORM,
@@ -96,13 +101,14 @@ def learned_system(stages: Stages, found: dict[str, Any], figures: dict[str, Any
         camera=view_camera(stages.statistics.camera),
         image=ImageInput("depth_and_normals", 4),
         encoder=resnet_shape(config.recogniser.network, 4),
-        best="learned",
-        best_unposed="learned_unposed",
+        best="information_gain",
+        best_unposed=BY_YAW if by_yaw else "learned_unposed",
         chosen_by="the method of the learned study, not chosen by a comparison",
         data=data_of(stages.statistics),
         made_by=made,
         made_with=versions_of(*MADE_WITH),
         size=recogniser.size_input,
+        azimuth=AzimuthShape(recogniser.azimuth.shape[1], recogniser.azimuth.width) if recogniser.azimuth else None,
         fusion=SetFusionShape(shape.width, shape.heads, shape.blocks),
         view_policies={name: _shape_of(policy, config.policy) for name, policy in policies.items()},
         evaluation=figures,
@@ -115,7 +121,9 @@ def learned_system(stages: Stages, found: dict[str, Any], figures: dict[str, Any
         single=fusions["posed"].single,
         fusion=fusions,
         view_policies={name: Network.of(policy) for name, policy in policies.items()},
-        knowledge=learn(fusions["posed"], validation, min(config.max_views, views)),
+        azimuth=Network.of(recogniser.azimuth) if recogniser.azimuth else None,
+        knowledge=learn(fusions["posed"], validation, expected, min(config.max_views, views)),
+        expected=expected,
         temperatures={name: jnp.asarray(values, jnp.float32) for name, values in temperatures.items()},
         strangeness=fit_strangeness(validation.logits, views),
     )

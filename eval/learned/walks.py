@@ -16,10 +16,14 @@ from jaxtyping import Array, Float, Int
 from mevs_jax.arrays import AnyArray
 from mevs_jax.beliefs import CalibratedFusion
 from mevs_jax.models import ViewPolicy
+from mevs_jax.models.azimuth import AzimuthHead
+from mevs_jax.models.expected_views import ExpectedViews
 from mevs_jax.policies.base import Knowledge, Policy
+from mevs_jax.policies.informed import information_gain_by_yaw
 from mevs_jax.policies.oracles import fused_oracle
 from mevs_jax.policies.registry import POLICIES
 from mevs_jax.selection import ViewTable, by_attention, select_from_table, sum_of_logits
+from mevs_jax.trained.parts import Network
 from mevs_jax.viewpoints import ViewGraph
 from train.choosing.chunks import in_chunks
 from train.choosing.features import Features
@@ -37,20 +41,24 @@ class OnLattice:
         predicted_entropy: (objects, views, views) predicted normalised entropies, if known; row i after seeing view i.
         entropy: (objects, views) true normalised entropies, if known.
         neighbours: pairs of neighbouring views, if the viewpoints have neighbours of their own (`ViewGraph.from_points`).
+        azimuths: (objects, views, classes, azimuths) log-probabilities of the azimuth of every view in the object's frame, for
+            objects of unknown yaw.
     """
 
     features: Features
     predicted_entropy: np.ndarray | None = None
     entropy: np.ndarray | None = None
     neighbours: list[list[int]] | None = None
+    azimuths: np.ndarray | None = None
 
     def table(self, with_features: bool) -> ViewTable:
         predicted_entropy, entropy = (
             None if known is None else jnp.asarray(known) for known in (self.predicted_entropy, self.entropy)
         )
         data = self.features
-        features = data.features if with_features else None
-        return ViewTable(data.logits, predicted_entropy, entropy, data.labels, features=features, clouds=data.clouds)
+        features, azimuths = (data.features, self.azimuths) if with_features else (None, None)
+        found = ViewTable(data.logits, predicted_entropy, entropy, data.labels, features=features, clouds=data.clouds)
+        return found if azimuths is None else replace(found, azimuths=jnp.asarray(azimuths))
 
 
 @dataclass(frozen=True)
@@ -114,6 +122,17 @@ def _policy_of_truth(by: str) -> Callable[[Any], Policy]:
     return partial(_oracle, by=by)
 
 
+@jax.jit
+def _azimuths_of_some(head: Network, some: tuple[Array, Array]) -> Array:
+    features, directions = some
+    return head.module(features, directions[..., 2])
+
+
+def azimuths_of(head: AzimuthHead, data: Features) -> Float[np.ndarray, "objects views classes azimuths"]:
+    """Log-probabilities of the azimuth of every view in the object's frame, for each class."""
+    return in_chunks(partial(_azimuths_of_some, Network.of(head)), (data.features, data.directions), 64)
+
+
 def _by_name(name: str, title: str, knows: str, believes: bool = True) -> Contender:
     return Contender(name, title, knows, _policy_named(name), believes)
 
@@ -137,6 +156,10 @@ def _oracle(fusion: CalibratedFusion, by: Any) -> Policy:
     return fused_oracle(fusion, by=by)
 
 
+Known = Knowledge | ExpectedViews | None
+"""What policies know about other objects."""
+
+
 @partial(jax.jit, static_argnames=("contender", "max_views"))
 def _walk_some(
     some: tuple[Array, ViewTable, Array],
@@ -144,14 +167,17 @@ def _walk_some(
     parameters: Any,
     fusion: CalibratedFusion,
     graph: ViewGraph,
-    knowledge: Knowledge | None,
+    knowledge: Known,
     max_views: int,
 ) -> Int[Array, "objects walks steps"]:
     starts = jnp.arange(0, graph.points.shape[0], contender.every)
     policy, fuse = contender.policy_of(parameters), by_attention(fusion) if contender.believes else sum_of_logits
 
     def of_object(key: Array, table: ViewTable, directions: Array) -> Array:
-        scene = table.scene(replace(graph, points=directions), knowledge)
+        known = (
+            Knowledge(expected_logits=knowledge.at(directions)) if isinstance(knowledge, ExpectedViews) else knowledge
+        )
+        scene = table.scene(replace(graph, points=directions), known)
 
         def run(key: Array, start: Array) -> Array:
             return select_from_table(key, table, scene, policy, start, max_views=max_views, fuse=fuse).views
@@ -169,7 +195,7 @@ def walk_all(
     fusion: CalibratedFusion,
     tables: ViewTable,
     directions: Float[AnyArray, "objects views 3"],
-    knowledge: Knowledge | None,
+    knowledge: Known,
     max_views: int,
     neighbours: list[list[int]] | None = None,
 ) -> Int[np.ndarray, "objects walks steps"]:
@@ -177,6 +203,7 @@ def walk_all(
 
     Args:
         directions: unit vectors to the views; the angles between views must be the same for all objects.
+        knowledge: about other objects; `ExpectedViews` are evaluated at the directions of each object.
         neighbours: pairs of neighbouring views; those of the Delaunay graph if None.
     """
     graph = ViewGraph.from_points(np.asarray(directions[0], np.float64), neighbours)
@@ -205,14 +232,13 @@ def beliefs_of(
     return in_chunks(partial(_beliefs_of_some, fusion), (data, views), max(1, 1024 // views.shape[1]))
 
 
-BY_TRAINING = "information_gain_of_training"
-"""Information gain by a table of the objects that the recogniser was trained on."""
+def _by_yaw(_: Any) -> Policy:
+    return information_gain_by_yaw
 
 
-def by_training_table() -> Contender:
-    return replace(
-        _by_name("information_gain", "information gain by a table of training objects", "others"), name=BY_TRAINING
-    )
+def by_expected_views(posed: bool = True) -> Contender:
+    found = _by_name("information_gain", "information gain by expected views", "others")
+    return found if posed else replace(found, policy_of=_by_yaw)
 
 
 def contenders(
@@ -220,9 +246,11 @@ def contenders(
     draws: int,
     oracle_views: int,
     oracle_starts: int,
+    *,
     entropies: bool,
     shared: bool,
-    training: bool = False,
+    expected: bool,
+    posed: bool,
 ) -> list[Contender]:
     """All policies of the study, in the order of the tables.
 
@@ -231,17 +259,17 @@ def contenders(
         draws: walks of random policies from each start view.
         oracle_views, oracle_starts: oracles take this many views, from every n-th start view.
         entropies: whether predicted and true depth entropies are known.
-        shared: whether all objects have the same candidate views in a known pose; only then do policies know about single views.
-        training: whether there is a table of training objects.
+        shared: whether all objects have the same candidate views in a known pose; only then is there a fixed order of views.
+        expected: whether it is known what the recogniser is expected to say of each class, from every direction.
+        posed: whether the pose of the objects is known.
     """
     found = [random_walker(draws), _by_name("farthest", "farthest from those seen", "nothing", believes=False)]
     if entropies:
         found.append(_by_name("predicted_entropy", "PointNet++ entropy (thesis)", "networks", believes=False))
     if shared:
         found.append(_by_name("fixed_order", "best fixed order", "others", believes=False))
-        found.append(_by_name("information_gain", "information gain by a table", "others"))
-    if training:
-        found.append(by_training_table())
+    if expected:
+        found.append(by_expected_views(posed))
     found += map(walker, learners)
     if entropies:
         found.append(_by_name("oracle_entropy", "entropy oracle (thesis)", "truth", believes=False))

@@ -96,7 +96,7 @@ class Programs:
     def _first(self, parts: Parts, candidates: core.Candidates) -> Array:
         """Scores of the first view, from 0 to 1: the best fixed order of views where there is one, else views from above."""
         slots = jnp.zeros(self._most)
-        if self._posed and parts.knowledge is not None:
+        if self._posed and parts.knowledge is not None and parts.knowledge.order is not None:
             order = candidates.weights @ parts.knowledge.order
             return jnp.concatenate([order / jnp.max(parts.knowledge.order), slots])
         return jnp.concatenate([1 - jnp.abs(candidates.directions[:, 2] - 0.5), slots])

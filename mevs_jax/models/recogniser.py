@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import jax
 import jax.numpy as jnp
 from flax import nnx
 from jaxtyping import Array, Bool, Float
 
 from mevs_jax.arrays import AnyArray
 from mevs_jax.inputs import SizeInput
+from mevs_jax.models.azimuth import AzimuthHead
 from mevs_jax.models.calling import TrainedByCall
 from mevs_jax.models.resnet import ResNet
 from mevs_jax.models.set_fusion import SetFusion
@@ -23,10 +25,13 @@ class Recogniser(TrainedByCall):
         fusion: computes logits from the features and directions of any set of views.
         size: how the object's radius is used: a vector that depends on it is added to the features of its views. None: not at
             all.
+        azimuth: from the features of a view to the azimuth of the camera in the object's frame; None: it is not estimated.
     """
 
-    def __init__(self, encoder: ResNet, fusion: SetFusion, size: SizeInput | None = None):
-        self.encoder, self.fusion, self.size_input = encoder, fusion, size
+    def __init__(
+        self, encoder: ResNet, fusion: SetFusion, size: SizeInput | None = None, azimuth: AzimuthHead | None = None
+    ):
+        self.encoder, self.fusion, self.size_input, self.azimuth = encoder, fusion, size, azimuth
         shape = (size.steps, encoder.head.in_features) if size else None
         self.size = nnx.Param(jnp.zeros(shape)) if shape else None
 
@@ -58,7 +63,12 @@ class Recogniser(TrainedByCall):
         *,
         train: bool = False,
         key: Array | None = None,
-    ) -> tuple[Float[Array, "*batch views classes"], Float[Array, "*batch classes"], Float[Array, "*batch classes"]]:
+    ) -> tuple[
+        Float[Array, "*batch views classes"],
+        Float[Array, "*batch classes"],
+        Float[Array, "*batch classes"],
+        Float[Array, "*batch views classes azimuths"] | None,
+    ]:
         """Logits of every single view, and of the present views of each object together.
 
         Args:
@@ -70,11 +80,16 @@ class Recogniser(TrainedByCall):
             key: PRNG key for dropout in the fusion; no dropout without.
 
         Returns:
-            Logits of single views; fused logits for a known pose; fused logits for an unknown pose.
+            Logits of single views; fused logits for a known pose; fused logits for an unknown pose; log-probabilities of the
+            azimuth of each view, None without such a head.
         """
         features = self.features(images, radius, train=train)
         posed, unposed = (self.fusion(features, directions, present, key, posed=known) for known in (True, False))
-        return self.encoder.head(features), posed, unposed
+        azimuth = None
+        if self.azimuth is not None:
+            drop = None if key is None else jax.random.fold_in(key, 1)
+            azimuth = self.azimuth(features, jnp.asarray(directions)[..., 2], drop)
+        return self.encoder.head(features), posed, unposed, azimuth
 
     def see(
         self, images: Float[AnyArray, "*batch height width channels"], radius: Float[AnyArray, "*batch"] | None = None

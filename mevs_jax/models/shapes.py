@@ -7,6 +7,7 @@ from typing import Literal
 
 from flax import nnx
 
+from mevs_jax.models.azimuth import AzimuthHead
 from mevs_jax.models.pointnet2 import Abstraction, PointNet2
 from mevs_jax.models.resnet import ResNet
 from mevs_jax.models.set_fusion import SetFusion
@@ -68,6 +69,18 @@ class SetFusionShape:
         """Returns a network of this shape with random weights, without dropout."""
         shape = {"width": self.width, "heads": self.heads, "blocks": self.blocks}
         return SetFusion(features, classes, **shape, dropout=0.0, rngs=rngs)
+
+
+@dataclass(frozen=True)
+class AzimuthShape:
+    """Arguments of `AzimuthHead`."""
+
+    azimuths: int
+    width: int
+
+    def network(self, features: int, classes: int, rngs: nnx.Rngs) -> AzimuthHead:
+        """Returns a network of this shape with random weights, without dropout."""
+        return AzimuthHead(features, classes, azimuths=self.azimuths, width=self.width, dropout=0.0, rngs=rngs)
 
 
 @dataclass(frozen=True)

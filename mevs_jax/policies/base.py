@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import TypeVar
+from typing import Literal, TypeVar
 
 import flax.struct
 import jax.numpy as jnp
@@ -21,12 +21,15 @@ class Observation:
         predicted_entropy: (views,) from the entropy predictor, for every candidate view; None where it is not used.
         features: (features,) from the encoder, for a learned fusion; None where it is not used.
         cloud: (embedding,) of the partial cloud, from PointNet++; None where it is not used.
+        azimuth: (classes, azimuths) log-probabilities of the camera's azimuth in the object's frame for each class; None where it
+            is not estimated.
     """
 
     logits: Float[Array, "*batch classes"]
     predicted_entropy: Float[Array, "*batch views"] | None = None
     features: Float[Array, "*batch features"] | None = None
     cloud: Float[Array, "*batch embedding"] | None = None
+    azimuth: Float[Array, "*batch classes azimuths"] | None = None
 
 
 @flax.struct.dataclass
@@ -54,15 +57,18 @@ class SelectionState:
 
 @flax.struct.dataclass
 class Knowledge:
-    """Statistics over other objects, none of which is a test object.
+    """Statistics over other objects, none of which is a test object. Each is None where it is not known.
 
     Attributes:
         order: (views,) scores of the best fixed order; the view with the highest score comes first.
         expected_logits: (classes, views, classes); entry [y, j] is the mean logits at view j of objects of class y.
+        by_yaw: (classes, yaws, views, classes); entry [y, k, j] is the mean logits at view j of objects of class y that are
+            turned about the vertical by 2πk / yaws.
     """
 
-    order: Float[Array, "*batch views"]
-    expected_logits: Float[Array, "*batch classes views classes"]
+    order: Float[Array, "*batch views"] | None = None
+    expected_logits: Float[Array, "*batch classes views classes"] | None = None
+    by_yaw: Float[Array, "*batch classes yaws views classes"] | None = None
 
 
 @flax.struct.dataclass
@@ -109,6 +115,15 @@ def required(value: T | None, name: str) -> T:
     if value is None:
         raise ValueError(f"this policy needs {name}, which is not given")
     return value
+
+
+def known(scene: Scene, name: Literal["order", "expected_logits", "by_yaw"]) -> Array:
+    """Returns a field of `Scene.knowledge`.
+
+    Raises:
+        ValueError: if it is None.
+    """
+    return required(getattr(required(scene.knowledge, "Scene.knowledge"), name), f"Scene.knowledge.{name}")
 
 
 def candidates(state: SelectionState, scene: Scene) -> Bool[Array, " views"]:

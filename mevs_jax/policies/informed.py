@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from mevs_jax.policies.base import Scene, SelectionState, required
+from mevs_jax.models.azimuth import yaw_log_probabilities
+from mevs_jax.policies.base import Scene, SelectionState, known, required
 
 
 def fixed_order(key: Array, state: SelectionState, scene: Scene) -> Float[Array, " views"]:
     """Scores that are the same for every object: the order of views that did best on other objects."""
     del key, state
-    return required(scene.knowledge, "Scene.knowledge").order
+    return known(scene, "order")
 
 
 def information_gain(key: Array, state: SelectionState, scene: Scene) -> Float[Array, " views"]:
@@ -21,14 +23,44 @@ def information_gain(key: Array, state: SelectionState, scene: Scene) -> Float[A
     and Brown (2002) and Wu et al. (3D ShapeNets, 2015), with a table in place of a generative model.
     """
     del key
-    expected = required(scene.knowledge, "Scene.knowledge").expected_logits  # (classes, views, classes)
+    probability = jax.nn.softmax(state.belief)
+    return _expected_decrease(state.belief, known(scene, "expected_logits"), probability)
+
+
+def information_gain_by_yaw(key: Array, state: SelectionState, scene: Scene) -> Float[Array, " views"]:
+    """`information_gain` for an object of unknown yaw φ, over hypotheses of class and yaw together.
+
+    The score is H(p) − Σ_y p(y) Σ_φ p(φ | y) H(softmax(belief + M[y, φ, j])). The distribution of the yaw for each class comes
+    from the azimuths that the recogniser finds in the views seen.
+    """
+    del key
+    present = jnp.arange(len(state.views)) < state.count
+    azimuths = required(state.seen.azimuth, "Observation.azimuth")
+    yaw = yaw_log_probabilities(azimuths, scene.graph.points[state.views], present)
+    expected, probability = known(scene, "by_yaw"), jax.nn.softmax(state.belief)
+    weights = (probability[:, None] * jnp.exp(yaw)).reshape(-1)
+    return _expected_decrease(state.belief, expected.reshape(-1, *expected.shape[2:]), weights)
+
+
+def _expected_decrease(
+    belief: Float[Array, " classes"],
+    expected: Float[Array, "hypotheses views classes"],
+    probability: Float[Array, " hypotheses"],
+) -> Float[Array, " views"]:
+    """The expected decrease of the belief's entropy in nats by each view.
+
+    Args:
+        belief: unnormalised log-probabilities.
+        expected: what each view adds to the belief under each hypothesis.
+        probability: of the hypotheses.
+    """
     # The softmax of belief + M is ∝ exp(belief) · exp(M). So its entropy, log Σ w − Σ w log w / Σ w for weights w, needs no
     # exponential for each walk, only products with the same matrices for all walks. The limit keeps Σ w above zero.
     shifted = jnp.maximum(expected - jnp.max(expected, axis=-1, keepdims=True), -80.0)
-    weights, belief = jnp.exp(shifted), state.belief - jnp.max(state.belief)
+    weights, belief = jnp.exp(shifted), belief - jnp.max(belief)
     likelihood = jnp.exp(belief)
     total = weights @ likelihood
     after = jnp.log(total) - (weights @ (likelihood * belief) + (weights * shifted) @ likelihood) / total
     own = jnp.sum(likelihood)
     before = jnp.log(own) - likelihood @ belief / own
-    return before - likelihood / own @ after
+    return before - probability @ after

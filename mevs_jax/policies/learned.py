@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from mevs_jax.models.view_policy import ViewPolicy, expected_gain, utility_of
-from mevs_jax.policies.base import Knowledge, Policy, Scene, SelectionState, candidates, required
+from mevs_jax.policies.base import Policy, Scene, SelectionState, candidates, known
 
 
 def learned(
@@ -35,8 +35,7 @@ def learned(
         if by == "state":
             return gain
         if by == "table":
-            knowledge = required(scene.knowledge, "Scene.knowledge")
-            gain_if = (gain_if + _gain_by_table(network, belief, knowledge)) / 2
+            gain_if = (gain_if + _gain_by_table(network, belief, known(scene, "expected_logits"))) / 2
         return expected_gain(belief, gain_if)
 
     return scores
@@ -53,10 +52,10 @@ _TABLE_WEIGHT = 0.5
 
 
 def _gain_by_table(
-    network: ViewPolicy, belief: Float[Array, " classes"], knowledge: Knowledge
+    network: ViewPolicy, belief: Float[Array, " classes"], expected: Float[Array, "classes views classes"]
 ) -> Float[Array, "views classes"]:
     """Gain in utility [j, y] if view j adds `_TABLE_WEIGHT` times its expected log-probabilities for class y to the belief."""
-    after = jax.nn.log_softmax(belief + _TABLE_WEIGHT * knowledge.expected_logits, axis=-1)
+    after = jax.nn.log_softmax(belief + _TABLE_WEIGHT * expected, axis=-1)
     own = jnp.diagonal(after, axis1=0, axis2=2)
     return utility_of(own, network.utility, network.floor) - utility_of(belief, network.utility, network.floor)
 
@@ -77,7 +76,7 @@ def looking_ahead(
 
     def scores(key: Array, state: SelectionState, scene: Scene) -> Float[Array, " views"]:
         del key
-        expected = jax.nn.log_softmax(required(scene.knowledge, "Scene.knowledge").expected_logits, axis=-1)
+        expected = jax.nn.log_softmax(known(scene, "expected_logits"), axis=-1)
         points, slots = scene.graph.points, jnp.arange(len(state.views))
         views = jax.nn.log_softmax(state.seen.logits / temperature, axis=-1)
         allowed, believed = candidates(state, scene), _normalised(state.belief)

@@ -25,6 +25,7 @@ import numpy as np
 from flax import nnx
 
 from mevs_jax.beliefs import CalibratedFusion
+from mevs_jax.models.expected_views import ExpectedViews
 from mevs_jax.plain import from_plain
 from mevs_jax.policies.base import Knowledge
 from mevs_jax.policies.registry import POLICIES
@@ -32,7 +33,7 @@ from mevs_jax.trained.card import model_card
 from mevs_jax.trained.description import FORM, Description
 from mevs_jax.trained.parts import Network, Parts
 from mevs_jax.trained.strangeness import LEVELS, Strangeness
-from mevs_jax.trained.system import TrainedSystem
+from mevs_jax.trained.system import BY_YAW, TrainedSystem
 
 DESCRIPTION, WEIGHTS, CARD, PROGRAMS = "trained.json", "weights.safetensors", "README.md", "stablehlo"
 SHIPPED = Path(__file__).parents[1] / "systems"
@@ -192,7 +193,7 @@ def _hash_of(content: dict[str, Any]) -> str:
 def _arrays_of(parts: Parts) -> dict[str, Any]:
     """All arrays by names joined with dots; those of a network by their place in it."""
     found: dict[str, Any] = {"viewpoints": parts.viewpoints, "neighbours": parts.neighbours, "single": parts.single}
-    networks = {"encoder": parts.encoder, "entropy": parts.entropy}
+    networks = {"encoder": parts.encoder, "entropy": parts.entropy, "azimuth": parts.azimuth}
     networks |= {f"view_policies.{name}": network for name, network in parts.view_policies.items()}
     for name, network in networks.items():
         if network is not None:
@@ -207,6 +208,8 @@ def _arrays_of(parts: Parts) -> dict[str, Any]:
             "knowledge.expected_logits": parts.knowledge.expected_logits,
         }
     found |= {f"temperatures.{name}": values for name, values in parts.temperatures.items()}
+    if parts.expected is not None:
+        found["expected"] = parts.expected.coefficients
     if parts.size is not None:
         found["size"] = parts.size
     if parts.strangeness is not None:
@@ -293,18 +296,22 @@ def check(description: Description) -> None:
         description.fusion is not None and 0 < size.smallest < size.largest < 1e9 and 2 <= size.steps <= 1000
     ):
         raise ValueError("the size is impossible, or used by another kind than a recogniser")
+    if description.azimuth is not None and description.fusion is None:
+        raise ValueError("nothing but a recogniser finds the azimuth of views")
     if (description.entropy is None) != (description.cloud is None):
         raise ValueError("an entropy predictor and its cloud belong together")
     if description.cloud is not None and not 1 <= description.cloud.points <= 2**20:
         raise ValueError("the number of points of a cloud is impossible")
     if (description.kind == "recogniser") != (description.fusion is not None):
         raise ValueError("a recogniser, and nothing else, has a fusion")
-    shapes = (description.encoder, description.fusion, description.entropy, *description.view_policies.values())
+    of = description
+    shapes = (of.encoder, of.fusion, of.azimuth, of.entropy, *of.view_policies.values())
     for shape in shapes:
         if shape is not None:
             _check_sizes(asdict(shape))
+    own = {*description.view_policies, *[BY_YAW] * (description.azimuth is not None)}
     for name in (description.best, description.best_unposed):
-        if name not in POLICIES and name not in description.view_policies:
+        if name not in POLICIES and name not in own:
             raise ValueError(f"it has no policy {name!r:.40}")
 
 
@@ -404,12 +411,18 @@ def _parts_of(description: Description, arrays: dict[str, np.ndarray]) -> Parts:
             fusion[name] = CalibratedFusion(
                 network.structure, network.weights, prior, temperatures, single, name == "posed"
             )
-    entropy, knowledge, strangeness = None, None, None
+    azimuth, entropy, knowledge, expected, strangeness = None, None, None, None, None
+    if (of_azimuth := description.azimuth) is not None:
+        azimuth = take.network("azimuth", lambda rngs: of_azimuth.network(features, classes, rngs))
     if (of_entropy := description.entropy) is not None:
         entropy = take.network("entropy", lambda rngs: of_entropy.network(views, rngs))
     if "knowledge.order" in arrays:
         table = take.take("knowledge.expected_logits", (classes, views, classes))
         knowledge = Knowledge(take.take("knowledge.order", (views,)), table)
+    if "expected" in arrays:
+        expected = ExpectedViews(take.take("expected", (classes, None, classes)))
+        if (expected.degree + 1) ** 2 != expected.coefficients.shape[1]:
+            raise ValueError(f"expected in {WEIGHTS} has {expected.coefficients.shape[1]} terms, not a square")
     if "strangeness.quantiles" in arrays:
         strangeness = Strangeness(take.take("strangeness.quantiles", (None, LEVELS)))
     names = sorted(name for name in arrays if name.startswith("temperatures."))
@@ -423,6 +436,8 @@ def _parts_of(description: Description, arrays: dict[str, np.ndarray]) -> Parts:
         size=None if description.size is None else take.take("size", (description.size.steps, features)),
         entropy=entropy,
         fusion=fusion,
+        azimuth=azimuth,
+        expected=expected,
         view_policies={
             name: take.network(f"view_policies.{name}", lambda rngs, of=of: of.network(classes, rngs))
             for name, of in description.view_policies.items()

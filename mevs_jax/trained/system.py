@@ -15,6 +15,7 @@ from mevs_jax.arrays import AnyArray
 from mevs_jax.cameras import cameras_at
 from mevs_jax.inputs import check_depth
 from mevs_jax.policies.base import Observation, Policy
+from mevs_jax.policies.informed import information_gain_by_yaw
 from mevs_jax.policies.learned import learned
 from mevs_jax.policies.registry import POLICIES, policy_named
 from mevs_jax.selection import Fuse, by_attention, sum_of_logits
@@ -30,6 +31,8 @@ if TYPE_CHECKING:
 
 _AND_TABLE = "learned_and_table"
 """The policy that averages the gains by the network `learned` and by the class × view table."""
+BY_YAW = "information_gain_by_yaw"
+"""`information_gain` where the yaw is unknown, for a recogniser that finds the azimuth of views."""
 
 
 @dataclass(frozen=True)
@@ -122,8 +125,11 @@ class TrainedSystem:
                 raise ValueError("its network needs the object's yaw")
             by = "table" if name == _AND_TABLE else "belief"
             return learned(parts.view_policies[network].module, parts.single, by=by)  # type: ignore[arg-type]
+        if name in ("information_gain", BY_YAW) and parts.azimuth is not None:
+            return policy_named("information_gain") if posed else information_gain_by_yaw
         if name not in POLICIES:
-            known = ", ".join(("best", *parts.view_policies, *POLICIES))
+            own = (*parts.view_policies, *[BY_YAW] * (parts.azimuth is not None))
+            known = ", ".join(("best", *own, *POLICIES))
             raise ValueError(f"unknown policy {name!r}; it is one of {known}")
         return policy_named(name)
 

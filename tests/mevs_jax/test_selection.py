@@ -27,10 +27,12 @@ from mevs_jax import (
     with_movement,
 )
 from mevs_jax.policies import policy_entry, policy_named, register_policy
+from mevs_jax.policies.informed import information_gain_by_yaw
 from tests.reference import numpy_rules, policies
 
 THRESHOLDS = (0.5, 0.6, 0.7, 0.8, 0.9, 0.95, 0.99)
 TABLES = 10_000
+YAWS = 6
 
 
 def random_tables(views: int, classes: int, count: int, seed: int) -> ViewTable:
@@ -43,6 +45,7 @@ def random_tables(views: int, classes: int, count: int, seed: int) -> ViewTable:
         entropy=jnp.asarray(entropy, jnp.float32),
         label=jnp.asarray(random.integers(0, classes, count), jnp.int32),
         ascent_scores={rung.policy: jnp.asarray(random.uniform(0, 1, (count, views, views))) for rung in ASCENT_RUNGS},
+        azimuths=jax.nn.log_softmax(jnp.asarray(random.normal(0, 1, (count, views, classes, YAWS)), jnp.float32)),
     )
 
 
@@ -103,6 +106,7 @@ def knowledge_of(views: int, classes: int) -> Knowledge:
     return Knowledge(
         order=jnp.asarray(random.permutation(views), jnp.float32),
         expected_logits=jnp.asarray(random.normal(0, 1.5, (classes, views, classes)), jnp.float32),
+        by_yaw=jnp.asarray(random.normal(0, 1.5, (classes, YAWS, views, classes)), jnp.float32),
     )
 
 
@@ -113,23 +117,27 @@ def whole_scene(table: ViewTable, graph: ViewGraph) -> Scene:
 DRAWING = ("random", "random_with_repetition")
 
 
-@pytest.mark.parametrize("policy", [name for name in POLICIES if name not in DRAWING])
+BY_YAW = "information_gain_by_yaw"
+
+
+@pytest.mark.parametrize("policy", [*(name for name in POLICIES if name not in DRAWING), BY_YAW])
 def test_every_step_of_a_policy_is_the_best_by_its_plain_rule(policy):
     """At each step of the jitted walk the view chosen has the highest score that slow, obvious code gives."""
     views, classes, count, max_views = 12, 4, 150, 8
     graph = ViewGraph.from_points(fibonacci_sphere(views))
     tables = random_tables(views, classes, count, seed=12)
     knowledge = knowledge_of(views, classes)
+    run = information_gain_by_yaw if policy == BY_YAW else POLICIES[policy]
 
     @jax.jit
     @jax.vmap
     def walk(table, start):
         scene = table.scene(graph, knowledge)
-        return select_from_table(jax.random.key(0), table, scene, POLICIES[policy], start, max_views=max_views).views
+        return select_from_table(jax.random.key(0), table, scene, run, start, max_views=max_views).views
 
     walks = np.asarray(walk(tables, jnp.arange(count, dtype=jnp.int32) % views))
-    plain_graph = {name: np.asarray(getattr(graph, name)) for name in ("neighbours", "distances")}
-    plain_knowledge = {name: np.asarray(getattr(knowledge, name)) for name in ("order", "expected_logits")}
+    plain_graph = {name: np.asarray(getattr(graph, name)) for name in ("neighbours", "distances", "points")}
+    plain_knowledge = {name: np.asarray(getattr(knowledge, name)) for name in ("order", "expected_logits", "by_yaw")}
     arrays = jax.tree.map(np.asarray, vars(tables))
     for index, walked in enumerate(walks):
         table = jax.tree.map(lambda leaf, at=index: leaf[at], arrays)

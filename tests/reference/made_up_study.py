@@ -24,8 +24,9 @@ from mevs_jax.models.set_fusion import SetFusion
 from tests.reference.evaluation import CLASSES, some_statistics, some_tables
 from tests.reference.leaks import filled, other_labels, other_statistics, seed_of
 from tests.reference.weights import untrained
+from train.choosing.config import LearnedConfig
 from train.choosing.policy import PolicyConfig, new_policy
-from train.choosing.stages import LearnedConfig, Stages
+from train.choosing.stages import Stages
 from train.tasks.entropy import EntropyTask
 from train.tasks.recogniser import RecogniserTask
 

@@ -10,7 +10,7 @@ from functools import cache, partial
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array
+from jaxtyping import Array, Float
 
 from data_pipeline.dataset.augment import object_changes, views_after
 from data_pipeline.errors import DataError
@@ -27,9 +27,21 @@ def see(network: Recogniser, task: Task, batch: Batch) -> jax.Array:
     return _see_images(network, task, task.inputs(batch), task.directions(batch), batch)
 
 
+def quarter_turns(images: Float[Array, "*batch side side 4"]) -> list[Float[Array, "*batch side side 4"]]:
+    """Returns images of depth and normals turned about the optical axis by 0, 90, 180 and 270 degrees."""
+    found = [images]
+    for _ in range(3):
+        near, right, down, away = jnp.moveaxis(jnp.rot90(found[-1], 1, (-3, -2)), -1, 0)
+        found.append(jnp.stack([near, down, -right, away], axis=-1))
+    return found
+
+
 def _see_images(network: Recogniser, task: RecogniserTask, images: Array, directions: Array, batch: Batch) -> jax.Array:
-    label = batch["label"][:, None].astype(jnp.float32)
-    return jnp.concatenate([network.see(images, task.radii(batch)), directions, label], axis=-1)
+    """Returns what `see` does; of a recogniser for any rotation, the mean over four turns of each image."""
+    label, radii = batch["label"][:, None].astype(jnp.float32), task.radii(batch)
+    turns = quarter_turns(images) if task.augmentation.turn else [images]
+    seen = sum((network.see(turned, radii) for turned in turns), jnp.float32(0)) / len(turns)
+    return jnp.concatenate([seen, directions, label], axis=-1)
 
 
 def _see_changed_by(changes: Array, network: Recogniser, task: RecogniserTask, batch: Batch) -> jax.Array:

@@ -15,6 +15,7 @@ from functools import cache, cached_property, partial
 from pathlib import Path
 from typing import Any
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from flax import nnx
@@ -24,18 +25,21 @@ from data_pipeline.capture.viewpoints import is_file
 from data_pipeline.dataset.batches import fold_of
 from data_pipeline.dataset.builder import DataConfig, open_split, prepare
 from data_pipeline.dataset.statistics import SUMMARY, DatasetStatistics, load_statistics
-from data_pipeline.errors import DataError
 from data_pipeline.progress import console
 from mevs_jax.beliefs import CalibratedFusion
 from mevs_jax.models import Recogniser, ViewPolicy
+from mevs_jax.models.azimuth import AzimuthHead
+from mevs_jax.models.expected_views import ExpectedViews
 from mevs_jax.models.set_fusion import SumFusion
 from train.chance import warn_of_chance
 from train.choosing.calibrated import calibrated
+from train.choosing.config import LearnedConfig
+from train.choosing.expected import fit_expected_views
 from train.choosing.features import Features
 from train.choosing.looks import embed, see, see_changed, see_rotated
 from train.choosing.policy import Lesson, PolicyConfig, Seen, Trained, new_policy, train_policies
 from train.choosing.q_learning import QLearningConfig, train_all_by_q_learning
-from train.choosing.variants import ABLATIONS, VARIANTS
+from train.choosing.variants import VARIANTS
 from train.finite import check_outputs
 from train.kept import is_stored, kept_array, made_by, trained_once
 from train.loop import fit, load_best
@@ -43,86 +47,13 @@ from train.many.seeds import train_seeds
 from train.outputs import Ask, network_outputs
 from train.starting_weights import StartingWeights
 from train.tasks.entropy import EntropyConfig, EntropyTask
-from train.tasks.recogniser import RecogniserConfig, RecogniserTask
+from train.tasks.recogniser import RecogniserTask
 from train.tasks.size import check_sizes, used_size
-
-
-@dataclass(frozen=True)
-class LearnedConfig:
-    """Settings of the learned study: learned fusion and learned choice of views."""
-
-    recogniser: RecogniserConfig = RecogniserConfig()
-    folds: int = 2
-    """parts of the training objects, for the ablation that learns from each part by a recogniser trained without it"""
-    fold_epochs: int = 0
-    """training epochs of those recognisers; 0: as many as for the recogniser itself"""
-    changed: int = 3
-    """augmented copies of each object that a policy learns from, mirrored and stretched as in the recogniser's training"""
-    policy: PolicyConfig = PolicyConfig()
-    q_learning: QLearningConfig = QLearningConfig()
-    """training of the policy that learns from walks alone, for comparison"""
-    seeds: int = 1
-    """number of complete trainings, each with other random weights"""
-    seed: int = 0
-    """seed of the first training; the others count up from it"""
-    max_views: int = 8
-    """views of a walk"""
-    draws: int = 8
-    """walks per object and start view, for policies that choose at random"""
-    fitting_starts: int = 1
-    """n: temperatures are fitted on walks from every n-th start view"""
-    lattices: tuple[int, ...] = (10,)
-    """further numbers of candidate views to test on, which are not trained on; of the same lattice, or of golden_angle if the
-    run's viewpoints are from a file"""
-    ablations: tuple[str, ...] = ()
-    """variants of the policy to compare with, for the first seed: as_it_is, look_ahead, probability, random_states, unchanged,
-    crossed, known, summed, cloud (needs PointNet++, trained by `mevs train`), q_learning"""
-    novel: int = 0
-    """number of class pairs that a policy is trained without and then tested on, for the first seed"""
-    rotation_epochs: int = 0
-    """epochs of further training of the recogniser on objects turned by any rotation, which are then tested too, for the first
-    seed; 0: no such training and test"""
-
 
 Aside = tuple[int, int]
 """Which of how many parts of the validation objects."""
 
 _SIZE = "--learned.recogniser.size"
-_FURTHER_RATE = 0.4
-"""Learning rate of the further training on turned objects, relative to that of the first training."""
-
-
-def check_learned(config: LearnedConfig, views: int) -> None:
-    """Raises `DataError` if the study cannot be run with these settings and this number of candidate views."""
-    if config.folds < 2 or config.seeds < 1:
-        raise DataError("--learned.folds must be at least 2 and --learned.seeds at least 1")
-    if config.changed < 0:
-        raise DataError(f"--learned.changed must be at least 0, got {config.changed}")
-    network, optimiser = config.recogniser.network, config.recogniser.optimiser
-    if (network.channels, network.standardise) != (4, False) or optimiser.validation_by != "object":
-        raise DataError(
-            "the recogniser sees depth and normals, four channels that are not standardised, and is validated by object; leave "
-            "out --learned.recogniser.network.channels, .standardise and --learned.recogniser.optimiser.validation-by"
-        )
-    if {optimiser.seed, optimiser.data_seed, config.policy.seed, config.q_learning.seed} - {0, config.seed}:
-        raise DataError("the seeds of a study are counted up from --learned.seed; leave out those of its networks")
-    for name in config.ablations:
-        if name not in ABLATIONS:
-            raise DataError(f"unknown ablation {name!r} in --learned.ablations; choose from {', '.join(ABLATIONS)}")
-    walks = [config.policy.most_seen, config.max_views]
-    if "q_learning" in config.ablations:
-        walks.append(config.q_learning.most_seen)
-    most, batch = max(walks), config.recogniser.optimiser
-    if not 2 <= most < views:
-        raise DataError(
-            f"walks of {most} views are not possible with {views} candidate views; set --learned.max-views, "
-            f"--learned.policy.most-seen and --learned.q-learning.most-seen to at least 2 and less than {views}"
-        )
-    if not batch.validation_views or 256 % batch.validation_views or batch.validation_views > views:
-        raise DataError(
-            f"--learned.recogniser.optimiser.validation-views must divide 256 and be at most {views}, "
-            f"got {batch.validation_views}"
-        )
 
 
 class Stages:
@@ -182,8 +113,7 @@ class Stages:
             optimiser = replace(optimiser, epochs=config.fold_epochs)
         augmentation = config.recogniser.augmentation
         if self.upright is not None:
-            rate = _FURTHER_RATE * optimiser.learning_rate
-            optimiser = replace(optimiser, epochs=config.rotation_epochs, learning_rate=rate)
+            optimiser = replace(optimiser, epochs=config.rotation_epochs)
             augmentation = replace(augmentation, turn=True)
         part = None if fold is None else (fold, config.folds)
         recogniser = replace(config.recogniser, optimiser=optimiser, augmentation=augmentation)
@@ -265,6 +195,28 @@ class Stages:
             return jnp.full(len(self.statistics.classes), -jnp.log(len(self.statistics.classes)))
         counts = np.array([self.statistics.counts["train"][name] for name in self.statistics.classes], np.float32)
         return jnp.log(jnp.asarray(counts / counts.sum()))
+
+    def expected_views(self) -> ExpectedViews:
+        """Returns what the recogniser is expected to say of each class, fitted on the objects that it was trained on."""
+
+        def fitted() -> np.ndarray:
+            task, classes = self.task(), len(self.statistics.classes)
+            recogniser = load_best(task, self.recogniser_folder())
+            seen = np.asarray(network_outputs(self.turned, "train", task, recogniser, see), np.float32)
+            seen = seen.reshape(-1, seen.shape[-1])[:, -classes - 4 :]
+            logits, directions, labels = np.split(seen, (classes, classes + 3), axis=1)
+            log_probabilities = jax.nn.log_softmax((logits - self.prior) / self.fusion().single, axis=-1)
+            found = fit_expected_views(directions, np.asarray(log_probabilities), labels[:, 0].astype(int))
+            return np.asarray(found.coefficients)
+
+        path = self.folder / "features" / "expected_views.npz"
+        return ExpectedViews(jnp.asarray(kept_array(path, made_by(self.statistics, self.recogniser_folder()), fitted)))
+
+    def azimuth_head(self) -> AzimuthHead | None:
+        """Returns the recogniser's network for the azimuth of views; None if it has none."""
+        recogniser = load_best(self.task(), self.recogniser_folder())
+        assert isinstance(recogniser, Recogniser)
+        return recogniser.azimuth
 
     def fusion(self, fold: int | None = None, posed: bool = True, summed: bool = False) -> CalibratedFusion:
         """Returns the recogniser's fusion, or the sum of its logits, with temperatures, for objects of known or unknown pose."""

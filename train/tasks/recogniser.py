@@ -22,6 +22,7 @@ from data_pipeline.dataset.reality import RealityAugmentation, realistic_views, 
 from mevs_jax import inputs as inputs_of
 from mevs_jax.inputs import SizeInput
 from mevs_jax.models import Recogniser, ResNet
+from mevs_jax.models.azimuth import AzimuthHead, azimuth_of, azimuth_weights
 from train.choosing.features import SetFusionConfig, new_fusion, random_sets
 from train.optimiser import OptimiserConfig
 from train.step import Batch, Hyperparameters, Metrics
@@ -45,14 +46,23 @@ class RecogniserConfig:
     size: SizeConfig = SizeConfig()
     balanced: bool = False
     """draw equally many training objects of each class, objects of rarer classes more often; else each object equally often"""
+    azimuths: int = 24
+    """number of azimuths that are told apart where the yaw of objects is unknown; 0: the azimuth of views is not estimated"""
     optimiser: OptimiserConfig = OptimiserConfig()
+
+
+Outputs = tuple[jax.Array, jax.Array, jax.Array, jax.Array | None]
+"""What a `Recogniser` returns."""
+_AZIMUTH_WEIGHT = 0.25
+"""Weight of the loss of the azimuth of views, relative to that of the class of single views."""
 
 
 @dataclass(frozen=True)
 class RecogniserTask:
     """Training of the recogniser by cross-entropy on single views and on random sets of an object's views in the batch.
 
-    The loss of a set is half that with the object's pose known, half that with it unknown.
+    The loss of a set is half that with the object's pose known, half that with it unknown. The azimuth of each view in the
+    object's frame is learned too, for the object's class.
     """
 
     network_config: ResNetConfig
@@ -67,6 +77,7 @@ class RecogniserTask:
     """(k, n): trained without part k of n parts of the training objects"""
     reality: RealityAugmentation | None = None
     size: SizeConfig | None = None
+    azimuths: int = 0
     name: str = "recogniser"
 
     @classmethod
@@ -86,6 +97,7 @@ class RecogniserTask:
             fold,
             used_reality(config.reality, "--learned.recogniser.reality"),
             used_size(config.size, "--learned.recogniser.size"),
+            config.azimuths,
             name,
         )
 
@@ -125,7 +137,12 @@ class RecogniserTask:
             rngs=rngs,
         )
         fusion = new_fusion(self.fusion_config, 8 * shape.width, self.classes, rngs)
-        return Recogniser(encoder, fusion, SizeInput() if self.size else None)
+        azimuth = None
+        if self.azimuths:
+            azimuth = AzimuthHead(
+                8 * shape.width, self.classes, azimuths=self.azimuths, dropout=self.fusion_config.dropout, rngs=rngs
+            )
+        return Recogniser(encoder, fusion, SizeInput() if self.size else None, azimuth)
 
     def inputs(self, batch: Batch) -> jax.Array:
         """Returns the images of a batch, (views, height, width, 4)."""
@@ -165,7 +182,7 @@ class RecogniserTask:
         radii = self.radii(batch)
         if self.size and radii is not None:
             radii = radii_for_training(jax.random.fold_in(key, 5), by_object(radii), self.size)
-        found = _metrics_of(*network(images, directions, present, radii, train=True, key=drop), labels)
+        found = self._metrics_of(network(images, directions, present, radii, train=True, key=drop), labels, directions)
         means = {name: jnp.mean(values) for name, values in found.items()}
         return means["loss"], means
 
@@ -184,11 +201,35 @@ class RecogniserTask:
         labels = batch["label"].reshape(images.shape[:2])[:, 0]
         radii = self.radii(batch)
         radii = None if radii is None else by_object(radii)
-        found = _metrics_of(*network(images, directions, jnp.ones(images.shape[:2], bool), radii), labels)
+        found = self._metrics_of(
+            network(images, directions, jnp.ones(images.shape[:2], bool), radii), labels, directions
+        )
         return {name: values.reshape(-1) for name, values in found.items()}
 
+    def _metrics_of(self, outputs: Outputs, labels: jax.Array, directions: jax.Array) -> Metrics:
+        """Returns metrics of every view, each (objects, views).
 
-def _metrics_of(each: jax.Array, posed: jax.Array, unposed: jax.Array, labels: jax.Array) -> Metrics:
+        The azimuth of a view has no meaning, and no loss, if training turns objects by any rotation.
+
+        Args:
+            outputs: of the network.
+            labels: (objects,) true classes.
+            directions: (objects, views, 3) unit vectors from the object to the cameras.
+        """
+        each, posed, unposed, azimuth = outputs
+        found = _metrics_of_class(each, posed, unposed, labels)
+        if azimuth is not None and not self.augmentation.turn:
+            found["loss"] += _AZIMUTH_WEIGHT * _azimuth_loss(azimuth, labels, directions)
+        return found
+
+
+def _azimuth_loss(azimuth: jax.Array, labels: jax.Array, directions: jax.Array) -> jax.Array:
+    """Returns the cross-entropy of the azimuth of each view if the object's class is known, (objects, views)."""
+    own = jnp.take_along_axis(azimuth, labels[:, None, None, None], axis=2)[:, :, 0]
+    return -jnp.sum(azimuth_weights(azimuth_of(directions), own.shape[-1]) * own, axis=-1)
+
+
+def _metrics_of_class(each: jax.Array, posed: jax.Array, unposed: jax.Array, labels: jax.Array) -> Metrics:
     """Returns metrics of every view, each (objects, views).
 
     Args:

@@ -83,7 +83,7 @@ def measured_with(change: str | None, out: Path) -> Measured:
             return real_study(fusion, learners, validation, test, **rest)
         known, after = (float(data.features.labels.sum() + data.features.logits.sum()) for data in (validation, test))
         found = {"temperatures": [known] * 3, "after_views": [after] * 3}
-        return {"policies": dict.fromkeys(("random", "learned"), found)}, {}
+        return {"policies": dict.fromkeys(("random", "learned", "information_gain"), found)}, {}
 
     def novel_classes(fusion, policies, whole, test, *rest):
         seen.given.append((fusion, [(classes, nnx.state(one)) for classes, one in policies], nnx.state(whole), rest))
@@ -170,9 +170,9 @@ def test_every_measurement_is_given_what_was_learned_from_other_objects(change, 
 @pytest.mark.parametrize("change", CHANGES)
 def test_temperatures_are_fitted_on_validation_objects(change, every):
     one, other = every[None], every[change]
-    assert len(temperatures_in(one.found)) == 11 + 4 * 2
+    assert len(temperatures_in(one.found)) == 10 + 4 * 3
     check_fitted(temperatures_in(one.found), temperatures_in(other.found))
-    assert len(one.refitted) == 11 + VIEWS  # of each policy, and of sets of views of each size
+    assert len(one.refitted) == 10 + VIEWS  # of each policy, and of sets of views of each size
     check_fitted(one.refitted, other.refitted)
     check_tested(accuracies_in(one.found), accuracies_in(other.found))
 

@@ -17,14 +17,25 @@ from eval.learned.stopping import Signal, compare_rules, walks_apart
 from eval.learned.study import fixed_order_scores, novel_classes, seeds_together, study
 from eval.learned.walks import Learner, OnLattice
 from eval.numbers.confidence import stops_at
-from eval.walks.knowledge import class_view_table
+from mevs_jax.models.expected_views import ExpectedViews
 from tests.reference.choosing import VIEWS, by_state, some_policy, telling
 from tests.reference.made_up_study import STUDIED
+from train.choosing.expected import fit_expected_views
+from train.choosing.features import Features
 from train.choosing.policy import (
     PolicyConfig,
     train_policy,
     walk,
 )
+
+
+def expected_of(data: Features) -> ExpectedViews:
+    """Expected views of some objects, as exact as directions that are few allow."""
+    views = data.logits.shape[1]
+    log_probabilities = np.asarray(jax.nn.log_softmax(data.logits)).reshape(-1, data.logits.shape[-1])
+    return fit_expected_views(
+        np.asarray(data.directions).reshape(-1, 3), log_probabilities, np.repeat(np.asarray(data.labels), views), 4
+    )
 
 
 @pytest.mark.slow
@@ -38,6 +49,7 @@ def test_what_looking_was_worth_is_learned_and_the_study_says_so(adding):
     policy, histories = train_policy(config, parts, (adding, validation))
     assert len(histories) == 2
     assert histories[-1][-1]["gain"] < 0.7 * histories[0][0]["gain"]
+    expected = expected_of(parts[0][1])
     others = (
         Learner("as_it_is", "without belief", policy, "state"),
         Learner("look_ahead", "two ahead", policy, "ahead"),
@@ -56,7 +68,7 @@ def test_what_looking_was_worth_is_learned_and_the_study_says_so(adding):
         draws=2,
         oracle_views=3,
         apart=[Learner("learned", "view policy", policy)] * 2,
-        training_table=class_view_table(parts[0][1].logits, parts[0][1].labels),
+        expected=expected,
     )
     after = {name: result["after_views"] for name, result in found["policies"].items()}
     alone = seeds_together([found], [each], "learned")  # which says nothing of other trainings
@@ -90,7 +102,7 @@ def test_what_looking_was_worth_is_learned_and_the_study_says_so(adding):
     assert low < found["against"]["random"]["learned"]["difference"][1] < high
     assert found["trying_starts"] == 6  # all of them, where there are so few
     assert after["label_oracle"][1] >= after["learned"][1]
-    for name in ("look_ahead", "learned_and_table", "information_gain_of_training"):
+    for name in ("look_ahead", "learned_and_table", "information_gain"):
         assert after[name][2] > after["random"][2] + 0.1
     first = found["policies"]["unsure"]["temperatures"][0] / found["policies"]["learned"]["temperatures"][0]
     assert first == pytest.approx(1 / 50, rel=1e-3)  # of a fusion of its own
@@ -107,13 +119,11 @@ def test_what_looking_was_worth_is_learned_and_the_study_says_so(adding):
     assert paying[0] < paying[-1]
     assert set(found["policies"]) >= {"farthest", "fixed_order", "information_gain", "belief_oracle"}
     assert [row["views"] for row in found["random_sets"]] == [1, 2, 3, 4, 5, 6]
-    table = class_view_table(parts[0][1].logits, parts[0][1].labels)
     pairs = [((0, 2), policy), ((1, 3), policy)]
-    without = novel_classes(adding, pairs, policy, test, max_views=3, draws=2, training_table=table)
-    by_table = without["gain"].pop("information_gain_of_training")["difference"]
-    np.testing.assert_allclose(
-        by_table[1:], (np.array(after["information_gain_of_training"]) - after["random"])[1:], atol=0.03
-    )
+    without = novel_classes(adding, pairs, policy, test, max_views=3, draws=2, expected=expected)
+    by_expected = without["gain"].pop("information_gain")["difference"]
+    np.testing.assert_allclose(by_expected[1:], (np.array(after["information_gain"]) - after["random"])[1:], atol=0.03)
+    assert without["gain"].pop("information_gain_without")["difference"] != by_expected
     assert without["objects"] == 120
     gain = np.array(after["learned"]) - after["random"]
     for found_without in without["gain"].values():  # the same policy: what is found on all objects

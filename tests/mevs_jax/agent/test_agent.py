@@ -41,7 +41,9 @@ def table_of(system, views) -> ViewTable:
     seen = [system.observe(depth, pose) for depth, pose in views]
     entropies = None if seen[0].predicted_entropy is None else jnp.stack([one.predicted_entropy for one in seen])
     features = jnp.stack([one.features for one in seen])
-    return ViewTable(jnp.stack([one.logits for one in seen]), entropies, None, jnp.int32(0), features=features)
+    azimuths = None if seen[0].azimuth is None else jnp.stack([one.azimuth for one in seen])
+    logits = jnp.stack([one.logits for one in seen])
+    return ViewTable(logits, entropies, None, jnp.int32(0), features=features, azimuths=azimuths)
 
 
 CENTER, RADIUS = np.array([0.5, -0.2, 0.8]), 0.3
@@ -76,6 +78,8 @@ def walk(agent, views, first, **reset):
         pytest.param("classifier", "farthest", marks=pytest.mark.slow),
         pytest.param("classifier", "fixed_order", marks=pytest.mark.slow),
         ("recogniser", "learned"),
+        ("recogniser", "information_gain"),
+        ("recogniser", "information_gain_by_yaw"),
         pytest.param("recogniser", "learned_and_table", marks=pytest.mark.slow),
     ],
 )
@@ -84,8 +88,11 @@ def test_walks_are_those_of_the_selection_loop_on_tables(request, kind, policy):
     system = request.getfixturevalue(kind)
     views = views_of(system)
     table, graph = table_of(system, views), system.graph
-    fuse = by_attention(system.parts.fusion["posed"]) if kind == "recogniser" else mevs_jax.sum_of_logits
-    run, scene = system.policy(policy), table.scene(graph, system.parts.knowledge)
+    posed = policy != "information_gain_by_yaw"
+    knowledge = system.parts.knowledge if posed else system.parts.knowledge_by_yaw(graph.points)
+    fusion = system.parts.fusion["posed" if posed else "unposed"] if kind == "recogniser" else None
+    fuse = by_attention(fusion) if fusion else mevs_jax.sum_of_logits
+    run, scene = system.policy(policy, posed=posed), table.scene(graph, knowledge)
 
     @jax.jit
     def by_table(key, first):
@@ -93,7 +100,7 @@ def test_walks_are_those_of_the_selection_loop_on_tables(request, kind, policy):
 
     agent = Agent(system, policy, stop=2, max_views=6)
     for first, placed in ((0, {}), (7, {"up": (0.3, -1.0, 0.2), "yaw": 0.7})):
-        seen, probabilities, reason = walk(agent, views, first, **placed)
+        seen, probabilities, reason = walk(agent, views, first, **placed | ({} if posed else {"yaw": None}))
         episode = by_table(agent.key, first)
         assert seen == list(map(int, episode.views))
         assert reason == "budget"

@@ -25,8 +25,9 @@ from data_pipeline.errors import DataError
 from eval.settings import TINY
 from mevs_jax.models import Recogniser
 from mevs_jax.viewpoints import viewpoint_lattice
-from train.choosing.looks import see_changed, see_rotated
-from train.choosing.stages import Stages, check_learned
+from train.choosing.config import check_learned
+from train.choosing.looks import quarter_turns, see, see_changed, see_rotated
+from train.choosing.stages import Stages
 from train.devices import Layout, check_batch, device_mesh
 from train.kept import summary_of
 from train.loop import fit, load_best, steps_of_an_epoch
@@ -62,6 +63,27 @@ def test_objects_turned_anyhow_are_seen_from_the_lattice_itself(turned):
         # A ray that falls between two pixels may fall to the other one after rounding.
         assert np.median(np.abs(found[:, : features + 10] - expected)) < 1e-4
         assert np.abs(turn - np.eye(3)).max() > 0.1
+
+
+def test_quarter_turns_are_those_of_the_object_about_the_optical_axis(turned):
+    statistics = load_statistics(turned)
+    task = RecogniserTask.of(TINY.learned.recogniser, 10, statistics.camera)
+    batch = next(iter(on_device(islice(evaluation_batches(turned, "val", images="depth"), 1))))
+    image, pose = task.inputs(batch)[:1], jnp.asarray(batch["pose"])[:1]
+    axis = np.asarray(pose[0, :3, 3] / np.linalg.norm(pose[0, :3, 3]))
+    for turns, found in enumerate(quarter_turns(image)):
+        expected = [
+            views_after(jnp.asarray(turn.as_matrix(), jnp.float32), image, pose, task.camera)[0]
+            for turn in (Rotation.from_rotvec(sign * turns * np.pi / 2 * axis) for sign in (1, -1))
+        ]
+        apart = [float(jnp.mean(jnp.abs(one - found) > 1e-3)) for one in expected]
+        assert apart[0] < 0.01, f"{turns} turns: {apart}"
+    averaged = replace(task, augmentation=replace(task.augmentation, turn=True))
+    network = nnx.jit(lambda: task.network(nnx.Rngs(0)))()
+    features = network.encoder.head.in_features
+    seen = jnp.stack([network.see(one) for one in quarter_turns(task.inputs(batch))]).mean(axis=0)
+    found = see(network, averaged, batch)[:, : features + 10]
+    np.testing.assert_allclose(found, seen, atol=1e-4)
 
 
 def test_changed_objects_are_each_changed_in_a_way_of_their_own_and_the_same_every_time(turned):
