@@ -35,7 +35,7 @@ class ViewTable:
         ascent_scores: by policy name, (views, views); row i scores the views after view i, by gradient ascent on a rendering.
         features: (views, features) of the encoder, for a learned fusion.
         clouds: (views, embedding) of the partial clouds, for a policy that uses them.
-        azimuths: (views, classes, azimuths) log-probabilities of the azimuth of each view in the object's frame, for each class.
+        pose_evidence: (views, classes, poses) of each view; see `Observation`.
     """
 
     logits: Float[Array, "*batch_and_backbones views classes"]
@@ -45,7 +45,7 @@ class ViewTable:
     ascent_scores: dict[str, Float[Array, "*batch views views"]] | None = None
     features: Float[Array, "*batch views features"] | None = None
     clouds: Float[Array, "*batch views embedding"] | None = None
-    azimuths: Float[Array, "*batch views classes azimuths"] | None = None
+    pose_evidence: Float[Array, "*batch views classes poses"] | None = None
 
     def observe(self, view: Int[Array, ""]) -> Observation:
         """Returns the observation of one view."""
@@ -54,7 +54,7 @@ class ViewTable:
             None if self.predicted_entropy is None else self.predicted_entropy[view],
             None if self.features is None else self.features[view],
             None if self.clouds is None else self.clouds[view],
-            None if self.azimuths is None else self.azimuths[view],
+            None if self.pose_evidence is None else self.pose_evidence[view],
         )
 
     def scene(

@@ -131,14 +131,17 @@ class ViewAugmentation:
 
 def object_changes(key: Array, objects: int, config: ViewAugmentation) -> Float[Array, "objects 3 3"]:
     """Returns random matrices to multiply the points of each object by, as `config` says."""
-    mirror, stretch, turn = jax.random.split(key, 3)
+    mirror, stretch, _ = jax.random.split(key, 3)
     factors = (1 + config.stretch) ** jax.random.uniform(stretch, (objects, 3), minval=-1.0)
     if config.mirror:
         factors = factors * jnp.where(jax.random.bernoulli(mirror, 0.5, (objects, 1)), jnp.array([-1.0, 1.0, 1.0]), 1.0)
     changes = jax.vmap(jnp.diag)(factors)
-    if config.turn:
-        changes = Rotation.from_quat(jax.random.normal(turn, (objects, 4))).as_matrix() @ changes
-    return changes
+    return object_turns(key, objects) @ changes if config.turn else changes
+
+
+def object_turns(key: Array, objects: int) -> Float[Array, "objects 3 3"]:
+    """Returns the rotations in the `object_changes` of this key, for a configuration that turns objects."""
+    return Rotation.from_quat(jax.random.normal(jax.random.split(key, 3)[2], (objects, 4))).as_matrix()
 
 
 def views_after(

@@ -77,8 +77,8 @@ class Observer:
 
 def as_table(found: Observation, label: Int[Array, "*objects"]) -> ViewTable:
     """The view table of what networks found in every view, of one object or several."""
-    features, azimuths = found.features, found.azimuth
-    return ViewTable(found.logits, found.predicted_entropy, None, label, features=features, azimuths=azimuths)
+    features, evidence = found.features, found.pose_evidence
+    return ViewTable(found.logits, found.predicted_entropy, None, label, features=features, pose_evidence=evidence)
 
 
 def beliefs_along(
@@ -154,7 +154,7 @@ class Walker:
         system, graph = self.system, self.system.graph
         fuse, run = system.fuse(parts, posed), system.policy(policy, parts, posed)
         calibrated_as = system.calibrated_as(policy, posed)
-        knowledge = parts.knowledge if posed else parts.knowledge_by_yaw(graph.points)
+        knowledge = parts.knowledge if posed else parts.knowledge_by_pose(graph.points)
         pairs = jnp.repeat(firsts, draws), jnp.tile(jnp.arange(draws), len(firsts))
 
         def around(item: tuple[Array, ViewTable]) -> tuple[Array, Array, Array]:

@@ -15,7 +15,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from flax import nnx
-from jaxtyping import Array
+from jaxtyping import Array, Float
 
 from data_pipeline.dataset.builder import open_split
 from data_pipeline.dataset.inputs import depth_and_normals
@@ -24,13 +24,15 @@ from data_pipeline.distributed import is_first
 from data_pipeline.errors import DataError
 from data_pipeline.files import read_json, write_npz
 from data_pipeline.progress import console
+from eval.learned.poses import UnknownPose, of_any_rotation, of_unknown_yaw
 from eval.learned.stopping import MOVEMENT_COSTS, VIEW_COSTS
 from eval.learned.study import ByObject, novel_classes, seeds_together, study
-from eval.learned.walks import Learner, OnLattice, azimuths_of
+from eval.learned.walks import Learner, OnLattice
 from eval.numbers.timing import milliseconds
 from eval.tables import load_view_tables
 from eval.thesis.results import machine
 from mevs_jax.models import Recogniser
+from mevs_jax.models.expected_views import ExpectedViews
 from mevs_jax.models.view_policy import expected_gain
 from train.choosing.stages import Aside, Stages, lattice_data
 from train.choosing.variants import VARIANTS
@@ -128,15 +130,12 @@ def _walks(
     costs = posed and not ablations and data == stages.out / "data"
     kind = ("" if posed else "_unposed") + ("_ablations" if ablations else "")
     path = stages.folder / f"walks_{views}{kind}.json"
-    upright = stages.upright is None
-    head = stages.azimuth_head() if upright and not posed else None
 
     def objects_of(split: str) -> OnLattice:
         features = stages.features(f"{views}_{split}", data, split)
         if "cloud" in names:
             features = replace(features, clouds=stages.clouds(data, split))
-        azimuths = None if head is None else azimuths_of(head, features)
-        return OnLattice(features, *_entropies(stages.out, data, split), load_statistics(data).neighbours, azimuths)
+        return OnLattice(features, *_entropies(stages.out, data, split), load_statistics(data).neighbours)
 
     def walk() -> dict[str, Any]:
         validation, test = map(objects_of, ("val", "test"))
@@ -161,7 +160,7 @@ def _walks(
             seed=stages.seed,
             apart=[learner_of(stages, method, (part, APART)) for part in range(APART)] if costs else (),
             others=not ablations,
-            expected=stages.expected_views() if upright else None,
+            known=_known(stages, posed, test.features.directions[0]),
         )
         arrays = {f"{name} {key}": value for name, policy in each.items() for key, value in vars(policy).items()}
         check_results(found, f"walks by the recogniser in {stages.recogniser_folder()}")
@@ -185,6 +184,14 @@ def _walks(
         ],
     }
     return kept_json(path, identity, walk)
+
+
+def _known(stages: Stages, posed: bool, directions: Float[Array, "views 3"]) -> ExpectedViews | UnknownPose | None:
+    """What is known about views for objects of known pose, of unknown yaw, or in any rotation."""
+    expected, head = stages.expected_views(), stages.pose_head()
+    if posed or head is None:
+        return expected if posed else None
+    return (of_unknown_yaw if stages.upright is None else of_any_rotation)(head, expected, directions)
 
 
 def _rotated(stages: Stages) -> dict[str, Any]:

@@ -16,6 +16,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from data_pipeline.progress import console
+from eval.learned.poses import UnknownPose
 from eval.learned.stopping import Signal, WalkRecord, confidences, cost_metrics, walks_apart
 from eval.learned.walks import (
     Contender,
@@ -221,7 +222,7 @@ def study(
     seed: int = 0,
     apart: Sequence[Learner] = (),
     others: bool = True,
-    expected: ExpectedViews | None = None,
+    known: ExpectedViews | UnknownPose | None = None,
 ) -> tuple[dict[str, Any], dict[str, ByObject]]:
     """Returns all metrics of one lattice of candidate views, and the results of each policy by object.
 
@@ -235,19 +236,15 @@ def study(
         apart: the method trained without each part of the validation objects (every n-th); with them, the metrics of stopping and
             of movement cost are added.
         others: whether to evaluate the other policies and random sets as well.
-        expected: what the recogniser is expected to say of each class from every direction; for an unknown pose, used if the
-            azimuths of views are known.
+        known: what the recogniser is expected to say of each class from every direction; of objects in the fusion's poses.
     """
     points, labels = test.features.directions[0], test.features.labels
     shared = fusion.posed and bool(jnp.allclose(test.features.directions, points, atol=1e-4))
     max_views = min(max_views, len(points))
     oracle_views = min(oracle_views, max_views)
-    known = expected if fusion.posed or validation.azimuths is not None else None
     knowledge: Known = known
-    if shared:
+    if shared and not isinstance(known, UnknownPose):
         knowledge = learn(fusion, validation.features, known, max_views)
-    elif known is not None and validation.azimuths is not None:
-        knowledge = Knowledge(by_yaw=known.by_yaw(points, validation.azimuths.shape[-1]))
     every_nth = max(1, len(points) // _TRYING_STARTS)
     some_starts = np.arange(0, len(points), every_nth)
     found: dict[str, Any] = {

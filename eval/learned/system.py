@@ -14,10 +14,10 @@ from eval.learned.study import learn
 from eval.run_file import versions_of
 from eval.system import MADE_WITH, data_of, identity_of, resnet_shape, save_system, stored_system
 from mevs_jax.models import Recogniser, ViewPolicy
-from mevs_jax.models.shapes import AzimuthShape, SetFusionShape, ViewPolicyShape
+from mevs_jax.models.shapes import PoseShape, SetFusionShape, ViewPolicyShape
 from mevs_jax.trained import Description, ImageInput, Network, Parts, TrainedSystem, fit_strangeness
 from mevs_jax.trained.description import FORM
-from mevs_jax.trained.system import BY_YAW
+from mevs_jax.trained.system import BY_POSE
 from train.choosing.stages import Stages, lattice_data
 from train.kept import made_by
 from train.loop import load_best
@@ -87,12 +87,12 @@ def learned_system(stages: Stages, found: dict[str, Any], figures: dict[str, Any
     policies = {name: stages.policy(name) for name in POLICIES}
     walks = found["lattices"][str(views)]["policies"]
     temperatures = {name: of["temperatures"] for name, of in walks.items() if name in figures["after_views"]}
-    by_yaw = recogniser.azimuth is not None
+    by_yaw = recogniser.pose is not None
     if "unposed" in found:
         unposed = found["unposed"][str(views)]["policies"]
         temperatures["learned_unposed"] = unposed["learned"]["temperatures"]
         if by_yaw:
-            temperatures[BY_YAW] = unposed["information_gain"]["temperatures"]
+            temperatures[BY_POSE] = unposed["information_gain"]["temperatures"]
     shape = config.recogniser.fusion
     description = Description(
         form=FORM,
@@ -102,13 +102,13 @@ def learned_system(stages: Stages, found: dict[str, Any], figures: dict[str, Any
         image=ImageInput("depth_and_normals", 4),
         encoder=resnet_shape(config.recogniser.network, 4),
         best="information_gain",
-        best_unposed=BY_YAW if by_yaw else "learned_unposed",
+        best_unposed=BY_POSE if by_yaw else "learned_unposed",
         chosen_by="the method of the learned study, not chosen by a comparison",
         data=data_of(stages.statistics),
         made_by=made,
         made_with=versions_of(*MADE_WITH),
         size=recogniser.size_input,
-        azimuth=AzimuthShape(recogniser.azimuth.shape[1], recogniser.azimuth.width) if recogniser.azimuth else None,
+        pose=PoseShape(recogniser.pose.shape[1], recogniser.pose.width) if recogniser.pose else None,
         fusion=SetFusionShape(shape.width, shape.heads, shape.blocks),
         view_policies={name: _shape_of(policy, config.policy) for name, policy in policies.items()},
         evaluation=figures,
@@ -121,7 +121,7 @@ def learned_system(stages: Stages, found: dict[str, Any], figures: dict[str, Any
         single=fusions["posed"].single,
         fusion=fusions,
         view_policies={name: Network.of(policy) for name, policy in policies.items()},
-        azimuth=Network.of(recogniser.azimuth) if recogniser.azimuth else None,
+        pose=Network.of(recogniser.pose) if recogniser.pose else None,
         knowledge=learn(fusions["posed"], validation, expected, min(config.max_views, views)),
         expected=expected,
         temperatures={name: jnp.asarray(values, jnp.float32) for name, values in temperatures.items()},

@@ -13,17 +13,16 @@ import numpy as np
 from flax import nnx
 from jaxtyping import Array, Float, Int
 
+from eval.learned.poses import UnknownPose
 from mevs_jax.arrays import AnyArray
 from mevs_jax.beliefs import CalibratedFusion
 from mevs_jax.models import ViewPolicy
-from mevs_jax.models.azimuth import AzimuthHead
 from mevs_jax.models.expected_views import ExpectedViews
 from mevs_jax.policies.base import Knowledge, Policy
-from mevs_jax.policies.informed import information_gain_by_yaw
+from mevs_jax.policies.informed import information_gain_by_pose
 from mevs_jax.policies.oracles import fused_oracle
 from mevs_jax.policies.registry import POLICIES
 from mevs_jax.selection import ViewTable, by_attention, select_from_table, sum_of_logits
-from mevs_jax.trained.parts import Network
 from mevs_jax.viewpoints import ViewGraph
 from train.choosing.chunks import in_chunks
 from train.choosing.features import Features
@@ -41,24 +40,20 @@ class OnLattice:
         predicted_entropy: (objects, views, views) predicted normalised entropies, if known; row i after seeing view i.
         entropy: (objects, views) true normalised entropies, if known.
         neighbours: pairs of neighbouring views, if the viewpoints have neighbours of their own (`ViewGraph.from_points`).
-        azimuths: (objects, views, classes, azimuths) log-probabilities of the azimuth of every view in the object's frame, for
-            objects of unknown yaw.
     """
 
     features: Features
     predicted_entropy: np.ndarray | None = None
     entropy: np.ndarray | None = None
     neighbours: list[list[int]] | None = None
-    azimuths: np.ndarray | None = None
 
     def table(self, with_features: bool) -> ViewTable:
         predicted_entropy, entropy = (
             None if known is None else jnp.asarray(known) for known in (self.predicted_entropy, self.entropy)
         )
         data = self.features
-        features, azimuths = (data.features, self.azimuths) if with_features else (None, None)
-        found = ViewTable(data.logits, predicted_entropy, entropy, data.labels, features=features, clouds=data.clouds)
-        return found if azimuths is None else replace(found, azimuths=jnp.asarray(azimuths))
+        features = data.features if with_features else None
+        return ViewTable(data.logits, predicted_entropy, entropy, data.labels, features=features, clouds=data.clouds)
 
 
 @dataclass(frozen=True)
@@ -122,17 +117,6 @@ def _policy_of_truth(by: str) -> Callable[[Any], Policy]:
     return partial(_oracle, by=by)
 
 
-@jax.jit
-def _azimuths_of_some(head: Network, some: tuple[Array, Array]) -> Array:
-    features, directions = some
-    return head.module(features, directions[..., 2])
-
-
-def azimuths_of(head: AzimuthHead, data: Features) -> Float[np.ndarray, "objects views classes azimuths"]:
-    """Log-probabilities of the azimuth of every view in the object's frame, for each class."""
-    return in_chunks(partial(_azimuths_of_some, Network.of(head)), (data.features, data.directions), 64)
-
-
 def _by_name(name: str, title: str, knows: str, believes: bool = True) -> Contender:
     return Contender(name, title, knows, _policy_named(name), believes)
 
@@ -156,8 +140,15 @@ def _oracle(fusion: CalibratedFusion, by: Any) -> Policy:
     return fused_oracle(fusion, by=by)
 
 
-Known = Knowledge | ExpectedViews | None
+Known = Knowledge | ExpectedViews | UnknownPose | None
 """What policies know about other objects."""
+
+
+def _at(known: Known, directions: Float[Array, "views 3"]) -> Knowledge | None:
+    """What is known about the views of one object."""
+    if isinstance(known, ExpectedViews):
+        return Knowledge(expected_logits=known.at(directions))
+    return known.knowledge if isinstance(known, UnknownPose) else known
 
 
 @partial(jax.jit, static_argnames=("contender", "max_views"))
@@ -174,10 +165,9 @@ def _walk_some(
     policy, fuse = contender.policy_of(parameters), by_attention(fusion) if contender.believes else sum_of_logits
 
     def of_object(key: Array, table: ViewTable, directions: Array) -> Array:
-        known = (
-            Knowledge(expected_logits=knowledge.at(directions)) if isinstance(knowledge, ExpectedViews) else knowledge
-        )
-        scene = table.scene(replace(graph, points=directions), known)
+        if isinstance(knowledge, UnknownPose) and table.features is not None:
+            table = replace(table, pose_evidence=knowledge.evidence(table.features, directions))
+        scene = table.scene(replace(graph, points=directions), _at(knowledge, directions))
 
         def run(key: Array, start: Array) -> Array:
             return select_from_table(key, table, scene, policy, start, max_views=max_views, fuse=fuse).views
@@ -209,7 +199,8 @@ def walk_all(
     graph = ViewGraph.from_points(np.asarray(directions[0], np.float64), neighbours)
     keys = jax.vmap(jax.random.fold_in, (None, 0))(key, jnp.arange(len(tables.label)))
     rest = contender, parameters, fusion, graph, knowledge, max_views
-    at_once = max(1, _WALKS_AT_ONCE * contender.every // (len(graph.points) * contender.draws))
+    most = _WALKS_AT_ONCE // 4 if isinstance(knowledge, UnknownPose) else _WALKS_AT_ONCE
+    at_once = max(1, most * contender.every // (len(graph.points) * contender.draws))
     return in_chunks(lambda some: _walk_some(some, *rest), (keys, tables, directions), at_once)
 
 
@@ -232,13 +223,13 @@ def beliefs_of(
     return in_chunks(partial(_beliefs_of_some, fusion), (data, views), max(1, 1024 // views.shape[1]))
 
 
-def _by_yaw(_: Any) -> Policy:
-    return information_gain_by_yaw
+def _by_pose(_: Any) -> Policy:
+    return information_gain_by_pose
 
 
 def by_expected_views(posed: bool = True) -> Contender:
     found = _by_name("information_gain", "information gain by expected views", "others")
-    return found if posed else replace(found, policy_of=_by_yaw)
+    return found if posed else replace(found, policy_of=_by_pose)
 
 
 def contenders(

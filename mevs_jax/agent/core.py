@@ -16,7 +16,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from mevs_jax.policies.base import Knowledge, Observation, Policy, Scene, SelectionState
-from mevs_jax.policies.informed import information_gain, information_gain_by_yaw
+from mevs_jax.policies.informed import information_gain, information_gain_by_pose
 from mevs_jax.selection import best_view
 from mevs_jax.trained.parts import Parts
 from mevs_jax.trained.system import TrainedSystem
@@ -167,7 +167,7 @@ def situation(
     elif expected is not None:
         expected = jnp.moveaxis(along(jnp.moveaxis(expected, 1, -1)), -1, 1)
     knowledge = (
-        Knowledge(None if order is None else along(order), expected) if posed else parts.knowledge_by_yaw(points)
+        Knowledge(None if order is None else along(order), expected) if posed else parts.knowledge_by_pose(points)
     )
     latest = jnp.maximum(memory.count - 1, 0)
     state = SelectionState(
@@ -208,8 +208,8 @@ def choose(
     gains = jnp.full(number, jnp.nan)
     if scene.knowledge is not None and scene.knowledge.expected_logits is not None:
         gains = information_gain(key, state, scene)[:number]
-    elif scene.knowledge is not None and scene.knowledge.by_yaw is not None:
-        gains = information_gain_by_yaw(key, state, scene)[:number]
+    elif scene.knowledge is not None and scene.knowledge.by_pose is not None:
+        gains = information_gain_by_pose(key, state, scene)[:number]
     remaining = left(state, scene)
     best = best_view(jnp.where(remaining, jnp.minimum(scores, jnp.finfo(scores.dtype).max), -jnp.inf), remaining)
     return jnp.where(jnp.any(remaining), best, -1), gains
@@ -219,8 +219,8 @@ def example(system: TrainedSystem, with_entropy: bool) -> Observation:
     """An observation of zeros."""
     classes, features = len(system.classes), 8 * system.description.encoder.width
     entropies = jnp.zeros(len(system.parts.viewpoints)) if with_entropy else None
-    azimuth = None if system.parts.azimuth is None else jnp.zeros(system.parts.azimuth.module.shape)
-    return Observation(jnp.zeros(classes), entropies, jnp.zeros(features), azimuth=azimuth)
+    evidence = None if system.parts.pose is None else jnp.zeros(system.parts.pose.module.shape)
+    return Observation(jnp.zeros(classes), entropies, jnp.zeros(features), pose_evidence=evidence)
 
 
 def why_not(system: TrainedSystem, policy: str | Policy, posed: bool, with_entropy: bool) -> str | None:

@@ -14,7 +14,8 @@ from jax.scipy.special import sph_harm_y
 from jaxtyping import Array, Float
 
 from mevs_jax.arrays import AnyArray
-from mevs_jax.models.azimuth import azimuth_of, yaws
+from mevs_jax.models.pose import azimuth_of, yaws
+from mevs_jax.models.rotation import rotation_grid
 
 
 def harmonics(directions: Float[AnyArray, "*batch 3"], degree: int) -> Float[Array, "*batch terms"]:
@@ -58,8 +59,13 @@ class ExpectedViews:
     def by_yaw(
         self, directions: Float[AnyArray, "views 3"], count: int
     ) -> Float[Array, "classes {count} views classes"]:
-        """The same for `count` yaws of the object (`mevs_jax.models.azimuth.yaws`) and directions in the world."""
+        """The same for `count` yaws of the object (`mevs_jax.models.pose.yaws`) and directions in the world."""
         cos, sin = (jnp.asarray(of(yaws(count)), jnp.float32)[:, None] for of in (np.cos, np.sin))
         x, y, z = jnp.moveaxis(jnp.asarray(directions), -1, 0)
         turned = [cos * x + sin * y, cos * y - sin * x, jnp.broadcast_to(z, (count, len(x)))]
         return self.at(jnp.stack(turned, axis=-1))
+
+    def by_rotation(self, directions: Float[AnyArray, "views 3"]) -> Float[Array, "classes rotations views classes"]:
+        """The same for every rotation of the object in `mevs_jax.models.rotation.rotation_grid`."""
+        grid = jnp.asarray(rotation_grid(), jnp.float32)
+        return self.at(jnp.einsum("rij,vi->rvj", grid, directions, precision=jax.lax.Precision.HIGHEST))

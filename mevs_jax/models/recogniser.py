@@ -9,8 +9,8 @@ from jaxtyping import Array, Bool, Float
 
 from mevs_jax.arrays import AnyArray
 from mevs_jax.inputs import SizeInput
-from mevs_jax.models.azimuth import AzimuthHead
 from mevs_jax.models.calling import TrainedByCall
+from mevs_jax.models.pose import PoseHead
 from mevs_jax.models.resnet import ResNet
 from mevs_jax.models.set_fusion import SetFusion
 
@@ -25,13 +25,11 @@ class Recogniser(TrainedByCall):
         fusion: computes logits from the features and directions of any set of views.
         size: how the object's radius is used: a vector that depends on it is added to the features of its views. None: not at
             all.
-        azimuth: from the features of a view to the azimuth of the camera in the object's frame; None: it is not estimated.
+        pose: from the features of a view to the pose of the object relative to the camera; None: it is not estimated.
     """
 
-    def __init__(
-        self, encoder: ResNet, fusion: SetFusion, size: SizeInput | None = None, azimuth: AzimuthHead | None = None
-    ):
-        self.encoder, self.fusion, self.size_input, self.azimuth = encoder, fusion, size, azimuth
+    def __init__(self, encoder: ResNet, fusion: SetFusion, size: SizeInput | None = None, pose: PoseHead | None = None):
+        self.encoder, self.fusion, self.size_input, self.pose = encoder, fusion, size, pose
         shape = (size.steps, encoder.head.in_features) if size else None
         self.size = nnx.Param(jnp.zeros(shape)) if shape else None
 
@@ -67,7 +65,7 @@ class Recogniser(TrainedByCall):
         Float[Array, "*batch views classes"],
         Float[Array, "*batch classes"],
         Float[Array, "*batch classes"],
-        Float[Array, "*batch views classes azimuths"] | None,
+        Float[Array, "*batch views classes poses"] | None,
     ]:
         """Logits of every single view, and of the present views of each object together.
 
@@ -81,15 +79,15 @@ class Recogniser(TrainedByCall):
 
         Returns:
             Logits of single views; fused logits for a known pose; fused logits for an unknown pose; log-probabilities of the
-            azimuth of each view, None without such a head.
+            pose in each view, None without such a head.
         """
         features = self.features(images, radius, train=train)
         posed, unposed = (self.fusion(features, directions, present, key, posed=known) for known in (True, False))
-        azimuth = None
-        if self.azimuth is not None:
+        pose = None
+        if self.pose is not None:
             drop = None if key is None else jax.random.fold_in(key, 1)
-            azimuth = self.azimuth(features, jnp.asarray(directions)[..., 2], drop)
-        return self.encoder.head(features), posed, unposed, azimuth
+            pose = self.pose(features, jnp.asarray(directions)[..., 2], drop)
+        return self.encoder.head(features), posed, unposed, pose
 
     def see(
         self, images: Float[AnyArray, "*batch height width channels"], radius: Float[AnyArray, "*batch"] | None = None

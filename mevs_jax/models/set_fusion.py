@@ -135,6 +135,29 @@ class SetFusion(nnx.Module):
         return self.head(self.last_norm(x[..., 0, :]))
 
 
+class OfFirstFeatures(nnx.Module):
+    """A fusion that is given the first features of every view, for views whose vectors hold others after them.
+
+    Args:
+        fusion: the network.
+        features: number of features that it is given.
+    """
+
+    def __init__(self, fusion: SetFusion, features: int):
+        self.fusion, self.features = fusion, features
+
+    def __call__(
+        self,
+        features: Float[AnyArray, "*batch views features"],
+        directions: Float[AnyArray, "*batch views 3"],
+        present: Bool[AnyArray, "*batch views"],
+        *,
+        posed: bool = True,
+    ) -> Float[Array, "*batch classes"]:
+        """Logits of the object, from the views that are present; arguments as of `SetFusion`."""
+        return self.fusion(features[..., : self.features], directions, present, posed=posed)
+
+
 class SumFusion(nnx.Module):
     """The thesis's sum of logits with the interface of `SetFusion`, for comparison; it ignores directions.
 

@@ -7,8 +7,8 @@ from typing import Literal
 
 from flax import nnx
 
-from mevs_jax.models.azimuth import AzimuthHead
 from mevs_jax.models.pointnet2 import Abstraction, PointNet2
+from mevs_jax.models.pose import PoseHead
 from mevs_jax.models.resnet import ResNet
 from mevs_jax.models.set_fusion import SetFusion
 from mevs_jax.models.view_policy import Utility, ViewPolicy
@@ -72,15 +72,15 @@ class SetFusionShape:
 
 
 @dataclass(frozen=True)
-class AzimuthShape:
-    """Arguments of `AzimuthHead`."""
+class PoseShape:
+    """Arguments of `PoseHead`."""
 
-    azimuths: int
+    poses: int
     width: int
 
-    def network(self, features: int, classes: int, rngs: nnx.Rngs) -> AzimuthHead:
+    def network(self, features: int, classes: int, rngs: nnx.Rngs) -> PoseHead:
         """Returns a network of this shape with random weights, without dropout."""
-        return AzimuthHead(features, classes, azimuths=self.azimuths, width=self.width, dropout=0.0, rngs=rngs)
+        return PoseHead(features, classes, poses=self.poses, width=self.width, dropout=0.0, rngs=rngs)
 
 
 @dataclass(frozen=True)

@@ -21,15 +21,15 @@ class Observation:
         predicted_entropy: (views,) from the entropy predictor, for every candidate view; None where it is not used.
         features: (features,) from the encoder, for a learned fusion; None where it is not used.
         cloud: (embedding,) of the partial cloud, from PointNet++; None where it is not used.
-        azimuth: (classes, azimuths) log-probabilities of the camera's azimuth in the object's frame for each class; None where it
-            is not estimated.
+        pose_evidence: (classes, poses) log-probability of the view for each pose of the object in the world, up to a constant, if
+            the object is of each class; None where it is not used.
     """
 
     logits: Float[Array, "*batch classes"]
     predicted_entropy: Float[Array, "*batch views"] | None = None
     features: Float[Array, "*batch features"] | None = None
     cloud: Float[Array, "*batch embedding"] | None = None
-    azimuth: Float[Array, "*batch classes azimuths"] | None = None
+    pose_evidence: Float[Array, "*batch classes poses"] | None = None
 
 
 @flax.struct.dataclass
@@ -62,13 +62,13 @@ class Knowledge:
     Attributes:
         order: (views,) scores of the best fixed order; the view with the highest score comes first.
         expected_logits: (classes, views, classes); entry [y, j] is the mean logits at view j of objects of class y.
-        by_yaw: (classes, yaws, views, classes); entry [y, k, j] is the mean logits at view j of objects of class y that are
-            turned about the vertical by 2πk / yaws.
+        by_pose: (classes, poses, views, classes); entry [y, k, j] is the mean logits at view j of objects of class y that are in
+            pose k, for objects of unknown pose.
     """
 
     order: Float[Array, "*batch views"] | None = None
     expected_logits: Float[Array, "*batch classes views classes"] | None = None
-    by_yaw: Float[Array, "*batch classes yaws views classes"] | None = None
+    by_pose: Float[Array, "*batch classes poses views classes"] | None = None
 
 
 @flax.struct.dataclass
@@ -117,7 +117,7 @@ def required(value: T | None, name: str) -> T:
     return value
 
 
-def known(scene: Scene, name: Literal["order", "expected_logits", "by_yaw"]) -> Array:
+def known(scene: Scene, name: Literal["order", "expected_logits", "by_pose"]) -> Array:
     """Returns a field of `Scene.knowledge`.
 
     Raises:

@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from mevs_jax.models.azimuth import yaw_log_probabilities
+from mevs_jax.models.pose import pose_log_probabilities
 from mevs_jax.policies.base import Scene, SelectionState, known, required
 
 
@@ -27,18 +27,17 @@ def information_gain(key: Array, state: SelectionState, scene: Scene) -> Float[A
     return _expected_decrease(state.belief, known(scene, "expected_logits"), probability)
 
 
-def information_gain_by_yaw(key: Array, state: SelectionState, scene: Scene) -> Float[Array, " views"]:
-    """`information_gain` for an object of unknown yaw φ, over hypotheses of class and yaw together.
+def information_gain_by_pose(key: Array, state: SelectionState, scene: Scene) -> Float[Array, " views"]:
+    """`information_gain` for an object of unknown pose φ, over hypotheses of class and pose together.
 
-    The score is H(p) − Σ_y p(y) Σ_φ p(φ | y) H(softmax(belief + M[y, φ, j])). The distribution of the yaw for each class comes
-    from the azimuths that the recogniser finds in the views seen.
+    The score is H(p) − Σ_y p(y) Σ_φ p(φ | y) H(softmax(belief + M[y, φ, j])). The distribution of the pose for each class comes
+    from what the recogniser says about it in the views seen.
     """
     del key
     present = jnp.arange(len(state.views)) < state.count
-    azimuths = required(state.seen.azimuth, "Observation.azimuth")
-    yaw = yaw_log_probabilities(azimuths, scene.graph.points[state.views], present)
-    expected, probability = known(scene, "by_yaw"), jax.nn.softmax(state.belief)
-    weights = (probability[:, None] * jnp.exp(yaw)).reshape(-1)
+    pose = pose_log_probabilities(required(state.seen.pose_evidence, "Observation.pose_evidence"), present)
+    expected, probability = known(scene, "by_pose"), jax.nn.softmax(state.belief)
+    weights = (probability[:, None] * jnp.exp(pose)).reshape(-1)
     return _expected_decrease(state.belief, expected.reshape(-1, *expected.shape[2:]), weights)
 
 

@@ -24,7 +24,7 @@ DESCRIPTION, WEIGHTS = "trained.json", "weights.safetensors"
 def arrays_of(parts: Parts) -> dict[str, Any]:
     """All arrays by names joined with dots; those of a network by their place in it."""
     found: dict[str, Any] = {"viewpoints": parts.viewpoints, "neighbours": parts.neighbours, "single": parts.single}
-    networks = {"encoder": parts.encoder, "entropy": parts.entropy, "azimuth": parts.azimuth}
+    networks = {"encoder": parts.encoder, "entropy": parts.entropy, "pose": parts.pose}
     networks |= {f"view_policies.{name}": network for name, network in parts.view_policies.items()}
     for name, network in networks.items():
         if network is not None:
@@ -109,9 +109,9 @@ def parts_of(description: Description, arrays: dict[str, np.ndarray]) -> Parts:
             fusion[name] = CalibratedFusion(
                 network.structure, network.weights, prior, temperatures, single, name == "posed"
             )
-    azimuth, entropy, knowledge, expected, strangeness = None, None, None, None, None
-    if (of_azimuth := description.azimuth) is not None:
-        azimuth = take.network("azimuth", lambda rngs: of_azimuth.network(features, classes, rngs))
+    pose, entropy, knowledge, expected, strangeness = None, None, None, None, None
+    if (of_pose := description.pose) is not None:
+        pose = take.network("pose", lambda rngs: of_pose.network(features, classes, rngs))
     if (of_entropy := description.entropy) is not None:
         entropy = take.network("entropy", lambda rngs: of_entropy.network(views, rngs))
     if "knowledge.order" in arrays:
@@ -134,7 +134,7 @@ def parts_of(description: Description, arrays: dict[str, np.ndarray]) -> Parts:
         size=None if description.size is None else take.take("size", (description.size.steps, features)),
         entropy=entropy,
         fusion=fusion,
-        azimuth=azimuth,
+        pose=pose,
         expected=expected,
         view_policies={
             name: take.network(f"view_policies.{name}", lambda rngs, of=of: of.network(classes, rngs))

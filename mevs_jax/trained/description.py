@@ -7,7 +7,7 @@ from typing import Any, Literal
 
 from mevs_jax.cameras import ViewCamera
 from mevs_jax.inputs import SizeInput
-from mevs_jax.models.shapes import AzimuthShape, PointNet2Shape, ResNetShape, SetFusionShape, ViewPolicyShape
+from mevs_jax.models.shapes import PointNet2Shape, PoseShape, ResNetShape, SetFusionShape, ViewPolicyShape
 
 FORM = 1
 """Version of the folder's form; a program reads this version alone."""
@@ -76,7 +76,7 @@ class Description:
         encoder: its shape.
         fusion: shape of the set fusion, for a recogniser.
         size: how the object's radius is used, for a recogniser that was trained with it.
-        azimuth: shape of the network that finds the azimuth of a view, for a recogniser that was trained with it.
+        pose: shape of the network that finds the azimuth of a view, for a recogniser that was trained with it.
         entropy: shape of the entropy predictor, if there is one.
         cloud: input of the entropy predictor.
         view_policies: shapes of the networks that score views, by name of the policy.
@@ -103,7 +103,7 @@ class Description:
     made_with: dict[str, str]
     fusion: SetFusionShape | None = None
     size: SizeInput | None = None
-    azimuth: AzimuthShape | None = None
+    pose: PoseShape | None = None
     entropy: PointNet2Shape | None = None
     cloud: CloudInput | None = None
     view_policies: dict[str, ViewPolicyShape] = field(default_factory=dict)

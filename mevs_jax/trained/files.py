@@ -25,7 +25,7 @@ from mevs_jax.policies.registry import POLICIES
 from mevs_jax.trained.arrays import DESCRIPTION, WEIGHTS, arrays_of, parts_of
 from mevs_jax.trained.card import model_card
 from mevs_jax.trained.description import FORM, Description
-from mevs_jax.trained.system import BY_YAW, TrainedSystem
+from mevs_jax.trained.system import BY_POSE, TrainedSystem
 
 CARD, PROGRAMS = "README.md", "stablehlo"
 SHIPPED = Path(__file__).parents[1] / "systems"
@@ -256,7 +256,7 @@ def check(description: Description) -> None:
         description.fusion is not None and 0 < size.smallest < size.largest < 1e9 and 2 <= size.steps <= 1000
     ):
         raise ValueError("the size is impossible, or used by another kind than a recogniser")
-    if description.azimuth is not None and description.fusion is None:
+    if description.pose is not None and description.fusion is None:
         raise ValueError("nothing but a recogniser finds the azimuth of views")
     if (description.entropy is None) != (description.cloud is None):
         raise ValueError("an entropy predictor and its cloud belong together")
@@ -265,11 +265,11 @@ def check(description: Description) -> None:
     if (description.kind == "recogniser") != (description.fusion is not None):
         raise ValueError("a recogniser, and nothing else, has a fusion")
     of = description
-    shapes = (of.encoder, of.fusion, of.azimuth, of.entropy, *of.view_policies.values())
+    shapes = (of.encoder, of.fusion, of.pose, of.entropy, *of.view_policies.values())
     for shape in shapes:
         if shape is not None:
             _check_sizes(asdict(shape))
-    own = {*description.view_policies, *[BY_YAW] * (description.azimuth is not None)}
+    own = {*description.view_policies, *[BY_POSE] * (description.pose is not None)}
     for name in (description.best, description.best_unposed):
         if name not in POLICIES and name not in own:
             raise ValueError(f"it has no policy {name!r:.40}")

@@ -15,6 +15,7 @@ from mevs_jax.beliefs import CalibratedFusion
 from mevs_jax.cameras import ViewCamera
 from mevs_jax.inputs import SizeInput, depth_and_normals, depth_image, view_cloud
 from mevs_jax.models.expected_views import ExpectedViews
+from mevs_jax.models.pose import yaw_evidence
 from mevs_jax.policies.base import Knowledge, Observation
 from mevs_jax.trained.description import CloudInput, ImageInput
 from mevs_jax.trained.strangeness import Strangeness
@@ -51,7 +52,7 @@ class Parts:
         fusion: of a recogniser, for a known and for an unknown yaw: `posed` and `unposed`.
         single: temperature of the logits of a single view.
         view_policies: networks that score views, by name of the policy.
-        azimuth: of a recogniser, from the features of a view to the azimuth of the camera in the object's frame.
+        pose: of a recogniser, from the features of a view to the azimuth of the camera in the object's frame.
         knowledge: statistics over other objects at the viewpoints, for policies that use them.
         expected: what a recogniser is expected to say of each class from any direction.
         temperatures: by name of the policy, (views,): temperature of the belief after 1, 2, … views of its walks.
@@ -66,21 +67,21 @@ class Parts:
     size: Float[Array, "steps features"] | None = None
     fusion: dict[str, CalibratedFusion] = flax.struct.field(default_factory=dict)
     view_policies: dict[str, Network] = flax.struct.field(default_factory=dict)
-    azimuth: Network | None = None
+    pose: Network | None = None
     knowledge: Knowledge | None = None
     expected: ExpectedViews | None = None
     temperatures: dict[str, Array] = flax.struct.field(default_factory=dict)
     strangeness: Strangeness | None = None
 
-    def knowledge_by_yaw(self, directions: Float[Array, "views 3"]) -> Knowledge | None:
+    def knowledge_by_pose(self, directions: Float[Array, "views 3"]) -> Knowledge | None:
         """What is known about views in directions of the world for objects of unknown yaw; None if nothing is.
 
         Args:
             directions: unit vectors from the object to the cameras.
         """
-        if self.expected is None or self.azimuth is None:
+        if self.expected is None or self.pose is None:
             return None
-        return Knowledge(by_yaw=self.expected.by_yaw(directions, self.azimuth.module.shape[1]))
+        return Knowledge(by_pose=self.expected.by_yaw(directions, self.pose.module.shape[1]))
 
 
 @lru_cache(maxsize=8)
@@ -158,7 +159,8 @@ def observe(
         pixels = sample_pixels(depth, cloud.points)
         seen = view_cloud(pixels, depth.reshape(-1)[pixels], pose, camera, cloud.frame, cloud.directions)
         entropies = parts.entropy.module(seen)
-    azimuth = None
-    if parts.azimuth is not None:
-        azimuth = parts.azimuth.module(features, pose[2, 3] / jnp.linalg.norm(pose[:3, 3]))
-    return Observation(logits_of(parts, parts.encoder.module, features), entropies, features, azimuth=azimuth)
+    evidence = None
+    if parts.pose is not None:
+        direction = pose[:3, 3] / jnp.linalg.norm(pose[:3, 3])
+        evidence = yaw_evidence(parts.pose.module(features, direction[2]), direction)
+    return Observation(logits_of(parts, parts.encoder.module, features), entropies, features, pose_evidence=evidence)

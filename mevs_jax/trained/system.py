@@ -15,7 +15,7 @@ from mevs_jax.arrays import AnyArray
 from mevs_jax.cameras import cameras_at
 from mevs_jax.inputs import check_depth
 from mevs_jax.policies.base import Observation, Policy
-from mevs_jax.policies.informed import information_gain_by_yaw
+from mevs_jax.policies.informed import information_gain_by_pose
 from mevs_jax.policies.learned import learned
 from mevs_jax.policies.registry import POLICIES, policy_named
 from mevs_jax.selection import Fuse, by_attention, sum_of_logits
@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 
 _AND_TABLE = "learned_and_table"
 """The policy that averages the gains by the network `learned` and by the class × view table."""
-BY_YAW = "information_gain_by_yaw"
+BY_POSE = "information_gain_by_pose"
 """`information_gain` where the yaw is unknown, for a recogniser that finds the azimuth of views."""
 
 
@@ -125,10 +125,10 @@ class TrainedSystem:
                 raise ValueError("its network needs the object's yaw")
             by = "table" if name == _AND_TABLE else "belief"
             return learned(parts.view_policies[network].module, parts.single, by=by)  # type: ignore[arg-type]
-        if name in ("information_gain", BY_YAW) and parts.azimuth is not None:
-            return policy_named("information_gain") if posed else information_gain_by_yaw
+        if name in ("information_gain", BY_POSE) and parts.pose is not None:
+            return policy_named("information_gain") if posed else information_gain_by_pose
         if name not in POLICIES:
-            own = (*parts.view_policies, *[BY_YAW] * (parts.azimuth is not None))
+            own = (*parts.view_policies, *[BY_POSE] * (parts.pose is not None))
             known = ", ".join(("best", *own, *POLICIES))
             raise ValueError(f"unknown policy {name!r}; it is one of {known}")
         return policy_named(name)

@@ -27,12 +27,12 @@ from mevs_jax import (
     with_movement,
 )
 from mevs_jax.policies import policy_entry, policy_named, register_policy
-from mevs_jax.policies.informed import information_gain_by_yaw
+from mevs_jax.policies.informed import information_gain_by_pose
 from tests.reference import numpy_rules, policies
 
 THRESHOLDS = (0.5, 0.6, 0.7, 0.8, 0.9, 0.95, 0.99)
 TABLES = 10_000
-YAWS = 6
+POSES = 6
 
 
 def random_tables(views: int, classes: int, count: int, seed: int) -> ViewTable:
@@ -45,7 +45,7 @@ def random_tables(views: int, classes: int, count: int, seed: int) -> ViewTable:
         entropy=jnp.asarray(entropy, jnp.float32),
         label=jnp.asarray(random.integers(0, classes, count), jnp.int32),
         ascent_scores={rung.policy: jnp.asarray(random.uniform(0, 1, (count, views, views))) for rung in ASCENT_RUNGS},
-        azimuths=jax.nn.log_softmax(jnp.asarray(random.normal(0, 1, (count, views, classes, YAWS)), jnp.float32)),
+        pose_evidence=jax.nn.log_softmax(jnp.asarray(random.normal(0, 1, (count, views, classes, POSES)), jnp.float32)),
     )
 
 
@@ -106,7 +106,7 @@ def knowledge_of(views: int, classes: int) -> Knowledge:
     return Knowledge(
         order=jnp.asarray(random.permutation(views), jnp.float32),
         expected_logits=jnp.asarray(random.normal(0, 1.5, (classes, views, classes)), jnp.float32),
-        by_yaw=jnp.asarray(random.normal(0, 1.5, (classes, YAWS, views, classes)), jnp.float32),
+        by_pose=jnp.asarray(random.normal(0, 1.5, (classes, POSES, views, classes)), jnp.float32),
     )
 
 
@@ -117,17 +117,17 @@ def whole_scene(table: ViewTable, graph: ViewGraph) -> Scene:
 DRAWING = ("random", "random_with_repetition")
 
 
-BY_YAW = "information_gain_by_yaw"
+BY_POSE = "information_gain_by_pose"
 
 
-@pytest.mark.parametrize("policy", [*(name for name in POLICIES if name not in DRAWING), BY_YAW])
+@pytest.mark.parametrize("policy", [*(name for name in POLICIES if name not in DRAWING), BY_POSE])
 def test_every_step_of_a_policy_is_the_best_by_its_plain_rule(policy):
     """At each step of the jitted walk the view chosen has the highest score that slow, obvious code gives."""
     views, classes, count, max_views = 12, 4, 150, 8
     graph = ViewGraph.from_points(fibonacci_sphere(views))
     tables = random_tables(views, classes, count, seed=12)
     knowledge = knowledge_of(views, classes)
-    run = information_gain_by_yaw if policy == BY_YAW else POLICIES[policy]
+    run = information_gain_by_pose if policy == BY_POSE else POLICIES[policy]
 
     @jax.jit
     @jax.vmap
@@ -137,7 +137,7 @@ def test_every_step_of_a_policy_is_the_best_by_its_plain_rule(policy):
 
     walks = np.asarray(walk(tables, jnp.arange(count, dtype=jnp.int32) % views))
     plain_graph = {name: np.asarray(getattr(graph, name)) for name in ("neighbours", "distances", "points")}
-    plain_knowledge = {name: np.asarray(getattr(knowledge, name)) for name in ("order", "expected_logits", "by_yaw")}
+    plain_knowledge = {name: np.asarray(getattr(knowledge, name)) for name in ("order", "expected_logits", "by_pose")}
     arrays = jax.tree.map(np.asarray, vars(tables))
     for index, walked in enumerate(walks):
         table = jax.tree.map(lambda leaf, at=index: leaf[at], arrays)

@@ -47,14 +47,6 @@ def scrambled(predicted_entropy: np.ndarray, seen: list[int], neighbours: np.nda
     return scores
 
 
-def azimuth_at(log_probabilities: np.ndarray, direction: np.ndarray, yaw: int) -> float:
-    """Log-probability, linear between azimuths, that a camera is where it is if the object has yaw number `yaw`."""
-    count = len(log_probabilities)
-    place = (np.arctan2(direction[1], direction[0]) / (2 * np.pi) * count - yaw) % count
-    share = place - np.floor(place)
-    return (1 - share) * log_probabilities[int(place) % count] + share * log_probabilities[(int(place) + 1) % count]
-
-
 def scores(policy: str, seen: list[int], table: dict, graph: dict, knowledge: dict) -> np.ndarray:
     """Scores of a policy that does not draw.
 
@@ -95,17 +87,14 @@ def scores(policy: str, seen: list[int], table: dict, graph: dict, knowledge: di
             )
             gain[view] = entropy_of(belief) - expected
         return gain
-    if policy == "information_gain_by_yaw":
+    if policy == "information_gain_by_pose":
         probability, gain = softmax(belief), np.zeros(views)
         for view in range(views):
             expected = 0.0
             for y, p in enumerate(probability):
-                evidence = np.zeros(knowledge["by_yaw"].shape[1])
-                for k in range(len(evidence)):
-                    for one in seen:
-                        evidence[k] += 0.75 * azimuth_at(table["azimuths"][one, y], graph["points"][one], k)
+                evidence = 0.75 * sum(table["pose_evidence"][one, y] for one in seen)
                 for k, share in enumerate(softmax(evidence)):
-                    expected += p * share * entropy_of(belief + knowledge["by_yaw"][y, k, view])
+                    expected += p * share * entropy_of(belief + knowledge["by_pose"][y, k, view])
             gain[view] = entropy_of(belief) - expected
         return gain
     if policy == "belief_oracle":

@@ -15,7 +15,7 @@ from data_pipeline.errors import Diverged
 from mevs_jax.arrays import AnyArray
 from mevs_jax.beliefs import CalibratedFusion
 from mevs_jax.calibration import class_weights, fit_temperature
-from mevs_jax.models.set_fusion import SetFusion, SumFusion
+from mevs_jax.models.set_fusion import OfFirstFeatures, SetFusion, SumFusion
 from train.choosing.chunks import in_chunks
 from train.choosing.features import Features, sets_of_size
 from train.finite import check_outputs
@@ -25,7 +25,7 @@ _CALIBRATED = (1, 2, 3, 4, 5, 6, 8, 12, 16, 24, 32, 40)
 
 
 def calibrated(
-    network: SetFusion | SumFusion,
+    network: SetFusion | OfFirstFeatures | SumFusion,
     validation: Features,
     prior: Float[Array, " classes"],
     posed: bool = True,

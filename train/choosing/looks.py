@@ -37,10 +37,17 @@ def quarter_turns(images: Float[Array, "*batch side side 4"]) -> list[Float[Arra
 
 
 def _see_images(network: Recogniser, task: RecogniserTask, images: Array, directions: Array, batch: Batch) -> jax.Array:
-    """Returns what `see` does; of a recogniser for any rotation, the mean over four turns of each image."""
+    """Returns what `see` does.
+
+    Of a recogniser for any rotation, features and logits are means over four turns of each image. The features of the image as it
+    is, which its rotation can be read from, come after those.
+    """
     label, radii = batch["label"][:, None].astype(jnp.float32), task.radii(batch)
-    turns = quarter_turns(images) if task.augmentation.turn else [images]
-    seen = sum((network.see(turned, radii) for turned in turns), jnp.float32(0)) / len(turns)
+    seen = network.see(images, radii)
+    if task.augmentation.turn:
+        mean = (seen + sum(network.see(turned, radii) for turned in quarter_turns(images)[1:])) / 4
+        features = network.encoder.head.in_features
+        seen = jnp.concatenate([mean[..., :features], seen[..., :features], mean[..., features:]], axis=-1)
     return jnp.concatenate([seen, directions, label], axis=-1)
 
 
@@ -56,7 +63,7 @@ def _see_changed_by(changes: Array, network: Recogniser, task: RecogniserTask, b
 
 
 @cache
-def see_rotated(viewpoints: tuple[tuple[float, ...], ...]) -> Ask:
+def see_rotated(viewpoints: tuple[tuple[float, ...], ...], own_frame: bool = False) -> Ask:
     """Returns a `see` for objects turned so that their cameras are in the directions of the lattice again.
 
     For data sets made with `turned`, where the lattice around each object is turned by a random rotation. Those rotations are
@@ -64,6 +71,7 @@ def see_rotated(viewpoints: tuple[tuple[float, ...], ...]) -> Ask:
 
     Args:
         viewpoints: unit vectors of the lattice.
+        own_frame: whether the directions that are returned are those in the object's own frame.
 
     Raises:
         DataError: if they lie in one plane with the origin, which does not determine a rotation.
@@ -82,7 +90,8 @@ def see_rotated(viewpoints: tuple[tuple[float, ...], ...]) -> Ask:
             return jnp.linalg.solve(directions.T @ directions, directions.T @ lattice).T
 
         turns = jax.vmap(turn_back)(views_by_object(task.directions(batch), task.camera.views))
-        return _see_changed_by(turns, network, task, batch)
+        found = _see_changed_by(turns, network, task, batch)
+        return found.at[:, -4:-1].set(task.directions(batch)) if own_frame else found
 
     return see
 

@@ -28,9 +28,9 @@ from data_pipeline.dataset.statistics import SUMMARY, DatasetStatistics, load_st
 from data_pipeline.progress import console
 from mevs_jax.beliefs import CalibratedFusion
 from mevs_jax.models import Recogniser, ViewPolicy
-from mevs_jax.models.azimuth import AzimuthHead
 from mevs_jax.models.expected_views import ExpectedViews
-from mevs_jax.models.set_fusion import SumFusion
+from mevs_jax.models.pose import PoseHead
+from mevs_jax.models.set_fusion import OfFirstFeatures, SetFusion, SumFusion
 from train.chance import warn_of_chance
 from train.choosing.calibrated import calibrated
 from train.choosing.config import LearnedConfig
@@ -101,6 +101,11 @@ class Stages:
         if size and (data / SUMMARY).exists():
             check_sizes(size, open_split(data, "train"), _SIZE)
 
+    @property
+    def _viewpoints(self) -> tuple[tuple[float, ...], ...]:
+        """The lattice of the run."""
+        return tuple(map(tuple, self.statistics.viewpoints))
+
     @cached_property
     def statistics(self) -> DatasetStatistics:
         return load_statistics(self.turned)
@@ -139,7 +144,10 @@ class Stages:
         task, folder = self.upright.task(fold), self.upright.recogniser_folder(fold)
 
         def put(network: nnx.Module) -> None:
-            nnx.update(network, nnx.state(load_best(task, folder)))
+            upright = load_best(task, folder)
+            assert isinstance(upright, Recogniser)
+            upright.pose = None  # azimuths; rotations are learned from the beginning
+            nnx.update(network, nnx.state(upright))
 
         return StartingWeights(f"{task.name} {made_by(self.statistics, folder)}", put)
 
@@ -165,7 +173,7 @@ class Stages:
         task, folder, classes = self.task(fold), self.recogniser_folder(fold), len(self.statistics.classes)
         self._check_sizes(data)
         if ask is None:
-            ask = see if self.upright is None else see_rotated(tuple(map(tuple, self.statistics.viewpoints)))
+            ask = see if self.upright is None else see_rotated(self._viewpoints)
         seen = kept_array(
             self.folder / "features" / f"{name}.npz",
             made_by(load_statistics(data), folder),
@@ -202,21 +210,23 @@ class Stages:
         def fitted() -> np.ndarray:
             task, classes = self.task(), len(self.statistics.classes)
             recogniser = load_best(task, self.recogniser_folder())
-            seen = np.asarray(network_outputs(self.turned, "train", task, recogniser, see), np.float32)
+            ask = see if self.upright is None else see_rotated(self._viewpoints, own_frame=True)
+            seen = np.asarray(network_outputs(self.turned, "train", task, recogniser, ask), np.float32)
             seen = seen.reshape(-1, seen.shape[-1])[:, -classes - 4 :]
             logits, directions, labels = np.split(seen, (classes, classes + 3), axis=1)
-            log_probabilities = jax.nn.log_softmax((logits - self.prior) / self.fusion().single, axis=-1)
+            temperature = self.fusion(posed=self.upright is None).single
+            log_probabilities = jax.nn.log_softmax((logits - self.prior) / temperature, axis=-1)
             found = fit_expected_views(directions, np.asarray(log_probabilities), labels[:, 0].astype(int))
             return np.asarray(found.coefficients)
 
         path = self.folder / "features" / "expected_views.npz"
         return ExpectedViews(jnp.asarray(kept_array(path, made_by(self.statistics, self.recogniser_folder()), fitted)))
 
-    def azimuth_head(self) -> AzimuthHead | None:
-        """Returns the recogniser's network for the azimuth of views; None if it has none."""
+    def pose_head(self) -> PoseHead | None:
+        """Returns the recogniser's network for the pose of objects; None if it has none."""
         recogniser = load_best(self.task(), self.recogniser_folder())
         assert isinstance(recogniser, Recogniser)
-        return recogniser.azimuth
+        return recogniser.pose
 
     def fusion(self, fold: int | None = None, posed: bool = True, summed: bool = False) -> CalibratedFusion:
         """Returns the recogniser's fusion, or the sum of its logits, with temperatures, for objects of known or unknown pose."""
@@ -225,7 +235,11 @@ class Stages:
             validation = self.features("turned_val" if fold is None else f"fold_{fold}_val", self.turned, "val", fold)
             recogniser = load_best(self.task(fold), self.recogniser_folder(fold))
             assert isinstance(recogniser, Recogniser)
-            network = SumFusion(recogniser.encoder.head, self.prior) if summed else recogniser.fusion
+            network: SetFusion | OfFirstFeatures | SumFusion = recogniser.fusion
+            if summed:
+                network = SumFusion(recogniser.encoder.head, self.prior)
+            elif self.upright is not None:
+                network = OfFirstFeatures(recogniser.fusion, recogniser.encoder.head.in_features)
             self._fusions[wanted] = calibrated(network, validation, self.prior, posed)
         return self._fusions[wanted]
 

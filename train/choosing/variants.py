@@ -41,7 +41,7 @@ class Variant:
 VARIANTS = {
     "learned": Variant("view policy"),
     "learned_unposed": Variant("view policy", posed=False),
-    "learned_and_table": Variant("view policy and table", by="table", network="learned"),
+    "learned_and_table": Variant("view policy and expected views", by="table", network="learned"),
     "as_it_is": Variant("… by the gain expected in the state, not per class", by="state", network="learned"),
     "look_ahead": Variant("… two views ahead", by="ahead", network="learned"),
     "probability": Variant(

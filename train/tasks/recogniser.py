@@ -15,14 +15,15 @@ import optax
 from flax import nnx
 
 from data_pipeline.capture.casting import CaptureConfig
-from data_pipeline.dataset.augment import ViewAugmentation, object_changes, random_shift, views_after
+from data_pipeline.dataset.augment import ViewAugmentation, object_changes, object_turns, random_shift, views_after
 from data_pipeline.dataset.batches import ViewBatches
 from data_pipeline.dataset.inputs import depth_and_normals, view_camera
 from data_pipeline.dataset.reality import RealityAugmentation, realistic_views, used_reality
 from mevs_jax import inputs as inputs_of
 from mevs_jax.inputs import SizeInput
 from mevs_jax.models import Recogniser, ResNet
-from mevs_jax.models.azimuth import AzimuthHead, azimuth_of, azimuth_weights
+from mevs_jax.models.pose import PoseHead, azimuth_of, azimuth_weights
+from mevs_jax.models.rotation import ROTATIONS, rotation_weights, seen_rotations
 from train.choosing.features import SetFusionConfig, new_fusion, random_sets
 from train.optimiser import OptimiserConfig
 from train.step import Batch, Hyperparameters, Metrics
@@ -47,14 +48,14 @@ class RecogniserConfig:
     balanced: bool = False
     """draw equally many training objects of each class, objects of rarer classes more often; else each object equally often"""
     azimuths: int = 24
-    """number of azimuths that are told apart where the yaw of objects is unknown; 0: the azimuth of views is not estimated"""
+    """number of azimuths that are told apart where the yaw of objects is unknown; 0: the pose of objects is not estimated"""
     optimiser: OptimiserConfig = OptimiserConfig()
 
 
 Outputs = tuple[jax.Array, jax.Array, jax.Array, jax.Array | None]
 """What a `Recogniser` returns."""
-_AZIMUTH_WEIGHT = 0.25
-"""Weight of the loss of the azimuth of views, relative to that of the class of single views."""
+_POSE_WEIGHT = 0.25
+"""Weight of the loss of the object's pose in views, relative to that of the class of single views."""
 
 
 @dataclass(frozen=True)
@@ -62,7 +63,7 @@ class RecogniserTask:
     """Training of the recogniser by cross-entropy on single views and on random sets of an object's views in the batch.
 
     The loss of a set is half that with the object's pose known, half that with it unknown. The azimuth of each view in the
-    object's frame is learned too, for the object's class.
+    object's frame is learned too, for the object's class; its rotation relative to the camera if training turns objects.
     """
 
     network_config: ResNetConfig
@@ -137,12 +138,11 @@ class RecogniserTask:
             rngs=rngs,
         )
         fusion = new_fusion(self.fusion_config, 8 * shape.width, self.classes, rngs)
-        azimuth = None
+        pose = None
         if self.azimuths:
-            azimuth = AzimuthHead(
-                8 * shape.width, self.classes, azimuths=self.azimuths, dropout=self.fusion_config.dropout, rngs=rngs
-            )
-        return Recogniser(encoder, fusion, SizeInput() if self.size else None, azimuth)
+            poses, dropout = ROTATIONS if self.augmentation.turn else self.azimuths, self.fusion_config.dropout
+            pose = PoseHead(8 * shape.width, self.classes, poses=poses, dropout=dropout, rngs=rngs)
+        return Recogniser(encoder, fusion, SizeInput() if self.size else None, pose)
 
     def inputs(self, batch: Batch) -> jax.Array:
         """Returns the images of a batch, (views, height, width, 4)."""
@@ -176,13 +176,15 @@ class RecogniserTask:
         images, poses = by_object(inputs), by_object(poses)
         labels = batch["label"].reshape(images.shape[:2])[:, 0]
         changes = object_changes(change, len(images), self.augmentation)
+        turns = object_turns(change, len(images)) if self.augmentation.turn else None
         shifts = jax.vmap(jax.vmap(partial(random_shift, largest=self.shift)))(jax.random.split(move, images.shape[:2]))
         images, directions = jax.vmap(partial(views_after, camera=self.camera))(changes, images, poses, shifts=shifts)
         present = random_sets(sets, len(images), images.shape[1], images.shape[1])
         radii = self.radii(batch)
         if self.size and radii is not None:
             radii = radii_for_training(jax.random.fold_in(key, 5), by_object(radii), self.size)
-        found = self._metrics_of(network(images, directions, present, radii, train=True, key=drop), labels, directions)
+        outputs = network(images, directions, present, radii, train=True, key=drop)
+        found = _metrics_of(outputs, labels, directions, turns)
         means = {name: jnp.mean(values) for name, values in found.items()}
         return means["loss"], means
 
@@ -192,7 +194,7 @@ class RecogniserTask:
         If training turns objects, they are turned here too, each by the same rotation every time.
         """
         by_object = partial(views_by_object, views=self.optimiser.validation_views)
-        images, directions = by_object(self.inputs(batch)), by_object(self.directions(batch))
+        images, directions, turns = by_object(self.inputs(batch)), by_object(self.directions(batch)), None
         if self.augmentation.turn:
             turns = object_changes(jax.random.key(1), len(images), ViewAugmentation(mirror=False, turn=True))
             images, directions = jax.vmap(partial(views_after, camera=self.camera))(
@@ -201,32 +203,31 @@ class RecogniserTask:
         labels = batch["label"].reshape(images.shape[:2])[:, 0]
         radii = self.radii(batch)
         radii = None if radii is None else by_object(radii)
-        found = self._metrics_of(
-            network(images, directions, jnp.ones(images.shape[:2], bool), radii), labels, directions
-        )
+        outputs = network(images, directions, jnp.ones(images.shape[:2], bool), radii)
+        found = _metrics_of(outputs, labels, directions, turns)
         return {name: values.reshape(-1) for name, values in found.items()}
 
-    def _metrics_of(self, outputs: Outputs, labels: jax.Array, directions: jax.Array) -> Metrics:
-        """Returns metrics of every view, each (objects, views).
 
-        The azimuth of a view has no meaning, and no loss, if training turns objects by any rotation.
+def _metrics_of(outputs: Outputs, labels: jax.Array, directions: jax.Array, turns: jax.Array | None) -> Metrics:
+    """Returns metrics of every view, each (objects, views).
 
-        Args:
-            outputs: of the network.
-            labels: (objects,) true classes.
-            directions: (objects, views, 3) unit vectors from the object to the cameras.
-        """
-        each, posed, unposed, azimuth = outputs
-        found = _metrics_of_class(each, posed, unposed, labels)
-        if azimuth is not None and not self.augmentation.turn:
-            found["loss"] += _AZIMUTH_WEIGHT * _azimuth_loss(azimuth, labels, directions)
-        return found
-
-
-def _azimuth_loss(azimuth: jax.Array, labels: jax.Array, directions: jax.Array) -> jax.Array:
-    """Returns the cross-entropy of the azimuth of each view if the object's class is known, (objects, views)."""
-    own = jnp.take_along_axis(azimuth, labels[:, None, None, None], axis=2)[:, :, 0]
-    return -jnp.sum(azimuth_weights(azimuth_of(directions), own.shape[-1]) * own, axis=-1)
+    Args:
+        outputs: of the network.
+        labels: (objects,) true classes.
+        directions: (objects, views, 3) unit vectors from the object to the cameras.
+        turns: (objects, 3, 3) rotations of the objects, if they are in any rotation.
+    """
+    each, posed, unposed, poses = outputs
+    found = _metrics_of_class(each, posed, unposed, labels)
+    if poses is not None:
+        own = jnp.take_along_axis(poses, labels[:, None, None, None], axis=2)[:, :, 0]
+        if turns is None:
+            wanted = azimuth_weights(azimuth_of(directions), own.shape[-1])
+        else:
+            turns = jnp.broadcast_to(turns[:, None], (*directions.shape, 3))
+            wanted = rotation_weights(seen_rotations(turns, directions))
+        found["loss"] -= _POSE_WEIGHT * jnp.sum(wanted * own, axis=-1)
+    return found
 
 
 def _metrics_of_class(each: jax.Array, posed: jax.Array, unposed: jax.Array, labels: jax.Array) -> Metrics:

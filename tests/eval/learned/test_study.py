@@ -68,7 +68,7 @@ def test_what_looking_was_worth_is_learned_and_the_study_says_so(adding):
         draws=2,
         oracle_views=3,
         apart=[Learner("learned", "view policy", policy)] * 2,
-        expected=expected,
+        known=expected,
     )
     after = {name: result["after_views"] for name, result in found["policies"].items()}
     alone = seeds_together([found], [each], "learned")  # which says nothing of other trainings

@@ -41,9 +41,9 @@ def table_of(system, views) -> ViewTable:
     seen = [system.observe(depth, pose) for depth, pose in views]
     entropies = None if seen[0].predicted_entropy is None else jnp.stack([one.predicted_entropy for one in seen])
     features = jnp.stack([one.features for one in seen])
-    azimuths = None if seen[0].azimuth is None else jnp.stack([one.azimuth for one in seen])
+    evidence = None if seen[0].pose_evidence is None else jnp.stack([one.pose_evidence for one in seen])
     logits = jnp.stack([one.logits for one in seen])
-    return ViewTable(logits, entropies, None, jnp.int32(0), features=features, azimuths=azimuths)
+    return ViewTable(logits, entropies, None, jnp.int32(0), features=features, pose_evidence=evidence)
 
 
 CENTER, RADIUS = np.array([0.5, -0.2, 0.8]), 0.3
@@ -79,7 +79,7 @@ def walk(agent, views, first, **reset):
         pytest.param("classifier", "fixed_order", marks=pytest.mark.slow),
         ("recogniser", "learned"),
         ("recogniser", "information_gain"),
-        ("recogniser", "information_gain_by_yaw"),
+        ("recogniser", "information_gain_by_pose"),
         pytest.param("recogniser", "learned_and_table", marks=pytest.mark.slow),
     ],
 )
@@ -88,8 +88,8 @@ def test_walks_are_those_of_the_selection_loop_on_tables(request, kind, policy):
     system = request.getfixturevalue(kind)
     views = views_of(system)
     table, graph = table_of(system, views), system.graph
-    posed = policy != "information_gain_by_yaw"
-    knowledge = system.parts.knowledge if posed else system.parts.knowledge_by_yaw(graph.points)
+    posed = policy != "information_gain_by_pose"
+    knowledge = system.parts.knowledge if posed else system.parts.knowledge_by_pose(graph.points)
     fusion = system.parts.fusion["posed" if posed else "unposed"] if kind == "recogniser" else None
     fuse = by_attention(fusion) if fusion else mevs_jax.sum_of_logits
     run, scene = system.policy(policy, posed=posed), table.scene(graph, knowledge)

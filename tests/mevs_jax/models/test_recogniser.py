@@ -27,7 +27,7 @@ def test_views_alone_and_together_are_the_encoder_and_the_fusion(recogniser, ran
     def both_ways(network: Recogniser):
         features = network.encoder.features(images)
         together = (network.fusion(features, directions, present, posed=posed) for posed in (True, False))
-        by_hand = network.encoder.head(features), *together, network.azimuth(features, directions[..., 2])
+        by_hand = network.encoder.head(features), *together, network.pose(features, directions[..., 2])
         return network(images, directions, present), by_hand, network.see(images), features
 
     found, by_hand, kept, features = both_ways(recogniser)

@@ -11,7 +11,7 @@ from mevs_jax.cameras import ViewCamera
 from mevs_jax.inputs import SizeInput
 from mevs_jax.models import Abstraction
 from mevs_jax.models.expected_views import ExpectedViews
-from mevs_jax.models.shapes import AzimuthShape, PointNet2Shape, ResNetShape, SetFusionShape, ViewPolicyShape
+from mevs_jax.models.shapes import PointNet2Shape, PoseShape, ResNetShape, SetFusionShape, ViewPolicyShape
 from mevs_jax.policies.base import Knowledge
 from mevs_jax.trained import (
     CloudInput,
@@ -48,7 +48,7 @@ def description(kind: str, **changes) -> Description:
         "made_by": "0",
         "made_with": {"jax": "0"},
         "fusion": SetFusionShape(16, 2, 1) if recogniser else None,
-        "azimuth": AzimuthShape(8, 16) if recogniser else None,
+        "pose": PoseShape(8, 16) if recogniser else None,
         "entropy": None if recogniser else PointNet2Shape((Abstraction(16, 0.4, 8, (8, 16)),), (32,), (16,)),
         "cloud": None if recogniser else CloudInput(64, "world", True),
         "view_policies": {"learned": shape, "learned_unposed": ViewPolicyShape(16, 2, 1, False, "log", 0.01)}
@@ -73,7 +73,7 @@ def system(kind: str = "classifier", seed: int = 0) -> TrainedSystem:
     encoder.head.kernel.set_value(8 * encoder.head.kernel[...])
     features = 8 * of.encoder.width
     temperatures = {name: jnp.linspace(1, 2, 6) for name in ("random", "farthest", "information_gain")}
-    fusion, policies, azimuth, expected = {}, {}, None, None
+    fusion, policies, pose, expected = {}, {}, None, None
     if of.fusion is not None:
         structure, weights = nnx.split(of.fusion.network(features, classes, rngs))
         prior = jnp.log(jnp.asarray([0.1, 0.2, 0.3, 0.4]))
@@ -89,11 +89,11 @@ def system(kind: str = "classifier", seed: int = 0) -> TrainedSystem:
             policies[name] = Network.of(policy)
             temperatures[name] = jnp.ones(6)
     table = random.normal(size=(classes, VIEWS, classes)) + 2 * np.eye(classes)[:, None]
-    if of.azimuth is not None:
-        azimuth = of.azimuth.network(features, classes, rngs)
-        azimuth.layer2.kernel.set_value(8 * azimuth.layer2.kernel[...])
+    if of.pose is not None:
+        pose = of.pose.network(features, classes, rngs)
+        pose.layer2.kernel.set_value(8 * pose.layer2.kernel[...])
         expected = ExpectedViews(jnp.asarray(random.normal(size=(classes, 16, classes)), jnp.float32))
-        table, azimuth = np.asarray(expected.at(graph.points)), Network.of(azimuth)
+        table, pose = np.asarray(expected.at(graph.points)), Network.of(pose)
     strange = fit_strangeness(9 + random.normal(size=(30, VIEWS, classes)), VIEWS)
     parts = Parts(
         encoder=Network.of(encoder),
@@ -104,7 +104,7 @@ def system(kind: str = "classifier", seed: int = 0) -> TrainedSystem:
         entropy=Network.of(of.entropy.network(VIEWS, rngs)) if of.entropy is not None else None,
         fusion=fusion,
         view_policies=policies,
-        azimuth=azimuth,
+        pose=pose,
         expected=expected,
         knowledge=Knowledge(jnp.asarray(random.permutation(VIEWS), jnp.float32), jnp.asarray(table, jnp.float32)),
         temperatures=temperatures,

@@ -10,8 +10,8 @@ from scipy.spatial.transform import Rotation
 from scipy.special import sph_harm_y
 
 from mevs_jax import fibonacci_sphere
-from mevs_jax.models.azimuth import AzimuthHead, azimuth_of, azimuth_weights, yaw_log_probabilities, yaws
 from mevs_jax.models.expected_views import harmonics
+from mevs_jax.models.pose import PoseHead, azimuth_of, azimuth_weights, pose_log_probabilities, yaw_evidence, yaws
 from train.choosing.expected import fit_expected_views
 
 CLASSES, COUNT = 3, 12
@@ -78,17 +78,18 @@ def test_the_yaw_is_where_the_azimuths_of_all_views_agree(random):
     other = np.stack([np.roll(peaks[0], 3), np.roll(peaks[1], 5), random.uniform(size=COUNT)])
     probabilities = np.where(np.arange(3)[:, None] < 2, peaks / 2 + other / 2, other) * 0.99 + 0.01 / COUNT
     azimuths = np.broadcast_to(np.log(probabilities)[:, None], (3, CLASSES, COUNT)).astype(np.float32)
-    found = np.asarray(yaw_log_probabilities(azimuths, directions.astype(np.float32), np.array([True, True, False])))
+    evidence = yaw_evidence(azimuths, directions.astype(np.float32))
+    found = np.asarray(pose_log_probabilities(evidence, np.array([True, True, False])))
     assert found.shape == (CLASSES, COUNT)
     assert (found.argmax(axis=1) == 5).all()
     assert np.exp(found[:, 5]).min() > 0.6
     np.testing.assert_allclose(np.exp(found).sum(axis=1), 1, rtol=1e-5)
-    none = yaw_log_probabilities(azimuths, directions.astype(np.float32), np.zeros(3, bool))
+    none = pose_log_probabilities(evidence, np.zeros(3, bool))
     np.testing.assert_allclose(np.exp(none), 1 / COUNT, rtol=1e-5)
 
 
 def test_azimuths_are_log_probabilities_for_each_class(random):
-    head = AzimuthHead(8, CLASSES, azimuths=COUNT, width=16, rngs=nnx.Rngs(0))
+    head = PoseHead(8, CLASSES, poses=COUNT, width=16, rngs=nnx.Rngs(0))
     features, height = random.normal(size=(2, 5, 8)).astype(np.float32), np.zeros((2, 5), np.float32)
     found = nnx.jit(head)(features, height)
     assert found.shape == (2, 5, CLASSES, COUNT)
