@@ -111,7 +111,7 @@ SMALL = Settings(
         fitting_starts=4,
         ablations=ABLATIONS,
         novel=5,
-        rotation_epochs=3,
+        rotation_epochs=10,
     ),
 )
 """The thesis's study at 64×64 with narrower networks.

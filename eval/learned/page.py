@@ -274,9 +274,12 @@ def _rotated(metrics: dict[str, Any]) -> str:
     ((_, found),) = metrics["seeds"][0]["rotated"].items()
     every = found["random_sets"][-1]
     return (
-        "<h2>Any rotation</h2><p>Objects are turned by an unknown rotation about any axis. The recognisers were trained for "
-        f"some further epochs on objects rotated in the same way. All {every['views']} views fused: "
-        f"{percent(every['learned']['accuracy'])} %.</p>" + _ladder(found) + _against(found)
+        "<h2>Any rotation</h2><p>Objects are turned by an unknown rotation about any axis. The recogniser was trained for "
+        "some further epochs on objects rotated in the same way, and finds the rotation of an object relative to the camera, for "
+        "each class. Expected views are averaged over rotations, weighted by their probability. All "
+        f"{every['views']} views fused: {percent(every['learned']['accuracy'])} %.</p>"
+        + _ladder(found)
+        + _against(found)
     )
 
 
