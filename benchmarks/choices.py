@@ -28,7 +28,7 @@ import tyro
 
 from data_pipeline.dataset.builder import open_split
 from data_pipeline.files import read_json, write_bytes, write_text
-from eval.learned.study import BASELINES, ByObject, seeds_together
+from eval.learned.comparison import BASELINES, ByObject, seeds_together
 from mevs_jax.markdown import markdown_table
 
 RESULTS = Path(__file__).parent / "results"

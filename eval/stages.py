@@ -19,15 +19,12 @@ import numpy as np
 from data_pipeline.dataset.builder import open_objects, prepare
 from data_pipeline.dataset.config import check_same_data
 from data_pipeline.dataset.statistics import SUMMARY, DatasetStatistics, load_statistics, report_left_out
-from data_pipeline.distributed import is_first
 from data_pipeline.errors import DataError, Diverged, Unreadable
-from data_pipeline.files import check_of_file, keep_json, read_json, write_json
+from data_pipeline.files import check_of_file, read_json, write_json
 from data_pipeline.objects.sources import load_object
 from data_pipeline.progress import console
 from eval.checks.agent import compare_walks, latency, recognised, stopping
 from eval.consistency import check_classifier, check_evaluated_with, check_made_with
-from eval.learned.measure import APART, check_parts, measure, together
-from eval.learned.system import make_learned_system
 from eval.numbers.policies import csv_of
 from eval.numbers.study import reachable_views, run_study
 from eval.rendering.policies import ascend_objects, ascent_study, load_ascent_scores
@@ -45,10 +42,8 @@ from eval.walks.own_policies import OwnPolicy, load_policies, own_rungs
 from mevs_jax.policies.registry import policy_named
 from mevs_jax.trained import load as load_system
 from train.chance import warn_of_chance
-from train.choosing.config import check_learned
-from train.choosing.stages import Stages, train_recognisers, trained_policies
 from train.devices import Layout, check_batch, device_mesh
-from train.finite import check_results, place_not_finite
+from train.finite import place_not_finite
 from train.kept import keep_beside, kept, kept_json, made_by, summary_of
 from train.log import read_history
 from train.loop import check_launch, fit, load_best
@@ -304,34 +299,6 @@ def make_system(settings: Settings, out: Path) -> Path:
     )
     save_system(system, folder)
     return folder
-
-
-def learn_to_choose(settings: Settings, out: Path) -> Path:
-    """Trains and evaluates learned fusion and learned view selection; returns the path of the page."""
-    config = settings.learned
-    check_learned(config, settings.dataset.capture.views)
-    check_same_data(settings.dataset, out / "data")
-    seeds = [
-        Stages(config, settings.dataset, out, seed, settings.entropy)
-        for seed in range(config.seed, config.seed + config.seeds)
-    ]
-    seeds[0].prepare()
-    check_parts(seeds[0].statistics)
-    train_recognisers(seeds)
-    trained_policies([stages.policy_job() for stages in seeds])
-    for part in range(APART):
-        trained_policies([stages.policy_job(aside=(part, APART)) for stages in seeds])
-    found = [measure(stages) for stages in seeds]
-    metrics = {"seeds": found, "together": together(seeds, found), "settings": asdict(config)}
-    check_results(metrics, "the metrics of the learned study")
-    page = out / "learned" / "index.html"
-    if is_first():
-        from eval.learned.page import write_learned_page  # imported late: it needs plots
-
-        keep_json(out / "learned" / "metrics.json", metrics)
-        write_learned_page(metrics, load_statistics(out / "data"), page)
-    make_learned_system(seeds[0], found[0])
-    return page
 
 
 def ascend_on_objects(settings: Settings, out: Path) -> None:

@@ -24,9 +24,10 @@ from data_pipeline.distributed import is_first
 from data_pipeline.errors import DataError
 from data_pipeline.files import read_json, write_npz
 from data_pipeline.progress import console
+from eval.learned.comparison import ByObject, seeds_together
 from eval.learned.poses import UnknownPose, of_any_rotation, of_unknown_yaw
 from eval.learned.stopping import MOVEMENT_COSTS, VIEW_COSTS
-from eval.learned.study import ByObject, novel_classes, seeds_together, study
+from eval.learned.study import novel_classes, study
 from eval.learned.walks import Learner, OnLattice
 from eval.numbers.timing import milliseconds
 from eval.tables import load_view_tables

@@ -10,7 +10,7 @@ from typing import Any
 
 from data_pipeline.dataset.statistics import DatasetStatistics
 from data_pipeline.files import write_text
-from eval.learned.study import BASELINES
+from eval.learned.comparison import BASELINES
 from eval.learned.walks import by_expected_views
 from eval.report import figures
 from eval.report.html import (

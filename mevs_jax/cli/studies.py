@@ -16,9 +16,9 @@ def thesis(call: Invocation) -> None:
 
 def learned(call: Invocation) -> None:
     """Learned fusion and learned choice."""
-    from eval import stages
+    from eval.learned.stage import learn_to_choose
 
-    print(f"Report: {stages.learn_to_choose(call.settings, call.out).absolute()}")
+    print(f"Report: {learn_to_choose(call.settings, call.out).absolute()}")
 
 
 def rendering(call: Invocation) -> None:

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from benchmarks import choices
-from eval.learned.study import BASELINES, ByObject, compared, seeds_together
+from eval.learned.comparison import BASELINES, ByObject, compared, seeds_together
 
 POLICIES = (*BASELINES, "learned", "belief_oracle")
 OBJECTS, STARTS = 30, 40

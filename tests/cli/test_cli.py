@@ -18,8 +18,9 @@ import pytest
 
 from data_pipeline.dataset.statistics import load_statistics
 from eval.learned.page import write_learned_page
+from eval.learned.stage import learn_to_choose
 from eval.settings import TINY
-from eval.stages import ascend_on_objects, learn_to_choose, report
+from eval.stages import ascend_on_objects, report
 from tests.cli.conftest import MEVS, mevs, refused
 from tests.conftest import open3d_or_skip
 

@@ -18,6 +18,7 @@ import eval.numbers.confidence as confidence
 import eval.numbers.study as study
 import eval.stages as stages
 import eval.system as system
+from eval.learned.stage import learn_to_choose
 from eval.numbers.policies import EvaluationInputs, evaluate_policies
 from eval.numbers.study import entropy_errors
 from eval.settings import TINY
@@ -333,7 +334,7 @@ def whole_run(out: Path) -> tuple[dict[str, Any], dict[str, Any]]:
     stages.train(settings, out)
     stages.evaluate(settings, out)
     stages.make_system(settings, out)
-    stages.learn_to_choose(settings, out)
+    learn_to_choose(settings, out)
     fitted: dict[str, Any] = {}
     tested: dict[str, Any] = {}
     for name in ("system", "learned/system"):

@@ -12,9 +12,10 @@ import pytest
 from flax import nnx
 
 from data_pipeline.errors import DataError
+from eval.learned.comparison import seeds_together
 from eval.learned.measure import check_parts
 from eval.learned.stopping import Signal, compare_rules, walks_apart
-from eval.learned.study import fixed_order_scores, novel_classes, seeds_together, study
+from eval.learned.study import fixed_order_scores, novel_classes, study
 from eval.learned.walks import Learner, OnLattice
 from eval.numbers.confidence import stops_at
 from mevs_jax.models.expected_views import ExpectedViews

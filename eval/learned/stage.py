@@ -1,0 +1,45 @@
+"""The learned study as a stage of a run: trainings, measurements, page and trained system."""
+
+from __future__ import annotations
+
+from dataclasses import asdict
+from pathlib import Path
+
+from data_pipeline.dataset.config import check_same_data
+from data_pipeline.dataset.statistics import load_statistics
+from data_pipeline.distributed import is_first
+from data_pipeline.files import keep_json
+from eval.learned.measure import APART, check_parts, measure, together
+from eval.learned.system import make_learned_system
+from eval.settings import Settings
+from train.choosing.config import check_learned
+from train.choosing.stages import Stages, train_recognisers, trained_policies
+from train.finite import check_results
+
+
+def learn_to_choose(settings: Settings, out: Path) -> Path:
+    """Trains and evaluates learned fusion and learned view selection; returns the path of the page."""
+    config = settings.learned
+    check_learned(config, settings.dataset.capture.views)
+    check_same_data(settings.dataset, out / "data")
+    seeds = [
+        Stages(config, settings.dataset, out, seed, settings.entropy)
+        for seed in range(config.seed, config.seed + config.seeds)
+    ]
+    seeds[0].prepare()
+    check_parts(seeds[0].statistics)
+    train_recognisers(seeds)
+    trained_policies([stages.policy_job() for stages in seeds])
+    for part in range(APART):
+        trained_policies([stages.policy_job(aside=(part, APART)) for stages in seeds])
+    found = [measure(stages) for stages in seeds]
+    metrics = {"seeds": found, "together": together(seeds, found), "settings": asdict(config)}
+    check_results(metrics, "the metrics of the learned study")
+    page = out / "learned" / "index.html"
+    if is_first():
+        from eval.learned.page import write_learned_page  # imported late: it needs plots
+
+        keep_json(out / "learned" / "metrics.json", metrics)
+        write_learned_page(metrics, load_statistics(out / "data"), page)
+    make_learned_system(seeds[0], found[0])
+    return page
