@@ -294,7 +294,7 @@ class ActiveRecognition:
             belief=state.belief,
             latest=self._seen(state.object_index, state.view),
             views=state.views,
-            seen=jax.tree.map(lambda leaf: jnp.where(present[:, None], leaf, 0), seen),
+            seen=jax.tree.map(lambda leaf: jnp.where(present.reshape(-1, *[1] * (leaf.ndim - 1)), leaf, 0), seen),
         )
 
     def scene(self, state: EnvironmentState, knowledge: Knowledge | None = None) -> Scene:
@@ -328,5 +328,6 @@ class ActiveRecognition:
 
         tables = self.tables
         return Observation(
-            tables.logits[object_index, view], *map(at, (tables.predicted_entropy, tables.features, tables.clouds))
+            tables.logits[object_index, view],
+            *map(at, (tables.predicted_entropy, tables.features, tables.clouds, tables.pose_evidence)),
         )

@@ -225,7 +225,9 @@ def _decide(system: TrainedSystem, policy: str, max_views: int) -> _Program:
             _described("probabilities", [len(system.classes)], "float32", "calibrated, of the classes"),
             _described("strangeness", [], "float32", "share of known objects that look less strange; NaN if unknown"),
             _described("next", [], "int32", "index of the next viewpoint; -1 if none is left"),
-            _described("gains", [views], "float32", "expected gain of each viewpoint in nats; NaN without a table"),
+            _described(
+                "gains", [views], "float32", "expected gain of each viewpoint in nats; NaN where it is not known"
+            ),
         ],
     }
     return decide, arguments, about

@@ -109,6 +109,7 @@ def seeds_together(
 
 
 def difference(mine: np.ndarray, base: np.ndarray) -> dict[str, Any]:
+    """Mean differences of two policies by number of views, with intervals, from their (steps, objects) results."""
     steps = min(len(mine), len(base))
     gain = mine[:steps] - base[:steps]
     return {"difference": gain.mean(axis=1).tolist(), "interval": intervals(gain)}

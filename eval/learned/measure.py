@@ -41,7 +41,7 @@ from train.finite import check_results
 from train.kept import kept_json, made_by
 from train.loop import load_best
 
-_FORM = 9
+_FORM = 10
 """Version of the stored walks; another version makes them stale."""
 APART = 2
 """Parts of the validation objects; stopping rules are fitted on walks of policies that were trained without their objects."""

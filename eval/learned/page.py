@@ -11,6 +11,7 @@ from typing import Any
 from data_pipeline.dataset.statistics import DatasetStatistics
 from data_pipeline.files import write_text
 from eval.learned.comparison import BASELINES
+from eval.learned.study import WITHOUT
 from eval.learned.walks import by_expected_views
 from eval.report import figures
 from eval.report.html import (
@@ -27,6 +28,7 @@ from eval.report.html import (
     table,
     warning,
 )
+from mevs_jax.trained.system import EXPECTED_VIEWS
 from train.chance import Chance
 
 METHOD = "learned"
@@ -212,7 +214,7 @@ def _lead(metrics: dict[str, Any], views: str) -> str:
     method, random = (together["policies"][name]["after_views"] for name in (METHOD, "random"))
     gains, first, others = together["against"]["random"], each[0], ""
     for name, title in (
-        ("information_gain", "Information gain by expected views"),
+        (EXPECTED_VIEWS, "Information gain by expected views"),
         ("learned_and_table", "The mean of both"),
     ):
         if name in gains:
@@ -248,11 +250,11 @@ def _unposed(metrics: dict[str, Any]) -> str:
     """Results for objects of unknown yaw, compared with a known pose from the same start views."""
     (views, unposed), *_ = metrics["seeds"][0]["unposed"].items()
     posed = metrics["seeds"][0]["lattices"][views]["policies"]
-    gains, by_yaw, rows = unposed["against"]["random"], "", []
-    if "information_gain" in gains:
-        by_yaw = (
+    gains, of_pose, rows = unposed["against"]["random"], "", []
+    if EXPECTED_VIEWS in gains:
+        of_pose = (
             " For each class, the azimuth of every view in the object's frame is estimated. Expected views are averaged over the "
-            f"yaw, weighted by its probability: {_gain_of_two(gains, 'information_gain')} points."
+            f"yaw, weighted by its probability: {_gain_of_two(gains, EXPECTED_VIEWS)} points."
         )
     for name, policy in unposed["policies"].items():
         if policy["knows"] != "truth":
@@ -262,7 +264,7 @@ def _unposed(metrics: dict[str, Any]) -> str:
     return (
         "<h2>Unknown yaw</h2>"
         "<p>Objects are turned about the vertical by an unknown angle; fusion and policy receive directions relative to the "
-        f"first view only. After two views the policy's gain over random is {_gain_of_two(gains)} points.{by_yaw}</p>"
+        f"first view only. After two views the policy's gain over random is {_gain_of_two(gains)} points.{of_pose}</p>"
         + table(["next view chosen by", *(str(step + 1) for step in range(len(rows[0]) - 1))], rows)
     )
 
@@ -303,8 +305,8 @@ def _novel(metrics: dict[str, Any], classes: list[str]) -> str:
     for name, title in (
         ("trained_without", "trained without these classes"),
         ("trained_with", "trained with all classes"),
-        ("information_gain", by_expected_views().title),
-        ("information_gain_without", "… without expected views of these classes"),
+        (EXPECTED_VIEWS, by_expected_views().title),
+        (WITHOUT, "… without expected views of these classes"),
     ):
         gain = found["gain"][name]
         rows.append([title, *(difference(gain["difference"][step], gain["interval"][step]) for step in steps)])

@@ -46,6 +46,7 @@ from mevs_jax.calibration import (
 from mevs_jax.models import ViewPolicy
 from mevs_jax.models.expected_views import ExpectedViews
 from mevs_jax.policies.base import Knowledge
+from mevs_jax.trained.system import EXPECTED_VIEWS
 from train.choosing.calibrated import beliefs_of_sets
 from train.choosing.features import Features, sets_of_size
 
@@ -148,6 +149,8 @@ def learn(fusion: CalibratedFusion, data: Features, expected: ExpectedViews | No
     return Knowledge(order, None if expected is None else expected.at(data.directions[0]))
 
 
+WITHOUT = "expected_views_without"
+"""Expected views without those of classes that are left out."""
 _TRYING_STARTS = 8
 """Approximate number of start views, spread over the lattice, for oracles and for walks with a movement cost."""
 
@@ -244,7 +247,7 @@ def study(
     fusions = {learner.name: learner.fusion or fusion for learner in learners}
     records: dict[str, WalkRecord] = {}
     entropies = shared and test.predicted_entropy is not None and test.entropy is not None
-    flags = {"entropies": entropies, "shared": shared, "expected": known is not None, "posed": fusion.posed}
+    flags = {"entropies": entropies, "shared": shared, "expected": known is not None}
     policies = contenders(learners, draws, oracle_views, every_nth, **flags)
     for contender in policies if others else [random_walker(draws), *map(walker, learners)]:
         name, own, walks, beliefs = contender.name, fusions.get(contender.name, fusion), [], []
@@ -303,7 +306,7 @@ def novel_classes(
     """
     after: dict[str, list[np.ndarray]] = {"random": [], "trained_without": [], "trained_with": []}
     if expected is not None:
-        after |= {"information_gain": [], "information_gain_without": []}
+        after |= {EXPECTED_VIEWS: [], WITHOUT: []}
     rows = []
     for classes, policy in policies:
         some = test.some(np.flatnonzero(np.isin(test.labels, classes)))
@@ -313,7 +316,7 @@ def novel_classes(
         if expected is not None:
             some_unknown = ExpectedViews(expected.coefficients.at[jnp.array(classes)].set(0.0))
             walkers.append((by_expected_views(), None, expected))
-            walkers.append((replace(by_expected_views(), name="information_gain_without"), None, some_unknown))
+            walkers.append((replace(by_expected_views(), name=WITHOUT), None, some_unknown))
         for contender, given, knowledge in walkers:
             table, key = OnLattice(some).table(contender.believes), jax.random.key(seed)
             views = walk_all(key, contender, given, fusion, table, some.directions, knowledge, max_views, neighbours)

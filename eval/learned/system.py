@@ -17,7 +17,7 @@ from mevs_jax.models import Recogniser, ViewPolicy
 from mevs_jax.models.shapes import PoseShape, SetFusionShape, ViewPolicyShape
 from mevs_jax.trained import Description, ImageInput, Network, Parts, TrainedSystem, fit_strangeness
 from mevs_jax.trained.description import FORM
-from mevs_jax.trained.system import BY_POSE
+from mevs_jax.trained.system import EXPECTED_VIEWS, UNPOSED
 from train.choosing.stages import Stages, lattice_data
 from train.kept import made_by
 from train.loop import load_best
@@ -28,7 +28,7 @@ POLICIES = {"learned": True, "learned_unposed": False}
 
 def figures_of(found: dict[str, Any], views: int) -> dict[str, Any]:
     """Figures of the study that a system carries, of one seed: accuracy by policy and number of views."""
-    usable = ("random", "farthest", "fixed_order", "information_gain", "learned", "learned_and_table")
+    usable = ("random", "farthest", "fixed_order", EXPECTED_VIEWS, "learned", "learned_and_table")
     of_lattice = found["lattices"][str(views)]
     policies = {name: of for name, of in of_lattice["policies"].items() if name in usable}
     figures = {
@@ -87,12 +87,12 @@ def learned_system(stages: Stages, found: dict[str, Any], figures: dict[str, Any
     policies = {name: stages.policy(name) for name in POLICIES}
     walks = found["lattices"][str(views)]["policies"]
     temperatures = {name: of["temperatures"] for name, of in walks.items() if name in figures["after_views"]}
-    by_yaw = recogniser.pose is not None
+    finds_pose = recogniser.pose is not None
     if "unposed" in found:
         unposed = found["unposed"][str(views)]["policies"]
         temperatures["learned_unposed"] = unposed["learned"]["temperatures"]
-        if by_yaw:
-            temperatures[BY_POSE] = unposed["information_gain"]["temperatures"]
+        if finds_pose:
+            temperatures[EXPECTED_VIEWS + UNPOSED] = unposed[EXPECTED_VIEWS]["temperatures"]
     shape = config.recogniser.fusion
     description = Description(
         form=FORM,
@@ -101,8 +101,8 @@ def learned_system(stages: Stages, found: dict[str, Any], figures: dict[str, Any
         camera=view_camera(stages.statistics.camera),
         image=ImageInput("depth_and_normals", 4),
         encoder=resnet_shape(config.recogniser.network, 4),
-        best="information_gain",
-        best_unposed=BY_POSE if by_yaw else "learned_unposed",
+        best=EXPECTED_VIEWS,
+        best_unposed=EXPECTED_VIEWS if finds_pose else "learned_unposed",
         chosen_by="the method of the learned study, not chosen by a comparison",
         data=data_of(stages.statistics),
         made_by=made,

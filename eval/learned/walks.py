@@ -19,16 +19,19 @@ from mevs_jax.beliefs import CalibratedFusion
 from mevs_jax.models import ViewPolicy
 from mevs_jax.models.expected_views import ExpectedViews
 from mevs_jax.policies.base import Knowledge, Policy
-from mevs_jax.policies.informed import information_gain_by_pose
+from mevs_jax.policies.informed import expected_views
 from mevs_jax.policies.oracles import fused_oracle
 from mevs_jax.policies.registry import POLICIES
 from mevs_jax.selection import ViewTable, by_attention, select_from_table, sum_of_logits
+from mevs_jax.trained.system import EXPECTED_VIEWS
 from mevs_jax.viewpoints import ViewGraph
 from train.choosing.chunks import in_chunks
 from train.choosing.features import Features
 from train.choosing.policy import By, learned_policy
 
 _WALKS_AT_ONCE = 2**11
+_SCORES_AT_ONCE = 2**26
+"""Hypotheses of class and pose × views × walks: about one gigabyte of temporary arrays."""
 
 
 @dataclass(frozen=True)
@@ -199,7 +202,9 @@ def walk_all(
     graph = ViewGraph.from_points(np.asarray(directions[0], np.float64), neighbours)
     keys = jax.vmap(jax.random.fold_in, (None, 0))(key, jnp.arange(len(tables.label)))
     rest = contender, parameters, fusion, graph, knowledge, max_views
-    most = _WALKS_AT_ONCE // 4 if isinstance(knowledge, UnknownPose) else _WALKS_AT_ONCE
+    most = _WALKS_AT_ONCE
+    if isinstance(knowledge, UnknownPose):  # each walk scores every view under every hypothesis
+        most = min(most, max(1, _SCORES_AT_ONCE // knowledge.hypotheses // len(graph.points)))
     at_once = max(1, most * contender.every // (len(graph.points) * contender.draws))
     return in_chunks(lambda some: _walk_some(some, *rest), (keys, tables, directions), at_once)
 
@@ -223,13 +228,13 @@ def beliefs_of(
     return in_chunks(partial(_beliefs_of_some, fusion), (data, views), max(1, 1024 // views.shape[1]))
 
 
-def _by_pose(_: Any) -> Policy:
-    return information_gain_by_pose
+def _by_expected_views(_: Any) -> Policy:
+    return expected_views
 
 
-def by_expected_views(posed: bool = True) -> Contender:
-    found = _by_name("information_gain", "information gain by expected views", "others")
-    return found if posed else replace(found, policy_of=_by_pose)
+def by_expected_views() -> Contender:
+    """Information gain by what the recogniser is expected to say; over class and pose if the pose of objects is unknown."""
+    return Contender(EXPECTED_VIEWS, "information gain by expected views", "others", _by_expected_views)
 
 
 def contenders(
@@ -241,7 +246,6 @@ def contenders(
     entropies: bool,
     shared: bool,
     expected: bool,
-    posed: bool,
 ) -> list[Contender]:
     """All policies of the study, in the order of the tables.
 
@@ -252,7 +256,6 @@ def contenders(
         entropies: whether predicted and true depth entropies are known.
         shared: whether all objects have the same candidate views in a known pose; only then is there a fixed order of views.
         expected: whether it is known what the recogniser is expected to say of each class, from every direction.
-        posed: whether the pose of the objects is known.
     """
     found = [random_walker(draws), _by_name("farthest", "farthest from those seen", "nothing", believes=False)]
     if entropies:
@@ -260,7 +263,7 @@ def contenders(
     if shared:
         found.append(_by_name("fixed_order", "best fixed order", "others", believes=False))
     if expected:
-        found.append(by_expected_views(posed))
+        found.append(by_expected_views())
     found += map(walker, learners)
     if entropies:
         found.append(_by_name("oracle_entropy", "entropy oracle (thesis)", "truth", believes=False))

@@ -42,7 +42,8 @@ class Agent:
         gain_per_cost: expected gain that one unit of a candidate's cost is worth, in units of the policy's scores (nats for
             `information_gain` and learned policies).
         distance: of the next cameras from the object's centre, in metres; by default that of the training views in radii.
-        max_candidates: largest number of candidates of `decide`.
+        max_candidates: largest number of candidates of `decide`. For an unknown yaw, a decision of a recogniser holds what it
+            expects of each: about 300 bytes × candidates × the square of the number of classes.
         seed: of random policies.
 
     Attributes:

@@ -16,7 +16,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from mevs_jax.policies.base import Knowledge, Observation, Policy, Scene, SelectionState
-from mevs_jax.policies.informed import information_gain, information_gain_by_pose
+from mevs_jax.policies.informed import information_gain
 from mevs_jax.selection import best_view
 from mevs_jax.trained.parts import Parts
 from mevs_jax.trained.system import TrainedSystem
@@ -197,7 +197,7 @@ def choose(
     cost: Float[Array, " candidates"],
     number: int,
 ) -> tuple[Int[Array, ""], Float[Array, " candidates"]]:
-    """The best candidate that is left, and the expected gain of each in nats; NaN where no table knows it.
+    """The best candidate that is left, and the expected gain of each in nats; NaN where it is not known.
 
     Args:
         cost: subtracted from the scores.
@@ -206,10 +206,9 @@ def choose(
     scores = policy(jax.random.fold_in(key, state.count), state, scene)
     scores = scores - jnp.concatenate([cost, jnp.zeros(len(scores) - number)])
     gains = jnp.full(number, jnp.nan)
-    if scene.knowledge is not None and scene.knowledge.expected_logits is not None:
+    known = scene.knowledge
+    if known is not None and (known.expected_logits is not None or known.by_pose is not None):
         gains = information_gain(key, state, scene)[:number]
-    elif scene.knowledge is not None and scene.knowledge.by_pose is not None:
-        gains = information_gain_by_pose(key, state, scene)[:number]
     remaining = left(state, scene)
     best = best_view(jnp.where(remaining, jnp.minimum(scores, jnp.finfo(scores.dtype).max), -jnp.inf), remaining)
     return jnp.where(jnp.any(remaining), best, -1), gains

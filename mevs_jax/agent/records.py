@@ -54,7 +54,7 @@ class Step:
         T_world_camera: (4, 4) pose of the next camera, in metres; None when done.
         direction: (3,) unit vector from the object to that camera, in the world's frame; None when done.
         index: of the candidate; −1 when done.
-        expected_gain: expected decrease of the belief's entropy in nats, by the class × view table; NaN without one.
+        expected_gain: expected decrease of the belief's entropy in nats, by views of other objects; NaN where none are known.
         done: whether no further view is needed, or none is possible.
         reason: why it is done.
         latency_ms: time that the call took.

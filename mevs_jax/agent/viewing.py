@@ -32,7 +32,7 @@ def view(history: History, system: TrainedSystem, *, host: str = "127.0.0.1", po
     """Serves a 3-D scene of a history, with a slider over the views; the unit is the object's radius.
 
     Every view shows its points, large and orange in the step in which they are new, smaller and blue later. Candidates are
-    darker and larger, the higher their expected gain is; grey where the system has no table to compute it from.
+    darker and larger, the higher their expected gain is; grey where the system does not know it.
 
     Args:
         history: of an agent, as `Walk.history`, or from `mevs_jax.agent.load_history`.

@@ -10,7 +10,6 @@ import flax.struct
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.scipy.special import sph_harm_y
 from jaxtyping import Array, Float
 
 from mevs_jax.arrays import AnyArray
@@ -21,19 +20,31 @@ from mevs_jax.models.rotation import rotation_grid
 def harmonics(directions: Float[AnyArray, "*batch 3"], degree: int) -> Float[Array, "*batch terms"]:
     """The real spherical harmonics of degree 0 to `degree` at unit vectors: (degree + 1)² terms, orthonormal on the sphere.
 
-    Terms are ordered by degree n, then by order m from −n to n.
+    Terms are ordered by degree n, then by order m from −n to n. Signs are those of `scipy.special.sph_harm_y`, which JAX computes
+    for each term anew.
     """
     directions = jnp.asarray(directions)
-    places = [(n, m) for n in range(degree + 1) for m in range(-n, n + 1)]
-    n, m = np.array(places).T
-    polar = jnp.arccos(jnp.clip(directions[..., 2], -1, 1)).reshape(-1)
-    each, of_order = np.unique(np.stack([n, abs(m)]), axis=1, return_inverse=True)
-    flat = [jnp.broadcast_to(array, (len(polar), each.shape[1])).reshape(-1) for array in (*each, polar[:, None])]
-    found = sph_harm_y(flat[0], flat[1], flat[2], jnp.zeros_like(flat[2]), n_max=degree).real
-    by_height = found.reshape(*directions.shape[:-1], -1)[..., of_order]
-    angle = abs(m) * azimuth_of(directions)[..., None]
-    around = jnp.where(m > 0, jnp.cos(angle), jnp.sin(angle)) * np.sqrt(2)
-    return by_height * jnp.where(m == 0, 1.0, around)
+    z, level, angle = directions[..., 2], jnp.linalg.norm(directions[..., :2], axis=-1), azimuth_of(directions)
+    by_height: dict[tuple[int, int], Array] = {}  # the normalised Legendre functions of z
+    for m in range(degree + 1):
+        last = by_height.get((m - 1, m - 1))
+        first = (
+            jnp.full_like(z, 0.5 / np.sqrt(np.pi)) if last is None else -np.sqrt((2 * m + 1) / (2 * m)) * level * last
+        )
+        by_height[m, m], before = first, jnp.zeros_like(z)
+        for n in range(m + 1, degree + 1):
+            scale = np.sqrt((4 * n**2 - 1) / (n**2 - m**2))
+            share = np.sqrt(((n - 1) ** 2 - m**2) / (4 * (n - 1) ** 2 - 1))
+            by_height[n, m] = scale * (z * by_height[n - 1, m] - share * before)
+            before = by_height[n - 1, m]
+
+    def term(n: int, m: int) -> Array:
+        if not m:
+            return by_height[n, 0]
+        around = jnp.cos(m * angle) if m > 0 else jnp.sin(-m * angle)
+        return np.sqrt(2) * by_height[n, abs(m)] * around
+
+    return jnp.stack([term(n, m) for n in range(degree + 1) for m in range(-n, n + 1)], axis=-1)
 
 
 @flax.struct.dataclass
@@ -57,10 +68,10 @@ class ExpectedViews:
         return jnp.einsum("...k,ykc->y...c", terms, self.coefficients, precision=jax.lax.Precision.HIGHEST)
 
     def by_yaw(
-        self, directions: Float[AnyArray, "views 3"], count: int
+        self, directions: Float[AnyArray, "views 3"], count: int, offset: float = 0.0
     ) -> Float[Array, "classes {count} views classes"]:
-        """The same for `count` yaws of the object (`mevs_jax.models.pose.yaws`) and directions in the world."""
-        cos, sin = (jnp.asarray(of(yaws(count)), jnp.float32)[:, None] for of in (np.cos, np.sin))
+        """The same for `count` yaws of the object (`mevs_jax.models.pose.yaws`) plus `offset`, and directions in the world."""
+        cos, sin = (jnp.asarray(of(yaws(count) + offset), jnp.float32)[:, None] for of in (np.cos, np.sin))
         x, y, z = jnp.moveaxis(jnp.asarray(directions), -1, 0)
         turned = [cos * x + sin * y, cos * y - sin * x, jnp.broadcast_to(z, (count, len(x)))]
         return self.at(jnp.stack(turned, axis=-1))

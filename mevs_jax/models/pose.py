@@ -1,8 +1,8 @@
 """What one view says about the pose of an object, and what several say together.
 
-An object that stands upright may be turned about the vertical axis by an unknown yaw. What is known about views of a class from
-each direction can be used only with a belief about that yaw. Objects in any rotation are the subject of
-`mevs_jax.models.rotation`.
+The yaw of upright objects is here. An object that stands upright may be turned about the vertical axis by an unknown yaw. What is
+known about views of a class from each direction can be used only with a belief about that yaw. Objects in any rotation are the
+subject of `mevs_jax.models.rotation`.
 """
 
 from __future__ import annotations
@@ -71,9 +71,12 @@ def yaws(count: int) -> Float[np.ndarray, " {count}"]:
 
 
 def azimuth_of(directions: Float[AnyArray, "*batch 3"]) -> Float[Array, "*batch"]:
-    """The azimuth of directions in radians, in (−π, π]."""
-    directions = jnp.asarray(directions)
-    return jnp.arctan2(directions[..., 1], directions[..., 0])
+    """The azimuth of directions in radians, in (−π, π].
+
+    Straight above and below it is the one whose camera has the same roll (`mevs_jax.look_at_origin`): −π/2 and π/2.
+    """
+    x, y, z = jnp.moveaxis(jnp.asarray(directions), -1, 0)
+    return jnp.where(jnp.abs(z) > 1 - 1e-6, -jnp.sign(z) * jnp.pi / 2, jnp.arctan2(y, x))
 
 
 def _between(angle: Float[Array, "*batch"], count: int) -> tuple[Array, Array, Array]:
@@ -92,7 +95,7 @@ def azimuth_weights(azimuth: Float[AnyArray, "*batch"], count: int) -> Float[Arr
 
 
 def yaw_evidence(
-    azimuths: Float[AnyArray, "*views classes azimuths"], directions: Float[AnyArray, "*views 3"]
+    azimuths: Float[AnyArray, "*views classes azimuths"], directions: Float[AnyArray, "*views 3"], offset: float = 0.0
 ) -> Float[Array, "*views classes azimuths"]:
     """What each view says about the yaw of the object: its log-probability for every class and yaw, up to a constant.
 
@@ -101,9 +104,11 @@ def yaw_evidence(
     Args:
         azimuths: log-probabilities of the azimuth of each view in the object's frame, as of `PoseHead`.
         directions: unit vectors from the object to the cameras, in the world.
+        offset: radians added to the yaws (`yaws`).
     """
     azimuths, count = jnp.asarray(azimuths), azimuths.shape[-1]
-    lower, upper, share = _between(azimuth_of(directions)[..., None] - jnp.asarray(yaws(count), jnp.float32), count)
+    yaw = jnp.asarray(yaws(count) + offset, jnp.float32)
+    lower, upper, share = _between(azimuth_of(directions)[..., None] - yaw, count)
 
     def at(index: Array) -> Array:
         return jnp.take_along_axis(azimuths, jnp.broadcast_to(index[..., None, :], azimuths.shape), axis=-1)

@@ -18,7 +18,8 @@ from mevs_jax.arrays import AnyArray
 from mevs_jax.cameras import look_at_origin
 
 ROTATIONS = 576
-"""Number of rotations that are told apart; the angle from any rotation to the nearest is at most about 20°."""
+"""Number of rotations that are told apart; from any rotation the nearest is 14° away on average, and at most about 27°."""
+_EXACT = jax.lax.Precision.HIGHEST
 _WIDTH = 0.2
 """Standard deviation in radians of the weights of rotations around a true one."""
 
@@ -44,13 +45,13 @@ def seen_rotations(
         directions: unit vectors from the object to the camera, in the world.
     """
     camera = jnp.vectorize(look_at_origin, signature="(n)->(m,m)")(jnp.asarray(directions))[..., :3, :3]
-    return jnp.swapaxes(camera, -1, -2) @ jnp.asarray(rotations)
+    return jnp.matmul(jnp.swapaxes(camera, -1, -2), jnp.asarray(rotations), precision=_EXACT)
 
 
 def _alike(rotations: Float[Array, "*batch 3 3"]) -> Float[Array, "*batch rotations"]:
     """1 + 2 cos of the angle to each rotation of the grid."""
     grid = jnp.asarray(rotation_grid(), jnp.float32).reshape(ROTATIONS, 9)
-    return rotations.reshape(*rotations.shape[:-2], 9) @ grid.T
+    return jnp.matmul(rotations.reshape(*rotations.shape[:-2], 9), grid.T, precision=_EXACT)
 
 
 def rotation_weights(rotations: Float[AnyArray, "*batch 3 3"]) -> Float[Array, "*batch rotations"]:

@@ -61,9 +61,9 @@ class Knowledge:
 
     Attributes:
         order: (views,) scores of the best fixed order; the view with the highest score comes first.
-        expected_logits: (classes, views, classes); entry [y, j] is the mean logits at view j of objects of class y.
-        by_pose: (classes, poses, views, classes); entry [y, k, j] is the mean logits at view j of objects of class y that are in
-            pose k, for objects of unknown pose.
+        expected_logits: (classes, views, classes); entry [y, j] is what view j of objects of class y shows on average: logits, or
+            log-probabilities.
+        by_pose: (classes, poses, views, classes); the same for objects of class y in each pose, for objects of unknown pose.
     """
 
     order: Float[Array, "*batch views"] | None = None

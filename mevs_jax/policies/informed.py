@@ -1,4 +1,4 @@
-"""Policies that use statistics over other objects: a fixed order of views, and expected information gain from a table."""
+"""Policies that use statistics over other objects: a fixed order of views, and expected information gain."""
 
 from __future__ import annotations
 
@@ -20,23 +20,34 @@ def information_gain(key: Array, state: SelectionState, scene: Scene) -> Float[A
     """Expected decrease of the belief's entropy in nats, assuming that view j of class y yields its mean logits.
 
     With p the belief and M[y, j] the mean logits, the score is H(p) − Σ_y p(y) H(softmax(belief + M[y, j])). As in Denzler
-    and Brown (2002) and Wu et al. (3D ShapeNets, 2015), with a table in place of a generative model.
+    and Brown (2002) and Wu et al. (3D ShapeNets, 2015), with mean logits in place of a generative model.
+
+    For an object of unknown pose φ (`Knowledge.by_pose` alone), hypotheses are of class and pose together, with probabilities
+    p(y) p(φ | y). The distribution of the pose for each class comes from what the recogniser says of it in the views seen.
     """
     del key
-    probability = jax.nn.softmax(state.belief)
-    return _expected_decrease(state.belief, known(scene, "expected_logits"), probability)
+    return _gain(state, scene, 1.0)
 
 
-def information_gain_by_pose(key: Array, state: SelectionState, scene: Scene) -> Float[Array, " views"]:
-    """`information_gain` for an object of unknown pose φ, over hypotheses of class and pose together.
+def expected_views(key: Array, state: SelectionState, scene: Scene) -> Float[Array, " views"]:
+    """`information_gain` with hypotheses weighted by the square roots of their classes' probabilities.
 
-    The score is H(p) − Σ_y p(y) Σ_φ p(φ | y) H(softmax(belief + M[y, φ, j])). The distribution of the pose for each class comes
-    from what the recogniser says about it in the views seen.
+    Unlikely classes count more than by their probability, so views are preferred that could still reveal them. The scores are in
+    nats, but no expectation. The policy is for what a recogniser is expected to say (`mevs_jax.models.expected_views`).
     """
     del key
+    return _gain(state, scene, 0.5)
+
+
+def _gain(state: SelectionState, scene: Scene, power: float) -> Float[Array, " views"]:
+    """Information gain if the hypotheses' weights are the probabilities of their classes to this power, normalised."""
+    probability = jax.nn.softmax(power * state.belief)
+    knowledge = required(scene.knowledge, "Scene.knowledge")
+    if knowledge.by_pose is None or knowledge.expected_logits is not None:
+        return _expected_decrease(state.belief, known(scene, "expected_logits"), probability)
     present = jnp.arange(len(state.views)) < state.count
     pose = pose_log_probabilities(required(state.seen.pose_evidence, "Observation.pose_evidence"), present)
-    expected, probability = known(scene, "by_pose"), jax.nn.softmax(state.belief)
+    expected = known(scene, "by_pose")
     weights = (probability[:, None] * jnp.exp(pose)).reshape(-1)
     return _expected_decrease(state.belief, expected.reshape(-1, *expected.shape[2:]), weights)
 

@@ -48,7 +48,7 @@ def _normalised(belief: Float[Array, " classes"]) -> Float[Array, " classes"]:
 
 
 _TABLE_WEIGHT = 0.5
-"""Weight of the table's log-probabilities when added to the belief; below 1 since views are not independent."""
+"""Weight of expected log-probabilities when added to the belief; below 1 since views are not independent."""
 
 
 def _gain_by_table(

@@ -34,10 +34,13 @@ def arrays_of(parts: Parts) -> dict[str, Any]:
         found["fusion.prior"] = parts.fusion["posed"].prior
         found |= {f"fusion.temperatures.{name}": fusion.temperatures for name, fusion in parts.fusion.items()}
     if parts.knowledge is not None:
-        found |= {
-            "knowledge.order": parts.knowledge.order,
-            "knowledge.expected_logits": parts.knowledge.expected_logits,
-        }
+        if parts.knowledge.order is None or parts.knowledge.by_pose is not None:
+            raise ValueError("the knowledge of a trained system is an order of its viewpoints and a class × view table")
+        found["knowledge.order"] = parts.knowledge.order
+        if (
+            parts.expected is None and parts.knowledge.expected_logits is not None
+        ):  # else it follows from expected views
+            found["knowledge.expected_logits"] = parts.knowledge.expected_logits
     found |= {f"temperatures.{name}": values for name, values in parts.temperatures.items()}
     if parts.expected is not None:
         found["expected"] = parts.expected.coefficients
@@ -93,6 +96,11 @@ class _Arrays:
 
 
 def parts_of(description: Description, arrays: dict[str, np.ndarray]) -> Parts:
+    """The parts that a description and the arrays of a file make.
+
+    Raises:
+        ValueError: if an array is missing, is left over, has another shape than is described, or is impossible.
+    """
     take = _Arrays(arrays)
     classes = len(description.classes)
     viewpoints = take.take("viewpoints", (None, 3))
@@ -114,13 +122,19 @@ def parts_of(description: Description, arrays: dict[str, np.ndarray]) -> Parts:
         pose = take.network("pose", lambda rngs: of_pose.network(features, classes, rngs))
     if (of_entropy := description.entropy) is not None:
         entropy = take.network("entropy", lambda rngs: of_entropy.network(views, rngs))
-    if "knowledge.order" in arrays:
-        table = take.take("knowledge.expected_logits", (classes, views, classes))
-        knowledge = Knowledge(take.take("knowledge.order", (views,)), table)
     if "expected" in arrays:
         expected = ExpectedViews(take.take("expected", (classes, None, classes)))
         if (expected.degree + 1) ** 2 != expected.coefficients.shape[1]:
             raise ValueError(f"expected in {WEIGHTS} has {expected.coefficients.shape[1]} terms, not a square")
+    elif pose is not None or "expected_views" in (description.best, description.best_unposed):
+        raise ValueError(f"{WEIGHTS} lacks expected")
+    if pose is None and description.best_unposed == "expected_views":
+        raise ValueError("without a pose, expected views cannot be used for an unknown yaw")
+    if "knowledge.order" in arrays:
+        table = None if expected is None else expected.at(viewpoints)
+        if "knowledge.expected_logits" in arrays:
+            table = take.take("knowledge.expected_logits", (classes, views, classes))
+        knowledge = Knowledge(take.take("knowledge.order", (views,)), table)
     if "strangeness.quantiles" in arrays:
         strangeness = Strangeness(take.take("strangeness.quantiles", (None, LEVELS)))
     names = sorted(name for name in arrays if name.startswith("temperatures."))

@@ -76,7 +76,7 @@ class Description:
         encoder: its shape.
         fusion: shape of the set fusion, for a recogniser.
         size: how the object's radius is used, for a recogniser that was trained with it.
-        pose: shape of the network that finds the azimuth of a view, for a recogniser that was trained with it.
+        pose: shape of the network that finds the yaw of objects, for a recogniser that was trained with it.
         entropy: shape of the entropy predictor, if there is one.
         cloud: input of the entropy predictor.
         view_policies: shapes of the networks that score views, by name of the policy.

@@ -25,7 +25,7 @@ from mevs_jax.policies.registry import POLICIES
 from mevs_jax.trained.arrays import DESCRIPTION, WEIGHTS, arrays_of, parts_of
 from mevs_jax.trained.card import model_card
 from mevs_jax.trained.description import FORM, Description
-from mevs_jax.trained.system import BY_POSE, TrainedSystem
+from mevs_jax.trained.system import EXPECTED_VIEWS, TrainedSystem
 
 CARD, PROGRAMS = "README.md", "stablehlo"
 SHIPPED = Path(__file__).parents[1] / "systems"
@@ -171,7 +171,7 @@ def _write(path: Path, content: bytes) -> None:
 
 def _halved(name: str, array: np.ndarray) -> np.ndarray:
     """Weights of networks in float16, unless they would overflow; everything else is kept as it is."""
-    networks = name.split(".")[0] in ("encoder", "entropy", "fusion", "view_policies")
+    networks = name.split(".")[0] in ("encoder", "entropy", "fusion", "pose", "view_policies")
     if not networks or array.dtype != np.float32 or array.ndim < 2 or np.abs(array).max(initial=0) > 60_000:
         return array
     return array.astype(np.float16)
@@ -257,7 +257,7 @@ def check(description: Description) -> None:
     ):
         raise ValueError("the size is impossible, or used by another kind than a recogniser")
     if description.pose is not None and description.fusion is None:
-        raise ValueError("nothing but a recogniser finds the azimuth of views")
+        raise ValueError("nothing but a recogniser finds poses")
     if (description.entropy is None) != (description.cloud is None):
         raise ValueError("an entropy predictor and its cloud belong together")
     if description.cloud is not None and not 1 <= description.cloud.points <= 2**20:
@@ -269,7 +269,7 @@ def check(description: Description) -> None:
     for shape in shapes:
         if shape is not None:
             _check_sizes(asdict(shape))
-    own = {*description.view_policies, *[BY_POSE] * (description.pose is not None)}
+    own = {*description.view_policies, *[EXPECTED_VIEWS] * (description.fusion is not None)}
     for name in (description.best, description.best_unposed):
         if name not in POLICIES and name not in own:
             raise ValueError(f"it has no policy {name!r:.40}")

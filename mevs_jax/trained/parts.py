@@ -52,7 +52,7 @@ class Parts:
         fusion: of a recogniser, for a known and for an unknown yaw: `posed` and `unposed`.
         single: temperature of the logits of a single view.
         view_policies: networks that score views, by name of the policy.
-        pose: of a recogniser, from the features of a view to the azimuth of the camera in the object's frame.
+        pose: of a recogniser, from the features of a view to the azimuth of the camera in the frame of an object of unknown yaw.
         knowledge: statistics over other objects at the viewpoints, for policies that use them.
         expected: what a recogniser is expected to say of each class from any direction.
         temperatures: by name of the policy, (views,): temperature of the belief after 1, 2, … views of its walks.

@@ -15,7 +15,7 @@ from mevs_jax.arrays import AnyArray
 from mevs_jax.cameras import cameras_at
 from mevs_jax.inputs import check_depth
 from mevs_jax.policies.base import Observation, Policy
-from mevs_jax.policies.informed import information_gain_by_pose
+from mevs_jax.policies.informed import expected_views
 from mevs_jax.policies.learned import learned
 from mevs_jax.policies.registry import POLICIES, policy_named
 from mevs_jax.selection import Fuse, by_attention, sum_of_logits
@@ -30,9 +30,11 @@ if TYPE_CHECKING:
 
 
 _AND_TABLE = "learned_and_table"
-"""The policy that averages the gains by the network `learned` and by the class × view table."""
-BY_POSE = "information_gain_by_pose"
-"""`information_gain` where the yaw is unknown, for a recogniser that finds the azimuth of views."""
+"""The policy that averages the gains by the network `learned` and by what views are expected to show."""
+EXPECTED_VIEWS = "expected_views"
+"""The policy by what a recogniser is expected to say (`mevs_jax.policies.informed.expected_views`)."""
+UNPOSED = "_unposed"
+"""Ends the name of a policy among the temperatures, for its walks around objects of unknown yaw."""
 
 
 @dataclass(frozen=True)
@@ -80,7 +82,7 @@ class TrainedSystem:
     @property
     def policies(self) -> tuple[str, ...]:
         """Names of the policies that can be used with this system, for objects of known yaw."""
-        own = [*self.parts.view_policies, *[_AND_TABLE] * ("learned" in self.parts.view_policies)]
+        own = [*self.parts.view_policies, *[_AND_TABLE] * ("learned" in self.parts.view_policies), EXPECTED_VIEWS]
         own = [name for name in own if name not in (shapes := self.description.view_policies) or shapes[name].posed]
         return tuple(name for name in (*POLICIES, *own) if self._has_inputs_of(name))
 
@@ -125,10 +127,10 @@ class TrainedSystem:
                 raise ValueError("its network needs the object's yaw")
             by = "table" if name == _AND_TABLE else "belief"
             return learned(parts.view_policies[network].module, parts.single, by=by)  # type: ignore[arg-type]
-        if name in ("information_gain", BY_POSE) and parts.pose is not None:
-            return policy_named("information_gain") if posed else information_gain_by_pose
+        if name == EXPECTED_VIEWS and parts.expected is not None:
+            return expected_views
         if name not in POLICIES:
-            own = (*parts.view_policies, *[BY_POSE] * (parts.pose is not None))
+            own = (*parts.view_policies, *[EXPECTED_VIEWS] * (parts.expected is not None))
             known = ", ".join(("best", *own, *POLICIES))
             raise ValueError(f"unknown policy {name!r}; it is one of {known}")
         return policy_named(name)
@@ -167,10 +169,18 @@ class TrainedSystem:
         return self._observe(self.parts, *given)
 
     def calibrated_as(self, policy: str, posed: bool = True) -> str:
-        """The policy whose temperatures are those of a policy's walks: itself, unless its yaw-free fusion is another one's."""
-        if not posed and (policy == "best" or self.parts.fusion):
-            return self.description.best_unposed
-        return self.description.best if policy == "best" else policy
+        """The policy whose temperatures are those of a policy's walks.
+
+        That is the policy itself. For an unknown yaw, where the fusion is another one, it is the policy's name with `_unposed`,
+        or the best policy for an unknown yaw if there are no temperatures of that name.
+        """
+        if policy == "best":
+            policy = self.description.best if posed else self.description.best_unposed
+        if posed or not self.parts.fusion:
+            return policy
+        names = (policy, self.description.best_unposed)
+        unposed = [name if name.endswith(UNPOSED) else name + UNPOSED for name in names]
+        return next((name for name in unposed if name in self.parts.temperatures), names[1])
 
     def log_probabilities(
         self, belief: Float[Array, "*batch classes"], count: int | Array, policy: str = "random"

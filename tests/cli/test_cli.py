@@ -107,7 +107,7 @@ def test_learning_writes_a_page_and_is_not_repeated(whole, tmp_path):
     for words in (
         "Means of 2 seeds",
         "Any rotation",
-        "Combined with a table",
+        "Information gain by expected views reaches",
         "Other random seeds",
     ):
         assert words in (tmp_path / "more.html").read_text()

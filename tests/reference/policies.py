@@ -87,8 +87,9 @@ def scores(policy: str, seen: list[int], table: dict, graph: dict, knowledge: di
             )
             gain[view] = entropy_of(belief) - expected
         return gain
-    if policy == "information_gain_by_pose":
-        probability, gain = softmax(belief), np.zeros(views)
+    if policy == "expected_views":
+        probability, gain = np.sqrt(softmax(belief)), np.zeros(views)
+        probability /= probability.sum()
         for view in range(views):
             expected = 0.0
             for y, p in enumerate(probability):

@@ -60,6 +60,15 @@ def check_learned(config: LearnedConfig, views: int) -> None:
             "the recogniser sees depth and normals, four channels that are not standardised, and is validated by object; leave "
             "out --learned.recogniser.network.channels, .standardise and --learned.recogniser.optimiser.validation-by"
         )
+    if config.recogniser.augmentation.turn:
+        raise DataError(
+            "--learned.recogniser.augmentation.turn is for objects in any rotation; leave it out and set "
+            "--learned.rotation-epochs, which trains a recogniser for them after that for upright objects"
+        )
+    if config.recogniser.azimuths and not 4 <= config.recogniser.azimuths <= 360:
+        raise DataError(
+            f"--learned.recogniser.azimuths must be 0, for none, or 4 to 360, got {config.recogniser.azimuths}"
+        )
     if {optimiser.seed, optimiser.data_seed, config.policy.seed, config.q_learning.seed} - {0, config.seed}:
         raise DataError("the seeds of a study are counted up from --learned.seed; leave out those of its networks")
     for name in config.ablations:

@@ -16,6 +16,8 @@ DEGREE = 6
 """Largest degree of the harmonics: 49 terms, which vary over about 30°."""
 _RIDGE = 1.0
 """Weight of the squared coefficients, in views; it matters only for a class with hardly any."""
+FITTED_AS = f"degree {DEGREE}, ridge {_RIDGE}"
+"""Names the way of fitting, for the identity of what is stored."""
 
 
 def fit_expected_views(
@@ -32,11 +34,11 @@ def fit_expected_views(
         labels: true class of each view.
         degree: largest degree of the harmonics.
     """
-    terms = np.asarray(harmonics(np.asarray(directions, np.float32), degree), np.float64)
-    penalty = _RIDGE / (4 * np.pi) * np.eye(terms.shape[1])
+    penalty = _RIDGE / (4 * np.pi) * np.eye((degree + 1) ** 2)
 
     def of_class(label: int) -> np.ndarray:
-        own = terms[labels == label]
-        return np.linalg.solve(own.T @ own + penalty, own.T @ log_probabilities[labels == label])
+        own = labels == label
+        terms = np.asarray(harmonics(np.asarray(directions[own], np.float32), degree), np.float64)
+        return np.linalg.solve(terms.T @ terms + penalty, terms.T @ log_probabilities[own])
 
     return ExpectedViews(jnp.asarray(np.stack([of_class(y) for y in range(log_probabilities.shape[1])]), jnp.float32))

@@ -97,6 +97,16 @@ def see_rotated(viewpoints: tuple[tuple[float, ...], ...], own_frame: bool = Fal
 
 
 @cache
+def answers(see: Ask, classes: int) -> Ask:
+    """Returns a `see` without features: logits, direction and label of every view."""
+
+    def of_views(network: Recogniser, task: Task, batch: Batch) -> jax.Array:
+        return see(network, task, batch)[:, -classes - 4 :]
+
+    return of_views
+
+
+@cache
 def see_changed(number: int) -> Ask:
     """Returns a `see` for objects that are augmented as in the recogniser's training.
 

@@ -34,9 +34,9 @@ from mevs_jax.models.set_fusion import OfFirstFeatures, SetFusion, SumFusion
 from train.chance import warn_of_chance
 from train.choosing.calibrated import calibrated
 from train.choosing.config import LearnedConfig
-from train.choosing.expected import fit_expected_views
+from train.choosing.expected import FITTED_AS, fit_expected_views
 from train.choosing.features import Features
-from train.choosing.looks import embed, see, see_changed, see_rotated
+from train.choosing.looks import answers, embed, see, see_changed, see_rotated
 from train.choosing.policy import Lesson, PolicyConfig, Seen, Trained, new_policy, train_policies
 from train.choosing.q_learning import QLearningConfig, train_all_by_q_learning
 from train.choosing.variants import VARIANTS
@@ -211,8 +211,10 @@ class Stages:
             task, classes = self.task(), len(self.statistics.classes)
             recogniser = load_best(task, self.recogniser_folder())
             ask = see if self.upright is None else see_rotated(self._viewpoints, own_frame=True)
-            seen = np.asarray(network_outputs(self.turned, "train", task, recogniser, ask), np.float32)
-            seen = seen.reshape(-1, seen.shape[-1])[:, -classes - 4 :]
+            seen = np.asarray(
+                network_outputs(self.turned, "train", task, recogniser, answers(ask, classes)), np.float32
+            )
+            seen = seen.reshape(-1, seen.shape[-1])
             logits, directions, labels = np.split(seen, (classes, classes + 3), axis=1)
             temperature = self.fusion(posed=self.upright is None).single
             log_probabilities = jax.nn.log_softmax((logits - self.prior) / temperature, axis=-1)
@@ -220,7 +222,8 @@ class Stages:
             return np.asarray(found.coefficients)
 
         path = self.folder / "features" / "expected_views.npz"
-        return ExpectedViews(jnp.asarray(kept_array(path, made_by(self.statistics, self.recogniser_folder()), fitted)))
+        made = f"{made_by(self.statistics, self.recogniser_folder())} {FITTED_AS}"
+        return ExpectedViews(jnp.asarray(kept_array(path, made, fitted)))
 
     def pose_head(self) -> PoseHead | None:
         """Returns the recogniser's network for the pose of objects; None if it has none."""

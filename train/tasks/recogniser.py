@@ -120,7 +120,7 @@ class RecogniserTask:
 
     @property
     def metrics(self) -> tuple[str, ...]:
-        return ("accuracy", "fused_accuracy", "unposed_accuracy", "loss")
+        return ("accuracy", "fused_accuracy", "unposed_accuracy", *["pose_loss"] * bool(self.azimuths), "loss")
 
     @property
     def hyperparameters(self) -> Hyperparameters:
@@ -209,7 +209,7 @@ class RecogniserTask:
 
 
 def _metrics_of(outputs: Outputs, labels: jax.Array, directions: jax.Array, turns: jax.Array | None) -> Metrics:
-    """Returns metrics of every view, each (objects, views).
+    """Returns metrics of every view, each (objects, views). The loss of the pose is a part of the loss, also in validation.
 
     Args:
         outputs: of the network.
@@ -226,7 +226,8 @@ def _metrics_of(outputs: Outputs, labels: jax.Array, directions: jax.Array, turn
         else:
             turns = jnp.broadcast_to(turns[:, None], (*directions.shape, 3))
             wanted = rotation_weights(seen_rotations(turns, directions))
-        found["loss"] -= _POSE_WEIGHT * jnp.sum(wanted * own, axis=-1)
+        found["pose_loss"] = -jnp.sum(wanted * own, axis=-1)
+        found["loss"] += _POSE_WEIGHT * found["pose_loss"]
     return found
 
 

@@ -83,7 +83,7 @@ def measured_with(change: str | None, out: Path) -> Measured:
             return real_study(fusion, learners, validation, test, **rest)
         known, after = (float(data.features.labels.sum() + data.features.logits.sum()) for data in (validation, test))
         found = {"temperatures": [known] * 3, "after_views": [after] * 3}
-        return {"policies": dict.fromkeys(("random", "learned", "information_gain"), found)}, {}
+        return {"policies": dict.fromkeys(("random", "learned", "expected_views"), found)}, {}
 
     def novel_classes(fusion, policies, whole, test, *rest):
         seen.given.append((fusion, [(classes, nnx.state(one)) for classes, one in policies], nnx.state(whole), rest))
@@ -188,7 +188,7 @@ def test_views_are_chosen_without_the_labels_of_test_objects(every):
     one, other = (
         {name: views for name, views in every[change].walks.items() if name not in TRUTH} for change in (None, "labels")
     )
-    assert {*one} >= {"random", "fixed_order", "information_gain", "learned", "learned_and_table", WITH_COST}
+    assert {*one} >= {"random", "fixed_order", "expected_views", "learned", "learned_and_table", WITH_COST}
     check_fitted(one, other)
 
 
@@ -229,7 +229,8 @@ def test_the_exported_system_is_of_validation_objects(change, every):
                 "unknown": figures["unknown_yaw"]["after_views"]["learned"][0],
             }
         )
-    assert {*fitted[0]["parts"].temperatures} >= {"random", "learned", "learned_unposed", "information_gain"}
+    named = {name + end for name in ("learned", "expected_views") for end in ("", "_unposed")}
+    assert {*fitted[0]["parts"].temperatures} >= {"random", *named}
     check_fitted(*fitted)
     check_tested(*tested)
 

@@ -78,8 +78,8 @@ def walk(agent, views, first, **reset):
         pytest.param("classifier", "farthest", marks=pytest.mark.slow),
         pytest.param("classifier", "fixed_order", marks=pytest.mark.slow),
         ("recogniser", "learned"),
-        ("recogniser", "information_gain"),
-        ("recogniser", "information_gain_by_pose"),
+        ("recogniser", "expected_views"),
+        ("recogniser", "expected_views_unposed"),
         pytest.param("recogniser", "learned_and_table", marks=pytest.mark.slow),
     ],
 )
@@ -88,7 +88,7 @@ def test_walks_are_those_of_the_selection_loop_on_tables(request, kind, policy):
     system = request.getfixturevalue(kind)
     views = views_of(system)
     table, graph = table_of(system, views), system.graph
-    posed = policy != "information_gain_by_pose"
+    policy, posed = policy.removesuffix("_unposed"), not policy.endswith("_unposed")
     knowledge = system.parts.knowledge if posed else system.parts.knowledge_by_pose(graph.points)
     fusion = system.parts.fusion["posed" if posed else "unposed"] if kind == "recogniser" else None
     fuse = by_attention(fusion) if fusion else mevs_jax.sum_of_logits

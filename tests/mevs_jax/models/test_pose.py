@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from flax import nnx
 from scipy.spatial.transform import Rotation
 from scipy.special import sph_harm_y
 
-from mevs_jax import fibonacci_sphere
+from mevs_jax import fibonacci_sphere, look_at_origin
 from mevs_jax.models.expected_views import harmonics
 from mevs_jax.models.pose import PoseHead, azimuth_of, azimuth_weights, pose_log_probabilities, yaw_evidence, yaws
 from train.choosing.expected import fit_expected_views
@@ -86,6 +87,17 @@ def test_the_yaw_is_where_the_azimuths_of_all_views_agree(random):
     np.testing.assert_allclose(np.exp(found).sum(axis=1), 1, rtol=1e-5)
     none = pose_log_probabilities(evidence, np.zeros(3, bool))
     np.testing.assert_allclose(np.exp(none), 1 / COUNT, rtol=1e-5)
+
+
+def test_a_view_from_straight_above_or_below_is_like_the_one_beside_it_with_the_same_roll(random):
+    said = np.log(np.full((1, CLASSES, COUNT), 1 / COUNT) + random.uniform(0, 1, (1, CLASSES, COUNT))).astype(
+        np.float32
+    )
+    for sign in (1, -1):
+        here, beside = (np.float32([[0, y, sign]]) for y in (0.0, -sign * 1e-4))
+        images = [np.asarray(look_at_origin(jnp.asarray(one[0])))[:3, :3] for one in (here, beside)]
+        np.testing.assert_allclose(*images, atol=1e-3)
+        np.testing.assert_allclose(yaw_evidence(said, here), yaw_evidence(said, beside), atol=1e-5)
 
 
 def test_azimuths_are_log_probabilities_for_each_class(random):

@@ -42,7 +42,7 @@ def description(kind: str, **changes) -> Description:
         "image": ImageInput("depth_and_normals", 4) if recogniser else ImageInput("depth", 1),
         "encoder": ResNetShape(10, 8, 4 if recogniser else 1, False, "patches"),
         "best": "learned" if recogniser else "information_gain",
-        "best_unposed": "learned_unposed" if recogniser else "farthest",
+        "best_unposed": "expected_views" if recogniser else "farthest",
         "chosen_by": "nothing",
         "data": DataDescription("made up", "0", {"val": 30}),
         "made_by": "0",
@@ -74,6 +74,8 @@ def system(kind: str = "classifier", seed: int = 0) -> TrainedSystem:
     features = 8 * of.encoder.width
     temperatures = {name: jnp.linspace(1, 2, 6) for name in ("random", "farthest", "information_gain")}
     fusion, policies, pose, expected = {}, {}, None, None
+    if of.pose is not None:
+        temperatures["expected_views_unposed"] = jnp.linspace(1.5, 3, 6)
     if of.fusion is not None:
         structure, weights = nnx.split(of.fusion.network(features, classes, rngs))
         prior = jnp.log(jnp.asarray([0.1, 0.2, 0.3, 0.4]))
