@@ -33,7 +33,11 @@ from mevs_jax.markdown import markdown_table
 
 RESULTS = Path(__file__).parent / "results"
 KEPT = RESULTS / "choices"
-METHODS = {"learned": "view policy", "learned_and_table": "view policy and expected views"}
+METHODS = {
+    "learned": "view policy",
+    "expected_views": "information gain by expected views",
+    "learned_and_table": "view policy and expected views",
+}
 _WHOLES: dict[type[np.unsignedinteger], int] = {np.uint8: 240, np.uint16: 720}
 """The stored value of a share of 1."""
 _KEPT = ("objects", "views", "trying_starts", "single_view")
