@@ -12,7 +12,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
-from scipy.spatial.transform import Rotation
 
 from mevs_jax.arrays import AnyArray
 from mevs_jax.cameras import look_at_origin
@@ -27,6 +26,8 @@ _WIDTH = 0.2
 @cache
 def rotation_grid(count: int = ROTATIONS) -> Float[np.ndarray, "{count} 3 3"]:
     """Rotation matrices that cover all rotations evenly: the super-Fibonacci spiral of Alexa (CVPR 2022)."""
+    from scipy.spatial.transform import Rotation  # imported late: few need it
+
     root, psi = np.sqrt(2), 1.533751168755204288118041  # psi⁴ = psi + 4
     share = (np.arange(count) + 0.5) / count
     alpha, beta = 2 * np.pi * count * share / root, 2 * np.pi * count * share / psi
