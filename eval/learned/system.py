@@ -103,7 +103,7 @@ def learned_system(stages: Stages, found: dict[str, Any], figures: dict[str, Any
         encoder=resnet_shape(config.recogniser.network, 4),
         best=EXPECTED_VIEWS,
         best_unposed=EXPECTED_VIEWS if finds_pose else "learned_unposed",
-        chosen_by="the method of the learned study, not chosen by a comparison",
+        chosen_by="validation objects of another study: as good as its other policies, for any candidates",
         data=data_of(stages.statistics),
         made_by=made,
         made_with=versions_of(*MADE_WITH),
