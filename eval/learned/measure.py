@@ -189,10 +189,12 @@ def _walks(
 
 def _known(stages: Stages, posed: bool, directions: Float[Array, "views 3"]) -> ExpectedViews | UnknownPose | None:
     """What is known about views for objects of known pose, of unknown yaw, or in any rotation."""
-    expected, head = stages.expected_views(), stages.pose_head()
-    if posed or head is None:
-        return expected if posed else None
-    return (of_unknown_yaw if stages.upright is None else of_any_rotation)(head, expected, directions)
+    if posed:
+        return stages.expected_views()
+    if (head := stages.pose_head()) is None:
+        return None
+    of_poses = of_unknown_yaw if stages.upright is None else of_any_rotation
+    return of_poses(head, stages.expected_views(), directions)
 
 
 def _rotated(stages: Stages) -> dict[str, Any]:

@@ -60,8 +60,8 @@ class UnknownPose:
 def of_unknown_yaw(head: PoseHead, expected: ExpectedViews, directions: Float[AnyArray, "views 3"]) -> UnknownPose:
     """What is known about upright objects of unknown yaw.
 
-    Objects of a data set have yaw 0. The yaws that are told apart are therefore moved by half a step: the true one is as far from
-    the nearest of them as it can be.
+    Objects of a data set have yaw 0. The yaws that are distinguished are therefore moved by half a step: the true one is as far
+    from the nearest of them as it can be.
 
     Args:
         head: finds azimuths.

@@ -22,7 +22,7 @@ class PoseHead(nnx.Module):
     Args:
         features: length of a view's feature vector.
         classes: number of classes.
-        poses: number of poses that are told apart: azimuths of the camera in the object's frame (`yaws`), or rotations.
+        poses: number of poses that are distinguished: azimuths of the camera in the object's frame (`yaws`), or rotations.
         width: of the hidden layer.
         dropout: rate of the features in training, in [0, 1).
         rngs: source of the initial weights.
@@ -66,7 +66,7 @@ class PoseHead(nnx.Module):
 
 
 def yaws(count: int) -> Float[np.ndarray, " {count}"]:
-    """The yaws, or azimuths, that are told apart, in radians: evenly spaced from 0."""
+    """The yaws, or azimuths, that are distinguished, in radians: evenly spaced from 0."""
     return np.arange(count) * 2 * np.pi / count
 
 

@@ -17,7 +17,7 @@ from mevs_jax.arrays import AnyArray
 from mevs_jax.cameras import look_at_origin
 
 ROTATIONS = 576
-"""Number of rotations that are told apart; from any rotation the nearest is 14° away on average, and at most about 27°."""
+"""Number of rotations that are distinguished; from any rotation the nearest is 14° away on average, and at most about 27°."""
 _EXACT = jax.lax.Precision.HIGHEST
 _WIDTH = 0.2
 """Standard deviation in radians of the weights of rotations around a true one."""

@@ -48,7 +48,7 @@ class RecogniserConfig:
     balanced: bool = False
     """draw equally many training objects of each class, objects of rarer classes more often; else each object equally often"""
     azimuths: int = 24
-    """number of azimuths that are told apart where the yaw of objects is unknown; 0: the pose of objects is not estimated"""
+    """number of azimuths that are distinguished where the yaw of objects is unknown; 0: the pose of objects is not estimated"""
     optimiser: OptimiserConfig = OptimiserConfig()
 
 
