@@ -54,8 +54,7 @@ class ViewTables:
 
 def objects_of(data: Path, split: str, statistics: DatasetStatistics) -> tuple[list[str], np.ndarray, np.ndarray]:
     """Names, labels (objects,) and normalised entropies (objects, views) of a split, in the order of the shards."""
-    source = open_split(data, split)
-    examples = [source[index] for index in range(len(source))]
+    examples = list(open_split(data, split, ("name", "label", "entropy")))
     names = [example["name"].decode() for example in examples]
     labels = np.array([example["label"] for example in examples], np.int32)
     return names, labels, np.stack([example["entropy"] / statistics.entropy_max for example in examples])

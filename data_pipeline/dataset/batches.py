@@ -11,7 +11,7 @@ and validation. The option `ViewBatches.validation_by` reproduces this, to show 
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -78,6 +78,12 @@ def sample_pixels(depth: np.ndarray, points: int, random: np.random.Generator) -
     return np.resize(random.permutation(hit), points).astype(np.int32)
 
 
+def _keys_read(points: int, images: str | None) -> tuple[str, ...]:
+    """Keys of an object that `views_of_example` reads: pixels that are not needed are not decoded."""
+    pixels = {images} if images else set()
+    return ("label", "pose", "entropy", "radius", *sorted(pixels | ({"depth"} if points else set())))
+
+
 def views_of_example(
     example: dict[str, Any], views: np.ndarray, *, points: int, images: str | None, random: np.random.Generator
 ) -> dict[str, np.ndarray]:
@@ -132,11 +138,12 @@ def equally_often(objects: np.ndarray, labels: np.ndarray) -> np.ndarray:
 class _TrainingObjects:
     """The objects of several splits, concatenated; the key `trainable` lists the views that may be used for training."""
 
-    def __init__(self, sources: list[Any], config: ViewBatches):
-        self._sources, self._config = sources, config
-        self._kept = objects_kept(sum(map(len, sources)), config)
+    def __init__(self, folder: Path, splits: Sequence[str], config: ViewBatches):
+        read = _keys_read(config.points, config.images)
+        self._sources, self._config = [open_split(folder, split, read) for split in splits], config
+        self._kept = objects_kept(sum(map(len, self._sources)), config)
         if config.balanced:
-            labels = [source[index]["label"] for source in sources for index in range(len(source))]
+            labels = [example["label"] for split in splits for example in open_split(folder, split, ("label",))]
             self._kept = equally_often(self._kept, np.array(labels)[self._kept])
 
     def __len__(self) -> int:
@@ -162,7 +169,7 @@ def training_splits(config: ViewBatches) -> tuple[str, ...]:
 
 
 def _training_objects(folder: Path, config: ViewBatches) -> _TrainingObjects:
-    return _TrainingObjects([open_split(folder, split) for split in training_splits(config)], config)
+    return _TrainingObjects(folder, training_splits(config), config)
 
 
 def validation_splits(config: ViewBatches) -> tuple[str, ...]:
@@ -183,7 +190,8 @@ def validation_batches(
         part: which of the objects; all by default.
     """
     by_object = config.validation_by == "object"
-    objects = open_split(folder, "val") if by_object else _training_objects(folder, config)
+    read = _keys_read(config.points, config.images)
+    objects = open_split(folder, "val", read) if by_object else _training_objects(folder, config)
     for index in range(len(objects))[part]:
         example = objects[index]
         count = len(example["entropy"])
@@ -270,7 +278,7 @@ def evaluation_batches(
     Args:
         chosen: positions of the objects; all by default.
     """
-    source = open_split(folder, split)
+    source = open_split(folder, split, _keys_read(points, images))
     for index in range(len(source)) if chosen is None else map(int, chosen):
         example = source[index]
         views = np.arange(len(example["entropy"]))

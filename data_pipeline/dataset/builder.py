@@ -388,10 +388,13 @@ def _capture(entries: Sequence[ObjectEntry], config: DataConfig, captures: Path)
     return left_out_of(entries, captures)
 
 
-def open_split(folder: Path, split: str) -> Any:
+def open_split(folder: Path, split: str, only: Sequence[str] = ()) -> Any:
     """Returns a random-access source of the objects of one split: `source[i]` is a dictionary of NumPy arrays.
+
+    Args:
+        only: keys of that dictionary; only these, where the data set has them, are decoded. All by default.
 
     Raises:
         DataError: if there are no shards, or damaged ones.
     """
-    return Objects(folder, split)
+    return Objects(folder, split, only)

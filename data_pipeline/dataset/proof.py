@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import operator
 import os
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any, SupportsIndex
 
@@ -85,11 +85,16 @@ def _unusable(folder: Path, damage: str) -> DataError:
 class Objects:
     """Random access to the objects of one split: `objects[i]` is a dictionary of NumPy arrays.
 
+    Args:
+        folder: of the data set.
+        split: name of the split.
+        only: keys of that dictionary; only these, where the data set has them, are decoded. All by default.
+
     Raises:
         DataError: when shards that are damaged are opened or read.
     """
 
-    def __init__(self, folder: Path, split: str):
+    def __init__(self, folder: Path, split: str, only: Sequence[str] = ()):
         import tensorflow_datasets as tfds
 
         where = folder_of_shards(folder)
@@ -101,8 +106,15 @@ class Objects:
             raise _unusable(folder, damage)
         self._folder = folder
         try:
-            self._source = tfds.builder_from_directory(str(where)).as_data_source(split=split)
-            self._length = len(self._source)
+            builder = tfds.builder_from_directory(str(where))
+            # TFDS decodes only some features where TensorFlow is installed, and not in its data sources.
+            raw = tfds.decode.DeserializeMethod.RAW_BYTES
+            self._records = builder.as_data_source(split=split, deserialize_method=raw)
+            self._length = len(self._records)
+            features = builder.info.features
+            if only:
+                features = tfds.features.FeaturesDict({key: features[key] for key in only if key in features})
+            self._decode = features.deserialize_example_np
         except Exception as error:  # of TFDS, ArrayRecord or Riegeli, each with kinds of its own
             raise self._damaged(error) from error
 
@@ -119,7 +131,7 @@ class Objects:
         if not -self._length <= index < self._length:
             raise IndexError(index)
         try:
-            return self._source[index]
+            return self._decode(self._records[index])
         except Exception as error:
             raise self._damaged(error) from error
 

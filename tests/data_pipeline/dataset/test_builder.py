@@ -54,6 +54,14 @@ def test_an_example_is_an_object_as_it_was_captured(data):
             assert example["entropy"][view] == pytest.approx(float(expected), abs=1e-5)
 
 
+def test_some_keys_are_read_alone(data):
+    some, whole = open_split(data, "test", ("label", "name", "entropy")), open_split(data, "test")
+    assert len(some) == len(whole)
+    for one, other in zip(some, whole, strict=True):
+        assert one.keys() == {"label", "name", "entropy"}
+        assert all(np.array_equal(one[key], other[key]) and type(one[key]) is type(other[key]) for key in one)
+
+
 def test_statistics_are_of_the_training_split_alone(data):
     statistics = load_statistics(data)
     source = open_split(data, "train")
