@@ -110,6 +110,7 @@ class Together:
 
     Attributes:
         members: with their results so far.
+        step: number of steps done.
         epoch: number of epochs done.
         seconds: training time so far.
         histories: of each member, the metrics of every epoch.
@@ -119,6 +120,7 @@ class Together:
 
     members: list[Member]
     epoch_steps: int
+    step: int = 0
     epoch: int = 0
     seconds: float = 0.0
     histories: list[list[dict[str, float]]] = field(default_factory=list)
@@ -127,7 +129,8 @@ class Together:
     def progress(self) -> dict[str, Any]:
         """What a checkpoint holds beside arrays."""
         members = [asdict(member) for member in self.members]
-        return {"epoch": self.epoch, "seconds": self.seconds, "histories": self.histories, "members": members}
+        done = {"step": self.step, "epoch": self.epoch, "seconds": self.seconds}
+        return done | {"histories": self.histories, "members": members}
 
     def after_epoch(
         self, training: np.ndarray, means: dict[str, Any], checked: dict[str, Any], finite: np.ndarray

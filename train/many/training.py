@@ -41,7 +41,7 @@ def train_members(
     halving: bool = False,
     starts: Starts = (),
 ) -> Together:
-    """Trains all members; an interrupted training resumes after its last complete epoch.
+    """Trains all members; a training that is stopped resumes after its last step, one that is killed after its last epoch.
 
     Args:
         task: the network's training; each member changes its hyper-parameters and seeds.
@@ -57,7 +57,7 @@ def train_members(
 
     Raises:
         DataError: if the devices cannot share the members equally.
-        Preempted: after SIGTERM, at the end of an epoch.
+        Preempted: after SIGTERM, once the states are saved.
     """
     if len(members) % mesh.size:
         raise DataError(
@@ -73,13 +73,14 @@ def train_members(
     with Checkpoints(folder) as checkpoints, progress_bar("views") as bar, Preemption() as preemption:
         if (saved := checkpoints.restore("latest", trainer.saved())) is not None:
             arrays, progress = saved
+            progress = {"step": progress["epoch"] * epoch_steps} | progress  # version 0.1 saved at ends of epochs alone
             trainer.resume(arrays)
             of = Together(
                 **progress | {"members": [Member(**member) for member in progress["members"]]}, epoch_steps=epoch_steps
             )
-            console.print(f"{title}: resuming after epoch {of.epoch}")
+            console.print(f"{title}: resuming after epoch {of.epoch}, step {of.step}")
         views = optimiser.batch_size * (len(members) if own_batches else 1)
-        total, done = epoch_steps * optimiser.epochs * views, of.epoch * epoch_steps * views
+        total, done = epoch_steps * optimiser.epochs * views, of.step * views
         line = bar.add_task(f"{title}: {task.name}", total=total, completed=done, note="")
         while of.epoch < optimiser.epochs:
             training = np.array([member.is_training(optimiser.patience) for member in of.members])
@@ -87,10 +88,15 @@ def train_members(
                 break
             started = time.perf_counter()
             trainer.begin(training)
-            batches.begin(trainer.places, of.epoch * epoch_steps)
-            for _ in range(epoch_steps):
+            batches.begin(trainer.places, of.step)
+            while of.step < (of.epoch + 1) * epoch_steps:
                 lead.limit(trainer.train(training, batches.next(trainer.places)))
+                of.step += 1
                 bar.advance(line, views)
+                if preemption.after_step() and of.step % epoch_steps:
+                    of.seconds += time.perf_counter() - started
+                    checkpoints.save("latest", of.step, trainer.saved(), of.progress())
+                    raise Preempted(f"{title} was asked to end after step {of.step}")
             means = {name: sums / epoch_steps for name, sums in trainer.sums().items()}
             with np.errstate(invalid="ignore"):  # of members that have stopped
                 checked = weighted_means([trainer.evaluate(*given) for given in batches.validation(trainer.places)])
@@ -99,10 +105,10 @@ def train_members(
             if halving and of.epoch in {max(1, optimiser.epochs // share) for share in (8, 4, 2)}:
                 of.halve()
             of.seconds += time.perf_counter() - started
-            checkpoints.save("latest", of.epoch, trainer.saved(), of.progress())
+            checkpoints.save("latest", of.step, trainer.saved(), of.progress())
             _print_epoch(title, of, optimiser)
-            if preemption.after_step():
-                raise Preempted(f"{title} was asked to end after epoch {of.epoch}")
+            if preemption.asked:
+                raise Preempted(f"{title} was asked to end after step {of.step}")
     of.best = on_host(trainer.saved()[1])
     return of
 

@@ -28,7 +28,7 @@ from tests.train.scaling_worker import SETTINGS
 from train.choosing.stages import Stages
 from train.devices import device_mesh
 from train.kept import summary_of
-from train.loop import fit, load_best, validate
+from train.loop import fit, load_best, steps_of_an_epoch, validate
 from train.many.members import Member, Together, by_configurations, task_of
 from train.many.sweep import SweepConfig, best_of, draw_members, sweep
 from train.preemption import Preempted
@@ -85,20 +85,24 @@ def test_members_end_as_separate_runs_do(every, out, tmp_path):
 
 
 @pytest.mark.slow
-def test_a_stopped_sweep_ends_as_if_it_had_not_been(out, tmp_path, monkeypatch):
+@pytest.mark.parametrize("at_end", [False, True], ids=["within an epoch", "at the end of an epoch"])
+def test_a_stopped_sweep_ends_as_if_it_had_not_been(at_end, out, tmp_path, monkeypatch):
     statistics, task = load_statistics(out / "data"), task_named("entropy", out)
     task = replace(task, optimiser=replace(task.optimiser, patience=5, epochs=3))
     whole = sweep(task, out / "data", statistics, tmp_path / "whole", SWEEP)
+    epoch = steps_of_an_epoch(task, statistics)
+    assert epoch > 1
+    after = epoch if at_end else epoch + 1
     real = train.many.training.train_batches
 
     def told_to_end(*arguments, **options):
         for number, batch in enumerate(real(*arguments, **options)):
-            if number == 1:
+            if number + 1 == after:
                 os.kill(os.getpid(), signal.SIGTERM)
             yield batch
 
     monkeypatch.setattr(train.many.training, "train_batches", told_to_end)
-    with pytest.raises(Preempted, match="after epoch 1"):
+    with pytest.raises(Preempted, match=f"after step {after}$"):
         sweep(task, out / "data", statistics, tmp_path / "stopped", SWEEP)
     monkeypatch.undo()
     assert not (tmp_path / "stopped" / "members.json").exists()
