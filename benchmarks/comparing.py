@@ -45,10 +45,10 @@ class Row:
 
 
 def take_turns(calls: list[Callable[[], Any]], rounds: int) -> np.ndarray:
-    """Times in milliseconds (calls, rounds); each round runs every call once, after a warm-up.
+    """Times in milliseconds (calls, rounds); each round runs every call once, after a warm-up, in another order.
 
-    The order changes from round to round: the threads of some libraries go on spinning for a while after a call, which slows down
-    the next one.
+    The threads of some libraries go on spinning for a while after a call, which would slow down the next one. So a call begins
+    once they rest.
     """
     random = np.random.default_rng(0)
     for call in calls:
@@ -56,10 +56,20 @@ def take_turns(calls: list[Callable[[], Any]], rounds: int) -> np.ndarray:
     taken = np.empty((len(calls), rounds))
     for turn in range(rounds):
         for number in random.permutation(len(calls)):
+            _wait_for_rest()
             start = time.perf_counter()
             jax.block_until_ready(calls[number]())
             taken[number, turn] = 1000 * (time.perf_counter() - start)
     return taken
+
+
+def _wait_for_rest() -> None:
+    """Returns once no thread of this process has worked for ten milliseconds, or after a second."""
+    for _ in range(100):
+        before = time.process_time()
+        time.sleep(0.01)
+        if time.process_time() - before < 0.001:
+            return
 
 
 def compare(
