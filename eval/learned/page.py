@@ -10,95 +10,21 @@ from typing import Any
 
 from data_pipeline.dataset.statistics import DatasetStatistics
 from data_pipeline.files import write_text
-from eval.learned.comparison import BASELINES
-from eval.learned.study import WITHOUT
-from eval.learned.walks import by_expected_views
+from eval.learned.other_cases import novel, rotated, scattered, unposed
+from eval.learned.tables import METHOD, accuracy, against, gain_of_two, ladder
 from eval.report import figures
 from eval.report.html import (
-    MARKS,
     ReportInputs,
     commands,
     difference,
     document,
     image,
     percent,
-    rows_by_knowledge,
-    signed,
-    span,
     table,
     warning,
 )
 from mevs_jax.trained.system import EXPECTED_VIEWS
 from train.chance import Chance
-
-METHOD = "learned"
-"""The policy that the page is about."""
-_SHOWN = (0, 1, 2, 3, 5, 7)
-"""Steps of a walk that the tables show; 0 is the first view."""
-
-
-def _accuracy(share: float, interval: list[float]) -> str:
-    return f"{percent(share)}<br><small class='note'>{span(interval)}</small>"
-
-
-def _closed(found: dict[str, Any], name: str) -> list[str]:
-    """Shares of the gap that a policy closes, in percent, with their intervals where they have one."""
-    cells = []
-    shares = found["gap_closed"].get(name, ())
-    intervals = found.get("gap_closed_interval", {}).get(name) or [None] * len(shares)
-    for share, interval in zip(shares, intervals, strict=True):
-        cell = "–" if share is None else signed(share, 0).lstrip("+")
-        if share is not None and interval is not None:
-            cell += f" <small class='note'>[{', '.join(signed(end, 0).lstrip('+') for end in interval)}]</small>"
-        cells.append(cell)
-    return cells
-
-
-def _ladder(found: dict[str, Any]) -> str:
-    rows, with_gap = [], bool(found["gap_closed"])
-    steps = [step for step in _SHOWN if step < len(found["policies"]["random"]["after_views"])]
-    for name, policy in found["policies"].items():
-        cells = [_accuracy(*cell) for cell in zip(policy["after_views"], policy["interval"], strict=True)]
-        closed = _closed(found, name)
-        row = [
-            html.escape(policy["title"]),
-            *(cells[step] if step < len(cells) else "" for step in steps),
-            *[" / ".join(closed)] * with_gap,
-        ]
-        rows.append((policy["knows"], row))
-    header = ["next view chosen by", *(str(step + 1) for step in steps), *["gap closed (%)"] * with_gap]
-    note = "Accuracy (%) after exactly the given number of views, with 95 % intervals over objects."
-    if with_gap:
-        note += (
-            " Gap closed: gain over random, in percent of the gain of the label-free oracle, after 2 / 3 / 4 views. The oracles "
-            f"try every view and walk from {found['trying_starts']} of the {found['views']} start views; the gap is computed on "
-            "these. The label oracle also finds views that are right by chance."
-        )
-    return table(header, rows_by_knowledge(rows)) + f"<p class='note'>{note}</p>"
-
-
-def _against(found: dict[str, Any], bases: tuple[str, ...] = BASELINES) -> str:
-    """Paired differences in accuracy and in the log-probability of the true class."""
-    rows, steps = [], (1, 2, 3)
-    for base in bases:
-        if base not in found["policies"]:
-            continue
-        rows.append([f"Difference from “{html.escape(found['policies'][base]['title'])}”"])
-        for name, policy in found["policies"].items():
-            if name not in found["against"][base] or policy["knows"] in ("nothing", "truth"):
-                continue
-            gain = found["against"][base][name]
-            rows.append([html.escape(policy["title"])])
-            for of in (gain, gain["likelihood"]):
-                known = zip(of["difference"], of["interval"], strict=True)
-                cells = [difference(*cell) for cell in known][1 : len(steps) + 1]
-                rows[-1] += cells + [""] * (len(steps) - len(cells))
-    header = [f"{step + 1} views{unit}" for unit in ("", ", nat/100") for step in steps]
-    return table(["next view chosen by", *header], rows) + (
-        "<p class='note'>Left: differences in accuracy, in percentage points. Right: differences in the log-probability of "
-        "the true class, in hundredths of a nat; they resolve smaller differences. With 95 % intervals over objects. "
-        f"{MARKS}</p>"
-    )
 
 
 def _ablations(metrics: dict[str, Any]) -> str:
@@ -108,8 +34,8 @@ def _ablations(metrics: dict[str, Any]) -> str:
     ((_, found),) = metrics["seeds"][0]["ablations"].items()
     return (
         "<h2>Ablations</h2><p>The view policy, and variants that each change one thing, from the same start views.</p>"
-        + _ladder(found)
-        + _against(found, ("random", METHOD))
+        + ladder(found)
+        + against(found, ("random", METHOD))
     )
 
 
@@ -117,7 +43,7 @@ def _sets(found: dict[str, Any]) -> str:
     rows = [
         [
             str(row["views"]),
-            *(_accuracy(row[name]["accuracy"], row[name]["interval"]) for name in ("sum", "learned")),
+            *(accuracy(row[name]["accuracy"], row[name]["interval"]) for name in ("sum", "learned")),
             difference(row["difference"], row["difference_interval"]),
             *(percent(row[name]["calibration_error"]) for name in ("sum", "learned")),
         ]
@@ -166,7 +92,7 @@ def _costs(found: dict[str, Any]) -> str:
                 cell
                 for step in steps
                 for cell in (
-                    _accuracy(row["after_views"][step], row["interval"][step]),
+                    accuracy(row["after_views"][step], row["interval"][step]),
                     f"{math.degrees(row['way'][step]):.0f}°",
                 )
             ),
@@ -202,12 +128,6 @@ def _both_rules(row: dict[str, Any]) -> list[str]:
     return [*cells, percent(own["accuracy"]), f"{own['views']:.2f}", fewer]
 
 
-def _gain_of_two(against: dict[str, Any], method: str = METHOD) -> str:
-    """The gain after two views over another policy."""
-    gain = against[method]
-    return difference(gain["difference"][1], gain["interval"][1])
-
-
 def _lead(metrics: dict[str, Any], views: str) -> str:
     """The main results, as means over all seeds."""
     each, together = [seed["lattices"][views] for seed in metrics["seeds"]], metrics["together"][views]
@@ -219,7 +139,7 @@ def _lead(metrics: dict[str, Any], views: str) -> str:
     ):
         if name in gains:
             known = together["policies"][name]["after_views"]
-            others += f" {title} reaches {percent(known[1])} %: {_gain_of_two(gains, name)}."
+            others += f" {title} reaches {percent(known[1])} %: {gain_of_two(gains, name)}."
     single = fmean(found["single_view"] for found in each)
     every, summed = (fmean(found["random_sets"][-1][name]["accuracy"] for found in each) for name in ("learned", "sum"))
     trainings = f" Means of {len(each)} seeds; the numbers below are of the first seed unless stated otherwise." * (
@@ -227,7 +147,7 @@ def _lead(metrics: dict[str, Any], views: str) -> str:
     )
     return (
         f'<p class="lead">Accuracy after two views is {percent(method[1])} % if the policy chooses the second and '
-        f"{percent(random[1])} % if it is random: {_gain_of_two(gains)} points.{others} Accuracy from one view is "
+        f"{percent(random[1])} % if it is random: {gain_of_two(gains)} points.{others} Accuracy from one view is "
         f"{percent(random[0])} %, and {percent(single)} % from its logits without the fusion; from all "
         f"{first['random_sets'][-1]['views']} views it is {percent(every)} % fused and {percent(summed)} % "
         f"summed.{trainings}</p><p>A <dfn>view</dfn> is one depth image of the object from one of the candidate directions. A "
@@ -243,88 +163,6 @@ def _lead(metrics: dict[str, Any], views: str) -> str:
         f'<p class="note">Over {first["objects"]} test objects and every start view. All policies use the same fusion, '
         f"objects and start views. Everything is fitted or chosen on {first['validation_objects']} validation objects. The "
         "views of these lattices are not in the training data, which has other directions around other objects.</p>"
-    )
-
-
-def _unposed(metrics: dict[str, Any]) -> str:
-    """Results for objects of unknown yaw, compared with a known pose from the same start views."""
-    (views, unposed), *_ = metrics["seeds"][0]["unposed"].items()
-    posed = metrics["seeds"][0]["lattices"][views]["policies"]
-    gains, of_pose, rows = unposed["against"]["random"], "", []
-    if EXPECTED_VIEWS in gains:
-        of_pose = (
-            " For each class, the azimuth of every view in the object's frame is estimated. Expected views are averaged over the "
-            f"yaw, weighted by its probability: {_gain_of_two(gains, EXPECTED_VIEWS)} points."
-        )
-    for name, policy in unposed["policies"].items():
-        if policy["knows"] != "truth":
-            for title, found in ((policy["title"], policy), ("… pose known", posed[name])):
-                cells = zip(found["after_views"], found["interval"], strict=True)
-                rows.append([html.escape(title), *(_accuracy(*cell) for cell in cells)])
-    return (
-        "<h2>Unknown yaw</h2>"
-        "<p>Objects are turned about the vertical by an unknown angle; fusion and policy receive directions relative to the "
-        f"first view only. After two views the policy's gain over random is {_gain_of_two(gains)} points.{of_pose}</p>"
-        + table(["next view chosen by", *(str(step + 1) for step in range(len(rows[0]) - 1))], rows)
-    )
-
-
-def _rotated(metrics: dict[str, Any]) -> str:
-    """Results for objects in any rotation."""
-    if "rotated" not in metrics["seeds"][0]:
-        return ""
-    ((_, found),) = metrics["seeds"][0]["rotated"].items()
-    every = found["random_sets"][-1]
-    return (
-        "<h2>Any rotation</h2><p>Objects are turned by an unknown rotation about any axis. The recogniser was trained for "
-        "some further epochs on objects rotated in the same way, and finds the rotation of an object relative to the camera, for "
-        "each class. Expected views are averaged over rotations, weighted by their probability. All "
-        f"{every['views']} views fused: {percent(every['learned']['accuracy'])} %.</p>"
-        + _ladder(found)
-        + _against(found)
-    )
-
-
-def _scattered(metrics: dict[str, Any]) -> str:
-    """Results with separate candidate directions for each object."""
-    ((views, found),) = metrics["seeds"][0]["scattered"].items()
-    return (
-        "<h2>Candidate directions that differ between objects</h2>"
-        f"<p>Each object has {views} candidate directions of its own, from a randomly rotated lattice.</p>"
-        + _ladder(found)
-        + _against(found)
-    )
-
-
-def _novel(metrics: dict[str, Any], classes: list[str]) -> str:
-    found = metrics["seeds"][0].get("novel")
-    if found is None:
-        return ""
-    steps = range(1, min(4, len(found["gain"]["trained_with"]["difference"])))
-    rows = []
-    for name, title in (
-        ("trained_without", "trained without these classes"),
-        ("trained_with", "trained with all classes"),
-        (EXPECTED_VIEWS, by_expected_views().title),
-        (WITHOUT, "… without expected views of these classes"),
-    ):
-        gain = found["gain"][name]
-        rows.append([title, *(difference(gain["difference"][step], gain["interval"][step]) for step in steps)])
-    each = [
-        [
-            html.escape(" and ".join(classes[label] for label in pair["classes"])),
-            str(pair["objects"]),
-            *(percent(pair[name][1]) for name in ("random", "trained_without", "trained_with")),
-        ]
-        for pair in found["pairs"]
-    ]
-    return (
-        "<h2>Classes left out of policy training</h2>"
-        f"<p>Gain over random in percentage points on the {found['objects']} test objects of pairs of classes that a policy was "
-        "trained without. Encoder and fusion were trained on all classes. Expected views are those of the objects that the "
-        "recogniser was trained on; no policy was trained for them.</p>"
-        + table(["policy", *(f"{step + 1} views" for step in steps)], rows)
-        + table(["classes", "objects", "random, 2 views", "trained without these", "trained with all"], each)
     )
 
 
@@ -365,8 +203,8 @@ def _seeds(metrics: dict[str, Any], views: str) -> str:
     return (
         "<h2>Other random seeds</h2><p>Everything is trained again from other initial weights and batches. Means over "
         f"{len(each)} seeds, first for each object:</p>"
-        + _ladder(metrics["together"][views])
-        + _against(metrics["together"][views])
+        + ladder(metrics["together"][views])
+        + against(metrics["together"][views])
         + f"<p>Calibration error (%) of the view policy after 1 to {len(errors)} views, mean over the seeds: "
         + f"{', '.join(map(percent, errors))}.</p><p>Each seed, with intervals over objects; rows of means have t intervals "
         f"over "
@@ -381,7 +219,7 @@ def active_section(inputs: ReportInputs) -> str:
     if inputs.learned is None:
         return ""
     views, found = next(iter(inputs.learned["seeds"][0]["lattices"].items()))
-    return "<h2>Learned fusion and view selection</h2>" + _lead(inputs.learned, views) + _ladder(found)
+    return "<h2>Learned fusion and view selection</h2>" + _lead(inputs.learned, views) + ladder(found)
 
 
 def _alt_of_curves(curves: dict[str, Any]) -> str:
@@ -424,7 +262,7 @@ def write_learned_page(metrics: dict[str, Any], statistics: DatasetStatistics, p
         titles = {name: policy["title"] for name, policy in found["policies"].items()}
         curves = {name: policy for name, policy in found["policies"].items() if name != "label_oracle"}
         parts.append(
-            (_lead(metrics, views) if not number else "") + f"<h2>{views} candidate views</h2>" + _ladder(found)
+            (_lead(metrics, views) if not number else "") + f"<h2>{views} candidate views</h2>" + ladder(found)
         )
         parts.append(
             image(
@@ -433,17 +271,17 @@ def write_learned_page(metrics: dict[str, Any], statistics: DatasetStatistics, p
                 _alt_of_curves(curves),
             )
         )
-        parts.append(_against(found))
+        parts.append(against(found))
         if not number:
             parts.append("<h2>Fusing random views</h2>" + _sets(found))
             parts.append("<h2>Confidence and calibration</h2>" + _confidence(found) + _costs(found))
             parts.append(
                 _decision(metrics)
                 + _ablations(metrics)
-                + _unposed(metrics)
-                + _scattered(metrics)
-                + _rotated(metrics)
-                + _novel(metrics, statistics.classes)
+                + unposed(metrics)
+                + scattered(metrics)
+                + rotated(metrics)
+                + novel(metrics, statistics.classes)
                 + _seeds(metrics, views)
             )
     parts.append(f"<p>{statistics.left_out_count} objects without a surface were left out.</p>{_next(metrics)}")
