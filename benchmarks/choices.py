@@ -2,7 +2,8 @@
 
 RUN is a directory in which `mevs study learned` was run. Its walks are added to those in
 `benchmarks/results/choices/`, in a file for each seed and kind of candidates. `benchmarks/results/choices.md` has the
-tables of all files there: means over seeds, first for each object, with 95 % intervals over objects.
+tables of all files there: means over seeds, first for each object, with 95 % intervals over objects. So seeds can be
+trained on different machines. With `--to NAME` the folder and the tables are called NAME.
 
 With these files another policy can be compared object by object. A file has the `names` of the objects in order, and
 for each policy `right`, the shares of its walks that are right after 1, 2, … views, in 240ths if in bytes and
@@ -32,7 +33,6 @@ from eval.learned.comparison import BASELINES, ByObject, seeds_together
 from mevs_jax.markdown import markdown_table
 
 RESULTS = Path(__file__).parent / "results"
-KEPT = RESULTS / "choices"
 METHODS = {
     "learned": "view policy",
     "expected_views": "information gain by expected views",
@@ -50,11 +50,16 @@ _SHOWN = (0, 1, 2, 3, 5, 7)
 class Options:
     run: Annotated[Path | None, tyro.conf.Positional] = None
     """directory in which `mevs study learned` was run"""
+    to: str = "choices"
+    """name of the folder of all results, and of the file with their tables"""
 
 
-def keep(run: Path) -> None:
-    """Stores the results of a run's walks for each object."""
-    names = np.array([one["name"].decode() for one in open_split(run / "data", "test")])
+def keep(run: Path, folder: Path) -> None:
+    """Stores the results of a run's walks for each object, and those of classes that are left out."""
+    folder.mkdir(exist_ok=True)
+    for path in (run / "learned").glob("seed_*/walks_novel.json"):
+        write_bytes(folder / f"{path.parent.name}_novel.json", path.read_bytes())
+    names = np.array([one["name"].decode() for one in open_split(run / "data", "test", ("name",))])
     for path in sorted((run / "learned").glob("seed_*/walks_*.npz")):
         found = read_json(path.with_suffix(".json"))
         summary: dict[str, Any] = {key: found[key] for key in _KEPT}
@@ -66,7 +71,7 @@ def keep(run: Path) -> None:
         kind = path.stem.removeprefix("walks_")
         buffer = io.BytesIO()
         np.savez_compressed(buffer, summary=json.dumps(summary), names=names, **arrays)
-        write_bytes(KEPT / f"{path.parent.name}_{kind}.npz", buffer.getvalue())
+        write_bytes(folder / f"{path.parent.name}_{kind}.npz", buffer.getvalue())
 
 
 def _packed(key: str, values: np.ndarray) -> np.ndarray:
@@ -141,10 +146,11 @@ def tables(found: dict[str, Any]) -> str:
 
 
 def main(options: Options) -> None:
+    folder = RESULTS / options.to
     if options.run is not None:
-        keep(options.run)
+        keep(options.run, folder)
     kinds = defaultdict(list)
-    for path in sorted(KEPT.glob("*.npz")):
+    for path in sorted(folder.glob("*.npz")):
         parts = re.fullmatch(r"seed_(\d+(?:_rotated)?)_(.*)", path.stem)
         if parts is None:
             print(
@@ -163,7 +169,7 @@ def main(options: Options) -> None:
         if len(seeds) > 1:
             for number, one, own in seeds:
                 text += f"### seed {number}\n\n" + tables(seeds_together([one], [own], "learned"))
-    write_text(RESULTS / "choices.md", text)
+    write_text(folder.with_suffix(".md"), text)
     print(text)
 
 

@@ -32,13 +32,14 @@ def test_what_is_kept_says_what_the_walks_said(tmp_path, monkeypatch, random):
     np.savez(folder / "walks_lattice_40.npz", **arrays)
     (folder / "walks_lattice_40.json").write_text(json.dumps(found))
     monkeypatch.setattr(
-        choices, "open_split", lambda folder, split: [{"name": b"chair_%d" % i} for i in range(OBJECTS)]
+        choices, "open_split", lambda folder, split, only: [{"name": b"chair_%d" % i} for i in range(OBJECTS)]
     )
     monkeypatch.setattr(choices, "RESULTS", tmp_path)
-    monkeypatch.setattr(choices, "KEPT", tmp_path / "choices")
-    choices.main(choices.Options(tmp_path / "run"))
+    (folder / "walks_novel.json").write_text("{}")
+    choices.main(choices.Options(tmp_path / "run", "others"))
 
-    told, mine = choices.kept(tmp_path / "choices" / "seed_0_lattice_40.npz")
+    assert (tmp_path / "others" / "seed_0_novel.json").read_text() == "{}"
+    told, mine = choices.kept(tmp_path / "others" / "seed_0_lattice_40.npz")
     for name, one in each.items():
         np.testing.assert_allclose(mine[name].right, one.right, atol=1e-12)
         np.testing.assert_allclose(mine[name].from_some, one.from_some, atol=1e-12)
@@ -46,7 +47,7 @@ def test_what_is_kept_says_what_the_walks_said(tmp_path, monkeypatch, random):
     again = seeds_together([told], [mine], "learned")
     gain = compared(each, "learned")["against"]["random"]["learned"]
     np.testing.assert_allclose(again["against"]["random"]["learned"]["interval"], gain["interval"], atol=1e-6)
-    page = (tmp_path / "choices.md").read_text()
+    page = (tmp_path / "others.md").read_text()
     low, high = gain["interval"][1]
     assert f"{100 * gain['difference'][1]:+.1f} [{100 * low:+.1f}, {100 * high:+.1f}]".replace("-", "−") in page
 
