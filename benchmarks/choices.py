@@ -3,7 +3,8 @@
 RUN is a directory in which `mevs study learned` was run. Its walks are added to those in
 `benchmarks/results/choices/`, in a file for each seed and kind of candidates. `benchmarks/results/choices.md` has the
 tables of all files there: means over seeds, first for each object, with 95 % intervals over objects. So seeds can be
-trained on different machines. With `--to NAME` the folder and the tables are called NAME.
+trained on different machines. With `--to NAME` the folder and the tables are called NAME. `seed_K_novel.json` has the
+results on classes that policies were trained without, as the study stored them.
 
 With these files another policy can be compared object by object. A file has the `names` of the objects in order, and
 for each policy `right`, the shares of its walks that are right after 1, 2, … views, in 240ths if in bytes and
@@ -56,7 +57,6 @@ class Options:
 
 def keep(run: Path, folder: Path) -> None:
     """Stores the results of a run's walks for each object, and those of classes that are left out."""
-    folder.mkdir(exist_ok=True)
     for path in (run / "learned").glob("seed_*/walks_novel.json"):
         write_bytes(folder / f"{path.parent.name}_novel.json", path.read_bytes())
     names = np.array([one["name"].decode() for one in open_split(run / "data", "test", ("name",))])
@@ -169,7 +169,7 @@ def main(options: Options) -> None:
         if len(seeds) > 1:
             for number, one, own in seeds:
                 text += f"### seed {number}\n\n" + tables(seeds_together([one], [own], "learned"))
-    write_text(folder.with_suffix(".md"), text)
+    write_text(folder.with_name(f"{folder.name}.md"), text)
     print(text)
 
 

@@ -64,12 +64,13 @@ def take_turns(calls: list[Callable[[], Any]], rounds: int) -> np.ndarray:
 
 
 def _wait_for_rest() -> None:
-    """Returns once no thread of this process has worked for ten milliseconds, or after a second."""
+    """Returns once no thread of this process has worked for ten milliseconds; after a second with a message."""
     for _ in range(100):
         before = time.process_time()
         time.sleep(0.01)
         if time.process_time() - before < 0.001:
             return
+    print("(threads of this process do not rest; they slow down the next call)", file=sys.stderr)
 
 
 def compare(

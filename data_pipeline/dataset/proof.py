@@ -107,7 +107,7 @@ class Objects:
         self._folder = folder
         try:
             builder = tfds.builder_from_directory(str(where))
-            # TFDS decodes only some features where TensorFlow is installed, and not in its data sources.
+            # TFDS's own partial decoding needs TensorFlow, and its data sources do not have it.
             raw = tfds.decode.DeserializeMethod.RAW_BYTES
             self._records = builder.as_data_source(split=split, deserialize_method=raw)
             self._length = len(self._records)

@@ -14,15 +14,15 @@ from mevs_jax.trained.system import EXPECTED_VIEWS
 
 def unposed(metrics: dict[str, Any]) -> str:
     """Results for objects of unknown yaw, compared with a known pose from the same start views."""
-    (views, unposed), *_ = metrics["seeds"][0]["unposed"].items()
+    (views, turned), *_ = metrics["seeds"][0]["unposed"].items()
     posed = metrics["seeds"][0]["lattices"][views]["policies"]
-    gains, of_pose, rows = unposed["against"]["random"], "", []
+    gains, of_pose, rows = turned["against"]["random"], "", []
     if EXPECTED_VIEWS in gains:
         of_pose = (
             " For each class, the azimuth of every view in the object's frame is estimated. Expected views are averaged over the "
             f"yaw, weighted by its probability: {gain_of_two(gains, EXPECTED_VIEWS)} points."
         )
-    for name, policy in unposed["policies"].items():
+    for name, policy in turned["policies"].items():
         if policy["knows"] != "truth":
             for title, found in ((policy["title"], policy), ("… pose known", posed[name])):
                 cells = zip(found["after_views"], found["interval"], strict=True)
@@ -61,6 +61,7 @@ def scattered(metrics: dict[str, Any]) -> str:
 
 
 def novel(metrics: dict[str, Any], classes: list[str]) -> str:
+    """Results on classes that policies were trained without."""
     found = metrics["seeds"][0].get("novel")
     if found is None:
         return ""

@@ -15,6 +15,7 @@ _SHOWN = (0, 1, 2, 3, 5, 7)
 
 
 def accuracy(share: float, interval: list[float]) -> str:
+    """A cell with an accuracy in percent and its interval."""
     return f"{percent(share)}<br><small class='note'>{span(interval)}</small>"
 
 
@@ -32,6 +33,7 @@ def _closed(found: dict[str, Any], name: str) -> list[str]:
 
 
 def ladder(found: dict[str, Any]) -> str:
+    """The accuracy of all policies by number of views, and the share of the gap that each closes."""
     rows, with_gap = [], bool(found["gap_closed"])
     steps = [step for step in _SHOWN if step < len(found["policies"]["random"]["after_views"])]
     for name, policy in found["policies"].items():
@@ -78,7 +80,7 @@ def against(found: dict[str, Any], bases: tuple[str, ...] = BASELINES) -> str:
     )
 
 
-def gain_of_two(against: dict[str, Any], method: str = METHOD) -> str:
-    """The gain after two views over another policy."""
-    gain = against[method]
+def gain_of_two(gains: dict[str, Any], method: str = METHOD) -> str:
+    """The gain of a policy after two views, of its gains over another one."""
+    gain = gains[method]
     return difference(gain["difference"][1], gain["interval"][1])

@@ -17,13 +17,17 @@ import pytest
 import trimesh
 
 from data_pipeline.dataset.builder import open_split
+from data_pipeline.dataset.statistics import load_statistics
 from data_pipeline.distributed import from_all, own_share, unresolved_name
 from data_pipeline.files import files_in
 from data_pipeline.lock import locked
+from eval.settings import TINY
+from eval.stages import tasks
 from mevs_jax import load
 from tests.train.test_scaling import CPU
 from tests.train.test_training import lines
 from train.kept import summary_of
+from train.loop import steps_of_an_epoch
 
 
 def start(*arguments: str, processes: int = 2) -> list[subprocess.Popen]:
@@ -147,7 +151,9 @@ def test_two_processes_sweep_as_two_devices_do(outs):
     given = ("--preset", "tiny", "--grid", "learning-rate=1e-3,1e-4", "--seeds", "2", "--sweep.halving", "--adopt")
     command = ("sweep", *given, "--entropy.optimiser.epochs", "4", "--out")
     alone_on_two_devices(*command, str(outs[0]))
-    said = killed_and_finished(outs[1] / "sweep" / "entropy" / "latest" / "1", *command, str(outs[1]))
+    task = tasks(TINY, load_statistics(outs[0] / "data"))[1]
+    epoch = steps_of_an_epoch(task, load_statistics(outs[0] / "data"))
+    said = killed_and_finished(outs[1] / "sweep" / "entropy" / "latest" / str(epoch), *command, str(outs[1]))
     assert "Best of 4" in said
     one, both = (json.loads((out / "sweep" / "entropy" / "members.json").read_text()) for out in outs)
     assert [member["dropped"] for member in both] == [member["dropped"] for member in one]

@@ -189,7 +189,8 @@ def sweep(
     """Trains all members and returns them with their results.
 
     Writes `members.json`, the metrics of every epoch into `epochs.csv`, and the best member as a run of its own into `network/`.
-    An interrupted sweep resumes after its last complete epoch; a finished one is read from `members.json`.
+    A sweep that SIGTERM ended resumes after its last step, one that was interrupted otherwise after its last complete epoch. A
+    finished one is read from `members.json`.
 
     Args:
         task: the network's training; each member changes its hyper-parameters.
@@ -202,7 +203,7 @@ def sweep(
     Raises:
         DataError: if the configurations are not valid, the devices cannot share the members equally, or the folder holds
             another sweep.
-        Preempted: after SIGTERM, at the end of an epoch.
+        Preempted: after SIGTERM, once the states are saved.
         Diverged: if every member diverged.
     """
     members = draw_members(config, task)

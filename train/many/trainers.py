@@ -56,7 +56,7 @@ class Trainer(Protocol):
     ) -> None: ...
 
     def begin(self, training: np.ndarray) -> None:
-        """Begins an epoch of those members that are training, which changes `places`."""
+        """Begins an epoch, or the rest of one, of those members that are training, which changes `places`."""
 
     def train(self, training: np.ndarray, batch: dict[str, np.ndarray]) -> jax.Array:
         """One step of those members that are training; returns an array to wait for."""

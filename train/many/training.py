@@ -41,7 +41,9 @@ def train_members(
     halving: bool = False,
     starts: Starts = (),
 ) -> Together:
-    """Trains all members; a training that is stopped resumes after its last step, one that is killed after its last epoch.
+    """Trains all members.
+
+    A training that SIGTERM ended resumes after its last step, one that was interrupted otherwise after its last complete epoch.
 
     Args:
         task: the network's training; each member changes its hyper-parameters and seeds.
@@ -125,7 +127,7 @@ class _Batches:
         self._sets: dict[int, ValidationSet] = {}
 
     def begin(self, places: np.ndarray, step: int) -> None:
-        """Begins an epoch, whose first step this is, of the members in these places; others may train elsewhere from now on."""
+        """Begins an epoch, or the rest of one, at this step, for the members in these places; others may train elsewhere now."""
         self._first_step, drawn = step, self._drawn(places)
         for of_places in (self._streams, self._sets):
             for place in set(of_places) - set(drawn):

@@ -55,10 +55,11 @@ def test_an_example_is_an_object_as_it_was_captured(data):
 
 
 def test_some_keys_are_read_alone(data):
-    some, whole = open_split(data, "test", ("label", "name", "entropy")), open_split(data, "test")
+    known = ("label", "name", "entropy", "depth")
+    some, whole = open_split(data, "test", (*known, "not stored")), open_split(data, "test")
     assert len(some) == len(whole)
     for one, other in zip(some, whole, strict=True):
-        assert one.keys() == {"label", "name", "entropy"}
+        assert one.keys() == set(known)
         assert all(np.array_equal(one[key], other[key]) and type(one[key]) is type(other[key]) for key in one)
 
 

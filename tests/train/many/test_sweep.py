@@ -84,6 +84,34 @@ def test_members_end_as_separate_runs_do(every, out, tmp_path):
     assert summary["best_loss"] == best.loss
 
 
+def metrics_of(folder: Path) -> list[dict[str, str]]:
+    """All metrics of all epochs of a sweep."""
+    return list(csv.DictReader((folder / "epochs.csv").open()))
+
+
+@pytest.mark.slow
+def test_a_sweep_of_version_0_1_goes_on_after_its_last_epoch(out, tmp_path, monkeypatch):
+    """It kept the number of epochs alone."""
+    statistics, task = load_statistics(out / "data"), task_named("entropy", out)
+    task = replace(task, optimiser=replace(task.optimiser, patience=5, epochs=2))
+    whole = sweep(task, out / "data", statistics, tmp_path / "whole", SWEEP)
+    real_progress, real_print = Together.progress, train.many.training._print_epoch
+
+    def stopped(*arguments):
+        real_print(*arguments)
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(
+        Together, "progress", lambda self: {k: v for k, v in real_progress(self).items() if k != "step"}
+    )
+    monkeypatch.setattr(train.many.training, "_print_epoch", stopped)
+    with pytest.raises(KeyboardInterrupt):
+        sweep(task, out / "data", statistics, tmp_path / "before", SWEEP)
+    monkeypatch.undo()
+    assert sweep(task, out / "data", statistics, tmp_path / "before", SWEEP) == whole
+    assert metrics_of(tmp_path / "before") == metrics_of(tmp_path / "whole")
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("at_end", [False, True], ids=["within an epoch", "at the end of an epoch"])
 def test_a_stopped_sweep_ends_as_if_it_had_not_been(at_end, out, tmp_path, monkeypatch):
@@ -106,7 +134,9 @@ def test_a_stopped_sweep_ends_as_if_it_had_not_been(at_end, out, tmp_path, monke
         sweep(task, out / "data", statistics, tmp_path / "stopped", SWEEP)
     monkeypatch.undo()
     assert not (tmp_path / "stopped" / "members.json").exists()
+    assert (tmp_path / "stopped" / "latest" / str(after)).exists()
     assert sweep(task, out / "data", statistics, tmp_path / "stopped", SWEEP) == whole
+    assert metrics_of(tmp_path / "stopped") == metrics_of(tmp_path / "whole")
     assert sweep(task, out / "data", statistics, tmp_path / "stopped", SWEEP) == whole  # not trained again
     with pytest.raises(DataError, match="other settings"):
         sweep(task, out / "data", statistics, tmp_path / "stopped", replace(SWEEP, members=2))
