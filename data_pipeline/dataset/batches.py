@@ -11,7 +11,7 @@ and validation. The option `ViewBatches.validation_by` reproduces this, to show 
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -80,8 +80,7 @@ def sample_pixels(depth: np.ndarray, points: int, random: np.random.Generator) -
 
 def _keys_read(points: int, images: str | None) -> tuple[str, ...]:
     """Keys of an object that `views_of_example` reads: pixels that are not needed are not decoded."""
-    pixels = {images} if images else set()
-    return ("label", "pose", "entropy", "radius", *sorted(pixels | ({"depth"} if points else set())))
+    return ("label", "pose", "entropy", "radius", *([images] if images else []), *(["depth"] if points else []))
 
 
 def views_of_example(
@@ -136,10 +135,10 @@ def equally_often(objects: np.ndarray, labels: np.ndarray) -> np.ndarray:
 
 
 class _TrainingObjects:
-    """The objects of several splits, concatenated; the key `trainable` lists the views that may be used for training."""
+    """The objects of all training splits, concatenated; the key `trainable` lists the views that may be used for training."""
 
-    def __init__(self, folder: Path, splits: Sequence[str], config: ViewBatches):
-        read = _keys_read(config.points, config.images)
+    def __init__(self, folder: Path, config: ViewBatches):
+        splits, read = training_splits(config), _keys_read(config.points, config.images)
         self._sources, self._config = [open_split(folder, split, read) for split in splits], config
         self._kept = objects_kept(sum(map(len, self._sources)), config)
         if config.balanced:
@@ -168,10 +167,6 @@ def training_splits(config: ViewBatches) -> tuple[str, ...]:
     return ("train",) if config.validation_by == "object" else ("train", "val")
 
 
-def _training_objects(folder: Path, config: ViewBatches) -> _TrainingObjects:
-    return _TrainingObjects(folder, training_splits(config), config)
-
-
 def validation_splits(config: ViewBatches) -> tuple[str, ...]:
     """Returns the splits used for validation."""
     return ("val",) if config.validation_by == "object" else training_splits(config)
@@ -191,7 +186,7 @@ def validation_batches(
     """
     by_object = config.validation_by == "object"
     read = _keys_read(config.points, config.images)
-    objects = open_split(folder, "val", read) if by_object else _training_objects(folder, config)
+    objects = open_split(folder, "val", read) if by_object else _TrainingObjects(folder, config)
     for index in range(len(objects))[part]:
         example = objects[index]
         count = len(example["entropy"])
@@ -247,7 +242,7 @@ def train_batches(
     import grain  # imported late: it takes a sixth of a second
 
     # The order is drawn anew for every epoch, and a batch may contain objects of two successive epochs.
-    objects = _training_objects(folder, config)
+    objects = _TrainingObjects(folder, config)
     stream = (
         grain.MapDataset.source(objects)
         .seed(config.seed)
