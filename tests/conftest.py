@@ -25,9 +25,10 @@ DEFAULT_FLAGS = os.environ.get("MEVS_TEST_DEFAULT_FLAGS", "0") not in ("", "0")
 
 if "PYTEST_XDIST_WORKER" not in os.environ:
     # One cache of compiled programs for all workers and for the programs that tests start, which inherit these variables. JAX
-    # is not imported yet.
-    compiled = tempfile.mkdtemp(prefix="mevs_jax-compiled-")
-    atexit.register(shutil.rmtree, compiled, ignore_errors=True)
+    # is not imported yet. CI names one for several runs of the tests.
+    compiled = os.environ.get("MEVS_TEST_COMPILED") or tempfile.mkdtemp(prefix="mevs_jax-compiled-")
+    if "MEVS_TEST_COMPILED" not in os.environ:
+        atexit.register(shutil.rmtree, compiled, ignore_errors=True)
     os.environ |= {"JAX_COMPILATION_CACHE_DIR": compiled, "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0.05"}
     # Tests compile much and run little: without most optimisations, and by XLA's older emitters, that takes a third of the time.
     # What runs long has all optimisations (`fully_compiled`); CI compares with PyTorch and plain loops with all of them, too.
@@ -153,6 +154,19 @@ def whole(tmp_path_factory) -> Path:
         assert "Report:" in result.stdout
 
     return made_once(tmp_path_factory, "whole", make)
+
+
+@pytest.fixture(scope="session")
+def studied(tmp_path_factory, whole) -> Path:
+    """The run of `whole` with a learned study by `tests.reference.leaks.LEARNED`, for reading only."""
+    from eval.learned.stage import learn_to_choose
+    from tests.reference.leaks import LEARNED
+
+    def make(folder: Path) -> None:
+        shutil.copytree(whole, folder)
+        learn_to_choose(LEARNED, folder)
+
+    return made_once(tmp_path_factory, "studied", make)
 
 
 @pytest.fixture(scope="session")

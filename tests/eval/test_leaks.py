@@ -31,6 +31,7 @@ from mevs_jax.trained import TrainedSystem
 from tests.reference.evaluation import CLASSES, OBJECTS, VIEWS, some_statistics, some_tables
 from tests.reference.leaks import (
     CHANGES,
+    LEARNED,
     check_fitted,
     check_tested,
     differing,
@@ -327,14 +328,8 @@ def test_no_figure_of_test_objects_decides_what_a_system_uses(monkeypatch):
 # ----------------------------------------------------------------------------------------------------------- from data to systems
 
 
-def whole_run(out: Path) -> tuple[dict[str, Any], dict[str, Any]]:
-    """What a run and a learned study with the preset `tiny` fit and choose, and what they find on test objects."""
-    settings = replace(TINY, learned=replace(TINY.learned, ablations=("crossed",)))
-    stages.make_data(settings, out)
-    stages.train(settings, out)
-    stages.evaluate(settings, out)
-    stages.make_system(settings, out)
-    learn_to_choose(settings, out)
+def found_by(out: Path) -> tuple[dict[str, Any], dict[str, Any]]:
+    """What a run and its learned study fitted and chose, and what they found on test objects."""
     fitted: dict[str, Any] = {}
     tested: dict[str, Any] = {}
     for name in ("system", "learned/system"):
@@ -353,11 +348,13 @@ def whole_run(out: Path) -> tuple[dict[str, Any], dict[str, Any]]:
 
 
 @pytest.mark.slow
-def test_everything_is_the_same_for_other_test_objects(tmp_path):
+def test_everything_is_the_same_for_other_test_objects(tmp_path, request):
     """Both systems to the last bit, and the losses of every network, from data sets whose test objects are others."""
-    one = whole_run(tmp_path / "one")
     with other_test_objects():
-        other = whole_run(tmp_path / "other")
+        for stage in (stages.make_data, stages.train, stages.evaluate, stages.make_system, learn_to_choose):
+            stage(LEARNED, tmp_path)
+    other = found_by(tmp_path)
+    one = found_by(request.getfixturevalue("studied"))  # late, since another worker may be making it
     trained = {place for place in one[0] if place.endswith("summary.json")}
     assert {"classifier/summary.json", "entropy/summary.json", "learned/seed_0/recogniser/summary.json"} <= trained
     assert "learned/seed_0/policies/learned_without_0_without_5/summary.json" in trained

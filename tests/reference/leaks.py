@@ -26,6 +26,7 @@ from data_pipeline.dataset.statistics import DatasetStatistics
 from data_pipeline.objects.mesh import ObjectEntry, ObjectSource
 from data_pipeline.objects.recipes import FurniturePiece
 from eval.learned.walks import Contender
+from eval.settings import TINY
 from eval.tables import ViewTables
 from eval.walks.grid import Results, read_object
 from eval.walks.ladder import Rung
@@ -34,6 +35,8 @@ from mevs_jax.viewpoints import ViewGraph
 
 Network = TypeVar("Network", bound=nnx.Module)
 
+LEARNED = replace(TINY, learned=replace(TINY.learned, ablations=("crossed", "cloud")))
+"""A run with a learned study of which two are compared."""
 CHANGES = ("labels", "outputs")
 """What is changed about test objects: all of their labels, or everything that networks say about them."""
 

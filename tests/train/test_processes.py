@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import shutil
 import signal
 import socket
 import subprocess
@@ -24,15 +23,15 @@ from train.loop import fit
 NETWORKS = ("classifier", "entropy")
 
 
-def slowly(out: Path, networks: tuple[str, ...]) -> list[str]:
-    """The options of `mevs train` that train these networks slowly."""
-    rates = [f"--{network}.optimiser.learning-rate=1e-4" for network in networks]
+def slowly(out: Path) -> list[str]:
+    """The options of `mevs train` that train both networks slowly."""
+    rates = [f"--{network}.optimiser.learning-rate=1e-4" for network in NETWORKS]
     return ["--preset", "tiny", "--out", str(out), *rates]
 
 
-def start(out: Path, *options: str, processes: int, networks: tuple[str, ...] = NETWORKS) -> list[subprocess.Popen]:
-    """`mevs train` in several processes that find each other on this machine; slowly for these networks."""
-    command = [sys.executable, "-m", "mevs_jax", "train", *slowly(out, networks), *options]
+def start(out: Path, *options: str, processes: int) -> list[subprocess.Popen]:
+    """`mevs train` in several processes that find each other on this machine."""
+    command = [sys.executable, "-m", "mevs_jax", "train", *slowly(out), *options]
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
         port = free.getsockname()[1]
@@ -75,28 +74,23 @@ def run(data, tmp_path):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("networks", [("entropy",), NETWORKS], ids="+".join)
-def test_two_processes_train_as_one_does(networks, run, whole):
+def test_two_processes_train_as_one_does(run):
     alone, together = run("alone"), run("together")
-    if "classifier" not in networks:  # the run has it already, and does not train it again
-        shutil.copytree(whole / "classifier", together / "classifier")
     statistics = load_statistics(alone / "data")
-    settings = parse("train", slowly(alone, networks)).settings
+    settings = parse("train", slowly(alone)).settings
     for task, name in zip(tasks(settings, statistics), NETWORKS, strict=True):
-        if name in networks:
-            fit(task, alone / "data", statistics, alone / name)
-    first, second = (ended(process, 0) for process in start(together, processes=2, networks=networks))
+        fit(task, alone / "data", statistics, alone / name)
+    first, second = (ended(process, 0) for process in start(together, processes=2))
     assert "classifier: best epoch" in first
     assert "epoch" not in second  # one speaks for all
-    for name in networks:
+    for name in NETWORKS:
         for mine, theirs in zip(lines(together / name), lines(alone / name), strict=True):
             for key in set(mine) - {"seconds"}:
                 assert mine[key] == pytest.approx(theirs[key], rel=1e-5, abs=1e-7), key
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("again", [False, True], ids=["lost", "lost and told to end"])
-def test_a_lost_process_ends_the_others_and_the_run_goes_on(run, again):
+def test_a_lost_process_ends_the_others_and_the_run_goes_on(run):
     out = run("lost")
     long = ("--classifier.optimiser.epochs", "500", "--classifier.optimiser.patience", "500")
 
@@ -107,8 +101,7 @@ def test_a_lost_process_ends_the_others_and_the_run_goes_on(run, again):
             time.sleep(0.2)
 
     first, second = start(out, *long, processes=2)
-    epoch = 2 if again else 1
-    wait_for_epoch(epoch)
+    wait_for_epoch(1)
     second.kill()
     killed = time.monotonic()
     said = first.communicate(timeout=60)[1]
@@ -117,9 +110,7 @@ def test_a_lost_process_ends_the_others_and_the_run_goes_on(run, again):
     ours, jax_own = "another process of this run is gone", "This most likely indicates that another task died"
     assert (first.returncode, ours in said) == (75, True) or (first.returncode, jax_own in said) == (-6, True), said
     done = lines(out / "classifier")[-1]["epoch"]
-    assert done >= epoch
-    if not again:
-        return
+    assert done >= 1
 
     # Both go on; told to end, they agree on a step, save and leave.
     both = start(out, *long, processes=2)

@@ -52,7 +52,6 @@ def test_what_looking_was_worth_is_learned_and_the_study_says_so(adding):
     assert histories[-1][-1]["gain"] < 0.7 * histories[0][0]["gain"]
     expected = expected_of(parts[0][1])
     others = (
-        Learner("as_it_is", "without belief", policy, "state"),
         Learner("look_ahead", "two ahead", policy, "ahead"),
         Learner("learned_and_table", "with a table", policy, "table"),
     )
