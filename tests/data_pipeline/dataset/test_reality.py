@@ -150,7 +150,8 @@ def test_views_of_an_object_share_its_wrong_sphere(images):
     batch = {"depth": jnp.asarray(np.tile(images, (2, 1, 1)) * 10_000).astype(jnp.uint16)}
     batch["pose"] = jnp.asarray(np.tile(POSES, (2, 1, 1)))
     config = RealityAugmentation(1.0, sensor="stereo", sphere=0.3)
-    depth, poses = realistic_views(jax.random.key(3), batch, CAMERA, config, views=3)
+    change = jax.jit(lambda key, batch: realistic_views(key, batch, CAMERA, config, views=3))
+    depth, poses = change(jax.random.key(3), batch)
     assert depth.shape == batch["depth"].shape
     eyes, centres = np.asarray(POSES)[:, :3, 3].astype(float), []
     for believed in np.asarray(poses, float).reshape(2, 3, 4, 4):

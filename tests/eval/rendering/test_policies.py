@@ -50,9 +50,10 @@ def views_of(mesh: Mesh, views: int, side: int) -> tuple[np.ndarray, np.ndarray]
     return np.stack(images), np.asarray(cameras.pose)
 
 
-@pytest.mark.parametrize("views", [6, pytest.param(VIEWS, marks=pytest.mark.slow)])
-def test_an_object_gets_a_row_for_every_view_and_what_shows_nothing_is_counted(views):
+@pytest.mark.slow
+def test_an_object_gets_a_row_for_every_view_and_what_shows_nothing_is_counted():
     open3d_or_skip()
+    views = 6
     mesh = load_object(ObjectEntry("chair", 0, "test", FurniturePiece("chair", 3)))
     depth, poses = views_of(mesh, views, 32)
     depth[4] = 0  # as if the object were out of sight

@@ -245,8 +245,8 @@ def has_all_tables_and_figures(report: Path) -> None:
             assert (report / "figures" / f"figure_{number:02d}.{kind}").stat().st_size > 1000
 
 
-@pytest.mark.parametrize("seeds", [1, pytest.param(2, marks=pytest.mark.slow)])
-def test_the_stages_make_everything_and_go_on(seeds, results, tmp_path, monkeypatch, capfd):
+@pytest.mark.slow
+def test_the_stages_make_everything_and_go_on(results, tmp_path, monkeypatch, capfd):
     """With data sets as the command makes them, but networks that are not trained, and outputs that are made up."""
     settings = PRESETS["tiny"]
     begun, rates, asked, trained = {}, {}, [], []
@@ -316,8 +316,6 @@ def test_the_stages_make_everything_and_go_on(seeds, results, tmp_path, monkeypa
     assert thesis_run.reproduce(settings, "tiny", tmp_path) == page
     assert "Walking" not in capfd.readouterr().err
     assert len(asked) == 20
-    if seeds == 1:
-        return
     # A second training of all networks: the first stays as it is, and numbers are of both.
     assert thesis_run.reproduce(replace(settings, seeds=2), "tiny", tmp_path) == page
     assert len(asked) == 40

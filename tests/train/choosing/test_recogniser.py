@@ -72,9 +72,10 @@ def test_quarter_turns_are_those_of_the_object_about_the_optical_axis(turned):
     batch = next(iter(on_device(islice(evaluation_batches(turned, "val", images="depth"), 1))))
     image, pose = task.inputs(batch)[:1], jnp.asarray(batch["pose"])[:1]
     axis = np.asarray(pose[0, :3, 3] / np.linalg.norm(pose[0, :3, 3]))
+    after = jax.jit(lambda turn: views_after(turn, image, pose, task.camera)[0])
     for turns, found in enumerate(quarter_turns(image)):
         expected = [
-            views_after(jnp.asarray(turn.as_matrix(), jnp.float32), image, pose, task.camera)[0]
+            after(jnp.asarray(turn.as_matrix(), jnp.float32))
             for turn in (Rotation.from_rotvec(sign * turns * np.pi / 2 * axis) for sign in (1, -1))
         ]
         apart = [float(jnp.mean(jnp.abs(one - found) > 1e-3)) for one in expected]
@@ -82,9 +83,10 @@ def test_quarter_turns_are_those_of_the_object_about_the_optical_axis(turned):
     averaged = replace(task, augmentation=replace(task.augmentation, turn=True))
     network = nnx.jit(lambda: task.network(nnx.Rngs(0)))()
     features = network.encoder.head.in_features
-    seen = jnp.stack([network.see(one) for one in quarter_turns(task.inputs(batch))]).mean(axis=0)
+    look = nnx.jit(lambda network, images: network.see(images))
+    seen = jnp.stack([look(network, one) for one in quarter_turns(task.inputs(batch))]).mean(axis=0)
     found = np.asarray(see(network, averaged, batch))[:, : 2 * features + 10]
-    plain = network.see(task.inputs(batch))[:, :features]
+    plain = look(network, task.inputs(batch))[:, :features]
     expected = np.concatenate([seen[:, :features], plain, seen[:, features:]], axis=1)
     np.testing.assert_allclose(found, expected, atol=1e-4)
 

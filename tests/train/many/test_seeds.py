@@ -46,9 +46,8 @@ def of_seeds(data, name: str, seeds=(3, 4)):
     return [replace(task, optimiser=replace(task.optimiser, seed=seed, data_seed=seed)) for seed in seeds]
 
 
-@pytest.mark.parametrize(
-    "name", ["entropy", *(pytest.param(name, marks=pytest.mark.slow) for name in ("classifier", "recogniser"))]
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["entropy", "classifier", "recogniser"])
 def test_every_seed_ends_as_it_does_alone(name, request, tmp_path):
     data = request.getfixturevalue("turned" if name == "recogniser" else "data")
     statistics, each = load_statistics(data), of_seeds(data, name)
