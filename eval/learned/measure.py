@@ -32,14 +32,12 @@ from eval.learned.walks import Learner, OnLattice
 from eval.numbers.timing import milliseconds
 from eval.tables import load_view_tables
 from eval.thesis.results import machine
-from mevs_jax.models import Recogniser
 from mevs_jax.models.expected_views import ExpectedViews
 from mevs_jax.models.view_policy import expected_gain
 from train.choosing.stages import Aside, Stages, lattice_data
 from train.choosing.variants import VARIANTS
 from train.finite import check_results
 from train.kept import kept_json, made_by
-from train.loop import load_best
 
 _FORM = 10
 """Version of the stored walks; another version makes them stale."""
@@ -244,9 +242,7 @@ def _decision(stages: Stages) -> dict[str, Any]:
 
 def _decision_times(stages: Stages, calls: int = 200) -> dict[str, Any]:
     """Time of one decision among all candidate views (ms), from stored features and from the latest depth image."""
-    task, camera, most = stages.task(), stages.dataset.capture, stages.config.max_views
-    recogniser = load_best(task, stages.recogniser_folder())
-    assert isinstance(recogniser, Recogniser)
+    camera, most, recogniser = stages.dataset.capture, stages.config.max_views, stages.recogniser()
     structure, weights = nnx.split((recogniser, stages.policy()))
     fusion, classes = stages.fusion(), len(stages.statistics.classes)
     candidates = jnp.asarray(stages.statistics.viewpoints, jnp.float32)

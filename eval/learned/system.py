@@ -13,14 +13,13 @@ from data_pipeline.distributed import agreed, is_first, wait_for_all
 from eval.learned.study import learn
 from eval.run_file import versions_of
 from eval.system import MADE_WITH, data_of, identity_of, resnet_shape, save_system, stored_system
-from mevs_jax.models import Recogniser, ViewPolicy
+from mevs_jax.models import ViewPolicy
 from mevs_jax.models.shapes import PoseShape, SetFusionShape, ViewPolicyShape
 from mevs_jax.trained import Description, ImageInput, Network, Parts, TrainedSystem, fit_strangeness
 from mevs_jax.trained.description import FORM
 from mevs_jax.trained.system import EXPECTED_VIEWS, UNPOSED
 from train.choosing.stages import Stages, lattice_data
 from train.kept import made_by
-from train.loop import load_best
 
 POLICIES = {"learned": True, "learned_unposed": False}
 """The view policies of a system, and whether they know the object's pose."""
@@ -79,8 +78,7 @@ def learned_system(stages: Stages, found: dict[str, Any], figures: dict[str, Any
     """
     views, config = stages.dataset.capture.views, stages.config
     data = lattice_data(stages.dataset, stages.out, views)
-    recogniser = load_best(stages.task(), stages.recogniser_folder())
-    assert isinstance(recogniser, Recogniser)
+    recogniser = stages.recogniser()
     validation, expected = stages.features(f"lattice_{views}_val", data, "val"), stages.expected_views()
     graph = load_statistics(data).graph
     fusions = {"posed": stages.fusion(), "unposed": stages.fusion(posed=False)}

@@ -82,6 +82,7 @@ class Stages:
         self.config, self.dataset, self.out, self.seed, self.entropy = config, dataset, out, seed, entropy
         self.turned, self.upright = out / "learned" / "turned", upright
         self.folder = out / "learned" / (f"seed_{seed}" if upright is None else f"seed_{seed}_rotated")
+        self._recognisers: dict[int | None, Recogniser] = {}
         self._fusions: dict[tuple, CalibratedFusion] = {}
 
     def rotated(self) -> Stages:
@@ -137,6 +138,14 @@ class Stages:
         summary = fit(task, self.turned, self.statistics, folder, self._start(fold), rate_option=option)
         warn_of_chance(task, summary, self.statistics)
 
+    def recogniser(self, fold: int | None = None) -> Recogniser:
+        """Returns the trained recogniser, or the one without part `fold`; it must not be changed."""
+        if fold not in self._recognisers:
+            recogniser = load_best(self.task(fold), self.recogniser_folder(fold))
+            assert isinstance(recogniser, Recogniser)
+            self._recognisers[fold] = recogniser
+        return self._recognisers[fold]
+
     def _start(self, fold: int | None) -> StartingWeights | None:
         """Returns the initial weights of a recogniser: those for upright objects, or None for random ones."""
         if self.upright is None:
@@ -177,7 +186,7 @@ class Stages:
         seen = kept_array(
             self.folder / "features" / f"{name}.npz",
             made_by(load_statistics(data), folder),
-            lambda: network_outputs(data, split, task, load_best(task, folder), ask, chosen).astype(np.float32),
+            lambda: network_outputs(data, split, task, self.recogniser(fold), ask, chosen).astype(np.float32),
         )
         check_outputs(seen, task.name, f"objects in the features {name}")
         ends = np.cumsum([seen.shape[-1] - classes - 4, classes, 3])
@@ -209,10 +218,9 @@ class Stages:
 
         def fitted() -> np.ndarray:
             task, classes = self.task(), len(self.statistics.classes)
-            recogniser = load_best(task, self.recogniser_folder())
             ask = see if self.upright is None else see_rotated(self._viewpoints, own_frame=True)
             seen = np.asarray(
-                network_outputs(self.turned, "train", task, recogniser, answers(ask, classes)), np.float32
+                network_outputs(self.turned, "train", task, self.recogniser(), answers(ask, classes)), np.float32
             )
             seen = seen.reshape(-1, seen.shape[-1])
             logits, directions, labels = np.split(seen, (classes, classes + 3), axis=1)
@@ -227,17 +235,14 @@ class Stages:
 
     def pose_head(self) -> PoseHead | None:
         """Returns the recogniser's network for the pose of objects; None if it has none."""
-        recogniser = load_best(self.task(), self.recogniser_folder())
-        assert isinstance(recogniser, Recogniser)
-        return recogniser.pose
+        return self.recogniser().pose
 
     def fusion(self, fold: int | None = None, posed: bool = True, summed: bool = False) -> CalibratedFusion:
         """Returns the recogniser's fusion, or the sum of its logits, with temperatures, for objects of known or unknown pose."""
         wanted = fold, posed, summed
         if wanted not in self._fusions:
             validation = self.features("turned_val" if fold is None else f"fold_{fold}_val", self.turned, "val", fold)
-            recogniser = load_best(self.task(fold), self.recogniser_folder(fold))
-            assert isinstance(recogniser, Recogniser)
+            recogniser = self.recogniser(fold)
             network: SetFusion | OfFirstFeatures | SumFusion = recogniser.fusion
             if summed:
                 network = SumFusion(recogniser.encoder.head, self.prior)
