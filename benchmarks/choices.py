@@ -145,6 +145,27 @@ def tables(found: dict[str, Any]) -> str:
     return text
 
 
+NOVEL = {
+    "trained_without": "view policy, trained without the two classes",
+    "trained_with": "view policy, trained with all classes",
+    "expected_views": "expected views",
+    "expected_views_without": "expected views without those of the two classes",
+}
+
+
+def novel_table(path: Path) -> str:
+    """Gains over random views on classes that a policy was trained without; `path` is a stored `walks_novel.json`."""
+    found = read_json(path)
+    steps = [step for step in _SHOWN[1:] if step < len(found["gain"]["trained_with"]["difference"])]
+    rows = [
+        [title, *(_difference(gain["difference"][step], gain["interval"][step]) for step in steps)]
+        for name, title in NOVEL.items()
+        if (gain := found["gain"].get(name)) is not None
+    ]
+    title = f"## Classes left out, {len(found['pairs'])} pairs, {found['objects']} objects: {path.stem}\n\n"
+    return title + _table(["points above random", *(str(step + 1) for step in steps)], rows)
+
+
 def main(options: Options) -> None:
     folder = RESULTS / options.to
     if options.run is not None:
@@ -169,6 +190,7 @@ def main(options: Options) -> None:
         if len(seeds) > 1:
             for number, one, own in seeds:
                 text += f"### seed {number}\n\n" + tables(seeds_together([one], [own], "learned"))
+    text += "".join(map(novel_table, sorted(folder.glob("*_novel.json"))))
     write_text(folder.with_name(f"{folder.name}.md"), text)
     print(text)
 

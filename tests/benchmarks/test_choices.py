@@ -35,10 +35,12 @@ def test_what_is_kept_says_what_the_walks_said(tmp_path, monkeypatch, random):
         choices, "open_split", lambda folder, split, only: [{"name": b"chair_%d" % i} for i in range(OBJECTS)]
     )
     monkeypatch.setattr(choices, "RESULTS", tmp_path)
-    (folder / "walks_novel.json").write_text("{}")
+    gain = {"difference": [0.0, 0.015, 0.01], "interval": [[0.0, 0.0], [0.008, 0.022], [-0.001, 0.02]]}
+    novel = {"objects": OBJECTS, "pairs": [{}], "gain": {"trained_with": gain, "expected_views_without": gain}}
+    (folder / "walks_novel.json").write_text(json.dumps(novel))
     choices.main(choices.Options(tmp_path / "run", "others"))
 
-    assert (tmp_path / "others" / "seed_0_novel.json").read_text() == "{}"
+    assert json.loads((tmp_path / "others" / "seed_0_novel.json").read_text()) == novel
     told, mine = choices.kept(tmp_path / "others" / "seed_0_lattice_40.npz")
     for name, one in each.items():
         np.testing.assert_allclose(mine[name].right, one.right, atol=1e-12)
@@ -48,6 +50,7 @@ def test_what_is_kept_says_what_the_walks_said(tmp_path, monkeypatch, random):
     gain = compared(each, "learned")["against"]["random"]["learned"]
     np.testing.assert_allclose(again["against"]["random"]["learned"]["interval"], gain["interval"], atol=1e-6)
     page = (tmp_path / "others.md").read_text()
+    assert "| expected views without those of the two classes | **+1.5 [+0.8, +2.2]** | +1.0 [−0.1, +2.0] |" in page
     low, high = gain["interval"][1]
     assert f"{100 * gain['difference'][1]:+.1f} [{100 * low:+.1f}, {100 * high:+.1f}]".replace("-", "−") in page
 
