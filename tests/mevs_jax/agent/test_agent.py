@@ -353,65 +353,6 @@ def test_a_policy_of_ones_own(classifier):
         Agent(classifier, wrong)
 
 
-REFUSED = {
-    "stop must be a probability": {"stop": 0.0},
-    "max_views must be from 1": {"max_views": 0},
-    r"unknown must be in \(0, 1\]": {"unknown": 1.5},
-    "gain_per_cost must be at least 0": {"gain_per_cost": -1.0},
-    "distance must be positive": {"distance": 0.0},
-    "unknown policy 'luck'": {"policy": "luck"},
-    r"policy label_oracle cannot be used here: this policy needs Scene\.": {"policy": "label_oracle"},
-}
-
-
-@pytest.mark.parametrize("message", REFUSED)
-def test_options_that_cannot_be_are_refused(classifier, message):
-    with pytest.raises(ValueError, match=message):
-        classifier.agent(**REFUSED[message])
-
-
-def test_calls_that_cannot_be_are_refused(classifier):
-    agent = Agent(classifier, max_views=1, stop=2)
-    depth, pose = views_of(classifier)[0]
-    for call in (agent.decide, lambda: agent.observe_view(depth, pose), lambda: agent.poses):
-        with pytest.raises(ValueError, match="call reset or reset_from_points first"):
-            call()
-    for message, options in {
-        "center must be three finite numbers": {"center": (0, 0), "radius": 1},
-        "radius must be positive": {"center": (0, 0, 0), "radius": -1},
-        "up must be a direction": {"center": (0, 0, 0), "radius": 1, "up": (0, 0, 0)},
-        "yaw must be a finite angle": {"center": (0, 0, 0), "radius": 1, "yaw": np.nan},
-    }.items():
-        with pytest.raises(ValueError, match=message):
-            agent.reset(**options)
-    agent.reset(center=CENTER, radius=RADIUS, yaw=0.0)
-    for message, options in {
-        r"reachable has shape \(3,\); there are 12 candidates": {"reachable": np.ones(3, bool)},
-        "or indices from 0 to 11": {"reachable": [12]},
-        "cost has 2 values; there are 12 candidates": {"cost": [1, 2]},
-        "cost has values that are NaN": {"cost": [np.nan] * 12},
-        "costs differ, but gain_per_cost is 0": {"cost": range(12)},
-        r"candidates must be poses \(candidates, 4, 4\)": {"candidates": np.eye(4)},
-        "a candidate is at the object's centre": {
-            "candidates": pose_towards(np.eye(3)[0], CENTER, 0.0, np.eye(3)[2])[None]
-        },
-    }.items():
-        with pytest.raises(ValueError, match=message):
-            agent.decide(**options)
-    agent.observe_view(depth, pose)
-    with pytest.raises(ValueError, match="the budget of 1 views is spent"):
-        agent.observe_view(depth, pose)
-    with pytest.raises(ValueError, match="needs depth images of 32×32 pixels, got 8×8"):
-        classifier.observe(np.zeros((8, 8)), pose)
-    agent.reset(center=CENTER, radius=RADIUS)
-    for message, given in {
-        r"takes images \(32, 32\) at poses \(4, 4\), got \(8, 8\)": (np.zeros((8, 8)), pose),
-        "pose is not finite, or at the object's centre": (depth, np.eye(4)),
-    }.items():
-        with pytest.raises(ValueError, match=message):
-            agent.observe_view(*given)
-
-
 def test_the_smallest_rotation_takes_z_to_up():
     for up in ((0, 0, 1), (0, 0, -3), (1, 2, 3), (0, -1, 0)):
         rotation = rotation_to_world(up, 0.0)
