@@ -27,11 +27,11 @@ if "PYTEST_XDIST_WORKER" not in os.environ:
     # One cache of compiled programs for all workers and for the programs that tests start, which inherit these variables. JAX
     # is not imported yet. CI names one for several runs of the tests.
     compiled = os.environ.get("MEVS_TEST_COMPILED") or tempfile.mkdtemp(prefix="mevs_jax-compiled-")
-    if "MEVS_TEST_COMPILED" not in os.environ:
+    if not os.environ.get("MEVS_TEST_COMPILED"):
         atexit.register(shutil.rmtree, compiled, ignore_errors=True)
     os.environ |= {"JAX_COMPILATION_CACHE_DIR": compiled, "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0.05"}
     # Tests compile much and run little: without most optimisations, and by XLA's older emitters, that takes a third of the time.
-    # What runs long has all optimisations (`fully_compiled`); CI compares with PyTorch and plain loops with all of them, too.
+    # What runs long has all optimisations (`fully_compiled`); CI runs some of the library's tests with all of them, too.
     jaxlib = tuple(map(int, version("jaxlib").split(".")[:2]))
     if not DEFAULT_FLAGS:
         flags = [

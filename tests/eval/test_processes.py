@@ -204,9 +204,12 @@ def test_processes_end_with_the_error_of_one(tmp_path):
     assert any("1.off" in said for _, said in ended)
     with locked(tmp_path / "run", "another job"):
         first, second = start(*given, str(tmp_path / "run"))
-        said = first.communicate(timeout=90)[1]
-        second.kill()
-        second.communicate()
+        try:
+            said = first.communicate(timeout=90)[1]
+        finally:
+            for process in (first, second):
+                process.kill()
+                process.communicate()
     assert first.returncode == 2, said
     assert "another job" in said
 

@@ -16,6 +16,7 @@ from data_pipeline.errors import DataError
 from eval import seeds, stages
 from eval.run_file import load_run, save_run
 from eval.settings import TINY, Settings
+from train.kept import summary_of
 
 SETTINGS = replace(TINY, seeds=2)
 
@@ -50,7 +51,12 @@ def test_the_run_of_a_seed_equals_a_run_from_that_seed_alone(whole, tmp_path):
         expected = metrics["policies"][row["policy"]]["after_views"][row["views"] - 1]
         assert row["each"][0] == pytest.approx(expected, abs=1e-5)
     assert found["single_view"][0] == pytest.approx(metrics["single_view"]["accuracy"])
-    assert found["single_view"][0] != found["single_view"][1]
+    of_second = json.loads((together / "seeds" / "1" / "metrics.json").read_text())
+    for row in found["rows"]:
+        expected = of_second["policies"][row["policy"]]["after_views"][row["views"] - 1]
+        assert row["each"][1] == pytest.approx(expected, abs=1e-5)
+    best = [summary_of(out / "entropy")["best_loss"] for out in (together, together / "seeds" / "1")]
+    assert best[0] != best[1]
     with (together / "seeds.csv").open(newline="") as file:
         rows = list(csv.DictReader(file))
     assert len(rows) == len(found["rows"])

@@ -35,7 +35,7 @@ from mevs_jax.viewpoints import ViewGraph
 
 Network = TypeVar("Network", bound=nnx.Module)
 
-LEARNED = replace(TINY, learned=replace(TINY.learned, ablations=("crossed", "cloud")))
+LEARNED = replace(TINY, learned=replace(TINY.learned, ablations=("crossed", "cloud", "summed")))
 """A run with a learned study of which two are compared."""
 CHANGES = ("labels", "outputs")
 """What is changed about test objects: all of their labels, or everything that networks say about them."""

@@ -136,6 +136,7 @@ class Stages:
             "--learned.recogniser.optimiser.learning-rate",
         )
         summary = fit(task, self.turned, self.statistics, folder, self._start(fold), rate_option=option)
+        self._recognisers.pop(fold, None)
         warn_of_chance(task, summary, self.statistics)
 
     def recogniser(self, fold: int | None = None) -> Recogniser:

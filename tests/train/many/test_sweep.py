@@ -111,7 +111,7 @@ def test_a_sweep_of_version_0_1_goes_on_after_its_last_epoch(out, tmp_path, monk
 
 @pytest.mark.slow
 def test_a_stopped_sweep_ends_as_if_it_had_not_been(out, tmp_path, monkeypatch):
-    """Told to end within an epoch; the test above ends at the end of one."""
+    """Told to end within an epoch."""
     statistics, task = load_statistics(out / "data"), task_named("entropy", out)
     task = replace(task, optimiser=replace(task.optimiser, patience=5, epochs=3))
     whole = sweep(task, out / "data", statistics, tmp_path / "whole", SWEEP)
