@@ -29,7 +29,7 @@ def _closed(found: dict[str, Any], name: str) -> list[str]:
         if share is not None and interval is not None:
             cell += f" <small class='note'>[{', '.join(signed(end, 0).lstrip('+') for end in interval)}]</small>"
         cells.append(cell)
-    return cells
+    return [f"<span class='whole'>{cell}{' /' * (number < len(cells))}</span>" for number, cell in enumerate(cells, 1)]
 
 
 def ladder(found: dict[str, Any]) -> str:
@@ -42,7 +42,7 @@ def ladder(found: dict[str, Any]) -> str:
         row = [
             html.escape(policy["title"]),
             *(cells[step] if step < len(cells) else "" for step in steps),
-            *[" / ".join(closed)] * with_gap,
+            *[" ".join(closed)] * with_gap,
         ]
         rows.append((policy["knows"], row))
     header = ["next view chosen by", *(str(step + 1) for step in steps), *["gap closed (%)"] * with_gap]

@@ -10,7 +10,7 @@ from mevs_jax.policies.registry import POLICIES, Knows, policy_entry
 KNOWS: dict[Knows, str] = {
     "nothing": "no information about the object",
     "networks": "outputs of the networks for the views seen",
-    "others": "statistics of other (validation) objects",
+    "others": "statistics of validation objects, or of training objects (expected views)",
     "learned": "a network trained on gains of views that were measured on validation objects",
     "rendering": "renderings of a surface or volume reconstructed from the latest view",
     "truth": "the object itself, which is not available to a robot",
