@@ -39,6 +39,12 @@ METHODS = {
     "expected_views": "information gain by expected views",
     "learned_and_table": "view policy and expected views",
 }
+NOVEL = {
+    "trained_without": "view policy, trained without the two classes",
+    "trained_with": "view policy, trained with all classes",
+    "expected_views": "expected views",
+    "expected_views_without": "expected views without those of the two classes",
+}
 _WHOLES: dict[type[np.unsignedinteger], int] = {np.uint8: 240, np.uint16: 720}
 """The stored value of a share of 1."""
 _KEPT = ("objects", "views", "trying_starts", "single_view")
@@ -143,14 +149,6 @@ def tables(found: dict[str, Any]) -> str:
         if rows:
             text += _table([f"{METHODS[method]} above", *steps[1:]], rows)
     return text
-
-
-NOVEL = {
-    "trained_without": "view policy, trained without the two classes",
-    "trained_with": "view policy, trained with all classes",
-    "expected_views": "expected views",
-    "expected_views_without": "expected views without those of the two classes",
-}
 
 
 def novel_table(path: Path) -> str:
