@@ -76,8 +76,10 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 
 def open3d_or_skip() -> None:
     """For what needs Open3D and its system libraries."""
+    from data_pipeline.objects.open3d_parts import load_open3d
+
     try:
-        import open3d  # noqa: F401
+        load_open3d()
     except (ImportError, OSError) as error:
         pytest.skip(f"Open3D cannot be loaded here: {error}")
 
@@ -225,6 +227,15 @@ def adding():
     from tests.reference.choosing import adding_fusion
 
     return adding_fusion()
+
+
+@pytest.fixture
+def named() -> None:
+    """Processes on CPUs find each other by the name of this machine; the test is skipped where it has no address."""
+    from data_pipeline.distributed import unresolved_name
+
+    if name := unresolved_name():
+        pytest.skip(f"processes on CPUs cannot reach each other: the name of this machine, {name}, has no address")
 
 
 @pytest.fixture

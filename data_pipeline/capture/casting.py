@@ -24,6 +24,7 @@ import numpy as np
 from data_pipeline.errors import DataError
 from data_pipeline.files import npz_bytes, write_bytes
 from data_pipeline.objects.mesh import Mesh
+from data_pipeline.objects.open3d_parts import load_open3d
 
 DEPTH_SCALE = 10_000
 """Stored depth units per metric unit. Equal to `mevs_jax.entropy.DEPTH_SCALE`, which would import JAX; a test compares them."""
@@ -188,8 +189,7 @@ class Caster(Protocol):
 
 def cast_open3d(mesh: Mesh) -> Cast:
     """Ray casting with Open3D's `RaycastingScene`, on one thread."""
-    import open3d
-
+    open3d = load_open3d()
     scene = open3d.t.geometry.RaycastingScene(nthreads=1)
     scene.add_triangles(open3d.core.Tensor(mesh.vertices), open3d.core.Tensor(mesh.faces.astype(np.uint32)))
 
@@ -220,7 +220,7 @@ def cast_embree(mesh: Mesh) -> Cast:
 def default_caster() -> Caster:
     """Returns the Open3D caster, or the Embree caster if Open3D cannot be loaded."""
     try:
-        import open3d  # noqa: F401
+        load_open3d()
     except (ImportError, OSError):
         return cast_embree
     return cast_open3d

@@ -15,6 +15,7 @@ import numpy as np
 from data_pipeline.capture.casting import Capture, Rig, store_depth
 from data_pipeline.errors import DataError
 from data_pipeline.objects.mesh import Mesh
+from data_pipeline.objects.open3d_parts import load_open3d
 
 
 def capture_with_visualizer(mesh: Mesh, rig: Rig) -> Capture:
@@ -24,7 +25,7 @@ def capture_with_visualizer(mesh: Mesh, rig: Rig) -> Capture:
         DataError: if Open3D cannot be loaded, there is no display, or Open3D rejects the resolution.
     """
     try:
-        import open3d
+        open3d = load_open3d()
     except (ImportError, OSError) as error:
         raise DataError(
             f"the visualizer backend needs Open3D, which cannot be loaded here ({error}); use --dataset.capture.backend raycast"

@@ -13,19 +13,14 @@ import numpy as np
 
 from data_pipeline.errors import DataError
 from data_pipeline.objects.mesh import Mesh
-
-
-def _open3d() -> Any:
-    import open3d
-
-    return open3d
+from data_pipeline.objects.open3d_parts import load_open3d
 
 
 @functools.cache
 def why_no_open3d() -> str | None:
     """Returns why Open3D cannot be loaded here, and what to do, in a clause; None if it can be."""
     try:
-        _open3d()
+        load_open3d()
     except (ImportError, OSError) as error:
         return (
             f"Open3D cannot be loaded here ({error}); it needs packages of the system, "
@@ -41,14 +36,14 @@ def require_open3d() -> None:
 
 
 def _surface(mesh: Mesh) -> Any:
-    utility = _open3d().utility
-    return _open3d().geometry.TriangleMesh(
+    utility = load_open3d().utility
+    return load_open3d().geometry.TriangleMesh(
         utility.Vector3dVector(mesh.vertices.astype(np.float64)), utility.Vector3iVector(mesh.faces)
     )
 
 
 def _cloud(points: np.ndarray) -> Any:
-    return _open3d().geometry.PointCloud(_open3d().utility.Vector3dVector(points.astype(np.float64)))
+    return load_open3d().geometry.PointCloud(load_open3d().utility.Vector3dVector(points.astype(np.float64)))
 
 
 def decimate(mesh: Mesh, faces: int) -> Mesh:
@@ -70,7 +65,7 @@ def normals_towards(points: np.ndarray, camera: np.ndarray) -> np.ndarray:
     """
     if len(points) < 3:
         raise DataError(f"normals need at least 3 points, got {len(points)}")
-    open3d, cloud = _open3d(), _cloud(points)
+    open3d, cloud = load_open3d(), _cloud(points)
     cloud.estimate_normals(open3d.geometry.KDTreeSearchParamKNN(12))
     cloud.orient_normals_towards_camera_location(camera.astype(np.float64))
     return np.asarray(cloud.normals, np.float32)
@@ -90,7 +85,7 @@ def reconstruct(points: np.ndarray, normals: np.ndarray, faces: int, *, depth: i
     """
     if len(points) < 16:
         raise DataError(f"a surface needs at least 16 points, got {len(points)}")
-    open3d, cloud = _open3d(), _cloud(points)
+    open3d, cloud = load_open3d(), _cloud(points)
     unit = normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
     cloud.normals = open3d.utility.Vector3dVector(unit.astype(np.float64))
     surface, support = open3d.geometry.TriangleMesh.create_from_point_cloud_poisson(cloud, depth=depth, n_threads=1)
@@ -106,7 +101,7 @@ def reconstruct(points: np.ndarray, normals: np.ndarray, faces: int, *, depth: i
 def voxelise(mesh: Mesh, nodes: int = 32) -> np.ndarray:
     """Returns the density (nodes, nodes, nodes), float32: 1 in every voxel of [−1, 1]³ that the surface intersects, else 0."""
     surface = _surface(mesh)
-    grid = _open3d().geometry.VoxelGrid.create_from_triangle_mesh_within_bounds(
+    grid = load_open3d().geometry.VoxelGrid.create_from_triangle_mesh_within_bounds(
         surface, 2 / nodes, -np.ones(3), np.ones(3)
     )
     return _density([voxel.grid_index for voxel in grid.get_voxels()], nodes)

@@ -6,7 +6,6 @@ import json
 import os
 import shutil
 import signal
-import socket
 import subprocess
 import sys
 import time
@@ -18,33 +17,20 @@ import trimesh
 
 from data_pipeline.dataset.builder import open_split
 from data_pipeline.dataset.statistics import load_statistics
-from data_pipeline.distributed import from_all, own_share, unresolved_name
+from data_pipeline.distributed import from_all, own_share
 from data_pipeline.files import files_in
 from data_pipeline.lock import locked
 from eval.settings import TINY
 from eval.stages import tasks
 from mevs_jax import load
-from tests.train.test_scaling import CPU
+from tests.reference.processes import CPU, start
 from train.kept import summary_of
 from train.loop import steps_of_an_epoch
 
+pytestmark = pytest.mark.usefixtures("named")
 
-def start(*arguments: str, processes: int = 2) -> list[subprocess.Popen]:
-    """A command of `mevs` in several processes."""
-    with socket.socket() as free:
-        free.bind(("127.0.0.1", 0))
-        port = free.getsockname()[1]
-    others = {"JAX_COORDINATOR_ADDRESS": f"127.0.0.1:{port}", "JAX_NUM_PROCESSES": str(processes)}
-    return [
-        subprocess.Popen(
-            [sys.executable, "-m", "mevs_jax", *arguments, "--distributed"],
-            stdout=subprocess.PIPE,
-            stderr=subprocess.PIPE,
-            text=True,
-            env=os.environ | CPU | others | {"JAX_PROCESS_ID": str(number)},
-        )
-        for number in range(processes)
-    ]
+SECONDS_TO_END = 300
+"""Long enough for a machine that is busy. Python's own way out ends with another exit code."""
 
 
 def alone(*arguments: str) -> None:
@@ -68,15 +54,9 @@ def killed_and_finished(made: Path, *arguments: str) -> str:
         assert processes[1].poll() is None, processes[1].communicate()
         time.sleep(0.02)
     processes[1].send_signal(signal.SIGKILL)
-    processes[0].communicate(timeout=120)
+    processes[0].communicate(timeout=SECONDS_TO_END)
     assert processes[0].returncode in (75, -6)
     return finished(start(*arguments))[0][0]
-
-
-@pytest.fixture(autouse=True)
-def named() -> None:
-    if name := unresolved_name():
-        pytest.skip(f"processes on CPUs cannot reach each other: the name of this machine, {name}, has no address")
 
 
 def finished(processes: list[subprocess.Popen]) -> list[tuple[str, str]]:
@@ -205,7 +185,7 @@ def test_processes_end_with_the_error_of_one(tmp_path):
     with locked(tmp_path / "run", "another job"):
         first, second = start(*given, str(tmp_path / "run"))
         try:
-            said = first.communicate(timeout=90)[1]
+            said = first.communicate(timeout=SECONDS_TO_END)[1]
         finally:
             for process in (first, second):
                 process.kill()
@@ -215,8 +195,8 @@ def test_processes_end_with_the_error_of_one(tmp_path):
 
 
 def ends(processes: list[subprocess.Popen]) -> list[tuple[int, str]]:
-    """Exit codes and messages of processes that end within a minute and a half."""
-    until = time.monotonic() + 90
+    """Exit codes and messages of processes that end by themselves."""
+    until = time.monotonic() + SECONDS_TO_END
     said = [process.communicate(timeout=max(1, until - time.monotonic()))[1] for process in processes]
     return [(process.returncode, message) for process, message in zip(processes, said, strict=True)]
 

@@ -44,15 +44,15 @@ States = dict[tuple[str, int], Any]
 
 
 def losses(
-    data: Path, mesh: Mesh, count: int, steps: int, of_one: States
+    data: Path, mesh: Mesh, steps: int, of_one: States
 ) -> tuple[dict[str, list[float]], dict[str, list[str]], States]:
     """The training loss of the first steps, how devices talk in a step, and the state at each stretch's beginning, by network.
 
-    The networks are the last `count`, and PointNet++ alone where weights are split. Stretches begin with the states `of_one`
+    Both networks, and PointNet++ alone where weights are split. Stretches begin with the states `of_one`
     device, if given.
     """
     out, talk, begins = {}, {}, {}
-    for task in tasks(SETTINGS, load_statistics(data))[-count if mesh.shape["model"] == 1 else -1 :]:
+    for task in tasks(SETTINGS, load_statistics(data))[0 if mesh.shape["model"] == 1 else -1 :]:
         structure, state = initial_state(task, task.optimiser.seed)
         where = parameter_sharding(mesh, state)
         state = place(state, where)
@@ -105,7 +105,7 @@ if __name__ == "__main__":
     if "steps" in asked:
         found, of_one = {}, {}
         for name, mesh in meshes().items():
-            *found[name], begins = losses(Path(asked["data"]), mesh, asked["networks"], asked["steps"], of_one)
+            *found[name], begins = losses(Path(asked["data"]), mesh, asked["steps"], of_one)
             of_one = of_one or begins
         print(json.dumps(found))
     else:

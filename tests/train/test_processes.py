@@ -2,23 +2,21 @@
 
 from __future__ import annotations
 
-import os
 import signal
-import socket
 import subprocess
-import sys
 import time
 from pathlib import Path
 
 import pytest
 
 from data_pipeline.dataset.statistics import load_statistics
-from data_pipeline.distributed import unresolved_name
 from eval.stages import tasks
 from mevs_jax.cli.parsing import parse
-from tests.train.test_scaling import CPU
+from tests.reference.processes import start
 from tests.train.test_training import lines
 from train.loop import fit
+
+pytestmark = pytest.mark.usefixtures("named")
 
 NETWORKS = ("classifier", "entropy")
 
@@ -27,30 +25,6 @@ def slowly(out: Path) -> list[str]:
     """The options of `mevs train` that train both networks slowly."""
     rates = [f"--{network}.optimiser.learning-rate=1e-4" for network in NETWORKS]
     return ["--preset", "tiny", "--out", str(out), *rates]
-
-
-def start(out: Path, *options: str, processes: int) -> list[subprocess.Popen]:
-    """`mevs train` in several processes that find each other on this machine."""
-    command = [sys.executable, "-m", "mevs_jax", "train", *slowly(out), *options]
-    with socket.socket() as free:
-        free.bind(("127.0.0.1", 0))
-        port = free.getsockname()[1]
-    others = {"JAX_COORDINATOR_ADDRESS": f"127.0.0.1:{port}", "JAX_NUM_PROCESSES": str(processes)}
-    return [
-        subprocess.Popen(
-            [*command, "--distributed"],
-            stderr=subprocess.PIPE,
-            text=True,
-            env=os.environ | CPU | others | {"JAX_PROCESS_ID": str(number)},
-        )
-        for number in range(processes)
-    ]
-
-
-@pytest.fixture(autouse=True)
-def named() -> None:
-    if name := unresolved_name():
-        pytest.skip(f"processes on CPUs cannot reach each other: the name of this machine, {name}, has no address")
 
 
 def ended(process: subprocess.Popen, code: int) -> str:
@@ -80,7 +54,7 @@ def test_two_processes_train_as_one_does(run):
     settings = parse("train", slowly(alone)).settings
     for task, name in zip(tasks(settings, statistics), NETWORKS, strict=True):
         fit(task, alone / "data", statistics, alone / name)
-    first, second = (ended(process, 0) for process in start(together, processes=2))
+    first, second = (ended(process, 0) for process in start("train", *slowly(together)))
     assert "classifier: best epoch" in first
     assert "epoch" not in second  # one speaks for all
     for name in NETWORKS:
@@ -100,12 +74,12 @@ def test_a_lost_process_ends_the_others_and_the_run_goes_on(run):
             assert time.monotonic() < until, "no epoch ends"
             time.sleep(0.2)
 
-    first, second = start(out, *long, processes=2)
+    first, second = start("train", *slowly(out), *long)
     wait_for_epoch(1)
     second.kill()
     killed = time.monotonic()
-    said = first.communicate(timeout=60)[1]
-    assert time.monotonic() - killed < 60
+    said = first.communicate(timeout=120)[1]
+    assert time.monotonic() - killed < 120
     # Where the loss comes out in a computation we say so; where it comes out in waiting for a checkpoint, JAX does.
     ours, jax_own = "another process of this run is gone", "This most likely indicates that another task died"
     assert (first.returncode, ours in said) == (75, True) or (first.returncode, jax_own in said) == (-6, True), said
@@ -113,7 +87,7 @@ def test_a_lost_process_ends_the_others_and_the_run_goes_on(run):
     assert done >= 1
 
     # Both go on; told to end, they agree on a step, save and leave.
-    both = start(out, *long, processes=2)
+    both = start("train", *slowly(out), *long)
     wait_for_epoch(done + 1)
     both[0].send_signal(signal.SIGTERM)
     said = [ended(process, 143) for process in both]

@@ -21,15 +21,12 @@ from data_pipeline.dataset.statistics import load_statistics
 from data_pipeline.distributed import is_lost_process
 from data_pipeline.errors import DataError
 from eval.stages import tasks
+from tests.reference.processes import CPU
 from tests.train.scaling_worker import SETTINGS
 from tests.train.test_training import lines
 from train.devices import Layout, check_batch, device_mesh, parameter_sharding
 from train.loop import fit, load_best
 from train.step import Task, initial_state, train_step_of
-
-ROOT = Path(__file__).resolve().parents[2]
-CPU = {"JAX_PLATFORMS": "cpu", "PYTHONPATH": str(ROOT)}
-"""Environment of processes of their own."""
 
 
 def work(**asked) -> subprocess.CompletedProcess:
@@ -51,12 +48,12 @@ def test_steps_on_many_devices_equal_those_on_one(data):
     and how far the curves then part depends on the processor. Batches and activations stay where they are: devices add up sums,
     and that is all they say to each other, unless weights are split.
     """
-    networks, steps = 2, 20
-    done = work(data=data, devices=8, networks=networks, steps=steps)
+    steps = 20
+    done = work(data=data, devices=8, steps=steps)
     assert done.returncode == 0, done.stderr
     found = json.loads(done.stdout)
     alone, silent = found.pop("1")
-    assert len(alone) == networks
+    assert len(alone) == len(tasks(SETTINGS, load_statistics(data))) == 2
     assert all(not said for said in silent.values())
     assert found["all"][1] == {name: ["all-reduce"] for name in alone}
     for mesh, (curve, _) in found.items():
