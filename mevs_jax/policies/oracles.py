@@ -6,7 +6,7 @@ from typing import Literal
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
 from mevs_jax.beliefs import CalibratedFusion
 from mevs_jax.policies.base import (
@@ -59,13 +59,19 @@ def pair_oracle(key: Array, state: SelectionState, scene: Scene) -> Float[Array,
     """
     logits, label = required(scene.logits, "Scene.logits"), required(scene.label, "Scene.label")
 
-    def best_partner() -> Float[Array, " views"]:
+    views = len(logits)
+    free = candidates(state, scene)
+
+    def with_best_partner(first: Int[Array, ""]) -> Float[Array, ""]:
         # Added in this order, (i, j) and (j, i) have the same sum to the last bit.
-        both = state.belief + (logits[:, None] + logits[None, :])
-        probability = jax.nn.log_softmax(both)[..., label]
-        partner = candidates(state, scene) & ~jnp.eye(len(logits), dtype=bool)
-        best = jnp.max(jnp.where(partner, probability, -jnp.inf), axis=1)
-        return jnp.where(jnp.any(partner, axis=1), best, label_oracle(key, state, scene))
+        probability = jax.nn.log_softmax(state.belief + (logits[first] + logits))[:, label]
+        return jnp.max(jnp.where(free & (jnp.arange(views) != first), probability, -jnp.inf))
+
+    def best_partner() -> Float[Array, " views"]:
+        # One by one: of many walks side by side, the log-probabilities of all pairs take gigabytes.
+        best = jax.lax.map(with_best_partner, jnp.arange(views))
+        partners = jnp.sum(free) - free
+        return jnp.where(partners > 0, best, label_oracle(key, state, scene))
 
     return jax.lax.cond(state.count % 2 == 1, best_partner, lambda: label_oracle(key, state, scene))
 
