@@ -6,8 +6,8 @@ policy share their random draws, all policies share their start views, and all d
 does not use the belief walks once for all backbones: `vmap` does this by itself, because only the logits have an axis
 of backbones.
 
-Objects are processed in chunks, which bounds the memory; several devices share the objects. The random draws of an object depend
-only on the seed and its position, so neither chunks nor devices change a result.
+Objects are processed in chunks, which bounds the memory; several devices, or the cores of a CPU, share them. The random
+draws of an object depend only on the seed and its position, so neither chunks nor devices nor cores change a result.
 """
 
 from __future__ import annotations
@@ -18,10 +18,11 @@ from functools import partial
 import flax.struct
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from eval.walks.ladder import Rung
-from eval.walks.over_objects import over_objects
+from eval.walks.over_objects import on_all_cores, over_objects
 from mevs_jax.metrics import is_right
 from mevs_jax.policies.base import Knowledge, with_movement
 from mevs_jax.selection import ViewTable, select_from_table
@@ -105,7 +106,6 @@ def read_object(
     return right[FIRST_MV - 1 :], used[FIRST_MV - 1 :], after, travelled
 
 
-@partial(jax.jit, static_argnames=("rungs", "max_views"))
 def run_grid(
     key: Array,
     tables: ViewTable,
@@ -133,7 +133,27 @@ def run_grid(
     Returns:
         Results by policy. Unreachable start views have weight zero.
     """
-    objects, starts = tables.label.shape[0], graph.points.shape[0]
+    objects = np.arange(len(tables.label)), tables
+    rest = key, graph, knowledge, reachable, movement_cost
+    return on_all_cores(_grid, objects, *rest, rungs=rungs, max_views=max_views)
+
+
+@partial(jax.jit, static_argnames=("rungs", "max_views"))
+def _grid(
+    objects: tuple[Int[Array, " objects"] | np.ndarray, ViewTable],
+    key: Array,
+    graph: ViewGraph,
+    knowledge: Knowledge | None,
+    reachable: Bool[Array, " views"] | None,
+    movement_cost: Float[Array, ""] | float | None,
+    *,
+    rungs: tuple[Rung, ...],
+    max_views: int,
+) -> dict[str, Results]:
+    """`run_grid` of some objects, given their numbers and tables."""
+    numbers, tables = objects
+    keys = jax.vmap(jax.random.fold_in, (None, 0))(key, numbers)
+    starts = graph.points.shape[0]
     start_weight = jnp.ones(starts) if reachable is None else reachable.astype(jnp.float32)
     start_weight /= jnp.sum(start_weight)
 
@@ -168,10 +188,9 @@ def run_grid(
             return Results(*found, views[:, :, :1].astype(small))
 
         at_once = max(1, min(256, _WALKS_AT_ONCE // (starts * rung.draws)))
-        at_once = min(at_once, -(-objects // jax.local_device_count()))
+        at_once = min(at_once, -(-len(keys) // jax.local_device_count()))
         chunked = partial(jax.lax.map, of_object, batch_size=at_once)
         found = over_objects(chunked, (keys, tables), at_once)
         return jax.tree.map(lambda leaf: jnp.moveaxis(leaf, 0, 1), found)
 
-    keys = jax.vmap(jax.random.fold_in, (None, 0))(key, jnp.arange(objects))
     return {rung.policy: evaluate(rung, keys, tables) for rung in rungs}

@@ -1,14 +1,23 @@
-"""Distribution of objects over all devices of this process; each runs the same program on its part, without communication."""
+"""Distribution of objects over all devices, or cores; each runs the same program on its part, without communication."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from functools import cache
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax import Array
 from jax.sharding import Mesh, PartitionSpec
+from jaxtyping import Int
+
+from data_pipeline.processes import usable_cpus
+
+_MOST_THREADS = 16
+"""Each takes the memory of a whole chunk of walks."""
 
 
 def over_objects(function: Callable[[Any], Any], arguments: Any, multiple: int = 1) -> Any:
@@ -30,3 +39,50 @@ def over_objects(function: Callable[[Any], Any], arguments: Any, multiple: int =
         mesh = Mesh(np.array(devices), "objects")
         function = jax.shard_map(function, mesh=mesh, in_specs=(over,), out_specs=over, check_vma=False)
     return jax.tree.map(lambda leaf: leaf[:objects], function(padded))
+
+
+def on_all_cores(program: Any, arguments: Any, *rest: Any, **static: Any) -> Any:
+    """Returns `program(arguments, *rest, **static)`, computed by one thread for each core where the only device is a CPU.
+
+    XLA runs a loop on one core, and two programs that one thread starts one after the other.
+
+    Args:
+        program: a jitted function that treats objects independently of each other; they are the second axis of its results.
+        arguments: a tree of arrays with a leading axis of objects.
+        rest: arguments that all objects share.
+        static: arguments by name that the program is compiled for.
+    """
+    (device, *more), leaves = jax.local_devices(), jax.tree.leaves(arguments)
+    objects, threads = len(leaves[0]), min(usable_cpus(), _MOST_THREADS, len(leaves[0]))
+    if more or device.platform != "cpu" or threads < 2:
+        return program(arguments, *rest, **static)
+    size = -(-objects // threads)
+    starts = [min(start, objects - size) for start in range(0, objects, size)]
+    given, structure = jax.tree.flatten((arguments, rest))
+    of_part = _of_part(program, structure, tuple(static.items()))
+    compiled = of_part.lower(given, 0, size).compile()  # once, not by every thread
+    with ThreadPoolExecutor(threads) as pool:
+        found = list(pool.map(lambda start: jax.block_until_ready(compiled(given, start)), starts))
+
+    def together(*parts: Array) -> Array:
+        whole = np.empty((len(parts[0]), objects, *parts[0].shape[2:]), parts[0].dtype)
+        for start, part in zip(starts, parts, strict=True):
+            whole[:, start : start + size] = part
+        return jnp.asarray(whole)
+
+    return jax.tree.map(together, *found)
+
+
+@cache
+def _of_part(program: Any, structure: Any, static: tuple[tuple[str, Any], ...]) -> Any:
+    """The program for the objects from a number on, given a list of arrays.
+
+    `jax.stages.Lowered` rebuilds trees of things that are no arrays, which not all trees can hold.
+    """
+
+    def of_part(given: list[Array], start: Int[Array, ""] | int, size: int) -> Any:
+        arguments, rest = structure.unflatten(given)
+        part = jax.tree.map(lambda leaf: jax.lax.dynamic_slice_in_dim(leaf, start, size), arguments)
+        return program(part, *rest, **dict(static))
+
+    return jax.jit(of_part, static_argnums=2)

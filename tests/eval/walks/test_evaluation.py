@@ -19,6 +19,7 @@ from data_pipeline.dataset.statistics import DatasetStatistics
 from eval.numbers.comparison import class_mean, first_reaching
 from eval.numbers.study import entropy_errors, exactly_random, reachable_views, run_study, single_view
 from eval.tables import ViewTables, load_view_tables, save_view_tables
+from eval.walks import over_objects
 from eval.walks.exact import expected_random
 from eval.walks.grid import FIRST_MV, THRESHOLDS, GridConfig, run_grid
 from eval.walks.knowledge import learn
@@ -178,6 +179,19 @@ def test_a_dearer_way_is_a_shorter_one(tables, graph, knowledge):
     np.testing.assert_array_equal(ways[0].views, free.views)
     means = [float(way.travelled[..., -1].mean()) for way in ways]
     assert means[0] > means[1] > means[2]
+
+
+def test_cores_change_nothing(tables, graph, knowledge, monkeypatch):
+    """One core; four; and more than there are objects."""
+    found = []
+    for cores in (1, 4, len(tables.labels) + 1):
+        monkeypatch.setattr(over_objects, "usable_cpus", lambda cores=cores: cores)
+        monkeypatch.setattr(over_objects, "_MOST_THREADS", cores)
+        found.append(walked(tables, graph, knowledge, "random", "information_gain", draws=2, backbones=2, max_views=4))
+    for results in found[1:]:
+        for policy, result in found[0].items():
+            for name, values in vars(result).items():
+                np.testing.assert_allclose(values, getattr(results[policy], name), atol=1e-6, err_msg=name)
 
 
 @pytest.mark.slow
