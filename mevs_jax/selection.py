@@ -189,8 +189,13 @@ def select_views(
             confidences=_put(episode.confidences, state.count - 1, confidence(belief).astype(jnp.float32)),
             count=state.count,
         )
-        scores = policy(jax.random.fold_in(key, state.count), state, scene)
-        return replace(state, view=best_view(scores, candidates(state, scene), scene.reachable)), episode
+
+        def next_view() -> Int[Array, ""]:
+            scores = policy(jax.random.fold_in(key, state.count), state, scene)
+            return best_view(scores, candidates(state, scene), scene.reachable)
+
+        # After the last view nothing is chosen.
+        return replace(state, view=jax.lax.cond(state.count < limit, next_view, lambda: state.view)), episode
 
     def observed(view: Int[Array, ""]) -> Observation:
         """The observation of a view, with logits in float32."""

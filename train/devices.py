@@ -17,6 +17,7 @@ from jax.experimental import multihost_utils
 from jax.sharding import AbstractMesh, Mesh, NamedSharding, PartitionSpec
 
 from data_pipeline.errors import DataError
+from data_pipeline.processes import usable_cpus
 from train.optimiser import OptimiserConfig
 
 DATA, MODEL = "data", "model"
@@ -27,6 +28,19 @@ _SMALLEST_SPLIT = 2**12
 def local_mesh() -> Mesh:
     """Returns the mesh of this process's own devices, for work that processes share out by objects."""
     return Mesh(np.array(jax.local_devices()).reshape(-1, 1), (DATA, MODEL))
+
+
+_MOST_AT_ONCE = 16
+"""Each program that runs takes its own memory."""
+
+
+def programs_at_once() -> int:
+    """Returns how many threads should run programs side by side: one for each core where the only device is a CPU, else one.
+
+    XLA runs a loop on one core, and a CPU runs two programs that one thread starts one after the other.
+    """
+    device, *others = jax.local_devices()
+    return 1 if others or device.platform != "cpu" else min(usable_cpus(), _MOST_AT_ONCE)
 
 
 @dataclass(frozen=True)

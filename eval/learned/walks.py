@@ -181,6 +181,13 @@ def _walk_some(
     return jax.vmap(of_object)(*some)
 
 
+def _most_at_once(contender: Contender) -> int:
+    """How many walks are computed together. Networks are faster on a CPU if what they compute of all of them fits its cache."""
+    if not contender.believes or jax.local_devices()[0].platform != "cpu":
+        return _WALKS_AT_ONCE
+    return _WALKS_AT_ONCE // (32 if contender.knows == "truth" else 8)  # oracles fuse the views once for each candidate
+
+
 def walk_all(
     key: Array,
     contender: Contender,
@@ -202,7 +209,7 @@ def walk_all(
     graph = ViewGraph.from_points(np.asarray(directions[0], np.float64), neighbours)
     keys = jax.vmap(jax.random.fold_in, (None, 0))(key, jnp.arange(len(tables.label)))
     rest = contender, parameters, fusion, graph, knowledge, max_views
-    most = _WALKS_AT_ONCE
+    most = _most_at_once(contender)
     if isinstance(knowledge, UnknownPose):  # each walk scores every view under every hypothesis
         most = min(most, max(1, _SCORES_AT_ONCE // knowledge.hypotheses // len(graph.points)))
     at_once = max(1, most * contender.every // (len(graph.points) * contender.draws))
@@ -211,14 +218,13 @@ def walk_all(
 
 @jax.jit
 def _beliefs_of_some(fusion: CalibratedFusion, some: tuple[Features, Array]) -> Array:
-    steps = some[1].shape[-1]
-    present = jnp.tril(jnp.ones((steps, steps), bool))
+    def of_object(one: Features, walks: Array) -> Array:
+        def after(views: Array) -> Array:
+            return fusion(one.features[views], one.directions[views], jnp.ones(views.shape, bool))
 
-    def of_walk(one: Features, order: Array) -> Array:
-        seen = jnp.broadcast_to(one.features[order], (steps, steps, one.features.shape[-1]))
-        return fusion(seen, jnp.broadcast_to(one.directions[order], (steps, steps, 3)), present)
+        return jnp.stack([after(walks[:, :count]) for count in range(1, walks.shape[1] + 1)], axis=1)
 
-    return jax.vmap(lambda one, orders: jax.vmap(lambda order: of_walk(one, order))(orders))(*some)
+    return jax.vmap(of_object)(*some)
 
 
 def beliefs_of(

@@ -14,10 +14,7 @@ from jax import Array
 from jax.sharding import Mesh, PartitionSpec
 from jaxtyping import Int
 
-from data_pipeline.processes import usable_cpus
-
-_MOST_THREADS = 16
-"""Each takes the memory of a whole chunk of walks."""
+from train.devices import programs_at_once
 
 
 def over_objects(function: Callable[[Any], Any], arguments: Any, multiple: int = 1) -> Any:
@@ -44,17 +41,14 @@ def over_objects(function: Callable[[Any], Any], arguments: Any, multiple: int =
 def on_all_cores(program: Any, arguments: Any, *rest: Any, **static: Any) -> Any:
     """Returns `program(arguments, *rest, **static)`, computed by one thread for each core where the only device is a CPU.
 
-    XLA runs a loop on one core, and two programs that one thread starts one after the other.
-
     Args:
         program: a jitted function that treats objects independently of each other; they are the second axis of its results.
         arguments: a tree of arrays with a leading axis of objects.
         rest: arguments that all objects share.
         static: arguments by name that the program is compiled for.
     """
-    (device, *more), leaves = jax.local_devices(), jax.tree.leaves(arguments)
-    objects, threads = len(leaves[0]), min(usable_cpus(), _MOST_THREADS, len(leaves[0]))
-    if more or device.platform != "cpu" or threads < 2:
+    objects = len(jax.tree.leaves(arguments)[0])
+    if (threads := min(programs_at_once(), objects)) < 2:
         return program(arguments, *rest, **static)
     size = -(-objects // threads)
     starts = [min(start, objects - size) for start in range(0, objects, size)]

@@ -26,10 +26,12 @@ class _Block(nnx.Module):
         self.layer1, self.layer2 = nnx.Linear(width, 2 * width, rngs=rngs), nnx.Linear(2 * width, width, rngs=rngs)
         self.dropout = dropout
 
-    def __call__(self, x: Array, present: Array, key: Array | None) -> Array:
+    def __call__(self, x: Array, present: Array, key: Array | None, asked: int) -> Array:
+        """The first `asked` of the tokens, each after attention to all tokens that are present."""
         mask = present[..., None, None, :]  # the same for all heads and queries
         keys = (None, None) if key is None else jax.random.split(key)
-        x = x + _dropout(keys[0], self.dropout, self.attention(self.norm1(x), mask=mask))
+        normed, x = self.norm1(x), x[..., :asked, :]
+        x = x + _dropout(keys[0], self.dropout, self.attention(normed[..., :asked, :], normed, mask=mask))
         hidden = self.layer2(jax.nn.gelu(self.layer1(self.norm2(x))))
         return x + _dropout(keys[1], self.dropout, hidden)
 
@@ -130,8 +132,10 @@ class SetFusion(nnx.Module):
         own = jnp.broadcast_to(own, (*tokens.shape[:-2], 1, tokens.shape[-1]))
         x = jnp.concatenate([own, tokens], axis=-2)
         attended = jnp.concatenate([jnp.ones((*present.shape[:-1], 1), bool), present], axis=-1)
-        for block, block_key in zip(self.blocks, keys[:-1], strict=True):
-            x = block(x, attended, block_key)
+        for number, (block, block_key) in enumerate(zip(self.blocks, keys[:-1], strict=True), 1):
+            x = block(
+                x, attended, block_key, 1 if number == len(self.blocks) else x.shape[-2]
+            )  # the head reads one token
         return self.head(self.last_norm(x[..., 0, :]))
 
 

@@ -264,8 +264,9 @@ def test_a_policy_may_look_back_on_all_that_was_seen():
         jax.debug.callback(lambda state: states.append(state), state)
         return -jnp.arange(10.0)
 
-    select_from_table(jax.random.key(0), table, Scene(graph), watch, 5, max_views=3)
+    select_from_table(jax.random.key(0), table, Scene(graph), watch, 5, max_views=4)
     jax.effects_barrier()
+    assert sorted(int(state.count) for state in states) == [1, 2, 3]  # after the last view there is nothing to choose
     last = max(states, key=lambda state: int(state.count))
     assert last.views.tolist() == [5, 0, 1]
     np.testing.assert_array_equal(last.seen.logits, table.logits[jnp.array([5, 0, 1])])

@@ -185,8 +185,7 @@ def test_cores_change_nothing(tables, graph, knowledge, monkeypatch):
     """One core; four; and more than there are objects."""
     found = []
     for cores in (1, 4, len(tables.labels) + 1):
-        monkeypatch.setattr(over_objects, "usable_cpus", lambda cores=cores: cores)
-        monkeypatch.setattr(over_objects, "_MOST_THREADS", cores)
+        monkeypatch.setattr(over_objects, "programs_at_once", lambda cores=cores: cores)
         found.append(walked(tables, graph, knowledge, "random", "information_gain", draws=2, backbones=2, max_views=4))
     for results in found[1:]:
         for policy, result in found[0].items():
