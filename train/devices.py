@@ -7,9 +7,10 @@ their last axis. The compiler derives the rest.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, TypeVar
 
 import jax
 import numpy as np
@@ -19,6 +20,9 @@ from jax.sharding import AbstractMesh, Mesh, NamedSharding, PartitionSpec
 from data_pipeline.errors import DataError
 from data_pipeline.processes import usable_cpus
 from train.optimiser import OptimiserConfig
+
+Item = TypeVar("Item")
+Result = TypeVar("Result")
 
 DATA, MODEL = "data", "model"
 _SMALLEST_SPLIT = 2**12
@@ -41,6 +45,13 @@ def programs_at_once() -> int:
     """
     device, *others = jax.local_devices()
     return 1 if others or device.platform != "cpu" else min(usable_cpus(), _MOST_AT_ONCE)
+
+
+def by_threads(function: Callable[[Item], Result], items: Sequence[Item]) -> list[Result]:
+    """Returns `function` of each item, of as many at once as `programs_at_once`; of the first alone, since that compiles."""
+    found = [function(item) for item in items[:1]]
+    with ThreadPoolExecutor(programs_at_once()) as pool:
+        return found + list(pool.map(function, items[1:]))
 
 
 @dataclass(frozen=True)

@@ -23,6 +23,7 @@ from eval.walks.own_policies import OwnPolicy, check_scores, own_rungs
 from mevs_jax.metrics import accuracy, class_accuracy, confusion_matrix
 from mevs_jax.policies.base import Knowledge
 from mevs_jax.viewpoints import ViewGraph
+from train.devices import by_threads
 
 HEADLINE_CT, HEADLINE_MV = 0.99, 4
 """The cell of the grid used in the thesis's first test and confusion matrices (§5.3)."""
@@ -231,17 +232,12 @@ def _confidence(
 ) -> dict[str, Any]:
     fitting = tuple(replace(rung, draws=1) for rung in rungs if rung.policy in CONFIDENCE_OF)
     walks = setting.walk(validation, fitting)
-    return {
-        name: confidence_of(
-            setting.starts_of(walks[name]),
-            validation.logits,
-            validation.labels,
-            setting.starts_of(results[name]),
-            tables.logits,
-            tables.labels,
-        )
-        for name in CONFIDENCE_OF
-    }
+
+    def of(name: str) -> dict[str, Any]:
+        fitted_on, shown = setting.starts_of(walks[name]), setting.starts_of(results[name])
+        return confidence_of(fitted_on, validation.logits, validation.labels, shown, tables.logits, tables.labels)
+
+    return dict(zip(CONFIDENCE_OF, by_threads(of, CONFIDENCE_OF), strict=True))
 
 
 def _movement(
@@ -258,14 +254,13 @@ def _movement(
 def _policies(
     setting: Setting, tables: ViewTables, shown: dict[str, Results], mv: int, column: int
 ) -> dict[str, dict[str, Any]]:
-    return {
-        name: summarise(result, tables.labels)
-        | {
+    def of(result: Results) -> dict[str, Any]:
+        return summarise(result, tables.labels) | {
             "headline_interval": intervals(cells(result)[0][mv - FIRST_MV, column]),
             "headline_confusion": headline_confusion(setting.starts_of(result), tables, mv).tolist(),
         }
-        for name, result in shown.items()
-    }
+
+    return dict(zip(shown, by_threads(of, list(shown.values())), strict=True))
 
 
 def run_study(
