@@ -146,7 +146,7 @@ def select_views(
         key: PRNG key for policies that draw at random.
         observe: returns the observation of a view.
         scene: the candidate views, and what else the policy may use.
-        policy: scores the views; see `mevs_jax.policies`.
+        policy: scores the views; see `mevs_jax.policies`. Its scores after the last view are not used.
         start: index of the first view, 0..views−1.
         threshold: on the confidence, CT in the thesis; None never stops early.
         max_views: 1..views, MV in the thesis.

@@ -7,10 +7,9 @@ their last axis. The compiler derives the rest.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, TypeVar
+from typing import Any
 
 import jax
 import numpy as np
@@ -18,11 +17,7 @@ from jax.experimental import multihost_utils
 from jax.sharding import AbstractMesh, Mesh, NamedSharding, PartitionSpec
 
 from data_pipeline.errors import DataError
-from data_pipeline.processes import usable_cpus
 from train.optimiser import OptimiserConfig
-
-Item = TypeVar("Item")
-Result = TypeVar("Result")
 
 DATA, MODEL = "data", "model"
 _SMALLEST_SPLIT = 2**12
@@ -32,26 +27,6 @@ _SMALLEST_SPLIT = 2**12
 def local_mesh() -> Mesh:
     """Returns the mesh of this process's own devices, for work that processes share out by objects."""
     return Mesh(np.array(jax.local_devices()).reshape(-1, 1), (DATA, MODEL))
-
-
-_MOST_AT_ONCE = 16
-"""Each program that runs takes its own memory."""
-
-
-def programs_at_once() -> int:
-    """Returns how many threads should run programs side by side: one for each core where the only device is a CPU, else one.
-
-    XLA runs a loop on one core, and a CPU runs two programs that one thread starts one after the other.
-    """
-    device, *others = jax.local_devices()
-    return 1 if others or device.platform != "cpu" else min(usable_cpus(), _MOST_AT_ONCE)
-
-
-def by_threads(function: Callable[[Item], Result], items: Sequence[Item]) -> list[Result]:
-    """Returns `function` of each item, of as many at once as `programs_at_once`; of the first alone, since that compiles."""
-    found = [function(item) for item in items[:1]]
-    with ThreadPoolExecutor(programs_at_once()) as pool:
-        return found + list(pool.map(function, items[1:]))
 
 
 @dataclass(frozen=True)

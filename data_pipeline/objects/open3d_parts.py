@@ -23,6 +23,7 @@ def load_open3d() -> Any:
     try:
         import open3d
     finally:
-        if left_out:
-            del sys.modules[_LEARNING]
+        if left_out:  # with the parts that Open3D has put under that name
+            for name in [name for name in sys.modules if f"{name}.".startswith(f"{_LEARNING}.")]:
+                sys.modules.pop(name, None)
     return open3d

@@ -15,6 +15,7 @@ from eval.numbers.comparison import cells, difference, intervals, summarise, vie
 from eval.numbers.confidence import confidence_of
 from eval.numbers.published_code import compatibility
 from eval.tables import ViewTables
+from eval.threads import by_threads
 from eval.walks.exact import expected_random
 from eval.walks.grid import FIRST_MV, THRESHOLDS, GridConfig, Results, run_grid
 from eval.walks.knowledge import learn
@@ -23,13 +24,14 @@ from eval.walks.own_policies import OwnPolicy, check_scores, own_rungs
 from mevs_jax.metrics import accuracy, class_accuracy, confusion_matrix
 from mevs_jax.policies.base import Knowledge
 from mevs_jax.viewpoints import ViewGraph
-from train.devices import by_threads
 
 HEADLINE_CT, HEADLINE_MV = 0.99, 4
 """The cell of the grid used in the thesis's first test and confusion matrices (§5.3)."""
 BASELINE = "random"
 CONFIDENCE_OF = ("random", "predicted_entropy", "information_gain")
 """Policies whose confidence is evaluated."""
+_NUMBERS_OF_PAIRS = 2**24
+"""Log-probabilities of pairs of views that are computed at once."""
 MOVING = ("predicted_entropy", "information_gain")
 MOVEMENT_COSTS = (0.02, 0.05, 0.1, 0.2, 0.5)
 """In units of the policy's score (normalised entropy or nats) per radian of movement."""
@@ -96,14 +98,16 @@ def best_pair(tables: ViewTables, reachable: np.ndarray) -> dict[str, Any]:
         probability = jnp.where(jnp.eye(len(logits), dtype=bool), -jnp.inf, jax.nn.log_softmax(pairs)[..., label])
         return jnp.argmax(pairs.reshape(-1, pairs.shape[-1])[jnp.argmax(probability)]) == label
 
-    right = np.asarray(jax.lax.map(lambda item: one(*item), (logits, jnp.asarray(tables.labels)), batch_size=64))
+    at_once = max(1, min(64, _NUMBERS_OF_PAIRS // (logits[0].size * logits.shape[1])))
+    right = np.asarray(jax.lax.map(lambda item: one(*item), (logits, jnp.asarray(tables.labels)), batch_size=at_once))
     return {"accuracy": float(right.mean()), "interval": intervals(right)}
 
 
 def headline_confusion(views: np.ndarray, tables: ViewTables, max_views: int) -> np.ndarray:
     """Confusion matrix at the headline cell, from walks (objects, starts, steps); each object has weight one."""
+    views = views[:, :, :max_views]
     walks = np.take_along_axis(tables.logits[:, None], np.maximum(views, 0)[..., None], axis=2)
-    beliefs = np.cumsum(np.where(views[..., None] >= 0, walks, 0), axis=2)[:, :, :max_views]
+    beliefs = np.cumsum(np.where(views[..., None] >= 0, walks, 0), axis=2)
     shifted = np.exp(beliefs - beliefs.max(axis=-1, keepdims=True))
     sure = 1 / shifted.sum(axis=-1) >= HEADLINE_CT
     at = np.where(sure.any(axis=-1), sure.argmax(axis=-1), max_views - 1)

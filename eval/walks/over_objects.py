@@ -14,7 +14,7 @@ from jax import Array
 from jax.sharding import Mesh, PartitionSpec
 from jaxtyping import Int
 
-from train.devices import programs_at_once
+from eval.threads import programs_at_once
 
 
 def over_objects(function: Callable[[Any], Any], arguments: Any, multiple: int = 1) -> Any:
@@ -48,7 +48,8 @@ def on_all_cores(program: Any, arguments: Any, *rest: Any, **static: Any) -> Any
         static: arguments by name that the program is compiled for.
     """
     objects = len(jax.tree.leaves(arguments)[0])
-    if (threads := min(programs_at_once(), objects)) < 2:
+    traced = any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves((arguments, rest)))
+    if traced or (threads := min(programs_at_once(), objects)) < 2:
         return program(arguments, *rest, **static)
     size = -(-objects // threads)
     starts = [min(start, objects - size) for start in range(0, objects, size)]
@@ -69,9 +70,10 @@ def on_all_cores(program: Any, arguments: Any, *rest: Any, **static: Any) -> Any
 
 @cache
 def _of_part(program: Any, structure: Any, static: tuple[tuple[str, Any], ...]) -> Any:
-    """The program for the objects from a number on, given a list of arrays.
+    """The program for the objects from a number on.
 
-    `jax.stages.Lowered` rebuilds trees of things that are no arrays, which not all trees can hold.
+    Its arguments are a flat list, because lowering also rebuilds them with descriptions in place of arrays, which the type checks
+    of the tests refuse.
     """
 
     def of_part(given: list[Array], start: Int[Array, ""] | int, size: int) -> Any:

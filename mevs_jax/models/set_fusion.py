@@ -132,10 +132,10 @@ class SetFusion(nnx.Module):
         own = jnp.broadcast_to(own, (*tokens.shape[:-2], 1, tokens.shape[-1]))
         x = jnp.concatenate([own, tokens], axis=-2)
         attended = jnp.concatenate([jnp.ones((*present.shape[:-1], 1), bool), present], axis=-1)
-        for number, (block, block_key) in enumerate(zip(self.blocks, keys[:-1], strict=True), 1):
-            x = block(
-                x, attended, block_key, 1 if number == len(self.blocks) else x.shape[-2]
-            )  # the head reads one token
+        last = len(self.blocks) - 1
+        for number, (block, block_key) in enumerate(zip(self.blocks, keys[:-1], strict=True)):
+            asked = 1 if number == last else x.shape[-2]  # the head reads the first token only
+            x = block(x, attended, block_key, asked)
         return self.head(self.last_norm(x[..., 0, :]))
 
 

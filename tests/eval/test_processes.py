@@ -30,7 +30,7 @@ from train.loop import steps_of_an_epoch
 pytestmark = pytest.mark.usefixtures("named")
 
 SECONDS_TO_END = 300
-"""Long enough for a machine that is busy. Python's own way out ends with another exit code."""
+"""Long enough for a machine that is busy."""
 
 
 def alone(*arguments: str) -> None:

@@ -184,19 +184,6 @@ def test_a_view_seen_again_adds_its_logits_again():
 
 
 @pytest.mark.parametrize("policy", list(POLICIES))
-def test_many_walks_need_little_memory(policy):
-    """No policy holds what it knows of all pairs of views for every walk: of 300 views and 30 classes that is 43 GB."""
-    views, classes, walks = 48, 8, 500
-    graph = ViewGraph.from_points(fibonacci_sphere(views))
-    table = jax.tree.map(lambda leaf: leaf[0], random_tables(views, classes, 1, seed=3))
-    scene = whole_scene(table, graph)
-    walk = partial(select_from_table, table=table, scene=scene, policy=POLICIES[policy], max_views=4)
-    given = jax.random.split(jax.random.key(0), walks), jnp.arange(walks) % views
-    compiled = jax.jit(jax.vmap(lambda key, start: walk(key, start=start))).lower(*given).compile()
-    assert compiled.memory_analysis().temp_size_in_bytes < 16 * walks * views * classes * 4
-
-
-@pytest.mark.parametrize("policy", list(POLICIES))
 def test_no_policy_goes_where_it_cannot(policy):
     views = 12
     graph = ViewGraph.from_points(fibonacci_sphere(views))
