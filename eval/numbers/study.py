@@ -30,8 +30,6 @@ HEADLINE_CT, HEADLINE_MV = 0.99, 4
 BASELINE = "random"
 CONFIDENCE_OF = ("random", "predicted_entropy", "information_gain")
 """Policies whose confidence is evaluated."""
-_NUMBERS_OF_PAIRS = 2**24
-"""Log-probabilities of pairs of views that are computed at once."""
 MOVING = ("predicted_entropy", "information_gain")
 MOVEMENT_COSTS = (0.02, 0.05, 0.1, 0.2, 0.5)
 """In units of the policy's score (normalised entropy or nats) per radian of movement."""
@@ -98,8 +96,7 @@ def best_pair(tables: ViewTables, reachable: np.ndarray) -> dict[str, Any]:
         probability = jnp.where(jnp.eye(len(logits), dtype=bool), -jnp.inf, jax.nn.log_softmax(pairs)[..., label])
         return jnp.argmax(pairs.reshape(-1, pairs.shape[-1])[jnp.argmax(probability)]) == label
 
-    at_once = max(1, min(64, _NUMBERS_OF_PAIRS // (logits[0].size * logits.shape[1])))
-    right = np.asarray(jax.lax.map(lambda item: one(*item), (logits, jnp.asarray(tables.labels)), batch_size=at_once))
+    right = np.asarray(jax.lax.map(lambda item: one(*item), (logits, jnp.asarray(tables.labels))))
     return {"accuracy": float(right.mean()), "interval": intervals(right)}
 
 

@@ -23,6 +23,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from eval.walks.ladder import Rung
 from eval.walks.over_objects import on_all_cores, over_objects
+from mevs_jax.arrays import AnyArray
 from mevs_jax.metrics import is_right
 from mevs_jax.policies.base import Knowledge, with_movement
 from mevs_jax.selection import ViewTable, select_from_table
@@ -140,7 +141,7 @@ def run_grid(
 
 @partial(jax.jit, static_argnames=("rungs", "max_views"))
 def _grid(
-    objects: tuple[Int[Array, " objects"] | np.ndarray, ViewTable],
+    objects: tuple[Int[AnyArray, " objects"], ViewTable],
     key: Array,
     graph: ViewGraph,
     knowledge: Knowledge | None,

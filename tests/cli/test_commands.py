@@ -299,7 +299,7 @@ def job(*arguments):
 cli._run, sys.argv = job, ["mevs", "run"]
 cli.main()
 """
-    result = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, timeout=300)
+    result = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, timeout=120)
     assert result.returncode == 130
     assert result.stdout == "lost\n"
     assert result.stderr == "mevs: interrupted; the same command goes on where it stopped\n"
@@ -326,7 +326,7 @@ cli.main()
         [sys.executable, "-c", script],
         capture_output=True,
         text=True,
-        timeout=300,
+        timeout=120,
         env=os.environ | {"PYTHONPATH": os.pathsep.join([str(tmp_path), root])},
     )
     said = "mevs: interrupted; the same command goes on where it stopped\n"
@@ -347,7 +347,7 @@ atexit.register(late)
 cli._run, sys.argv = lambda *arguments: print("done"), ["mevs", "run"]
 cli.main()
 """
-    result = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, timeout=300)
+    result = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, timeout=120)
     assert (result.returncode, result.stdout, result.stderr) == (-signal.SIGINT, "done\n", "")
 
 

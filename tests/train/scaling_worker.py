@@ -48,8 +48,7 @@ def losses(
 ) -> tuple[dict[str, list[float]], dict[str, list[str]], States]:
     """The training loss of the first steps, how devices talk in a step, and the state at each stretch's beginning, by network.
 
-    Both networks, and PointNet++ alone where weights are split. Stretches begin with the states `of_one`
-    device, if given.
+    Both networks, and PointNet++ alone where weights are split. Stretches begin with the states `of_one` device, if given.
     """
     out, talk, begins = {}, {}, {}
     for task in tasks(SETTINGS, load_statistics(data))[0 if mesh.shape["model"] == 1 else -1 :]:
