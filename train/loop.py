@@ -11,7 +11,6 @@ import time
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -54,11 +53,19 @@ class Lead:
     def __init__(self, steps: int = 4):
         self._steps, self._running = steps, deque[jax.Array]()
 
-    def limit(self, result: jax.Array) -> None:
-        """Takes a result of the newest step and waits for the result from `steps` steps earlier."""
+    def limit(self, result: jax.Array) -> int:
+        """Takes a result of the newest step, and waits for that of `steps` steps earlier; returns how many steps have ended."""
         self._running.append(result)
-        if len(self._running) > self._steps:
-            self._running.popleft().block_until_ready()
+        if len(self._running) <= self._steps:
+            return 0
+        self._running.popleft().block_until_ready()
+        return 1
+
+    def end(self) -> int:
+        """Waits for all steps; returns how many have ended that were not counted yet."""
+        ended = len(jax.block_until_ready(self._running))
+        self._running.clear()
+        return ended
 
 
 def steps_of_an_epoch(task: Task, statistics: DatasetStatistics) -> int:
@@ -191,7 +198,7 @@ class _Training:
         """Trains to the end of the epoch; returns the mean of every metric over its steps.
 
         Args:
-            bar: called after every step.
+            bar: called with the number of steps that have ended since the last call.
 
         Raises:
             Preempted: after SIGTERM, once the state is saved.
@@ -201,13 +208,13 @@ class _Training:
         while self.step < end:
             self.state, loss = self._train_step(self.state, place_batch(self.mesh, next(batches)), self.hyper)
             self.step += 1
-            self._lead.limit(loss)
-            bar()
+            bar(self._lead.limit(loss))
             if preemption.after_step() and self.step < end:
                 self.progress["seconds"] += time.perf_counter() - started
                 self._check({f"sum of the training {k}": float(total) for k, total in self.state.sums.items()})
                 checkpoints.save("latest", self.step, self.state, self.progress)
                 raise Preempted(f"{self.task.name} was asked to end after step {self.step}")
+        bar(self._lead.end())
         return {name: float(total) / self.epoch_steps for name, total in self.state.sums.items()}
 
     def finish_epoch(
@@ -345,7 +352,10 @@ def fit(
             completed=training.step * config.batch_size,
             note="",
         )
-        advance = partial(bar.advance, line, config.batch_size)
+
+        def advance(steps: int) -> None:
+            bar.advance(line, steps * config.batch_size)
+
         while not training.is_finished:
             started = time.perf_counter()
             means = training.train_epoch(batches, checkpoints, preemption, advance)

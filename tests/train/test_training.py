@@ -27,7 +27,7 @@ from eval.settings import TINY
 from eval.stages import tasks
 from train.checkpoints import Checkpoints
 from train.kept import config_of
-from train.loop import fit, load_best
+from train.loop import Lead, fit, load_best, steps_of_an_epoch
 from train.optimiser import OptimiserConfig, _as_matrix, descent, learning_rate
 from train.preemption import Preempted
 from train.starting_weights import weights_from_network
@@ -164,6 +164,21 @@ def test_training_goes_on_from_other_weights(trained, data, tmp_path):
     assert lines(tmp_path)[0]["train/loss"] < 0.8 * lines(trained / "classifier")[0]["train/loss"]
     with pytest.raises(DataError, match="other settings"):
         fit(once, data, statistics, tmp_path)
+
+
+def test_the_progress_shown_is_of_steps_that_have_ended():
+    lead = Lead(steps=2)
+    assert [lead.limit(jnp.float32(step)) for step in range(5)] == [0, 0, 1, 1, 1]
+    assert [lead.end(), lead.end()] == [2, 0]
+
+
+def test_all_views_are_counted_by_the_end(data, tmp_path, monkeypatch):
+    shown, bar, statistics = [], train.loop.progress_bar("views"), load_statistics(data)
+    monkeypatch.setattr(bar, "advance", lambda line, views: shown.append(views))
+    monkeypatch.setattr(train.loop, "progress_bar", lambda unit: bar)
+    task = tasks(SETTINGS, statistics)[0]
+    fit(task, data, statistics, tmp_path)
+    assert sum(shown) == task.optimiser.epochs * steps_of_an_epoch(task, statistics) * task.optimiser.batch_size
 
 
 def test_a_finished_run_is_not_repeated_nor_mixed(trained, data):

@@ -92,13 +92,14 @@ def train_members(
             trainer.begin(training)
             batches.begin(trainer.places, of.step)
             while of.step < (of.epoch + 1) * epoch_steps:
-                lead.limit(trainer.train(training, batches.next(trainer.places)))
+                ended = lead.limit(trainer.train(training, batches.next(trainer.places)))
                 of.step += 1
-                bar.advance(line, views)
+                bar.advance(line, ended * views)
                 if preemption.after_step() and of.step % epoch_steps:
                     of.seconds += time.perf_counter() - started
                     checkpoints.save("latest", of.step, trainer.saved(), of.progress())
                     raise Preempted(f"{title} was asked to end after step {of.step}")
+            bar.advance(line, lead.end() * views)
             means = {name: sums / epoch_steps for name, sums in trainer.sums().items()}
             with np.errstate(invalid="ignore"):  # of members that have stopped
                 checked = weighted_means([trainer.evaluate(*given) for given in batches.validation(trainer.places)])
