@@ -95,7 +95,9 @@ def best_view(
     ordered = scores == jnp.inf
     allowed = allowed | (ordered if reachable is None else ordered & reachable)
     best = jnp.max(jnp.where(allowed, scores, -jnp.inf))
-    return jnp.argmax(allowed & (scores == best)).astype(jnp.int32)
+    index = jnp.arange(scores.shape[0], dtype=jnp.int32)
+    first = jnp.min(jnp.where(allowed & (scores == best), index, index.size))  # argmax is slower on CPU
+    return jnp.where(first < index.size, first, 0)
 
 
 Fuse = Callable[[SelectionState, Scene], Float[Array, " classes"]]

@@ -236,4 +236,5 @@ def local_maxima(
     maximum unless neighbours share the largest weight.
     """
     weights, neighbours = jnp.asarray(weights), jnp.asarray(neighbours)
-    return jnp.all(~neighbours | (weights[None, :] < weights[:, None]), axis=1)
+    # Along the first axis, which XLA vectorises on CPU.
+    return jnp.all(~neighbours.T | (weights[:, None] < weights[None, :]), axis=0)

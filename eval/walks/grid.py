@@ -32,6 +32,8 @@ from mevs_jax.viewpoints import ViewGraph
 THRESHOLDS = (0.5, 0.6, 0.7, 0.8, 0.9, 0.95, 0.99)
 FIRST_MV, LAST_MV = 2, 9
 _WALKS_AT_ONCE = 2**12
+_WALKS_IN_CACHE = 2**11
+"""As many walks, with what 40 views and their neighbours need, stay in the cache of a CPU's core."""
 
 
 @dataclass(frozen=True)
@@ -188,7 +190,8 @@ def _grid(
             small = jnp.int8 if starts < 128 else jnp.int16
             return Results(*found, views[:, :, :1].astype(small))
 
-        at_once = max(1, min(256, _WALKS_AT_ONCE // (starts * rung.draws)))
+        most = _WALKS_IN_CACHE if jax.local_devices()[0].platform == "cpu" else _WALKS_AT_ONCE
+        at_once = max(1, min(256, most // (starts * rung.draws)))
         at_once = min(at_once, -(-len(keys) // jax.local_device_count()))
         chunked = partial(jax.lax.map, of_object, batch_size=at_once)
         found = over_objects(chunked, (keys, tables), at_once)

@@ -212,6 +212,13 @@ def test_equal_neighbours_exclude_each_other():
     np.testing.assert_array_equal(local_maxima(np.array([2.0, 1.0, 2.0], np.float32), neighbours), [True, False, True])
 
 
+def test_local_maxima_where_only_one_of_two_views_counts_the_other(random):
+    """As where a neighbour cannot be reached."""
+    for _ in range(20):
+        weights, neighbours = random.random(9).astype(np.float32), random.random((9, 9)) < 0.3
+        np.testing.assert_array_equal(local_maxima(weights, neighbours), numpy_rules.local_maxima(weights, neighbours))
+
+
 @pytest.mark.parametrize("lowest", [-0.1, 0.0, 0.3])
 def test_opposite_views_of_a_hemisphere_are_no_neighbours(lowest):
     """The hull of viewpoints on one side is closed by faces that are none of the sphere."""

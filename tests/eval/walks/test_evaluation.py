@@ -212,7 +212,7 @@ tables = load_view_tables(sys.argv[1])
 graph = ViewGraph.from_points(fibonacci_sphere(10))
 stacked = tables.stacked()
 known = jax.tree.map(lambda leaf: leaf[None], learn(stacked.logits, stacked.label))
-grid._WALKS_AT_ONCE = 60
+grid._WALKS_IN_CACHE = 60
 rungs = tuple(Rung(name, name, "nothing", 2) for name in ("random", "information_gain"))
 found = run_grid(jax.random.key(0), replace(stacked, logits=stacked.logits[:, None]), graph, known, rungs, max_views=5)
 assert programs_at_once() == 1
