@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
 import jax
@@ -111,62 +112,99 @@ def _flat(grid: Float[Array, "rows columns"], count: int) -> Float[Array, " {cou
     return grid.T.reshape(-1)[:count]
 
 
+_STAGES = ((0.25, 0.7, 0.8), (0.5, 0.8, 0.42), (0.75, 0.9, 0.12))
+"""When points are left out, as a share of those to choose; by which share of the estimated last distance, so that an estimate
+somewhat too large does no harm; and for which share of the cloud there is room then. Measured on surfaces and volumes, where
+estimates are 0.9 to 1.3 times, 0.9 to 1.0 times and 1.0 times the last distance."""
+
+
+class _Part(NamedTuple):
+    """The points of a cloud that may still be chosen, and those that are chosen.
+
+    Attributes:
+        kept: indices of the first in the cloud.
+        there: which of these are points; the others are padding.
+        chosen: indices are those in the cloud; `nearest` is of the points that are kept.
+        least: squared distance from the chosen points below which none was kept.
+        well: whether no point that was left out could have been chosen.
+    """
+
+    kept: Int[Array, " kept"]
+    there: Bool[Array, " kept"]
+    chosen: _Chosen
+    least: Float[Array, ""]
+    well: Bool[Array, ""]
+
+
 def sample_large(points: Float[Array, "points 3"], k: int) -> Int[Array, " {k}"]:
     """The indices of `sample`, with less work for one large cloud.
 
     A point that is nearer to the chosen points than the last of the `k` will be is never chosen, and need not be looked at again.
-    After half of the `k` points, more than half of all points are that near. That distance is estimated from how it fell between
-    a quarter and a half. If the estimate was too large, or more points are left than there is room for, the rest are chosen from
-    all points, as `sample` does.
+    After half of the `k` points, more than half of all points are that near. That distance is estimated from how it fell while
+    the number of points doubled. If the estimate was too large, or more points are left than there is room for, the rest are
+    chosen from all points, as `sample` does.
     """
-    quarter = _choose_all(points, _Chosen.begun(points, k), 1, k // 4)
-    half = _choose_all(points, quarter, k // 4, k // 2)
-    least = 0.8 * half.distance * half.distance / quarter.distance
-    least = jnp.where(least > 0, least, jnp.inf)  # none are left out where points coincide or are not finite
-    kept, left = _compacted(half.nearest >= least, int(0.42 * points.shape[0]))
-    there = jnp.arange(len(kept)) < left
-    last = half.indices[k // 2 - 1]
-    few = _Chosen(
-        jnp.zeros(k, jnp.int32).at[k // 2 - 1].set(jnp.argmax(there & (kept == last)).astype(jnp.int32)),
-        half.number,
-        jnp.where(there, half.nearest[kept], -1.0),
-        jnp.where(left <= len(kept), half.distance, -1.0),
-    )
-    few = _choose(points[kept], few, k, least)
-    right = few.number - (few.distance < least) * (few.number > k // 2)  # the last one may be too near
-    later = (jnp.arange(k) >= k // 2) & (jnp.arange(k) < right)
-    indices = jnp.where(later, kept[few.indices], half.indices)
+    counts = [int(share * k) for share, _, _ in _STAGES]
+    before = _choose_all(points, _Chosen.begun(points, k), 1, counts[0] // 2)
+    whole = _choose_all(points, before, counts[0] // 2, counts[0])
+    everywhere = jnp.arange(points.shape[0], dtype=jnp.int32), jnp.ones(points.shape[0], bool)
+    part = _Part(*everywhere, whole, jnp.float32(-jnp.inf), jnp.array(True))
+    doubling = whole.distance / before.distance
+    for (share, safety, room), count, until in zip(_STAGES, counts, (*counts[1:], k), strict=True):
+        distance = part.chosen.distance
+        least = safety * distance * doubling ** -math.log2(share)
+        part = _continued(points, _narrowed(part, least, int(room * points.shape[0])), count, until)
+        if share == 0.25:  # now there are twice as many
+            doubling = part.chosen.distance / distance
 
     def rest() -> Array:
+        chosen = part.chosen
+
         def catch_up(carry: tuple[Array, Array]) -> tuple[Array, Array]:
             i, nearest = carry
-            here = points[indices[i]]
+            here = points[chosen.indices[i]]
             return i + 1, jnp.minimum(nearest, squared_distance(*(points - here).T))
 
-        begin = (jnp.int32(k // 2 - 1), half.nearest)
-        nearest = jax.lax.while_loop(lambda carry: carry[0] < right - 1, catch_up, begin)[1]
-        return _choose(points, _Chosen(indices, right, nearest, half.distance), k).indices
+        begin = (jnp.int32(counts[0] - 1), whole.nearest)
+        nearest = jax.lax.while_loop(lambda carry: carry[0] < chosen.number - 1, catch_up, begin)[1]
+        return _choose(points, chosen._replace(nearest=nearest), k)
 
-    return jax.lax.cond(right < k, rest, lambda: indices)
+    return jax.lax.cond(part.well, lambda: part.chosen.indices, rest)
 
 
-def _choose(
-    points: Float[Array, "points 3"], begun: _Chosen, until: int, least: float | Float[Array, ""] = -jnp.inf
-) -> _Chosen:
-    """Chooses points until there are `until`, or one is nearer than the squared distance `least`."""
+def _narrowed(part: _Part, least: Float[Array, ""], most: int) -> _Part:
+    """The part without the points that are nearer than `least`, with room for `most`."""
+    # None are kept where points coincide or are not finite.
+    least = jnp.where(least > 0, jnp.maximum(least, part.least), jnp.inf)
+    kept, left = _compacted(part.there & (part.chosen.nearest >= least), most)
+    there = jnp.arange(most) < left
+    nearest = jnp.where(there, part.chosen.nearest[kept], -1.0)
+    return _Part(part.kept[kept], there, part.chosen._replace(nearest=nearest), least, part.well & (left <= most))
+
+
+def _continued(points: Float[Array, "points 3"], part: _Part, count: int, until: int) -> _Part:
+    """The part with `until` points chosen instead of `count`, unless one that was left out could be among them."""
+    indices = part.chosen.indices
+    last = jnp.argmax(part.there & (part.kept == indices[count - 1])).astype(jnp.int32)
+    found = _choose_all(points[part.kept], part.chosen._replace(indices=indices.at[count - 1].set(last)), count, until)
+    well = part.well & (found.distance >= part.least)
+    new = (jnp.arange(len(indices)) >= count) & (jnp.arange(len(indices)) < until) & well
+    indices = jnp.where(new, part.kept[found.indices], indices)
+    number = jnp.where(well, until, part.chosen.number)
+    return part._replace(chosen=found._replace(indices=indices, number=number), well=well)
+
+
+def _choose(points: Float[Array, "points 3"], begun: _Chosen, until: int) -> Int[Array, " k"]:
+    """The indices of `until` points, of which some are chosen already."""
     grids = _Grids.of(points)
 
-    def step(carry: tuple[Array, Array, Array, Array]) -> tuple[Array, Array, Array, Array]:
-        indices, count, nearest, _ = carry
-        nearest, last, distance = _next(grids, nearest, indices[count - 1])
-        return indices.at[count].set(last), count + 1, nearest, distance
+    def step(carry: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
+        indices, count, nearest = carry
+        nearest, last, _ = _next(grids, nearest, indices[count - 1])
+        return indices.at[count].set(last), count + 1, nearest
 
-    def more(carry: tuple[Array, Array, Array, Array]) -> Bool[Array, ""]:
-        return (carry[1] < until) & ~(carry[3] < least)
-
-    begin = (begun.indices, begun.number, _grid(begun.nearest, -1.0), begun.distance)
-    indices, count, nearest, distance = jax.lax.while_loop(more, step, begin)
-    return _Chosen(indices, count, _flat(nearest, points.shape[0]), distance)
+    begin = (begun.indices, begun.number, _grid(begun.nearest, -1.0))
+    return jax.lax.while_loop(lambda carry: carry[1] < until, step, begin)[0]
 
 
 def _compacted(wanted: Bool[Array, " points"], most: int) -> tuple[Int[Array, " {most}"], Int[Array, ""]]:
