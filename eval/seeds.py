@@ -27,7 +27,7 @@ from train.devices import device_mesh
 from train.kept import keep_beside, kept_json, made_by
 from train.many.seeds import check_networks, train_seeds
 from train.optimiser import OptimiserConfig
-from train.starting_weights import StartingWeights
+from train.weights.starting import StartingWeights
 
 LARGEST = 1000
 """Largest number of seeds of a run."""

@@ -48,10 +48,10 @@ from train.kept import keep_beside, kept, kept_json, made_by, summary_of
 from train.log import read_history
 from train.loop import check_launch, fit, load_best
 from train.plan import plan_of, planned_statistics
-from train.starting_weights import StartingWeights
 from train.step import Task
 from train.tasks.classifier import ClassifierTask
 from train.tasks.entropy import EntropyTask
+from train.weights.starting import StartingWeights
 
 
 def check_output(out: Path) -> None:

@@ -39,9 +39,9 @@ from train.kept import check_config, config_of, content_of, finished, goes_on_wi
 from train.log import MetricsLog
 from train.optimiser import learning_rate
 from train.preemption import Preempted, Preemption
-from train.starting_weights import StartingWeights
 from train.step import Task, TrainState, abstract_state, evaluate_step_of, initial_state, train_step_of
 from train.validation import ValidationSet
+from train.weights.starting import StartingWeights
 
 
 class Lead:

@@ -18,7 +18,7 @@ from flax import nnx
 
 from data_pipeline.dataset.batches import ViewBatches
 from train.optimiser import OptimiserConfig, descent, learning_rate
-from train.starting_weights import StartingWeights
+from train.weights.starting import StartingWeights
 
 Batch = dict[str, jax.Array]
 Metrics = dict[str, jax.Array]

@@ -14,9 +14,9 @@ from train.devices import Layout, device_mesh
 from train.loop import check_training, load_best
 from train.many.seeds import train_seeds
 from train.optimiser import OptimiserConfig
-from train.starting_weights import StartingWeights, weights_from_network
 from train.tasks.classifier import ClassifierConfig, ClassifierTask, ResNetConfig, starting_weights
 from train.tasks.entropy import EntropyConfig, EntropyTask
+from train.weights.starting import StartingWeights, weights_from_network
 
 VIEWS = (10, 40)
 """The thesis's two data sets, by number of views per object."""

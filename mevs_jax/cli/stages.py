@@ -10,7 +10,7 @@ from mevs_jax.cli.parsing import Invocation, keep_adopted
 if TYPE_CHECKING:
     from jax.sharding import Mesh
 
-    from train.starting_weights import StartingWeights
+    from train.weights.starting import StartingWeights
 
 
 def run(call: Invocation) -> None:

@@ -23,8 +23,8 @@ from mevs_jax.trained import UnreadableSystem, load, save
 from mevs_jax.trained.files import DESCRIPTION, WEIGHTS, _hash_of
 from tests.data_pipeline.objects import making
 from tests.mevs_jax.trained import making as systems
-from tests.train import weights_making as weights
-from train.weights_files import read_state_dict
+from tests.train.weights import making as weights
+from train.weights.files import read_state_dict
 
 REFERENCE = Path(__file__).parents[1] / "reference"
 CORPUS = Path(__file__).parent / "corpus"

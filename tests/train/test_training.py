@@ -30,9 +30,9 @@ from train.kept import config_of
 from train.loop import Lead, fit, load_best, steps_of_an_epoch
 from train.optimiser import OptimiserConfig, _as_matrix, descent, learning_rate
 from train.preemption import Preempted
-from train.starting_weights import weights_from_network
 from train.step import abstract_state, samples_before
 from train.tasks.entropy import EntropyTask
+from train.weights.starting import weights_from_network
 
 SETTINGS = replace(
     TINY,

@@ -45,10 +45,10 @@ from train.kept import is_stored, kept_array, made_by, trained_once
 from train.loop import fit, load_best
 from train.many.seeds import train_seeds
 from train.outputs import Ask, network_outputs
-from train.starting_weights import StartingWeights
 from train.tasks.entropy import EntropyConfig, EntropyTask
 from train.tasks.recogniser import RecogniserTask
 from train.tasks.size import check_sizes, used_size
+from train.weights.starting import StartingWeights
 
 Aside = tuple[int, int]
 """Which of how many parts of the validation objects."""

@@ -20,11 +20,11 @@ from train.checkpoints import Checkpoints
 from train.devices import parameter_sharding, place
 from train.finite import not_finite
 from train.loop import identity_of
-from train.starting_weights import StartingWeights
 from train.step import Task, initial_state
 from train.tasks.classifier import ClassifierTask
 from train.tasks.entropy import EntropyTask
 from train.tasks.recogniser import RecogniserTask
+from train.weights.starting import StartingWeights
 
 SweepTask = ClassifierTask | EntropyTask | RecogniserTask
 

@@ -18,7 +18,6 @@ from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from train.devices import DATA, on_host, place, place_batch
 from train.finite import all_finite
 from train.many.members import Member, SweepTask, task_of
-from train.starting_weights import StartingWeights
 from train.step import (
     Hyperparameters,
     TrainState,
@@ -27,6 +26,7 @@ from train.step import (
     initial_state,
     train_step_of,
 )
+from train.weights.starting import StartingWeights
 
 Way = Literal["at once", "in turn"]
 Starts = Sequence[StartingWeights | None]

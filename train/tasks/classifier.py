@@ -21,8 +21,8 @@ from data_pipeline.errors import DataError
 from mevs_jax.inputs import depth_image
 from mevs_jax.models import ResNet
 from train.optimiser import OptimiserConfig
-from train.starting_weights import StartingWeights, weights_from_torch
 from train.step import Batch, Hyperparameters, Metrics
+from train.weights.starting import StartingWeights, weights_from_torch
 
 
 @dataclass(frozen=True)

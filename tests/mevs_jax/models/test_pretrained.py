@@ -17,10 +17,10 @@ from data_pipeline.errors import DataError
 from mevs_jax import ResNet
 from tests.mevs_jax.models.test_networks import GOLDEN, golden_shapes, made, outputs
 from tests.reference.weights import made_up_inputs, made_up_weights, untrained
-from tests.train.weights_making import entry, safetensors
-from train.starting_weights import weights_from_network, weights_from_torch
+from tests.train.weights.making import entry, safetensors
 from train.tasks.classifier import ResNetConfig, starting_weights
-from train.weights_files import read_state_dict
+from train.weights.files import read_state_dict
+from train.weights.starting import weights_from_network, weights_from_torch
 
 
 @pytest.fixture(scope="module")

@@ -18,7 +18,7 @@ from safetensors.numpy import save_file
 
 from data_pipeline.errors import DataError
 from tests.reference.weights import small_state
-from tests.train.weights_making import (
+from tests.train.weights.making import (
     HOSTILE_PICKLES,
     MAGIC,
     entry,
@@ -29,10 +29,10 @@ from tests.train.weights_making import (
     text,
     zipped,
 )
-from train.starting_weights import resnet_depth
-from train.weights_files import read_state_dict
+from train.weights.files import read_state_dict
+from train.weights.starting import resnet_depth
 
-REFERENCE = Path(__file__).parents[1] / "reference"
+REFERENCE = Path(__file__).parents[2] / "reference"
 MOST_MEGABYTES = 100
 """Largest memory that Python may hold while it reads a hostile file of less than a few megabytes."""
 

@@ -18,7 +18,7 @@ from safetensors import deserialize
 
 from data_pipeline.errors import DataError, reason_of
 from data_pipeline.objects.names import shown
-from train.weights_pickle import LONGEST_NAME, MOST_BYTES, Tensor, WeightsUnpickler
+from train.weights.pickle_format import LONGEST_NAME, MOST_BYTES, Tensor, WeightsUnpickler
 
 LARGEST_FILE = 1 << 30
 """Largest size of a file of weights in bytes."""

@@ -13,7 +13,7 @@ from flax import nnx
 from data_pipeline.errors import DataError
 from mevs_jax.models import ResNet
 from mevs_jax.models.pretrained import resnet_from_torch
-from train.weights_files import read_state_dict
+from train.weights.files import read_state_dict
 
 
 @dataclass(frozen=True)
