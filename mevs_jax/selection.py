@@ -17,6 +17,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
+from mevs_jax.arrays import first_true
 from mevs_jax.beliefs import CalibratedFusion, confidence
 from mevs_jax.policies.base import Knowledge, Observation, Policy, Scene, SelectionState, candidates
 from mevs_jax.viewpoints import ViewGraph
@@ -95,9 +96,8 @@ def best_view(
     ordered = scores == jnp.inf
     allowed = allowed | (ordered if reachable is None else ordered & reachable)
     best = jnp.max(jnp.where(allowed, scores, -jnp.inf))
-    index = jnp.arange(scores.shape[0], dtype=jnp.int32)
-    first = jnp.min(jnp.where(allowed & (scores == best), index, index.size))  # argmax is slower on CPU
-    return jnp.where(first < index.size, first, 0)
+    first = first_true(allowed & (scores == best))
+    return jnp.where(first < scores.shape[0], first, 0)
 
 
 Fuse = Callable[[SelectionState, Scene], Float[Array, " classes"]]

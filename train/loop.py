@@ -63,8 +63,9 @@ class Lead:
 
     def end(self) -> int:
         """Waits for all steps; returns how many have ended that were not counted yet."""
-        ended = len(jax.block_until_ready(self._running))
-        self._running.clear()
+        ended = len(self._running)
+        while self._running:
+            self._running.popleft().block_until_ready()
         return ended
 
 

@@ -183,7 +183,7 @@ def _walk_some(
 
 def _most_at_once(contender: Contender) -> int:
     """How many walks are computed together. Networks are faster on a CPU if what they compute of all of them fits its cache."""
-    if not contender.believes or jax.local_devices()[0].platform != "cpu":
+    if not contender.believes or jax.default_backend() != "cpu":
         return _WALKS_AT_ONCE
     return _WALKS_AT_ONCE // (32 if contender.knows == "truth" else 8)  # oracles fuse the views once for each candidate
 

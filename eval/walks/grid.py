@@ -190,7 +190,7 @@ def _grid(
             small = jnp.int8 if starts < 128 else jnp.int16
             return Results(*found, views[:, :, :1].astype(small))
 
-        most = _WALKS_IN_CACHE if jax.local_devices()[0].platform == "cpu" else _WALKS_AT_ONCE
+        most = _WALKS_IN_CACHE if jax.default_backend() == "cpu" else _WALKS_AT_ONCE
         at_once = max(1, min(256, most // (starts * rung.draws)))
         at_once = min(at_once, -(-len(keys) // jax.local_device_count()))
         chunked = partial(jax.lax.map, of_object, batch_size=at_once)

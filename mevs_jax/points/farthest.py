@@ -9,6 +9,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
+from mevs_jax.arrays import first_true
 from mevs_jax.points.distances import squared_distance
 
 LARGE = 8192
@@ -61,15 +62,10 @@ def _next(
     # Every value is above -2. Without this bound, XLA merges the two maxima into one, which it does not vectorise.
     best = jnp.maximum(jnp.max(nearest, axis=0), -2.0)
     farthest = jnp.max(best)
-    column = _first_equal(best, farthest)
-    row = _first_equal(jax.lax.dynamic_index_in_dim(nearest, column, 1, keepdims=False), farthest)
+    column = first_true(best == farthest)
+    row = first_true(jax.lax.dynamic_index_in_dim(nearest, column, 1, keepdims=False) == farthest)
+    # Where a distance is NaN, none is equal.
     return nearest, jnp.minimum(column * rows + row, grids.points.shape[0] - 1), farthest
-
-
-def _first_equal(values: Float[Array, " n"], value: Float[Array, ""]) -> Int[Array, ""]:
-    """The smallest index at which `values` equals `value`, or the last index if it never does."""
-    index = jnp.arange(values.shape[0], dtype=jnp.int32)
-    return jnp.min(jnp.where(values == value, index, index[-1]))
 
 
 class _Chosen(NamedTuple):
@@ -93,7 +89,7 @@ class _Chosen(NamedTuple):
         return cls(jnp.zeros(k, jnp.int32), jnp.int32(1), farthest, farthest[0])
 
 
-def _choose_all(points: Float[Array, "points 3"], begun: _Chosen, count: int, until: int) -> _Chosen:
+def _choose_all(points: Float[Array, "points 3"], begun: _Chosen, count: int | Int[Array, ""], until: int) -> _Chosen:
     """Chooses points until there are `until`; `count` are chosen already."""
     grids = _Grids.of(points)
 
@@ -103,8 +99,9 @@ def _choose_all(points: Float[Array, "points 3"], begun: _Chosen, count: int, un
         return indices.at[i].set(last), last, nearest, distance
 
     begin = (begun.indices, begun.indices[count - 1], _grid(begun.nearest, -1.0), begun.distance)
-    # Four steps in an iteration of the loop take a tenth less time.
-    indices, _, nearest, distance = jax.lax.fori_loop(count, until, step, begin, unroll=4)
+    # Four steps in an iteration of the loop take a tenth less time; their number must be known then.
+    unroll = 4 if isinstance(count, int) else None
+    indices, _, nearest, distance = jax.lax.fori_loop(count, until, step, begin, unroll=unroll)
     return _Chosen(indices, jnp.int32(until), _flat(nearest, points.shape[0]), distance)
 
 
@@ -154,7 +151,7 @@ def sample_large(points: Float[Array, "points 3"], k: int) -> Int[Array, " {k}"]
         distance = part.chosen.distance
         least = safety * distance * doubling ** -math.log2(share)
         part = _continued(points, _narrowed(part, least, int(room * points.shape[0])), count, until)
-        if share == 0.25:  # now there are twice as many
+        if until == counts[1]:  # the number of points has doubled
             doubling = part.chosen.distance / distance
 
     def rest() -> Array:
@@ -167,7 +164,7 @@ def sample_large(points: Float[Array, "points 3"], k: int) -> Int[Array, " {k}"]
 
         begin = (jnp.int32(counts[0] - 1), whole.nearest)
         nearest = jax.lax.while_loop(lambda carry: carry[0] < chosen.number - 1, catch_up, begin)[1]
-        return _choose(points, chosen._replace(nearest=nearest), k)
+        return _choose_all(points, chosen._replace(nearest=nearest), chosen.number, k).indices
 
     return jax.lax.cond(part.well, lambda: part.chosen.indices, rest)
 
@@ -192,19 +189,6 @@ def _continued(points: Float[Array, "points 3"], part: _Part, count: int, until:
     indices = jnp.where(new, part.kept[found.indices], indices)
     number = jnp.where(well, until, part.chosen.number)
     return part._replace(chosen=found._replace(indices=indices, number=number), well=well)
-
-
-def _choose(points: Float[Array, "points 3"], begun: _Chosen, until: int) -> Int[Array, " k"]:
-    """The indices of `until` points, of which some are chosen already."""
-    grids = _Grids.of(points)
-
-    def step(carry: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
-        indices, count, nearest = carry
-        nearest, last, _ = _next(grids, nearest, indices[count - 1])
-        return indices.at[count].set(last), count + 1, nearest
-
-    begin = (begun.indices, begun.number, _grid(begun.nearest, -1.0))
-    return jax.lax.while_loop(lambda carry: carry[1] < until, step, begin)[0]
 
 
 def _compacted(wanted: Bool[Array, " points"], most: int) -> tuple[Int[Array, " {most}"], Int[Array, ""]]:

@@ -166,10 +166,13 @@ def test_training_goes_on_from_other_weights(trained, data, tmp_path):
         fit(once, data, statistics, tmp_path)
 
 
-def test_the_progress_shown_is_of_steps_that_have_ended():
-    lead = Lead(steps=2)
-    assert [lead.limit(jnp.float32(step)) for step in range(5)] == [0, 0, 1, 1, 1]
+def test_the_progress_shown_is_of_steps_that_have_ended(monkeypatch):
+    lead, results, ended = Lead(steps=2), [jnp.int32(step) for step in range(5)], []
+    monkeypatch.setattr(type(results[0]), "block_until_ready", lambda step: ended.append(int(step)))
+    assert [lead.limit(step) for step in results] == [0, 0, 1, 1, 1]
+    assert ended == [0, 1, 2]
     assert [lead.end(), lead.end()] == [2, 0]
+    assert ended == [0, 1, 2, 3, 4]
 
 
 def test_all_views_are_counted_by_the_end(data, tmp_path, monkeypatch):
