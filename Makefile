@@ -29,7 +29,7 @@ lint: $(READY)
 bench: export GLIBC_TUNABLES = glibc.malloc.hugetlb=1  # large pages, as `mevs` asks for them; peers have them, too
 bench: $(READY)  ## what is fast, beside its peers, in one run
 	$(BIN)/python benchmarks/points.py
-	$(BIN)/python benchmarks/images.py
+	$(BIN)/python benchmarks/images.py --layers
 	$(BIN)/python benchmarks/capture.py
 	$(BIN)/python benchmarks/evaluation.py
 	$(BIN)/python benchmarks/members.py
