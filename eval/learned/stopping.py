@@ -19,7 +19,7 @@ from flax import nnx
 from jaxtyping import Array, Bool, Float, Int
 
 from data_pipeline.dataset.batches import fold_of
-from eval.learned.walks import Contender, Known, Learner, OnLattice, beliefs_of, policy_parameters, walk_all, walker
+from eval.learned.walks import Known, Learner, OnLattice, beliefs_of, policy_parameters, walk_all, walker
 from eval.numbers.comparison import intervals
 from eval.numbers.confidence import logits_along, stops_at
 from eval.walks.grid import THRESHOLDS
@@ -197,7 +197,7 @@ def moving(
 ) -> list[dict[str, Any]]:
     """Accuracy and distance travelled (radians) after each number of views, by movement cost, from every n-th start view."""
     policy_of = _costing(nnx.graphdef(learner.network))
-    contender = Contender("with_cost", "", "learned", policy_of, every=every)
+    contender = replace(walker(learner), name="with_cost", policy_of=policy_of, every=every)
     directions, rows = test.features.directions, []
     distances = np.asarray(graph_of(directions[0]).distances)
     for cost in MOVEMENT_COSTS:

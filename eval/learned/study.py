@@ -260,7 +260,7 @@ def study(
                 own,
                 data.table(contender.believes),
                 data.features.directions,
-                knowledge if name == EXPECTED_VIEWS or not isinstance(knowledge, UnknownPose) else None,
+                knowledge,
                 contender.max_views or max_views,
                 data.neighbours,
             )

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cache, partial
-from typing import Any
+from typing import Any, Literal
 
 import jax
 import jax.numpy as jnp
@@ -59,6 +59,9 @@ class OnLattice:
         return ViewTable(data.logits, predicted_entropy, entropy, data.labels, features=features, clouds=data.clouds)
 
 
+Used = Literal["predicted_entropy", "entropy", "clouds", "knowledge"]
+
+
 @dataclass(frozen=True)
 class Contender:
     """A policy in the study.
@@ -72,6 +75,7 @@ class Contender:
         draws: walks from each start view.
         max_views: length of its walks; 0 for that of the study.
         every: it walks from every n-th start view.
+        uses: what it is given besides the views seen, and the truth. Programs are shared by data sets that differ in the rest.
     """
 
     name: str
@@ -82,6 +86,7 @@ class Contender:
     draws: int = 1
     max_views: int = 0
     every: int = 1
+    uses: tuple[Used, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -120,18 +125,20 @@ def _policy_of_truth(by: str) -> Callable[[Any], Policy]:
     return partial(_oracle, by=by)
 
 
-def _by_name(name: str, title: str, knows: str, believes: bool = True) -> Contender:
-    return Contender(name, title, knows, _policy_named(name), believes)
+def _by_name(name: str, title: str, knows: str, *uses: Used) -> Contender:
+    """A registered policy that does not use the belief."""
+    return Contender(name, title, knows, _policy_named(name), believes=False, uses=uses)
 
 
 def random_walker(draws: int) -> Contender:
-    return replace(_by_name("random", "random", "nothing", believes=False), draws=draws)
+    return replace(_by_name("random", "random", "nothing"), draws=draws)
 
 
 def walker(learner: Learner) -> Contender:
     """The contender of a learner; its parameters are those of `policy_parameters`."""
     policy_of = _policy_learned(nnx.graphdef(learner.network), learner.by)
-    return Contender(learner.name, learner.title, "learned", policy_of)
+    uses: tuple[Used, ...] = ("clouds", "knowledge") if learner.by in ("table", "ahead") else ("clouds",)
+    return Contender(learner.name, learner.title, "learned", policy_of, uses=uses)
 
 
 def policy_parameters(learner: Learner, fusion: CalibratedFusion) -> tuple[nnx.State, Array]:
@@ -208,7 +215,12 @@ def walk_all(
     """
     graph = ViewGraph.from_points(np.asarray(directions[0], np.float64), neighbours)
     keys = jax.vmap(jax.random.fold_in, (None, 0))(key, jnp.arange(len(tables.label)))
-    rest = contender, parameters, fusion, graph, knowledge, max_views
+    optional: tuple[Used, ...] = "predicted_entropy", "entropy", "clouds"
+    unused: dict[str, Any] = {name: None for name in optional if name not in contender.uses}
+    tables = replace(tables, **unused)
+    knowledge = knowledge if "knowledge" in contender.uses else None
+    unnamed = replace(contender, name="", title="", knows="", max_views=0, uses=())  # what a program depends on
+    rest = unnamed, parameters, fusion, graph, knowledge, max_views
     most = _most_at_once(contender)
     if isinstance(knowledge, UnknownPose):  # each walk scores every view under every hypothesis
         most = min(most, max(1, _SCORES_AT_ONCE // knowledge.hypotheses // len(graph.points)))
@@ -240,7 +252,8 @@ def _by_expected_views(_: Any) -> Policy:
 
 def by_expected_views() -> Contender:
     """Information gain by what the recogniser is expected to say; over class and pose if the pose of objects is unknown."""
-    return Contender(EXPECTED_VIEWS, "information gain by expected views", "others", _by_expected_views)
+    title = "information gain by expected views"
+    return Contender(EXPECTED_VIEWS, title, "others", _by_expected_views, uses=("knowledge",))
 
 
 def contenders(
@@ -263,16 +276,16 @@ def contenders(
         shared: whether all objects have the same candidate views in a known pose; only then is there a fixed order of views.
         expected: whether it is known what the recogniser is expected to say of each class, from every direction.
     """
-    found = [random_walker(draws), _by_name("farthest", "farthest from those seen", "nothing", believes=False)]
+    found = [random_walker(draws), _by_name("farthest", "farthest from those seen", "nothing")]
     if entropies:
-        found.append(_by_name("predicted_entropy", "PointNet++ entropy (thesis)", "networks", believes=False))
+        found.append(_by_name("predicted_entropy", "PointNet++ entropy (thesis)", "networks", "predicted_entropy"))
     if shared:
-        found.append(_by_name("fixed_order", "best fixed order", "others", believes=False))
+        found.append(_by_name("fixed_order", "best fixed order", "others", "knowledge"))
     if expected:
         found.append(by_expected_views())
     found += map(walker, learners)
     if entropies:
-        found.append(_by_name("oracle_entropy", "entropy oracle (thesis)", "truth", believes=False))
+        found.append(_by_name("oracle_entropy", "entropy oracle (thesis)", "truth", "entropy"))
     for by, title in (("belief", "label-free oracle"), ("label", "greedy label oracle")):
         policy_of, name = _policy_of_truth(by), f"{by}_oracle"
         found.append(Contender(name, title, "truth", policy_of, True, 1, oracle_views, oracle_starts))

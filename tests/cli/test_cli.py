@@ -15,8 +15,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from data_pipeline.dataset.statistics import load_statistics
-from eval.learned.page import write_learned_page
 from eval.learned.stage import learn_to_choose
 from eval.settings import TINY
 from eval.stages import ascend_on_objects, report
@@ -98,19 +96,9 @@ def test_learning_writes_a_page_and_is_not_repeated(studied, tmp_path):
         "PointNet++ entropy (thesis)",
         "view policy",
     ]
-    for words in (*said, "label-free oracle", "Classes left out of policy training"):
+    said += ["label-free oracle", "Classes left out of policy training", "Means of 2 seeds", "Any rotation"]
+    for words in (*said, "Information gain by expected views reaches", "Other random seeds"):
         assert html.escape(words) in page
-    found = json.loads((out / "learned" / "metrics.json").read_text())
-    first = found["seeds"][0]
-    more = found | {"seeds": [first, {"lattices": first["lattices"]}]}
-    write_learned_page(more, load_statistics(out / "data"), tmp_path / "more.html")
-    for words in (
-        "Means of 2 seeds",
-        "Any rotation",
-        "Information gain by expected views reaches",
-        "Other random seeds",
-    ):
-        assert words in (tmp_path / "more.html").read_text()
 
 
 @pytest.mark.slow
