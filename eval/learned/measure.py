@@ -34,6 +34,7 @@ from eval.tables import load_view_tables
 from eval.thesis.results import machine
 from mevs_jax.models.expected_views import ExpectedViews
 from mevs_jax.models.view_policy import expected_gain
+from train.choosing.expected import FITTED_AS
 from train.choosing.stages import Aside, Stages, lattice_data
 from train.choosing.variants import VARIANTS
 from train.finite import check_results
@@ -180,6 +181,7 @@ def _walks(
             config.fitting_starts,
             _entropy_tables(stages.out, data, "test") is not None,
             costs and [VIEW_COSTS, MOVEMENT_COSTS],
+            FITTED_AS,
         ],
     }
     return kept_json(path, identity, walk)
@@ -213,7 +215,7 @@ def _novel(stages: Stages) -> dict[str, Any]:
         "made_by": made_by(load_statistics(data), stages.recogniser_folder()),
         "form": _FORM,
         "policy": read_json(stages.policy_folder() / "summary.json")["identity"],
-        "walks": [pairs, stages.config.max_views, stages.config.draws],
+        "walks": [pairs, stages.config.max_views, stages.config.draws, FITTED_AS],
     }
 
     def walk() -> dict[str, Any]:

@@ -18,6 +18,7 @@ from mevs_jax.models.shapes import PoseShape, SetFusionShape, ViewPolicyShape
 from mevs_jax.trained import Description, ImageInput, Network, Parts, TrainedSystem, fit_strangeness
 from mevs_jax.trained.description import FORM
 from mevs_jax.trained.system import EXPECTED_VIEWS, UNPOSED
+from train.choosing.expected import FITTED_AS
 from train.choosing.stages import Stages, lattice_data
 from train.kept import made_by
 
@@ -56,7 +57,7 @@ def make_learned_system(stages: Stages, found: dict[str, Any]) -> Path:
     networks = [stages.policy_folder(name) for name in POLICIES]
     made = identity_of(
         made_by(stages.statistics, stages.recogniser_folder()),
-        [(network / "summary.json").read_text() for network in networks],
+        [FITTED_AS, *((network / "summary.json").read_text() for network in networks)],
         figures,
     )
     if not agreed(stored_system(folder, made)):
@@ -101,7 +102,7 @@ def learned_system(stages: Stages, found: dict[str, Any], figures: dict[str, Any
         encoder=resnet_shape(config.recogniser.network, 4),
         best=EXPECTED_VIEWS,
         best_unposed=EXPECTED_VIEWS if finds_pose else "learned_unposed",
-        chosen_by="validation objects of another study: as good as its other policies, for any candidates",
+        chosen_by="validation objects of another study, on candidates that all objects share",
         data=data_of(stages.statistics),
         made_by=made,
         made_with=versions_of(*MADE_WITH),

@@ -65,9 +65,10 @@ def _expected_decrease(
         probability: of the hypotheses.
     """
     # The softmax of belief + M is ∝ exp(belief) · exp(M). So its entropy, log Σ w − Σ w log w / Σ w for weights w, needs no
-    # exponential for each walk, only products with the same matrices for all walks. The limit keeps Σ w above zero.
-    shifted = jnp.maximum(expected - jnp.max(expected, axis=-1, keepdims=True), -80.0)
-    weights, belief = jnp.exp(shifted), belief - jnp.max(belief)
+    # exponential for each walk, only products with the same matrices for all walks. The limits keep Σ w above zero, and classes
+    # of no probability (−∞) out of the sums.
+    shifted, belief = (jnp.maximum(of - jnp.max(of, axis=-1, keepdims=True), -80.0) for of in (expected, belief))
+    weights = jnp.exp(shifted)
     likelihood = jnp.exp(belief)
     total = weights @ likelihood
     after = jnp.log(total) - (weights @ (likelihood * belief) + (weights * shifted) @ likelihood) / total

@@ -19,6 +19,8 @@ from mevs_jax.trained.strangeness import LEVELS, Strangeness
 
 DESCRIPTION, WEIGHTS = "trained.json", "weights.safetensors"
 """Names of the files that describe them and that hold them."""
+_MOST_DEGREE = 16
+"""Of expected views; the time to load them grows with its square."""
 
 
 def arrays_of(parts: Parts) -> dict[str, Any]:
@@ -124,8 +126,9 @@ def parts_of(description: Description, arrays: dict[str, np.ndarray]) -> Parts:
         entropy = take.network("entropy", lambda rngs: of_entropy.network(views, rngs))
     if "expected" in arrays:
         expected = ExpectedViews(take.take("expected", (classes, None, classes)))
-        if (expected.degree + 1) ** 2 != expected.coefficients.shape[1]:
-            raise ValueError(f"expected in {WEIGHTS} has {expected.coefficients.shape[1]} terms, not a square")
+        terms = expected.coefficients.shape[1]
+        if (expected.degree + 1) ** 2 != terms or expected.degree > _MOST_DEGREE:
+            raise ValueError(f"expected in {WEIGHTS} has {terms} terms, not the square of 1 to {_MOST_DEGREE + 1}")
     elif pose is not None or "expected_views" in (description.best, description.best_unposed):
         raise ValueError(f"{WEIGHTS} lacks expected")
     if pose is None and description.best_unposed == "expected_views":

@@ -79,15 +79,19 @@ def scores(policy: str, seen: list[int], table: dict, graph: dict, knowledge: di
         return maxima_first(entropy, seen, neighbours)
     if policy == "lowest_entropy":
         return -entropy
-    if policy == "information_gain":
-        probability, gain = softmax(belief), np.zeros(views)
+    if policy in ("information_gain", "expected_views"):
+        probability, gain = (
+            softmax(belief) if policy == "information_gain" else np.sqrt(softmax(belief)),
+            np.zeros(views),
+        )
+        probability /= probability.sum()
         for view in range(views):
             expected = sum(
                 p * entropy_of(belief + knowledge["expected_logits"][y, view]) for y, p in enumerate(probability)
             )
             gain[view] = entropy_of(belief) - expected
         return gain
-    if policy == "expected_views":
+    if policy == "expected_views_by_pose":
         probability, gain = np.sqrt(softmax(belief)), np.zeros(views)
         probability /= probability.sum()
         for view in range(views):

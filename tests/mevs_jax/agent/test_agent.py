@@ -282,6 +282,26 @@ def test_the_yaw_may_be_unknown(recogniser, classifier):
     assert agent.decide().index == int(np.argmin(classifier.viewpoints @ classifier.viewpoints[0]))  # farthest
 
 
+def test_beliefs_do_not_depend_on_an_unknown_yaw(recogniser):
+    """Nor on that which is told, if the object is turned by it; what is told of a turned object that is not true matters."""
+    views = [views_of(recogniser)[index] for index in (0, 3, 5)]
+
+    def beliefs(yaw: float, told: float | None) -> np.ndarray:
+        agent, rotation, found = Agent(recogniser, stop=2, max_views=4), rotation_to_world((0, 0, 1), yaw), []
+        agent.reset(center=CENTER, radius=RADIUS, yaw=told)
+        for depth, pose in views:
+            placed = np.eye(4)
+            placed[:3, :3], placed[:3, 3] = rotation @ pose[:3, :3], CENTER + RADIUS * rotation @ pose[:3, 3]
+            metres = np.where(depth > 0, RADIUS * depth, np.inf).astype(np.float32)
+            found.append(agent.observe(metres, K, placed).probabilities)
+        return np.stack(found)
+
+    for yaw in (0.7, -2.5):
+        np.testing.assert_allclose(beliefs(yaw, None), beliefs(0.0, None), atol=1e-5)
+        np.testing.assert_allclose(beliefs(yaw, yaw), beliefs(0.0, 0.0), atol=1e-5)
+        assert np.abs(beliefs(yaw, 0.0) - beliefs(0.0, 0.0)).max() > 1e-3
+
+
 def test_strange_objects_are_unknown(classifier):
     views = views_of(classifier)
     agent = Agent(classifier, stop=2, max_views=2, unknown=0.9)

@@ -203,6 +203,32 @@ def test_weights_of_another_form_are_refused(written, tmp_path):
         load(copy)
 
 
+def test_expected_views_that_cannot_be_used_are_refused(tmp_path):
+    from safetensors.numpy import load_file
+    from safetensors.numpy import save as as_bytes
+
+    folder = tmp_path / "system"
+    save(making.system("recogniser"), folder)
+    arrays = load_file(folder / WEIGHTS)
+    classes = arrays["expected"].shape[0]
+    for terms in (5, 18**2):
+        changed = np.zeros((classes, terms, classes), np.float32)
+        copy = shutil.copytree(folder, tmp_path / str(terms))
+        restamped(copy, as_bytes(arrays | {"expected": changed}))
+        with pytest.raises(UnreadableSystem, match=f"expected in {WEIGHTS} has {terms} terms"):
+            load(copy)
+    copy = shutil.copytree(folder, tmp_path / "none")
+    restamped(copy, as_bytes({name: array for name, array in arrays.items() if name != "expected"}))
+    with pytest.raises(UnreadableSystem, match="lacks expected"):
+        load(copy)
+
+    def poseless(content):
+        content.update(pose=None, best_unposed="expected_views")
+
+    with pytest.raises(UnreadableSystem, match="without a pose, expected views cannot be used for an unknown yaw"):
+        load(damaged(folder, tmp_path, poseless))
+
+
 @pytest.mark.parametrize(
     "change",
     [
