@@ -80,10 +80,7 @@ def scores(policy: str, seen: list[int], table: dict, graph: dict, knowledge: di
     if policy == "lowest_entropy":
         return -entropy
     if policy in ("information_gain", "expected_views"):
-        probability, gain = (
-            softmax(belief) if policy == "information_gain" else np.sqrt(softmax(belief)),
-            np.zeros(views),
-        )
+        probability, gain = softmax(belief) ** (1.0 if policy == "information_gain" else 0.5), np.zeros(views)
         probability /= probability.sum()
         for view in range(views):
             expected = sum(

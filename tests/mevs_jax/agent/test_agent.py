@@ -49,6 +49,13 @@ def table_of(system, views) -> ViewTable:
 CENTER, RADIUS = np.array([0.5, -0.2, 0.8]), 0.3
 
 
+def in_metres(depth, pose, rotation):
+    """A depth image and its camera, around an object that is turned by the rotation, away from the origin."""
+    placed = np.eye(4)
+    placed[:3, :3], placed[:3, 3] = rotation @ pose[:3, :3], CENTER + RADIUS * rotation @ pose[:3, 3]
+    return np.where(depth > 0, RADIUS * depth, np.inf).astype(np.float32), K, placed
+
+
 def walk(agent, views, first, **reset):
     """Views and probabilities of a walk in metres, around an object away from the origin."""
     reset = {"yaw": 0.0} | reset
@@ -56,11 +63,7 @@ def walk(agent, views, first, **reset):
     rotation = rotation_to_world(reset.get("up", (0, 0, 1)), reset["yaw"] or 0.0)
     seen, found, index = [], [], first
     while True:
-        depth, pose = views[index]
-        placed = np.eye(4)
-        placed[:3, :3], placed[:3, 3] = rotation @ pose[:3, :3], CENTER + RADIUS * rotation @ pose[:3, 3]
-        metres = np.where(depth > 0, RADIUS * depth, np.inf).astype(np.float32)
-        found.append(agent.observe(metres, K, placed).probabilities)
+        found.append(agent.observe(*in_metres(*views[index], rotation)).probabilities)
         seen.append(index)
         step = agent.decide()
         if step.done:
@@ -283,18 +286,13 @@ def test_the_yaw_may_be_unknown(recogniser, classifier):
 
 
 def test_beliefs_do_not_depend_on_an_unknown_yaw(recogniser):
-    """Nor on that which is told, if the object is turned by it; what is told of a turned object that is not true matters."""
+    """If the yaw is known, beliefs are those of the object that is not turned. A wrong yaw changes them."""
     views = [views_of(recogniser)[index] for index in (0, 3, 5)]
 
     def beliefs(yaw: float, told: float | None) -> np.ndarray:
-        agent, rotation, found = Agent(recogniser, stop=2, max_views=4), rotation_to_world((0, 0, 1), yaw), []
+        agent, rotation = Agent(recogniser, stop=2, max_views=4), rotation_to_world((0, 0, 1), yaw)
         agent.reset(center=CENTER, radius=RADIUS, yaw=told)
-        for depth, pose in views:
-            placed = np.eye(4)
-            placed[:3, :3], placed[:3, 3] = rotation @ pose[:3, :3], CENTER + RADIUS * rotation @ pose[:3, 3]
-            metres = np.where(depth > 0, RADIUS * depth, np.inf).astype(np.float32)
-            found.append(agent.observe(metres, K, placed).probabilities)
-        return np.stack(found)
+        return np.stack([agent.observe(*in_metres(*view, rotation)).probabilities for view in views])
 
     for yaw in (0.7, -2.5):
         np.testing.assert_allclose(beliefs(yaw, None), beliefs(0.0, None), atol=1e-5)
