@@ -202,9 +202,7 @@ def moving(
     distances = np.asarray(graph_of(directions[0]).distances)
     for cost in MOVEMENT_COSTS:
         given = policy_parameters(learner, fusion), jnp.float32(cost)
-        views = walk_all(
-            key, contender, given, fusion, test.table(True), directions, knowledge, max_views, test.neighbours
-        )
+        views = walk_all(key, contender, given, fusion, test.table(), directions, knowledge, max_views, test.neighbours)
         steps = distances[views[:, :, :-1], views[:, :, 1:]]
         travelled = np.concatenate([np.zeros_like(steps[..., :1]), np.cumsum(steps, axis=-1)], axis=-1)
         right = (
@@ -249,7 +247,7 @@ def walks_apart(
     for part, learner in enumerate(apart):
         own = np.flatnonzero(part_of == part)
         some, given = features.some(own), policy_parameters(learner, fusion)
-        table, contender = OnLattice(some).table(True), replace(walker(learner), every=every)
+        table, contender = OnLattice(some).table(), replace(walker(learner), every=every)
         views[own] = walk_all(key, contender, given, fusion, table, some.directions, knowledge, steps, graph)
         beliefs[own] = beliefs_of(fusion, some, views[own])
         gains[own] = best_gains(learner, fusion, some, views[own], beliefs[own])

@@ -258,7 +258,7 @@ def study(
                 replace(contender, every=every),
                 parameters.get(name),
                 own,
-                data.table(contender.believes),
+                data.table(),
                 data.features.directions,
                 knowledge,
                 contender.max_views or max_views,
@@ -318,7 +318,7 @@ def novel_classes(
             walkers.append((by_expected_views(), None, expected))
             walkers.append((replace(by_expected_views(), name=WITHOUT), None, some_unknown))
         for contender, given, knowledge in walkers:
-            table, key = OnLattice(some).table(contender.believes), jax.random.key(seed)
+            table, key = OnLattice(some).table(), jax.random.key(seed)
             views = walk_all(key, contender, given, fusion, table, some.directions, knowledge, max_views, neighbours)
             right = beliefs_of(fusion, some, views).argmax(axis=-1) == np.asarray(some.labels)[:, None, None]
             after[contender.name].append(right.mean(axis=1).T)

@@ -50,13 +50,14 @@ class OnLattice:
     entropy: np.ndarray | None = None
     neighbours: list[list[int]] | None = None
 
-    def table(self, with_features: bool) -> ViewTable:
+    def table(self) -> ViewTable:
         predicted_entropy, entropy = (
             None if known is None else jnp.asarray(known) for known in (self.predicted_entropy, self.entropy)
         )
         data = self.features
-        features = data.features if with_features else None
-        return ViewTable(data.logits, predicted_entropy, entropy, data.labels, features=features, clouds=data.clouds)
+        return ViewTable(
+            data.logits, predicted_entropy, entropy, data.labels, features=data.features, clouds=data.clouds
+        )
 
 
 Used = Literal["predicted_entropy", "entropy", "clouds", "knowledge"]
@@ -217,7 +218,7 @@ def walk_all(
     keys = jax.vmap(jax.random.fold_in, (None, 0))(key, jnp.arange(len(tables.label)))
     optional: tuple[Used, ...] = "predicted_entropy", "entropy", "clouds"
     unused: dict[str, Any] = {name: None for name in optional if name not in contender.uses}
-    tables = replace(tables, **unused)
+    tables = replace(tables, features=tables.features if contender.believes else None, **unused)
     knowledge = knowledge if "knowledge" in contender.uses else None
     unnamed = replace(contender, name="", title="", knows="", max_views=0, uses=())  # what a program depends on
     rest = unnamed, parameters, fusion, graph, knowledge, max_views
