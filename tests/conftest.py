@@ -184,7 +184,15 @@ def browser() -> Iterator[Any]:
     # WebGL without a graphics card, and the same pixels whenever the same is drawn.
     drawing = ["--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--disable-accelerated-2d-canvas"]
     with playwright.sync_playwright() as started:
-        opened = started.chromium.launch(executable_path=program, args=["--no-sandbox", *drawing])
+        for attempt in range(3):  # a start that says nothing for a minute was seen once, and never again
+            try:
+                opened = started.chromium.launch(
+                    executable_path=program, args=["--no-sandbox", *drawing], timeout=60_000
+                )
+                break
+            except playwright.TimeoutError:
+                if attempt == 2:
+                    raise
         yield opened
         opened.close()
 
