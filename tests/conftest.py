@@ -96,10 +96,16 @@ def fully_compiled() -> Iterator[None]:
 
 
 def made_once(factory: pytest.TempPathFactory, name: str, make: Callable[[Path], None]) -> Path:
-    """A folder that the first worker to need it makes, for all workers of this test session. It must not be written to."""
+    """A folder that the first worker to need it makes, for all workers of this test session. It must not be written to.
+
+    With `MEVS_TEST_MADE=DIRECTORY` several sessions that test the same code share it, as in CI.
+    """
     shared = factory.getbasetemp()
     if "PYTEST_XDIST_WORKER" in os.environ:
         shared = shared.parent  # each worker has a folder of its own in it
+    if given := os.environ.get("MEVS_TEST_MADE"):
+        shared = Path(given) / f"jax-{version('jax')}"
+        shared.mkdir(parents=True, exist_ok=True)
     folder, done = shared / f"shared_{name}", shared / f"shared_{name}.done"
     with (shared / f"shared_{name}.lock").open("w") as lock:
         fcntl.flock(lock, fcntl.LOCK_EX)
