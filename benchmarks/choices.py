@@ -154,7 +154,7 @@ def tables(found: dict[str, Any]) -> str:
 def novel_table(path: Path) -> str:
     """Gains over random views on classes that a policy was trained without; `path` is a stored `walks_novel.json`."""
     found = read_json(path)
-    steps = [step for step in _SHOWN[1:] if step < len(found["gain"]["trained_with"]["difference"])]
+    steps = [step for step in _SHOWN[1:] if step < len(next(iter(found["gain"].values()))["difference"])]
     rows = [
         [title, *(_difference(gain["difference"][step], gain["interval"][step]) for step in steps)]
         for name, title in NOVEL.items()

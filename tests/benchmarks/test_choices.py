@@ -36,7 +36,7 @@ def test_what_is_kept_says_what_the_walks_said(tmp_path, monkeypatch, random):
     )
     monkeypatch.setattr(choices, "RESULTS", tmp_path)
     gain = {"difference": [0.0, 0.015, 0.01], "interval": [[0.0, 0.0], [0.008, 0.022], [-0.001, 0.02]]}
-    novel = {"objects": OBJECTS, "pairs": [{}], "gain": {"trained_with": gain, "expected_views_without": gain}}
+    novel = {"objects": OBJECTS, "pairs": [{}], "gain": {"expected_views_without": gain}}
     (folder / "walks_novel.json").write_text(json.dumps(novel))
     choices.main(choices.Options(tmp_path / "run", "others"))
 
