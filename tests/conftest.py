@@ -11,6 +11,8 @@ import subprocess
 import sys
 import tempfile
 from collections.abc import Callable, Iterator
+from contextlib import suppress
+from functools import partial
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -190,17 +192,20 @@ def browser() -> Iterator[Any]:
     # WebGL without a graphics card, and the same pixels whenever the same is drawn.
     drawing = ["--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--disable-accelerated-2d-canvas"]
     with playwright.sync_playwright() as started:
-        for attempt in range(3):  # a start that says nothing for a minute was seen once, and never again
-            try:
-                opened = started.chromium.launch(
-                    executable_path=program, args=["--no-sandbox", *drawing], timeout=60_000
-                )
-                break
-            except playwright.TimeoutError:
-                if attempt == 2:
-                    raise
+        launch = partial(
+            started.chromium.launch, executable_path=program, args=["--no-sandbox", *drawing], timeout=60_000
+        )
+        opened = _at_the_third_try(launch, playwright.TimeoutError)
         yield opened
         opened.close()
+
+
+def _at_the_third_try(start: Callable[[], Any], late: type[Exception]) -> Any:
+    """What `start` returns, which may be late twice: once, Chromium said nothing until it was given up."""
+    for _ in range(2):
+        with suppress(late):
+            return start()
+    return start()
 
 
 @pytest.fixture
