@@ -30,7 +30,7 @@ from data_pipeline.dataset.builder import open_split
 from data_pipeline.files import write_text
 from eval.numbers.comparison import intervals
 from eval.settings import PRESETS
-from mevs_jax.beliefs import CalibratedFusion
+from mevs_jax.beliefs.fusing import CalibratedFusion
 from mevs_jax.markdown import markdown_table
 from train.choosing.calibrated import beliefs_of_sets
 from train.choosing.features import Features, sets_of_size

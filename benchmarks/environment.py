@@ -110,7 +110,7 @@ def vector(count: int) -> Iterator[Measured]:
         import ap_gym
         import gymnasium
 
-        from mevs_jax.gymnasium import ActiveRecognitionVectorEnv
+        from mevs_jax.environment.gymnasium import ActiveRecognitionVectorEnv
     except ImportError as error:
         print(f"left out: {error}", file=sys.stderr)
         return

@@ -34,16 +34,16 @@ from data_pipeline.files import write_json
 from eval.settings import SMALL, TINY, Settings
 from eval.stages import tasks
 from mevs_jax import fibonacci_sphere
-from mevs_jax.beliefs import CalibratedFusion
+from mevs_jax.beliefs.fusing import CalibratedFusion
 from mevs_jax.models.set_fusion import SetFusion
 from train.choosing import averaged
 from train.choosing.features import Features
 from train.choosing.policy import Lesson, train_policies
-from train.devices import device_mesh
 from train.loop import fit, steps_of_an_epoch
 from train.many.members import SweepTask, member_of
 from train.many.trainers import TRAINERS, AtOnce, Trainer, Way
 from train.many.training import train_members
+from train.running.devices import device_mesh
 from train.tasks.recogniser import RecogniserTask
 
 SEEDS, OBJECTS, STEPS = 4, 12, 8

@@ -33,7 +33,7 @@ from mevs_jax import bootstrap_interval, maxima_first
 from mevs_jax.markdown import markdown_table
 from mevs_jax.models.batch_norm import BatchNorm
 from train.loop import load_best
-from train.outputs import network_outputs
+from train.results.outputs import network_outputs
 
 RESULTS = Path(__file__).parent / "results" / "precision.md"
 

@@ -32,7 +32,7 @@ from data_pipeline.distributed import join_processes
 from data_pipeline.files import write_json
 from eval.settings import SMALL, THESIS
 from eval.stages import tasks
-from train.devices import device_mesh, parameter_sharding, place, place_batch
+from train.running.devices import device_mesh, parameter_sharding, place, place_batch
 from train.step import Task, initial_state, train_step_of
 
 PRESETS = {"small": SMALL, "thesis": THESIS}

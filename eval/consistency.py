@@ -12,8 +12,8 @@ from data_pipeline.errors import DataError
 from data_pipeline.files import as_read
 from eval.run_file import NAME, plain
 from eval.settings import Settings
-from train.kept import config_of
 from train.own_code import named
+from train.results.kept import config_of
 
 
 def check_made_with(settings: Settings, out: Path) -> None:

@@ -22,11 +22,11 @@ from eval.numbers.policies import EvaluationInputs
 from eval.numbers.trainings import csv_over_trainings, rows_over_trainings, walks_of_all
 from eval.run_file import save_run
 from eval.settings import Settings
-from train.chance import warn_of_chance
-from train.devices import device_mesh
-from train.kept import keep_beside, kept_json, made_by
 from train.many.seeds import check_networks, train_seeds
 from train.optimiser import OptimiserConfig
+from train.results.chance import warn_of_chance
+from train.results.kept import keep_beside, kept_json, made_by
+from train.running.devices import device_mesh
 from train.weights.starting import StartingWeights
 
 LARGEST = 1000

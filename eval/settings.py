@@ -22,7 +22,7 @@ from train.optimiser import OptimiserConfig
 from train.tasks.classifier import ClassifierConfig, ResNetConfig
 from train.tasks.entropy import EntropyConfig, PointNet2Config
 from train.tasks.recogniser import RecogniserConfig
-from train.thesis_networks import ThesisConfig
+from train.tasks.thesis_networks import ThesisConfig
 
 
 @dataclass(frozen=True)

@@ -41,13 +41,13 @@ from eval.walks.live import Agreement, Networks, compare_with_tables
 from eval.walks.own_policies import OwnPolicy, load_policies, own_rungs
 from mevs_jax.policies.registry import policy_named
 from mevs_jax.trained import load as load_system
-from train.chance import warn_of_chance
-from train.devices import Layout, check_batch, device_mesh
-from train.finite import place_not_finite
-from train.kept import keep_beside, kept, kept_json, made_by, summary_of
-from train.log import read_history
 from train.loop import check_launch, fit, load_best
-from train.plan import plan_of, planned_statistics
+from train.planning.plan import plan_of, planned_statistics
+from train.results.chance import warn_of_chance
+from train.results.finite import place_not_finite
+from train.results.kept import keep_beside, kept, kept_json, made_by, summary_of
+from train.running.devices import Layout, check_batch, device_mesh
+from train.running.log import read_history
 from train.step import Task
 from train.tasks.classifier import ClassifierTask
 from train.tasks.entropy import EntropyTask

@@ -18,9 +18,9 @@ from eval import stages
 from eval.report.sweep import write_sweep_report
 from eval.settings import Settings
 from train.choosing.stages import Stages
-from train.kept import config_of
 from train.many.members import Member, SweepTask
 from train.many.sweep import sweep
+from train.results.kept import config_of
 
 
 def train_sweep(settings: Settings, out: Path, mesh: jax.sharding.Mesh | None = None) -> tuple[Path, list[Member]]:

@@ -28,8 +28,9 @@ from eval.tables import ViewTables
 from eval.walks.grid import run_grid
 from eval.walks.knowledge import learn
 from eval.walks.ladder import ladder
-from mevs_jax.beliefs import running_sum
-from mevs_jax.calibration import fit_temperature
+from mevs_jax.beliefs.calibration import fit_temperature
+from mevs_jax.beliefs.fusing import running_sum
+from mevs_jax.geometry.viewpoints import ViewGraph
 from mevs_jax.models.shapes import PointNet2Shape, ResNetShape
 from mevs_jax.policies.base import Knowledge
 from mevs_jax.trained import (
@@ -46,7 +47,6 @@ from mevs_jax.trained import (
     verify,
 )
 from mevs_jax.trained.description import FORM
-from mevs_jax.viewpoints import ViewGraph
 from train.tasks.classifier import ClassifierTask, ResNetConfig
 from train.tasks.entropy import EntropyTask
 

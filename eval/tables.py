@@ -13,8 +13,8 @@ from data_pipeline.dataset.builder import open_split
 from data_pipeline.dataset.statistics import DatasetStatistics
 from data_pipeline.errors import Diverged
 from data_pipeline.files import write_npz
-from mevs_jax.selection import ViewTable
-from train.outputs import network_outputs
+from mevs_jax.selection.loop import ViewTable
+from train.results.outputs import network_outputs
 from train.tasks.classifier import ClassifierTask
 from train.tasks.entropy import EntropyTask
 

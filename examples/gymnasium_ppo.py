@@ -31,10 +31,10 @@ from eval.numbers.comparison import intervals
 from eval.tables import load_view_tables
 from eval.walks.knowledge import learn
 from mevs_jax import POLICIES, ActiveRecognition, EnvironmentObservation, ViewGraph, ViewTable
-from mevs_jax.calibration import fit_exponent
+from mevs_jax.beliefs.calibration import fit_exponent
+from mevs_jax.beliefs.metrics import is_right
 from mevs_jax.markdown import markdown_table
-from mevs_jax.metrics import is_right
-from mevs_jax.selection import best_view
+from mevs_jax.selection.loop import best_view
 
 
 @dataclass(frozen=True)

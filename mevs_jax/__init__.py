@@ -6,6 +6,7 @@ Everything takes *one* object, cloud or view; put `jax.vmap` on for many. No fil
 from __future__ import annotations
 
 from importlib import import_module
+from importlib.util import find_spec
 from typing import Any
 
 __version__ = "0.2.0"
@@ -16,17 +17,18 @@ _MODULES = {
         "Belief",
         "History",
         "Step",
+        "Walk",
         "load_history",
         "look",
         "replay",
     ),
-    "beliefs": (
+    "beliefs.fusing": (
         "CalibratedFusion",
         "confidence",
         "discounted",
         "mean_of_probabilities",
     ),
-    "calibration": (
+    "beliefs.calibration": (
         "calibration_error_by_chance",
         "expected_calibration_error",
         "fit_exponent",
@@ -34,7 +36,7 @@ _MODULES = {
         "negative_log_likelihood",
         "reliability",
     ),
-    "cameras": (
+    "geometry.cameras": (
         "Camera",
         "ViewCamera",
         "cameras_at",
@@ -44,28 +46,28 @@ _MODULES = {
         "pixel_directions",
         "unproject",
     ),
-    "canonical": (
+    "geometry.canonical": (
         "CanonicalView",
         "canonical_view",
     ),
-    "compiled": ("keep_compiled",),
-    "decisions": (
+    "deploy.compiled": ("keep_compiled",),
+    "selection.decisions": (
         "Decision",
         "NextView",
     ),
-    "entropy": (
+    "beliefs.entropy": (
         "depth_entropy",
         "depth_levels",
         "level_entropy",
         "quantise_depth",
         "shannon_entropy",
     ),
-    "environment": (
+    "environment.pure": (
         "ActiveRecognition",
         "EnvironmentObservation",
         "EnvironmentState",
     ),
-    "metrics": (
+    "beliefs.metrics": (
         "accuracy",
         "bootstrap_interval",
         "bootstrap_means",
@@ -102,7 +104,7 @@ _MODULES = {
     "policies.learned": ("learned",),
     "policies.oracles": ("fused_oracle",),
     "policies.registry": ("POLICIES", "policy_named", "register_policy"),
-    "selection": (
+    "selection.loop": (
         "sum_of_logits",
         "Episode",
         "ViewTable",
@@ -110,14 +112,14 @@ _MODULES = {
         "select_from_table",
         "select_views",
     ),
-    "sphere": ("estimate_sphere",),
+    "geometry.sphere": ("estimate_sphere",),
     "trained": (
         "TrainedSystem",
         "UnreadableSystem",
         "from_pretrained",
         "load",
     ),
-    "viewpoints": (
+    "geometry.viewpoints": (
         "ViewGraph",
         "fibonacci_sphere",
         "local_maxima",
@@ -128,16 +130,19 @@ _MODULES = {
     ),
 }
 """The public names, by the module that defines them. A module is imported when one of its names is first used (PEP 562), so that
-importing the package takes a moment and needs no JAX."""
+importing the package takes a moment and needs no JAX. Modules and folders of the package are reached the same way."""
 _HOMES = {name: module for module, names in _MODULES.items() for name in names}
 
 __all__ = sorted(_HOMES)
 
 
 def __getattr__(name: str) -> Any:
-    if name not in _HOMES:
+    if name in _HOMES:
+        value = getattr(import_module(f"mevs_jax.{_HOMES[name]}"), name)
+    elif not name.startswith("_") and find_spec(f"mevs_jax.{name}"):
+        value = import_module(f"mevs_jax.{name}")
+    else:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    value = getattr(import_module(f"mevs_jax.{_HOMES[name]}"), name)
     globals()[name] = value
     return value
 

@@ -32,13 +32,22 @@ from data_pipeline.distributed import is_first
 from data_pipeline.errors import DataError, Diverged
 from data_pipeline.files import as_read, check_of_file, keep_checks, keep_json
 from data_pipeline.progress import console, progress_bar
-from train.checkpoints import Checkpoints, drop_damaged
-from train.devices import DATA, Layout, check_batch, device_mesh, parameter_sharding, place, place_batch, summed_over
-from train.finite import all_finite, not_finite
-from train.kept import check_config, config_of, content_of, finished, goes_on_with
-from train.log import MetricsLog
 from train.optimiser import learning_rate
-from train.preemption import Preempted, Preemption
+from train.results.finite import all_finite, not_finite
+from train.results.kept import check_config, config_of, content_of, finished, goes_on_with
+from train.running.checkpoints import Checkpoints, drop_damaged
+from train.running.devices import (
+    DATA,
+    Layout,
+    check_batch,
+    device_mesh,
+    parameter_sharding,
+    place,
+    place_batch,
+    summed_over,
+)
+from train.running.log import MetricsLog
+from train.running.preemption import Preempted, Preemption
 from train.step import Task, TrainState, abstract_state, evaluate_step_of, initial_state, train_step_of
 from train.validation import ValidationSet
 from train.weights.starting import StartingWeights

@@ -5,7 +5,7 @@ libX11, libgomp). If they are missing, trimesh's Embree binding is used. Both us
 so holes and flipped triangles of CAD models do no harm.
 
 A capture stores for each view the depth as 16-bit integers in units of 1/10,000 (the thesis's format) and a shaded image. The
-partial cloud of a view is not stored: it is the depth unprojected with the pose (`mevs_jax.cameras.unproject`). The thesis's
+partial cloud of a view is not stored: it is the depth unprojected with the pose (`mevs_jax.unproject`). The thesis's
 method, an Open3D window, is in `data_pipeline.capture.visualizer`. Capture workers import this module, so it must not import
 JAX, which would slow their start; only `rig_for`, which workers do not call, needs it.
 """
@@ -27,7 +27,7 @@ from data_pipeline.objects.mesh import Mesh
 from data_pipeline.objects.open3d_parts import load_open3d
 
 DEPTH_SCALE = 10_000
-"""Stored depth units per metric unit. Equal to `mevs_jax.entropy.DEPTH_SCALE`, which would import JAX; a test compares them."""
+"""Stored depth units per metric unit. Equal to that of `mevs_jax.beliefs.entropy`, which imports JAX; a test compares them."""
 
 AMBIENT = 0.25
 """Grey level, in [0, 1], of a surface seen edge-on."""
@@ -159,7 +159,7 @@ def rig_for(config: CaptureConfig) -> Rig:
     import jax
 
     from data_pipeline.capture.viewpoints import viewpoints_of  # which needs this module
-    from mevs_jax.cameras import cameras_at, pixel_directions
+    from mevs_jax.geometry.cameras import cameras_at, pixel_directions
 
     cameras = cameras_at(
         viewpoints_of(config).points.astype(np.float32),

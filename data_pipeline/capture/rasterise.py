@@ -13,7 +13,7 @@ import numpy as np
 
 from data_pipeline.capture.casting import AMBIENT, DEPTH_SCALE, Capture, Rig, face_normals
 from data_pipeline.objects.mesh import Mesh
-from mevs_jax.cameras import Camera, pixel_directions
+from mevs_jax.geometry.cameras import Camera, pixel_directions
 from mevs_jax.rendering import pad_triangles, render_depth
 
 _VIEWS_PER_BATCH = 8  # on an accelerator; bounds memory to 150 MB for 100,000 faces at 224×224

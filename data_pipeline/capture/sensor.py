@@ -22,8 +22,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from mevs_jax.arrays import AnyArray
-from mevs_jax.cameras import ViewCamera, partial_cloud, pixel_directions
-from mevs_jax.inputs import depth_and_normals
+from mevs_jax.geometry.cameras import ViewCamera, partial_cloud, pixel_directions
+from mevs_jax.geometry.inputs import depth_and_normals
 
 Kind = Literal["none", "structured-light", "stereo"]
 

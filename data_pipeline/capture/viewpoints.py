@@ -180,7 +180,7 @@ def viewpoints_of(config: CaptureConfig) -> OwnViewpoints:
         ValueError: if its lattice does not exist, or not with this number of viewpoints.
     """
     if not is_file(config.lattice):
-        from mevs_jax.viewpoints import viewpoint_lattice  # which imports JAX
+        from mevs_jax.geometry.viewpoints import viewpoint_lattice  # which imports JAX
 
         return OwnViewpoints(viewpoint_lattice(config.views, config.lattice))
     path = Path(config.lattice.removeprefix(FILE)).expanduser()

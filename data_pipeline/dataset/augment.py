@@ -15,7 +15,7 @@ from jax.scipy.spatial.transform import Rotation
 from jaxtyping import Array, Float, Int
 
 from data_pipeline.capture.casting import CaptureConfig
-from mevs_jax.cameras import Camera, look_at_origin, pixel_directions
+from mevs_jax.geometry.cameras import Camera, look_at_origin, pixel_directions
 
 
 @dataclass(frozen=True)

@@ -52,7 +52,7 @@ from data_pipeline.files import check_of_file, keep_checks, keep_json
 from data_pipeline.objects.changes import changes_between
 from data_pipeline.objects.mesh import SOURCE_SPLITS, ObjectEntry, ObjectSource
 from data_pipeline.progress import console, progress_bar
-from mevs_jax.entropy import level_entropy
+from mevs_jax.beliefs.entropy import level_entropy
 
 
 def split_objects(entries: Sequence[ObjectEntry], validation_share: float, seed: int) -> dict[str, list[ObjectEntry]]:

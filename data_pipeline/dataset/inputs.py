@@ -1,4 +1,4 @@
-"""Conversion of stored views into network inputs: `mevs_jax.inputs`, applied to stored depth."""
+"""Conversion of stored views into network inputs: `mevs_jax.geometry.inputs`, applied to stored depth."""
 
 from __future__ import annotations
 
@@ -8,9 +8,9 @@ import numpy as np
 from jaxtyping import Array, Float, Int, Integer
 
 from data_pipeline.capture.casting import CaptureConfig
-from mevs_jax import inputs
-from mevs_jax.cameras import ViewCamera
-from mevs_jax.entropy import DEPTH_STEP
+from mevs_jax.beliefs.entropy import DEPTH_STEP
+from mevs_jax.geometry import inputs
+from mevs_jax.geometry.cameras import ViewCamera
 
 
 def metric_depth(stored: jax.Array | np.ndarray) -> jax.Array:
@@ -28,7 +28,7 @@ def image_input(
 ) -> Float[Array, "height width channels"]:
     """Returns one stored view as an image in [0, 1], background 0, repeated over the channels.
 
-    Depth is converted by `mevs_jax.inputs.depth_image`. A shaded image is divided by 255.
+    Depth is converted by `mevs_jax.geometry.inputs.depth_image`. A shaded image is divided by 255.
 
     Args:
         view: stored depth or shaded image.
@@ -40,7 +40,7 @@ def image_input(
 
 
 def depth_and_normals(view: Integer[Array, "height width"], camera: CaptureConfig) -> Float[Array, "height width 4"]:
-    """Returns depth and normals of one stored view, as `mevs_jax.inputs.depth_and_normals`."""
+    """Returns depth and normals of one stored view, as `mevs_jax.geometry.inputs.depth_and_normals`."""
     return inputs.depth_and_normals(metric_depth(view), view_camera(camera))
 
 
@@ -52,13 +52,13 @@ def cloud_input(
     frame: str,
     directions: bool = False,
 ) -> Float[Array, "points 3"] | Float[Array, "points 6"]:
-    """Returns the points at the sampled pixels of one stored view, as `mevs_jax.inputs.view_cloud`.
+    """Returns the points at the sampled pixels of one stored view, as `mevs_jax.geometry.inputs.view_cloud`.
 
     Args:
         pixels: flat pixel indices.
         pixel_depth: stored depth at these pixels.
         pose: camera to world.
-        frame: `world` or `camera`, as in `mevs_jax.cameras.unproject`.
+        frame: `world` or `camera`, as in `mevs_jax.geometry.cameras.unproject`.
         directions: append to each point the unit vector towards the camera.
     """
     return inputs.view_cloud(pixels, metric_depth(pixel_depth), pose, view_camera(camera), frame, directions)

@@ -19,8 +19,8 @@ from data_pipeline.capture.sensor import Kind, SensorConfig, sense
 from data_pipeline.dataset.inputs import metric_depth
 from data_pipeline.errors import DataError
 from mevs_jax.arrays import AnyArray
-from mevs_jax.cameras import ViewCamera, look_at_origin, partial_cloud, pixel_directions
-from mevs_jax.source_view import MARGIN
+from mevs_jax.geometry.cameras import ViewCamera, look_at_origin, partial_cloud, pixel_directions
+from mevs_jax.geometry.source_view import MARGIN
 
 
 @dataclass(frozen=True)

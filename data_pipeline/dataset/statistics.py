@@ -14,7 +14,7 @@ from data_pipeline.capture.casting import CaptureConfig
 from data_pipeline.errors import DataError, Diverged
 from data_pipeline.files import digest_of, read_json
 from data_pipeline.progress import console
-from mevs_jax.viewpoints import ViewGraph
+from mevs_jax.geometry.viewpoints import ViewGraph
 
 SPLITS = ("train", "val", "test")
 SUMMARY = "summary.json"

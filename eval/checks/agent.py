@@ -30,7 +30,7 @@ from eval.numbers.comparison import intervals
 from eval.numbers.confidence import stopping as by_risk
 from eval.tables import ViewTables
 from mevs_jax.agent import Agent
-from mevs_jax.selection import ViewTable, select_from_table
+from mevs_jax.selection.loop import ViewTable, select_from_table
 from mevs_jax.trained import TrainedSystem
 
 STOPS = (0.9, 0.95, 0.99)

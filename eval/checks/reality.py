@@ -24,7 +24,7 @@ from eval.checks.walks import BASELINE, Observer, Walker, Walks
 from eval.numbers.comparison import intervals
 from eval.numbers.confidence import stopping
 from mevs_jax.agent.core import can_run
-from mevs_jax.selection import ViewTable
+from mevs_jax.selection.loop import ViewTable
 from mevs_jax.trained import TrainedSystem
 
 VIEWS = (1, 2, 4)

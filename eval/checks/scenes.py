@@ -21,7 +21,7 @@ from data_pipeline.files import digest_of
 from data_pipeline.objects.mesh import Mesh
 from eval.numbers.study import reachable_views
 from mevs_jax import canonical_view
-from mevs_jax.cameras import ViewCamera, cameras_at, pixel_directions
+from mevs_jax.geometry.cameras import ViewCamera, cameras_at, pixel_directions
 
 RADIUS = 0.5
 """Metres in a radius of an object: furniture seen from two radii is one metre away."""

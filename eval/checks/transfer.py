@@ -26,8 +26,8 @@ from eval.numbers.comparison import intervals
 from eval.numbers.confidence import stopping
 from eval.system import USABLE
 from mevs_jax.agent.core import can_run
-from mevs_jax.cameras import pixel_directions
-from mevs_jax.selection import ViewTable
+from mevs_jax.geometry.cameras import pixel_directions
+from mevs_jax.selection.loop import ViewTable
 from mevs_jax.trained import TrainedSystem
 
 VIEWS = (1, 2, 3, 4, 8)

@@ -13,9 +13,9 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from eval.numbers.comparison import intervals
-from mevs_jax.beliefs import running_sum
+from mevs_jax.beliefs.fusing import running_sum
 from mevs_jax.policies.base import Observation
-from mevs_jax.selection import ViewTable, select_from_table
+from mevs_jax.selection.loop import ViewTable, select_from_table
 from mevs_jax.trained import TrainedSystem
 from mevs_jax.trained.parts import Parts
 

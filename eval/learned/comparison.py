@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from eval.numbers.comparison import interval_of_both, intervals
-from mevs_jax.metrics import bootstrap_means
+from mevs_jax.beliefs.metrics import bootstrap_means
 
 BASELINES = ("random", "farthest", "fixed_order")
 """The policies with which learned policies are compared."""

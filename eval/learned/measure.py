@@ -37,8 +37,8 @@ from mevs_jax.models.view_policy import expected_gain
 from train.choosing.expected import FITTED_AS
 from train.choosing.stages import Aside, Stages, lattice_data
 from train.choosing.variants import VARIANTS
-from train.finite import check_results
-from train.kept import kept_json, made_by
+from train.results.finite import check_results
+from train.results.kept import kept_json, made_by
 
 _FORM = 10
 """Version of the stored walks; another version makes them stale."""

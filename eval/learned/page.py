@@ -24,7 +24,7 @@ from eval.report.html import (
     warning,
 )
 from mevs_jax.trained.system import EXPECTED_VIEWS
-from train.chance import Chance
+from train.results.chance import Chance
 
 
 def _ablations(metrics: dict[str, Any]) -> str:

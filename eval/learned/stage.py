@@ -14,7 +14,7 @@ from eval.learned.system import make_learned_system
 from eval.settings import Settings
 from train.choosing.config import check_learned
 from train.choosing.stages import Stages, train_recognisers, trained_policies
-from train.finite import check_results
+from train.results.finite import check_results
 
 
 def learn_to_choose(settings: Settings, out: Path) -> Path:

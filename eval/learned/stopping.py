@@ -24,8 +24,8 @@ from eval.numbers.comparison import intervals
 from eval.numbers.confidence import logits_along, stops_at
 from eval.walks.grid import THRESHOLDS
 from mevs_jax.arrays import AnyArray
-from mevs_jax.beliefs import CalibratedFusion, running_sum
-from mevs_jax.calibration import class_weights
+from mevs_jax.beliefs.calibration import class_weights
+from mevs_jax.beliefs.fusing import CalibratedFusion, running_sum
 from mevs_jax.models.view_policy import expected_gain
 from mevs_jax.policies.base import Policy, with_movement
 from train.choosing.chunks import in_chunks

@@ -35,14 +35,14 @@ from eval.learned.walks import (
 from eval.numbers.comparison import intervals
 from eval.numbers.confidence import stopping
 from mevs_jax.arrays import AnyArray
-from mevs_jax.beliefs import CalibratedFusion
-from mevs_jax.calibration import (
+from mevs_jax.beliefs.calibration import (
     calibration_error_by_chance,
     class_weights,
     expected_calibration_error,
     fit_temperature,
     log_likelihood,
 )
+from mevs_jax.beliefs.fusing import CalibratedFusion
 from mevs_jax.models import ViewPolicy
 from mevs_jax.models.expected_views import ExpectedViews
 from mevs_jax.policies.base import Knowledge

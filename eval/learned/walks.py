@@ -15,16 +15,16 @@ from jaxtyping import Array, Float, Int
 
 from eval.learned.poses import UnknownPose
 from mevs_jax.arrays import AnyArray
-from mevs_jax.beliefs import CalibratedFusion
+from mevs_jax.beliefs.fusing import CalibratedFusion
+from mevs_jax.geometry.viewpoints import ViewGraph
 from mevs_jax.models import ViewPolicy
 from mevs_jax.models.expected_views import ExpectedViews
 from mevs_jax.policies.base import Knowledge, Policy
 from mevs_jax.policies.informed import expected_views
 from mevs_jax.policies.oracles import fused_oracle
 from mevs_jax.policies.registry import POLICIES
-from mevs_jax.selection import ViewTable, by_attention, select_from_table, sum_of_logits
+from mevs_jax.selection.loop import ViewTable, by_attention, select_from_table, sum_of_logits
 from mevs_jax.trained.system import EXPECTED_VIEWS
-from mevs_jax.viewpoints import ViewGraph
 from train.choosing.chunks import in_chunks
 from train.choosing.features import Features
 from train.choosing.policy import By, learned_policy

@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Float
 
 from eval.walks.grid import Results
-from mevs_jax.metrics import bootstrap_interval, bootstrap_means
+from mevs_jax.beliefs.metrics import bootstrap_interval, bootstrap_means
 
 _KEY = 1
 """Seed of the bootstrap; every cell uses the same resampled objects."""

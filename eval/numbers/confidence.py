@@ -16,14 +16,14 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from eval.numbers.comparison import intervals
-from mevs_jax.beliefs import discounted, mean_of_probabilities, running_sum
-from mevs_jax.calibration import (
+from mevs_jax.beliefs.calibration import (
     expected_calibration_error,
     fit_exponent,
     fit_temperature,
     negative_log_likelihood,
     reliability,
 )
+from mevs_jax.beliefs.fusing import discounted, mean_of_probabilities, running_sum
 
 RISKS = (0.3, 0.2, 0.15, 0.1, 0.05, 0.02)
 READINGS = {

@@ -26,10 +26,10 @@ from eval.tables import ViewTables, load_view_tables
 from eval.walks.grid import FIRST_MV, THRESHOLDS, GridConfig, Results
 from eval.walks.ladder import Rung
 from eval.walks.own_policies import OwnPolicy, own_rungs
+from mevs_jax.geometry.viewpoints import ViewGraph
 from mevs_jax.policies.base import Policy
 from mevs_jax.policies.registry import POLICIES, Knows, PolicyEntry, policy_entry
-from mevs_jax.viewpoints import ViewGraph
-from train.kept import made_by, why
+from train.results.kept import made_by, why
 
 By = Literal["views", "threshold"]
 

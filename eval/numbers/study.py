@@ -21,9 +21,9 @@ from eval.walks.grid import FIRST_MV, THRESHOLDS, GridConfig, Results, run_grid
 from eval.walks.knowledge import learn
 from eval.walks.ladder import SCRAMBLED, Rung, ladder
 from eval.walks.own_policies import OwnPolicy, check_scores, own_rungs
-from mevs_jax.metrics import accuracy, class_accuracy, confusion_matrix
+from mevs_jax.beliefs.metrics import accuracy, class_accuracy, confusion_matrix
+from mevs_jax.geometry.viewpoints import ViewGraph
 from mevs_jax.policies.base import Knowledge
-from mevs_jax.viewpoints import ViewGraph
 
 HEADLINE_CT, HEADLINE_MV = 0.99, 4
 """The cell of the grid used in the thesis's first test and confusion matrices (§5.3)."""

@@ -25,8 +25,8 @@ from data_pipeline.dataset.batches import views_of_example
 from data_pipeline.dataset.builder import open_split
 from data_pipeline.objects.mesh import Mesh
 from eval.rendering.ascent import Method, ascend_on_sphere
+from mevs_jax.geometry.viewpoints import ViewGraph, fibonacci_sphere, local_maxima
 from mevs_jax.policies.base import maxima_first
-from mevs_jax.viewpoints import ViewGraph, fibonacci_sphere, local_maxima
 from train.tasks.classifier import ClassifierTask
 from train.tasks.entropy import EntropyTask
 

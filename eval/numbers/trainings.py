@@ -18,7 +18,7 @@ from eval.numbers.study import BASELINE, Setting, exactly_random
 from eval.walks.grid import Results, run_grid
 from eval.walks.ladder import Rung, ladder
 from eval.walks.own_policies import OwnPolicy, own_rungs
-from mevs_jax.selection import ViewTable
+from mevs_jax.selection.loop import ViewTable
 
 
 def walks_of_all(

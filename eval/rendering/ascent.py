@@ -24,7 +24,8 @@ from data_pipeline.objects.mesh import Mesh, ObjectEntry
 from data_pipeline.objects.reconstruction import decimate, require_open3d, voxelise
 from data_pipeline.objects.sources import load_object
 from eval.projections import longitude_latitude
-from mevs_jax.cameras import Camera, cameras_at
+from mevs_jax.geometry.cameras import Camera, cameras_at
+from mevs_jax.geometry.viewpoints import fibonacci_sphere
 from mevs_jax.rendering import (
     Ascent,
     ascend,
@@ -35,7 +36,6 @@ from mevs_jax.rendering import (
     render_mesh,
     soft_depth_entropy,
 )
-from mevs_jax.viewpoints import fibonacci_sphere
 
 FACES = 500
 """largest number of faces of a mesh after decimation"""

@@ -42,7 +42,7 @@ from eval.rendering.ascent import METHODS, ascend_on_sphere, padded_triangles
 from eval.tables import ViewTables, objects_of
 from eval.walks.grid import GridConfig, run_grid
 from eval.walks.ladder import ASCENT_RUNGS, KNOWS, Rung, ladder
-from mevs_jax.cameras import Camera, partial_cloud
+from mevs_jax.geometry.cameras import Camera, partial_cloud
 from mevs_jax.rendering import corners_of_cells, distinct_optima
 
 COMPARED = ("random", "farthest", "predicted_entropy", "oracle_entropy")

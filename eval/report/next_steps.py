@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from eval.report.html import ReportInputs, commands
-from train.chance import Chance
+from train.results.chance import Chance
 
 RUN = "RUN"
 """Stands for the folder of the run: the page is the same wherever the run is."""

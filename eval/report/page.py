@@ -35,8 +35,8 @@ from eval.report.next_steps import next_section
 from eval.report.policies import ascent_section, draws, ladder_section, lead, movement_section
 from eval.report.scenes import scenes_section
 from eval.report.seeds import seeds_section
-from mevs_jax.viewpoints import local_maxima
-from train.chance import Chance
+from mevs_jax.geometry.viewpoints import local_maxima
+from train.results.chance import Chance
 
 _SPLITS = {"train": "training", "val": "validation", "test": "test", "other": "no split"}
 """Where the source had objects that were left out."""

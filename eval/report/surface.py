@@ -13,8 +13,8 @@ from jaxtyping import Array, Bool, Float, Integer
 
 from data_pipeline.capture.casting import CaptureConfig
 from data_pipeline.dataset.inputs import metric_depth, view_camera
-from mevs_jax.cameras import ViewCamera, partial_cloud
-from mevs_jax.inputs import depth_and_normals
+from mevs_jax.geometry.cameras import ViewCamera, partial_cloud
+from mevs_jax.geometry.inputs import depth_and_normals
 
 MOST_POINTS = 4000
 _FINEST, _COARSER = 0.025, 1.12

@@ -14,12 +14,12 @@ from jaxtyping import Array, Bool, Float, Int
 from eval.tables import ViewTables
 from eval.walks.knowledge import learn
 from eval.walks.own_policies import state_after
-from mevs_jax.beliefs import discounted
+from mevs_jax.beliefs.fusing import discounted
+from mevs_jax.geometry.viewpoints import ViewGraph
 from mevs_jax.policies.base import Knowledge
 from mevs_jax.policies.informed import information_gain
 from mevs_jax.policies.registry import POLICIES
-from mevs_jax.selection import ViewTable, select_from_table
-from mevs_jax.viewpoints import ViewGraph
+from mevs_jax.selection.loop import ViewTable, select_from_table
 
 POLICY = "information_gain"
 """The policy that walks. Its scores are the expected gains."""

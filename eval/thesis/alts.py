@@ -8,8 +8,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from eval.thesis.figures import FigureInputs
-from mevs_jax.viewpoints import local_maxima
-from train.thesis_networks import BACKBONES, FRAMES
+from mevs_jax.geometry.viewpoints import local_maxima
+from train.tasks.thesis_networks import BACKBONES, FRAMES
 
 
 def _extremes(values: Sequence[float] | np.ndarray, names: Sequence[str], form: str = "{:.0f}") -> str:

@@ -18,9 +18,9 @@ from eval.numbers.study import HEADLINE_CT, HEADLINE_MV, exactly_random, headlin
 from eval.tables import ViewTables
 from eval.walks.grid import FIRST_MV, THRESHOLDS, GridConfig, Results, run_grid
 from eval.walks.ladder import SCRAMBLED, Rung, ladder
-from mevs_jax.selection import ViewTable
-from mevs_jax.viewpoints import ViewGraph
-from train.thesis_networks import BACKBONES, FRAMES, PIPELINE, Frame
+from mevs_jax.geometry.viewpoints import ViewGraph
+from mevs_jax.selection.loop import ViewTable
+from train.tasks.thesis_networks import BACKBONES, FRAMES, PIPELINE, Frame
 
 ORACLE_MV = 5
 """The largest limit on views of the thesis's oracle (Table 15)."""

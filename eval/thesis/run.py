@@ -31,14 +31,14 @@ from eval.thesis.figures import FigureInputs
 from eval.thesis.page import write_thesis_report
 from eval.thesis.results import NO_ACCELERATOR, LatticeTables, all_results, machine
 from eval.thesis.seeds import csv_of, folders_of, over_trainings, table_of
-from train.finite import check_results
-from train.kept import keep_beside, kept_array, kept_json, made_by
-from train.log import read_history
 from train.loop import load_best
-from train.outputs import network_outputs
+from train.results.finite import check_results
+from train.results.kept import keep_beside, kept_array, kept_json, made_by
+from train.results.outputs import network_outputs
+from train.running.log import read_history
 from train.tasks.classifier import ClassifierTask
 from train.tasks.entropy import EntropyTask
-from train.thesis_networks import (
+from train.tasks.thesis_networks import (
     BACKBONES,
     FRAMES,
     PIPELINE,

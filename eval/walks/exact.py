@@ -18,7 +18,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from mevs_jax.metrics import is_right
+from mevs_jax.beliefs.metrics import is_right
 
 LARGEST = 12_000
 """Largest number of subsets, over all sizes, to evaluate for an object."""

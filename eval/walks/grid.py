@@ -24,10 +24,10 @@ from jaxtyping import Array, Bool, Float, Int
 from eval.walks.ladder import Rung
 from eval.walks.over_objects import on_all_cores, over_objects
 from mevs_jax.arrays import AnyArray
-from mevs_jax.metrics import is_right
+from mevs_jax.beliefs.metrics import is_right
+from mevs_jax.geometry.viewpoints import ViewGraph
 from mevs_jax.policies.base import Knowledge, with_movement
-from mevs_jax.selection import ViewTable, select_from_table
-from mevs_jax.viewpoints import ViewGraph
+from mevs_jax.selection.loop import ViewTable, select_from_table
 
 THRESHOLDS = (0.5, 0.6, 0.7, 0.8, 0.9, 0.95, 0.99)
 FIRST_MV, LAST_MV = 2, 9

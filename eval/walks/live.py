@@ -25,11 +25,11 @@ from eval.tables import ViewTables
 from eval.walks.ladder import ASCENT_RUNGS, Rung
 from eval.walks.over_objects import over_objects
 from mevs_jax.arrays import AnyArray
+from mevs_jax.geometry.viewpoints import ViewGraph
 from mevs_jax.policies.base import Knowledge, Observation, Policy, Scene
 from mevs_jax.policies.registry import POLICIES
-from mevs_jax.selection import Episode, ViewTable, select_from_table, select_views
-from mevs_jax.viewpoints import ViewGraph
-from train.devices import device_mesh, parameter_sharding, place
+from mevs_jax.selection.loop import Episode, ViewTable, select_from_table, select_views
+from train.running.devices import device_mesh, parameter_sharding, place
 from train.tasks.classifier import ClassifierTask
 from train.tasks.entropy import EntropyTask
 

@@ -19,11 +19,11 @@ from jaxtyping import Array, Bool, Int
 
 from data_pipeline.errors import DataError, kind_and_reason_of
 from eval.walks.ladder import ASCENT_RUNGS, SCRAMBLED, Rung, ladder
-from mevs_jax.beliefs import running_sum
+from mevs_jax.beliefs.fusing import running_sum
+from mevs_jax.geometry.viewpoints import ViewGraph
 from mevs_jax.policies.base import Knowledge, Policy, Scene, SelectionState, candidates
 from mevs_jax.policies.registry import POLICIES, Knows, PolicyEntry, policy_entry
-from mevs_jax.selection import ViewTable
-from mevs_jax.viewpoints import ViewGraph
+from mevs_jax.selection.loop import ViewTable
 from train.own_code import OwnCode, load_own
 
 _CHUNK = 16

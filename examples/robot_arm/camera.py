@@ -12,7 +12,7 @@ from jaxtyping import Array, Float
 
 from data_pipeline.capture.sensor import Kind, SensorConfig, sense
 from examples.robot_arm.scene import FIELD_OF_VIEW, HEIGHT, RADIUS, WIDTH, Scene
-from mevs_jax.cameras import ViewCamera
+from mevs_jax.geometry.cameras import ViewCamera
 
 _FARTHEST = 3.0
 """Metres beyond which the camera sees nothing."""

@@ -21,9 +21,9 @@ from mevs_jax.agent.present import Present, sphere_of
 from mevs_jax.agent.programs import Programs
 from mevs_jax.agent.records import Belief, History, Reason, Step, plain
 from mevs_jax.arrays import AnyArray, AnyVector
-from mevs_jax.inputs import check_depth
+from mevs_jax.geometry.inputs import check_depth
+from mevs_jax.geometry.source_view import check_source
 from mevs_jax.policies.base import Policy
-from mevs_jax.source_view import check_source
 from mevs_jax.trained.system import TrainedSystem
 
 Reachable = AnyArray | Sequence[int] | Callable[[np.ndarray], bool] | None

@@ -7,8 +7,8 @@ import numpy as np
 from jaxtyping import Float
 
 from mevs_jax.agent.core import SAME, Candidates
+from mevs_jax.geometry.viewpoints import great_circle_distances, hull_edges
 from mevs_jax.trained.system import TrainedSystem
-from mevs_jax.viewpoints import great_circle_distances, hull_edges
 
 _NEAREST = 3
 """Number of viewpoints that the values of a direction between them are interpolated from."""

@@ -15,12 +15,12 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
+from mevs_jax.geometry.viewpoints import ViewGraph
 from mevs_jax.policies.base import Knowledge, Observation, Policy, Scene, SelectionState
 from mevs_jax.policies.informed import information_gain
-from mevs_jax.selection import best_view
+from mevs_jax.selection.loop import best_view
 from mevs_jax.trained.parts import Parts
 from mevs_jax.trained.system import TrainedSystem
-from mevs_jax.viewpoints import ViewGraph
 
 REPEATED = 0.02
 """Views whose directions differ by less, in radians, are one view taken again."""

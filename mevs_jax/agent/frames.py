@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from mevs_jax.arrays import AnyArray, AnyVector
-from mevs_jax.source_view import checked_pose, upright
+from mevs_jax.geometry.source_view import checked_pose, upright
 
 
 def rotation_to_world(up: AnyVector, yaw: float) -> Float[np.ndarray, "3 3"]:

@@ -14,9 +14,9 @@ from jaxtyping import Array, Float, Int, Shaped
 from mevs_jax.agent.agent import Agent
 from mevs_jax.agent.frames import points_of
 from mevs_jax.agent.records import Belief, History, Reason
-from mevs_jax.cameras import ViewCamera, look_at_origin
+from mevs_jax.geometry.cameras import ViewCamera, look_at_origin
+from mevs_jax.geometry.sphere import estimate_sphere
 from mevs_jax.rendering.depth import pad_triangles, render_depth
-from mevs_jax.sphere import estimate_sphere
 from mevs_jax.trained.system import TrainedSystem
 
 MOST_FRAMES = 512

@@ -12,8 +12,8 @@ from mevs_jax.agent import core
 from mevs_jax.agent.frames import points_of
 from mevs_jax.agent.programs import Programs
 from mevs_jax.agent.records import Belief, History
-from mevs_jax.canonical import CanonicalView, canonical_view
-from mevs_jax.sphere import estimate_sphere
+from mevs_jax.geometry.canonical import CanonicalView, canonical_view
+from mevs_jax.geometry.sphere import estimate_sphere
 from mevs_jax.trained.system import TrainedSystem
 
 _REACH = 1.3

@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Float
 
 from mevs_jax.agent.records import History
-from mevs_jax.cameras import partial_cloud
+from mevs_jax.geometry.cameras import partial_cloud
 from mevs_jax.trained.system import TrainedSystem
 
 if TYPE_CHECKING:

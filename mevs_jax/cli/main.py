@@ -234,7 +234,7 @@ def _say_and_end(error: Exception) -> None:
         asked = f"JAX_PLATFORMS={platforms} asks for a device" if platforms else "JAX chose a device"
         _fail(f"{asked} that cannot be used here ({reason}); set JAX_PLATFORMS=cpu, or install what the device needs")
     from data_pipeline.distributed import is_lost_process
-    from train.preemption import Preempted
+    from train.running.preemption import Preempted
 
     if isinstance(error, Preempted):
         _fail(f"{error} and saved it; the same command goes on from there", 143)

@@ -9,7 +9,7 @@ from mevs_jax.cli.failure import Unusable
 from mevs_jax.cli.parsing import Invocation
 
 if TYPE_CHECKING:
-    from train.devices import Layout
+    from train.running.devices import Layout
 
 
 def is_asked(options: Any) -> bool:
@@ -51,7 +51,7 @@ def layout_of(options: Any) -> Layout:
     Raises:
         DataError: if they cannot train together.
     """
-    from train.devices import Layout
+    from train.running.devices import Layout
 
     processes = 1 if options.plan_processes is None else options.plan_processes
     if options.distributed and None in (options.plan_devices, options.plan_processes):

@@ -61,7 +61,7 @@ def data(call: Invocation) -> None:
 
 def train(call: Invocation) -> None:
     """The networks."""
-    from train.devices import device_mesh
+    from train.running.devices import device_mesh
     from train.tasks.classifier import starting_weights
 
     classifier = call.settings.classifier

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from mevs_jax.cli.failure import Unusable
-from mevs_jax.compiled import keep_compiled
+from mevs_jax.deploy.compiled import keep_compiled
 
 if TYPE_CHECKING:
     from mevs_jax.agent import Walk

@@ -8,7 +8,7 @@ from flax import nnx
 from jaxtyping import Array, Bool, Float
 
 from mevs_jax.arrays import AnyArray
-from mevs_jax.inputs import SizeInput
+from mevs_jax.geometry.inputs import SizeInput
 from mevs_jax.models.calling import TrainedByCall
 from mevs_jax.models.pose import PoseHead
 from mevs_jax.models.resnet import ResNet

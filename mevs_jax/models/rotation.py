@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from mevs_jax.arrays import AnyArray
-from mevs_jax.cameras import look_at_origin
+from mevs_jax.geometry.cameras import look_at_origin
 
 ROTATIONS = 576
 """Number of rotations that are distinguished; from any rotation the nearest is 14° away on average, and at most about 27°."""

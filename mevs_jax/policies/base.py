@@ -9,7 +9,7 @@ import flax.struct
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from mevs_jax.viewpoints import ViewGraph, local_maxima
+from mevs_jax.geometry.viewpoints import ViewGraph, local_maxima
 
 
 @flax.struct.dataclass

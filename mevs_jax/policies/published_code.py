@@ -6,8 +6,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
+from mevs_jax.geometry.viewpoints import local_maxima
 from mevs_jax.policies.base import Scene, SelectionState, candidates, maxima_first, required
-from mevs_jax.viewpoints import local_maxima
 
 
 def scrambled_entropy(key: Array, state: SelectionState, scene: Scene) -> Float[Array, " views"]:

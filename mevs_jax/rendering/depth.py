@@ -18,7 +18,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int, UInt32
 
 from mevs_jax.arrays import AnyArray
-from mevs_jax.cameras import Camera
+from mevs_jax.geometry.cameras import Camera
 from mevs_jax.points.bits import WORD, bits_until, set_bits
 
 _TILE, _AT_ONCE = 16, 64  # pixels per side of a tile; faces per group

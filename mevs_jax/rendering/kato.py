@@ -16,7 +16,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
 from mevs_jax.arrays import AnyArray
-from mevs_jax.cameras import Camera
+from mevs_jax.geometry.cameras import Camera
 from mevs_jax.rendering.depth import render_depth
 from mevs_jax.rendering.piecewise import limited
 

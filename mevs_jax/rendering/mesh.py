@@ -19,7 +19,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
 from mevs_jax.arrays import AnyArray
-from mevs_jax.cameras import Camera
+from mevs_jax.geometry.cameras import Camera
 from mevs_jax.rendering.piecewise import limited, smaller
 
 _NEAREST = 1e-3  # least depth of a corner of a visible face

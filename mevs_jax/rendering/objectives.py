@@ -13,8 +13,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from mevs_jax.arrays import AnyArray
-from mevs_jax.cameras import Camera
-from mevs_jax.entropy import DEPTH_SCALE, shannon_entropy
+from mevs_jax.beliefs.entropy import DEPTH_SCALE, shannon_entropy
+from mevs_jax.geometry.cameras import Camera
 from mevs_jax.rendering.piecewise import limited
 
 _LEVELS = 256

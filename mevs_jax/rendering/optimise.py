@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import optax
 from jaxtyping import Array, Bool, Float, Int
 
-from mevs_jax.cameras import orbit
+from mevs_jax.geometry.cameras import orbit
 
 Objective = Callable[[Float[Array, "4 4"]], Float[Array, ""]]
 """A function of a camera's pose, to be maximised."""

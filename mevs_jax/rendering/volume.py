@@ -16,7 +16,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from mevs_jax.arrays import AnyArray
-from mevs_jax.cameras import Camera, pixel_directions
+from mevs_jax.geometry.cameras import Camera, pixel_directions
 from mevs_jax.rendering.piecewise import limited
 
 

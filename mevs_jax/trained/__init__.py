@@ -1,9 +1,9 @@
 """Trained systems: one folder that describes itself, and everything that is needed to use it."""
 
+from mevs_jax.beliefs.strangeness import Strangeness, fit_strangeness
 from mevs_jax.trained.description import CloudInput, DataDescription, Description, ImageInput
 from mevs_jax.trained.files import UnreadableSystem, from_pretrained, load, save, verify
 from mevs_jax.trained.parts import Network, Parts
-from mevs_jax.trained.strangeness import Strangeness, fit_strangeness
 from mevs_jax.trained.system import TrainedSystem
 
 __all__ = [

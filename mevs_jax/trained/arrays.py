@@ -10,12 +10,12 @@ import jax.numpy as jnp
 import numpy as np
 from flax import nnx
 
-from mevs_jax.beliefs import CalibratedFusion
+from mevs_jax.beliefs.fusing import CalibratedFusion
+from mevs_jax.beliefs.strangeness import LEVELS, Strangeness
 from mevs_jax.models.expected_views import ExpectedViews
 from mevs_jax.policies.base import Knowledge
 from mevs_jax.trained.description import Description
 from mevs_jax.trained.parts import Network, Parts
-from mevs_jax.trained.strangeness import LEVELS, Strangeness
 
 DESCRIPTION, WEIGHTS = "trained.json", "weights.safetensors"
 """Names of the files that describe them and that hold them."""

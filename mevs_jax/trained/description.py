@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
-from mevs_jax.cameras import ViewCamera
-from mevs_jax.inputs import SizeInput
+from mevs_jax.geometry.cameras import ViewCamera
+from mevs_jax.geometry.inputs import SizeInput
 from mevs_jax.models.shapes import PointNet2Shape, PoseShape, ResNetShape, SetFusionShape, ViewPolicyShape
 
 FORM = 1

@@ -125,7 +125,7 @@ def save(system: TrainedSystem, folder: str | Path, *, half: bool = False, stabl
         system: the system.
         folder: where to; a folder that holds anything but a trained system is refused.
         half: whether networks are stored in float16, which halves the file. They compute in float32 all the same.
-        stablehlo: whether the compiled programs of `mevs_jax.export` are written too.
+        stablehlo: whether the compiled programs of `mevs_jax.deploy.export` are written too.
 
     Raises:
         FileExistsError: for a folder that holds something else.
@@ -150,7 +150,7 @@ def save(system: TrainedSystem, folder: str | Path, *, half: bool = False, stabl
         made.chmod(0o755)
         _write(made / WEIGHTS, weights)
         if stablehlo:
-            from mevs_jax.export import export
+            from mevs_jax.deploy.export import export
 
             export(system, made / PROGRAMS)
         _write(made / CARD, model_card(system.description, len(weights)).encode())

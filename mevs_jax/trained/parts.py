@@ -11,14 +11,14 @@ import numpy as np
 from flax import nnx
 from jaxtyping import Array, Float, Int
 
-from mevs_jax.beliefs import CalibratedFusion
-from mevs_jax.cameras import ViewCamera
-from mevs_jax.inputs import SizeInput, depth_and_normals, depth_image, view_cloud
+from mevs_jax.beliefs.fusing import CalibratedFusion
+from mevs_jax.beliefs.strangeness import Strangeness
+from mevs_jax.geometry.cameras import ViewCamera
+from mevs_jax.geometry.inputs import SizeInput, depth_and_normals, depth_image, view_cloud
 from mevs_jax.models.expected_views import ExpectedViews
 from mevs_jax.models.pose import yaw_evidence
 from mevs_jax.policies.base import Knowledge, Observation
 from mevs_jax.trained.description import CloudInput, ImageInput
-from mevs_jax.trained.strangeness import Strangeness
 
 
 @flax.struct.dataclass

@@ -12,16 +12,16 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from mevs_jax.arrays import AnyArray
-from mevs_jax.cameras import cameras_at
-from mevs_jax.inputs import check_depth
+from mevs_jax.geometry.cameras import cameras_at
+from mevs_jax.geometry.inputs import check_depth
+from mevs_jax.geometry.viewpoints import ViewGraph, great_circle_distances
 from mevs_jax.policies.base import Observation, Policy
 from mevs_jax.policies.informed import expected_views
 from mevs_jax.policies.learned import learned
 from mevs_jax.policies.registry import POLICIES, policy_named
-from mevs_jax.selection import Fuse, by_attention, sum_of_logits
+from mevs_jax.selection.loop import Fuse, by_attention, sum_of_logits
 from mevs_jax.trained.description import Description
 from mevs_jax.trained.parts import Parts, observe
-from mevs_jax.viewpoints import ViewGraph, great_circle_distances
 
 if TYPE_CHECKING:
     from pathlib import Path

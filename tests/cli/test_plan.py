@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 import yaml
 
-import train.plan
+import train.planning.plan
 from mevs_jax.cli.planning import plan_text
 from tests.cli.conftest import refused
 
@@ -25,8 +25,10 @@ MILLION = ("--plan-objects", "1000000")
 def without_costs(monkeypatch):
     """Plans that only count, at once."""
     names = ("weights_bytes", "state_bytes", "gradients_bytes", "inputs_bytes", "activations_bytes")
-    monkeypatch.setattr(train.plan, "memory_of", lambda *_: dict.fromkeys((*names, "view_activations_bytes"), 1))
-    monkeypatch.setattr(train.plan, "flop_of", lambda *_: 1.0)
+    monkeypatch.setattr(
+        train.planning.plan, "memory_of", lambda *_: dict.fromkeys((*names, "view_activations_bytes"), 1)
+    )
+    monkeypatch.setattr(train.planning.plan, "flop_of", lambda *_: 1.0)
 
 
 @pytest.mark.parametrize(

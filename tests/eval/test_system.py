@@ -10,8 +10,8 @@ import pytest
 from eval.checks.agent import stopping
 from eval.system import USABLE, walk_validation
 from eval.tables import ViewTables
+from mevs_jax.geometry.viewpoints import ViewGraph, fibonacci_sphere
 from mevs_jax.trained import Strangeness, fit_strangeness
-from mevs_jax.viewpoints import ViewGraph, fibonacci_sphere
 from tests.mevs_jax.trained import making
 
 VIEWS, CLASSES = making.VIEWS, len(making.CLASSES)

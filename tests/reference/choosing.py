@@ -8,7 +8,7 @@ import numpy as np
 from flax import nnx
 
 from mevs_jax import fibonacci_sphere
-from mevs_jax.beliefs import CalibratedFusion
+from mevs_jax.beliefs.fusing import CalibratedFusion
 from mevs_jax.models import ViewPolicy
 from mevs_jax.models.set_fusion import SetFusion
 from mevs_jax.policies.learned import learned

@@ -30,8 +30,8 @@ from eval.settings import TINY
 from eval.tables import ViewTables
 from eval.walks.grid import Results, read_object
 from eval.walks.ladder import Rung
-from mevs_jax.selection import ViewTable
-from mevs_jax.viewpoints import ViewGraph
+from mevs_jax.geometry.viewpoints import ViewGraph
+from mevs_jax.selection.loop import ViewTable
 
 Network = TypeVar("Network", bound=nnx.Module)
 

@@ -11,8 +11,8 @@ from data_pipeline.dataset.statistics import DatasetStatistics
 from data_pipeline.objects.furniture import CLASSES
 from eval.thesis.results import LatticeTables, all_results, machine
 from eval.walks.grid import GridConfig
-from mevs_jax.viewpoints import fibonacci_sphere
-from train.thesis_networks import BACKBONES, VIEWS
+from mevs_jax.geometry.viewpoints import fibonacci_sphere
+from train.tasks.thesis_networks import BACKBONES, VIEWS
 
 OBJECTS = 10
 

@@ -19,8 +19,8 @@ from data_pipeline.dataset.batches import train_batches
 from data_pipeline.dataset.statistics import load_statistics
 from eval.settings import TINY
 from eval.stages import tasks
-from train.devices import DATA, MODEL, device_mesh, parameter_sharding, place, place_batch
-from train.preemption import Preempted
+from train.running.devices import DATA, MODEL, device_mesh, parameter_sharding, place, place_batch
+from train.running.preemption import Preempted
 from train.step import initial_state, train_step_of
 
 _BRIEF = replace(TINY.classifier.optimiser, epochs=4, learning_rate=1e-4)

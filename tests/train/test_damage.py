@@ -17,10 +17,10 @@ from data_pipeline.errors import DataError
 from data_pipeline.files import CHECKS
 from eval.settings import TINY
 from eval.stages import tasks
-from train.checkpoints import Checkpoints, damage_of
-from train.kept import trained_once
 from train.loop import fit, load_best
 from train.optimiser import OptimiserConfig
+from train.results.kept import trained_once
+from train.running.checkpoints import Checkpoints, damage_of
 
 
 def task_of(statistics):

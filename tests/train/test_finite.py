@@ -20,12 +20,12 @@ from eval.stages import _check_metrics, tasks
 from eval.tables import ViewTables, compute_view_tables
 from tests.reference.choosing import CLASSES, fusion_of, some_features
 from tests.reference.weights import untrained
-from train.chance import Chance, warn_of_chance, wilson_interval
 from train.choosing.averaged import AveragedConfig, Fitting, fit_together
 from train.choosing.calibrated import calibrated
 from train.choosing.policy import PolicyConfig, train_policy
 from train.choosing.q_learning import QLearningConfig, train_by_q_learning
-from train.finite import all_finite, check_outputs, check_results, place_not_finite
+from train.results.chance import Chance, warn_of_chance, wilson_interval
+from train.results.finite import all_finite, check_outputs, check_results, place_not_finite
 
 
 def test_one_number_that_is_not_finite_is_found():

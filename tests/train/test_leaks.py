@@ -17,7 +17,7 @@ from tests.reference.leaks import check_fitted, check_tested
 from train.loop import fit, load_best, steps_of_an_epoch
 from train.many.sweep import SweepConfig, sweep
 from train.optimiser import OptimiserConfig
-from train.outputs import network_outputs
+from train.results.outputs import network_outputs
 from train.tasks.classifier import ClassifierTask
 from train.tasks.recogniser import RecogniserTask
 from train.validation import ValidationSet, class_weights_of

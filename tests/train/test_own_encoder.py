@@ -14,7 +14,7 @@ from data_pipeline.dataset.statistics import load_statistics
 from data_pipeline.errors import DataError
 from eval.settings import TINY
 from train.loop import fit, load_best
-from train.outputs import network_outputs
+from train.results.outputs import network_outputs
 from train.tasks.classifier import ClassifierTask
 
 ENCODER = """

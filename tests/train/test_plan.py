@@ -14,11 +14,11 @@ from data_pipeline.errors import DataError
 from data_pipeline.files import write_json
 from eval.settings import PRESETS, TINY
 from eval.stages import tasks
-from train.costs import bytes_of, flop_of, memory_of, views_like
-from train.devices import Layout, check_batch
 from train.loop import check_launch, check_training, identity_of
 from train.optimiser import OptimiserConfig
-from train.plan import NetworkPlan, bytes_of_a_record, notes_on, planned_statistics
+from train.planning.costs import bytes_of, flop_of, memory_of, views_like
+from train.planning.plan import NetworkPlan, bytes_of_a_record, notes_on, planned_statistics
+from train.running.devices import Layout, check_batch
 from train.step import abstract_state, initial_state, train_step_of
 from train.validation import ValidationSet
 

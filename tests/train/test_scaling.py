@@ -24,8 +24,8 @@ from eval.stages import tasks
 from tests.reference.processes import CPU
 from tests.train.scaling_worker import SETTINGS
 from tests.train.test_training import lines
-from train.devices import Layout, check_batch, device_mesh, parameter_sharding
 from train.loop import fit, load_best
+from train.running.devices import Layout, check_batch, device_mesh, parameter_sharding
 from train.step import Task, initial_state, train_step_of
 
 

@@ -19,10 +19,10 @@ from jax.sharding import PartitionSpec
 from jaxtyping import Array, Float, Int
 
 from data_pipeline.errors import Diverged
-from train.devices import DATA, local_mesh
-from train.finite import all_finite, not_finite
 from train.many.seeds import shared_equally
 from train.many.trainers import way_for
+from train.results.finite import all_finite, not_finite
+from train.running.devices import DATA, local_mesh
 
 Data = TypeVar("Data")
 Validate = Callable[[nnx.State], dict[str, float]]

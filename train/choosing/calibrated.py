@@ -13,12 +13,12 @@ from jaxtyping import Array, Bool, Float
 
 from data_pipeline.errors import Diverged
 from mevs_jax.arrays import AnyArray
-from mevs_jax.beliefs import CalibratedFusion
-from mevs_jax.calibration import class_weights, fit_temperature
+from mevs_jax.beliefs.calibration import class_weights, fit_temperature
+from mevs_jax.beliefs.fusing import CalibratedFusion
 from mevs_jax.models.set_fusion import OfFirstFeatures, SetFusion, SumFusion
 from train.choosing.chunks import in_chunks
 from train.choosing.features import Features, sets_of_size
-from train.finite import check_outputs
+from train.results.finite import check_outputs
 
 _CALIBRATED = (1, 2, 3, 4, 5, 6, 8, 12, 16, 24, 32, 40)
 """Numbers of views for which a temperature is fitted; temperatures between them are interpolated."""

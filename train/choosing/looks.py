@@ -1,6 +1,6 @@
 """What the learned study computes for each view of a batch: features, logits, directions, labels, embeddings.
 
-These are `ask` functions for `train.outputs.network_outputs`.
+These are `ask` functions for `train.results.outputs.network_outputs`.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from jaxtyping import Array, Float
 from data_pipeline.dataset.augment import object_changes, views_after
 from data_pipeline.errors import DataError
 from mevs_jax.models import PointNet2, Recogniser
-from train.outputs import Ask
+from train.results.outputs import Ask
 from train.step import Batch, Task
 from train.tasks.entropy import EntropyTask
 from train.tasks.recogniser import RecogniserTask, views_by_object

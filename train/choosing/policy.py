@@ -22,14 +22,14 @@ from flax import nnx
 from jaxtyping import Array, Bool, Float, Int
 
 from data_pipeline.progress import console
-from mevs_jax.beliefs import CalibratedFusion
-from mevs_jax.calibration import class_weights
+from mevs_jax.beliefs.calibration import class_weights
+from mevs_jax.beliefs.fusing import CalibratedFusion
+from mevs_jax.geometry.viewpoints import ViewGraph
 from mevs_jax.models.view_policy import Utility, ViewPolicy, expected_gain, utility_of
 from mevs_jax.policies.base import Policy
 from mevs_jax.policies.learned import learned, looking_ahead
 from mevs_jax.policies.uninformed import random_view
-from mevs_jax.selection import ViewTable, by_attention, select_from_table
-from mevs_jax.viewpoints import ViewGraph
+from mevs_jax.selection.loop import ViewTable, by_attention, select_from_table
 from train.choosing.averaged import AveragedConfig, Fitting, fit_together, mean_losses
 from train.choosing.chunks import in_chunks
 from train.choosing.features import Features

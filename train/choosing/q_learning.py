@@ -24,7 +24,7 @@ from flax import nnx
 from jaxtyping import Array, Float, Int
 
 from data_pipeline.progress import console
-from mevs_jax.beliefs import CalibratedFusion
+from mevs_jax.beliefs.fusing import CalibratedFusion
 from mevs_jax.models.view_policy import ViewPolicy, utility_of
 from mevs_jax.policies.base import Policy
 from train.choosing.averaged import Fitted, Fitting, fit_together, mean_losses

@@ -26,12 +26,11 @@ from data_pipeline.dataset.batches import fold_of
 from data_pipeline.dataset.builder import DataConfig, open_split, prepare
 from data_pipeline.dataset.statistics import SUMMARY, DatasetStatistics, load_statistics
 from data_pipeline.progress import console
-from mevs_jax.beliefs import CalibratedFusion
+from mevs_jax.beliefs.fusing import CalibratedFusion
 from mevs_jax.models import Recogniser, ViewPolicy
 from mevs_jax.models.expected_views import ExpectedViews
 from mevs_jax.models.pose import PoseHead
 from mevs_jax.models.set_fusion import OfFirstFeatures, SetFusion, SumFusion
-from train.chance import warn_of_chance
 from train.choosing.calibrated import calibrated
 from train.choosing.config import LearnedConfig
 from train.choosing.expected import FITTED_AS, fit_expected_views
@@ -40,11 +39,12 @@ from train.choosing.looks import answers, embed, see, see_changed, see_rotated
 from train.choosing.policy import Lesson, PolicyConfig, Seen, Trained, new_policy, train_policies
 from train.choosing.q_learning import QLearningConfig, train_all_by_q_learning
 from train.choosing.variants import VARIANTS
-from train.finite import check_outputs
-from train.kept import is_stored, kept_array, made_by, trained_once
 from train.loop import fit, load_best
 from train.many.seeds import train_seeds
-from train.outputs import Ask, network_outputs
+from train.results.chance import warn_of_chance
+from train.results.finite import check_outputs
+from train.results.kept import is_stored, kept_array, made_by, trained_once
+from train.results.outputs import Ask, network_outputs
 from train.tasks.entropy import EntropyConfig, EntropyTask
 from train.tasks.recogniser import RecogniserTask
 from train.tasks.size import check_sizes, used_size

@@ -16,10 +16,10 @@ from jax.sharding import Mesh
 from data_pipeline.dataset.statistics import DatasetStatistics
 from data_pipeline.distributed import is_first, wait_for_all
 from data_pipeline.files import check_of_file, keep_checks, keep_json, write_text
-from train.checkpoints import Checkpoints
-from train.devices import parameter_sharding, place
-from train.finite import not_finite
 from train.loop import identity_of
+from train.results.finite import not_finite
+from train.running.checkpoints import Checkpoints
+from train.running.devices import parameter_sharding, place
 from train.step import Task, initial_state
 from train.tasks.classifier import ClassifierTask
 from train.tasks.entropy import EntropyTask

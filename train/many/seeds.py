@@ -15,13 +15,13 @@ from data_pipeline.distributed import agreed, is_first, wait_for_all
 from data_pipeline.errors import DataError, Diverged, Unreadable
 from data_pipeline.files import keep_json, read_json
 from data_pipeline.progress import console
-from train.checkpoints import has_save
-from train.devices import Layout, device_mesh
-from train.kept import check_config, finished
 from train.loop import check_training, fit, identity_of
 from train.many.members import SweepTask, export_member, member_of
 from train.many.trainers import Starts
 from train.many.training import train_members
+from train.results.kept import check_config, finished
+from train.running.checkpoints import has_save
+from train.running.devices import Layout, device_mesh
 
 
 def number_together(networks: int, mesh: Mesh) -> int:

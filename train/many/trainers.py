@@ -15,9 +15,9 @@ import jax.numpy as jnp
 import numpy as np
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
-from train.devices import DATA, on_host, place, place_batch
-from train.finite import all_finite
 from train.many.members import Member, SweepTask, task_of
+from train.results.finite import all_finite
+from train.running.devices import DATA, on_host, place, place_batch
 from train.step import (
     Hyperparameters,
     TrainState,

@@ -18,13 +18,13 @@ from data_pipeline.dataset.batches import train_batches
 from data_pipeline.dataset.statistics import DatasetStatistics
 from data_pipeline.errors import DataError
 from data_pipeline.progress import console, progress_bar
-from train.checkpoints import Checkpoints, drop_damaged
-from train.devices import on_host
 from train.loop import Lead, steps_of_an_epoch, weighted_means
 from train.many.members import Member, SweepTask, Together, task_of
 from train.many.trainers import TRAINERS, Starts, Way, way_for
 from train.optimiser import OptimiserConfig
-from train.preemption import Preempted, Preemption
+from train.running.checkpoints import Checkpoints, drop_damaged
+from train.running.devices import on_host
+from train.running.preemption import Preempted, Preemption
 from train.validation import MOST_KEPT, ValidationSet, WeightedBatch
 
 

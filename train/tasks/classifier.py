@@ -18,7 +18,7 @@ from data_pipeline.dataset.batches import ViewBatches
 from data_pipeline.dataset.inputs import image_input, view_camera
 from data_pipeline.dataset.reality import RealityAugmentation, realistic_views, used_reality
 from data_pipeline.errors import DataError
-from mevs_jax.inputs import depth_image
+from mevs_jax.geometry.inputs import depth_image
 from mevs_jax.models import ResNet
 from train.optimiser import OptimiserConfig
 from train.step import Batch, Hyperparameters, Metrics

@@ -19,8 +19,8 @@ from data_pipeline.dataset.augment import ViewAugmentation, object_changes, obje
 from data_pipeline.dataset.batches import ViewBatches
 from data_pipeline.dataset.inputs import depth_and_normals, view_camera
 from data_pipeline.dataset.reality import RealityAugmentation, realistic_views, used_reality
-from mevs_jax import inputs as inputs_of
-from mevs_jax.inputs import SizeInput
+from mevs_jax.geometry import inputs as inputs_of
+from mevs_jax.geometry.inputs import SizeInput
 from mevs_jax.models import Recogniser, ResNet
 from mevs_jax.models.pose import PoseHead, azimuth_of, azimuth_weights
 from mevs_jax.models.rotation import ROTATIONS, rotation_weights, seen_rotations

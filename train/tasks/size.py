@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from data_pipeline.errors import DataError
-from mevs_jax.inputs import SizeInput
+from mevs_jax.geometry.inputs import SizeInput
 
 
 @dataclass(frozen=True)

@@ -17,7 +17,7 @@ from data_pipeline.capture.sensor import (
     sense,
 )
 from mevs_jax import fibonacci_sphere, look_at_origin
-from mevs_jax.cameras import ViewCamera
+from mevs_jax.geometry.cameras import ViewCamera
 
 CAMERA = ViewCamera(resolution=48)
 KINDS = ("structured-light", "stereo")

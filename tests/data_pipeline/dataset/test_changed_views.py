@@ -16,7 +16,7 @@ from data_pipeline.capture.casting import CaptureConfig, capture, rig_for
 from data_pipeline.dataset.augment import ViewAugmentation, object_changes, views_after
 from data_pipeline.dataset.inputs import depth_and_normals
 from data_pipeline.objects.mesh import Mesh
-from mevs_jax.cameras import Camera, look_at_origin, pixel_directions
+from mevs_jax.geometry.cameras import Camera, look_at_origin, pixel_directions
 
 CAMERA = CaptureConfig(views=6, resolution=48)
 

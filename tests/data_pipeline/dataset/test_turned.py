@@ -12,7 +12,7 @@ from data_pipeline.capture.casting import CaptureConfig, rig_for
 from data_pipeline.dataset.batches import ViewBatches, equally_often, fold_of, train_batches
 from data_pipeline.dataset.builder import open_split
 from data_pipeline.dataset.statistics import load_statistics
-from mevs_jax.cameras import Camera, look_at_origin, pixel_directions
+from mevs_jax.geometry.cameras import Camera, look_at_origin, pixel_directions
 
 CAMERA = CaptureConfig(views=6, resolution=48)
 

@@ -18,7 +18,7 @@ from data_pipeline.objects.recipes import FurniturePiece
 from eval.checks.reality import RealityConfig, check_reality
 from eval.checks.transfer import STRANGER, Objects, check_transfer, strangers
 from eval.checks.walks import BASELINE, Walker, Walks
-from mevs_jax.selection import ViewTable
+from mevs_jax.selection.loop import ViewTable
 from mevs_jax.trained import TrainedSystem
 from tests.mevs_jax.trained import making
 from tests.reference.leaks import check_fitted, check_tested, other_labels, some_walks, without_bootstrap

@@ -16,7 +16,7 @@ from eval.checks import reality
 from eval.checks.camera import cast_canonical
 from eval.checks.reality import RealityConfig, check_reality, conditions_of
 from eval.checks.scenes import CONDITIONS, Condition, Placed, reachable_in, views_in
-from mevs_jax.cameras import ViewCamera, cameras_at, partial_cloud
+from mevs_jax.geometry.cameras import ViewCamera, cameras_at, partial_cloud
 from tests.eval.checks.test_transfer import write_off
 from tests.mevs_jax.trained import making
 

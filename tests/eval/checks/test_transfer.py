@@ -11,7 +11,7 @@ from data_pipeline.errors import DataError
 from data_pipeline.objects.recipes import FurniturePiece
 from data_pipeline.objects.sources import objects_to_test
 from eval.checks.transfer import STRANGER, auroc, check_transfer, matched, strangers
-from mevs_jax.selection import ViewTable
+from mevs_jax.selection.loop import ViewTable
 from tests.mevs_jax.trained import making
 
 

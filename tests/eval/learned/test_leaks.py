@@ -18,7 +18,7 @@ import train.choosing.stages as choosing
 from eval.learned.system import figures_of, learned_system
 from eval.settings import TINY
 from eval.tables import ViewTables, save_view_tables
-from mevs_jax.beliefs import CalibratedFusion
+from mevs_jax.beliefs.fusing import CalibratedFusion
 from mevs_jax.trained import TrainedSystem
 from tests.reference.evaluation import CLASSES
 from tests.reference.leaks import (

@@ -17,7 +17,7 @@ from eval.numbers.trainings import csv_over_trainings, rows_over_trainings, walk
 from eval.tables import ViewTables
 from eval.walks.grid import GridConfig
 from eval.walks.ladder import ladder
-from mevs_jax.viewpoints import ViewGraph, fibonacci_sphere
+from mevs_jax.geometry.viewpoints import ViewGraph, fibonacci_sphere
 
 VIEWS, CLASSES, OBJECTS = 8, 3, 12
 

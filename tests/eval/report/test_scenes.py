@@ -20,7 +20,7 @@ from eval.report.walks import OF_EACH, Walks, walks_of
 from eval.walks.grid import GridConfig
 from eval.walks.ladder import Rung
 from mevs_jax import fibonacci_sphere, look_at_origin
-from mevs_jax.entropy import DEPTH_SCALE
+from mevs_jax.beliefs.entropy import DEPTH_SCALE
 from tests.reference.evaluation import CLASSES, OBJECTS, VIEWS, some_statistics, some_tables
 
 STEPS = 4

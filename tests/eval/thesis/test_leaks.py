@@ -28,8 +28,8 @@ from tests.reference.leaks import (
     without_bootstrap,
 )
 from train.tasks.entropy import EntropyTask
-from train.thesis_networks import FRAMES, PIPELINE, ThesisFolder
-from train.thesis_networks import VIEWS as LATTICES
+from train.tasks.thesis_networks import FRAMES, PIPELINE, ThesisFolder
+from train.tasks.thesis_networks import VIEWS as LATTICES
 
 SETTINGS = replace(TINY, evaluation=GridConfig(max_views=5, draws=1))
 STATISTICS = replace(some_statistics(some_tables()), capture={"resolution": 32, "views": VIEWS})

@@ -11,8 +11,8 @@ import mevs_jax
 from mevs_jax.agent import Agent, load_history, replay
 from mevs_jax.agent.candidates import candidates_of
 from mevs_jax.agent.frames import points_of, pose_towards, rotation_to_world
-from mevs_jax.beliefs import running_sum
-from mevs_jax.selection import ViewTable, by_attention, select_from_table
+from mevs_jax.beliefs.fusing import running_sum
+from mevs_jax.selection.loop import ViewTable, by_attention, select_from_table
 from tests.mevs_jax.trained import making
 
 K = np.array([[16 / np.tan(np.pi / 6), 0, 15.5], [0, 16 / np.tan(np.pi / 6), 15.5], [0, 0, 1]])

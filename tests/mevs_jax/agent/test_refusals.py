@@ -8,7 +8,7 @@ import pytest
 from mevs_jax.agent import Agent
 from mevs_jax.agent.frames import aimed, mask_of, pose_towards
 from mevs_jax.agent.looking import Frames, look_at_frames
-from mevs_jax.inputs import check_depth
+from mevs_jax.geometry.inputs import check_depth
 from tests.mevs_jax.agent.test_agent import CENTER, RADIUS, K, views_of
 from tests.mevs_jax.trained import making
 

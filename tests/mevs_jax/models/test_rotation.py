@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from eval.learned.poses import of_any_rotation, of_unknown_yaw
 from mevs_jax import fibonacci_sphere
-from mevs_jax.cameras import look_at_origin
+from mevs_jax.geometry.cameras import look_at_origin
 from mevs_jax.models.expected_views import ExpectedViews
 from mevs_jax.models.pose import PoseHead, pose_log_probabilities, yaw_evidence
 from mevs_jax.models.rotation import ROTATIONS, nearest_rotations, rotation_grid, rotation_weights, seen_rotations

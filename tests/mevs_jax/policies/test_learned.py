@@ -14,7 +14,7 @@ from mevs_jax.policies.learned import learned, looking_ahead
 from mevs_jax.policies.oracles import fused_oracle
 from mevs_jax.policies.registry import POLICIES
 from mevs_jax.policies.uninformed import random_view
-from mevs_jax.selection import by_attention, select_from_table
+from mevs_jax.selection.loop import by_attention, select_from_table
 from tests.reference.choosing import CLASSES, VIEWS, asked, fused, plain_walk, some_features
 from train.choosing.policy import (
     graph_of,

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import pytest
 
 from mevs_jax import POLICIES, ViewGraph, fibonacci_sphere, select_from_table
-from tests.mevs_jax.test_selection import random_tables, whole_scene
+from tests.mevs_jax.selection.test_selection import random_tables, whole_scene
 
 
 @pytest.mark.parametrize("policy", list(POLICIES))

@@ -6,9 +6,10 @@ import jax.numpy as jnp
 import numpy as np
 from flax import nnx
 
-from mevs_jax.beliefs import CalibratedFusion
-from mevs_jax.cameras import ViewCamera
-from mevs_jax.inputs import SizeInput
+from mevs_jax.beliefs.fusing import CalibratedFusion
+from mevs_jax.geometry.cameras import ViewCamera
+from mevs_jax.geometry.inputs import SizeInput
+from mevs_jax.geometry.viewpoints import ViewGraph, fibonacci_sphere
 from mevs_jax.models import Abstraction
 from mevs_jax.models.expected_views import ExpectedViews
 from mevs_jax.models.shapes import PointNet2Shape, PoseShape, ResNetShape, SetFusionShape, ViewPolicyShape
@@ -24,7 +25,6 @@ from mevs_jax.trained import (
     fit_strangeness,
 )
 from mevs_jax.trained.description import FORM
-from mevs_jax.viewpoints import ViewGraph, fibonacci_sphere
 
 CLASSES = ("bed", "chair", "sofa", "table")
 VIEWS = 12
@@ -119,8 +119,8 @@ def depth_of_ball(
     direction: np.ndarray, side: int = 32, centre=(0.1, -0.2, 0.15), radius: float = 0.6, notch: bool = True
 ) -> np.ndarray:
     """Depth image of a ball in the unit sphere, by the camera of the system, and with a notch so that views differ."""
-    from mevs_jax.cameras import ViewCamera as Camera
-    from mevs_jax.cameras import look_at_origin, pixel_directions
+    from mevs_jax.geometry.cameras import ViewCamera as Camera
+    from mevs_jax.geometry.cameras import look_at_origin, pixel_directions
 
     pose = np.asarray(look_at_origin(jnp.asarray(direction) * 2.0))
     rays = np.asarray(pixel_directions(Camera(side, 60.0, 2.0).at(jnp.asarray(pose))))

@@ -23,15 +23,15 @@ from data_pipeline.dataset.batches import evaluation_batches
 from data_pipeline.dataset.statistics import load_statistics
 from data_pipeline.errors import DataError
 from eval.settings import TINY
+from mevs_jax.geometry.viewpoints import viewpoint_lattice
 from mevs_jax.models import Recogniser
 from mevs_jax.models.rotation import ROTATIONS
-from mevs_jax.viewpoints import viewpoint_lattice
 from train.choosing.config import check_learned
 from train.choosing.looks import quarter_turns, see, see_changed, see_rotated
 from train.choosing.stages import Stages
-from train.devices import Layout, check_batch, device_mesh
-from train.kept import summary_of
 from train.loop import fit, load_best, steps_of_an_epoch
+from train.results.kept import summary_of
+from train.running.devices import Layout, check_batch, device_mesh
 from train.step import part_of
 from train.tasks.recogniser import RecogniserTask
 from train.validation import ValidationSet

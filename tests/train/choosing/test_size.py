@@ -15,11 +15,11 @@ from flax import nnx
 from data_pipeline.dataset.builder import open_split
 from data_pipeline.errors import DataError
 from eval.settings import TINY
-from mevs_jax.cameras import cameras_at
+from mevs_jax.geometry.cameras import cameras_at
+from mevs_jax.geometry.viewpoints import fibonacci_sphere
 from mevs_jax.models import Recogniser
-from mevs_jax.viewpoints import fibonacci_sphere
 from train.choosing.looks import see
-from train.kept import content_of
+from train.results.kept import content_of
 from train.tasks.recogniser import RecogniserTask
 from train.tasks.size import SizeConfig, check_sizes, radii_for_training, used_size
 

@@ -22,13 +22,13 @@ from eval.settings import TINY
 from eval.stages import tasks
 from tests.train.scaling_worker import SETTINGS
 from tests.train.test_training import lines
-from train.devices import device_mesh
-from train.kept import config_of, summary_of
 from train.loop import fit, load_best
 from train.many.members import Member, member_of, task_of
 from train.many.seeds import shared_equally, train_seeds
 from train.many.trainers import TRAINERS
 from train.many.training import _Batches
+from train.results.kept import config_of, summary_of
+from train.running.devices import device_mesh
 from train.tasks.recogniser import RecogniserTask
 
 ROOT = Path(__file__).resolve().parents[3]
@@ -234,7 +234,7 @@ import numpy as np
 from tests.train.many.test_seeds import of_seeds
 from tests.train.scaling_worker import COLLECTIVES
 from data_pipeline.dataset.batches import train_batches
-from train.devices import device_mesh
+from train.running.devices import device_mesh
 from train.many.members import member_of
 from train.many.trainers import AtOnce, way_for
 from pathlib import Path

@@ -26,12 +26,12 @@ from eval.stages import tasks
 from eval.sweeping import adopt, train_sweep
 from tests.train.scaling_worker import SETTINGS
 from train.choosing.stages import Stages
-from train.devices import device_mesh
-from train.kept import summary_of
 from train.loop import fit, load_best, steps_of_an_epoch, validate
 from train.many.members import Member, Together, by_configurations, task_of
 from train.many.sweep import SweepConfig, best_of, draw_members, sweep
-from train.preemption import Preempted
+from train.results.kept import summary_of
+from train.running.devices import device_mesh
+from train.running.preemption import Preempted
 from train.step import TrainState, evaluate_step_of, initial_state
 from train.validation import ValidationSet
 

@@ -1,0 +1,37 @@
+"""Compiled programs are kept in a folder of the user's, for the next process."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+
+from mevs_jax.deploy.compiled import _prune
+
+PROGRAM = """
+import jax, jax.numpy as jnp
+from mevs_jax import keep_compiled
+print(keep_compiled())
+jax.jit(lambda x: jnp.sin(x) @ x)(jnp.ones((7, 7))).block_until_ready()
+"""
+
+
+def test_programs_are_kept_in_the_users_cache(tmp_path):
+    there = {"XDG_CACHE_HOME": str(tmp_path)}
+    given = {name: value for name, value in os.environ.items() if name != "JAX_COMPILATION_CACHE_DIR"} | there
+    ended = subprocess.run([sys.executable, "-c", PROGRAM], capture_output=True, text=True, env=given, timeout=300)
+    assert ended.returncode == 0, ended.stderr
+    folder = tmp_path / "mevs_jax" / "compiled"
+    assert ended.stdout.strip() == str(folder)
+    assert list(folder.iterdir())
+    other = given | {"JAX_COMPILATION_CACHE_DIR": str(tmp_path / "own")}
+    ended = subprocess.run([sys.executable, "-c", PROGRAM], capture_output=True, text=True, env=other, timeout=300)
+    assert ended.stdout.strip() == str(tmp_path / "own")
+
+
+def test_the_oldest_programs_go_first(tmp_path):
+    for age, name in enumerate(("a-cache", "b-cache", "c-cache", "d-cache", "notes.txt")):
+        (tmp_path / name).write_bytes(bytes(100))
+        os.utime(tmp_path / name, (1000 - age, 1000 - age))
+    _prune(tmp_path, 250)
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["a-cache", "b-cache", "notes.txt"]
