@@ -13,7 +13,7 @@ from data_pipeline.files import as_read
 from eval.run_file import NAME, plain
 from eval.settings import Settings
 from train.own_code import named
-from train.results.kept import config_of
+from train.results.identity import config_of
 
 
 def check_made_with(settings: Settings, out: Path) -> None:

@@ -25,7 +25,8 @@ from eval.settings import Settings
 from train.many.seeds import check_networks, train_seeds
 from train.optimiser import OptimiserConfig
 from train.results.chance import warn_of_chance
-from train.results.kept import keep_beside, kept_json, made_by
+from train.results.identity import made_by
+from train.results.kept import keep_beside, kept_json
 from train.running.devices import device_mesh
 from train.weights.starting import StartingWeights
 

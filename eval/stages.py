@@ -45,7 +45,8 @@ from train.loop import check_launch, fit, load_best
 from train.planning.plan import plan_of, planned_statistics
 from train.results.chance import warn_of_chance
 from train.results.finite import place_not_finite
-from train.results.kept import keep_beside, kept, kept_json, made_by, summary_of
+from train.results.identity import made_by, summary_of, why_other
+from train.results.kept import keep_beside, kept, kept_json
 from train.running.devices import Layout, check_batch, device_mesh
 from train.running.log import read_history
 from train.step import Task
@@ -183,10 +184,12 @@ def _tables(
         tables = compute_view_tables(out / "data", split, statistics, classify, networks[0], predict, networks[1])
         return replace(tables, made_by=made)
 
-    def is_current(tables: ViewTables) -> bool:
-        return tables.made_by == made and tables.is_finite
+    def why_stale(tables: ViewTables) -> str | None:
+        if not tables.is_finite:
+            return "it has numbers that are not finite"
+        return why_other({"made_by": tables.made_by}, {"made_by": made})
 
-    return kept(path, load_view_tables, save_view_tables, is_current, compute)
+    return kept(path, load_view_tables, save_view_tables, why_stale, compute)
 
 
 def check_evaluation(config: GridConfig) -> None:

@@ -20,7 +20,7 @@ from eval.settings import Settings
 from train.choosing.stages import Stages
 from train.many.members import Member, SweepTask
 from train.many.sweep import sweep
-from train.results.kept import config_of
+from train.results.identity import config_of
 
 
 def train_sweep(settings: Settings, out: Path, mesh: jax.sharding.Mesh | None = None) -> tuple[Path, list[Member]]:

@@ -12,8 +12,9 @@ import numpy as np
 from data_pipeline.dataset.builder import open_split
 from data_pipeline.dataset.statistics import DatasetStatistics
 from data_pipeline.errors import Diverged
-from data_pipeline.files import write_npz
+from data_pipeline.files import npz_bytes
 from mevs_jax.selection.loop import ViewTable
+from train.results.kept import check_kept, keep
 from train.results.outputs import network_outputs
 from train.tasks.classifier import ClassifierTask
 from train.tasks.entropy import EntropyTask
@@ -85,18 +86,12 @@ def compute_view_tables(
 
 
 def save_view_tables(path: Path, tables: ViewTables) -> None:
-    write_npz(
-        path,
-        names=np.array(tables.names),
-        labels=tables.labels,
-        logits=tables.logits,
-        predicted_entropy=tables.predicted_entropy,
-        entropy=tables.entropy,
-        made_by=np.array(tables.made_by),
-    )
+    keep(path, npz_bytes(**vars(tables)))
 
 
 def load_view_tables(path: Path) -> ViewTables:
+    """Reads what `save_view_tables` wrote; raises `Unreadable` if the file is not as it was written."""
+    check_kept(path)
     with np.load(path) as stored:
         predicted = "predicted_entropy" if "predicted_entropy" in stored else "utility"  # its name in version 0.1
         arrays = {name: stored[name] for name in ("labels", "logits", "entropy")} | {

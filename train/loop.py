@@ -34,7 +34,8 @@ from data_pipeline.files import as_read, check_of_file, keep_checks, keep_json
 from data_pipeline.progress import console, progress_bar
 from train.optimiser import learning_rate
 from train.results.finite import all_finite, not_finite
-from train.results.kept import check_config, config_of, content_of, finished, goes_on_with
+from train.results.identity import config_of, content_of
+from train.results.networks import check_config, finished, goes_on_with
 from train.running.checkpoints import Checkpoints, drop_damaged
 from train.running.devices import (
     DATA,

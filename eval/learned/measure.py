@@ -38,7 +38,8 @@ from train.choosing.expected import FITTED_AS
 from train.choosing.stages import Aside, Stages, lattice_data
 from train.choosing.variants import VARIANTS
 from train.results.finite import check_results
-from train.results.kept import kept_json, made_by
+from train.results.identity import made_by
+from train.results.kept import kept_json
 
 _FORM = 10
 """Version of the stored walks; another version makes them stale."""

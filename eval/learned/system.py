@@ -20,7 +20,7 @@ from mevs_jax.trained.description import FORM
 from mevs_jax.trained.system import EXPECTED_VIEWS, UNPOSED
 from train.choosing.expected import FITTED_AS
 from train.choosing.stages import Stages, lattice_data
-from train.results.kept import made_by
+from train.results.identity import made_by
 
 POLICIES = {"learned": True, "learned_unposed": False}
 """The view policies of a system, and whether they know the object's pose."""

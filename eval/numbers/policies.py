@@ -6,8 +6,6 @@ numbers.
 
 from __future__ import annotations
 
-import csv
-import io
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from importlib import import_module
@@ -29,7 +27,8 @@ from eval.walks.own_policies import OwnPolicy, own_rungs
 from mevs_jax.geometry.viewpoints import ViewGraph
 from mevs_jax.policies.base import Policy
 from mevs_jax.policies.registry import POLICIES, Knows, PolicyEntry, policy_entry
-from train.results.kept import made_by, why
+from train.results.identity import made_by, why
+from train.results.records import csv_of as rows_as_csv
 
 By = Literal["views", "threshold"]
 
@@ -231,9 +230,4 @@ def _rows_of_grid(rung: Rung, results: Results, base: Results) -> list[dict[str,
 
 def csv_of(metrics: Mapping[str, Any]) -> bytes:
     """Returns the content of `metrics.csv`: the rows of `tidy_rows`, of all policies in `metrics.json`."""
-    rows = tidy_rows(metrics["ladder"], metrics["policies"], metrics["against_random"])
-    text = io.StringIO()
-    writer = csv.DictWriter(text, list(rows[0]), lineterminator="\n")
-    writer.writeheader()
-    writer.writerows(rows)
-    return text.getvalue().encode()
+    return rows_as_csv(tidy_rows(metrics["ladder"], metrics["policies"], metrics["against_random"]))

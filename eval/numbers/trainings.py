@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import csv
-import io
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -19,6 +17,7 @@ from eval.walks.grid import Results, run_grid
 from eval.walks.ladder import Rung, ladder
 from eval.walks.own_policies import OwnPolicy, own_rungs
 from mevs_jax.selection.loop import ViewTable
+from train.results.records import csv_of, ends, numbered
 
 
 def walks_of_all(
@@ -87,24 +86,16 @@ def rows_over_trainings(rungs: Sequence[Rung], results: Mapping[str, Results]) -
 
 def csv_over_trainings(rows: Sequence[Mapping[str, Any]]) -> bytes:
     """The rows as CSV, with a column for each end of an interval and for each training."""
-    text = io.StringIO()
-    flat = [dict(_flat(row)) for row in rows]
-    writer = csv.DictWriter(text, list(flat[0]), lineterminator="\n")
-    writer.writeheader()
-    writer.writerows(flat)
-    return text.getvalue().encode()
+    return csv_of([_flat(row) for row in rows])
 
 
-def _flat(row: Mapping[str, Any]) -> list[tuple[str, Any]]:
-    found: list[tuple[str, Any]] = []
+def _flat(row: Mapping[str, Any]) -> dict[str, Any]:
+    flat: dict[str, Any] = {}
     for name, value in row.items():
         if not isinstance(value, list):
-            found.append((name, value.lstrip("— ") if name == "title" else value))
+            flat[name] = value.lstrip("— ") if name == "title" else value
         elif name.endswith("each"):
-            found += [
-                (f"{name.removesuffix('each') or 'accuracy_'}training_{number}", one)
-                for number, one in enumerate(value)
-            ]
+            flat |= numbered(f"{name.removesuffix('each') or 'accuracy_'}training", value)
         else:
-            found += [(f"{name}_{end}", one) for end, one in zip(("low", "high"), value, strict=True)]
-    return found
+            flat |= ends(name, value)
+    return flat

@@ -33,7 +33,8 @@ from eval.thesis.results import NO_ACCELERATOR, LatticeTables, all_results, mach
 from eval.thesis.seeds import csv_of, folders_of, over_trainings, table_of
 from train.loop import load_best
 from train.results.finite import check_results
-from train.results.kept import keep_beside, kept_array, kept_json, made_by
+from train.results.identity import made_by
+from train.results.kept import keep_beside, kept_array, kept_json
 from train.results.outputs import network_outputs
 from train.running.log import read_history
 from train.tasks.classifier import ClassifierTask

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import csv
-import io
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -12,6 +10,8 @@ import numpy as np
 
 from eval.numbers.comparison import interval_of_both, intervals
 from eval.thesis.layout import Row, ThesisTable
+from train.results.records import csv_of as rows_as_csv
+from train.results.records import ends, numbered
 from train.tasks.thesis_networks import BACKBONES, FRAMES, VIEWS, ThesisFolder
 
 _GAINS = {
@@ -71,20 +71,15 @@ def over_trainings(each: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
 
 def csv_of(rows: Sequence[dict[str, Any]]) -> bytes:
     """The rows as CSV, with a column for each end of an interval and for each training."""
-    text = io.StringIO()
-    flat = []
-    for row in rows:
-        ends = {
-            f"{name}_{end}": value
-            for name in ("over_objects", "over_both")
-            for end, value in zip(("low", "high"), row[name], strict=True)
-        }
-        own = {f"training_{number}": value for number, value in enumerate(row["each"])}
-        flat.append({key: row[key] for key in ("table", "name", "mean")} | ends | own)
-    writer = csv.DictWriter(text, list(flat[0]), lineterminator="\n")
-    writer.writeheader()
-    writer.writerows(flat)
-    return text.getvalue().encode()
+    return rows_as_csv(
+        [
+            {name: row[name] for name in ("table", "name", "mean")}
+            | ends("over_objects", row["over_objects"])
+            | ends("over_both", row["over_both"])
+            | numbered("training", row["each"])
+            for row in rows
+        ]
+    )
 
 
 def table_of(rows: Sequence[dict[str, Any]]) -> ThesisTable:

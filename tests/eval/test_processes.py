@@ -28,7 +28,7 @@ from mevs_jax.cli.parsing import parse
 from tests.reference.leaks import LEARNED
 from tests.reference.processes import CPU, start
 from train.loop import steps_of_an_epoch
-from train.results.kept import summary_of
+from train.results.identity import summary_of
 
 pytestmark = pytest.mark.usefixtures("named")
 

@@ -16,7 +16,7 @@ from data_pipeline.errors import DataError
 from eval import seeds, stages
 from eval.run_file import load_run, save_run
 from eval.settings import TINY, Settings
-from train.results.kept import summary_of
+from train.results.identity import summary_of
 
 SETTINGS = replace(TINY, seeds=2)
 

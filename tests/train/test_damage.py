@@ -19,7 +19,7 @@ from eval.settings import TINY
 from eval.stages import tasks
 from train.loop import fit, load_best
 from train.optimiser import OptimiserConfig
-from train.results.kept import trained_once
+from train.results.networks import trained_once
 from train.running.checkpoints import Checkpoints, damage_of
 
 

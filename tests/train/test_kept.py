@@ -7,7 +7,8 @@ import pytest
 
 from data_pipeline.errors import DataError, Unreadable
 from data_pipeline.files import CHECKS, keep_json, read_json, write_json
-from train.results.kept import check_config, keep_beside, kept_array, kept_json
+from train.results.kept import keep_beside, kept_array, kept_json
+from train.results.networks import check_config
 
 
 def test_content_is_computed_once_for_each_identity(tmp_path):

@@ -27,7 +27,7 @@ from eval.settings import TINY
 from eval.stages import tasks
 from train.loop import Lead, fit, load_best, steps_of_an_epoch
 from train.optimiser import OptimiserConfig, _as_matrix, descent, learning_rate
-from train.results.kept import config_of
+from train.results.identity import config_of
 from train.running.checkpoints import Checkpoints
 from train.running.preemption import Preempted
 from train.step import abstract_state, samples_before

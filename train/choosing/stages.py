@@ -43,7 +43,9 @@ from train.loop import fit, load_best
 from train.many.seeds import train_seeds
 from train.results.chance import warn_of_chance
 from train.results.finite import check_outputs
-from train.results.kept import is_stored, kept_array, made_by, trained_once
+from train.results.identity import made_by
+from train.results.kept import kept_array
+from train.results.networks import is_stored, trained_once
 from train.results.outputs import Ask, network_outputs
 from train.tasks.entropy import EntropyConfig, EntropyTask
 from train.tasks.recogniser import RecogniserTask

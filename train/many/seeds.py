@@ -19,7 +19,7 @@ from train.loop import check_training, fit, identity_of
 from train.many.members import SweepTask, export_member, member_of
 from train.many.trainers import Starts
 from train.many.training import train_members
-from train.results.kept import check_config, finished
+from train.results.networks import check_config, finished
 from train.running.checkpoints import has_save
 from train.running.devices import Layout, device_mesh
 

@@ -21,7 +21,8 @@ from data_pipeline.files import as_read, keep_json, read_json, write_text
 from data_pipeline.progress import console
 from train.many.members import Member, SweepTask, Together, by_configurations, export_member, member_of, task_of
 from train.many.training import train_members
-from train.results.kept import check_config, content_of, why
+from train.results.identity import content_of, why
+from train.results.networks import check_config
 from train.running.devices import device_mesh
 from train.tasks.entropy import EntropyTask
 from train.tasks.recogniser import RecogniserTask

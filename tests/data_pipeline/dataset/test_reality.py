@@ -27,7 +27,7 @@ from eval.checks.camera import cast_canonical
 from eval.settings import TINY
 from mevs_jax import canonical_view
 from mevs_jax.geometry.cameras import ViewCamera, cameras_at, partial_cloud
-from train.results.kept import content_of
+from train.results.identity import content_of
 from train.tasks.classifier import ClassifierTask
 from train.tasks.recogniser import RecogniserTask
 

@@ -22,7 +22,7 @@ from train.choosing.policy import (
     train_policy,
     unseen,
 )
-from train.results.kept import trained_once
+from train.results.networks import trained_once
 
 
 @pytest.mark.slow

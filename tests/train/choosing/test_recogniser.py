@@ -30,7 +30,7 @@ from train.choosing.config import check_learned
 from train.choosing.looks import quarter_turns, see, see_changed, see_rotated
 from train.choosing.stages import Stages
 from train.loop import fit, load_best, steps_of_an_epoch
-from train.results.kept import summary_of
+from train.results.identity import summary_of
 from train.running.devices import Layout, check_batch, device_mesh
 from train.step import part_of
 from train.tasks.recogniser import RecogniserTask

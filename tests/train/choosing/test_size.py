@@ -19,7 +19,7 @@ from mevs_jax.geometry.cameras import cameras_at
 from mevs_jax.geometry.viewpoints import fibonacci_sphere
 from mevs_jax.models import Recogniser
 from train.choosing.looks import see
-from train.results.kept import content_of
+from train.results.identity import content_of
 from train.tasks.recogniser import RecogniserTask
 from train.tasks.size import SizeConfig, check_sizes, radii_for_training, used_size
 

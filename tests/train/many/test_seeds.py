@@ -27,7 +27,7 @@ from train.many.members import Member, member_of, task_of
 from train.many.seeds import shared_equally, train_seeds
 from train.many.trainers import TRAINERS
 from train.many.training import _Batches
-from train.results.kept import config_of, summary_of
+from train.results.identity import config_of, summary_of
 from train.running.devices import device_mesh
 from train.tasks.recogniser import RecogniserTask
 

@@ -29,7 +29,7 @@ from train.choosing.stages import Stages
 from train.loop import fit, load_best, steps_of_an_epoch, validate
 from train.many.members import Member, Together, by_configurations, task_of
 from train.many.sweep import SweepConfig, best_of, draw_members, sweep
-from train.results.kept import summary_of
+from train.results.identity import summary_of
 from train.running.devices import device_mesh
 from train.running.preemption import Preempted
 from train.step import TrainState, evaluate_step_of, initial_state
