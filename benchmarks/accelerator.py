@@ -30,7 +30,7 @@ from flax import nnx
 from benchmarks import members
 from benchmarks.capture import depths, wobbly_ball
 from benchmarks.comparing import classification_loss, forward_of, machine_name, take_turns, training_step
-from benchmarks.evaluation import BACKBONES, CLASSES, RUNGS, VIEWS, made_up_tables
+from benchmarks.evaluation import BACKBONES, CLASSES, COMPARED, VIEWS, made_up_tables
 from data_pipeline.capture.casting import CaptureConfig, capture, rig_for
 from data_pipeline.dataset.builder import prepare
 from data_pipeline.files import write_json, write_text
@@ -230,7 +230,7 @@ def evaluation(sizes: Sizes) -> Iterator[Row]:
 
     def whole() -> Any:
         return [
-            run_grid(jax.random.key(seed), tables, graph, nothing, RUNGS, max_views=LAST_MV)
+            run_grid(jax.random.key(seed), tables, graph, nothing, COMPARED, max_views=LAST_MV)
             for seed in range(sizes.seeds)
         ]
 

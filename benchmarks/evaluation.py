@@ -23,13 +23,13 @@ import numpy as np
 
 from data_pipeline.files import write_json
 from eval.walks.grid import FIRST_MV, LAST_MV, THRESHOLDS, run_grid
-from eval.walks.ladder import Rung
 from mevs_jax import Knowledge, ViewGraph, ViewTable, fibonacci_sphere
 from mevs_jax.markdown import markdown_table
+from mevs_jax.policies import policy_record
 from tests.reference import numpy_rules
 
 OBJECTS, VIEWS, CLASSES, BACKBONES = 908, 40, 10, 3
-RUNGS = tuple(Rung(name, name, "nothing") for name in ("random", "predicted_entropy", "oracle_entropy"))
+COMPARED = tuple(map(policy_record, ("random", "predicted_entropy", "oracle_entropy")))
 SUBSET = 4
 
 
@@ -53,14 +53,14 @@ def loop_over_objects(tables: ViewTable, neighbours: np.ndarray, objects: int) -
         np.asarray(leaf) for leaf in (tables.logits, tables.predicted_entropy, tables.entropy, tables.label)
     )
     random = np.random.default_rng(0)
-    shape = (objects, BACKBONES, len(RUNGS), LAST_MV - FIRST_MV + 1, len(THRESHOLDS))
+    shape = (objects, BACKBONES, len(COMPARED), LAST_MV - FIRST_MV + 1, len(THRESHOLDS))
     right = np.zeros(shape, bool)
     for index, backbone, policy, limit, threshold in np.ndindex(*shape):
         weights, graph = {
             "random": (random.uniform(0, 1, (LAST_MV + 1, VIEWS)), None),
             "predicted_entropy": (predicted_entropy[index], neighbours),
             "oracle_entropy": (np.broadcast_to(entropy[index], (VIEWS, VIEWS)), neighbours),
-        }[RUNGS[policy].policy]
+        }[COMPARED[policy].name]
         _, predictions, _ = numpy_rules.walk(
             logits[index, backbone], weights, graph, index % VIEWS, THRESHOLDS[threshold], FIRST_MV + limit
         )
@@ -73,7 +73,7 @@ def main() -> None:
     nothing = Knowledge(jnp.zeros((BACKBONES, VIEWS)), jnp.zeros((BACKBONES, CLASSES, VIEWS, CLASSES)))
 
     def program(tables: ViewTable = tables):
-        return jax.block_until_ready(run_grid(jax.random.key(0), tables, graph, nothing, RUNGS, max_views=LAST_MV))
+        return jax.block_until_ready(run_grid(jax.random.key(0), tables, graph, nothing, COMPARED, max_views=LAST_MV))
 
     start = time.perf_counter()
     results = program()
@@ -85,7 +85,7 @@ def main() -> None:
         times.append(time.perf_counter() - start)
     # Measured before the loop and the check below, so that they do not count. The unit on Linux is kilobytes.
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20
-    grid_cells = BACKBONES * len(RUNGS) * (LAST_MV - FIRST_MV + 1) * len(THRESHOLDS)
+    grid_cells = BACKBONES * len(COMPARED) * (LAST_MV - FIRST_MV + 1) * len(THRESHOLDS)
     walks = OBJECTS * VIEWS * grid_cells
 
     start = time.perf_counter()
@@ -95,11 +95,11 @@ def main() -> None:
     # Compares the predictions of the program with those of the loop, on the subset and its start views.
     views = {name: np.asarray(result.views)[0, :SUBSET, :, 0] for name, result in results.items()}
     logits = np.asarray(tables.logits)
-    for policy, rung in enumerate(RUNGS):
-        if rung.policy == "random":
+    for number, policy in enumerate(COMPARED):
+        if policy.name == "random":
             continue
         for index in range(SUBSET):
-            walk = views[rung.policy][index, index % VIEWS]
+            walk = views[policy.name][index, index % VIEWS]
             for backbone in range(BACKBONES):
                 beliefs = np.cumsum(logits[index, backbone, walk], axis=0)
                 sure = np.array([numpy_rules.softmax_confidence(belief) for belief in beliefs])
@@ -107,7 +107,7 @@ def main() -> None:
                     stops = np.flatnonzero(sure[: FIRST_MV + limit] >= THRESHOLDS[column])
                     end = stops[0] if len(stops) else FIRST_MV + limit - 1
                     answer = beliefs[end].argmax() == np.asarray(tables.label)[index]
-                    assert answer == right[index, backbone, policy, limit, column]
+                    assert answer == right[index, backbone, number, limit, column]
 
     machine = f"{platform.processor() or platform.machine()}, {jax.devices()[0].device_kind}, JAX {jax.__version__}"
     row = {

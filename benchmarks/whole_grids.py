@@ -27,8 +27,8 @@ from flax import nnx
 from jax import Array
 
 from data_pipeline.files import write_json
+from eval.machine import machine
 from eval.numbers.comparison import intervals
-from eval.thesis.results import machine
 
 RESULT = Path(__file__).parent / "results" / "whole_grids.json"
 

@@ -14,13 +14,13 @@ from eval.walks.grid import GridConfig
 from eval.walks.live import LiveConfig
 from mevs_jax.models import Abstraction
 from train.choosing.config import LearnedConfig
-from train.choosing.features import SetFusionConfig
 from train.choosing.policy import PolicyConfig
 from train.choosing.variants import ABLATIONS
 from train.many.sweep import SweepConfig
 from train.optimiser import OptimiserConfig
 from train.tasks.classifier import ClassifierConfig, ResNetConfig
 from train.tasks.entropy import EntropyConfig, PointNet2Config
+from train.tasks.fusion import SetFusionConfig
 from train.tasks.recogniser import RecogniserConfig
 from train.tasks.thesis_networks import ThesisConfig
 

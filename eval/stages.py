@@ -13,7 +13,6 @@ from pathlib import Path
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 from data_pipeline.dataset.builder import open_objects, prepare
@@ -36,10 +35,9 @@ from eval.system import USABLE, classifier_system, figures_of, identity_of, save
 from eval.tables import ViewTables, compute_view_tables, load_view_tables, save_view_tables
 from eval.walks.grid import FIRST_MV, GridConfig
 from eval.walks.knowledge import learn
-from eval.walks.ladder import ASCENT_RUNGS
-from eval.walks.live import Agreement, Networks, compare_with_tables
-from eval.walks.own_policies import OwnPolicy, load_policies, own_rungs
-from mevs_jax.policies.registry import policy_named
+from eval.walks.live import GIVEN, Agreement, Networks, compare_with_tables
+from eval.walks.own_policies import checked, load_policies, own_identity
+from mevs_jax.policies.registry import PolicyRecord, policy_record
 from mevs_jax.trained import load as load_system
 from train.loop import check_launch, fit, load_best
 from train.planning.plan import plan_of, planned_statistics
@@ -198,14 +196,14 @@ def check_evaluation(config: GridConfig) -> None:
         raise DataError("--evaluation.max-views must be at least 2 and --evaluation.draws at least 1")
 
 
-def policies_of(settings: Settings, statistics: DatasetStatistics) -> tuple[OwnPolicy, ...]:
+def policies_of(settings: Settings, statistics: DatasetStatistics) -> tuple[PolicyRecord, ...]:
     """Returns the policies of `--policy`, checked on this data set before anything is trained or evaluated.
 
     Raises:
         DataError: if one cannot be used.
     """
     if own := load_policies(settings.policies):
-        own_rungs(own, statistics.graph, len(statistics.classes), 1)
+        checked(own, statistics.graph, len(statistics.classes))
     return own
 
 
@@ -223,7 +221,7 @@ def evaluate(settings: Settings, out: Path) -> dict[str, Any]:
         "made_by": made_by(statistics, out / "classifier", out / "entropy"),
         "by_view": by_view_made,
         "climbed": None if climbed is None else asdict(settings.rendering),
-        **({"policies": [policy.identity for policy in own]} if own else {}),
+        **({"policies": [own_identity(policy) for policy in own]} if own else {}),
     }
     check_evaluation(settings.evaluation)
 
@@ -315,21 +313,16 @@ def check_live(settings: Settings, out: Path) -> dict[str, Agreement]:
     """Compares walks with the networks in the loop with walks on view tables; writes `live.json`."""
     for policy in settings.live.policies:
         try:
-            policy_named(policy)
+            record = policy_record(policy)
         except ValueError as error:
             raise DataError(str(error)) from error
-        if policy in {rung.policy for rung in ASCENT_RUNGS}:
+        if not record.can_use(GIVEN):
             raise DataError(
                 f"{policy} needs the tables of mevs study rendering, which live walks do not have; leave it out"
             )
     statistics = load_statistics(out / "data")
     check_made_with(settings, out)
-    own = own_rungs(
-        load_policies(settings.policies),
-        statistics.graph,
-        len(statistics.classes),
-        1,
-    )
+    own = checked(load_policies(settings.policies), statistics.graph, len(statistics.classes))
     classify, predict = tasks(settings, statistics)
     networks = Networks(classify, load_best(classify, out / "classifier"), predict, load_best(predict, out / "entropy"))
     validation = _tables(settings, out, statistics, "val")
@@ -338,7 +331,7 @@ def check_live(settings: Settings, out: Path) -> dict[str, Agreement]:
         "test",
         networks,
         _tables(settings, out, statistics, "test"),
-        learn(jnp.asarray(validation.logits), jnp.asarray(validation.labels)),
+        learn(validation.logits, validation.labels),
         statistics.graph,
         config=settings.live,
         own=own,
@@ -395,9 +388,11 @@ def report(settings: Settings, preset: str, out: Path) -> Path:
 
     if is_current(page, described()):
         return page
-    from eval.report.page import write_report  # imported late: it needs plots
+    from eval.learned.page import active_section  # imported late, as they need plots
+    from eval.report.page import write_report
 
     statistics = load_statistics(data)
+    learned = _metrics(active, f"mevs study learned --out {out}") if active.exists() else None
     inputs = ReportInputs(
         statistics=statistics,
         metrics=found,
@@ -408,7 +403,8 @@ def report(settings: Settings, preset: str, out: Path) -> Path:
         summaries={name: summary_of(folder) for name, folder in networks.items()},
         preset=preset,
         settings=plain(settings),
-        learned=_metrics(active, f"mevs study learned --out {out}") if active.exists() else None,
+        learned=learned,
+        learned_section="" if learned is None else active_section(learned),
         seeds=_metrics(over_seeds, f"mevs eval --out {out}") if settings.seeds > 1 and over_seeds.exists() else None,
     )
     write_report(inputs, page, described())  # the tables may have been made again

@@ -50,12 +50,12 @@ from mevs_jax.trained.description import FORM
 from train.tasks.classifier import ClassifierTask, ResNetConfig
 from train.tasks.entropy import EntropyTask
 
-_RUNGS = tuple(
-    rung
-    for rung in ladder(draws=1)
-    if rung.knows in ("nothing", "networks", "others") and rung.policy != "random_with_repetition"
+_USABLE = tuple(
+    policy
+    for policy in ladder()
+    if policy.knows in ("nothing", "networks", "others") and policy.name != "random_with_repetition"
 )
-USABLE = tuple(rung.policy for rung in _RUNGS)
+USABLE = tuple(policy.name for policy in _USABLE)
 """Policies of the ladder that a robot can use: those that know nothing, predictions of networks, or other objects."""
 
 MADE_WITH = ("mevs-jax", "jax", "flax", "numpy")
@@ -107,14 +107,14 @@ def walk_validation(tables: ViewTables, graph: ViewGraph, max_views: int, seed: 
     parts: dict[str, list[tuple[np.ndarray, np.ndarray]]] = {name: [] for name in USABLE}
     for held in range(2):
         walking, other = (_some(tables, np.flatnonzero((half == held) == inside)) for inside in (True, False))
-        knowledge = learn(jnp.asarray(other.logits), jnp.asarray(other.labels))
+        knowledge = learn(other.logits, other.labels)
         one_backbone = walking.stacked()
         found = run_grid(
             jax.random.key(seed),
             replace(one_backbone, logits=one_backbone.logits[:, None]),
             graph,
             jax.tree.map(lambda leaf: leaf[None], knowledge),
-            _RUNGS,
+            _USABLE,
             max_views=max_views,
         )
         for name in USABLE:
@@ -208,7 +208,7 @@ def classifier_system(
     console.print(f"Calibrating {len(USABLE)} policies on {len(validation.labels)} validation objects")
     walks = walk_validation(validation, graph, max_views)
     labels, classes = validation.labels, len(statistics.classes)
-    knowledge = learn(jnp.asarray(validation.logits), jnp.asarray(labels))
+    knowledge = learn(validation.logits, labels)
     single = fit_temperature(
         jnp.asarray(validation.logits).reshape(-1, classes), jnp.repeat(jnp.asarray(labels), statistics.views)
     )

@@ -1,4 +1,4 @@
-"""Programs side by side: on a CPU, XLA runs a loop on one core."""
+"""Calls side by side, by threads: on a CPU, XLA runs a loop on one core."""
 
 from __future__ import annotations
 
@@ -6,24 +6,10 @@ from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import TypeVar
 
-import jax
-
-from data_pipeline.processes import usable_cpus
+from train.running.over_objects import programs_at_once
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
-
-_MOST_AT_ONCE = 16
-"""The most programs side by side, because each needs memory of its own."""
-
-
-def programs_at_once() -> int:
-    """Returns how many threads should run programs side by side: one for each core where the only device is a CPU, else one.
-
-    Programs that one thread starts run one after the other. Those of several threads run side by side.
-    """
-    device, *others = jax.local_devices()
-    return 1 if others or device.platform != "cpu" else min(usable_cpus(), _MOST_AT_ONCE)
 
 
 def by_threads(function: Callable[[Item], Result], items: Sequence[Item]) -> list[Result]:

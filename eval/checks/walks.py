@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
+from functools import cache, partial
 from typing import Any
 
 import jax
@@ -15,9 +15,11 @@ from jaxtyping import Array, Bool, Float, Int
 from eval.numbers.comparison import intervals
 from mevs_jax.beliefs.fusing import running_sum
 from mevs_jax.policies.base import Observation
-from mevs_jax.selection.loop import ViewTable, select_from_table
+from mevs_jax.selection.loop import ViewTable
+from mevs_jax.selection.walks import every_walk, walks_around
 from mevs_jax.trained import TrainedSystem
 from mevs_jax.trained.parts import Parts
+from train.running.over_objects import over_objects
 
 BASELINE = "random"
 _AT_ONCE = 16
@@ -103,7 +105,7 @@ class Walker:
 
     def __init__(self, system: TrainedSystem) -> None:
         self.system = system
-        self._walks = jax.jit(self._around_all, static_argnames=("policy", "steps", "posed", "draws"))
+        self._around = cache(self._around_by)
 
     def walk(
         self,
@@ -129,51 +131,36 @@ class Walker:
         """
         can_reach = np.ones(len(self.system.viewpoints), bool) if reachable is None else np.asarray(reachable)
         steps, firsts = min(steps, int(can_reach.sum())), jnp.asarray(np.flatnonzero(can_reach))
-        given = (
-            self.system.parts,
-            jax.tree.map(jnp.asarray, tables),
-            firsts,
-            jnp.asarray(can_reach),
-            jax.random.key(seed),
-        )
-        return Walks(*map(np.asarray, self._walks(*given, policy=policy, steps=steps, posed=posed, draws=draws)))
+        objects = np.arange(len(tables.label)), tables
+        shared = self.system.parts, every_walk(firsts, draws), jnp.asarray(can_reach), jax.random.key(seed)
+        return Walks(*over_objects(self._around(policy, posed), objects, *shared, at_once=_AT_ONCE, steps=steps))
 
-    def _around_all(
-        self,
-        parts: Parts,
-        tables: ViewTable,
-        firsts: Array,
-        can_reach: Array,
-        key: Array,
-        *,
-        policy: str,
-        steps: int,
-        posed: bool,
-        draws: int,
-    ) -> tuple[Array, Array, Array]:
+    def _around_by(self, policy: str, posed: bool) -> Callable[..., tuple[Array, Array, Array]]:
         system, graph = self.system, self.system.graph
-        fuse, run = system.fuse(parts, posed), system.policy(policy, parts, posed)
-        calibrated_as = system.calibrated_as(policy, posed)
-        knowledge = parts.knowledge if posed else parts.knowledge_by_pose(graph.points)
-        pairs = jnp.repeat(firsts, draws), jnp.tile(jnp.arange(draws), len(firsts))
+        log_probabilities = partial(system.log_probabilities, policy=system.calibrated_as(policy, posed))
 
-        def around(item: tuple[Array, ViewTable]) -> tuple[Array, Array, Array]:
-            number, table = item
-            scene = table.scene(graph, knowledge, can_reach)
+        def around(
+            one: tuple[Array, ViewTable],
+            parts: Parts,
+            walks: tuple[Array, Array],
+            can_reach: Array,
+            key: Array,
+            *,
+            steps: int,
+        ) -> tuple[Array, Array, Array]:
+            """Whether predictions are right, confidences and views of the walks around one object."""
+            number, table = one
+            fuse, run = system.fuse(parts, posed), system.policy(policy, parts, posed)
+            scene = table.scene(graph, parts.knowledge if posed else parts.knowledge_by_pose(graph.points), can_reach)
+            views = walks_around(
+                jax.random.fold_in(key, number), table.observe, scene, run, walks, max_views=steps, fuse=fuse
+            ).views
+            beliefs = jax.vmap(partial(beliefs_along, parts, table, posed=posed))(views)
+            calibrated = jax.vmap(jax.vmap(log_probabilities), (0, None))(beliefs, jnp.arange(1, steps + 1))
+            right = jnp.argmax(calibrated, axis=-1) == table.label
+            return right, jnp.exp(jnp.max(calibrated, axis=-1)), views
 
-            def from_view(first: Array, draw: Array) -> tuple[Array, Array, Array]:
-                own = jax.random.fold_in(jax.random.fold_in(key, number), first * draws + draw)
-                views = select_from_table(own, table, scene, run, first, max_views=steps, fuse=fuse).views
-                beliefs = beliefs_along(parts, table, views, posed)
-                calibrated = jax.vmap(partial(system.log_probabilities, policy=calibrated_as))(
-                    beliefs, jnp.arange(1, steps + 1)
-                )
-                right = jnp.argmax(calibrated, axis=-1) == table.label
-                return right, jnp.exp(jnp.max(calibrated, axis=-1)), views
-
-            return jax.vmap(from_view)(*pairs)
-
-        return jax.lax.map(around, (jnp.arange(len(tables.label)), tables), batch_size=_AT_ONCE)
+        return around
 
 
 def rows_of(walks: dict[str, Walks], views: Sequence[int]) -> list[dict[str, Any]]:

@@ -108,6 +108,21 @@ def seeds_together(
     return same | {"against_over_both": over_both} | {"policies": policies} | compared(each, method)
 
 
+def gains_of_seeds(seeds: Sequence[Mapping[str, Float[np.ndarray, "steps objects"]]]) -> dict[str, Any]:
+    """Gains of policies over random selection: means over seeds, with intervals over objects, and over objects and trainings."""
+    gains = {
+        name: np.stack([one[name] - one["random"] for one in seeds], axis=1) for name in seeds[0] if name != "random"
+    }
+    return {
+        name: {
+            "difference": gain.mean(axis=(1, 2)).tolist(),
+            "interval": intervals(gain.mean(axis=1)),
+            **({"over_both": interval_of_both(gain).tolist()} if len(seeds) > 1 else {}),
+        }
+        for name, gain in gains.items()
+    }
+
+
 def difference(mine: np.ndarray, base: np.ndarray) -> dict[str, Any]:
     """Mean differences of two policies by number of views, with intervals, from their (steps, objects) results."""
     steps = min(len(mine), len(base))

@@ -5,8 +5,8 @@ Results are stored in the folder of the seed and reused.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import fields, replace
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, fields, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -24,24 +24,26 @@ from data_pipeline.distributed import is_first
 from data_pipeline.errors import DataError
 from data_pipeline.files import read_json, write_npz
 from data_pipeline.progress import console
-from eval.learned.comparison import ByObject, seeds_together
+from eval.learned.comparison import ByObject, gains_of_seeds, seeds_together
 from eval.learned.poses import UnknownPose, of_any_rotation, of_unknown_yaw
 from eval.learned.stopping import MOVEMENT_COSTS, VIEW_COSTS
-from eval.learned.study import novel_classes, study
-from eval.learned.walks import Learner, OnLattice
+from eval.learned.study import novel_classes, novel_metrics, study
+from eval.learned.walks import OnLattice, Walking, by_network
+from eval.machine import machine
 from eval.numbers.timing import milliseconds
 from eval.tables import load_view_tables
-from eval.thesis.results import machine
 from mevs_jax.models.expected_views import ExpectedViews
 from mevs_jax.models.view_policy import expected_gain
+from mevs_jax.policies.registry import PolicyRecord
 from train.choosing.expected import FITTED_AS
+from train.choosing.features import Features
 from train.choosing.stages import Aside, Stages, lattice_data
 from train.choosing.variants import VARIANTS
 from train.results.finite import check_results
 from train.results.identity import made_by
 from train.results.kept import kept_json
 
-_FORM = 10
+_FORM = 11
 """Version of the stored walks; another version makes them stale."""
 APART = 2
 """Parts of the validation objects; stopping rules are fitted on walks of policies that were trained without their objects."""
@@ -59,25 +61,24 @@ def check_parts(statistics: DatasetStatistics) -> None:
 def measure(stages: Stages) -> dict[str, Any]:
     """Returns the metrics of one seed, by number of candidate views.
 
-    The first seed also has unknown yaw, separate candidate directions for each object, ablations, classes left out of policy
-    training, and objects in any rotation.
+    Classes left out of policy training are measured for every seed. The first seed also has unknown yaw, separate candidate
+    directions for each object, ablations, and objects in any rotation.
     """
     own, config = stages.dataset.capture.views, stages.config
 
     def on_lattice(views: int, **given: Any) -> dict[str, Any]:
-        data = lattice_data(stages.dataset, stages.out, views)
-        return _walks(stages, f"lattice_{views}", data, **given)
+        return _Walks(stages, f"lattice_{views}", lattice_data(stages.dataset, stages.out, views), **given).metrics()
 
     found = {"lattices": {str(views): on_lattice(views) for views in (own, *config.lattices)}}
+    if config.novel:
+        found["novel"] = _novel(stages)
     if stages.seed != config.seed:
         return found
     found["decision"] = _decision(stages)
     found["unposed"] = {str(own): on_lattice(own, posed=False)}
-    found["scattered"] = {str(own): _walks(stages, "turned", stages.turned)}
+    found["scattered"] = {str(own): _Walks(stages, "turned", stages.turned).metrics()}
     if config.ablations:
         found["ablations"] = {str(own): on_lattice(own, ablations=config.ablations)}
-    if config.novel:
-        found["novel"] = _novel(stages)
     if config.rotation_epochs:
         found["rotated"] = {str(own): _rotated(stages)}
     return found
@@ -89,103 +90,149 @@ def together(seeds: Sequence[Stages], found: Sequence[dict[str, Any]]) -> dict[s
     for views, first in found[0]["lattices"].items():
         each = []
         for stages in seeds:
-            with np.load(stages.folder / f"walks_lattice_{views}.npz") as kept:
-                each.append(
-                    {
-                        name: ByObject(**{field.name: kept[f"{name} {field.name}"] for field in fields(ByObject)})
-                        for name in first["policies"]
-                    }
-                )
+            kept = _by_object(stages, f"walks_lattice_{views}")
+            each.append(
+                {
+                    name: ByObject(**{field.name: kept[f"{name} {field.name}"] for field in fields(ByObject)})
+                    for name in first["policies"]
+                }
+            )
         lattices[views] = seeds_together([one["lattices"][views] for one in found], each, "learned")
     return lattices
 
 
-def learner_of(stages: Stages, name: str, aside: Aside | None = None) -> Learner:
-    """Returns a variant of the view policy by its name in `VARIANTS`, trained first if it is not yet.
+def novel_together(seeds: Sequence[Stages]) -> dict[str, Any] | None:
+    """Gains over random selection on classes that policies were trained without, over all seeds; None if not measured."""
+    if not seeds[0].config.novel:
+        return None
+    return gains_of_seeds([_by_object(stages, "walks_novel") for stages in seeds])
 
-    Args:
-        aside: part of the validation objects that it is not trained on.
+
+def _by_object(stages: Stages, name: str) -> dict[str, np.ndarray]:
+    """The results by object that are stored with metrics."""
+    with np.load(stages.folder / f"{name}.npz") as kept:
+        return {name: kept[name] for name in kept.files}
+
+
+@dataclass(frozen=True)
+class _Walks:
+    """Walks on one data set, of all policies or of the method and its ablations.
+
+    Attributes:
+        stages: of the seed.
+        views: names the data set in the files of features and walks.
+        data: its folder.
+        ablations: variants of the method; if there are any, nothing else is compared with it.
+        posed: whether the pose of objects is known.
     """
-    variant = VARIANTS[name]
-    made_as = variant.network or name
-    fusion = stages.fusion(posed=variant.posed, summed=True) if variant.summed else None
-    return Learner(name, variant.title, stages.policy(made_as, aside=aside), variant.by, made_as, fusion)
 
+    stages: Stages
+    views: str
+    data: Path
+    ablations: tuple[str, ...] = ()
+    posed: bool = True
 
-def _walks(
-    stages: Stages, views: str, data: Path, ablations: tuple[str, ...] = (), posed: bool = True
-) -> dict[str, Any]:
-    """Metrics of the walks on one data set, of all policies or of the method and its ablations.
+    @property
+    def variants(self) -> list[str]:
+        """The variants of the view policy, the method first."""
+        method = "learned" if self.posed else "learned_unposed"
+        further = ["learned_and_table"] * (self.posed and not self.ablations)
+        return [method, *(name for name in self.ablations if name != "cloud" or self.stages.has_clouds), *further]
 
-    `views` names the data set in the files of features and walks.
-    """
-    config, method = stages.config, "learned" if posed else "learned_unposed"
-    names = [method, *ablations, *["learned_and_table"] * (posed and not ablations)]
-    if "cloud" in names and not stages.has_clouds:
-        console.print(
-            f"The ablation with PointNet++ embeddings is left out; train PointNet++ with: mevs train --out {stages.out}"
-        )
-        names.remove("cloud")
-    learners = [learner_of(stages, name) for name in names]
-    learners[0] = replace(learners[0], name="learned")
-    costs = posed and not ablations and data == stages.out / "data"
-    kind = ("" if posed else "_unposed") + ("_ablations" if ablations else "")
-    path = stages.folder / f"walks_{views}{kind}.json"
+    @property
+    def with_costs(self) -> bool:
+        """Whether stopping rules and movement costs are measured, which need the objects of `turned` one by one."""
+        return self.posed and not self.ablations and self.data == self.stages.out / "data"
 
-    def objects_of(split: str) -> OnLattice:
-        features = stages.features(f"{views}_{split}", data, split)
-        if "cloud" in names:
-            features = replace(features, clouds=stages.clouds(data, split))
-        return OnLattice(features, *_entropies(stages.out, data, split), load_statistics(data).neighbours)
+    def metrics(self) -> dict[str, Any]:
+        """The metrics, computed first if they are not stored."""
+        for name in self.variants:
+            self._policy(name)  # trained first, as the identity says with what
+        if "cloud" in self.ablations and not self.stages.has_clouds:
+            console.print(
+                f"The ablation with PointNet++ embeddings is left out; train PointNet++ with: "
+                f"mevs train --out {self.stages.out}"
+            )
+        kind = ("" if self.posed else "_unposed") + ("_ablations" if self.ablations else "")
+        return _kept(self.stages.folder / f"walks_{self.views}{kind}.json", self._identity(), self._walk)
 
-    def walk() -> dict[str, Any]:
-        validation, test = map(objects_of, ("val", "test"))
-        if costs:  # their parts are identified by position
+    def _policy(self, name: str, aside: Aside | None = None) -> PolicyRecord:
+        """A variant of the view policy, trained first if it is not yet; `aside` is as for `Stages.policy`."""
+        variant, called = VARIANTS[name], "learned" if name == self.variants[0] else name
+        network = self.stages.policy(variant.network or name, aside=aside)
+        fusion = self.stages.fusion(posed=self.posed, summed=variant.summed)
+        return by_network(called, variant.title, network, fusion, variant.by)
+
+    def _identity(self) -> dict[str, Any]:
+        stages, config = self.stages, self.stages.config
+        networks = [stages.policy_folder(VARIANTS[name].network or name) for name in self.variants]
+        return {
+            "form": _FORM,
+            "made_by": made_by(load_statistics(self.data), stages.recogniser_folder()),
+            "policies": [read_json(folder / "summary.json")["identity"] for folder in networks],
+            "walks": [
+                self.variants,
+                config.max_views,
+                config.draws,
+                config.fitting_starts,
+                _tables_made_by(stages.out, self.data),
+                self.with_costs and [VIEW_COSTS, MOVEMENT_COSTS],
+                FITTED_AS,
+            ],
+            "clouds": made_by(load_statistics(self.data), stages.out / "entropy") if "cloud" in self.variants else None,
+        }
+
+    def _walk(self) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
+        stages, config, (method, *_) = self.stages, self.stages.config, self.variants
+        lattices = self._objects("val"), self._objects("test")
+        if self.with_costs:  # their parts are identified by position
             learned_from = stages.features("turned_val", stages.turned, "val")
-            assert np.array_equal(validation.features.labels, learned_from.labels), "the objects have another order"
-        pose = "" if posed else ", unknown yaw"
-        objects, count, _ = test.features.logits.shape
-        around = ", separate for each object" if data == stages.turned else ""
-        around = ", objects in any rotation" if stages.upright is not None else around
-        console.print(
-            f"Walking {objects} test objects, {count} candidate views{around}{pose}{', ablations' * bool(ablations)}"
-        )
+            assert np.array_equal(lattices[0].features.labels, learned_from.labels), "the objects have another order"
+        console.print(self._title(lattices[1].features))
         found, each = study(
-            stages.fusion(posed=posed),
-            learners,
-            validation,
-            test,
-            max_views=config.max_views,
-            draws=config.draws,
-            fitting_starts=config.fitting_starts,
-            seed=stages.seed,
-            apart=[learner_of(stages, method, (part, APART)) for part in range(APART)] if costs else (),
-            others=not ablations,
-            known=_known(stages, posed, test.features.directions[0]),
+            stages.fusion(posed=self.posed),
+            [self._policy(name) for name in self.variants],
+            lattices,
+            Walking(config.max_views, config.draws, fitting_starts=config.fitting_starts, seed=stages.seed),
+            fusions={name: stages.fusion(summed=True) for name in self.variants if VARIANTS[name].summed},
+            apart=[self._policy(method, (part, APART)) for part in range(APART)] if self.with_costs else (),
+            others=not self.ablations,
+            known=_known(stages, self.posed, lattices[1].features.directions[0]),
         )
-        arrays = {f"{name} {key}": value for name, policy in each.items() for key, value in vars(policy).items()}
         check_results(found, f"walks by the recogniser in {stages.recogniser_folder()}")
+        return found, {f"{name} {key}": value for name, one in each.items() for key, value in vars(one).items()}
+
+    def _objects(self, split: str) -> OnLattice:
+        features = self.stages.features(f"{self.views}_{split}", self.data, split)
+        if "cloud" in self.variants:
+            features = replace(features, clouds=self.stages.clouds(self.data, split))
+        path, entropies = _entropy_tables(self.stages.out, self.data, split), (None, None)
+        if path is not None:
+            tables = load_view_tables(path)
+            entropies = tables.predicted_entropy, tables.entropy
+        return OnLattice(features, *entropies, load_statistics(self.data).neighbours)
+
+    def _title(self, test: Features) -> str:
+        objects, count, _ = test.logits.shape
+        around = ", separate for each object" if self.data == self.stages.turned else ""
+        around = ", objects in any rotation" if self.stages.upright is not None else around
+        pose = "" if self.posed else ", unknown yaw"
+        ablations = ", ablations" * bool(self.ablations)
+        return f"Walking {objects} test objects, {count} candidate views{around}{pose}{ablations}"
+
+
+def _kept(
+    path: Path, identity: Any, compute: Callable[[], tuple[dict[str, Any], dict[str, np.ndarray]]]
+) -> dict[str, Any]:
+    """Returns metrics that are stored together with results by object; computes both first if they are not."""
+
+    def computed() -> dict[str, Any]:
+        found, arrays = compute()
         if is_first():
             write_npz(path.with_suffix(".npz"), **arrays)
         return found
 
-    identity = {
-        "form": _FORM,
-        "made_by": made_by(load_statistics(data), stages.recogniser_folder()),
-        "policies": [
-            read_json(stages.policy_folder(learner.made_as) / "summary.json")["identity"] for learner in learners
-        ],
-        "walks": [
-            names,
-            config.max_views,
-            config.draws,
-            config.fitting_starts,
-            _entropy_tables(stages.out, data, "test") is not None,
-            costs and [VIEW_COSTS, MOVEMENT_COSTS],
-            FITTED_AS,
-        ],
-    }
-    return kept_json(path, identity, walk)
+    return kept_json(path, identity, computed)
 
 
 def _known(stages: Stages, posed: bool, directions: Float[Array, "views 3"]) -> ExpectedViews | UnknownPose | None:
@@ -202,39 +249,41 @@ def _rotated(stages: Stages) -> dict[str, Any]:
     """Metrics for objects in any rotation, after further training of the recogniser on such objects."""
     rotated = stages.rotated()
     rotated.train_recogniser()
-    return _walks(rotated, "turned", stages.turned, posed=False)
+    return _Walks(rotated, "turned", stages.turned, posed=False).metrics()
+
+
+def _pairs(stages: Stages) -> list[tuple[int, int]]:
+    """The pairs of classes that policies are trained without."""
+    half = len(stages.statistics.classes) // 2
+    return [(first, first + half) for first in range(min(stages.config.novel, half))]
 
 
 def _novel(stages: Stages) -> dict[str, Any]:
     """Metrics of policies on classes that they were trained without; encoder and fusion were trained on all classes."""
-    views, classes = stages.dataset.capture.views, len(stages.statistics.classes)
-    data = lattice_data(stages.dataset, stages.out, views)
-    half = classes // 2
-    pairs = [(first, first + half) for first in range(min(stages.config.novel, half))]
-    policies = [(pair, stages.policy(without=pair)) for pair in pairs]
+    views, config, pairs = stages.dataset.capture.views, stages.config, _pairs(stages)
+    data, fusion = lattice_data(stages.dataset, stages.out, views), stages.fusion()
+    policies = [by_network("trained_without", "", stages.policy(without=pair), fusion) for pair in pairs]
     identity = {
         "made_by": made_by(load_statistics(data), stages.recogniser_folder()),
         "form": _FORM,
         "policy": read_json(stages.policy_folder() / "summary.json")["identity"],
-        "walks": [pairs, stages.config.max_views, stages.config.draws, FITTED_AS],
+        "walks": [pairs, config.max_views, config.draws, FITTED_AS],
     }
 
-    def walk() -> dict[str, Any]:
-        test = stages.features(f"lattice_{views}_test", data, "test")
+    def walk() -> tuple[dict[str, Any], dict[str, np.ndarray]]:
+        features = stages.features(f"lattice_{views}_test", data, "test")
         console.print(f"Walking test objects of {2 * len(pairs)} classes that a policy was trained without")
-        return novel_classes(
-            stages.fusion(),
-            policies,
-            stages.policy(),
-            test,
-            stages.config.max_views,
-            stages.config.draws,
-            stages.seed,
-            load_statistics(data).neighbours,
+        each = novel_classes(
+            fusion,
+            list(zip(pairs, policies, strict=True)),
+            by_network("trained_with", "", stages.policy(), fusion),
+            OnLattice(features, neighbours=load_statistics(data).neighbours),
+            Walking(min(config.max_views, views), config.draws, seed=stages.seed),
             stages.expected_views(),
         )
+        return novel_metrics(each, pairs, features.labels), each
 
-    return kept_json(stages.folder / "walks_novel.json", identity, walk)
+    return _kept(stages.folder / "walks_novel.json", identity, walk)
 
 
 def _decision(stages: Stages) -> dict[str, Any]:
@@ -288,10 +337,7 @@ def _entropy_tables(out: Path, data: Path, split: str) -> Path | None:
     return path if data == out / "data" and path.exists() else None
 
 
-def _entropies(out: Path, data: Path, split: str) -> tuple[np.ndarray | None, np.ndarray | None]:
-    """Predicted and true entropies of the split, or None for each without view tables of `mevs run`."""
-    path = _entropy_tables(out, data, split)
-    if path is None:
-        return None, None
-    tables = load_view_tables(path)
-    return tables.predicted_entropy, tables.entropy
+def _tables_made_by(out: Path, data: Path) -> list[str]:
+    """What made the view tables of `mevs run` for this data set; empty without them."""
+    paths = [_entropy_tables(out, data, split) for split in ("val", "test")]
+    return [load_view_tables(path).made_by for path in paths if path is not None]

@@ -7,7 +7,7 @@ from typing import Any
 
 from eval.learned.study import WITHOUT
 from eval.learned.tables import accuracy, against, gain_of_two, ladder
-from eval.learned.walks import by_expected_views
+from eval.learned.walks import BY_EXPECTED_VIEWS
 from eval.report.html import difference, percent, table
 from mevs_jax.trained.system import EXPECTED_VIEWS
 
@@ -65,16 +65,18 @@ def novel(metrics: dict[str, Any], classes: list[str]) -> str:
     found = metrics["seeds"][0].get("novel")
     if found is None:
         return ""
-    steps = range(1, min(4, len(found["gain"]["trained_with"]["difference"])))
-    rows = []
+    gains, rows, seeds = metrics.get("novel", found["gain"]), [], len(metrics["seeds"])
+    steps = range(1, min(4, len(gains["trained_with"]["difference"])))
+    over = "objects" if seeds < 2 else f"objects and {seeds} trainings; the second table is of the first"
     for name, title in (
         ("trained_without", "trained without these classes"),
         ("trained_with", "trained with all classes"),
-        (EXPECTED_VIEWS, by_expected_views().title),
+        (EXPECTED_VIEWS, BY_EXPECTED_VIEWS.title),
         (WITHOUT, "… without expected views of these classes"),
     ):
-        gain = found["gain"][name]
-        rows.append([title, *(difference(gain["difference"][step], gain["interval"][step]) for step in steps)])
+        gain = gains[name]
+        intervals = gain.get("over_both", gain["interval"])
+        rows.append([title, *(difference(gain["difference"][step], intervals[step]) for step in steps)])
     each = [
         [
             html.escape(" and ".join(classes[label] for label in pair["classes"])),
@@ -90,7 +92,9 @@ def novel(metrics: dict[str, Any], classes: list[str]) -> str:
         "<h2>Classes left out of policy training</h2>"
         f"<p>Gain over random in percentage points on the {found['objects']} test objects of pairs of classes that a policy was "
         "trained without. Encoder and fusion were trained on all classes. Expected views are those of the objects that the "
-        "recogniser was trained on; no policy was trained for them.</p>"
+        "recogniser was trained on; no policy was trained for them. Intervals are over "
+        + over
+        + ".</p>"
         + table(["policy", *(f"{step + 1} views" for step in steps)], rows)
         + table(
             [

@@ -14,7 +14,6 @@ from eval.learned.other_cases import novel, rotated, scattered, unposed
 from eval.learned.tables import METHOD, accuracy, against, gain_of_two, ladder
 from eval.report import figures
 from eval.report.html import (
-    ReportInputs,
     commands,
     difference,
     document,
@@ -214,12 +213,10 @@ def _seeds(metrics: dict[str, Any], views: str) -> str:
     )
 
 
-def active_section(inputs: ReportInputs) -> str:
-    """The section of the run's report; empty if `mevs study learned` was not run."""
-    if inputs.learned is None:
-        return ""
-    views, found = next(iter(inputs.learned["seeds"][0]["lattices"].items()))
-    return "<h2>Learned fusion and view selection</h2>" + _lead(inputs.learned, views) + ladder(found)
+def active_section(metrics: dict[str, Any]) -> str:
+    """The section of the run's report."""
+    views, found = next(iter(metrics["seeds"][0]["lattices"].items()))
+    return "<h2>Learned fusion and view selection</h2>" + _lead(metrics, views) + ladder(found)
 
 
 def _alt_of_curves(curves: dict[str, Any]) -> str:

@@ -9,7 +9,7 @@ from data_pipeline.dataset.config import check_same_data
 from data_pipeline.dataset.statistics import load_statistics
 from data_pipeline.distributed import is_first
 from data_pipeline.files import keep_json
-from eval.learned.measure import APART, check_parts, measure, together
+from eval.learned.measure import APART, check_parts, measure, novel_together, together
 from eval.learned.system import make_learned_system
 from eval.settings import Settings
 from train.choosing.config import check_learned
@@ -34,6 +34,8 @@ def learn_to_choose(settings: Settings, out: Path) -> Path:
         trained_policies([stages.policy_job(aside=(part, APART)) for stages in seeds])
     found = [measure(stages) for stages in seeds]
     metrics = {"seeds": found, "together": together(seeds, found), "settings": asdict(config)}
+    if (novel := novel_together(seeds)) is not None:
+        metrics["novel"] = novel
     check_results(metrics, "the metrics of the learned study")
     page = out / "learned" / "index.html"
     if is_first():

@@ -7,30 +7,30 @@ objects, and is then used on test objects.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import cache, partial
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from flax import nnx
 from jaxtyping import Array, Bool, Float, Int
 
 from data_pipeline.dataset.batches import fold_of
-from eval.learned.walks import Known, Learner, OnLattice, beliefs_of, policy_parameters, walk_all, walker
+from eval.learned.walks import Known, OnLattice, Walking, beliefs_of, right_along, walk_all
 from eval.numbers.comparison import intervals
 from eval.numbers.confidence import logits_along, stops_at
 from eval.walks.grid import THRESHOLDS
 from mevs_jax.arrays import AnyArray
 from mevs_jax.beliefs.calibration import class_weights
 from mevs_jax.beliefs.fusing import CalibratedFusion, running_sum
-from mevs_jax.models.view_policy import expected_gain
-from mevs_jax.policies.base import Policy, with_movement
-from train.choosing.chunks import in_chunks
+from mevs_jax.policies.base import Policy, as_tree, candidates, with_movement
+from mevs_jax.policies.registry import PolicyRecord
+from mevs_jax.selection.loop import ViewTable
+from mevs_jax.selection.walks import state_after
 from train.choosing.features import Features
-from train.choosing.policy import graph_of, learned_policy
+from train.choosing.policy import graph_of
+from train.running.over_objects import over_objects
 
 VIEW_COSTS = (0.2, 0.1, 0.05, 0.02, 0.01, 0.005)
 """Costs of a view, in the unit of the policy's gain: nats of the true class's log-probability, unless trained otherwise."""
@@ -140,75 +140,47 @@ def _difference(gain: Float[np.ndarray, " objects"]) -> dict[str, Any]:
     return {"difference": float(gain.mean()), "interval": intervals(gain)}
 
 
-@partial(jax.jit, static_argnames="structure")
-def _best_gains_of_some(
-    given: tuple[nnx.State, Array], some: tuple[Features, Array, Array], structure: nnx.GraphDef
-) -> Array:
-    weights, temperature = given
-    network = nnx.merge(structure, weights)
-    steps = some[1].shape[-1]
+def _best_scores_of(
+    one: tuple[Features, Int[Array, "walks steps"], Float[Array, "walks steps classes"]], policy: Policy
+) -> Float[Array, "walks steps"]:
+    data, walks, beliefs = one
+    table = ViewTable(data.logits, None, None, data.labels, clouds=data.clouds)
+    scene = table.scene(graph_of(data.directions))
 
-    def of_walk(one: Features, order: Array, beliefs: Array) -> Array:
-        views = jax.nn.log_softmax(one.logits[order] / temperature, axis=-1)
-
+    def of_walk(views: Array, beliefs: Array) -> Array:
         def after(count: Array, belief: Array) -> Array:
-            present = jnp.arange(steps) < count
-            clouds = None if one.clouds is None else one.clouds[order]
-            gain_if = network(belief, views, one.directions[order], present, one.directions, clouds)[1]
-            seen = jnp.any((order[:, None] == jnp.arange(len(one.directions))) & present[:, None], axis=0)
-            return jnp.max(jnp.where(seen, -jnp.inf, expected_gain(belief, gain_if)))
+            state = state_after(table, views, count, belief)
+            scores = policy(jax.random.key(0), state, scene)  # which networks do not draw from
+            return jnp.max(jnp.where(candidates(state, scene), scores, -jnp.inf))
 
-        return jax.vmap(after)(jnp.arange(1, steps + 1), beliefs)
+        return jax.vmap(after)(jnp.arange(1, len(views) + 1), beliefs)
 
-    return jax.vmap(lambda one, orders, beliefs: jax.vmap(partial(of_walk, one))(orders, beliefs))(*some)
+    return jax.vmap(of_walk)(walks, beliefs)
 
 
 def best_gains(
-    learner: Learner,
-    fusion: CalibratedFusion,
+    policy: PolicyRecord,
     data: Features,
     views: Int[np.ndarray, "objects walks steps"],
     beliefs: Float[AnyArray, "objects walks steps classes"],
 ) -> Float[np.ndarray, "objects walks steps"]:
-    """Expected gain of the best remaining view after each step of each walk."""
-    structure, given = nnx.graphdef(learner.network), policy_parameters(learner, fusion)
-    at_once = max(1, 256 // views.shape[1])
-    return in_chunks(partial(_best_gains_of_some, given, structure=structure), (data, views, beliefs), at_once)
-
-
-def _with_cost(given: tuple[tuple[nnx.State, Array], Array], structure: nnx.GraphDef) -> Policy:
-    return with_movement(learned_policy(given[0], structure), given[1])
-
-
-@cache
-def _costing(structure: nnx.GraphDef) -> Callable[[Any], Policy]:
-    """Returns the same function for the same structure: walks are compiled once for each function."""
-    return partial(_with_cost, structure=structure)
+    """Gain of the best remaining view after each step of each walk, as the network of a policy expects it."""
+    objects, at_once = (data, views, beliefs), 256 // views.shape[1]
+    return over_objects(_best_scores_of, objects, as_tree(policy.score), at_once=at_once, by_all=True)
 
 
 def moving(
-    key: Array,
-    learner: Learner,
-    fusion: CalibratedFusion,
-    test: OnLattice,
-    knowledge: Known,
-    max_views: int,
-    every: int,
+    key: Array, policy: PolicyRecord, fusion: CalibratedFusion, test: OnLattice, knowledge: Known, walking: Walking
 ) -> list[dict[str, Any]]:
-    """Accuracy and distance travelled (radians) after each number of views, by movement cost, from every n-th start view."""
-    policy_of = _costing(nnx.graphdef(learner.network))
-    contender = replace(walker(learner), name="with_cost", policy_of=policy_of, every=every)
-    directions, rows = test.features.directions, []
-    distances = np.asarray(graph_of(directions[0]).distances)
+    """Accuracy and distance travelled (radians) after each number of views, by movement cost, from the oracles' start views."""
+    distances, rows = np.asarray(graph_of(test.features.directions[0]).distances), []
     for cost in MOVEMENT_COSTS:
-        given = policy_parameters(learner, fusion), jnp.float32(cost)
-        views = walk_all(key, contender, given, fusion, test.table(), directions, knowledge, max_views, test.neighbours)
-        steps = distances[views[:, :, :-1], views[:, :, 1:]]
-        travelled = np.concatenate([np.zeros_like(steps[..., :1]), np.cumsum(steps, axis=-1)], axis=-1)
-        right = (
-            beliefs_of(fusion, test.features, views).argmax(axis=-1) == np.asarray(test.features.labels)[:, None, None]
-        )
-        after = right.mean(axis=1).T
+        costly = replace(policy, name="with_cost", score=with_movement(policy.score, jnp.float32(cost)))
+        steps = {"max_views": walking.max_views, "every": walking.every_nth}
+        views = walk_all(key, costly, fusion, test, knowledge, **steps)
+        ways = distances[views[:, :, :-1], views[:, :, 1:]]
+        travelled = np.concatenate([np.zeros_like(ways[..., :1]), np.cumsum(ways, axis=-1)], axis=-1)
+        after = right_along(fusion, test.features, views)
         rows.append(
             {
                 "cost": cost,
@@ -222,75 +194,61 @@ def moving(
 
 def walks_apart(
     key: Array,
-    apart: Sequence[Learner],
+    apart: Sequence[PolicyRecord],
     fusion: CalibratedFusion,
     validation: OnLattice,
     knowledge: Known,
-    max_views: int,
-    every: int,
+    walking: Walking,
     temperatures: Float[np.ndarray, " steps"],
 ) -> HeldOut:
-    """Walks over validation objects, each by the policy that was trained without it, from every n-th start view.
+    """Walks over validation objects, each by the policy that was trained without it, from the start views that are fitted on.
 
     Args:
         apart: the policies; number i was trained without every object j with j mod n = i. The fusion and its temperatures
             are of all validation objects.
         temperatures: of the method's confidences, by number of views.
     """
-    features, graph = validation.features, validation.neighbours
+    features = validation.features
     part_of = fold_of(len(features.labels), len(apart))
-    steps = min(max_views, features.logits.shape[1])
-    starts = len(range(0, features.logits.shape[1], every))
-    views = np.zeros((len(part_of), starts, steps), np.int32)
-    gains = np.zeros(views.shape, np.float32)
-    beliefs = np.zeros((*views.shape, features.logits.shape[-1]), np.float32)
-    for part, learner in enumerate(apart):
-        own = np.flatnonzero(part_of == part)
-        some, given = features.some(own), policy_parameters(learner, fusion)
-        table, contender = OnLattice(some).table(), replace(walker(learner), every=every)
-        views[own] = walk_all(key, contender, given, fusion, table, some.directions, knowledge, steps, graph)
-        beliefs[own] = beliefs_of(fusion, some, views[own])
-        gains[own] = best_gains(learner, fusion, some, views[own], beliefs[own])
+    found: list[tuple[np.ndarray, ...]] = []
+    for part, policy in enumerate(apart):
+        some = features.some(np.flatnonzero(part_of == part))
+        steps = {"max_views": walking.max_views, "every": walking.fitting_starts}
+        views = walk_all(key, policy, fusion, replace(validation, features=some), knowledge, **steps)
+        beliefs = beliefs_of(fusion, some, views)
+        found.append((beliefs, best_gains(policy, some, views, beliefs)))
+    order = np.argsort(np.argsort(part_of, kind="stable"), kind="stable")  # back to the order of the objects
+    beliefs, gains = (np.concatenate(parts)[order] for parts in zip(*found, strict=True))
     confidence = confidences(beliefs / temperatures[:, None], features.labels)
     return HeldOut(confidence, replace(confidence, value=-gains))
 
 
-def cost_metrics(
-    key: Array,
-    learner: Learner,
+def rules_compared(
+    policy: PolicyRecord,
     held_out: HeldOut,
-    fusion: CalibratedFusion,
     lattices: tuple[OnLattice, OnLattice],
-    knowledge: Known,
     records: dict[str, WalkRecord],
-    max_views: int,
-    every: int,
 ) -> dict[str, Any]:
-    """Metrics of the method's stopping rule compared with two others, and of its walks with a movement cost.
+    """Metrics of the method's stopping rule compared with two others.
 
-    The other rules are the thesis's rule and the expected gain of the next view. The thesis's rule: walks by predicted
-    entropy (or random ones without a predictor), sums of logits, and a threshold on their uncalibrated confidence. Walks
-    with a movement cost begin at every n-th start view.
+    They are the thesis's rule and the expected gain of the next view. The thesis's rule: walks by predicted entropy (or random
+    ones without a predictor), sums of logits, and a threshold on their uncalibrated confidence.
 
     Args:
         held_out: signals along walks over validation objects, by policies that were trained without them.
         lattices: of validation and of test objects.
     """
-    validation, test = lattices
     walked_by = next(name for name in ("predicted_entropy", "random") if name in records)
-    both, method = (validation.features, test.features), records[learner.name]
+    both, method = [lattice.features for lattice in lattices], records[policy.name]
     thesis = [
         confidences(jax.vmap(jax.vmap(running_sum))(logits_along(jnp.asarray(views), data.logits)), data.labels)
         for data, views in zip(both, records[walked_by].views, strict=True)
     ]
     tested = method.confidence[1]
-    gain = -best_gains(learner, fusion, test.features, method.views[1], method.beliefs[1])
+    not_paying = replace(tested, value=-best_gains(policy, both[1], method.views[1], method.beliefs[1]))
     ours = held_out.confidence, tested
     return {
         "thesis_walks": walked_by,
         "beside_thesis": compare_rules(thesis, ours),
-        "not_paying": compare_rules(
-            [held_out.not_paying, replace(tested, value=gain)], ours, [-cost for cost in VIEW_COSTS]
-        ),
-        "moving": moving(key, learner, fusion, test, knowledge, max_views, every),
+        "not_paying": compare_rules([held_out.not_paying, not_paying], ours, [-cost for cost in VIEW_COSTS]),
     }

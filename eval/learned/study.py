@@ -6,7 +6,7 @@ own walks over validation objects, because the beliefs along well-chosen views d
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -16,24 +16,24 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from data_pipeline.progress import console
-from eval.learned.comparison import ByObject, compared, difference
+from eval.learned.comparison import ByObject, difference
+from eval.learned.comparison import compared as compared_by_object
 from eval.learned.poses import UnknownPose
-from eval.learned.stopping import Signal, WalkRecord, confidences, cost_metrics, walks_apart
+from eval.learned.stopping import Signal, WalkRecord, confidences, moving, rules_compared, walks_apart
 from eval.learned.walks import (
-    Contender,
+    BY_EXPECTED_VIEWS,
+    RANDOM,
     Known,
-    Learner,
     OnLattice,
+    Walking,
     beliefs_of,
-    by_expected_views,
-    contenders,
-    policy_parameters,
-    random_walker,
+    compared,
+    right_along,
     walk_all,
-    walker,
 )
 from eval.numbers.comparison import intervals
 from eval.numbers.confidence import stopping
+from eval.walks.knowledge import FixedOrder, fit_order, worth_of
 from mevs_jax.arrays import AnyArray
 from mevs_jax.beliefs.calibration import (
     calibration_error_by_chance,
@@ -43,12 +43,18 @@ from mevs_jax.beliefs.calibration import (
     log_likelihood,
 )
 from mevs_jax.beliefs.fusing import CalibratedFusion
-from mevs_jax.models import ViewPolicy
 from mevs_jax.models.expected_views import ExpectedViews
 from mevs_jax.policies.base import Knowledge
+from mevs_jax.policies.registry import Need, PolicyRecord
 from mevs_jax.trained.system import EXPECTED_VIEWS
 from train.choosing.calibrated import beliefs_of_sets
 from train.choosing.features import Features, sets_of_size
+from train.running.over_objects import over_objects
+
+WITHOUT = "expected_views_without"
+"""Expected views without those of classes that are left out."""
+_STARTS_OF_EACH = 4
+"""Start views of each object that the best fixed order is fitted on; over all objects, every view is one as often."""
 
 
 @jax.jit
@@ -96,63 +102,49 @@ def walk_metrics(
     return found, signals, likelihood
 
 
-def fixed_order_scores(
-    fusion: CalibratedFusion, data: Features, most: int, starts: int = 8, objects: int = 300
-) -> np.ndarray:
-    """Scores (views,) of a fixed order of views; the first view of the order has the largest score.
+def _worth_of_one(
+    one: tuple[Features, Int[Array, " starts"]], fusion: CalibratedFusion, before: Int[Array, " before"]
+) -> Float[Array, "views criteria"]:
+    """What each view is worth for an object; a view seen before adds nothing."""
+    data, starts = one
 
-    A greedy search chooses the first `most` views by their class-balanced accuracy on some validation objects from some start
-    views. Each later view is the farthest from those before it.
+    def after(start: Array, view: Array) -> Array:
+        members = jnp.concatenate([before, start[None], view[None]])
+        first = jnp.argmax(members[:, None] == members, axis=1) == jnp.arange(len(members))
+        return worth_of(fusion(data.features[members], data.directions[members], first), data.labels)
+
+    each = jax.vmap(jax.vmap(after, (0, None)), (None, 0))(starts, jnp.arange(len(data.directions)))
+    return jnp.mean(each, axis=1)
+
+
+def order_of_fused(fusion: CalibratedFusion, data: Features, most: int) -> FixedOrder:
+    """Returns the best fixed order of views for a learned fusion, over all objects.
+
+    A greedy search chooses the first `most` views. Each later view is the farthest from those before it.
     """
-    some = jnp.asarray(np.unique(np.linspace(0, len(data.labels) - 1, objects).astype(int)))
-    data = jax.tree.map(lambda leaf: leaf[some], data)
-    views = data.features.shape[1]
-    begin = np.unique(np.linspace(0, views - 1, starts).astype(int))
-    weights = class_weights(data.labels, data.logits.shape[-1])
+    objects, views, classes = data.logits.shape
+    starts = (np.arange(objects)[:, None] + np.arange(_STARTS_OF_EACH) * views // _STARTS_OF_EACH) % views
 
-    @jax.jit
-    def right_with(seen: Array) -> Array:
-        """Class-balanced accuracy with the views (sets, slots) seen; −1 marks an empty slot."""
+    def worth(before: frozenset[int]) -> np.ndarray:
+        given = np.array(sorted(before), int)
+        return over_objects(_worth_of_one, (data, starts), fusion, given, at_once=1, by_all=True)
 
-        def of_set(one: Array) -> Array:
-            beliefs = fusion(
-                data.features[:, one], data.directions[:, one], jnp.broadcast_to(one >= 0, (len(some), len(one)))
-            )
-            own = jnp.take_along_axis(beliefs, data.labels[:, None], axis=1)
-            return jnp.mean(weights * jnp.all(beliefs <= own, axis=1))
-
-        return jax.lax.map(of_set, seen)
-
-    order: list[int] = []
-    for _ in range(most):
-        sets = np.full((views, len(begin), most + 1), -1)
-        for view in range(views):
-            for row, start in enumerate(begin):
-                members = list(dict.fromkeys([int(start), *order, view]))
-                sets[view, row, : len(members)] = members
-        share = np.asarray(right_with(jnp.asarray(sets.reshape(-1, most + 1)))).reshape(views, -1).mean(axis=1)
-        share[order] = -1
-        order.append(int(share.argmax()))
-    points = np.asarray(data.directions[0])
+    found = fit_order(worth, class_weights(data.labels, classes), np.ones(views, bool), most)
+    order, points = [*found.views], np.asarray(data.directions[0])
     while len(order) < views:
         near = (points @ points[order].T).max(axis=1)
         near[order] = 2
         order.append(int(near.argmin()))
-    scores = np.zeros(views, np.float32)
-    scores[order] = np.arange(views, 0, -1)
-    return scores
+    return replace(found, views=order)
 
 
-def learn(fusion: CalibratedFusion, data: Features, expected: ExpectedViews | None, most: int) -> Knowledge:
+def learn(
+    fusion: CalibratedFusion, data: Features, expected: ExpectedViews | None, most: int
+) -> tuple[Knowledge, FixedOrder]:
     """What policies know about the views of a lattice: their best fixed order, of validation objects, and expected views."""
-    order = jnp.asarray(fixed_order_scores(fusion, data, most))
-    return Knowledge(order, None if expected is None else expected.at(data.directions[0]))
-
-
-WITHOUT = "expected_views_without"
-"""Expected views without those of classes that are left out."""
-_TRYING_STARTS = 8
-"""Approximate number of start views, spread over the lattice, for oracles and for walks with a movement cost."""
+    order = order_of_fused(fusion, data, most)
+    expected_logits = None if expected is None else expected.at(data.directions[0])
+    return Knowledge(order.scores(data.logits.shape[1]), expected_logits), order
 
 
 def random_sets_study(
@@ -195,16 +187,12 @@ def random_sets_study(
 
 def study(
     fusion: CalibratedFusion,
-    learners: Sequence[Learner],
-    validation: OnLattice,
-    test: OnLattice,
+    learned: Sequence[PolicyRecord],
+    lattices: tuple[OnLattice, OnLattice],
+    walking: Walking,
     *,
-    max_views: int,
-    draws: int,
-    oracle_views: int = 4,
-    fitting_starts: int = 1,
-    seed: int = 0,
-    apart: Sequence[Learner] = (),
+    fusions: Mapping[str, CalibratedFusion] | None = None,
+    apart: Sequence[PolicyRecord] = (),
     others: bool = True,
     known: ExpectedViews | UnknownPose | None = None,
 ) -> tuple[dict[str, Any], dict[str, ByObject]]:
@@ -212,118 +200,134 @@ def study(
 
     Args:
         fusion: of the recogniser that computed the features.
-        learners: trained view policies; the first is the method, the others are compared with it.
-        max_views: length of a walk.
-        draws: walks of random policies from each start view.
-        oracle_views: length of the oracles' walks, at most `max_views`.
-        fitting_starts: temperatures are fitted on walks from every n-th start view.
+        learned: trained view policies; the first is the method, the others are compared with it.
+        lattices: of validation and of test objects.
+        walking: how policies walk.
+        fusions: those of policies that have another one, by name.
         apart: the method trained without each part of the validation objects (every n-th); with them, the metrics of stopping and
             of movement cost are added.
         others: whether to evaluate the other policies and random sets as well.
         known: what the recogniser is expected to say of each class from every direction; of objects in the fusion's poses.
     """
-    points, labels = test.features.directions[0], test.features.labels
+    validation, test = lattices
+    points, labels, method = test.features.directions[0], test.features.labels, learned[0].name
     shared = fusion.posed and bool(jnp.allclose(test.features.directions, points, atol=1e-4))
-    max_views = min(max_views, len(points))
-    oracle_views = min(oracle_views, max_views)
-    knowledge: Known = known
+    walking, knowledge, order = walking.on(len(points)), known, None
     if shared and not isinstance(known, UnknownPose):
-        knowledge = learn(fusion, validation.features, known, max_views)
-    every_nth = max(1, len(points) // _TRYING_STARTS)
-    some_starts = np.arange(0, len(points), every_nth)
+        knowledge, order = learn(fusion, validation.features, known, walking.max_views)
     found: dict[str, Any] = {
         "objects": len(labels),
-        "trying_starts": len(some_starts),
+        "trying_starts": len(range(0, len(points), walking.every_nth)),
         "validation_objects": len(validation.features.labels),
         "views": len(points),
         "single_view": float(jnp.mean(jnp.argmax(test.features.logits, -1) == labels[:, None])),
         "policies": {},
     }
+    if order is not None:
+        found["fixed_order"] = {"fitted_by": order.fitted_by}
     if others:
-        found["random_sets"] = random_sets_study(fusion, validation.features, test.features, draws)
+        found["random_sets"] = random_sets_study(fusion, validation.features, test.features, walking.draws)
+    policies = compared(learned, fusion, _given(test, shared, known)) if others else (RANDOM, *learned)
     each: dict[str, ByObject] = {}
-    parameters: dict[str, Any] = {"belief_oracle": fusion, "label_oracle": fusion}
-    parameters |= {learner.name: policy_parameters(learner, fusion) for learner in learners}
-    fusions = {learner.name: learner.fusion or fusion for learner in learners}
     records: dict[str, WalkRecord] = {}
-    entropies = shared and test.predicted_entropy is not None and test.entropy is not None
-    flags = {"entropies": entropies, "shared": shared, "expected": known is not None}
-    policies = contenders(learners, draws, oracle_views, every_nth, **flags)
-    for contender in policies if others else [random_walker(draws), *map(walker, learners)]:
-        name, own, walks, beliefs = contender.name, fusions.get(contender.name, fusion), [], []
-        for split, data in enumerate((validation, test)):
-            every = contender.every if data is test else max(contender.every, fitting_starts)
-            views = walk_all(
-                jax.random.fold_in(jax.random.key(seed), split),
-                replace(contender, every=every),
-                parameters.get(name),
-                own,
-                data.table(),
-                data.features.directions,
-                knowledge,
-                contender.max_views or max_views,
-                data.neighbours,
-            )
-            walks.append(views)
-            beliefs.append(beliefs_of(own, data.features, views))
-        metrics, signals, likelihood = walk_metrics(beliefs, [data.features.labels for data in (validation, test)])
-        right = signals[1].right
-        records[name] = WalkRecord(walks, beliefs, signals)
-        by_start = right.reshape(len(right), -1, contender.draws, right.shape[-1]).mean(axis=2)
-        from_some = by_start if contender.every > 1 else by_start[:, some_starts]
-        each[name] = ByObject(by_start.mean(axis=1).T, likelihood, from_some.mean(axis=1).T)
-        found["policies"][name] = {"title": contender.title, "knows": contender.knows, **metrics}
-        console.print(f"{contender.title}: " + " ".join(f"{100 * share:.1f}" for share in metrics["after_views"]))
+    for policy in policies:
+        own = (fusions or {}).get(policy.name, fusion)
+        records[policy.name], metrics, each[policy.name] = _walked(policy, own, lattices, knowledge, walking)
+        found["policies"][policy.name] = {"title": policy.title, "knows": policy.knows, **metrics}
+        console.print(f"{policy.title}: " + " ".join(f"{100 * share:.1f}" for share in metrics["after_views"]))
     if apart:
-        key, method = jax.random.key(seed), learners[0]
-        lattices, scale = (validation, test), np.array(found["policies"][method.name]["temperatures"])
-        held_out = walks_apart(key, apart, fusion, validation, knowledge, max_views, fitting_starts, scale)
-        found["costs"] = cost_metrics(key, method, held_out, fusion, lattices, knowledge, records, max_views, every_nth)
-    return found | compared(each, learners[0].name), each
+        key, scale = jax.random.key(walking.seed), np.array(found["policies"][method]["temperatures"])
+        held_out = walks_apart(key, apart, fusion, validation, knowledge, walking, scale)
+        rules = rules_compared(learned[0], held_out, lattices, records)
+        found["costs"] = rules | {"moving": moving(key, learned[0], fusion, test, knowledge, walking)}
+    return found | compared_by_object(each, method), each
+
+
+def _given(test: OnLattice, shared: bool, known: Known) -> frozenset[Need]:
+    """What policies of the study can be given.
+
+    Args:
+        shared: whether all objects have the same candidate views in a known pose; only then is there a fixed order of views.
+        known: what the recogniser is expected to say.
+    """
+    given: set[Need] = {"belief", "features", "logits", "label"}
+    if shared and test.predicted_entropy is not None and test.entropy is not None:
+        given |= {"predicted_entropy", "entropy"}
+    given |= {"order"} if shared and not isinstance(known, UnknownPose) else set()
+    given |= {"expected_views"} if known is not None else set()
+    given |= {"clouds"} if test.features.clouds is not None else set()
+    return frozenset(given)
+
+
+def _walked(
+    policy: PolicyRecord,
+    fusion: CalibratedFusion,
+    lattices: tuple[OnLattice, OnLattice],
+    knowledge: Known,
+    walking: Walking,
+) -> tuple[WalkRecord, dict[str, Any], ByObject]:
+    """The walks of a policy, its metrics, and its results by object."""
+    tries = "features" in policy.needs  # an oracle, which fuses every view at every step
+    starts, steps = (walking.every_nth, walking.oracle_views) if tries else (1, walking.max_views)
+    walks, beliefs = [], []
+    for split, data in enumerate(lattices):
+        key, every = jax.random.fold_in(jax.random.key(walking.seed), split), starts
+        if not split:
+            every = max(starts, walking.fitting_starts)
+        views = walk_all(key, policy, fusion, data, knowledge, max_views=steps, draws=walking.draws, every=every)
+        walks.append(views)
+        beliefs.append(beliefs_of(fusion, data.features, views))
+    metrics, signals, likelihood = walk_metrics(beliefs, [data.features.labels for data in lattices])
+    right = signals[1].right
+    by_start = right.reshape(len(right), -1, policy.draws(walking.draws), right.shape[-1]).mean(axis=2)
+    from_some = by_start if tries else by_start[:, :: walking.every_nth]
+    by_object = ByObject(by_start.mean(axis=1).T, likelihood, from_some.mean(axis=1).T)
+    return WalkRecord(walks, beliefs, signals), metrics, by_object
 
 
 def novel_classes(
     fusion: CalibratedFusion,
-    policies: Sequence[tuple[tuple[int, ...], ViewPolicy]],
-    whole: ViewPolicy,
-    test: Features,
-    max_views: int,
-    draws: int,
-    seed: int = 0,
-    neighbours: list[list[int]] | None = None,
+    pairs: Sequence[tuple[tuple[int, ...], PolicyRecord]],
+    whole: PolicyRecord,
+    test: OnLattice,
+    walking: Walking,
     expected: ExpectedViews | None = None,
-) -> dict[str, Any]:
-    """Results of policies on classes that they were trained without, with random selection and a fully trained policy.
+) -> dict[str, Float[np.ndarray, "steps objects"]]:
+    """Results by object of policies on classes that they were trained without, with random selection and a fully trained policy.
 
     Expected views need no policy that was trained. They are evaluated for all classes, and without those of the classes left out,
-    as if these were not known to give any evidence.
+    as if these were not known to give any evidence. The objects are those of each pair's classes, pair after pair.
 
     Args:
-        policies: pairs of the classes that a policy was trained without, and the policy.
+        pairs: of the classes that a policy was trained without, and the policy.
         whole: the policy that was trained on all classes.
-        neighbours: as for `walk_all`.
         expected: as for `study`.
     """
-    after: dict[str, list[np.ndarray]] = {"random": [], "trained_without": [], "trained_with": []}
-    if expected is not None:
-        after |= {EXPECTED_VIEWS: [], WITHOUT: []}
-    rows = []
-    for classes, policy in policies:
-        some = test.some(np.flatnonzero(np.isin(test.labels, classes)))
-        learners = Learner("trained_without", "", policy), Learner("trained_with", "", whole)
-        walkers: list[tuple[Contender, Any, Known]] = [(random_walker(draws), None, None)]
-        walkers += [(walker(one), policy_parameters(one, fusion), None) for one in learners]
+    found: dict[str, list[np.ndarray]] = {}
+    for classes, without in pairs:
+        some = replace(test, features=test.features.some(np.flatnonzero(np.isin(test.features.labels, classes))))
+        walkers: list[tuple[str, PolicyRecord, Known]] = [("random", RANDOM, None)]
+        walkers += [("trained_without", without, expected), ("trained_with", whole, expected)]
         if expected is not None:
-            some_unknown = ExpectedViews(expected.coefficients.at[jnp.array(classes)].set(0.0))
-            walkers.append((by_expected_views(), None, expected))
-            walkers.append((replace(by_expected_views(), name=WITHOUT), None, some_unknown))
-        for contender, given, knowledge in walkers:
-            table, key = OnLattice(some).table(), jax.random.key(seed)
-            views = walk_all(key, contender, given, fusion, table, some.directions, knowledge, max_views, neighbours)
-            right = beliefs_of(fusion, some, views).argmax(axis=-1) == np.asarray(some.labels)[:, None, None]
-            after[contender.name].append(right.mean(axis=1).T)
-        row = {"classes": list(classes), "objects": len(some.labels)}
-        rows.append(row | {name: found[-1].mean(axis=1).tolist() for name, found in after.items()})
-    every = {name: np.concatenate(found, axis=1) for name, found in after.items()}
-    gains = {name: difference(mine, every["random"]) for name, mine in every.items() if name != "random"}
-    return {"objects": every["random"].shape[1], "pairs": rows, "gain": gains}
+            unknown = ExpectedViews(expected.coefficients.at[jnp.array(classes)].set(0.0))
+            walkers += [(EXPECTED_VIEWS, BY_EXPECTED_VIEWS, expected), (WITHOUT, BY_EXPECTED_VIEWS, unknown)]
+        for name, policy, knowledge in walkers:
+            steps, key = {"max_views": walking.max_views, "draws": walking.draws}, jax.random.key(walking.seed)
+            views = walk_all(key, policy, fusion, some, knowledge, **steps)
+            found.setdefault(name, []).append(right_along(fusion, some.features, views))
+    return {name: np.concatenate(parts, axis=1) for name, parts in found.items()}
+
+
+def novel_metrics(
+    each: Mapping[str, Float[np.ndarray, "steps objects"]],
+    pairs: Sequence[tuple[int, ...]],
+    labels: Int[AnyArray, " objects"],
+) -> dict[str, Any]:
+    """The metrics of `novel_classes`; `labels` are of all test objects."""
+    rows, first = [], 0
+    for classes in pairs:
+        own = slice(first, first := first + int(np.isin(labels, classes).sum()))
+        means = {name: right[:, own].mean(axis=1).tolist() for name, right in each.items()}
+        rows.append({"classes": list(classes), "objects": own.stop - own.start} | means)
+    gains = {name: difference(mine, each["random"]) for name, mine in each.items() if name != "random"}
+    return {"objects": first, "pairs": rows, "gain": gains}

@@ -121,7 +121,7 @@ def learned_system(stages: Stages, found: dict[str, Any], figures: dict[str, Any
         fusion=fusions,
         view_policies={name: Network.of(policy) for name, policy in policies.items()},
         pose=Network.of(recogniser.pose) if recogniser.pose else None,
-        knowledge=learn(fusions["posed"], validation, expected, min(config.max_views, views)),
+        knowledge=learn(fusions["posed"], validation, expected, min(config.max_views, views))[0],
         expected=expected,
         temperatures={name: jnp.asarray(values, jnp.float32) for name, values in temperatures.items()},
         strangeness=fit_strangeness(validation.logits, views),

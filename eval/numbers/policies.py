@@ -7,7 +7,7 @@ numbers.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from importlib import import_module
 from pathlib import Path
 from typing import Any, Literal
@@ -22,11 +22,10 @@ from eval.numbers.study import BASELINE, Setting, check_own
 from eval.run_file import load_run
 from eval.tables import ViewTables, load_view_tables
 from eval.walks.grid import FIRST_MV, THRESHOLDS, GridConfig, Results
-from eval.walks.ladder import Rung
-from eval.walks.own_policies import OwnPolicy, own_rungs
+from eval.walks.own_policies import checked, own_policy
 from mevs_jax.geometry.viewpoints import ViewGraph
 from mevs_jax.policies.base import Policy
-from mevs_jax.policies.registry import POLICIES, Knows, PolicyEntry, policy_entry
+from mevs_jax.policies.registry import POLICIES, Knows, PolicyRecord, policy_record
 from train.results.identity import made_by, why
 from train.results.records import csv_of as rows_as_csv
 
@@ -82,14 +81,14 @@ class PolicyStudy:
     Attributes:
         objects: names of the test objects.
         labels: (objects,) their true classes.
-        rungs: the policies, random selection first.
+        policies: the policies, random selection first.
         results: the results of each on every object, by name.
         reachable: (views,) the views that the camera can visit and start from.
     """
 
     objects: list[str]
     labels: Int[np.ndarray, " objects"]
-    rungs: tuple[Rung, ...]
+    policies: tuple[PolicyRecord, ...]
     results: dict[str, Results]
     reachable: Bool[np.ndarray, " views"]
 
@@ -109,8 +108,8 @@ class PolicyStudy:
         """Returns the numbers as a list of rows; see `to_frame`."""
         base = self.results[BASELINE]
         if by == "threshold":
-            return [row for rung in self.rungs for row in _rows_of_grid(rung, self.results[rung.policy], base)]
-        names = [{"policy": rung.policy, "title": rung.title, "knows": rung.knows} for rung in self.rungs]
+            return [row for policy in self.policies for row in _rows_of_grid(policy, self.results[policy.name], base)]
+        names = [{"policy": one.name, "title": one.title, "knows": one.knows} for one in self.policies]
         summaries = {name: summarise(result, self.labels) for name, result in self.results.items()}
         against = {name: difference(result, base) for name, result in self.results.items() if name != BASELINE}
         return tidy_rows(names, summaries, against)
@@ -153,29 +152,24 @@ def evaluate_policies(
     if not isinstance(run, str | Path | EvaluationInputs):
         raise DataError(f"evaluate_policies needs a run directory, or view tables, not a {type(run).__name__}")
     inputs = run if isinstance(run, EvaluationInputs) else EvaluationInputs.of_run(Path(run))
-    own = tuple(_own(name, policy, knows) for name, policy in policies.items() if not _is_baseline(name, policy))
+    own = [
+        own_policy(name, policy, f"policy {name!r}", knows)
+        for name, policy in policies.items()
+        if not _is_baseline(name, policy)
+    ]
     tables = inputs.tables
     setting = Setting.of(inputs.graph, inputs.validation, inputs.config)
-    draws = setting.config.draws
-    further = own_rungs(own, setting.graph, tables.logits.shape[-1], draws)
-    rungs = (Rung.of(BASELINE, draws), *further)
-    results, _ = setting.with_random(tables, rungs)
-    check_own(own, further, results, tables, setting)
-    return PolicyStudy(tables.names, tables.labels, rungs, results, setting.can_reach)
+    further = checked(own, setting.graph, tables.logits.shape[-1])
+    compared = (policy_record(BASELINE), *further)
+    results, _ = setting.with_random(tables, compared)
+    check_own(further, results, tables, setting)
+    return PolicyStudy(tables.names, tables.labels, compared, results, setting.can_reach)
 
 
 def _is_baseline(name: str, policy: Policy) -> bool:
     if name == BASELINE and policy is not POLICIES[BASELINE]:
         raise DataError(f"the policy name {name!r} is that of the baseline; choose another")
     return name == BASELINE
-
-
-def _own(name: str, policy: Policy, knows: Knows) -> OwnPolicy:
-    registered = next((other for other, found in POLICIES.items() if found is policy), None)
-    entry = PolicyEntry(name, policy, name.replace("_", " "), knows)
-    if registered is not None:
-        entry = replace(policy_entry(registered), name=name)
-    return OwnPolicy(f"policy {name!r}", entry)
 
 
 def tidy_rows(
@@ -207,14 +201,14 @@ def tidy_rows(
     return rows
 
 
-def _rows_of_grid(rung: Rung, results: Results, base: Results) -> list[dict[str, Any]]:
+def _rows_of_grid(policy: PolicyRecord, results: Results, base: Results) -> list[dict[str, Any]]:
     right, used, _, _ = cells(results)
     gain = difference(results, base)
     return [
         {
-            "policy": rung.policy,
-            "title": rung.title.lstrip("— "),
-            "knows": rung.knows,
+            "policy": policy.name,
+            "title": policy.title.lstrip("— "),
+            "knows": policy.knows,
             "max_views": row + FIRST_MV,
             "threshold": threshold,
             "accuracy": float(right[row, column].mean()),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -18,12 +19,13 @@ from eval.tables import ViewTables
 from eval.threads import by_threads
 from eval.walks.exact import expected_random
 from eval.walks.grid import FIRST_MV, THRESHOLDS, GridConfig, Results, run_grid
-from eval.walks.knowledge import learn
-from eval.walks.ladder import SCRAMBLED, Rung, ladder
-from eval.walks.own_policies import OwnPolicy, check_scores, own_rungs
+from eval.walks.knowledge import Criterion, learn, order_of_sums
+from eval.walks.ladder import SCRAMBLED, ladder
+from eval.walks.own_policies import check_scores, checked
 from mevs_jax.beliefs.metrics import accuracy, class_accuracy, confusion_matrix
 from mevs_jax.geometry.viewpoints import ViewGraph
-from mevs_jax.policies.base import Knowledge
+from mevs_jax.policies.base import Knowledge, with_movement
+from mevs_jax.policies.registry import PolicyRecord
 
 HEADLINE_CT, HEADLINE_MV = 0.99, 4
 """The cell of the grid used in the thesis's first test and confusion matrices (§5.3)."""
@@ -167,12 +169,14 @@ class Setting:
     Attributes:
         graph: the candidate views.
         knowledge: statistics over validation objects.
+        order_by: what the best fixed order was fitted by.
         config: settings of the evaluation; `max_views` at most the number of views that can be reached.
         can_reach: (views,) bool.
     """
 
     graph: ViewGraph
     knowledge: Knowledge
+    order_by: Criterion
     config: GridConfig
     can_reach: np.ndarray
 
@@ -181,26 +185,32 @@ class Setting:
         """What follows from the settings of an evaluation, with the knowledge learned from validation objects."""
         can_reach = reachable_views(np.asarray(graph.points), config.lowest_elevation)
         config = replace(config, max_views=min(config.max_views, int(can_reach.sum())))
-        knowledge = learn(jnp.asarray(validation.logits), jnp.asarray(validation.labels))
-        return Setting(graph, knowledge, config, can_reach)
+        order = order_of_sums(validation.logits, validation.labels, can_reach)
+        return Setting(graph, learn(validation.logits, validation.labels, order), order.fitted_by, config, can_reach)
 
     @property
     def reachable(self) -> jax.Array | None:
         return None if self.can_reach.all() else jnp.asarray(self.can_reach)
 
-    def walk(self, tables: ViewTables, rungs: tuple[Rung, ...], **rest: Any) -> dict[str, Results]:
-        """Results of some policies on all objects of a split, by name; `rest` are further arguments of `run_grid`."""
-        one_backbone = tables.stacked()
-        stacked = replace(one_backbone, logits=one_backbone.logits[:, None])
-        knowledge = jax.tree.map(lambda leaf: leaf[None], self.knowledge)
-        key, max_views = jax.random.key(self.config.seed), self.config.max_views
+    def walk(
+        self, tables: ViewTables, policies: Sequence[PolicyRecord], draws: int | None = None
+    ) -> dict[str, Results]:
+        """Results of some policies on all objects of a split, by name; `draws` other than those of the settings if given."""
+        one_backbone, config = tables.stacked(), self.config
         return run_grid(
-            key, stacked, self.graph, knowledge, rungs, max_views=max_views, reachable=self.reachable, **rest
+            jax.random.key(config.seed),
+            replace(one_backbone, logits=one_backbone.logits[:, None]),
+            self.graph,
+            jax.tree.map(lambda leaf: leaf[None], self.knowledge),
+            policies,
+            max_views=config.max_views,
+            draws=config.draws if draws is None else draws,
+            reachable=self.reachable,
         )
 
-    def with_random(self, tables: ViewTables, rungs: tuple[Rung, ...]) -> tuple[dict[str, Results], int]:
+    def with_random(self, tables: ViewTables, policies: Sequence[PolicyRecord]) -> tuple[dict[str, Results], int]:
         """Walks of policies, among them random selection, whose results are exact up to the number of views returned."""
-        results = self.walk(tables, rungs)
+        results = self.walk(tables, policies)
         logits, labels = jnp.asarray(tables.logits)[:, None], jnp.asarray(tables.labels)
         results[BASELINE], exact = exactly_random(results[BASELINE], logits, labels, self.can_reach)
         return results, exact
@@ -210,18 +220,12 @@ class Setting:
         return np.asarray(result.views)[0, :, self.can_reach, 0].swapaxes(0, 1)
 
 
-def check_own(
-    own: tuple[OwnPolicy, ...],
-    rungs: tuple[Rung, ...],
-    results: dict[str, Results],
-    tables: ViewTables,
-    setting: Setting,
-) -> None:
-    """Raises `DataError` if scores of a user's policy mean nothing (`check_scores`); `rungs` are the policies as evaluated."""
-    for policy, rung in zip(own, rungs, strict=True):
-        walks = np.asarray(results[rung.policy].views)[0, :, :, 0]
+def check_own(own: Sequence[PolicyRecord], results: dict[str, Results], tables: ViewTables, setting: Setting) -> None:
+    """Raises `DataError` if scores of a user's policy mean nothing (`check_scores`)."""
+    for policy in own:
+        walks = np.asarray(results[policy.name].views)[0, :, :, 0]
         key, stacked = jax.random.key(setting.config.seed), tables.stacked()
-        check_scores(policy, rung, key, stacked, walks, setting.graph, setting.knowledge, setting.reachable)
+        check_scores(policy, key, stacked, walks, setting.graph, setting.knowledge, setting.reachable)
 
 
 def _confidence(
@@ -229,10 +233,9 @@ def _confidence(
     tables: ViewTables,
     validation: ViewTables,
     results: dict[str, Results],
-    rungs: tuple[Rung, ...],
+    policies: Sequence[PolicyRecord],
 ) -> dict[str, Any]:
-    fitting = tuple(replace(rung, draws=1) for rung in rungs if rung.policy in CONFIDENCE_OF)
-    walks = setting.walk(validation, fitting)
+    walks = setting.walk(validation, [policy for policy in policies if policy.name in CONFIDENCE_OF], draws=1)
 
     def of(name: str) -> dict[str, Any]:
         fitted_on, shown = setting.starts_of(walks[name]), setting.starts_of(results[name])
@@ -242,12 +245,13 @@ def _confidence(
 
 
 def _movement(
-    setting: Setting, tables: ViewTables, results: dict[str, Results], rungs: tuple[Rung, ...]
+    setting: Setting, tables: ViewTables, results: dict[str, Results], policies: Sequence[PolicyRecord]
 ) -> dict[str, list[dict[str, Any]]]:
     found = {name: [{"cost": 0.0} | accuracy_by_distance(results[name])] for name in MOVING}
-    moving = tuple(rung for rung in rungs if rung.policy in MOVING)
+    moving = [policy for policy in policies if policy.name in MOVING]
     for cost in MOVEMENT_COSTS:
-        for name, result in setting.walk(tables, moving, movement_cost=jnp.float32(cost)).items():
+        costly = [replace(policy, score=with_movement(policy.score, jnp.float32(cost))) for policy in moving]
+        for name, result in setting.walk(tables, costly).items():
             found[name].append({"cost": cost} | accuracy_by_distance(result))
     return found
 
@@ -271,7 +275,7 @@ def run_study(
     config: GridConfig,
     by_view: ViewTables | None = None,
     leak: dict[str, dict[str, float]] | None = None,
-    own: tuple[OwnPolicy, ...] = (),
+    own: Sequence[PolicyRecord] = (),
 ) -> dict[str, Any]:
     """All metrics of the test split.
 
@@ -290,20 +294,19 @@ def run_study(
     setting = Setting.of(statistics.graph, validation, config)
     config, can_reach = setting.config, setting.can_reach
 
-    further = own_rungs(own, setting.graph, len(statistics.classes), config.draws)
-    rungs = ladder(config.draws, further)
-    console.print(f"Walking {len(tables.labels)} test objects from {can_reach.sum()} views by {len(rungs)} policies")
-    results, exact = setting.with_random(tables, (*rungs, SCRAMBLED))
-    shown = {rung.policy: results[rung.policy] for rung in rungs}
-    check_own(own, further, results, tables, setting)
+    own = checked(own, setting.graph, len(statistics.classes))
+    policies = ladder(own)
+    console.print(f"Walking {len(tables.labels)} test objects from {can_reach.sum()} views by {len(policies)} policies")
+    results, exact = setting.with_random(tables, (*policies, SCRAMBLED))
+    shown = {policy.name: results[policy.name] for policy in policies}
+    check_own(own, results, tables, setting)
 
     other = None
     if by_view is not None:
         wanted = ("random", "random_with_repetition", "predicted_entropy")
-        switched = (*(rung for rung in rungs if rung.policy in wanted), SCRAMBLED)
-        other, _ = setting.with_random(by_view, switched)
+        other, _ = setting.with_random(by_view, [*(one for one in policies if one.name in wanted), SCRAMBLED])
 
-    sources = {policy.entry.name: {"own": policy.code.identity if policy.code else {}} for policy in own}
+    sources = {policy.name: {"own": dict(policy.code or {})} for policy in own}
     mv = min(HEADLINE_MV, config.max_views)
     return {
         "objects": len(tables.labels),
@@ -320,16 +323,17 @@ def run_study(
         "single_view": single_view(tables, len(statistics.classes), can_reach),
         "entropy": entropy_errors(tables, statistics),
         "ladder": [
-            {"policy": rung.policy, "title": rung.title, "knows": rung.knows} | sources.get(rung.policy, {})
-            for rung in rungs
+            {"policy": policy.name, "title": policy.title, "knows": policy.knows} | sources.get(policy.name, {})
+            for policy in policies
         ],
         "policies": _policies(setting, tables, shown, mv, THRESHOLDS.index(HEADLINE_CT)),
         "against_random": {
             name: difference(result, shown[BASELINE]) for name, result in shown.items() if name != BASELINE
         },
+        "fixed_order": {"fitted_by": setting.order_by},
         "views_to_reach": views_to_reach(shown, BASELINE),
         "best_pair": best_pair(tables, can_reach),
-        "confidence": _confidence(setting, tables, validation, results, rungs),
-        "movement": _movement(setting, tables, results, rungs),
+        "confidence": _confidence(setting, tables, validation, results, policies),
+        "movement": _movement(setting, tables, results, policies),
         "compatibility": compatibility(results, other, statistics.views, leak),
     }

@@ -14,15 +14,16 @@ from eval.numbers.comparison import interval_of_both, intervals
 from eval.numbers.policies import EvaluationInputs
 from eval.numbers.study import BASELINE, Setting, exactly_random
 from eval.walks.grid import Results, run_grid
-from eval.walks.ladder import Rung, ladder
-from eval.walks.own_policies import OwnPolicy, own_rungs
+from eval.walks.ladder import ladder
+from eval.walks.own_policies import checked
+from mevs_jax.policies.registry import PolicyRecord
 from mevs_jax.selection.loop import ViewTable
 from train.results.records import csv_of, ends, numbered
 
 
 def walks_of_all(
-    inputs: Sequence[EvaluationInputs], own: tuple[OwnPolicy, ...] = ()
-) -> tuple[tuple[Rung, ...], dict[str, Results]]:
+    inputs: Sequence[EvaluationInputs], own: Sequence[PolicyRecord] = ()
+) -> tuple[tuple[PolicyRecord, ...], dict[str, Results]]:
     """The grid of all trainings as one program: trainings × objects × start views × draws × policies × thresholds.
 
     Args:
@@ -48,26 +49,27 @@ def walks_of_all(
     )
     labels = jnp.asarray(first.tables.labels)
     table = ViewTable(logits, entropies, jnp.asarray(first.tables.entropy), labels)
-    rungs = ladder(config.draws, own_rungs(own, first.graph, logits.shape[-1], config.draws))
+    policies = ladder(checked(own, first.graph, logits.shape[-1]))
     results = run_grid(
         jax.random.key(config.seed),
         table,
         first.graph,
         knowledge,
-        rungs,
+        policies,
         max_views=config.max_views,
+        draws=config.draws,
         reachable=settings[0].reachable,
     )
     results[BASELINE], _ = exactly_random(results[BASELINE], logits, labels, can_reach)
-    return rungs, results
+    return policies, results
 
 
-def rows_over_trainings(rungs: Sequence[Rung], results: Mapping[str, Results]) -> list[dict[str, Any]]:
+def rows_over_trainings(policies: Sequence[PolicyRecord], results: Mapping[str, Results]) -> list[dict[str, Any]]:
     """A row for each policy and number of views: accuracy and difference from random, with both kinds of interval."""
     after = {name: np.moveaxis(np.asarray(result.after, float), -1, 0) for name, result in results.items()}
     rows = []
-    for rung in rungs:
-        found, gain = after[rung.policy], after[rung.policy] - after[BASELINE]
+    for policy in policies:
+        found, gain = after[policy.name], after[policy.name] - after[BASELINE]
         columns = {
             "accuracy": found.mean(axis=(-2, -1)),
             "over_objects": intervals(found.mean(axis=-2)),
@@ -80,7 +82,9 @@ def rows_over_trainings(rungs: Sequence[Rung], results: Mapping[str, Results]) -
         }
         for step in range(len(found)):
             numbers = {name: np.asarray(column[step], float).tolist() for name, column in columns.items()}
-            rows.append({"policy": rung.policy, "title": rung.title, "knows": rung.knows, "views": step + 1} | numbers)
+            rows.append(
+                {"policy": policy.name, "title": policy.title, "knows": policy.knows, "views": step + 1} | numbers
+            )
     return rows
 
 

@@ -41,7 +41,7 @@ from eval.numbers.study import exactly_random, reachable_views
 from eval.rendering.ascent import METHODS, ascend_on_sphere, padded_triangles
 from eval.tables import ViewTables, objects_of
 from eval.walks.grid import GridConfig, run_grid
-from eval.walks.ladder import ASCENT_RUNGS, KNOWS, Rung, ladder
+from eval.walks.ladder import BY_ASCENT, ladder
 from mevs_jax.geometry.cameras import Camera, partial_cloud
 from mevs_jax.rendering import corners_of_cells, distinct_optima
 
@@ -131,7 +131,7 @@ def scores_of_object(
         points: (views, 3) unit vectors to the candidate views.
 
     Returns:
-        Scores (views, views) for each policy of `ASCENT_RUNGS`, and `without_surface`, the number of views that show too
+        Scores (views, views) for each policy of `BY_ASCENT`, and `without_surface`, the number of views that show too
         little for a surface.
     """
     volumes, surfaces, missing = [], [], 0
@@ -240,7 +240,7 @@ def load_ascent_scores(out: Path, statistics: DatasetStatistics, config: Renderi
     paths = [npz_of(folder, names[at]) for at in chosen]
     if not all(path.exists() for path in paths):
         return None
-    scores: dict[str, list[np.ndarray]] = {rung.policy: [] for rung in ASCENT_RUNGS}
+    scores: dict[str, list[np.ndarray]] = {policy.name: [] for policy in BY_ASCENT}
     missing = 0
     for path in paths:
         with np.load(path) as stored:
@@ -271,15 +271,15 @@ def ascent_study(
         logits=table.logits[:, None],
         ascent_scores={name: jnp.asarray(scores, jnp.float32) for name, scores in climbed.scores.items()},
     )
-    compared = [rung for rung in ladder(config.draws) if rung.policy in COMPARED]
-    rungs: tuple[Rung, ...] = tuple(sorted((*compared, *ASCENT_RUNGS), key=lambda rung: [*KNOWS].index(rung.knows)))
+    compared = [policy for policy in ladder(BY_ASCENT) if policy.name in COMPARED or policy in BY_ASCENT]
     console.print(f"Walking {len(chosen)} test objects by differentiable rendering")
     found = run_grid(
         jax.random.key(config.seed),
         table,
         statistics.graph,
         None,
-        rungs,
+        compared,
+        draws=config.draws,
         max_views=min(config.max_views, int(can_reach.sum())),
         reachable=None if can_reach.all() else jnp.asarray(can_reach),
     )
@@ -289,7 +289,7 @@ def ascent_study(
         "views_without_surface": climbed.without_surface,
         "views": len(chosen) * tables.entropy.shape[1],
         "settings": asdict(climbed.config),
-        "ladder": [{"policy": rung.policy, "title": rung.title, "knows": rung.knows} for rung in rungs],
+        "ladder": [{"policy": policy.name, "title": policy.title, "knows": policy.knows} for policy in compared],
         "policies": {name: summarise(result, some.labels) for name, result in found.items()},
         "against": {
             base: {name: difference(result, found[base]) for name, result in found.items() if name != base}

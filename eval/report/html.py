@@ -47,6 +47,8 @@ class ReportInputs:
     settings: dict[str, Any]
     learned: dict[str, Any] | None = None
     """metrics of `mevs study learned`, if it was run"""
+    learned_section: str = ""
+    """the section that the study writes of these"""
     seeds: dict[str, Any] | None = None
     """metrics over several trainings, if there are any"""
     validation: ViewTables | None = None

@@ -15,7 +15,6 @@ import numpy as np
 from data_pipeline.capture.viewpoints import FILE, is_file
 from data_pipeline.dataset.builder import open_split
 from data_pipeline.files import write_text
-from eval.learned.page import active_section
 from eval.report import figures
 from eval.report.confidence import confidence_section
 from eval.report.current import mark
@@ -223,7 +222,7 @@ _SECTIONS = (
     ladder_section,
     seeds_section,
     ascent_section,
-    active_section,
+    lambda inputs: inputs.learned_section,
     movement_section,
     confidence_section,
     grid_section,

@@ -13,13 +13,13 @@ from jaxtyping import Array, Bool, Float, Int
 
 from eval.tables import ViewTables
 from eval.walks.knowledge import learn
-from eval.walks.own_policies import state_after
 from mevs_jax.beliefs.fusing import discounted
 from mevs_jax.geometry.viewpoints import ViewGraph
 from mevs_jax.policies.base import Knowledge
 from mevs_jax.policies.informed import information_gain
 from mevs_jax.policies.registry import POLICIES
 from mevs_jax.selection.loop import ViewTable, select_from_table
+from mevs_jax.selection.walks import state_after
 
 POLICY = "information_gain"
 """The policy that walks. Its scores are the expected gains."""
@@ -90,7 +90,7 @@ def walks_of(tables: ViewTables, validation: ViewTables, graph: ViewGraph, metri
     steps = min(metrics["max_views"][-1], int(reachable.sum()))
     allowed = np.flatnonzero(reachable)
     starts = allowed[np.arange(len(tables.labels)) % len(allowed)]
-    knowledge = learn(jnp.asarray(validation.logits), jnp.asarray(validation.labels))
+    knowledge = learn(validation.logits, validation.labels)
     fitted = metrics["confidence"][POLICY]["readings"]["temperature"]["temperatures"][:steps]
     views, gains, log_probabilities = _walk(
         tables.stacked(), jnp.asarray(starts), graph, knowledge, jnp.asarray(reachable), jnp.asarray(fitted), steps

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import os
-import platform
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
@@ -17,8 +15,9 @@ from eval.numbers.comparison import class_mean, intervals
 from eval.numbers.study import HEADLINE_CT, HEADLINE_MV, exactly_random, headline_confusion
 from eval.tables import ViewTables
 from eval.walks.grid import FIRST_MV, THRESHOLDS, GridConfig, Results, run_grid
-from eval.walks.ladder import SCRAMBLED, Rung, ladder
+from eval.walks.ladder import SCRAMBLED, ladder
 from mevs_jax.geometry.viewpoints import ViewGraph
+from mevs_jax.policies.registry import PolicyRecord, policy_record
 from mevs_jax.selection.loop import ViewTable
 from train.tasks.thesis_networks import BACKBONES, FRAMES, PIPELINE, Frame
 
@@ -118,12 +117,13 @@ POLICIES = ("random", "random_with_repetition", "predicted_entropy", "oracle_ent
 
 
 def walk(
-    lattice: LatticeTables, graph: ViewGraph, config: GridConfig, frame: Frame, rungs: tuple[Rung, ...]
+    lattice: LatticeTables, graph: ViewGraph, config: GridConfig, frame: Frame, policies: Sequence[PolicyRecord]
 ) -> dict[str, Results]:
     """The grid (backbones, objects, MV, CT) of every policy; random selection in exact expectation where possible."""
     table = lattice.stacked(frame)
     max_views = min(config.max_views, lattice.entropy.shape[1])
-    found = run_grid(jax.random.key(config.seed), table, graph, None, rungs, max_views=max_views)
+    key = jax.random.key(config.seed)
+    found = run_grid(key, table, graph, None, policies, max_views=max_views, draws=config.draws)
     if "random" in found:
         everywhere = np.ones(lattice.entropy.shape[1], bool)
         found["random"], _ = exactly_random(found["random"], table.logits, table.label, everywhere)
@@ -178,10 +178,10 @@ def pipeline(
 ) -> dict[str, Any]:
     """The thesis's multi-view grid on one lattice: Tables 7–8 and 10–15, and the confusion matrices of Fig. 23."""
     graph = statistics.graph
-    rungs = (*(rung for rung in ladder(config.draws) if rung.policy in POLICIES), SCRAMBLED)
-    found = walk(test, graph, config, "world", rungs)
-    camera = walk(test, graph, config, "camera", tuple(r for r in rungs if r.knows == "networks"))
-    chosen = walk(validation, graph, config, "world", tuple(r for r in rungs if r.policy == "predicted_entropy"))
+    policies = [*(policy for policy in ladder() if policy.name in POLICIES), SCRAMBLED]
+    found = walk(test, graph, config, "world", policies)
+    camera = walk(test, graph, config, "camera", [policy for policy in policies if policy.knows == "networks"])
+    chosen = walk(validation, graph, config, "world", [policy_record("predicted_entropy")])
     max_views = found["random"].after.shape[-1]
     confusion = {}
     for name in ("random", "predicted_entropy"):
@@ -211,33 +211,6 @@ def pipeline(
 
 
 # ---------------------------------------------------------------------------------------------------------------- machine
-
-
-NO_ACCELERATOR = "none but the CPU"
-
-
-def machine() -> dict[str, Any]:
-    """The machine that computed the results (Table 1)."""
-    device = jax.devices()[0]
-    memory = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") / 2**30 if hasattr(os, "sysconf") else None
-    return {
-        "operating_system": f"{platform.system()} {platform.release()}",
-        "cpu": _processor(),
-        "cores": os.cpu_count(),
-        "device": NO_ACCELERATOR if device.platform == "cpu" else f"{len(jax.devices())} × {device.device_kind}",
-        "memory_gib": memory,
-        "python": platform.python_version(),
-        "jax": jax.__version__,
-    }
-
-
-def _processor() -> str:
-    try:
-        with open("/proc/cpuinfo") as file:
-            names = [line.split(":", 1)[1].strip() for line in file if line.startswith("model name")]
-    except OSError:
-        names = []
-    return names[0] if names else platform.processor() or platform.machine()
 
 
 def all_results(

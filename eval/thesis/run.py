@@ -21,6 +21,7 @@ from data_pipeline.files import keep_json, read_json
 from data_pipeline.objects.reconstruction import why_no_open3d
 from data_pipeline.objects.sources import load_object
 from data_pipeline.progress import console
+from eval.machine import NO_ACCELERATOR, machine
 from eval.numbers.timing import decision_memory_alone, time_ascent, time_local_maxima, time_predictor
 from eval.rendering.ascent import METHODS
 from eval.seeds import check_seeds
@@ -29,7 +30,7 @@ from eval.stages import check_evaluation
 from eval.tables import objects_of
 from eval.thesis.figures import FigureInputs
 from eval.thesis.page import write_thesis_report
-from eval.thesis.results import NO_ACCELERATOR, LatticeTables, all_results, machine
+from eval.thesis.results import LatticeTables, all_results
 from eval.thesis.seeds import csv_of, folders_of, over_trainings, table_of
 from train.loop import load_best
 from train.results.finite import check_results

@@ -1,4 +1,4 @@
-"""The thesis's grid as one program: objects × start views × draws × policies × backbones × thresholds × limits on views.
+"""The thesis's grid, a program for each policy: objects × start views × draws × backbones × thresholds × limits on views.
 
 The views of a walk depend on neither the confidence threshold (CT) nor the limit on views (MV). So each object is
 walked once from each start view up to the largest MV, and every cell is computed from that walk. The cells of a
@@ -7,13 +7,14 @@ does not use the belief walks once for all backbones: `vmap` does this by itself
 of backbones.
 
 Objects are processed in chunks, which bounds the memory; several devices, or the cores of a CPU, share them. The random
-draws of an object depend only on the seed and its position, so neither chunks nor devices nor cores change a result.
+numbers of a walk depend only on the seed, the object's position, the start view and the draw (`walks_around`), so neither
+chunks nor devices nor cores change a result.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 
 import flax.struct
 import jax
@@ -21,13 +22,14 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from eval.walks.ladder import Rung
-from eval.walks.over_objects import on_all_cores, over_objects
 from mevs_jax.arrays import AnyArray
 from mevs_jax.beliefs.metrics import is_right
 from mevs_jax.geometry.viewpoints import ViewGraph
-from mevs_jax.policies.base import Knowledge, with_movement
-from mevs_jax.selection.loop import ViewTable, select_from_table
+from mevs_jax.policies.base import Knowledge, Policy, as_tree
+from mevs_jax.policies.registry import PolicyRecord
+from mevs_jax.selection.loop import ViewTable
+from mevs_jax.selection.walks import every_walk, walks_around
+from train.running.over_objects import over_objects
 
 THRESHOLDS = (0.5, 0.6, 0.7, 0.8, 0.9, 0.95, 0.99)
 FIRST_MV, LAST_MV = 2, 9
@@ -114,11 +116,11 @@ def run_grid(
     tables: ViewTable,
     graph: ViewGraph,
     knowledge: Knowledge | None,
-    rungs: tuple[Rung, ...],
+    policies: Sequence[PolicyRecord],
     *,
     max_views: int,
-    reachable: Bool[Array, " views"] | None = None,
-    movement_cost: Float[Array, ""] | float | None = None,
+    draws: int = 1,
+    reachable: Bool[AnyArray, " views"] | None = None,
 ) -> dict[str, Results]:
     """Walks every object from every start view by every policy and computes the whole grid.
 
@@ -128,73 +130,53 @@ def run_grid(
             have an axis of backbones too: a backbone is then a whole system, such as one of several trainings.
         graph: the candidate views.
         knowledge: statistics of other objects, with a leading axis of backbones; None if no policy needs them.
-        rungs: the policies.
+        policies: the policies, whose names differ.
         max_views: the largest MV.
+        draws: walks of a random policy from each start view.
         reachable: the views that the camera can visit and start from; None for all.
-        movement_cost: subtracted from the policies' scores for each radian of movement.
 
     Returns:
         Results by policy. Unreachable start views have weight zero.
     """
-    objects = np.arange(len(tables.label)), tables
-    rest = key, graph, knowledge, reachable, movement_cost
-    return on_all_cores(_grid, objects, *rest, rungs=rungs, max_views=max_views)
+    objects, starts = (np.arange(len(tables.label)), tables), len(graph.points)
+    most = _WALKS_IN_CACHE if jax.default_backend() == "cpu" else _WALKS_AT_ONCE
+
+    def results(policy: PolicyRecord) -> Results:
+        own = policy.draws(draws)
+        shared, at_once = (key, as_tree(policy.score), graph, knowledge, reachable), min(256, most // (starts * own))
+        found = over_objects(_results_of, objects, *shared, at_once=at_once, draws=own, max_views=max_views)
+        return jax.tree.map(lambda leaf: jnp.asarray(leaf.swapaxes(0, 1)), found)
+
+    return {policy.name: results(policy) for policy in policies}
 
 
-@partial(jax.jit, static_argnames=("rungs", "max_views"))
-def _grid(
-    objects: tuple[Int[AnyArray, " objects"], ViewTable],
+def _results_of(
+    one: tuple[Int[Array, ""], ViewTable],
     key: Array,
+    policy: Policy,
     graph: ViewGraph,
     knowledge: Knowledge | None,
-    reachable: Bool[Array, " views"] | None,
-    movement_cost: Float[Array, ""] | float | None,
+    reachable: Bool[AnyArray, " views"] | None,
     *,
-    rungs: tuple[Rung, ...],
+    draws: int,
     max_views: int,
-) -> dict[str, Results]:
-    """`run_grid` of some objects, given their numbers and tables."""
-    numbers, tables = objects
-    keys = jax.vmap(jax.random.fold_in, (None, 0))(key, numbers)
-    starts = graph.points.shape[0]
-    start_weight = jnp.ones(starts) if reachable is None else reachable.astype(jnp.float32)
-    start_weight /= jnp.sum(start_weight)
+) -> Results:
+    """The results of a policy on one object, whose number and table are given."""
+    (number, table), starts = one, len(graph.points)
+    weight = jnp.ones(starts) if reachable is None else reachable.astype(jnp.float32)
+    weight = (weight / jnp.sum(weight)).repeat(draws) / draws
 
-    def evaluate(rung: Rung, keys: Array, tables: ViewTable) -> Results:
-        policy = rung.scores
-        if movement_cost is not None:
-            policy = with_movement(policy, movement_cost)
+    def walks(logits: Array, entropies: Array | None, knowledge: Knowledge | None) -> Int[Array, "walks steps"]:
+        own = replace(table, logits=logits, predicted_entropy=entropies)
+        scene, every = own.scene(graph, knowledge, reachable), every_walk(jnp.arange(starts), draws)
+        return walks_around(
+            jax.random.fold_in(key, number), own.observe, scene, policy, every, max_views=max_views
+        ).views
 
-        def walk(key: Array, table: ViewTable, knowledge: Knowledge | None, start: Array) -> Array:
-            scene = table.scene(graph, knowledge, reachable)
-            return select_from_table(key, table, scene, policy, start, max_views=max_views).views
-
-        def of_object(arguments: tuple[Array, ViewTable]) -> Results:
-            key, table = arguments
-            keys = jax.random.split(key, (starts, rung.draws))
-            over_draws = jax.vmap(walk, (0, None, None, None))
-            over_starts = jax.vmap(over_draws, (0, None, None, 0))
-
-            def with_backbone(logits: Array, entropies: Array | None, knowledge: Knowledge | None) -> Array:
-                own = replace(table, logits=logits, predicted_entropy=entropies)
-                return over_starts(keys, own, knowledge, jnp.arange(starts))
-
-            entropies = table.predicted_entropy
-            each = 0 if entropies is not None and entropies.ndim == 3 else None
-            views = jax.vmap(with_backbone, (0, each, 0))(table.logits, entropies, knowledge)
-            steps_first = views.reshape(*views.shape[:-3], -1, max_views).swapaxes(-1, -2)
-            read = jax.vmap(read_object, (0, None, None, 0, None))
-            found = read(
-                table.logits, table.label, graph.distances, steps_first, start_weight.repeat(rung.draws) / rung.draws
-            )
-            small = jnp.int8 if starts < 128 else jnp.int16
-            return Results(*found, views[:, :, :1].astype(small))
-
-        most = _WALKS_IN_CACHE if jax.default_backend() == "cpu" else _WALKS_AT_ONCE
-        at_once = max(1, min(256, most // (starts * rung.draws)))
-        at_once = min(at_once, -(-len(keys) // jax.local_device_count()))
-        chunked = partial(jax.lax.map, of_object, batch_size=at_once)
-        found = over_objects(chunked, (keys, tables), at_once)
-        return jax.tree.map(lambda leaf: jnp.moveaxis(leaf, 0, 1), found)
-
-    return {rung.policy: evaluate(rung, keys, tables) for rung in rungs}
+    entropies = table.predicted_entropy
+    each = 0 if entropies is not None and entropies.ndim == 3 else None
+    views = jax.vmap(walks, (0, each, 0))(table.logits, entropies, knowledge)
+    read = jax.vmap(read_object, (0, None, None, 0, None))
+    found = read(table.logits, table.label, graph.distances, views.swapaxes(-1, -2), weight)
+    shown = views.reshape(-1, starts, draws, max_views)[:, :, :1]
+    return Results(*found, shown.astype(jnp.int8 if starts < 128 else jnp.int16))

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Iterable
 
-from mevs_jax.policies.base import Policy
-from mevs_jax.policies.registry import POLICIES, Knows, policy_entry
+from mevs_jax.policies.registry import Knows, PolicyRecord, policy_record
 
 KNOWS: dict[Knows, str] = {
     "nothing": "no information about the object",
@@ -18,43 +17,15 @@ KNOWS: dict[Knows, str] = {
 """What the policies of each kind use, as shown in the report."""
 
 
-@dataclass(frozen=True)
-class Rung:
-    """One policy as it is evaluated.
-
-    Attributes:
-        policy: its name in `mevs_jax.POLICIES`, or that of `function`.
-        title: its name in the report.
-        knows: the information that it uses, a key of `KNOWS`.
-        draws: walks that are averaged for each object and start view; 1 for a deterministic policy.
-        function: the policy, if it is not registered.
-    """
-
-    policy: str
-    title: str
-    knows: Knows
-    draws: int = 1
-    function: Policy | None = None
-
-    @classmethod
-    def of(cls, name: str, draws: int = 1) -> Rung:
-        """Returns the rung of a registered policy."""
-        entry = policy_entry(name)
-        return cls(name, entry.title, entry.knows, draws)
-
-    @property
-    def scores(self) -> Policy:
-        """The policy."""
-        return self.function or POLICIES[self.policy]
-
-
-SCRAMBLED = Rung.of("scrambled_entropy")
+SCRAMBLED = policy_record("scrambled_entropy")
 """The thesis's policy as its published code implements it. It is not part of `ladder`; the compatibility table shows it."""
 
-ASCENT_RUNGS = tuple(map(Rung.of, ("diff_volume", "diff_mesh", "diff_volume_whole", "diff_mesh_whole")))
+BY_ASCENT = tuple(map(policy_record, ("diff_volume", "diff_mesh", "diff_volume_whole", "diff_mesh_whole")))
 """The policies by differentiable rendering. They have a table of their own, on fewer objects."""
 
-_DETERMINISTIC = (
+_LADDER = (
+    "random",
+    "random_with_repetition",
     "farthest",
     "predicted_entropy",
     "predicted_entropy_without_maxima",
@@ -69,17 +40,11 @@ _DETERMINISTIC = (
 )
 
 
-def ladder(draws: int, own: tuple[Rung, ...] = ()) -> tuple[Rung, ...]:
-    """Returns all policies; random ones walk `draws` times from each start view. The first is the baseline of the others.
+def ladder(own: Iterable[PolicyRecord] = ()) -> tuple[PolicyRecord, ...]:
+    """Returns all policies. The first is the baseline of the others.
 
     Args:
-        draws: walks of a random policy from each start view of an object.
         own: further policies, which follow those that use the same information.
     """
-    official = (
-        Rung.of("random", draws),
-        Rung.of("random_with_repetition", draws),
-        *map(Rung.of, _DETERMINISTIC),
-    )
     order = [*KNOWS]
-    return tuple(sorted((*official, *own), key=lambda rung: order.index(rung.knows)))
+    return tuple(sorted((*map(policy_record, _LADDER), *own), key=lambda policy: order.index(policy.knows)))

@@ -7,14 +7,13 @@ this mode. It also checks the table mode of the study: both must choose the same
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 from typing import Any
 
 import flax.struct
 import jax
-import jax.numpy as jnp
 import numpy as np
 from flax import nnx
 from jaxtyping import Array, Int, Integer
@@ -22,18 +21,21 @@ from jaxtyping import Array, Int, Integer
 from data_pipeline.dataset.batches import evaluation_batches
 from data_pipeline.progress import progress_bar
 from eval.tables import ViewTables
-from eval.walks.ladder import ASCENT_RUNGS, Rung
-from eval.walks.over_objects import over_objects
 from mevs_jax.arrays import AnyArray
 from mevs_jax.geometry.viewpoints import ViewGraph
-from mevs_jax.policies.base import Knowledge, Observation, Policy, Scene
-from mevs_jax.policies.registry import POLICIES
-from mevs_jax.selection.loop import Episode, ViewTable, select_from_table, select_views
-from train.running.devices import device_mesh, parameter_sharding, place
+from mevs_jax.policies.base import Knowledge, Observation, Policy, Scene, as_tree
+from mevs_jax.policies.registry import POLICIES, Need, PolicyRecord, policy_record
+from mevs_jax.selection.loop import Episode, ViewTable
+from mevs_jax.selection.walks import every_walk, walks_around
+from train.running.over_objects import over_objects
 from train.tasks.classifier import ClassifierTask
 from train.tasks.entropy import EntropyTask
 
 _CLOUD = ("pixels", "pixel_depth", "pose")
+GIVEN: frozenset[Need] = frozenset(
+    {"belief", "predicted_entropy", "order", "expected_views", "entropy", "logits", "label"}
+)
+"""What policies of live walks are given; that is not the tables of `mevs study rendering`."""
 
 
 @flax.struct.dataclass
@@ -59,60 +61,62 @@ class Networks:
     predictor: nnx.Module
 
 
-class LiveWalker:
-    """Walks objects with the networks in the loop, on all devices.
+def walk_live(
+    networks: Networks,
+    key: Array,
+    some: tuple[AnyArray, Captures, Scene, AnyArray],
+    policy: Policy,
+    *,
+    at_once: int,
+    max_views: int,
+    threshold: float | None = None,
+) -> Episode:
+    """Walks objects with the networks in the loop; one program is compiled for each policy and number of objects.
 
-    One program is compiled for each policy and number of objects.
+    Args:
+        key: of the evaluation.
+        some: numbers, captures, scenes and start views of objects, all with a leading axis of objects.
+        policy: the policy.
+        at_once: objects that are walked together.
+        max_views: limit on views (MV).
+        threshold: confidence threshold (CT); None to continue to `max_views`.
     """
+    structures, states = zip(*map(nnx.split, (networks.classifier, networks.predictor)), strict=True)
+    static = {"tasks": (networks.classify, networks.predict), "structures": structures}
+    shared = key, states, as_tree(policy)
+    return over_objects(_walk_live, some, *shared, at_once=at_once, **static, max_views=max_views, threshold=threshold)
 
-    def __init__(self, networks: Networks, graph: ViewGraph):
-        self._graph, self._tasks = graph, (networks.classify, networks.predict)
-        self._structures, states = zip(
-            *(nnx.split(network) for network in (networks.classifier, networks.predictor)), strict=True
+
+def _walk_live(
+    one: tuple[Array, Captures, Scene, Array],
+    key: Array,
+    states: tuple[nnx.State, nnx.State],
+    policy: Policy,
+    *,
+    tasks: tuple[ClassifierTask, EntropyTask],
+    structures: tuple[nnx.GraphDef, nnx.GraphDef],
+    **limits: Any,
+) -> Episode:
+    (number, captures, scene, start), (classify, predict) = one, tasks
+
+    def observe(view: Int[Array, ""]) -> Observation:
+        classifier, predictor = (
+            nnx.merge(structure, state, copy=True) for structure, state in zip(structures, states, strict=True)
         )
-        self._states = place(states, parameter_sharding(device_mesh(), states))
+        image: dict[str, Array] = {classify.images: captures.images[view][None]}
+        cloud = {name: captures.clouds[name][view][None] for name in _CLOUD}
+        return Observation(classifier(classify.inputs(image))[0], predictor(predict.inputs(cloud))[0])
 
-    def walk(
-        self,
-        keys: Array,
-        captures: Captures,
-        scenes: Scene,
-        starts: Int[Array, " objects"],
-        *,
-        policy: str | Policy,
-        max_views: int,
-        threshold: float | None = None,
-    ) -> Episode:
-        """Returns the episodes of several objects; `keys`, `captures`, `starts` and all of `scenes` have an axis of objects.
+    walks = walks_around(jax.random.fold_in(key, number), observe, scene, policy, every_walk(start[None], 1), **limits)
+    return jax.tree.map(lambda leaf: leaf[0], walks)
 
-        Args:
-            policy: a name in `POLICIES`, or a policy.
-            max_views: limit on views (MV).
-            threshold: confidence threshold (CT); None to continue to `max_views`.
-        """
-        if isinstance(policy, str):
-            policy = POLICIES[policy]
-        return self._walk(self._states, keys, captures, scenes, starts, policy, max_views, threshold)
 
-    @partial(jax.jit, static_argnums=(0, 6, 7, 8))
-    def _walk(self, states, keys, captures, scenes, starts, policy, max_views, threshold):
-        classify, predict = self._tasks
-
-        def of_object(arguments: tuple[Array, Captures, Scene, Array]) -> Episode:
-            key, captures, scene, start = arguments
-
-            def observe(view: Int[Array, ""]) -> Observation:
-                classifier, predictor = (
-                    nnx.merge(structure, state, copy=True)
-                    for structure, state in zip(self._structures, states, strict=True)
-                )
-                image: dict[str, Array] = {classify.images: captures.images[view][None]}
-                cloud = {name: captures.clouds[name][view][None] for name in _CLOUD}
-                return Observation(classifier(classify.inputs(image))[0], predictor(predict.inputs(cloud))[0])
-
-            return select_views(key, observe, scene, policy, start, threshold=threshold, max_views=max_views)
-
-        return over_objects(jax.vmap(of_object), (keys, captures, scenes, starts))
+def _walk_table(one: tuple[Array, ViewTable, Scene, Array], key: Array, policy: Policy, *, max_views: int) -> Episode:
+    number, table, scene, start = one
+    walks = walks_around(
+        jax.random.fold_in(key, number), table.observe, scene, policy, every_walk(start[None], 1), max_views=max_views
+    )
+    return jax.tree.map(lambda leaf: leaf[0], walks)
 
 
 @dataclass(frozen=True)
@@ -147,54 +151,37 @@ def compare_with_tables(
     graph: ViewGraph,
     *,
     config: LiveConfig,
-    own: tuple[Rung, ...] = (),
+    own: Sequence[PolicyRecord] = (),
 ) -> dict[str, Agreement]:
     """Walks the first objects of a split in both modes with the same keys, object i from view i modulo the number of views.
 
     Args:
         own: further policies, which are not registered.
     """
-    without_tables = {rung.policy for rung in ASCENT_RUNGS}  # which live walks have not
-    names = dict.fromkeys(config.policies or (name for name in POLICIES if name not in without_tables))
-    policies = {name: POLICIES[name] for name in names} | {rung.policy: rung.scores for rung in own}
-    walker = LiveWalker(networks, graph)
-    views, stacked = graph.points.shape[0], tables.stacked()
-    objects, max_views = min(config.objects, len(tables.labels)), min(config.max_views, views)
-    at_once = min(config.at_once, objects)
-
-    @partial(jax.jit, static_argnames="policy")
-    def by_table(keys: Array, tables: ViewTable, starts: Array, policy: Policy) -> Episode:
-        def one(key: Array, table: ViewTable, start: Array) -> Episode:
-            scene = table.scene(graph, knowledge)
-            return select_from_table(key, table, scene, policy, start, max_views=max_views)
-
-        return jax.vmap(one)(keys, tables, starts)
-
+    names = dict.fromkeys(config.policies or (name for name in POLICIES if policy_record(name).can_use(GIVEN)))
+    policies = {policy.name: as_tree(policy.score) for policy in (*map(policy_record, names), *own)}
+    views, stacked, key = len(graph.points), tables.stacked(), jax.random.key(0)
+    objects = min(config.objects, len(tables.labels))
+    limits = {"at_once": min(config.at_once, objects), "max_views": min(config.max_views, views)}
     walks: dict[str, list[tuple[np.ndarray, np.ndarray]]] = {policy: [] for policy in policies}
-    batches = evaluation_batches(
-        data,
-        split,
-        points=networks.predict.network_config.points,
-        images=networks.classify.images,
-        chosen=np.arange(objects),
-    )
+    points, images = networks.predict.network_config.points, networks.classify.images
+    batches = evaluation_batches(data, split, points=points, images=images, chosen=np.arange(objects))
     with progress_bar("objects") as bar:
         line = bar.add_task("Walking live", total=objects, note="")
-        for first in range(0, objects, at_once):
-            chunk = [_captures(next(batches), networks) for _ in range(min(at_once, objects - first))]
+        for first in range(0, objects, size := limits["at_once"]):
+            chunk = [_captures(next(batches), networks) for _ in range(min(size, objects - first))]
             # A shorter last chunk is padded, so that nothing is compiled again.
-            index = np.resize(np.arange(len(chunk)), at_once)
+            index = np.resize(np.arange(len(chunk)), size)
             captures = jax.tree.map(lambda *leaves: np.stack(leaves), *(chunk[i] for i in index))
             index += first
             part = jax.tree.map(lambda leaf, at=index: leaf[at], stacked)
-            keys = jax.vmap(partial(jax.random.fold_in, jax.random.key(0)))(jnp.asarray(index))
-            starts = jnp.asarray(index % views, jnp.int32)
+            starts = (index % views).astype(np.int32)
             scenes = jax.vmap(lambda table: table.scene(graph, knowledge))(part)
             for name, policy in policies.items():
-                live = walker.walk(keys, captures, scenes, starts, policy=policy, max_views=max_views)
-                stored = by_table(keys, part, starts, policy)
-                same = np.all(np.asarray(live.views) == np.asarray(stored.views), axis=1)
-                apart = np.abs(np.asarray(live.confidences) - np.asarray(stored.confidences)).max(axis=1)
+                live = walk_live(networks, key, (index, captures, scenes, starts), policy, **limits)
+                stored = over_objects(_walk_table, (index, part, scenes, starts), key, policy, **limits)
+                same = np.all(live.views == stored.views, axis=1)
+                apart = np.abs(live.confidences - stored.confidences).max(axis=1)
                 walks[name].append((same[: len(chunk)], apart[: len(chunk)]))
             bar.advance(line, len(chunk))
     return {policy: _agreement(parts) for policy, parts in walks.items()}

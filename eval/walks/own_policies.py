@@ -8,8 +8,7 @@ from __future__ import annotations
 
 import inspect
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
-from functools import partial
+from dataclasses import replace
 from typing import Any
 
 import jax
@@ -18,40 +17,34 @@ import numpy as np
 from jaxtyping import Array, Bool, Int
 
 from data_pipeline.errors import DataError, kind_and_reason_of
-from eval.walks.ladder import ASCENT_RUNGS, SCRAMBLED, Rung, ladder
-from mevs_jax.beliefs.fusing import running_sum
+from eval.walks.ladder import BY_ASCENT, SCRAMBLED, ladder
+from mevs_jax.arrays import AnyArray
 from mevs_jax.geometry.viewpoints import ViewGraph
-from mevs_jax.policies.base import Knowledge, Policy, Scene, SelectionState, candidates
-from mevs_jax.policies.registry import POLICIES, Knows, PolicyEntry, policy_entry
+from mevs_jax.policies.base import Knowledge, Policy, Scene, SelectionState, as_tree, candidates
+from mevs_jax.policies.registry import POLICIES, Knows, PolicyRecord, policy_record
 from mevs_jax.selection.loop import ViewTable
-from train.own_code import OwnCode, load_own
+from mevs_jax.selection.walks import state_after, walk_key
+from train.own_code import load_own
+from train.running.over_objects import over_objects
 
-_CHUNK = 16
+_AT_ONCE = 16
 """Objects whose walks are checked at a time."""
 
 
-@dataclass(frozen=True)
-class OwnPolicy:
-    """A policy of a user.
-
-    Attributes:
-        called: how messages call it.
-        entry: its name, title and information.
-        code: where it comes from; None for a function that was given in Python.
-    """
-
-    called: str
-    entry: PolicyEntry
-    code: OwnCode | None = None
-
-    @property
-    def identity(self) -> dict[str, str]:
-        """What identifies the policy in `metrics.json`: it changes when the source file is edited."""
-        shown = {"policy": self.entry.name, "title": self.entry.title, "knows": self.entry.knows}
-        return shown | (self.code.identity if self.code else {})
+def own_identity(policy: PolicyRecord) -> dict[str, str]:
+    """What identifies a user's policy in `metrics.json`: it changes when the source file is edited."""
+    return {"policy": policy.name, "title": policy.title, "knows": policy.knows} | dict(policy.code or {})
 
 
-def load_policies(references: Sequence[str]) -> tuple[OwnPolicy, ...]:
+def own_policy(name: str, policy: Policy, called: str, knows: Knows = "networks") -> PolicyRecord:
+    """Returns the record of a user's policy: with title and information of its registration, if it is registered."""
+    registered = next((other for other, known in POLICIES.items() if known is policy), None)
+    if registered is not None:
+        return replace(policy_record(registered), name=name, called=called)
+    return PolicyRecord(name, policy, name.replace("_", " "), knows, called=called)
+
+
+def load_policies(references: Sequence[str]) -> tuple[PolicyRecord, ...]:
     """Loads the policies of `--policy`.
 
     A function that its module registers (`register_policy`) has its name, title and information from there. Any other has the
@@ -60,25 +53,24 @@ def load_policies(references: Sequence[str]) -> tuple[OwnPolicy, ...]:
     Raises:
         DataError: if one cannot be loaded, or its name is taken.
     """
-    found = []
+    loaded = []
     for reference in references:
         code = load_own(reference, "--policy")
-        name = next((name for name, policy in POLICIES.items() if policy is code.function), None)
-        entry = PolicyEntry(code.name, code.function, code.name.replace("_", " "), "networks")
-        found.append(OwnPolicy(f"--policy {reference}", entry if name is None else policy_entry(name), code))
-    return named_apart(found)
+        name = next((name for name, policy in POLICIES.items() if policy is code.function), code.name)
+        loaded.append(replace(own_policy(name, code.function, f"--policy {reference}"), code=code.identity))
+    return named_apart(loaded)
 
 
-def named_apart(policies: Sequence[OwnPolicy]) -> tuple[OwnPolicy, ...]:
+def named_apart(policies: Sequence[PolicyRecord]) -> tuple[PolicyRecord, ...]:
     """Returns the policies, if no name is used twice or by the ladder; raises `DataError` otherwise."""
-    taken = {rung.policy for rung in (*ladder(1), *ASCENT_RUNGS, SCRAMBLED)}
+    taken = {official.name for official in (*ladder(), *BY_ASCENT, SCRAMBLED)}
     for own in policies:
-        name = own.entry.name
-        if name in taken:
+        if own.name in taken:
             raise DataError(
-                f"{own.called}: the name {name!r} is taken by another policy of the evaluation; register it under another name"
+                f"{own.called}: the name {own.name!r} is taken by another policy of the evaluation; register it under another "
+                f"name"
             )
-        taken.add(name)
+        taken.add(own.name)
     return tuple(policies)
 
 
@@ -92,37 +84,29 @@ def limited(policy: Policy, knows: Knows) -> Policy:
         if knows != "rendering":
             hidden["ascent_scores"] = None
 
-    def scores(key: Array, state: SelectionState, scene: Scene) -> Any:  # checked by `own_rungs`
+    def scores(key: Array, state: SelectionState, scene: Scene) -> Any:  # checked by `checked`
         return policy(key, state, replace(scene, **hidden))
 
     return scores
 
 
-def own_rungs(policies: Sequence[OwnPolicy], graph: ViewGraph, classes: int, draws: int) -> tuple[Rung, ...]:
-    """Returns the policies as they are evaluated; one that uses its key is walked `draws` times from each start view.
+def checked(policies: Sequence[PolicyRecord], graph: ViewGraph, classes: int) -> tuple[PolicyRecord, ...]:
+    """Returns users' policies as they are evaluated: given what they declare to know, and marked if they draw at random.
 
     Raises:
         DataError: for a policy that takes other arguments, cannot be traced, or returns no score for every view.
     """
-    rungs = []
+    found = []
     for own in policies:
         _check_signature(own)
-        policy = limited(own.entry.policy, own.entry.knows)
-        rungs.append(
-            Rung(
-                own.entry.name,
-                own.entry.title,
-                own.entry.knows,
-                draws if _draws_at_random(own, policy, graph, classes) else 1,
-                policy,
-            )
-        )
-    return tuple(rungs)
+        own = replace(own, score=limited(own.score, own.knows))
+        found.append(replace(own, random=_draws_at_random(own, graph, classes)))
+    return tuple(found)
 
 
-def _check_signature(own: OwnPolicy) -> None:
+def _check_signature(own: PolicyRecord) -> None:
     try:
-        signature = inspect.signature(own.entry.policy)
+        signature = inspect.signature(own.score)
     except (TypeError, ValueError):  # a callable without one
         return
     try:
@@ -133,7 +117,7 @@ def _check_signature(own: OwnPolicy) -> None:
         ) from error
 
 
-def _draws_at_random(own: OwnPolicy, policy: Policy, graph: ViewGraph, classes: int) -> bool:
+def _draws_at_random(own: PolicyRecord, graph: ViewGraph, classes: int) -> bool:
     """Whether the scores depend on the key, found by tracing the policy."""
     views = len(graph.points)
     table = ViewTable(jnp.zeros((views, classes)), jnp.zeros((views, views)), jnp.zeros(views), jnp.int32(0))
@@ -141,14 +125,14 @@ def _draws_at_random(own: OwnPolicy, policy: Policy, graph: ViewGraph, classes: 
 
     def scores(key: Array) -> Any:
         state = state_after(table, jnp.full(2, -1, jnp.int32).at[0].set(0), jnp.int32(1))
-        return policy(key, state, table.scene(graph, knowledge, jnp.ones(views, bool)))
+        return own.score(key, state, table.scene(graph, knowledge, jnp.ones(views, bool)))
 
     try:
         traced, shape = jax.make_jaxpr(scores, return_shape=True)(jax.random.key(0))
     except Exception as error:  # of the user's own code
         reason, hint = kind_and_reason_of(error), ""
         if "None" in reason or "not given" in reason:
-            hint = f" (the scene of a policy that knows {own.entry.knows!r} has no other fields; see register_policy)"
+            hint = f" (the scene of a policy that knows {own.knows!r} has no other fields; see register_policy)"
         raise DataError(f"{own.called} cannot be used: {reason}{hint}; repair it") from error
     arrays = jax.tree.leaves(shape)
     if len(arrays) != 1 or arrays[0].shape != (views,) or not jnp.issubdtype(arrays[0].dtype, jnp.floating):
@@ -160,46 +144,28 @@ def _draws_at_random(own: OwnPolicy, policy: Policy, graph: ViewGraph, classes: 
     return id(traced.jaxpr.invars[0]) in used
 
 
-def state_after(table: ViewTable, views: Int[Array, " steps"], count: Int[Array, ""]) -> SelectionState:
-    """Returns the state of the selection loop after the first `count` views of a walk, with the sum of logits as belief."""
-    there = jnp.arange(len(views)) < count
-    order = jnp.where(there, views, 0)
-
-    def shown(leaf: Array) -> Array:
-        return jnp.where(there.reshape(-1, *[1] * (leaf.ndim - 1)), leaf, 0)
-
-    seen = jax.tree.map(shown, jax.vmap(table.observe)(order))
-    latest = order[jnp.maximum(count - 1, 0)]
-    attempted = jnp.any((order[:, None] == jnp.arange(table.logits.shape[0])) & there[:, None], axis=0)
-    return SelectionState(
-        count=count,
-        view=latest,
-        attempted=attempted,
-        belief=running_sum(seen.logits)[-1],
-        latest=table.observe(latest),
-        views=jnp.where(there, views, -1),
-        seen=seen,
-    )
-
-
-@partial(jax.jit, static_argnames="policy")
-def _faults(
-    keys: Array,
-    tables: ViewTable,
-    walks: Int[Array, "objects starts steps"],
+def _faults_along(
+    one: tuple[Array, ViewTable, Int[Array, "starts steps"]],
+    key: Array,
+    policy: Policy,
     graph: ViewGraph,
     knowledge: Knowledge,
     reachable: Bool[Array, " views"] | None,
-    policy: Policy,
-) -> Bool[Array, "objects starts 2"]:
-    """Whether scores along a walk are NaN, and whether they rank no view, since all candidates have the same infinite score."""
+) -> Bool[Array, "starts 2"]:
+    """Whether scores along walks are NaN, and whether they rank no view, since all candidates have the same infinite score.
 
-    def of_walk(key: Array, table: ViewTable, views: Array) -> Array:
-        scene = table.scene(graph, knowledge, reachable)
+    Args:
+        one: number, table and walks of an object.
+    """
+    number, table, walks = one
+    scene = table.scene(graph, knowledge, reachable)
+
+    def of_walk(start: Array, views: Array) -> Array:
+        own = walk_key(key, number, start, 0)
 
         def of_step(count: Array) -> Array:
             state = state_after(table, views, count)
-            scores, allowed = policy(jax.random.fold_in(key, count), state, scene), candidates(state, scene)
+            scores, allowed = policy(jax.random.fold_in(own, count), state, scene), candidates(state, scene)
             moves = (count < len(views)) & (views[jnp.minimum(count, len(views) - 1)] >= 0)
             infinite = [jnp.all((scores == end) | ~allowed) for end in (jnp.inf, -jnp.inf)]
             unranked = (infinite[0] | infinite[1]) & (jnp.sum(allowed) > 1)
@@ -207,21 +173,19 @@ def _faults(
 
         return jnp.any(jax.vmap(of_step)(jnp.arange(1, len(views))), axis=0)
 
-    over_starts = jax.vmap(of_walk, (0, None, 0))
-    return jax.lax.map(lambda one: over_starts(*one), (keys, tables, walks), batch_size=_CHUNK)
+    return jax.vmap(of_walk)(jnp.arange(len(walks)), walks)
 
 
 def check_scores(
-    own: OwnPolicy,
-    rung: Rung,
+    own: PolicyRecord,
     key: Array,
     tables: ViewTable,
     walks: Int[np.ndarray, "objects starts steps"],
     graph: ViewGraph,
     knowledge: Knowledge,
-    reachable: Bool[Array, " views"] | None,
+    reachable: Bool[AnyArray, " views"] | None,
 ) -> None:
-    """Checks the scores along walks, the first of each start view.
+    """Checks the scores of a user's policy along walks, the first of each start view.
 
     Args:
         key: of the evaluation.
@@ -231,14 +195,12 @@ def check_scores(
     Raises:
         DataError: if a candidate's score is NaN, or the scores rank no candidate.
     """
-    objects, starts = walks.shape[:2]
-    keys = jax.vmap(jax.random.fold_in, (None, 0))(key, jnp.arange(objects))
-    keys = jax.vmap(lambda of_object: jax.random.split(of_object, (starts, rung.draws))[:, 0])(keys)
-    views = jnp.asarray(walks, jnp.int32)
-    found = np.asarray(_faults(keys, tables, views, graph, knowledge, reachable, rung.scores))
+    objects = np.arange(len(walks)), tables, walks.astype(np.int32)
+    shared = key, as_tree(own.score), graph, knowledge, reachable
+    faults = over_objects(_faults_along, objects, *shared, at_once=_AT_ONCE)
     for fault, what in enumerate(("scores that are NaN", "every view that is left the same infinite score")):
-        if found[..., fault].any():
-            at, start = np.argwhere(found[..., fault])[0]
+        if faults[..., fault].any():
+            at, start = np.argwhere(faults[..., fault])[0]
             raise DataError(
                 f"{own.called} gives {what} (first: test object {at} from start view {start}), so its "
                 f"choices mean nothing; repair it"

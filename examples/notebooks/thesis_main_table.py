@@ -21,8 +21,8 @@ import eval.thesis
 import mevs_jax
 from data_pipeline.objects.furniture import furniture
 from eval.walks.grid import THRESHOLDS, run_grid
-from eval.walks.ladder import Rung
 from mevs_jax.agent.looking import unit_triangles
+from mevs_jax.policies import policy_record
 from mevs_jax.rendering.depth import pad_triangles, render_depth
 
 system = mevs_jax.load("furniture10")
@@ -81,14 +81,9 @@ axis.legend(fontsize=8)
 
 # %%
 tables = mevs_jax.ViewTable(observations.logits[:, None], observations.predicted_entropy, entropy, jnp.array(labels))
-rungs = (
-    Rung.of("random", draws=32),
-    Rung.of("predicted_entropy"),
-    Rung.of("information_gain"),
-    Rung.of("oracle_entropy"),
-)
+policies = [policy_record(name) for name in ("random", "predicted_entropy", "information_gain", "oracle_entropy")]
 knowledge = jax.tree.map(lambda array: array[None], system.parts.knowledge)
-results = run_grid(jax.random.key(0), tables, system.graph, knowledge, rungs, max_views=9)
+results = run_grid(jax.random.key(0), tables, system.graph, knowledge, policies, max_views=9, draws=32)
 right = {name: 100 * np.asarray(result.right[0]) for name, result in results.items()}  # (objects, MV, CT)
 
 

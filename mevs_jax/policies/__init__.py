@@ -15,7 +15,7 @@ from mevs_jax.policies.base import (
     with_movement,
 )
 from mevs_jax.policies.oracles import fused_oracle
-from mevs_jax.policies.registry import POLICIES, PolicyEntry, policy_entry, policy_named, register_policy
+from mevs_jax.policies.registry import POLICIES, PolicyRecord, policy_named, policy_record, register_policy
 from mevs_jax.policies.rendering import by_ascent
 
 __all__ = [
@@ -23,15 +23,15 @@ __all__ = [
     "Knowledge",
     "Observation",
     "Policy",
-    "PolicyEntry",
+    "PolicyRecord",
     "Scene",
     "SelectionState",
     "by_ascent",
     "candidates",
     "fused_oracle",
     "maxima_first",
-    "policy_entry",
     "policy_named",
+    "policy_record",
     "register_policy",
     "required",
     "with_movement",

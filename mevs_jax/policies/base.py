@@ -7,6 +7,7 @@ from typing import Literal, TypeVar
 
 import flax.struct
 import jax.numpy as jnp
+from jax.tree_util import Partial
 from jaxtyping import Array, Bool, Float, Int
 
 from mevs_jax.geometry.viewpoints import ViewGraph, local_maxima
@@ -150,6 +151,14 @@ def maxima_first(
     return jnp.where(left & ~maximum, -jnp.inf, weights)
 
 
+def as_tree(policy: Policy) -> Partial:
+    """Returns the policy as an argument of compiled functions: the arrays of a `Partial` are traced, a function is static.
+
+    Policies of networks of one structure then share a program.
+    """
+    return policy if isinstance(policy, Partial) else Partial(policy)
+
+
 def with_movement(policy: Policy, cost: float | Float[Array, ""]) -> Policy:
     """Returns `policy` with a movement cost subtracted from its scores.
 
@@ -157,8 +166,10 @@ def with_movement(policy: Policy, cost: float | Float[Array, ""]) -> Policy:
         policy: the policy without movement cost.
         cost: per radian of great-circle distance from the latest view.
     """
+    return Partial(_with_movement, as_tree(policy), cost)
 
-    def scores(key: Array, state: SelectionState, scene: Scene) -> Float[Array, " views"]:
-        return policy(key, state, scene) - cost * scene.graph.distances[state.view]
 
-    return scores
+def _with_movement(
+    policy: Policy, cost: float | Float[Array, ""], key: Array, state: SelectionState, scene: Scene
+) -> Float[Array, " views"]:
+    return policy(key, state, scene) - cost * scene.graph.distances[state.view]

@@ -2,14 +2,45 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from functools import cache
 from typing import Literal
 
 import jax
 import jax.numpy as jnp
+from flax import nnx
+from jax.tree_util import Partial
 from jaxtyping import Array, Float
 
 from mevs_jax.models.view_policy import ViewPolicy, expected_gain, utility_of
 from mevs_jax.policies.base import Policy, Scene, SelectionState, candidates, known
+
+By = Literal["belief", "state", "table", "ahead"]
+"""How a network's policy scores candidates: the options of `learned`, or `ahead` for `looking_ahead`."""
+
+
+def of_network(network: ViewPolicy, temperature: Float[Array, ""], by: By = "belief") -> Partial:
+    """Returns `learned` or `looking_ahead` with the weights as arguments: those of one structure share compiled programs.
+
+    Args:
+        network, temperature: as for `learned`.
+        by: how candidates are scored.
+    """
+    return Partial(_scores_by(nnx.graphdef(network), by), nnx.state(network), temperature)
+
+
+@cache
+def _scores_by(structure: nnx.GraphDef, by: By) -> Callable[..., Float[Array, " views"]]:
+    """The same function for the same arguments, as programs are compiled once for each function."""
+
+    def scores(
+        weights: nnx.State, temperature: Array, key: Array, state: SelectionState, scene: Scene
+    ) -> Float[Array, " views"]:
+        network = nnx.merge(structure, weights)
+        policy = looking_ahead(network, temperature) if by == "ahead" else learned(network, temperature, by=by)
+        return policy(key, state, scene)
+
+    return scores
 
 
 def learned(

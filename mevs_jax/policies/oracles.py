@@ -6,6 +6,7 @@ from typing import Literal
 
 import jax
 import jax.numpy as jnp
+from jax.tree_util import Partial
 from jaxtyping import Array, Float, Int
 
 from mevs_jax.beliefs.fusing import CalibratedFusion
@@ -84,17 +85,26 @@ def fused_oracle(fusion: CalibratedFusion, *, by: Literal["belief", "label"] = "
         by: `belief` to approach the belief after all views, `label` to maximise the probability of the true class.
     """
 
-    def scores(key: Array, state: SelectionState, scene: Scene) -> Float[Array, " views"]:
-        del key
-        features, points = required(scene.features, "Scene.features"), scene.graph.points
-        seen = features[state.views], points[state.views], jnp.arange(len(state.views)) < state.count
+    return Partial(_by_label if by == "label" else _by_belief, fusion)
 
-        def with_one_more(*view: Array) -> Float[Array, " classes"]:
-            return fusion(*(jnp.concatenate([known, new[None]]) for known, new in zip(seen, view, strict=True)))
 
-        after = jax.vmap(with_one_more)(features, points, jnp.ones(len(points), bool))
-        if by == "label":
-            return after[:, required(scene.label, "Scene.label")]
-        return after @ jnp.exp(fusion(features, points, jnp.ones(len(points), bool)))
+def _by_belief(fusion: CalibratedFusion, key: Array, state: SelectionState, scene: Scene) -> Float[Array, " views"]:
+    features, points, after = _with_one_more(fusion, state, scene)
+    return after @ jnp.exp(fusion(features, points, jnp.ones(len(points), bool)))
 
-    return scores
+
+def _by_label(fusion: CalibratedFusion, key: Array, state: SelectionState, scene: Scene) -> Float[Array, " views"]:
+    return _with_one_more(fusion, state, scene)[2][:, required(scene.label, "Scene.label")]
+
+
+def _with_one_more(
+    fusion: CalibratedFusion, state: SelectionState, scene: Scene
+) -> tuple[Float[Array, "views features"], Float[Array, "views 3"], Float[Array, "views classes"]]:
+    """The features of all views, their directions, and the belief after each of them."""
+    features, points = required(scene.features, "Scene.features"), scene.graph.points
+    seen = features[state.views], points[state.views], jnp.arange(len(state.views)) < state.count
+
+    def after(*view: Array) -> Float[Array, " classes"]:
+        return fusion(*(jnp.concatenate([known, new[None]]) for known, new in zip(seen, view, strict=True)))
+
+    return features, points, jax.vmap(after)(features, points, jnp.ones(len(points), bool))

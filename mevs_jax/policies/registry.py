@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass
 from typing import Literal, get_args, overload
 
@@ -17,28 +17,59 @@ from mevs_jax.policies.uninformed import farthest_view, random_view, random_with
 Knows = Literal["nothing", "networks", "others", "learned", "rendering", "truth"]
 """The kinds of information that a policy may use, from the least to the most; `eval.walks.ladder.KNOWS` describes them."""
 
+Need = Literal[
+    "belief",
+    "predicted_entropy",
+    "clouds",
+    "order",
+    "expected_views",
+    "renderings",
+    "entropy",
+    "logits",
+    "label",
+    "features",
+]
+"""What a policy can need besides the views seen: the belief, observations, knowledge, renderings, and what oracles know."""
+
 POLICIES: dict[str, Policy] = {}
 """All registered policies by name, in order of registration. Add one with `register_policy`."""
 
 
-@dataclass(frozen=True)
-class PolicyEntry:
-    """What is known of a registered policy.
+@dataclass(frozen=True, eq=False)
+class PolicyRecord:
+    """A policy, and what is known of it.
 
     Attributes:
-        name: under which it is registered.
-        policy: the function.
+        name: its name in results; that under which it is registered, if it is.
+        score: the policy itself. The arrays of a `jax.tree_util.Partial` are traced, so that programs are compiled once for a
+            structure.
         title: its name in reports.
         knows: the information that it uses.
+        needs: what it must be given besides the views seen; evaluations give it nothing else.
+        random: whether its scores depend on the key.
+        called: how messages call a user's policy.
+        code: what identifies the source of a user's policy, if it is known.
     """
 
     name: str
-    policy: Policy
+    score: Policy
     title: str
     knows: Knows
+    needs: frozenset[Need] = frozenset()
+    random: bool = False
+    called: str = ""
+    code: Mapping[str, str] | None = None
+
+    def can_use(self, given: Collection[Need]) -> bool:
+        """Whether all that the policy needs is given."""
+        return self.needs <= {*given}
+
+    def draws(self, most: int) -> int:
+        """How many walks from each start view are worth averaging: one, unless the policy draws at random."""
+        return most if self.random else 1
 
 
-_ENTRIES: dict[str, PolicyEntry] = {}
+_RECORDS: dict[str, PolicyRecord] = {}
 
 
 @overload
@@ -70,7 +101,7 @@ def register_policy(
     if name in POLICIES and not _is_defined_again(policy, POLICIES[name]):
         raise ValueError(f"the policy name {name!r} is taken: register the policy under another name")
     POLICIES[name] = policy
-    _ENTRIES[name] = PolicyEntry(name, policy, title or name.replace("_", " "), knows)
+    _RECORDS[name] = PolicyRecord(name, policy, title or name.replace("_", " "), knows)
     return policy
 
 
@@ -95,34 +126,47 @@ def policy_named(name: str) -> Policy:
     return POLICIES[name]
 
 
-def policy_entry(name: str) -> PolicyEntry:
-    """Returns title and information of the policy registered under `name`.
+def policy_record(name: str) -> PolicyRecord:
+    """Returns the record of the policy registered under `name`.
 
     Raises:
         ValueError: for an unknown name; the message lists the names that exist.
     """
     policy = policy_named(name)
-    entry = _ENTRIES.get(name)
-    if entry is None or entry.policy is not policy:  # put into `POLICIES` by hand
-        return PolicyEntry(name, policy, name.replace("_", " "), "networks")
-    return entry
+    record = _RECORDS.get(name)
+    if record is None or record.score is not policy:  # put into `POLICIES` by hand
+        return PolicyRecord(name, policy, name.replace("_", " "), "networks")
+    return record
 
 
-register_policy("random", random_view, knows="nothing")
-register_policy("random_with_repetition", random_with_repetition, title="random, with repetition", knows="nothing")
-register_policy("farthest", farthest_view, title="farthest from those seen", knows="nothing")
-register_policy("fixed_order", fixed_order, title="best fixed order", knows="others")
-register_policy("predicted_entropy", predicted_entropy, title="PointNet++ entropy (thesis)")
-register_policy("predicted_entropy_without_maxima", predicted_entropy_without_maxima, title="— without local maxima")
-register_policy("remembered_entropy", remembered_entropy, title="— mean over all clouds seen")
-register_policy("scrambled_entropy", scrambled_entropy, title="sorted in place")
-register_policy("information_gain", information_gain, title="expected information gain", knows="others")
-register_policy("diff_volume", by_ascent("diff_volume"), title="ascent on a volume", knows="rendering")
-register_policy("diff_mesh", by_ascent("diff_mesh"), title="ascent on a surface", knows="rendering")
-register_policy("diff_volume_whole", by_ascent("diff_volume_whole"), title="ascent on the whole volume", knows="truth")
-register_policy("diff_mesh_whole", by_ascent("diff_mesh_whole"), title="ascent on the whole mesh", knows="truth")
-register_policy("oracle_entropy", oracle_entropy, title="entropy oracle (thesis)", knows="truth")
-register_policy("lowest_entropy", lowest_entropy, title="lowest entropy (control)", knows="truth")
-register_policy("belief_oracle", belief_oracle, title="label-free oracle", knows="truth")
-register_policy("label_oracle", label_oracle, title="greedy label oracle", knows="truth")
-register_policy("pair_oracle", pair_oracle, title="best pair by label", knows="truth")
+_ENTROPY: tuple[Need, ...] = ("predicted_entropy",)
+_DRAWING = (random_view, random_with_repetition)
+_OFFICIAL: tuple[tuple[str, Policy, Knows, tuple[Need, ...], str], ...] = (
+    ("random", random_view, "nothing", (), "random"),
+    ("random_with_repetition", random_with_repetition, "nothing", (), "random, with repetition"),
+    ("farthest", farthest_view, "nothing", (), "farthest from those seen"),
+    ("fixed_order", fixed_order, "others", ("order",), "best fixed order"),
+    ("predicted_entropy", predicted_entropy, "networks", _ENTROPY, "PointNet++ entropy (thesis)"),
+    (
+        "predicted_entropy_without_maxima",
+        predicted_entropy_without_maxima,
+        "networks",
+        _ENTROPY,
+        "— without local maxima",
+    ),
+    ("remembered_entropy", remembered_entropy, "networks", _ENTROPY, "— mean over all clouds seen"),
+    ("scrambled_entropy", scrambled_entropy, "networks", _ENTROPY, "sorted in place"),
+    ("information_gain", information_gain, "others", ("belief", "expected_views"), "expected information gain"),
+    ("diff_volume", by_ascent("diff_volume"), "rendering", ("renderings",), "ascent on a volume"),
+    ("diff_mesh", by_ascent("diff_mesh"), "rendering", ("renderings",), "ascent on a surface"),
+    ("diff_volume_whole", by_ascent("diff_volume_whole"), "truth", ("renderings",), "ascent on the whole volume"),
+    ("diff_mesh_whole", by_ascent("diff_mesh_whole"), "truth", ("renderings",), "ascent on the whole mesh"),
+    ("oracle_entropy", oracle_entropy, "truth", ("entropy",), "entropy oracle (thesis)"),
+    ("lowest_entropy", lowest_entropy, "truth", ("entropy",), "lowest entropy (control)"),
+    ("belief_oracle", belief_oracle, "truth", ("belief", "logits"), "label-free oracle"),
+    ("label_oracle", label_oracle, "truth", ("belief", "logits", "label"), "greedy label oracle"),
+    ("pair_oracle", pair_oracle, "truth", ("belief", "logits", "label"), "best pair by label"),
+)
+for _name, _score, _knows, _needs, _title in _OFFICIAL:
+    register_policy(_name, _score, title=_title, knows=_knows)
+    _RECORDS[_name] = PolicyRecord(_name, _score, _title, _knows, frozenset(_needs), _score in _DRAWING)

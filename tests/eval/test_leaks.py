@@ -109,10 +109,10 @@ def run_with(change: str | None, out: Path) -> Run:
             return {"val": VALIDATION}[split]
         return other_tables(TEST if classifier is trained["classifier"] else BY_VIEW, change)
 
-    def run_grid(key, tables, graph, knowledge, rungs, **rest):
-        found = walk_grid_anyhow(key, tables, graph, knowledge, rungs, **rest)
+    def run_grid(key, tables, graph, knowledge, policies, **rest):
+        found = walk_grid_anyhow(key, tables, graph, knowledge, policies, **rest)
         run.knowledge.append(knowledge)
-        run.walks.append({rung.policy: np.asarray(found[rung.policy].views) for rung in rungs if rung.knows != "truth"})
+        run.walks.append({one.name: np.asarray(found[one.name].views) for one in policies if one.knows != "truth"})
         return found
 
     def fit_confidences(logits, labels):
@@ -138,7 +138,7 @@ def run_with(change: str | None, out: Path) -> Run:
         patch.setattr(stages, "compute_view_tables", compute_view_tables)
         patch.setattr(stages, "compare_with_tables", compare_with_tables)
         patch.setattr(stages, "save_system", lambda system, folder: setattr(run, "system", system))
-        patch.setattr(study, "ladder", lambda *given: tuple(one for one in ladder(*given) if one.policy in WALKED))
+        patch.setattr(study, "ladder", lambda *given: tuple(one for one in ladder(*given) if one.name in WALKED))
         patch.setattr(study, "run_grid", run_grid)
         patch.setattr(system, "run_grid", run_grid)
         patch.setattr(confidence, "_fit", fit_confidences)
@@ -235,7 +235,7 @@ def test_policies_of_users_know_validation_objects(change, monkeypatch):
 
     known = []
 
-    def run_grid(key, tables, graph, knowledge, rungs, **rest):
+    def run_grid(key, tables, graph, knowledge, policies, **rest):
         known.append(knowledge)
         raise Enough
 
@@ -283,9 +283,9 @@ def test_no_half_of_the_validation_objects_is_walked_with_knowledge_of_itself(mo
     """Its accuracy, by which the best policy is chosen, would be too high otherwise."""
     walked = []
 
-    def run_grid(key, tables, graph, knowledge, rungs, **rest):
+    def run_grid(key, tables, graph, knowledge, policies, **rest):
         walked.append((np.asarray(tables.logits[:, 0]), knowledge))
-        return walk_grid_anyhow(key, tables, graph, knowledge, rungs, **rest)
+        return walk_grid_anyhow(key, tables, graph, knowledge, policies, **rest)
 
     monkeypatch.setattr(system, "run_grid", run_grid)
     system.walk_validation(VALIDATION, STATISTICS.graph, 2)

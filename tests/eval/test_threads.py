@@ -5,13 +5,12 @@ from __future__ import annotations
 import threading
 import time
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
 from eval import threads
-from eval.walks import over_objects
+from train.running import over_objects
 
 
 @pytest.mark.parametrize("items", [[], [3], [5, 1, 4, 1, 2, 0]])
@@ -37,14 +36,16 @@ def test_results_have_the_order_of_the_items(items, monkeypatch):
     assert most == min(3, max(1, len(items) - 1)) * bool(items)
 
 
-def test_objects_are_traced_as_they_are(monkeypatch):
-    """Under `jit` there is nothing to share out."""
-    monkeypatch.setattr(over_objects, "programs_at_once", lambda: 2)
-    program = jax.jit(lambda numbers, scale: (scale * numbers)[None])
+def plus(one, added, *, times: int):
+    return {"sum": times * (one["number"] + added), "vector": jnp.full(3, one["number"])}
 
-    def whole(numbers):
-        return over_objects.on_all_cores(program, numbers, 2.0)
 
-    numbers = jnp.arange(5.0)
-    np.testing.assert_array_equal(jax.jit(whole)(numbers), whole(numbers))
-    np.testing.assert_array_equal(whole(numbers), [2 * np.arange(5.0)])
+@pytest.mark.parametrize("count", [1, 5, 40])
+@pytest.mark.parametrize("threads_at_once", [1, 3])
+def test_a_function_of_one_object_is_applied_to_all(count, threads_at_once, monkeypatch):
+    """Whatever is left over in the last part."""
+    monkeypatch.setattr(over_objects, "programs_at_once", lambda: threads_at_once)
+    numbers = np.arange(count, dtype=np.float32)
+    found = over_objects.over_objects(plus, {"number": numbers}, jnp.float32(0.5), at_once=2, times=3)
+    np.testing.assert_array_equal(found["sum"], 3 * (numbers + 0.5))
+    np.testing.assert_array_equal(found["vector"], np.stack([numbers] * 3, axis=1))

@@ -11,7 +11,6 @@ from mevs_jax import fibonacci_sphere
 from mevs_jax.beliefs.fusing import CalibratedFusion
 from mevs_jax.models import ViewPolicy
 from mevs_jax.models.set_fusion import SetFusion
-from mevs_jax.policies.learned import learned
 from train.choosing.features import Features
 
 VIEWS, CLASSES, SEEN = 6, 4, 3
@@ -93,10 +92,6 @@ class Sum(nnx.Module):
     def __call__(self, features, directions, present, *, posed=True):
         del directions, posed
         return jnp.sum(jnp.where(present[..., None], features, 0.0), axis=-2)
-
-
-def by_state(weights, structure):
-    return learned(nnx.merge(structure, weights), 1.0, by="state")
 
 
 def adding_fusion() -> CalibratedFusion:

@@ -25,12 +25,13 @@ from data_pipeline.dataset.config import DataConfig
 from data_pipeline.dataset.statistics import DatasetStatistics
 from data_pipeline.objects.mesh import ObjectEntry, ObjectSource
 from data_pipeline.objects.recipes import FurniturePiece
-from eval.learned.walks import Contender
+from eval.learned.walks import OnLattice
 from eval.settings import TINY
 from eval.tables import ViewTables
 from eval.walks.grid import Results, read_object
-from eval.walks.ladder import Rung
 from mevs_jax.geometry.viewpoints import ViewGraph
+from mevs_jax.policies.base import as_tree
+from mevs_jax.policies.registry import PolicyRecord
 from mevs_jax.selection.loop import ViewTable
 
 Network = TypeVar("Network", bound=nnx.Module)
@@ -172,34 +173,38 @@ def _read(tables: ViewTable, distances: jax.Array, views: jax.Array) -> tuple[ja
 
 
 def walk_grid_anyhow(
-    key: jax.Array, tables: ViewTable, graph: ViewGraph, knowledge: Any, rungs: Sequence[Rung], **rest: Any
+    key: jax.Array, tables: ViewTable, graph: ViewGraph, knowledge: Any, policies: Sequence[PolicyRecord], **rest: Any
 ) -> dict[str, Results]:
     """In place of `run_grid`: the results of random walks, which depend on everything but the labels."""
     objects, backbones, views, _ = tables.logits.shape
     found = {}
-    for rung in rungs:
-        given = _given(tables, rung.knows == "truth"), graph, knowledge, rung.policy, sorted(rest.items())
+    for policy in policies:
+        given = _given(tables, policy.knows == "truth"), graph, knowledge, policy.name, sorted(rest.items())
         seed = seed_of((jax.random.key_data(key), given))
         one = some_walks(seed, objects * backbones, range(views), views, rest["max_views"])
         walks = jnp.asarray(one.reshape(backbones, objects, views, -1))
-        found[rung.policy] = Results(*_read(tables, graph.distances, walks), walks[:, :, :, None])
+        found[policy.name] = Results(*_read(tables, graph.distances, walks), walks[:, :, :, None])
     return found
 
 
 def walk_all_anyhow(
     key: jax.Array,
-    contender: Contender,
-    parameters: Any,
+    policy: PolicyRecord,
     fusion: Any,
-    tables: ViewTable,
-    directions: Any,
+    lattice: OnLattice,
     knowledge: Any,
+    *,
     max_views: int,
-    neighbours: Any = None,
+    draws: int = 1,
+    every: int = 1,
 ) -> np.ndarray:
     """In place of `eval.learned.walks.walk_all`: random walks, which depend on everything but the labels."""
-    given = _given(tables, contender.knows == "truth"), parameters, fusion, directions, knowledge, neighbours
-    seed = seed_of((jax.random.key_data(key), contender.name, max_views, given))
+    tables, directions = lattice.table(policy.needs), lattice.features.directions
+    parameters = jax.tree.leaves(as_tree(policy.score))
+    if not policy.needs & {"order", "expected_views"}:
+        knowledge = None
+    given = _given(tables, policy.knows == "truth"), parameters, fusion, directions, knowledge, lattice.neighbours
+    seed = seed_of((jax.random.key_data(key), policy.name, max_views, given))
     objects, views, _ = directions.shape
-    starts = np.repeat(np.arange(0, views, contender.every), contender.draws)
+    starts = np.repeat(np.arange(0, views, every), policy.draws(draws))
     return some_walks(seed, objects, starts, views, max_views)

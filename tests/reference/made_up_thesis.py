@@ -9,7 +9,8 @@ import numpy as np
 
 from data_pipeline.dataset.statistics import DatasetStatistics
 from data_pipeline.objects.furniture import CLASSES
-from eval.thesis.results import LatticeTables, all_results, machine
+from eval.machine import machine
+from eval.thesis.results import LatticeTables, all_results
 from eval.walks.grid import GridConfig
 from mevs_jax.geometry.viewpoints import fibonacci_sphere
 from train.tasks.thesis_networks import BACKBONES, VIEWS

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from functools import partial
 
 import jax
 import jax.numpy as jnp
@@ -16,9 +15,9 @@ from mevs_jax.arrays import AnyArray
 from mevs_jax.beliefs.calibration import class_weights, fit_temperature
 from mevs_jax.beliefs.fusing import CalibratedFusion
 from mevs_jax.models.set_fusion import OfFirstFeatures, SetFusion, SumFusion
-from train.choosing.chunks import in_chunks
 from train.choosing.features import Features, sets_of_size
 from train.results.finite import check_outputs
+from train.running.over_objects import over_objects
 
 _CALIBRATED = (1, 2, 3, 4, 5, 6, 8, 12, 16, 24, 32, 40)
 """Numbers of views for which a temperature is fitted; temperatures between them are interpolated."""
@@ -64,10 +63,11 @@ def calibrated(
     return replace(uncalibrated, temperatures=jnp.asarray(every, jnp.float32), single=single)
 
 
-@jax.jit
-def _beliefs_of_some_sets(fusion: CalibratedFusion, some: tuple[Features, Array]) -> Array:
-    data, sets = some
-    return jax.vmap(lambda present: fusion(data.features, data.directions, present), 1, 1)(sets)
+def _beliefs_of_one(
+    one: tuple[Features, Bool[Array, "draws views"]], fusion: CalibratedFusion
+) -> Float[Array, "draws classes"]:
+    data, sets = one
+    return jax.vmap(lambda present: fusion(data.features, data.directions, present))(sets)
 
 
 def beliefs_of_sets(
@@ -75,4 +75,4 @@ def beliefs_of_sets(
 ) -> Float[np.ndarray, "draws objects classes"]:
     """Returns the log-probabilities of the classes after each set of views."""
     sets = np.asarray(present).swapaxes(0, 1)
-    return in_chunks(partial(_beliefs_of_some_sets, fusion), (data, sets), 16).swapaxes(0, 1)
+    return over_objects(_beliefs_of_one, (data, sets), fusion, at_once=16, by_all=True).swapaxes(0, 1)

@@ -42,7 +42,7 @@ class LearnedConfig:
     """variants of the policy to compare with, for the first seed: as_it_is, look_ahead, probability, random_states, unchanged,
     crossed, known, summed, cloud (needs PointNet++, trained by `mevs train`), q_learning"""
     novel: int = 0
-    """number of class pairs that a policy is trained without and then tested on, for the first seed"""
+    """number of class pairs that a policy is trained without and then tested on"""
     rotation_epochs: int = 0
     """epochs of further training of the recogniser on objects turned by any rotation, which are then tested too, for the first
     seed; 0: no such training and test"""

@@ -11,8 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from functools import cache, partial
-from typing import Any, Literal, TypeVar
+from typing import Any, Generic, TypeVar
 
 import flax.struct
 import jax
@@ -26,13 +25,14 @@ from mevs_jax.beliefs.calibration import class_weights
 from mevs_jax.beliefs.fusing import CalibratedFusion
 from mevs_jax.geometry.viewpoints import ViewGraph
 from mevs_jax.models.view_policy import Utility, ViewPolicy, expected_gain, utility_of
-from mevs_jax.policies.base import Policy
-from mevs_jax.policies.learned import learned, looking_ahead
+from mevs_jax.policies.base import Policy, as_tree
+from mevs_jax.policies.learned import of_network
 from mevs_jax.policies.uninformed import random_view
-from mevs_jax.selection.loop import ViewTable, by_attention, select_from_table
+from mevs_jax.selection.loop import ViewTable, by_attention
+from mevs_jax.selection.walks import walks_around
 from train.choosing.averaged import AveragedConfig, Fitting, fit_together, mean_losses
-from train.choosing.chunks import in_chunks
 from train.choosing.features import Features
+from train.running.over_objects import over_objects
 
 Tree = TypeVar("Tree")
 Seen = tuple[CalibratedFusion, Features]
@@ -105,82 +105,70 @@ def graph_of(directions: Float[Array, "views 3"]) -> ViewGraph:
     return ViewGraph(directions, jnp.zeros((views, views), bool), distances)
 
 
-@partial(jax.jit, static_argnames=("policy_of", "most", "walks"))
-def _walk_some(
-    some: tuple[Array, Features],
+def _walks_of(
+    one: tuple[Int[Array, ""], Features],
+    key: Array,
+    drawn: Array,
     fusion: CalibratedFusion,
-    policy_of: Callable[..., Policy],
-    parameters: Any,
+    policy: Policy,
+    *,
     most: int,
     walks: int,
-) -> Int[Array, "objects walks most"]:
-    policy = policy_of(parameters)
-
-    def of_object(key: Array, one: Features) -> Array:
-        graph = graph_of(one.directions)
-        table = ViewTable(one.logits, None, None, one.labels, features=one.features, clouds=one.clouds)
-        starts, keys = jax.random.split(key)
-        start = jax.random.randint(starts, (walks,), 0, one.directions.shape[0])
-
-        def run(key: Array, start: Array) -> Array:
-            scene, fuse = table.scene(graph), by_attention(fusion)
-            return select_from_table(key, table, scene, policy, start, max_views=most, fuse=fuse).views
-
-        return jax.vmap(run)(jax.random.split(keys, walks), start)
-
-    return jax.vmap(of_object)(*some)
+) -> Int[Array, "walks most"]:
+    number, data = one
+    table = ViewTable(data.logits, None, None, data.labels, features=data.features, clouds=data.clouds)
+    starts = jax.random.randint(jax.random.fold_in(drawn, number), (walks,), 0, len(data.directions))
+    scene, pairs = table.scene(graph_of(data.directions)), (starts, jnp.arange(walks))
+    fuse = by_attention(fusion)
+    return walks_around(
+        jax.random.fold_in(key, number), table.observe, scene, policy, pairs, max_views=most, fuse=fuse
+    ).views
 
 
 def walk(
-    key: Array,
-    fusion: CalibratedFusion,
-    data: Features,
-    policy_of: Callable[..., Policy],
-    parameters: Any,
-    most: int,
-    walks: int,
+    key: Array, fusion: CalibratedFusion, data: Features, policy: Policy, most: int, walks: int
 ) -> Int[np.ndarray, "objects walks most"]:
     """Returns the views of walks from random starts.
 
     Args:
-        policy_of: `policy_of(parameters)` is the policy that chooses the views; a static argument of the compiled walk.
+        policy: chooses the views.
         most: views of a walk.
         walks: walks for each object.
     """
-    keys = jax.vmap(jax.random.fold_in, (None, 0))(key, jnp.arange(len(data.labels)))
-    rest = fusion, policy_of, parameters, most, walks
-    return in_chunks(lambda some: _walk_some(some, *rest), (keys, data), 64)
+    objects, (key, drawn) = (np.arange(len(data.labels)), data), jax.random.split(key)
+    shared = key, drawn, fusion, as_tree(policy)
+    return over_objects(_walks_of, objects, *shared, at_once=64, by_all=True, most=most, walks=walks)
 
 
-@partial(jax.jit, static_argnames="config")
-def _choices_of_some(fusion: CalibratedFusion, some: tuple[Features, Array, Array], config: PolicyConfig) -> Choices:
-    most, by = some[1].shape[-1], (config.utility, config.floor)
+def _choices_of(
+    one: tuple[Features, Int[Array, "walks most"], Int[Array, "walks most candidates"]],
+    fusion: CalibratedFusion,
+    *,
+    config: PolicyConfig,
+) -> Choices:
+    (data, walks, candidates), by = one, (config.utility, config.floor)
+    most, single = walks.shape[-1], jax.nn.log_softmax(data.logits / fusion.single, axis=-1)
 
-    def of_object(one: Features, walks: Array, candidates: Array) -> Choices:
-        single = jax.nn.log_softmax(one.logits / fusion.single, axis=-1)
+    def of_state(order: Array, count: Array, candidates: Array) -> Choices:
+        present = jnp.arange(most) < count
+        features, directions = data.features[order], data.directions[order]
+        belief = fusion(features, directions, present)
 
-        def of_state(order: Array, count: Array, candidates: Array) -> Choices:
-            present = jnp.arange(most) < count
-            features, directions = one.features[order], one.directions[order]
-            belief = fusion(features, directions, present)
+        def with_one_more(view: Array) -> Array:
+            return fusion(
+                jnp.concatenate([features, data.features[view][None]]),
+                jnp.concatenate([directions, data.directions[view][None]]),
+                jnp.concatenate([present, jnp.array([True])]),
+            )
 
-            def with_one_more(view: Array) -> Array:
-                return fusion(
-                    jnp.concatenate([features, one.features[view][None]]),
-                    jnp.concatenate([directions, one.directions[view][None]]),
-                    jnp.concatenate([present, jnp.array([True])]),
-                )
+        after = jax.vmap(with_one_more)(candidates)
+        gain = utility_of(after[:, data.labels], *by) - utility_of(belief[data.labels], *by)
+        known = belief, single[order], directions, present, data.directions[candidates]
+        clouds = None if data.clouds is None else data.clouds[order]
+        return Choices(*known, gain, data.labels, jnp.float32(1), clouds)
 
-            after = jax.vmap(with_one_more)(candidates)
-            gain = utility_of(after[:, one.labels], *by) - utility_of(belief[one.labels], *by)
-            known = belief, single[order], directions, present, one.directions[candidates]
-            clouds = None if one.clouds is None else one.clouds[order]
-            return Choices(*known, gain, one.labels, jnp.float32(1), clouds)
-
-        of_walk = jax.vmap(of_state, (None, 0, 0))
-        return jax.vmap(of_walk, (0, None, 0))(walks, jnp.arange(1, most + 1), candidates)
-
-    return jax.vmap(of_object)(*some)
+    of_walk = jax.vmap(of_state, (None, 0, 0))
+    return jax.vmap(of_walk, (0, None, 0))(walks, jnp.arange(1, most + 1), candidates)
 
 
 def unseen(
@@ -206,7 +194,7 @@ def choices_along(
 ) -> Choices:
     """Returns every state of some walks with the gain of its candidates, as arrays on the host."""
     same = replace(config, seed=0)  # one program for all seeds
-    found = in_chunks(partial(_choices_of_some, fusion, config=same), (data, walks, candidates), 16)
+    found = over_objects(_choices_of, (data, walks, candidates), fusion, at_once=16, by_all=True, config=same)
     return jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[3:]), found)
 
 
@@ -239,22 +227,6 @@ def policy_loss(network: ViewPolicy, some: Choices, differences: float) -> dict[
         "gain_if": error(own, some.gain),
         "differences": differences * (compared[0] + compared[1]),
     }
-
-
-By = Literal["belief", "state", "table", "ahead"]
-"""How a view policy scores candidates: the options of `mevs_jax.policies.learned.learned`, or "ahead" for `looking_ahead`."""
-
-
-def learned_policy(given: tuple[nnx.State, Array], structure: nnx.GraphDef, by: By = "belief") -> Policy:
-    """Returns the policy `learned` or `looking_ahead` of a network.
-
-    Args:
-        given: weights and temperature of single views, which may be arguments of a compiled program.
-        structure: graph definition of the network.
-        by: how candidates are scored.
-    """
-    network, temperature = nnx.merge(structure, given[0]), given[1]
-    return looking_ahead(network, temperature) if by == "ahead" else learned(network, temperature, by=by)
 
 
 def new_policy(config: PolicyConfig, classes: int, posed: bool = True, cloud: int = 0) -> ViewPolicy:
@@ -313,30 +285,63 @@ def train_policies(config: PolicyConfig, lessons: Sequence[Lesson]) -> list[Trai
         config: of all policies; each lesson has a seed of its own.
         lessons: all with as many objects, views and parts.
     """
+    return in_rounds(config, lessons, _gather, _fit)
+
+
+Samples = TypeVar("Samples")
+
+
+@dataclass(frozen=True)
+class Round(Generic[Samples]):
+    """What a policy learns from in one round of its training.
+
+    Attributes:
+        name: of the policy and the round, for messages.
+        config: settings, with the seed of the policy.
+        untrained: its network with random weights.
+        before: its network after the round before; None in the first.
+        train, check: samples to learn from, and those of validation objects, if there are any.
+    """
+
+    name: str
+    config: Any
+    untrained: ViewPolicy
+    before: ViewPolicy | None
+    train: Samples
+    check: Samples | None
+
+
+Gather = Callable[[Seen, ViewPolicy | None, Any, tuple[int, int]], Samples]
+"""What new walks on some objects tell, by the network of the round before; the numbers of round and part seed them."""
+Fit = Callable[[Any, Sequence[Round[Samples]]], list[tuple[ViewPolicy, list[dict[str, float]]]]]
+"""Networks of the best epoch, or of the last without validation samples, and their losses by epoch."""
+
+
+def in_rounds(config: Any, lessons: Sequence[Lesson], gather: Gather[Samples], fit: Fit[Samples]) -> list[Trained]:
+    """Returns for each lesson the network after all rounds. Every round gathers samples, and trains on those of all rounds."""
     configs = [replace(config, seed=lesson.seed) for lesson in lessons]
-    policies: list[ViewPolicy | None] = [None] * len(lessons)
-    gathered: list[list[Choices]] = [[] for _ in lessons]
-    gathered_for_check: list[list[Choices]] = [[] for _ in lessons]
+    untrained = [_untrained(own, lesson) for own, lesson in zip(configs, lessons, strict=True)]
+    networks: list[ViewPolicy | None] = [None] * len(lessons)
+    train: list[list[Samples]] = [[] for _ in lessons]
+    check: list[list[Samples]] = [[] for _ in lessons]
     histories: list[list[list[dict[str, float]]]] = [[] for _ in lessons]
     for number in range(config.rounds):
-        each = []
-        for index, (own, lesson) in enumerate(zip(configs, lessons, strict=True)):
-            guide, parts = policies[index], lesson.parts
-            gathered[index] += [_gather(seen, guide, own, (number, part)) for part, seen in enumerate(parts)]
+        rounds = []
+        for index, lesson in enumerate(lessons):
+            guide, own, parts = networks[index], configs[index], lesson.parts
+            train[index] += [gather(seen, guide, own, (number, part)) for part, seen in enumerate(parts)]
             if lesson.validation is not None:
-                gathered_for_check[index].append(_gather(lesson.validation, guide, own, (number, len(parts))))
-            train, check = _balanced(joined(gathered[index])), gathered_for_check[index]
-            each.append((own, lesson, train, _balanced(joined(check)) if check else None))
-        fitted = _fit(config, each, f"round {number + 1} of {config.rounds}")
-        for index, (policy, history) in enumerate(fitted):
-            policies[index] = policy
+                check[index].append(gather(lesson.validation, guide, own, (number, len(parts))))
+            samples = joined(train[index]), joined(check[index]) if check[index] else None
+            name = f"{lesson.name}, round {number + 1} of {config.rounds},"
+            rounds.append(Round(name, own, untrained[index], guide, *samples))
+        for index, (network, history) in enumerate(fit(config, rounds)):
+            networks[index] = network
             histories[index].append(history)
             last = ", ".join(f"{name} {value:.4f}" for name, value in history[-1].items())
-            console.print(
-                f"{lessons[index].name}, round {number + 1} of {config.rounds}, {len(each[index][2].label)} states: {last}"
-            )
-    trained = zip(configs, lessons, policies, histories, strict=True)
-    return [(policy or _untrained(own, lesson), history) for own, lesson, policy, history in trained]
+            console.print(f"{rounds[index].name} {len(jax.tree.leaves(rounds[index].train)[0])} samples: {last}")
+    trained = zip(networks, untrained, histories, strict=True)
+    return [(network or before, history) for network, before, history in trained]
 
 
 def _untrained(config: PolicyConfig, lesson: Lesson) -> ViewPolicy:
@@ -345,19 +350,9 @@ def _untrained(config: PolicyConfig, lesson: Lesson) -> ViewPolicy:
     return new_policy(config, data.logits.shape[-1], fusion.posed, cloud)
 
 
-def _fit(
-    config: PolicyConfig,
-    each: Sequence[tuple[PolicyConfig, Lesson, Choices, Choices | None]],
-    when: str,
-) -> list[tuple[ViewPolicy, list[dict[str, float]]]]:
-    """Returns trained networks of their best epoch, or of the last without validation states, and their losses by epoch.
-
-    Args:
-        each: for each policy its settings, lesson, states to learn from and validation states.
-        when: the round, for messages.
-    """
-    networks = [_untrained(own, lesson) for own, lesson, _, _ in each]
-    structure = nnx.graphdef(networks[0])
+def _fit(config: PolicyConfig, rounds: Sequence[Round[Choices]]) -> list[tuple[ViewPolicy, list[dict[str, float]]]]:
+    """Trains networks from the same random weights in every round."""
+    structure = nnx.graphdef(rounds[0].untrained)
 
     def loss_of(parameters: nnx.State, some: Choices, key: Array) -> Array:
         del key
@@ -370,42 +365,30 @@ def _fit(
 
     fittings = [
         Fitting(
-            own.seed,
-            nnx.state(network),
-            train,
-            None if validation is None else mean_losses(check, validation, 1024),
-            f"{lesson.name}, {when},",
+            one.config.seed,
+            nnx.state(one.untrained),
+            _balanced(one.train),
+            None if one.check is None else mean_losses(check, _balanced(one.check), 1024),
+            one.name,
         )
-        for network, (own, lesson, train, validation) in zip(networks, each, strict=True)
+        for one in rounds
     ]
     fitted = fit_together(config, loss_of, fittings, "--learned.policy.learning-rate")
     return [(nnx.merge(structure, best), history) for best, history in fitted]
 
 
 def _gather(seen: Seen, guide: ViewPolicy | None, config: PolicyConfig, number: tuple[int, int]) -> Choices:
-    """Returns every state of new walks on some objects, with the gain of random candidates.
-
-    Args:
-        guide: the policy that chooses the views of the walks; random views if None.
-        number: numbers of the round and the part, which seed the walks and candidates.
-    """
+    """Returns every state of new walks on some objects, with the gain of random candidates; the first walks are random."""
     (fusion, data), (round_number, part) = seen, number
-    key = jax.random.fold_in(jax.random.fold_in(jax.random.key(config.seed), round_number), part)
-    policy_of: Callable[..., Policy] = _at_random if guide is None else _guided(nnx.graphdef(guide))
-    given = (None if guide is None else nnx.state(guide)), fusion.single
-    views = walk(key, fusion, data, policy_of, given, config.most_seen, config.walks)
+    policy = random_view if guide is None else of_network(guide, fusion.single)
+    views = walk(round_key(config, number), fusion, data, policy, config.most_seen, config.walks)
     candidates = unseen(views, data.features.shape[1], config.candidates, config.seed + 100 * round_number + part)
     return choices_along(fusion, data, views, candidates, config)
 
 
-def _at_random(_: Any) -> Policy:
-    return random_view
-
-
-@cache
-def _guided(structure: nnx.GraphDef) -> Callable[..., Policy]:
-    """Returns the same function for the same structure: walks are compiled once per function, not once per set of weights."""
-    return partial(learned_policy, structure=structure)
+def round_key(config: PolicyConfig, number: tuple[int, int]) -> Array:
+    """Returns the key of the walks of a round and part."""
+    return jax.random.fold_in(jax.random.fold_in(jax.random.key(config.seed), number[0]), number[1])
 
 
 def _balanced(choices: Choices) -> Choices:

@@ -11,26 +11,27 @@ object, and there is a reward at every step instead of only the last.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import cache, partial
-from typing import Any
+from functools import partial
 
 import flax.struct
 import jax
 import jax.numpy as jnp
 import numpy as np
 from flax import nnx
+from jax.tree_util import Partial
 from jaxtyping import Array, Float, Int
 
-from data_pipeline.progress import console
 from mevs_jax.beliefs.fusing import CalibratedFusion
 from mevs_jax.models.view_policy import ViewPolicy, utility_of
-from mevs_jax.policies.base import Policy
-from train.choosing.averaged import Fitted, Fitting, fit_together, mean_losses
-from train.choosing.chunks import in_chunks
+from mevs_jax.policies.base import Policy, Scene, SelectionState, as_tree
+from mevs_jax.policies.learned import of_network
+from mevs_jax.policies.uninformed import random_view
+from train.choosing.averaged import Fitting, fit_together, mean_losses
 from train.choosing.features import Features
-from train.choosing.policy import Lesson, PolicyConfig, Seen, Trained, joined, learned_policy, new_policy, walk
+from train.choosing.policy import Lesson, PolicyConfig, Round, Seen, Trained, in_rounds, round_key, walk
+from train.running.over_objects import over_objects
 
 
 @dataclass(frozen=True)
@@ -68,24 +69,19 @@ class Transitions:
     reward: Float[Array, "walks transitions"]
 
 
-@partial(jax.jit, static_argnames="config")
-def _transitions_of_some(
-    fusion: CalibratedFusion, some: tuple[Features, Array], config: QLearningConfig
+def _transitions_of(
+    one: tuple[Features, Int[Array, "walks steps"]], fusion: CalibratedFusion, *, config: QLearningConfig
 ) -> Transitions:
-    steps = some[1].shape[-1]
+    data, walks = one
+    steps, single = walks.shape[-1], jax.nn.log_softmax(data.logits / fusion.single, axis=-1)
 
-    def of_object(one: Features, walks: Array) -> Transitions:
-        single = jax.nn.log_softmax(one.logits / fusion.single, axis=-1)
+    def of_walk(order: Array) -> Transitions:
+        seen = data.features[order], data.directions[order]
+        beliefs = jax.vmap(lambda count: fusion(*seen, jnp.arange(steps) < count))(jnp.arange(1, steps + 1))
+        reward = jnp.diff(utility_of(beliefs[:, data.labels], config.utility, config.floor))
+        return Transitions(beliefs, single[order], order, data.directions, reward)
 
-        def of_walk(order: Array) -> Transitions:
-            seen = one.features[order], one.directions[order]
-            beliefs = jax.vmap(lambda count: fusion(*seen, jnp.arange(steps) < count))(jnp.arange(1, steps + 1))
-            reward = jnp.diff(utility_of(beliefs[:, one.labels], config.utility, config.floor))
-            return Transitions(beliefs, single[order], order, one.directions, reward)
-
-        return jax.vmap(of_walk)(walks)
-
-    return jax.vmap(of_object)(*some)
+    return jax.vmap(of_walk)(walks)
 
 
 def transitions_along(
@@ -96,7 +92,7 @@ def transitions_along(
 ) -> Transitions:
     """Returns beliefs and rewards along some walks, as arrays on the host."""
     same = replace(config, seed=0)  # one program for all seeds
-    found = in_chunks(partial(_transitions_of_some, fusion, config=same), (data, walks), 64)
+    found = over_objects(_transitions_of, (data, walks), fusion, at_once=64, by_all=True, config=same)
     return jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:]), found)
 
 
@@ -129,26 +125,17 @@ def temporal_difference(
     return taken - (some.reward + discount * ahead)
 
 
-def exploring(given: tuple[nnx.State, Array], structure: nnx.GraphDef, share: float) -> Policy:
-    """Returns the ε-greedy policy: random scores with probability `share`, else the network's values.
-
-    Args:
-        given: weights and temperature of single views.
-    """
-    greedy = learned_policy(given, structure, by="state")
-
-    def scores(key: Array, state: Any, scene: Any) -> Array:
-        whether, drawn = jax.random.split(key)
-        any_view = jax.random.uniform(drawn, (scene.graph.points.shape[0],))
-        return jnp.where(jax.random.bernoulli(whether, share), any_view, greedy(key, state, scene))
-
-    return scores
+def exploring(policy: Policy, share: float) -> Policy:
+    """Returns the ε-greedy form of a policy: random scores with probability `share`, else its own."""
+    return Partial(_exploring, as_tree(policy), share)
 
 
-@cache
-def _exploring(structure: nnx.GraphDef, share: float) -> Callable[..., Policy]:
-    """Returns the same function for the same arguments: walks are compiled once for each function."""
-    return partial(exploring, structure=structure, share=share)
+def _exploring(
+    greedy: Policy, share: Float[Array, ""] | float, key: Array, state: SelectionState, scene: Scene
+) -> Float[Array, " views"]:
+    whether, drawn = jax.random.split(key)
+    any_view = jax.random.uniform(drawn, (len(scene.graph.points),))
+    return jnp.where(jax.random.bernoulli(whether, share), any_view, greedy(key, state, scene))
 
 
 def train_by_q_learning(
@@ -166,58 +153,27 @@ def train_by_q_learning(
 
 def train_all_by_q_learning(config: QLearningConfig, lessons: Sequence[Lesson]) -> list[Trained]:
     """Returns for each lesson what `train_by_q_learning` returns; the networks are trained together, as by `train_policies`."""
-    networks = [
-        new_policy(replace(config, seed=lesson.seed), lesson.parts[0][1].logits.shape[-1], lesson.parts[0][0].posed)
-        for lesson in lessons
-    ]
-    structure, weights = nnx.graphdef(networks[0]), [nnx.state(network) for network in networks]
-    replays: list[list[Transitions]] = [[] for _ in lessons]
-    replays_for_check: list[list[Transitions]] = [[] for _ in lessons]
-    histories: list[list[list[dict[str, float]]]] = [[] for _ in lessons]
-    for number in range(config.rounds):
-        share = config.exploration if number else 1.0
-        policy_of = _exploring(structure, share)
-        fittings = []
-        for index, lesson in enumerate(lessons):
-            key = jax.random.fold_in(jax.random.key(lesson.seed), number)
-            new, new_for_check = _walked(config, lesson, weights[index], policy_of, key)
-            replays[index] += new
-            replays_for_check[index] += new_for_check
-            train, check = joined(replays[index]), replays_for_check[index]
-            named = f"{lesson.name}, round {number + 1} of {config.rounds},"
-            fittings.append((lesson.seed, weights[index], train, joined(check) if check else None, named))
-        for index, (found, history) in enumerate(_fit(config, structure, number > 0, fittings)):
-            weights[index] = found
-            histories[index].append(history)
-            console.print(f"{fittings[index][-1]} {len(fittings[index][2].order)} walks: {history[-1]}")
-    return [(nnx.merge(structure, own), history) for own, history in zip(weights, histories, strict=True)]
+    return in_rounds(config, lessons, _gather, _fit)
 
 
-def _walked(
-    config: QLearningConfig, lesson: Lesson, weights: nnx.State, policy_of: Callable[..., Policy], key: Array
-) -> tuple[list[Transitions], list[Transitions]]:
-    """Returns what new walks on a lesson's objects tell, by part, and on its validation objects."""
-    found, parts = [], [*lesson.parts] if lesson.validation is None else [*lesson.parts, lesson.validation]
-    for part, (fusion, data) in enumerate(parts):
-        given, own = (weights, fusion.single), jax.random.fold_in(key, part)
-        walks = walk(own, fusion, data, policy_of, given, config.most_seen + 1, config.walks)
-        found.append(transitions_along(fusion, data, walks, config))
-    return found[: len(lesson.parts)], found[len(lesson.parts) :]
+def _gather(seen: Seen, guide: ViewPolicy | None, config: QLearningConfig, number: tuple[int, int]) -> Transitions:
+    """Returns what new walks on some objects tell; the first are random."""
+    fusion, data = seen
+    policy: Policy = random_view
+    if guide is not None:
+        policy = exploring(of_network(guide, fusion.single, "state"), config.exploration)
+    walks = walk(round_key(config, number), fusion, data, policy, config.most_seen + 1, config.walks)
+    return transitions_along(fusion, data, walks, config)
 
 
 def _fit(
-    config: QLearningConfig,
-    structure: nnx.GraphDef,
-    ahead: bool,
-    each: Sequence[tuple[int, nnx.State, Transitions, Transitions | None, str]],
-) -> list[Fitted]:
-    """Trains networks from their targets' weights; returns new weights and the losses by epoch.
+    config: QLearningConfig, rounds: Sequence[Round[Transitions]]
+) -> list[tuple[ViewPolicy, list[dict[str, float]]]]:
+    """Trains networks from the weights of their targets, those of the round before.
 
-    Args:
-        ahead: whether the next state's value counts; not in the first round, where the target is untrained.
-        each: for each network its seed, its target's weights, transitions to learn from and for validation, and its name.
+    In the first round, where the target is untrained, the value of the next state does not count.
     """
-    discount = config.discount if ahead else 0.0
+    structure, discount = nnx.graphdef(rounds[0].untrained), config.discount if rounds[0].before else 0.0
 
     def loss_of(parameters: nnx.State, some: Transitions, key: Array | None, target: nnx.State) -> Array:
         del key
@@ -229,7 +185,9 @@ def _fit(
         return {"error": loss_of(mean, some, None, target)}
 
     fittings = []
-    for seed, target, train, check, name in each:
-        validate = None if check is None else mean_losses(partial(error, target=target), check, 256)
-        fittings.append(Fitting(seed, target, train, validate, name, (target,)))
-    return fit_together(config, loss_of, fittings, "--learned.q-learning.learning-rate")
+    for one in rounds:
+        target = nnx.state(one.before or one.untrained)
+        validate = None if one.check is None else mean_losses(partial(error, target=target), one.check, 256)
+        fittings.append(Fitting(one.config.seed, target, one.train, validate, one.name, (target,)))
+    fitted = fit_together(config, loss_of, fittings, "--learned.q-learning.learning-rate")
+    return [(nnx.merge(structure, best), history) for best, history in fitted]

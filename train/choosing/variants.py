@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
-from train.choosing.policy import By
+from mevs_jax.policies.learned import By
 
 
 @dataclass(frozen=True)
@@ -15,7 +15,7 @@ class Variant:
     Attributes:
         title: title in the report.
         posed: whether the objects' pose is known.
-        by: how candidates are scored; see `train.choosing.policy.By`.
+        by: how candidates are scored; see `mevs_jax.policies.learned.By`.
         network: name of the variant whose network is used; its own if empty.
         changed: whether it also learns from mirrored and stretched copies of the objects.
         learns_from: "validation": validation objects; "parts": training objects in parts, each with the features of a recogniser

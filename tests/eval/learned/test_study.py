@@ -15,11 +15,12 @@ from data_pipeline.errors import DataError
 from eval.learned.comparison import seeds_together
 from eval.learned.measure import check_parts
 from eval.learned.stopping import Signal, compare_rules, walks_apart
-from eval.learned.study import fixed_order_scores, novel_classes, study
-from eval.learned.walks import Learner, OnLattice
+from eval.learned.study import novel_classes, novel_metrics, order_of_fused, study
+from eval.learned.walks import OnLattice, Walking, by_network
 from eval.numbers.confidence import stops_at
 from mevs_jax.models.expected_views import ExpectedViews
-from tests.reference.choosing import VIEWS, by_state, some_policy, telling
+from mevs_jax.policies.learned import of_network
+from tests.reference.choosing import VIEWS, some_policy, telling
 from tests.reference.made_up_study import STUDIED
 from train.choosing.expected import fit_expected_views
 from train.choosing.features import Features
@@ -51,23 +52,22 @@ def test_what_looking_was_worth_is_learned_and_the_study_says_so(adding):
     assert len(histories) == 2
     assert histories[-1][-1]["gain"] < 0.7 * histories[0][0]["gain"]
     expected = expected_of(parts[0][1])
-    others = (
-        Learner("look_ahead", "two ahead", policy, "ahead"),
-        Learner("learned_and_table", "with a table", policy, "table"),
+    method, unsure = (
+        by_network("learned", "view policy", policy, adding),
+        replace(adding, temperatures=jnp.full(1, 50.0)),
     )
     found, each = study(
         adding,
         [
-            Learner("learned", "view policy", policy),
-            *others,
-            Learner("unsure", "another fusion", policy, fusion=replace(adding, temperatures=jnp.full(1, 50.0))),
+            method,
+            by_network("look_ahead", "two ahead", policy, adding, "ahead"),
+            by_network("learned_and_table", "with a table", policy, adding, "table"),
+            by_network("unsure", "another fusion", policy, unsure),
         ],
-        OnLattice(validation),
-        OnLattice(test),
-        max_views=3,
-        draws=2,
-        oracle_views=3,
-        apart=[Learner("learned", "view policy", policy)] * 2,
+        (OnLattice(validation), OnLattice(test)),
+        Walking(3, 2, oracle_views=3),
+        fusions={"unsure": unsure},
+        apart=[method] * 2,
         known=expected,
     )
     after = {name: result["after_views"] for name, result in found["policies"].items()}
@@ -119,23 +119,27 @@ def test_what_looking_was_worth_is_learned_and_the_study_says_so(adding):
     assert paying[0] < paying[-1]
     assert set(found["policies"]) >= {"farthest", "fixed_order", "expected_views", "belief_oracle"}
     assert [row["views"] for row in found["random_sets"]] == [1, 2, 3, 4, 5, 6]
-    pairs = [((0, 2), policy), ((1, 3), policy)]
-    without = novel_classes(adding, pairs, policy, test, max_views=3, draws=2, expected=expected)
+    pairs = [(0, 2), (1, 3)]
+
+    def of_pairs(some, expected):
+        own = [(pair, method) for pair in some]
+        each = novel_classes(adding, own, method, OnLattice(test), Walking(3, 2), expected)
+        return novel_metrics(each, some, test.labels)
+
+    without = of_pairs(pairs, expected)
     by_expected = without["gain"].pop("expected_views")["difference"]
     np.testing.assert_allclose(by_expected[1:], (np.array(after["expected_views"]) - after["random"])[1:], atol=0.03)
     without_them = without["gain"].pop("expected_views_without")["difference"]
     assert without_them != by_expected
-    for (classes, _), row in zip(pairs, without["pairs"], strict=True):
+    for classes, row in zip(pairs, without["pairs"], strict=True):
         nothing = ExpectedViews(expected.coefficients.at[jnp.array(classes)].set(0))
-        rest = novel_classes(adding, [(classes, policy)], policy, test, max_views=3, draws=2, expected=nothing)
+        rest = of_pairs([classes], nothing)
         np.testing.assert_allclose(row["expected_views_without"], rest["pairs"][0]["expected_views"])
     assert without["objects"] == 120
     gain = np.array(after["learned"]) - after["random"]
     for found_without in without["gain"].values():  # the same policy: what is found on all objects
         np.testing.assert_allclose(found_without["difference"], gain, atol=0.02)
-    chosen = walk(
-        jax.random.key(0), adding, test, partial(by_state, structure=nnx.graphdef(policy)), nnx.state(policy), 3, 4
-    )
+    chosen = walk(jax.random.key(0), adding, test, of_network(policy, jnp.float32(1), "state"), 3, 4)
     assert chosen.shape == (120, 4, 3)
     assert all(len(set(order)) == 3 for order in chosen.reshape(-1, 3).tolist())
 
@@ -189,8 +193,8 @@ def test_stopping_is_fitted_on_walks_of_policies_that_did_not_learn_from_the_obj
     for sign in (1.0, -1.0):
         policy = some_policy()
         nnx.update(policy, jax.tree.map(lambda leaf, sign=sign: sign * leaf, nnx.state(policy)))
-        chosen.append(Learner("learned", "", policy))
-    given = jax.random.key(0), adding, data, None, 3, 2, np.ones(3)
+        chosen.append(by_network("learned", "", policy, adding))
+    given = jax.random.key(0), adding, data, None, Walking(3, 1, fitting_starts=2), np.ones(3)
     both = walks_apart(given[0], chosen, *given[1:])
     each = [walks_apart(given[0], [one], *given[1:]) for one in chosen]
     for name in ("confidence", "not_paying"):
@@ -204,9 +208,10 @@ def test_stopping_is_fitted_on_walks_of_policies_that_did_not_learn_from_the_obj
 
 
 def test_the_fixed_order_begins_with_the_views_that_tell_most(adding):
-    scores = fixed_order_scores(adding, telling(200, 5), 3)
-    assert sorted(np.argsort(-scores)[:3].tolist()) == [0, 2, 3]
-    assert sorted(scores.tolist()) == list(range(1, VIEWS + 1))
+    found = order_of_fused(adding, telling(200, 5), 3)
+    assert sorted(found.views[:3]) == [0, 2, 3]
+    assert sorted(found.views) == list(range(VIEWS))
+    assert np.argsort(-np.asarray(found.scores(VIEWS))).tolist() == found.views
 
 
 @pytest.mark.slow
@@ -215,12 +220,9 @@ def test_a_study_walks_all_policies_from_the_same_starts(adding):
     data = telling(40, 3)
     found, each = study(
         adding,
-        [Learner("learned", "view policy", some_policy())],
-        OnLattice(telling(40, 2)),
-        OnLattice(data),
-        max_views=2,
-        draws=1,
-        oracle_views=2,
+        [by_network("learned", "view policy", some_policy(), adding)],
+        (OnLattice(telling(40, 2)), OnLattice(data)),
+        Walking(2, 1, oracle_views=2),
     )
     assert set(found["policies"]) >= {"random", "learned", "farthest", "fixed_order", "label_oracle"}
     after = {name: result["after_views"] for name, result in found["policies"].items()}

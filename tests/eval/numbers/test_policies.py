@@ -52,7 +52,7 @@ def test_the_numbers_are_those_of_the_run(whole):
 
 def test_results_are_kept_by_object(inputs):
     study = evaluate_policies(inputs, {"mine": opposite})
-    assert [rung.policy for rung in study.rungs] == ["random", "mine"]
+    assert [policy.name for policy in study.policies] == ["random", "mine"]
     right, walks = study.right("mine"), study.walks("mine")
     assert right.shape == study.travelled("mine").shape == (OBJECTS, 9)
     assert walks.shape == (OBJECTS, VIEWS, 9)

@@ -48,11 +48,11 @@ def found(each):
 
 
 def test_all_trainings_at_once_walk_as_each_does_alone(each, found):
-    rungs, results = found
-    assert [rung.policy for rung in rungs] == [rung.policy for rung in ladder(2)]
+    policies, results = found
+    assert policies == ladder()
     for number, inputs in enumerate(each):
         setting = Setting.of(inputs.graph, inputs.validation, inputs.config)
-        alone, _ = setting.with_random(inputs.tables, ladder(2))
+        alone, _ = setting.with_random(inputs.tables, ladder())
         for name, result in alone.items():
             for field in ("right", "used", "after", "travelled"):
                 mine, theirs = getattr(results[name], field)[number], getattr(result, field)[0]
@@ -62,9 +62,9 @@ def test_all_trainings_at_once_walk_as_each_does_alone(each, found):
 
 
 def test_rows_have_means_both_intervals_and_every_training(found):
-    rungs, results = found
-    rows = rows_over_trainings(rungs, results)
-    assert len(rows) == len(rungs) * 4
+    policies, results = found
+    rows = rows_over_trainings(policies, results)
+    assert len(rows) == len(policies) * 4
     row = next(row for row in rows if row["policy"] == "information_gain" and row["views"] == 3)
     after, random = (np.asarray(results[name].after)[:, :, 2] for name in ("information_gain", "random"))
     assert row["accuracy"] == pytest.approx(after.mean())

@@ -11,7 +11,7 @@ from data_pipeline.objects.mesh import Mesh, ObjectEntry
 from data_pipeline.objects.recipes import FurniturePiece
 from data_pipeline.objects.sources import load_object
 from eval.rendering.policies import RenderingConfig, chosen_objects, scores_of_object, view_scores
-from eval.walks.ladder import ASCENT_RUNGS
+from eval.walks.ladder import BY_ASCENT
 from mevs_jax import cameras_at, fibonacci_sphere, rendering
 from tests.conftest import open3d_or_skip
 
@@ -60,7 +60,7 @@ def test_an_object_gets_a_row_for_every_view_and_what_shows_nothing_is_counted()
     config = RenderingConfig(starts=2, resolution=16, faces=64)
     found = scores_of_object(mesh, depth, poses, np.pi / 3, jnp.asarray(fibonacci_sphere(views)), config)
     assert found.pop("without_surface") == 1
-    assert set(found) == {rung.policy for rung in ASCENT_RUNGS}
+    assert set(found) == {policy.name for policy in BY_ASCENT}
     for name, rows in found.items():
         assert rows.shape == (views, views)
         assert np.isfinite(rows).all()

@@ -18,9 +18,9 @@ from eval.report.scenes import _which, nats
 from eval.report.surface import MOST_POINTS, seen_by, surface_of
 from eval.report.walks import OF_EACH, Walks, walks_of
 from eval.walks.grid import GridConfig
-from eval.walks.ladder import Rung
 from mevs_jax import fibonacci_sphere, look_at_origin
 from mevs_jax.beliefs.entropy import DEPTH_SCALE
+from mevs_jax.policies import policy_record
 from tests.reference.evaluation import CLASSES, OBJECTS, VIEWS, some_statistics, some_tables
 
 STEPS = 4
@@ -43,7 +43,7 @@ def walks(tables):
 
 def test_walks_are_those_of_the_evaluation(tables, walks):
     setting = Setting.of(some_statistics(tables).graph, tables, GridConfig(max_views=STEPS))
-    evaluated = setting.walk(tables, (Rung.of("information_gain"),))["information_gain"]
+    evaluated = setting.walk(tables, [policy_record("information_gain")])["information_gain"]
     starts = np.arange(OBJECTS) % VIEWS
     np.testing.assert_array_equal(walks.views, np.asarray(evaluated.views)[0, np.arange(OBJECTS), starts, 0])
 

@@ -19,14 +19,15 @@ from data_pipeline.dataset.statistics import DatasetStatistics
 from eval.numbers.comparison import class_mean, first_reaching
 from eval.numbers.study import entropy_errors, exactly_random, reachable_views, run_study, single_view
 from eval.tables import ViewTables, load_view_tables, save_view_tables
-from eval.walks import over_objects
 from eval.walks.exact import expected_random
 from eval.walks.grid import FIRST_MV, THRESHOLDS, GridConfig, run_grid
 from eval.walks.knowledge import learn
-from eval.walks.ladder import ASCENT_RUNGS, Rung
+from eval.walks.ladder import BY_ASCENT
 from mevs_jax import POLICIES, ViewGraph, bootstrap_interval, fibonacci_sphere, select_from_table
+from mevs_jax.policies import PolicyRecord, policy_record, with_movement
 from tests.reference import numpy_rules
 from tests.reference.evaluation import CLASSES, OBJECTS, VIEWS, some_statistics, some_tables
+from train.running import over_objects
 
 
 @pytest.fixture(scope="module")
@@ -49,14 +50,19 @@ def knowledge(tables):
     return learn(jnp.asarray(tables.logits), jnp.asarray(tables.labels))
 
 
-def walked(tables, graph, knowledge, *policies: str, draws: int = 1, backbones: int = 1, **rest):
+def walked(tables, graph, knowledge, *policies: str | PolicyRecord, draws: int = 1, backbones: int = 1, **rest):
     """Results of some policies; further backbones see the logits of the first turned round by so many classes."""
     stacked = tables.stacked()
     turned = jnp.stack([jnp.roll(stacked.logits, shift, axis=-1) for shift in range(backbones)], axis=1)
     known = jax.tree.map(lambda leaf: jnp.stack([leaf] * backbones), knowledge)
-    rungs = tuple(Rung(policy, policy, "nothing", draws) for policy in policies)
-    rest.setdefault("max_views", 9)
-    return run_grid(jax.random.key(0), replace(stacked, logits=turned), graph, known, rungs, **rest)
+    rest = {"max_views": 9, "draws": draws} | rest
+    return run_grid(
+        jax.random.key(0), replace(stacked, logits=turned), graph, known, [*map(record_of, policies)], **rest
+    )
+
+
+def record_of(policy: str | PolicyRecord) -> PolicyRecord:
+    return policy_record(policy) if isinstance(policy, str) else policy
 
 
 @pytest.mark.parametrize("policy", ["predicted_entropy", "oracle_entropy", "information_gain"])
@@ -171,10 +177,10 @@ def test_what_cannot_be_reached_is_neither_started_from_nor_seen(tables, graph, 
 
 
 def test_a_dearer_way_is_a_shorter_one(tables, graph, knowledge):
-    ways = [
-        walked(tables, graph, knowledge, "predicted_entropy", movement_cost=jnp.float32(cost))["predicted_entropy"]
-        for cost in (0.0, 0.3, 50.0)
-    ]
+    entropy, ways = policy_record("predicted_entropy"), []
+    for cost in (0.0, 0.3, 50.0):
+        costly = replace(entropy, score=with_movement(entropy.score, jnp.float32(cost)))
+        ways.append(walked(tables, graph, knowledge, costly)[entropy.name])
     free = walked(tables, graph, knowledge, "predicted_entropy")["predicted_entropy"]
     np.testing.assert_array_equal(ways[0].views, free.views)
     means = [float(way.travelled[..., -1].mean()) for way in ways]
@@ -182,7 +188,7 @@ def test_a_dearer_way_is_a_shorter_one(tables, graph, knowledge):
 
 
 def test_cores_change_nothing(tables, graph, knowledge, monkeypatch):
-    """One core; some, whose last parts overlap with those before; and more than there are objects."""
+    """One core; some, whose last parts are filled up; and more than there are objects."""
     found = []
     for cores in (1, 5, 7, len(tables.labels) + 1):
         monkeypatch.setattr(over_objects, "programs_at_once", lambda cores=cores: cores)
@@ -205,7 +211,7 @@ from eval.threads import programs_at_once
 from eval.walks import grid
 from eval.walks.grid import run_grid
 from eval.walks.knowledge import learn
-from eval.walks.ladder import Rung
+from mevs_jax.policies import policy_record
 from eval.tables import load_view_tables
 from mevs_jax import ViewGraph, fibonacci_sphere
 tables = load_view_tables(sys.argv[1])
@@ -213,8 +219,9 @@ graph = ViewGraph.from_points(fibonacci_sphere(10))
 stacked = tables.stacked()
 known = jax.tree.map(lambda leaf: leaf[None], learn(stacked.logits, stacked.label))
 grid._WALKS_IN_CACHE = 60
-rungs = tuple(Rung(name, name, "nothing", 2) for name in ("random", "information_gain"))
-found = run_grid(jax.random.key(0), replace(stacked, logits=stacked.logits[:, None]), graph, known, rungs, max_views=5)
+policies = [policy_record(name) for name in ("random", "information_gain")]
+stacked = replace(stacked, logits=stacked.logits[:, None])
+found = run_grid(jax.random.key(0), stacked, graph, known, policies, max_views=5, draws=2)
 assert programs_at_once() == 1
 np.savez(sys.argv[2], devices=jax.device_count(), **{f"{p}_{n}": getattr(r, n) for p, r in found.items() for n in vars(r)})
 """
@@ -314,7 +321,7 @@ def test_the_study_repeats(study, tables, statistics):
 
 def test_the_study_is_complete(study):
     names = [rung["policy"] for rung in study["ladder"]]
-    assert set(names) == set(POLICIES) - {"scrambled_entropy"} - {rung.policy for rung in ASCENT_RUNGS}
+    assert set(names) == set(POLICIES) - {"scrambled_entropy"} - {policy.name for policy in BY_ASCENT}
     assert set(study["policies"]) == set(names)
     assert set(study["against_random"]) == set(names) - {"random"}
     assert study["left_out"] == {"train": {"x": "empty"}, "test": {}}

@@ -10,8 +10,9 @@ from flax import nnx
 
 from data_pipeline.capture.casting import CaptureConfig
 from eval.walks.knowledge import learn
-from eval.walks.live import Captures, LiveWalker, Networks
+from eval.walks.live import Captures, Networks, walk_live
 from mevs_jax import POLICIES, ViewGraph, ViewTable, fibonacci_sphere, select_from_table
+from mevs_jax.selection.walks import walk_key
 from train.tasks.classifier import ClassifierConfig, ClassifierTask, ResNetConfig
 from train.tasks.entropy import EntropyConfig, EntropyTask, PointNet2Config
 
@@ -71,19 +72,20 @@ def tables(networks, captures) -> ViewTable:
 def both_ways(networks, captures, tables, policy, threshold=None):
     graph = ViewGraph.from_points(fibonacci_sphere(VIEWS))
     knowledge = learn(tables.logits[:100], tables.label[:100])
-    keys = jax.random.split(jax.random.key(0), OBJECTS)
-    starts = jnp.arange(OBJECTS, dtype=jnp.int32) % VIEWS
+    numbers, key = jnp.arange(OBJECTS, dtype=jnp.int32), jax.random.key(0)
+    starts = numbers % VIEWS
     scenes = jax.vmap(lambda table: table.scene(graph, knowledge))(tables)
-    walker = LiveWalker(networks, graph)
-    live = walker.walk(keys, captures, scenes, starts, policy=policy, max_views=5, threshold=threshold)
+    limits = {"max_views": 5, "threshold": threshold}
+    some = numbers, captures, scenes, starts
+    live = walk_live(networks, key, some, POLICIES[policy], at_once=OBJECTS, **limits)
 
     @jax.jit
     @jax.vmap
-    def by_table(key, table, start):
-        scene = table.scene(graph, knowledge)
-        return select_from_table(key, table, scene, POLICIES[policy], start, threshold=threshold, max_views=5)
+    def by_table(number, table, start):
+        own, scene = walk_key(key, number, start, 0), table.scene(graph, knowledge)
+        return select_from_table(own, table, scene, POLICIES[policy], start, **limits)
 
-    return live, by_table(keys, tables, starts)
+    return live, by_table(numbers, tables, starts)
 
 
 @pytest.mark.parametrize("policy", [name for name in POLICIES if not name.startswith("diff_")])

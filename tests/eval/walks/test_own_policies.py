@@ -9,10 +9,11 @@ import pytest
 
 from data_pipeline.errors import DataError
 from eval.walks.knowledge import learn
-from eval.walks.ladder import KNOWS, Rung, ladder
-from eval.walks.own_policies import OwnPolicy, check_scores, load_policies, named_apart, own_rungs, state_after
+from eval.walks.ladder import KNOWS, ladder
+from eval.walks.own_policies import check_scores, checked, load_policies, named_apart, own_identity
 from mevs_jax import POLICIES, ViewGraph, fibonacci_sphere, select_from_table
-from mevs_jax.policies import PolicyEntry
+from mevs_jax.policies import PolicyRecord
+from mevs_jax.selection.walks import state_after
 from tests.reference.evaluation import CLASSES, VIEWS, some_tables
 
 
@@ -21,8 +22,8 @@ def graph() -> ViewGraph:
     return ViewGraph.from_points(fibonacci_sphere(VIEWS))
 
 
-def own(policy, knows="networks", name="mine") -> OwnPolicy:
-    return OwnPolicy("--policy mine.py:mine", PolicyEntry(name, policy, "my own", knows))
+def own(policy, knows="networks", name="mine") -> PolicyRecord:
+    return PolicyRecord(name, policy, "my own", knows, called="--policy mine.py:mine")
 
 
 def opposite(key, state, scene):
@@ -35,16 +36,16 @@ def at_random(key, state, scene):
 
 
 def test_a_policy_is_walked_once_unless_it_draws(graph):
-    rungs = own_rungs([own(opposite, "nothing"), own(at_random)], graph, CLASSES, 7)
-    assert [(rung.title, rung.knows, rung.draws) for rung in rungs] == [
+    mine = checked([own(opposite, "nothing"), own(at_random)], graph, CLASSES)
+    assert [(policy.title, policy.knows, policy.draws(7)) for policy in mine] == [
         ("my own", "nothing", 1),
         ("my own", "networks", 7),
     ]
-    together = ladder(7, rungs)
-    assert together[0].policy == "random"
-    order = [[*KNOWS].index(rung.knows) for rung in together]
+    together = ladder(mine)
+    assert together[0].name == "random"
+    order = [[*KNOWS].index(policy.knows) for policy in together]
     assert order == sorted(order)
-    assert [rung for rung in together if rung not in rungs] == list(ladder(7))
+    assert [policy for policy in together if policy not in mine] == list(ladder())
 
 
 @pytest.mark.parametrize(
@@ -64,10 +65,10 @@ def test_a_policy_is_given_what_it_declares_to_know(field, allowed, graph):
 
     for knows in KNOWS:
         if knows in allowed:
-            assert len(own_rungs([own(uses, knows)], graph, CLASSES, 1)) == 1
+            assert len(checked([own(uses, knows)], graph, CLASSES)) == 1
         else:
             with pytest.raises(DataError, match=f"cannot be used: .*knows '{knows}' has no other fields"):
-                own_rungs([own(uses, knows)], graph, CLASSES, 1)
+                checked([own(uses, knows)], graph, CLASSES)
 
 
 @pytest.mark.parametrize(
@@ -84,7 +85,7 @@ def test_a_policy_is_given_what_it_declares_to_know(field, allowed, graph):
 )
 def test_what_is_no_policy_is_one_sentence(policy, said, graph):
     with pytest.raises(DataError, match=f"^--policy mine.py:mine {said}") as error:
-        own_rungs([own(policy)], graph, CLASSES, 1)
+        checked([own(policy)], graph, CLASSES)
     assert "\n" not in str(error.value)
 
 
@@ -106,23 +107,23 @@ def test_a_registered_function_keeps_its_title(tmp_path):
     )
     try:
         first, second = load_policies([f"{path}:mine", f"{path}:plain_one"])
-        assert (first.entry.name, first.entry.title, first.entry.knows) == (
+        assert (first.name, first.title, first.knows) == (
             "registered_in_a_test",
             "my title",
             "others",
         )
-        assert (second.entry.name, second.entry.title, second.entry.knows) == ("plain_one", "plain one", "networks")
-        assert first.identity == {
+        assert (second.name, second.title, second.knows) == ("plain_one", "plain one", "networks")
+        assert own_identity(first) == {
             "policy": "registered_in_a_test",
             "title": "my title",
             "knows": "others",
             "module": "mine.py",
             "name": "mine",
-            "source": second.identity["source"],
+            "source": second.code["source"],
         }
         path.write_text(path.read_text().replace("my title", "another title"))
         (again,) = load_policies([f"{path}:mine"])  # an edited file replaces what it registered
-        assert again.entry.title == "another title"
+        assert again.title == "another title"
     finally:
         POLICIES.pop("registered_in_a_test", None)
 
@@ -158,10 +159,10 @@ def test_scores_that_mean_nothing_are_found(value, said, graph):
 
     walks = np.tile(np.array([0, 1, 2, 3, -1], np.int8), (len(tables.labels), VIEWS, 1))
     arguments = jax.random.key(0), stacked, walks, graph, knowledge, None
-    mine, rung = own(policy), Rung("mine", "mine", "networks", 1, policy)
+    mine = own(policy)
     if not said:
-        return check_scores(mine, rung, *arguments)
+        return check_scores(mine, *arguments)
     with pytest.raises(DataError, match=f"gives .*{said}.* test object 0 from start view 0"):
-        check_scores(mine, rung, *arguments)
+        check_scores(mine, *arguments)
     walks[..., 3] = -1  # scores that no choice was made by
-    return check_scores(mine, rung, *arguments)
+    return check_scores(mine, *arguments)

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from eval.walks.ladder import ASCENT_RUNGS
+from eval.walks.ladder import BY_ASCENT
 from mevs_jax import (
     POLICIES,
     Knowledge,
@@ -44,7 +44,7 @@ def random_tables(views: int, classes: int, count: int, seed: int) -> ViewTable:
         predicted_entropy=jnp.asarray(random.uniform(0, 1, (count, views, views)), jnp.float32),
         entropy=jnp.asarray(entropy, jnp.float32),
         label=jnp.asarray(random.integers(0, classes, count), jnp.int32),
-        ascent_scores={rung.policy: jnp.asarray(random.uniform(0, 1, (count, views, views))) for rung in ASCENT_RUNGS},
+        ascent_scores={policy.name: jnp.asarray(random.uniform(0, 1, (count, views, views))) for policy in BY_ASCENT},
         pose_evidence=jax.nn.log_softmax(jnp.asarray(random.normal(0, 1, (count, views, classes, POSES)), jnp.float32)),
     )
 

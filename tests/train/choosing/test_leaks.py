@@ -12,7 +12,7 @@ import pytest
 import eval.learned.stopping as stopping
 from eval.learned.measure import APART
 from eval.learned.stopping import walks_apart
-from eval.learned.walks import Learner, OnLattice
+from eval.learned.walks import OnLattice, Walking, by_network
 from eval.settings import TINY
 from tests.reference.leaks import CHANGES, check_fitted, check_tested
 from tests.reference.made_up_study import STUDIED, Study
@@ -105,15 +105,16 @@ def test_held_out_policies_walk_objects_that_they_did_not_learn_from(tmp_path, m
     seen = stages.features("turned_val", stages.turned, "val")
     copies = stages.changed(2)
 
-    def walk(key, contender, given, fusion, table, directions, knowledge, steps, graph):
-        walked.append(numbers_of(seen.logits, table.logits))
-        return np.zeros((len(table.logits), 1, steps), np.int32)
+    def walk(key, policy, fusion, lattice, knowledge, *, max_views, every):
+        walked.append(numbers_of(seen.logits, lattice.features.logits))
+        return np.zeros((len(lattice.features.logits), 1, max_views), np.int32)
 
     monkeypatch.setattr(stopping, "walk_all", walk)
-    monkeypatch.setattr(stopping, "best_gains", lambda *given: np.zeros(given[3].shape))
-    apart = [Learner("learned", "", stages.policy(aside=(part, APART))) for part in range(APART)]
+    monkeypatch.setattr(stopping, "best_gains", lambda policy, data, views, beliefs: np.zeros(views.shape))
+    fusion = stages.fusion()
+    apart = [by_network("learned", "", stages.policy(aside=(part, APART)), fusion) for part in range(APART)]
     lessons = [parts for name, (parts, _) in study.fitted_on][-APART:]
-    walks_apart(jax.random.key(0), apart, stages.fusion(), OnLattice(seen), None, 3, 1, np.ones(3))
+    walks_apart(jax.random.key(0), apart, fusion, OnLattice(seen), None, Walking(3, 1), np.ones(3))
     assert sorted(set().union(*walked)) == list(range(len(seen.labels)))
     for parts, own in zip(lessons, walked, strict=True):
         assert len(parts) == 3

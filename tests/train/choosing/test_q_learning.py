@@ -5,12 +5,14 @@ from __future__ import annotations
 from functools import partial
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from flax import nnx
 
 from mevs_jax.models import ViewPolicy
-from tests.reference.choosing import CLASSES, asked, by_state, fused, moved, some_features, telling
+from mevs_jax.policies.learned import of_network
+from tests.reference.choosing import CLASSES, asked, fused, moved, some_features, telling
 from train.choosing.policy import (
     walk,
 )
@@ -51,7 +53,7 @@ def test_q_learning_finds_the_telling_view_too(adding):
     network, histories = train_by_q_learning(config, [(adding, telling(160, 0))], (adding, telling(80, 1)))
     assert len(histories) == 2
     data, key = telling(120, 2), jax.random.key(0)
-    chosen = walk(key, adding, data, partial(by_state, structure=nnx.graphdef(network)), nnx.state(network), 2, 4)
+    chosen = walk(key, adding, data, of_network(network, jnp.float32(1), "state"), 2, 4)
     told = 2 + np.asarray(data.labels)[:, None] // 2
     from_the_first = chosen[..., 0] == 0  # where the pair is known, and so which view settles it
     assert (chosen[..., 1] == told)[from_the_first].mean() > 0.8
