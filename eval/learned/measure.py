@@ -5,7 +5,7 @@ Results are stored in the folder of the seed and reused.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 from functools import partial
 from pathlib import Path
@@ -20,9 +20,8 @@ from jaxtyping import Array, Float
 from data_pipeline.dataset.builder import open_split
 from data_pipeline.dataset.inputs import depth_and_normals
 from data_pipeline.dataset.statistics import DatasetStatistics, load_statistics
-from data_pipeline.distributed import is_first
 from data_pipeline.errors import DataError
-from data_pipeline.files import read_json, write_npz
+from data_pipeline.files import read_json
 from data_pipeline.progress import console
 from eval.learned.comparison import ByObject, gains_of_seeds, seeds_together
 from eval.learned.poses import UnknownPose, of_any_rotation, of_unknown_yaw
@@ -40,11 +39,9 @@ from train.choosing.features import Features
 from train.choosing.stages import Aside, Stages, lattice_data
 from train.choosing.variants import VARIANTS
 from train.results.finite import check_results
-from train.results.identity import made_by
-from train.results.kept import kept_json
+from train.results.identity import identity_of, made_by
+from train.results.kept import arrays_beside, kept_json, kept_with_arrays
 
-_FORM = 11
-"""Version of the stored walks; another version makes them stale."""
 APART = 2
 """Parts of the validation objects; stopping rules are fitted on walks of policies that were trained without their objects."""
 
@@ -110,8 +107,8 @@ def novel_together(seeds: Sequence[Stages]) -> dict[str, Any] | None:
 
 def _by_object(stages: Stages, name: str) -> dict[str, np.ndarray]:
     """The results by object that are stored with metrics."""
-    with np.load(stages.folder / f"{name}.npz") as kept:
-        return {name: kept[name] for name in kept.files}
+    path = stages.folder / f"{name}.json"
+    return arrays_beside(path, read_json(path))
 
 
 @dataclass(frozen=True)
@@ -154,7 +151,8 @@ class _Walks:
                 f"mevs train --out {self.stages.out}"
             )
         kind = ("" if self.posed else "_unposed") + ("_ablations" if self.ablations else "")
-        return _kept(self.stages.folder / f"walks_{self.views}{kind}.json", self._identity(), self._walk)
+        path = self.stages.folder / f"walks_{self.views}{kind}.json"
+        return kept_with_arrays(path, self._identity(), self._walk)[0]
 
     def _policy(self, name: str, aside: Aside | None = None) -> PolicyRecord:
         """A variant of the view policy, trained first if it is not yet; `aside` is as for `Stages.policy`."""
@@ -166,21 +164,21 @@ class _Walks:
     def _identity(self) -> dict[str, Any]:
         stages, config = self.stages, self.stages.config
         networks = [stages.policy_folder(VARIANTS[name].network or name) for name in self.variants]
-        return {
-            "form": _FORM,
-            "made_by": made_by(load_statistics(self.data), stages.recogniser_folder()),
-            "policies": [read_json(folder / "summary.json")["identity"] for folder in networks],
-            "walks": [
+        clouds = [stages.out / "entropy"] if "cloud" in self.variants else []
+        return identity_of(
+            "walks",
+            made_by=made_by(load_statistics(self.data), stages.recogniser_folder(), *clouds),
+            policies=[read_json(folder / "summary.json")["identity"] for folder in networks],
+            tables_made_by=_tables_made_by(stages.out, self.data),
+            walks=[
                 self.variants,
                 config.max_views,
                 config.draws,
                 config.fitting_starts,
-                _tables_made_by(stages.out, self.data),
                 self.with_costs and [VIEW_COSTS, MOVEMENT_COSTS],
                 FITTED_AS,
             ],
-            "clouds": made_by(load_statistics(self.data), stages.out / "entropy") if "cloud" in self.variants else None,
-        }
+        )
 
     def _walk(self) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
         stages, config, (method, *_) = self.stages, self.stages.config, self.variants
@@ -221,20 +219,6 @@ class _Walks:
         return f"Walking {objects} test objects, {count} candidate views{around}{pose}{ablations}"
 
 
-def _kept(
-    path: Path, identity: Any, compute: Callable[[], tuple[dict[str, Any], dict[str, np.ndarray]]]
-) -> dict[str, Any]:
-    """Returns metrics that are stored together with results by object; computes both first if they are not."""
-
-    def computed() -> dict[str, Any]:
-        found, arrays = compute()
-        if is_first():
-            write_npz(path.with_suffix(".npz"), **arrays)
-        return found
-
-    return kept_json(path, identity, computed)
-
-
 def _known(stages: Stages, posed: bool, directions: Float[Array, "views 3"]) -> ExpectedViews | UnknownPose | None:
     """What is known about views for objects of known pose, of unknown yaw, or in any rotation."""
     if posed:
@@ -263,12 +247,12 @@ def _novel(stages: Stages) -> dict[str, Any]:
     views, config, pairs = stages.dataset.capture.views, stages.config, _pairs(stages)
     data, fusion = lattice_data(stages.dataset, stages.out, views), stages.fusion()
     policies = [by_network("trained_without", "", stages.policy(without=pair), fusion) for pair in pairs]
-    identity = {
-        "made_by": made_by(load_statistics(data), stages.recogniser_folder()),
-        "form": _FORM,
-        "policy": read_json(stages.policy_folder() / "summary.json")["identity"],
-        "walks": [pairs, config.max_views, config.draws, FITTED_AS],
-    }
+    identity = identity_of(
+        "walks",
+        made_by=made_by(load_statistics(data), stages.recogniser_folder()),
+        policy=read_json(stages.policy_folder() / "summary.json")["identity"],
+        walks=[pairs, config.max_views, config.draws, FITTED_AS],
+    )
 
     def walk() -> tuple[dict[str, Any], dict[str, np.ndarray]]:
         features = stages.features(f"lattice_{views}_test", data, "test")
@@ -283,12 +267,12 @@ def _novel(stages: Stages) -> dict[str, Any]:
         )
         return novel_metrics(each, pairs, features.labels), each
 
-    return _kept(stages.folder / "walks_novel.json", identity, walk)
+    return kept_with_arrays(stages.folder / "walks_novel.json", identity, walk)[0]
 
 
 def _decision(stages: Stages) -> dict[str, Any]:
     policy = read_json(stages.policy_folder() / "summary.json")["identity"]
-    identity = {"policy": policy, "machine": machine(), "candidates": stages.dataset.capture.views}
+    identity = identity_of("decision", policy=policy, machine=machine(), candidates=stages.dataset.capture.views)
     return kept_json(stages.folder / "decision.json", identity, partial(_decision_times, stages))
 
 

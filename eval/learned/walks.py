@@ -59,8 +59,8 @@ class OnLattice:
         data = self.features
         return ViewTable(
             data.logits,
-            self.predicted_entropy if "predicted_entropy" in needs else None,
-            self.entropy if "entropy" in needs else None,
+            jnp.asarray(self.predicted_entropy) if "predicted_entropy" in needs else None,
+            jnp.asarray(self.entropy) if "entropy" in needs else None,
             data.labels,
             features=data.features if "belief" in needs else None,
             clouds=data.clouds if "clouds" in needs else None,
@@ -197,7 +197,7 @@ def walk_all(
         every: walks begin at every n-th view.
     """
     views, table, graph = lattice.features.logits.shape[1], lattice.table(policy.needs), lattice.graph()
-    walks = every_walk(np.arange(0, views, every), policy.draws(draws))
+    walks = every_walk(jnp.arange(0, views, every), policy.draws(draws))
     if not policy.needs & {"order", "expected_views"}:
         knowledge = None
     objects = np.arange(len(table.label)), table, lattice.features.directions

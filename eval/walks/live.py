@@ -9,11 +9,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import flax.struct
 import jax
+import jax.numpy as jnp
 import numpy as np
 from flax import nnx
 from jaxtyping import Array, Int, Integer
@@ -61,62 +63,59 @@ class Networks:
     predictor: nnx.Module
 
 
-def walk_live(
-    networks: Networks,
+def walk_each(
     key: Array,
-    some: tuple[AnyArray, Captures, Scene, AnyArray],
+    some: tuple[AnyArray, Captures | ViewTable, Scene, AnyArray],
     policy: Policy,
+    networks: Networks | None = None,
     *,
     at_once: int,
-    max_views: int,
-    threshold: float | None = None,
+    **limits: Any,
 ) -> Episode:
-    """Walks objects with the networks in the loop; one program is compiled for each policy and number of objects.
+    """Walks objects once each; one program is compiled for each policy and number of objects.
 
     Args:
         key: of the evaluation.
-        some: numbers, captures, scenes and start views of objects, all with a leading axis of objects.
+        some: numbers, captures or view tables, scenes and start views of objects, all with a leading axis of objects.
         policy: the policy.
+        networks: look at the captures; None for view tables.
         at_once: objects that are walked together.
-        max_views: limit on views (MV).
-        threshold: confidence threshold (CT); None to continue to `max_views`.
+        limits: `max_views` and `threshold`, as for `select_views`.
     """
-    structures, states = zip(*map(nnx.split, (networks.classifier, networks.predictor)), strict=True)
-    static = {"tasks": (networks.classify, networks.predict), "structures": structures}
-    shared = key, states, as_tree(policy)
-    return over_objects(_walk_live, some, *shared, at_once=at_once, **static, max_views=max_views, threshold=threshold)
+    states, static = (), limits
+    if networks is not None:
+        structures, states = zip(*map(nnx.split, (networks.classifier, networks.predictor)), strict=True)
+        static = {"tasks": (networks.classify, networks.predict), "structures": structures, **limits}
+    return Episode(
+        *map(jnp.asarray, over_objects(_walk, some, key, states, as_tree(policy), at_once=at_once, **static))
+    )
 
 
-def _walk_live(
-    one: tuple[Array, Captures, Scene, Array],
+def _walk(
+    one: tuple[Array, Captures | ViewTable, Scene, Array],
     key: Array,
-    states: tuple[nnx.State, nnx.State],
+    states: tuple[nnx.State, ...],
     policy: Policy,
     *,
-    tasks: tuple[ClassifierTask, EntropyTask],
-    structures: tuple[nnx.GraphDef, nnx.GraphDef],
+    tasks: tuple[ClassifierTask, EntropyTask] | None = None,
+    structures: tuple[nnx.GraphDef, ...] = (),
     **limits: Any,
-) -> Episode:
-    (number, captures, scene, start), (classify, predict) = one, tasks
+) -> tuple[Array, ...]:
+    number, shown, scene, start = one
 
-    def observe(view: Int[Array, ""]) -> Observation:
-        classifier, predictor = (
-            nnx.merge(structure, state, copy=True) for structure, state in zip(structures, states, strict=True)
-        )
-        image: dict[str, Array] = {classify.images: captures.images[view][None]}
-        cloud = {name: captures.clouds[name][view][None] for name in _CLOUD}
+    def look(view: Int[Array, ""]) -> Observation:
+        assert isinstance(shown, Captures)
+        assert tasks is not None
+        (classify, predict), merge = tasks, partial(nnx.merge, copy=True)
+        classifier, predictor = (merge(structure, state) for structure, state in zip(structures, states, strict=True))
+        image: dict[str, Array] = {classify.images: shown.images[view][None]}
+        cloud = {name: shown.clouds[name][view][None] for name in _CLOUD}
         return Observation(classifier(classify.inputs(image))[0], predictor(predict.inputs(cloud))[0])
 
-    walks = walks_around(jax.random.fold_in(key, number), observe, scene, policy, every_walk(start[None], 1), **limits)
-    return jax.tree.map(lambda leaf: leaf[0], walks)
-
-
-def _walk_table(one: tuple[Array, ViewTable, Scene, Array], key: Array, policy: Policy, *, max_views: int) -> Episode:
-    number, table, scene, start = one
-    walks = walks_around(
-        jax.random.fold_in(key, number), table.observe, scene, policy, every_walk(start[None], 1), max_views=max_views
-    )
-    return jax.tree.map(lambda leaf: leaf[0], walks)
+    observe = shown.observe if isinstance(shown, ViewTable) else look
+    own, walks = jax.random.fold_in(key, number), every_walk(start[None], 1)
+    found = walks_around(own, observe, scene, policy, walks, **limits)
+    return found.views[0], found.predictions[0], found.confidences[0], found.count[0]
 
 
 @dataclass(frozen=True)
@@ -178,10 +177,10 @@ def compare_with_tables(
             starts = (index % views).astype(np.int32)
             scenes = jax.vmap(lambda table: table.scene(graph, knowledge))(part)
             for name, policy in policies.items():
-                live = walk_live(networks, key, (index, captures, scenes, starts), policy, **limits)
-                stored = over_objects(_walk_table, (index, part, scenes, starts), key, policy, **limits)
-                same = np.all(live.views == stored.views, axis=1)
-                apart = np.abs(live.confidences - stored.confidences).max(axis=1)
+                live = walk_each(key, (index, captures, scenes, starts), policy, networks, **limits)
+                stored = walk_each(key, (index, part, scenes, starts), policy, **limits)
+                same = np.all(np.asarray(live.views == stored.views), axis=1)
+                apart = np.abs(np.asarray(live.confidences - stored.confidences)).max(axis=1)
                 walks[name].append((same[: len(chunk)], apart[: len(chunk)]))
             bar.advance(line, len(chunk))
     return {policy: _agreement(parts) for policy, parts in walks.items()}

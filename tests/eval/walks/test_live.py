@@ -10,7 +10,7 @@ from flax import nnx
 
 from data_pipeline.capture.casting import CaptureConfig
 from eval.walks.knowledge import learn
-from eval.walks.live import Captures, Networks, walk_live
+from eval.walks.live import Captures, Networks, walk_each
 from mevs_jax import POLICIES, ViewGraph, ViewTable, fibonacci_sphere, select_from_table
 from mevs_jax.selection.walks import walk_key
 from train.tasks.classifier import ClassifierConfig, ClassifierTask, ResNetConfig
@@ -77,7 +77,7 @@ def both_ways(networks, captures, tables, policy, threshold=None):
     scenes = jax.vmap(lambda table: table.scene(graph, knowledge))(tables)
     limits = {"max_views": 5, "threshold": threshold}
     some = numbers, captures, scenes, starts
-    live = walk_live(networks, key, some, POLICIES[policy], at_once=OBJECTS, **limits)
+    live = walk_each(key, some, POLICIES[policy], networks, at_once=OBJECTS, **limits)
 
     @jax.jit
     @jax.vmap
