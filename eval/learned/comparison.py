@@ -15,6 +15,7 @@ from mevs_jax.beliefs.metrics import bootstrap_means
 
 BASELINES = ("random", "farthest", "fixed_order")
 """The policies with which learned policies are compared."""
+_ORACLES = ("belief_oracle", "label_oracle")
 _GAP = 3
 """Numbers of views, from 2 on, at which the gap between random and the label-free oracle is computed."""
 
@@ -39,27 +40,29 @@ def compared(each: Mapping[str, ByObject], method: str) -> dict[str, Any]:
 
     The gap is the gain of the label-free oracle over random.
     """
-    from_some = {name: policy.from_some.mean(axis=1) for name, policy in each.items()}
     against = {
         base: {
             name: difference(mine.right, each[base].right)
             | {"likelihood": difference(mine.likelihood, each[base].likelihood)}
             for name, mine in each.items()
-            if name not in (base, "belief_oracle", "label_oracle")  # the oracles walk from some start views only
+            if name not in (base, *_ORACLES)  # which walk from some start views only
         }
         for base in (*BASELINES, method)
         if base in each
     }
-    gap_closed = {
-        name: _gap_closed(mine, from_some["random"], from_some["belief_oracle"])
-        for name, mine in from_some.items()
-        if "belief_oracle" in each and name not in ("random", "belief_oracle", "label_oracle")
+    closed: dict[str, list[tuple[float | None, list[float] | None]]] = {}
+    if "belief_oracle" in each:
+        random, oracle = each["random"].from_some, each["belief_oracle"].from_some
+        steps = slice(1, min(len(oracle), 1 + _GAP))
+        gap = oracle[steps] - random[steps]
+        for name, mine in each.items():
+            if name not in ("random", *_ORACLES):
+                closed[name] = list(map(_share, mine.from_some[steps] - random[steps], gap))
+    return {
+        "against": against,
+        "gap_closed": {name: [share for share, _ in steps] for name, steps in closed.items()},
+        "gap_closed_interval": {name: [interval for _, interval in steps] for name, steps in closed.items()},
     }
-    walked = {name: policy.from_some for name, policy in each.items()}
-    intervals_of_gap = {
-        name: _interval_of_gap(walked[name], walked["random"], walked["belief_oracle"]) for name in gap_closed
-    }
-    return {"against": against, "gap_closed": gap_closed, "gap_closed_interval": intervals_of_gap}
 
 
 def seeds_together(
@@ -73,30 +76,23 @@ def seeds_together(
         found: the metrics that `study` returned for each seed.
         seeds: the results of each policy by object, for each seed.
     """
-
-    def mean(name: str) -> ByObject:
+    policies, each, first = {}, {}, found[0]
+    for name, policy in first["policies"].items():
         values = [vars(seed[name]) for seed in seeds]
-        return ByObject(**{key: np.mean([value[key] for value in values], axis=0) for key in values[0]})
-
-    each, first = {name: mean(name) for name in found[0]["policies"]}, found[0]
-    policies = {
-        name: {key: policy[key] for key in ("title", "knows")}
-        | {
+        each[name] = ByObject(**{key: np.mean([value[key] for value in values], axis=0) for key in values[0]})
+        errors = [one["policies"][name]["calibration_error"] for one in found]
+        policies[name] = {key: policy[key] for key in ("title", "knows")} | {
             "after_views": each[name].right.mean(axis=1).tolist(),
             "interval": intervals(each[name].right),
-            "calibration_error": np.mean(
-                [one["policies"][name]["calibration_error"] for one in found], axis=0
-            ).tolist(),
+            "calibration_error": np.mean(errors, axis=0).tolist(),
         }
-        for name, policy in first["policies"].items()
-    }
-    same = {key: first[key] for key in ("views", "trying_starts")}
+    same = {key: first[key] for key in ("views", "trying_starts")} | {"policies": policies} | compared(each, method)
     if len(seeds) < 2:  # one training says nothing of others
-        return same | {"policies": policies} | compared(each, method)
+        return same
     every = {name: np.stack([seed[name].right for seed in seeds], axis=1) for name in policies}
     for name, policy in policies.items():
         policy["over_both"] = interval_of_both(every[name]).tolist()
-    over_both = {
+    same["against_over_both"] = {
         base: {
             name: interval_of_both(right - every[base]).tolist()
             for name, right in every.items()
@@ -105,7 +101,7 @@ def seeds_together(
         for base in BASELINES
         if base in every
     }
-    return same | {"against_over_both": over_both} | {"policies": policies} | compared(each, method)
+    return same
 
 
 def gains_of_seeds(seeds: Sequence[Mapping[str, Float[np.ndarray, "steps objects"]]]) -> dict[str, Any]:
@@ -126,32 +122,29 @@ def gains_of_seeds(seeds: Sequence[Mapping[str, Float[np.ndarray, "steps objects
 def difference(mine: np.ndarray, base: np.ndarray) -> dict[str, Any]:
     """Mean differences of two policies by number of views, with intervals, from their (steps, objects) results."""
     steps = min(len(mine), len(base))
-    gain = mine[:steps] - base[:steps]
-    return {"difference": gain.mean(axis=1).tolist(), "interval": intervals(gain)}
+    return gain_of(mine[:steps] - base[:steps])
 
 
-def _interval_of_gap(mine: np.ndarray, random: np.ndarray, oracle: np.ndarray) -> list[list[float] | None]:
-    """95 % intervals of `_gap_closed` by a bootstrap over objects; None where the oracle's gain is not clearly positive.
+def gain_of(gain: Float[np.ndarray, "*steps objects"]) -> dict[str, Any]:
+    """Mean of differences by object, with intervals."""
+    return {"difference": gain.mean(axis=-1).tolist(), "interval": intervals(gain)}
 
-    Args:
-        mine, random, oracle: (steps, objects) results by object.
+
+def _share(
+    gain: Float[np.ndarray, " objects"], gap: Float[np.ndarray, " objects"]
+) -> tuple[float | None, list[float] | None]:
+    """A gain over random as a share of the oracle's gain, and its 95 % interval by a bootstrap over objects.
+
+    The share is None where the oracle has no gain, and the interval where its gain is not clearly positive.
     """
-    found: list[list[float] | None] = []
-    for step in range(1, min(len(oracle), 1 + _GAP)):
-        gain, gap = (np.asarray(_resampled(one[step] - random[step])) for one in (mine, oracle))
-        clear = np.quantile(gap, 0.025) > 0
-        shares = gain[gap > 0] / gap[gap > 0]
-        found.append(np.quantile(shares, (0.025, 0.975)).tolist() if clear else None)
-    return found
+    share = float(gain.mean() / gap.mean()) if gap.mean() > 0 else None
+    gains, gaps = (np.asarray(_resampled(values)) for values in (gain, gap))
+    if np.quantile(gaps, 0.025) <= 0:
+        return share, None
+    shares = gains[gaps > 0] / gaps[gaps > 0]
+    return share, np.quantile(shares, (0.025, 0.975)).tolist()
 
 
 @jax.jit
 def _resampled(values: Array) -> Array:
     return bootstrap_means(jax.random.key(1), values)
-
-
-def _gap_closed(mine: np.ndarray, random: np.ndarray, oracle: np.ndarray) -> list[float | None]:
-    """Gain over random as a share of the oracle's gain, from 2 views on; None where the oracle has no gain."""
-    steps = slice(1, min(len(oracle), 1 + _GAP))
-    gains = zip(mine[steps] - random[steps], oracle[steps] - random[steps], strict=True)
-    return [float(gain / gap) if gap > 0 else None for gain, gap in gains]

@@ -17,6 +17,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from data_pipeline.dataset.batches import fold_of
+from eval.learned.comparison import gain_of
 from eval.learned.walks import Known, OnLattice, Walking, beliefs_of, right_along, walk_all
 from eval.numbers.comparison import intervals
 from eval.numbers.confidence import logits_along, stops_at
@@ -107,8 +108,8 @@ def compare_rules(
                 "threshold": own,
                 "accuracy": float(with_ours[0].mean()),
                 "views": float(with_ours[1].mean()),
-                "accuracy_difference": _difference(with_ours[0] - accuracy),
-                "views_difference": _difference(with_ours[1] - views),
+                "accuracy_difference": gain_of(with_ours[0] - accuracy),
+                "views_difference": gain_of(with_ours[1] - views),
             }
         rows.append(row)
     return rows
@@ -134,10 +135,6 @@ class HeldOut:
 
     confidence: Signal
     not_paying: Signal
-
-
-def _difference(gain: Float[np.ndarray, " objects"]) -> dict[str, Any]:
-    return {"difference": float(gain.mean()), "interval": intervals(gain)}
 
 
 def _best_scores_of(
