@@ -112,7 +112,11 @@ _MODULES = {
         "select_from_table",
         "select_views",
     ),
-    "geometry.sphere": ("estimate_sphere",),
+    "geometry.source_view": ("DepthImage",),
+    "geometry.sphere": (
+        "Sphere",
+        "estimate_sphere",
+    ),
     "trained": (
         "TrainedSystem",
         "UnreadableSystem",

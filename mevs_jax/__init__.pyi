@@ -42,6 +42,8 @@ from mevs_jax.geometry.cameras import pixel_directions as pixel_directions
 from mevs_jax.geometry.cameras import unproject as unproject
 from mevs_jax.geometry.canonical import CanonicalView as CanonicalView
 from mevs_jax.geometry.canonical import canonical_view as canonical_view
+from mevs_jax.geometry.source_view import DepthImage as DepthImage
+from mevs_jax.geometry.sphere import Sphere as Sphere
 from mevs_jax.geometry.sphere import estimate_sphere as estimate_sphere
 from mevs_jax.geometry.viewpoints import ViewGraph as ViewGraph
 from mevs_jax.geometry.viewpoints import fibonacci_sphere as fibonacci_sphere

@@ -23,7 +23,6 @@ from eval.checks.transfer import STRANGER, matched
 from eval.checks.walks import BASELINE, Observer, Walker, Walks
 from eval.numbers.comparison import intervals
 from eval.numbers.confidence import stopping
-from mevs_jax.agent.core import can_run
 from mevs_jax.selection.loop import ViewTable
 from mevs_jax.trained import TrainedSystem
 
@@ -215,7 +214,7 @@ def _policies(system: TrainedSystem, posed: bool) -> dict[str, str]:
     """Names of the policies by their part in the table."""
     best = system.description.best if posed else system.description.best_unposed
     parts = {BASELINE: BASELINE, "thesis": THESIS, "best": best}
-    return {part: name for part, name in parts.items() if can_run(system, name, posed)}
+    return {part: name for part, name in parts.items() if system.can_run(name, posed)}
 
 
 def _walks(walker: Walker, tables: ViewTable, condition: Condition, config: RealityConfig) -> dict[str, Walks]:

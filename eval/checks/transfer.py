@@ -25,7 +25,6 @@ from eval.checks.walks import BASELINE, Observer, Walker, Walks, rows_of
 from eval.numbers.comparison import intervals
 from eval.numbers.confidence import stopping
 from eval.system import USABLE
-from mevs_jax.agent.core import can_run
 from mevs_jax.geometry.cameras import pixel_directions
 from mevs_jax.selection.loop import ViewTable
 from mevs_jax.trained import TrainedSystem
@@ -165,7 +164,7 @@ def check_transfer(
         raise DataError(f"{data} has no object left of a class that the system knows; {len(objects.left_out)} left out")
     of_known = jax.tree.map(lambda leaf: leaf[known], objects.tables)
     best = system.description.best if posed else system.description.best_unposed
-    policies = [name for name in dict.fromkeys((BASELINE, *USABLE, best)) if can_run(system, name, posed)]
+    policies = [name for name in dict.fromkeys((BASELINE, *USABLE, best)) if system.can_run(name, posed)]
     walker, walks = Walker(system), {}
     for name in policies:
         times = draws if name == BASELINE else 1

@@ -8,28 +8,31 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Sequence
+from dataclasses import KW_ONLY, dataclass
 from typing import Any
 
 import jax
 import numpy as np
 from jaxtyping import Bool, Float
 
-from mevs_jax.agent import core
 from mevs_jax.agent.candidates import candidates_of
-from mevs_jax.agent.frames import aimed, mask_of, pose_towards, rotation_to_world
+from mevs_jax.agent.frames import aimed, mask_of, pose_towards
 from mevs_jax.agent.present import Present, sphere_of
 from mevs_jax.agent.programs import Programs
 from mevs_jax.agent.records import Belief, History, Reason, Step, plain
 from mevs_jax.arrays import AnyArray, AnyVector
 from mevs_jax.geometry.inputs import check_depth
-from mevs_jax.geometry.source_view import check_source
+from mevs_jax.geometry.source_view import DepthImage
+from mevs_jax.geometry.sphere import Sphere
 from mevs_jax.policies.base import Policy
+from mevs_jax.trained.situation import Candidates
 from mevs_jax.trained.system import TrainedSystem
 
 Reachable = AnyArray | Sequence[int] | Callable[[np.ndarray], bool] | None
 """Which candidates can be reached: a mask, indices, a function of the camera's pose (4, 4), or None for all."""
 
 
+@dataclass(eq=False, repr=False)
 class Agent:
     """Recognises one object after another: `reset`, then `observe` and `decide` in turn until `Step.done`.
 
@@ -53,46 +56,34 @@ class Agent:
         ValueError: for an option out of its range, or a policy that needs what an agent does not have.
     """
 
-    def __init__(
-        self,
-        system: TrainedSystem,
-        policy: str | Policy = "best",
-        *,
-        stop: float = 0.95,
-        max_views: int = 8,
-        unknown: float | None = None,
-        gain_per_cost: float = 0.0,
-        distance: float | None = None,
-        max_candidates: int | None = None,
-        seed: int = 0,
-    ):
-        views = len(system.viewpoints)
-        _check(stop > 0, f"stop must be a probability above 0, got {stop}")
-        _check(
-            int(max_views) == max_views and 1 <= max_views <= 512, f"max_views must be from 1 to 512, got {max_views}"
-        )
+    system: TrainedSystem
+    policy: str | Policy = "best"
+    _: KW_ONLY
+    stop: float = 0.95
+    max_views: int = 8
+    unknown: float | None = None
+    gain_per_cost: float = 0.0
+    distance: float | None = None
+    max_candidates: int | None = None
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        most, unknown, gain, distance = self.max_views, self.unknown, self.gain_per_cost, self.distance
+        _check(self.stop > 0, f"stop must be a probability above 0, got {self.stop}")
+        _check(int(most) == most and 1 <= most <= 512, f"max_views must be from 1 to 512, got {most}")
         _check(unknown is None or 0 < unknown <= 1, f"unknown must be in (0, 1] or None, got {unknown}")
-        _check(
-            unknown is None or system.parts.strangeness is not None,
-            "this system cannot tell unknown objects: leave out unknown",
-        )
-        _check(
-            np.isfinite(gain_per_cost) and gain_per_cost >= 0, f"gain_per_cost must be at least 0, got {gain_per_cost}"
-        )
+        tells = unknown is None or self.system.parts.strangeness is not None
+        _check(tells, "this system cannot tell unknown objects: leave out unknown")
+        _check(np.isfinite(gain) and gain >= 0, f"gain_per_cost must be at least 0, got {gain}")
         _check(distance is None or 0 < distance < np.inf, f"distance must be positive, in metres, got {distance}")
-        if system.description.image.content == "image":
-            raise ValueError("this system reads shaded images, which a depth camera does not give; train one on depth")
-        self.system, self.stop, self.max_views = system, float(stop), int(max_views)
-        self.unknown = None if unknown is None else float(unknown)
-        self.distance = None if distance is None else float(distance)
-        self.gain_per_cost, self.seed = float(gain_per_cost), int(seed)
-        self.size = max(views, 128 if max_candidates is None else int(max_candidates))
-        self.policy = policy
-        self._resets, self.key = 0, jax.random.key(seed)
+        shaded = self.system.description.image.content == "image"
+        _check(not shaded, "this system reads shaded images, which a depth camera does not give; train one on depth")
+        self.size = max(len(self.system.viewpoints), 128 if self.max_candidates is None else int(self.max_candidates))
+        self._resets, self.key = 0, jax.random.key(self.seed)
         self._programs: dict[bool, Programs] = {}
-        self._lattice = candidates_of(system, None, self.size)
+        self._lattice = candidates_of(self.system, None, self.size)
         self._object: Present | None = None
-        self.history = History(system.name, {})
+        self.history = History(self.system.name, {})
         self._program(True)
 
     def _program(self, posed: bool) -> Programs:
@@ -146,34 +137,24 @@ class Agent:
         Raises:
             ValueError: for an argument out of its range, or a policy that cannot be used without the yaw.
         """
-        middle = np.asarray(center, float).reshape(-1)
+        self.begin(Sphere(center, float(radius), up, yaw), true_size=true_size)
+
+    def begin(self, sphere: Sphere, *, true_size: bool = True) -> None:
+        """`reset`, for an object whose place is one record."""
         _check(
-            middle.shape == (3,) and bool(np.isfinite(middle).all()),
-            f"center must be three finite numbers, got {np.asarray(center).tolist()}",
+            self.distance is None or self.distance > sphere.radius,
+            f"the agent's distance of {self.distance} m is inside the object's radius of {sphere.radius:.3g} m; make it larger",
         )
-        _check(0 < float(radius) < np.inf, f"radius must be positive, in metres, got {radius}")
-        _check(
-            self.distance is None or self.distance > radius,
-            f"the agent's distance of {self.distance} m is inside the object's radius of {radius:.3g} m; make it larger",
-        )
-        _check(yaw is None or bool(np.isfinite(yaw)), f"yaw must be a finite angle in radians, or None, got {yaw}")
-        rotation = rotation_to_world(up, yaw or 0.0)
-        program = self._program(yaw is not None)  # refuses a policy first
+        program = self._program(sphere.yaw is not None)  # refuses a policy first
         self._resets += 1
         self.key = jax.random.fold_in(jax.random.key(self.seed), self._resets)
-        turn = np.eye(4, dtype=np.float32)
-        turn[:3, :3] = rotation.T @ rotation_to_world(up, 0.0)
-        none_failed = np.zeros((0, 3))
-        self._object = Present(
-            middle, float(radius), rotation, turn, program, program.blank(), None, none_failed, bool(true_size)
-        )
-        options = {"center": middle.tolist(), "radius": float(radius), "up": np.asarray(up, float).tolist()}
+        self._object = Present(sphere, program, program.blank(), true_size)
+        options = {"center": sphere.position.tolist(), "radius": sphere.radius, "up": np.asarray(sphere.up).tolist()}
         options |= {} if true_size else {"true_size": False}
-        options |= {"yaw": None if yaw is None else float(yaw)}
+        named = ("stop", "max_views", "unknown", "gain_per_cost", "distance", "seed")
         policy = self.policy if isinstance(self.policy, str) else getattr(self.policy, "__name__", "a function")
-        mine = {"policy": policy, "stop": self.stop, "max_views": self.max_views, "unknown": self.unknown}
-        mine |= {"gain_per_cost": self.gain_per_cost, "distance": self.distance, "seed": self.seed}
-        self.history = History(self.system.name, {"agent": mine, "reset": options})
+        mine = {"policy": policy} | {name: getattr(self, name) for name in named}
+        self.history = History(self.system.name, {"agent": mine, "reset": options | {"yaw": sphere.yaw}})
 
     def reset_from_points(self, points: AnyArray, **options: Any) -> None:
         """Begins with a new object whose centre and radius are estimated from points on its surface, and from all views to come.
@@ -186,8 +167,8 @@ class Agent:
             options: `up`, `yaw` and `true_size` as of `reset`.
         """
         cloud = np.array(points, float)
-        rotation = rotation_to_world(options.get("up", (0.0, 0.0, 1.0)), options.get("yaw") or 0.0)
-        center, radius = sphere_of(cloud, rotation)
+        turned = Sphere((0.0, 0.0, 0.0), 1.0, options.get("up", (0.0, 0.0, 1.0)), options.get("yaw"))
+        center, radius = sphere_of(cloud, turned.rotation)
         self.reset(center=center, radius=radius, **options)
         self._current.points = cloud
 
@@ -215,30 +196,32 @@ class Agent:
         Raises:
             ValueError: for an input that cannot be used, or beyond `max_views`.
         """
+        return self.see(DepthImage(depth, K, T_world_camera, mask, None if floor is None else float(floor)))
+
+    def see(self, image: DepthImage) -> Belief:
+        """`observe`, for an image that is one record with its camera."""
         begun, of = time.perf_counter(), self._current
         self._check_budget()
-        frame = (depth, K, T_world_camera, mask, floor)
         if of.points is None:
-            view = of.seen(self.system, frame)
+            view = of.seen(self.system, image)
         else:
-            check_source(depth, K, T_world_camera, mask)
-            if mask is None and floor is None:
+            if image.mask is None and image.floor is None:
                 raise ValueError(
                     "an object of unknown size needs a mask of its pixels or a floor, to be told from the rest"
                 )
-            of, view = of.refined(self.system, frame, self.history)
+            of, view = of.refined(self.system, image.copy(), self.history)
             self._object = of
         return self._add(view.depth, of.placed(self.system, view), view.unknown, begun)
 
     @property
     def center(self) -> Float[np.ndarray, " 3"]:
         """Centre of the present object in the world, in metres, as it is given or estimated by now."""
-        return self._current.center.copy()
+        return self._current.sphere.position.copy()
 
     @property
     def radius(self) -> float:
         """Radius of the present object in metres, as it is given or estimated by now."""
-        return self._current.radius
+        return self._current.sphere.radius
 
     def observe_view(self, depth: Float[np.ndarray, "side side"], pose: Float[np.ndarray, "4 4"]) -> Belief:
         """Adds a view that the system's own camera has taken, as it is in the data set.
@@ -270,8 +253,8 @@ class Agent:
 
     def _add(self, depth: np.ndarray, pose: np.ndarray, unseen: float, begun: float) -> Belief:
         of = self._current
-        of.memory, found = of.programs.see(self.system.parts, of.memory, depth, pose, of.known_radius)
-        (probabilities, strangeness), count = jax.device_get((found, of.memory.count))
+        of.memory, said = of.programs.see(self.system.parts, of.memory, depth, pose, of.known_radius)
+        (probabilities, strangeness), count = jax.device_get((said, of.memory.count))
         label = int(probabilities.argmax())
         belief = Belief(
             probabilities=probabilities,
@@ -316,27 +299,12 @@ class Agent:
         number = len(poses)
         where, useful = (self._lattice, np.ones(number, bool)) if candidates is None else self._given(poses)
         allowed = (
-            np.array([bool(reachable(pose)) for pose in poses]) if callable(reachable) else mask_of(reachable, number)
+            np.array([reachable(pose) for pose in poses], bool) if callable(reachable) else mask_of(reachable, number)
         )
-        costs = np.zeros(number) if cost is None else np.asarray(cost, float).reshape(-1)
-        _check(costs.shape == (number,), f"cost has {costs.size} values; there are {number} candidates")
-        _check(not np.isnan(costs).any(), "cost has values that are NaN")
-        finite = costs[np.isfinite(costs)]
-        worth = self.gain_per_cost > 0 or not len(finite) or bool(np.ptp(finite) == 0)
-        _check(
-            worth, "costs differ, but gain_per_cost is 0; make the agent with the gain that one unit of cost is worth"
-        )
-        allowed = allowed & useful & np.isfinite(costs)
-        weighted = self.gain_per_cost * np.where(np.isfinite(costs), costs, 0.0)
-        reason = self._reason()
+        costs = self._costs(cost, number)
+        reason, index, gains = self._reason(), -1, np.zeros(0)
         if not reason:
-            wide = np.zeros((2, self.size), np.float32)
-            wide[0, :number], wide[1, :number] = allowed, weighted
-            index, gains = jax.device_get(
-                of.programs.choose(
-                    self.system.parts, of.memory, where, self._is_failed(where), wide[0] > 0, wide[1], self.key
-                )
-            )
+            index, gains = self._choose(where, allowed & useful & np.isfinite(costs), costs)
             if index < 0:
                 reason = "nothing reachable" if of.belief is None or of.belief.known else "unknown object"
         elapsed = 1e3 * (time.perf_counter() - begun)
@@ -347,12 +315,32 @@ class Agent:
             event["gains"] = [float(gain) if np.isfinite(gain) else None for gain in gains[:number]]
             if candidates is not None:
                 event["directions"] = np.asarray(where.directions)[:number].tolist()
-            chosen = poses[int(index)]
-            away = chosen[:3, 3] - of.center
-            direction = away / np.linalg.norm(away)
-            step = Step(chosen, direction, int(index), float(gains[index]), False, "", elapsed)
+            step = Step(poses[index], of.towards(poses[index]), index, float(gains[index]), False, "", elapsed)
         self.history.events.append(event | {"step": plain(step)})
         return step
+
+    def _costs(self, cost: AnyVector | None, number: int) -> Float[np.ndarray, " candidates"]:
+        """Costs of candidates as they are given, infinite where they cannot be reached."""
+        costs = np.zeros(number) if cost is None else np.asarray(cost, float).reshape(-1)
+        _check(costs.shape == (number,), f"cost has {costs.size} values; there are {number} candidates")
+        _check(not np.isnan(costs).any(), "cost has values that are NaN")
+        finite = costs[np.isfinite(costs)]
+        worth = self.gain_per_cost > 0 or not len(finite) or bool(np.ptp(finite) == 0)
+        _check(
+            worth, "costs differ, but gain_per_cost is 0; make the agent with the gain that one unit of cost is worth"
+        )
+        return costs
+
+    def _choose(self, where: Candidates, allowed: np.ndarray, costs: np.ndarray) -> tuple[int, np.ndarray]:
+        """The best of the allowed candidates, −1 without one, and the expected gains."""
+        of, number = self._current, len(costs)
+        wide = np.zeros((2, self.size), np.float32)
+        wide[0, :number], wide[1, :number] = allowed, self.gain_per_cost * np.where(np.isfinite(costs), costs, 0.0)
+        chosen = of.programs.choose(
+            self.system.parts, of.memory, where, of.has_failed(where), wide[0] > 0, wide[1], self.key
+        )
+        index, gains = jax.device_get(chosen)
+        return int(index), gains
 
     def _reason(self) -> Reason:
         belief = self._current.belief
@@ -367,18 +355,18 @@ class Agent:
     @property
     def poses(self) -> Float[np.ndarray, "views 4 4"]:
         """Poses `T_world_camera` of the system's viewpoints around the object, in metres."""
-        of, camera = self._current, self.system.description.camera
-        distance = camera.distance * of.radius if self.distance is None else self.distance
-        directions = self.system.viewpoints.astype(float) @ of.rotation.T
-        return np.stack([pose_towards(one, of.center, distance, of.rotation[:, 2]) for one in directions])
+        sphere, camera = self._current.sphere, self.system.description.camera
+        distance = camera.distance * sphere.radius if self.distance is None else self.distance
+        directions = self.system.viewpoints.astype(float) @ sphere.rotation.T
+        return np.stack([pose_towards(one, sphere.position, distance, sphere.axis) for one in directions])
 
-    def _given(self, poses: np.ndarray) -> tuple[core.Candidates, Bool[np.ndarray, " candidates"]]:
+    def _given(self, poses: np.ndarray) -> tuple[Candidates, Bool[np.ndarray, " candidates"]]:
         """Candidates of a caller, and which of them `observe` could use."""
-        of = self._current
+        sphere = self._current.sphere
         if not poses.size:
             return self._lattice, np.zeros(len(poses), bool)
-        directions, useful = aimed(poses, of.center, of.radius)
-        return candidates_of(self.system, directions @ of.rotation, self.size), useful
+        directions, useful = aimed(poses, sphere.position, sphere.radius)
+        return candidates_of(self.system, directions @ sphere.rotation, self.size), useful
 
     def mark_failed(self, step: Step | AnyArray) -> None:
         """Says that a view could not be taken, so that it is not chosen again.
@@ -390,20 +378,13 @@ class Agent:
         pose = step.T_world_camera if isinstance(step, Step) else np.asarray(step, float)
         if pose is None or np.shape(pose) != (4, 4):
             raise ValueError("mark_failed needs a step that has a pose, or a pose (4, 4)")
-        away = pose[:3, 3] - of.center
+        away = pose[:3, 3] - of.sphere.position
         _check(
             bool(np.isfinite(away).all() and np.linalg.norm(away) > 1e-9),
             "mark_failed needs a pose of finite numbers, away from the object's centre",
         )
-        of.failed = np.concatenate([of.failed, (away / np.linalg.norm(away) @ of.rotation)[None]])
+        of.failed.append(of.towards(pose) @ of.sphere.rotation)
         self.history.events.append({"call": "mark_failed", "direction": of.failed[-1].tolist()})
-
-    def _is_failed(self, where: core.Candidates) -> np.ndarray:
-        failed = self._current.failed
-        if not len(failed):
-            return np.zeros(self.size, bool)
-        close = np.asarray(where.directions) @ failed.T > np.cos(float(where.same))
-        return close.any(axis=1)
 
     @property
     def _current(self) -> Present:

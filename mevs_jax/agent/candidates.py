@@ -6,8 +6,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from mevs_jax.agent.core import SAME, Candidates
 from mevs_jax.geometry.viewpoints import great_circle_distances, hull_edges
+from mevs_jax.trained.situation import SAME, Candidates
 from mevs_jax.trained.system import TrainedSystem
 
 _NEAREST = 3

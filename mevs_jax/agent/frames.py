@@ -7,25 +7,8 @@ from collections.abc import Sequence
 import numpy as np
 from jaxtyping import Bool, Float
 
-from mevs_jax.arrays import AnyArray, AnyVector
-from mevs_jax.geometry.source_view import checked_pose, upright
-
-
-def rotation_to_world(up: AnyVector, yaw: float) -> Float[np.ndarray, "3 3"]:
-    """Rotation from the object's frame to the world: the smallest one from z to `up`, after one by `yaw` about z.
-
-    Args:
-        up: (3,) the object's upward direction in the world, of any length.
-        yaw: in radians.
-
-    Raises:
-        ValueError: for an upward direction without a length.
-    """
-    axis = np.asarray(up, float).reshape(-1)
-    if axis.shape != (3,) or not np.isfinite(axis).all() or np.linalg.norm(axis) < 1e-9:
-        raise ValueError(f"up must be a direction of three finite numbers, got {np.asarray(up).tolist()}")
-    turn = np.array([[np.cos(yaw), -np.sin(yaw), 0], [np.sin(yaw), np.cos(yaw), 0], [0, 0, 1]])
-    return upright(axis).T @ turn
+from mevs_jax.arrays import AnyArray
+from mevs_jax.geometry.source_view import checked_pose
 
 
 def pose_towards(
@@ -47,24 +30,6 @@ def pose_towards(
     pose[:3, :3] = np.stack([right, np.cross(forward, right), forward], axis=1)
     pose[:3, 3] = center + distance * direction
     return pose
-
-
-def points_of(
-    depth: AnyArray, K: AnyArray, T_world_camera: AnyArray, mask: AnyArray | None = None
-) -> Float[np.ndarray, "points 3"]:
-    """The points that a depth image shows, in the world, in metres.
-
-    Args:
-        depth: (height, width) metres along the optical axis, 0, NaN or infinite where unknown.
-        K: (3, 3) intrinsics, centres of pixels at whole numbers.
-        T_world_camera: (4, 4) pose.
-        mask: (height, width) True for the pixels that are wanted; all by default.
-    """
-    image, pose = np.asarray(depth), np.asarray(T_world_camera, float)
-    wanted = (image > 0) & np.isfinite(image)
-    rows, columns = np.nonzero(wanted if mask is None else wanted & np.asarray(mask, bool))
-    rays = np.stack([columns, rows, np.ones(len(rows))], axis=1) @ np.linalg.inv(np.asarray(K, float)).T
-    return (rays * image[rows, columns, None]) @ pose[:3, :3].T + pose[:3, 3]
 
 
 def aimed(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import partial
 from typing import Any
@@ -12,10 +13,10 @@ import numpy as np
 from jaxtyping import Array, Float, Int, Shaped
 
 from mevs_jax.agent.agent import Agent
-from mevs_jax.agent.frames import points_of
-from mevs_jax.agent.records import Belief, History, Reason
+from mevs_jax.agent.records import Belief, History, Reason, Step
 from mevs_jax.geometry.cameras import ViewCamera, look_at_origin
-from mevs_jax.geometry.sphere import estimate_sphere
+from mevs_jax.geometry.source_view import DepthImage
+from mevs_jax.geometry.sphere import Sphere, estimate_sphere
 from mevs_jax.rendering.depth import pad_triangles, render_depth
 from mevs_jax.trained.system import TrainedSystem
 
@@ -92,16 +93,26 @@ def look(
     camera = system.description.camera
     known = 1.0 if metres is None else radius * metres
     agent.reset(center=(0.0, 0.0, 0.0), radius=known, yaw=0.0, true_size=metres is not None)
-    seen, beliefs = [], []
-    index = agent.decide().index if first is None else first
-    while True:
+
+    def take(index: int) -> Belief:
         pose = np.asarray(look_at_origin(jnp.asarray(system.viewpoints[index]) * camera.distance))
-        depth = np.asarray(_depth(jnp.asarray(triangles), jnp.asarray(pose), camera))
-        seen.append(index)
-        beliefs.append(agent.observe_view(depth, pose))
-        step = agent.decide()
+        return agent.observe_view(np.asarray(_depth(jnp.asarray(triangles), jnp.asarray(pose), camera)), pose)
+
+    return _walk(agent, agent.decide().index if first is None else first, take, agent.decide)
+
+
+def _walk(
+    agent: Agent, index: int, take: Callable[[int], Belief | None], decide: Callable[[], Step], left_out: Any = None
+) -> Walk:
+    """Takes one view after another, from the first index on; `take` returns None for one that cannot be used."""
+    seen, beliefs = [], []
+    while True:
+        if (belief := take(index)) is not None:
+            seen.append(index)
+            beliefs.append(belief)
+        step = decide()
         if step.done:
-            return Walk(tuple(seen), tuple(beliefs), step.reason, agent.history)
+            return Walk(tuple(seen), tuple(beliefs), step.reason, agent.history, left_out or {})
         index = step.index
 
 
@@ -153,22 +164,17 @@ class Frames:
         depth: (frames, height, width) metres.
         K: (frames, 3, 3) intrinsics.
         T_world_camera: (frames, 4, 4) poses.
-        center, radius: of the object's sphere, in metres.
-        up: its upward direction in the world.
+        sphere: of the object.
         mask: (frames, height, width) True at the object's pixels, or None.
-        floor: height of the supporting surface in the world along `up`, or None.
-        yaw: of the object, as of `Agent.reset`; None if it is unknown.
+        floor: height of the supporting surface in the world along the object's upward direction, or None.
     """
 
     depth: Shaped[np.ndarray, "frames height width"]
     K: Float[np.ndarray, "frames 3 3"]
     T_world_camera: Float[np.ndarray, "frames 4 4"]
-    center: Float[np.ndarray, " 3"]
-    radius: float
-    up: Float[np.ndarray, " 3"]
+    sphere: Sphere
     mask: np.ndarray | None = None
     floor: float | None = None
-    yaw: float | None = None
 
     @classmethod
     def of(cls, stored: dict[str, np.ndarray]) -> Frames:
@@ -182,38 +188,48 @@ class Frames:
         for name in ("depth", "K", "T_world_camera"):
             if name not in stored:
                 raise ValueError(f"there is no array {name!r}; it holds {', '.join(stored) or 'nothing'}")
-        depth, poses = stored["depth"], np.asarray(stored["T_world_camera"], float)
-        if depth.ndim != 3 or not 1 <= len(depth) <= MOST_FRAMES:
+        depth, poses, K = stored["depth"], *(np.asarray(stored[name], float) for name in ("T_world_camera", "K"))
+        number = len(depth) if depth.ndim == 3 else 0
+        if not 1 <= number <= MOST_FRAMES:
             raise ValueError(
                 f"depth must be (frames, height, width) with 1 to {MOST_FRAMES} frames, got shape {depth.shape}"
             )
-        number = len(depth)
         if poses.shape != (number, 4, 4):
             raise ValueError(f"T_world_camera must be ({number}, 4, 4), got shape {poses.shape}")
-        K = np.asarray(stored["K"], float)
         if K.shape not in ((3, 3), (number, 3, 3)):
             raise ValueError(f"K must be (3, 3) or ({number}, 3, 3), got shape {K.shape}")
         K = np.broadcast_to(K, (number, 3, 3))
         mask = np.asarray(stored["mask"], bool) if "mask" in stored else None
         if mask is not None and mask.shape != depth.shape:
             raise ValueError(f"mask must have the shape of depth, {depth.shape}, got {mask.shape}")
+        up, yaw = stored.get("up", np.array((0.0, 0.0, 1.0))), _number(stored, "yaw")
         if "center" in stored and "radius" in stored:
-            center, radius = np.asarray(stored["center"], float).reshape(-1), _number(stored, "radius")
+            center, radius = stored["center"], _number(stored, "radius")
         elif "center" in stored or "radius" in stored:
             raise ValueError("center and radius of the object belong together; give both, or neither and a mask")
         elif mask is not None:
-            found = [points_of(*one) for one in zip(depth, K, poses, mask, strict=True)]
-            center, radius = estimate_sphere(np.concatenate(found), up=stored.get("up", (0.0, 0.0, 1.0)))
+            shown = [DepthImage(*one).points() for one in zip(depth, K, poses, mask, strict=True)]
+            center, radius = estimate_sphere(np.concatenate(shown), up=up)
         else:
             raise ValueError(
                 "center and radius of the object are needed, or a mask of its pixels to estimate them from"
             )
-        up = np.asarray(stored.get("up", (0.0, 0.0, 1.0)), float).reshape(-1)
-        floor, yaw = (_number(stored, name) if name in stored else None for name in ("floor", "yaw"))
-        return cls(depth, K, poses, center, float(radius), up, mask, floor, yaw)
+        return cls(depth, K, poses, Sphere(center, radius, up, yaw), mask, _number(stored, "floor"))
+
+    def image(self, index: int) -> DepthImage:
+        """One of them.
+
+        Raises:
+            ValueError: for an image that cannot be used.
+        """
+        mask = None if self.mask is None else self.mask[index]
+        return DepthImage(self.depth[index], self.K[index], self.T_world_camera[index], mask, self.floor)
 
 
-def _number(stored: dict[str, np.ndarray], name: str) -> float:
+def _number(stored: dict[str, np.ndarray], name: str) -> Any:
+    """A number, or None if it is not stored."""
+    if name not in stored:
+        return None
     if np.size(stored[name]) != 1:
         raise ValueError(f"{name} must be one number, got shape {np.shape(stored[name])}")
     return float(np.reshape(stored[name], ()))
@@ -230,21 +246,34 @@ def look_at_frames(agent: Agent, frames: Frames, *, first: int = 0) -> Walk:
     number = len(frames.depth)
     if not 0 <= first < number:
         raise ValueError(f"first must be a frame from 0 to {number - 1}, got {first}")
-    agent.reset(center=frames.center, radius=frames.radius, up=frames.up, yaw=frames.yaw)
-    left, index = np.ones(number, bool), first
-    seen, beliefs, left_out = [], [], {}
-    while True:
-        mask = None if frames.mask is None else frames.mask[index]
-        pose = frames.T_world_camera[index]
+    agent.begin(frames.sphere)
+    left, left_out = np.ones(number, bool), dict[int, str]()
+
+    def take(index: int) -> Belief | None:
         left[index] = False
         try:
-            beliefs.append(agent.observe(frames.depth[index], frames.K[index], pose, mask=mask, floor=frames.floor))
-            seen.append(index)
+            return agent.see(frames.image(index))
         except ValueError as error:
             left_out[index] = str(error)
-        step = agent.decide(left, candidates=frames.T_world_camera)
-        if step.done and not beliefs:
-            raise ValueError(f"no frame can be used; of the first, {next(iter(left_out.values()))}")
-        if step.done:
-            return Walk(tuple(seen), tuple(beliefs), step.reason, agent.history, left_out)
-        index = step.index
+            return None
+
+    walk = _walk(agent, first, take, lambda: agent.decide(left, candidates=frames.T_world_camera), left_out)
+    if not walk.beliefs:
+        raise ValueError(f"no frame can be used; of the first, {left_out[first]}")
+    return walk
+
+
+def replay(history: History, agent: Agent) -> list[Belief]:
+    """Gives an agent the images of a history again, in the same order; returns its beliefs.
+
+    Args:
+        history: of this agent's system, or of another one with the same camera.
+        agent: which is reset first, as it was for the history.
+
+    Raises:
+        ValueError: for a history without an object, or images of another size than the agent's.
+    """
+    if "reset" not in history.options:
+        raise ValueError("the history has no object: its agent was not reset")
+    agent.reset(**history.options["reset"])
+    return [agent.observe_view(depth, pose) for depth, pose in zip(history.depths, history.poses, strict=True)]

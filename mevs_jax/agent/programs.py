@@ -1,7 +1,8 @@
-"""The compiled programs of an agent, for one policy."""
+"""The compiled steps of an agent for one policy: how a view changes what it remembers, and how the next one is chosen."""
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import jax
@@ -9,10 +10,16 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from mevs_jax.agent import core
-from mevs_jax.policies.base import Policy
+from mevs_jax.geometry.viewpoints import ViewGraph
+from mevs_jax.policies.base import Observation, Policy, Scene, SelectionState
+from mevs_jax.policies.informed import information_gain
+from mevs_jax.selection.loop import Fuse, best_view
 from mevs_jax.trained.parts import Parts, observe
+from mevs_jax.trained.situation import Candidates, Memory, angles, situation
 from mevs_jax.trained.system import TrainedSystem
+
+REPEATED = 0.02
+"""Views whose directions differ by less, in radians, are one view taken again."""
 
 
 class Programs:
@@ -20,9 +27,9 @@ class Programs:
 
     def __init__(self, system: TrainedSystem, policy: str | Policy, posed: bool, most: int):
         entropy = system.parts.entropy is not None and posed
-        if entropy and core.why_not(system, policy, posed, False) is None:
+        if entropy and system.why_not(policy, posed, False) is None:
             entropy = False  # the policy does not use predicted entropies
-        if (reason := core.why_not(system, policy, posed, entropy)) is not None:
+        if (reason := system.why_not(policy, posed, entropy)) is not None:
             name = policy if isinstance(policy, str) else getattr(policy, "__name__", "given")
             without = "" if posed else " for an object of unknown yaw"
             raise ValueError(f"the policy {name} cannot be used here{without}: {reason}")
@@ -34,7 +41,7 @@ class Programs:
         shared = system.__dict__.setdefault("programs", {})
         self._see = shared.setdefault((entropy, posed, most), jax.jit(self.see_view))
 
-    def see(self, parts: Parts, memory: core.Memory, depth: np.ndarray, pose: np.ndarray, radius: float) -> Any:
+    def see(self, parts: Parts, memory: Memory, depth: np.ndarray, pose: np.ndarray, radius: float) -> Any:
         """`see_view`, compiled, with the temperatures of the policy."""
         return self._see(parts, memory, depth, pose, np.float32(radius), self.temperatures(parts))
 
@@ -42,61 +49,100 @@ class Programs:
         """The temperatures of the policy's walks; those of random ones for a policy without its own."""
         return parts.temperatures.get(self._temperatures_of, parts.temperatures["random"])
 
-    def blank(self) -> core.Memory:
-        like = core.example(self._system, self._entropy)
-        return core.blank(like, self._most)
+    def blank(self) -> Memory:
+        """The memory before the first view."""
+        return Memory.blank(self._system.example(self._entropy), self._most)
 
     def see_view(
         self,
         parts: Parts,
-        memory: core.Memory,
+        memory: Memory,
         depth: Float[Array, "side side"],
         pose: Float[Array, "4 4"],
         radius: Float[Array, ""],
         temperatures: Float[Array, " counts"],
-    ) -> tuple[core.Memory, tuple[Array, Array]]:
+    ) -> tuple[Memory, tuple[Array, Array]]:
         """The memory after a view; calibrated probabilities and strangeness.
 
         Args:
             radius: of the object in metres; NaN if its size is unknown.
             temperatures: of the belief after 1, 2, … views; the last one holds for more.
         """
-        system, of = self._system, self._system.description
+        of = self._system.description
         cloud = of.cloud if self._entropy else None
         seen = observe(parts, depth, pose, radius, image=of.image, size=of.size, cloud=cloud, camera=of.camera)
         direction = pose[:3, 3] / jnp.linalg.norm(pose[:3, 3])
-        memory = core.remember(system, parts, memory, seen, direction, self._posed)
+        memory = remember(memory, seen, direction, self._system.fuse(parts, self._posed))
         at = jnp.clip(memory.count, 1, len(temperatures)) - 1
         probabilities = jax.nn.softmax(memory.belief / temperatures[at])
         strangeness = jnp.float32(jnp.nan)
         if parts.strangeness is not None:
-            present = jnp.arange(self._most) < memory.count
-            strangeness = parts.strangeness.of(memory.seen.logits, present)
+            strangeness = parts.strangeness.of(memory.seen.logits, memory.present)
         return memory, (probabilities, strangeness)
 
     def choose_next(
         self,
         parts: Parts,
-        memory: core.Memory,
-        candidates: core.Candidates,
+        memory: Memory,
+        candidates: Candidates,
         failed: Array,
         allowed: Array,
         cost: Array,
         key: Array,
     ) -> tuple[Array, Array]:
-        state, scene = core.situation(parts, memory, candidates, failed, allowed, self._posed)
-        policy = self._policy
-        run = self._system.policy(policy, parts, self._posed) if isinstance(policy, str) else policy
-        index, gains = core.choose(key, run, state, scene, cost, len(candidates.directions))
-        left = core.left(state, scene)
-        scores = self._first(parts, candidates) - jnp.concatenate([cost, jnp.zeros(self._most)])
-        first = jnp.argmax(jnp.where(left, scores, -jnp.inf))
-        return jnp.where(memory.count > 0, index, jnp.where(jnp.any(left), first, -1)), gains
+        """The best candidate that is left, or −1; and the expected gain of each in nats, NaN where it is not known.
 
-    def _first(self, parts: Parts, candidates: core.Candidates) -> Array:
+        Args:
+            failed: candidates that could not be reached although they were chosen.
+            allowed: candidates that may be chosen.
+            cost: subtracted from the scores.
+            key: of random policies.
+        """
+        state, scene = situation(parts, memory, candidates, failed, allowed, self._posed)
+        policy, number, slots = self._policy, len(candidates.directions), jnp.zeros(self._most)
+        run = self._system.policy(policy, parts, self._posed) if isinstance(policy, str) else policy
+        assert scene.reachable is not None
+        left, costs = scene.reachable & ~state.attempted, jnp.concatenate([cost, slots])
+        scores = run(jax.random.fold_in(key, state.count), state, scene) - costs
+        highest = jnp.finfo(scores.dtype).max
+        index = best_view(jnp.where(left, jnp.minimum(scores, highest), -jnp.inf), left)
+        first = jnp.argmax(jnp.where(left, jnp.concatenate([self._first(parts, candidates), slots]) - costs, -jnp.inf))
+        chosen = jnp.where(jnp.any(left), jnp.where(memory.count > 0, index, first), -1)
+        known, gains = scene.knowledge, jnp.full(number, jnp.nan)
+        if known is not None and (known.expected_logits is not None or known.by_pose is not None):
+            gains = information_gain(key, state, scene)[:number]
+        return chosen, gains
+
+    def _first(self, parts: Parts, candidates: Candidates) -> Float[Array, " candidates"]:
         """Scores of the first view, from 0 to 1: the best fixed order of views where there is one, else views from above."""
-        slots = jnp.zeros(self._most)
         if self._posed and parts.knowledge is not None and parts.knowledge.order is not None:
-            order = candidates.weights @ parts.knowledge.order
-            return jnp.concatenate([order / jnp.max(parts.knowledge.order), slots])
-        return jnp.concatenate([1 - jnp.abs(candidates.directions[:, 2] - 0.5), slots])
+            return candidates.weights @ parts.knowledge.order / jnp.max(parts.knowledge.order)
+        return 1 - jnp.abs(candidates.directions[:, 2] - 0.5)
+
+
+def remember(memory: Memory, observation: Observation, direction: Float[Array, 3], fuse: Fuse) -> Memory:
+    """The memory with one more view, and the belief after it.
+
+    A view from the direction of an earlier one takes its place: it holds no new evidence.
+    """
+    most = len(memory.directions)
+    apart = jnp.where(memory.present, angles(direction[None], memory.directions)[0], jnp.inf)
+    again = jnp.min(apart) < REPEATED
+    slot = jnp.where(again, jnp.argmin(apart), memory.count)
+    memory = Memory(
+        count=memory.count + ~again,
+        directions=memory.directions.at[slot].set(direction),
+        seen=jax.tree.map(lambda history, now: history.at[slot].set(now), memory.seen, observation),
+        belief=memory.belief - jnp.where(again, memory.seen.logits[slot], 0.0),  # of a fusion that adds logits
+    )
+    graph = ViewGraph(memory.directions, jnp.zeros((most, most), bool), jnp.zeros((most, most)))
+    state = SelectionState(
+        count=memory.count,
+        view=slot,
+        attempted=memory.present,
+        belief=memory.belief,
+        latest=observation,
+        views=jnp.where(memory.present, jnp.arange(most), -1),
+        seen=memory.seen,
+    )
+    return replace(memory, belief=fuse(state, Scene(graph)))

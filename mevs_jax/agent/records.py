@@ -7,13 +7,10 @@ import json
 import os
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any, Literal
 
 import numpy as np
 from jaxtyping import Float
-
-if TYPE_CHECKING:
-    from mevs_jax.agent.agent import Agent
 
 Reason = Literal["", "sure", "budget", "nothing reachable", "unknown object"]
 """Why an agent is done; empty while it is not."""
@@ -101,7 +98,7 @@ class History:
     def save(self, path: str | Path) -> None:
         """Writes the history into one `.npz` file, which `load_history` reads. Nothing in it is executed when it is read."""
         path = Path(path)
-        text = json.dumps({"system": self.system, "options": self.options, "events": self.events})
+        text = json.dumps({"system": self.system, "options": self.options, "events": self.events}, default=float)
         side = self.depths[0].shape if self.depths else (0, 0)
         content = io.BytesIO()
         np.savez_compressed(
@@ -138,22 +135,6 @@ def load_history(path: str | Path) -> History:
         raise ValueError(f"{path} is no history of an agent (images of shape {depths.shape}, poses {poses.shape})")
     history.depths, history.poses = list(depths), list(poses)
     return history
-
-
-def replay(history: History, agent: Agent) -> list[Belief]:
-    """Gives an agent the images of a history again, in the same order; returns its beliefs.
-
-    Args:
-        history: of this agent's system, or of another one with the same camera.
-        agent: which is reset first, as it was for the history.
-
-    Raises:
-        ValueError: for a history without an object, or images of another size than the agent's.
-    """
-    if "reset" not in history.options:
-        raise ValueError("the history has no object: its agent was not reset")
-    agent.reset(**history.options["reset"])
-    return [agent.observe_view(depth, pose) for depth, pose in zip(history.depths, history.poses, strict=True)]
 
 
 def plain(record: Belief | Step) -> dict[str, Any]:

@@ -134,7 +134,7 @@ def load_system(name: str) -> TrainedSystem:
 
 def export(options: ExportOptions) -> None:
     """Writes the trained system of a run, or any other, into a folder."""
-    from mevs_jax.trained import save
+    from mevs_jax.deploy.export import export as write_programs
 
     if (options.out is None) == (options.system is None):
         raise Unusable("mevs export needs a run or a system: --out DIR or --system PATH, one of them")
@@ -144,7 +144,7 @@ def export(options: ExportOptions) -> None:
         assert options.system is not None
         system = load_system(options.system)
     try:
-        save(system, options.to, half=options.half, stablehlo=options.stablehlo)
+        system.save(options.to, half=options.half, programs=write_programs if options.stablehlo else None)
     except (FileExistsError, ImportError) as error:
         raise Unusable(str(error)) from error
     except OSError as error:

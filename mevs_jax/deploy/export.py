@@ -22,6 +22,7 @@ from jaxtyping import Array
 
 from mevs_jax.agent.candidates import candidates_of
 from mevs_jax.agent.programs import Programs
+from mevs_jax.deploy import exported as loader
 from mevs_jax.points.ops import portable
 from mevs_jax.trained.parts import features_of, logits_of
 from mevs_jax.trained.system import TrainedSystem
@@ -76,18 +77,19 @@ def export(
         "made_with": {"jax": version("jax"), "mevs-jax": version("mevs-jax")},
         "programs": {},
     }
-    for name, (function, arguments, about) in programs.items():
+    for name, (function, inputs, outputs) in programs.items():
+        (b,) = jax.export.symbolic_shape("b")
         with portable():
-            exported = jax.export.export(jax.jit(function), platforms=list(platforms))(*arguments)
+            exported = jax.export.export(jax.jit(function), platforms=list(platforms))(*_arguments(inputs, b))
         content = bytes(exported.serialize())
         (folder / f"{name}.stablehlo").write_bytes(content)
-        manifest["programs"][name] = about | {
+        manifest["programs"][name] = {
+            "inputs": inputs,
+            "outputs": outputs,
             "file": f"{name}.stablehlo",
             "sha256": hashlib.sha256(content).hexdigest(),
             "platforms": list(platforms),
         }
-    from mevs_jax.deploy import exported as loader
-
     shutil.copyfile(str(loader.__file__), folder / LOADER)
     (folder / MANIFEST).write_text(json.dumps(manifest, indent=1))
     return folder
@@ -98,136 +100,112 @@ _FRAMES = {
     "camera": "x right, y down, z forward (OpenCV); poses map the camera's frame to the object's",
 }
 
-_Program = tuple[Callable[..., Any], tuple[Any, ...], dict[str, Any]]
+_Program = tuple[Callable[..., Any], list[dict[str, Any]], list[dict[str, Any]]]
+"""A function, and its inputs and outputs as the manifest describes them."""
 
 
-def _described(name: str, shape: Sequence[Any], dtype: str, about: str) -> dict[str, Any]:
+def _array(name: str, shape: Sequence[Any], about: str, dtype: str = "float32") -> dict[str, Any]:
     return {"name": name, "shape": list(shape), "dtype": dtype, "about": about}
+
+
+def _arguments(inputs: Sequence[dict[str, Any]], b: Any) -> list[Any]:
+    """The shapes of inputs, for any extent `b`."""
+
+    def of(one: dict[str, Any]) -> Any:
+        if "arrays" in one:
+            return {part["name"]: of(part) for part in one["arrays"]}
+        return jax.ShapeDtypeStruct([b if extent == "b" else extent for extent in one["shape"]], one["dtype"])
+
+    return [of(one) for one in inputs]
+
+
+def _radius(system: TrainedSystem, shape: Sequence[Any]) -> list[dict[str, Any]]:
+    """The input of a system that uses the size of objects; none for another one."""
+    about = "of the object in metres; NaN if its size is unknown"
+    return [_array("radius", shape, about)] if system.description.size else []
 
 
 def _recognise(system: TrainedSystem) -> _Program:
     """Depth images to features and calibrated probabilities of single views."""
-    description, parts = system.description, system.parts
-    side, classes = description.camera.resolution, len(system.classes)
-    (b,) = jax.export.symbolic_shape("b")
+    of, parts = system.description, system.parts
+    side = of.camera.resolution
 
     def recognise(depth: Array, radius: Array | float = jnp.nan) -> dict[str, Array]:
-        of, radii = description, jnp.broadcast_to(jnp.asarray(radius), depth.shape[:1])
+        radii = jnp.broadcast_to(jnp.asarray(radius), depth.shape[:1])
         features = features_of(parts, depth, radii, image=of.image, size=of.size, camera=of.camera)
         logits = logits_of(parts, parts.encoder.module, features) / parts.single
         return {"features": features, "probabilities": jax.nn.softmax(logits, axis=-1)}
 
-    about = {
-        "inputs": [
-            _described("depth", ["b", side, side], "float32", "radii along the optical axis; 0 where nothing is hit"),
-            *_radius_input(system, ["b"]),
+    return (
+        recognise,
+        [
+            _array("depth", ["b", side, side], "radii along the optical axis; 0 where nothing is hit"),
+            *_radius(system, ["b"]),
         ],
-        "outputs": [
-            _described("features", ["b", 8 * description.encoder.width], "float32", "of each view"),
-            _described("probabilities", ["b", classes], "float32", "of the classes, from each view alone"),
+        [
+            _array("features", ["b", 8 * of.encoder.width], "of each view"),
+            _array("probabilities", ["b", len(of.classes)], "of the classes, from each view alone"),
         ],
-    }
-    depth, radius = (jax.ShapeDtypeStruct(shape, jnp.float32) for shape in ((b, side, side), (b,)))
-    return recognise, (depth, radius) if description.size else (depth,), about
-
-
-def _radius_input(system: TrainedSystem, shape: Sequence[Any]) -> list[dict[str, Any]]:
-    """The input of a system that uses the size of objects; none for another one."""
-    about = "of the object in metres; NaN if its size is unknown"
-    return [_described("radius", shape, "float32", about)] if system.description.size else []
+    )
 
 
 def _entropies(system: TrainedSystem) -> _Program:
     """Clouds to the predicted entropies of all views."""
-    cloud, parts, views = system.description.cloud, system.parts, len(system.viewpoints)
+    cloud, network, views = system.description.cloud, system.parts.entropy, len(system.viewpoints)
     assert cloud is not None
-    assert parts.entropy is not None
-    network = parts.entropy
-    (b,) = jax.export.symbolic_shape("b")
-
-    def entropies(clouds: Array) -> dict[str, Array]:
-        return {"entropies": network.module(clouds)}
-
+    assert network is not None
     columns = "x, y, z" + (" and the unit vector to the camera" if cloud.directions else "")
-    frame = (
-        "the object's frame"
-        if cloud.frame == "world"
-        else "the camera's frame, its origin moved to the object's centre"
+    moved = "the camera's frame, its origin moved to the object's centre"
+    frame = "the object's frame" if cloud.frame == "world" else moved
+    return (
+        lambda clouds: {"entropies": network.module(clouds)},
+        [_array("clouds", ["b", cloud.points, cloud.columns], f"{columns}, in {frame}, in radii")],
+        [_array("entropies", ["b", views], "of each view, relative to the largest in training")],
     )
-    shape = ["b", cloud.points, cloud.columns]
-    about = {
-        "inputs": [_described("clouds", shape, "float32", f"{columns}, in {frame}, in radii")],
-        "outputs": [
-            _described("entropies", ["b", views], "float32", "of each view, relative to the largest in training")
-        ],
-    }
-    return entropies, (jax.ShapeDtypeStruct((b, *shape[1:]), jnp.float32),), about
 
 
 def _decide(system: TrainedSystem, policy: str, max_views: int) -> _Program:
     """One step of an agent whose candidates are the system's viewpoints."""
-    programs = Programs(system, policy, True, max_views)
+    programs, parts = Programs(system, policy, True, max_views), system.parts
     views, side = len(system.viewpoints), system.description.camera.resolution
     lattice = candidates_of(system, None, views)
+    leaves, structure = jax.tree.flatten(programs.blank())
+    names = [f"memory{index:02d}" for index in range(len(leaves))]
 
     def decide(
-        memory: Any,
-        depth: Array,
-        pose: Array,
-        reachable: Array,
-        cost: Array,
-        seed: Array,
-        radius: Array | float = jnp.nan,
+        memory: Any, depth: Array, pose: Array, reachable: Array, cost: Array, seed: Array, radius: Any = jnp.nan
     ) -> dict[str, Any]:
-        structure = jax.tree.structure(programs.blank())
-        unpacked = jax.tree.unflatten(structure, [memory[name] for name in sorted(memory)])
-        unpacked, (probabilities, strangeness) = programs.see_view(
-            system.parts, unpacked, depth, pose, jnp.asarray(radius, jnp.float32), programs.temperatures(system.parts)
+        before = jax.tree.unflatten(structure, [memory[name] for name in names])
+        after, (probabilities, strangeness) = programs.see_view(
+            parts, before, depth, pose, jnp.asarray(radius, jnp.float32), programs.temperatures(parts)
         )
-        key = jax.random.key(seed)
-        failed = jnp.zeros(views, bool)
-        following, gains = programs.choose_next(system.parts, unpacked, lattice, failed, reachable, cost, key)
+        following, gains = programs.choose_next(
+            parts, after, lattice, jnp.zeros(views, bool), reachable, cost, jax.random.key(seed)
+        )
         return {
-            "memory": dict(zip(sorted(memory), jax.tree.leaves(unpacked), strict=True)),
+            "memory": dict(zip(names, jax.tree.leaves(after), strict=True)),
             "probabilities": probabilities,
             "strangeness": strangeness,
             "next": following,
             "gains": gains,
         }
 
-    leaves = jax.tree.leaves(programs.blank())
-    memory = {f"memory{index:02d}": jax.ShapeDtypeStruct(leaf.shape, leaf.dtype) for index, leaf in enumerate(leaves)}
-    arguments = (
-        memory,
-        jax.ShapeDtypeStruct((side, side), jnp.float32),
-        jax.ShapeDtypeStruct((4, 4), jnp.float32),
-        jax.ShapeDtypeStruct((views,), bool),
-        jax.ShapeDtypeStruct((views,), jnp.float32),
-        jax.ShapeDtypeStruct((), jnp.uint32),
-        *[jax.ShapeDtypeStruct((), jnp.float32)] * (system.description.size is not None),
-    )
-    about = {
-        "inputs": [
-            {
-                "name": "memory",
-                "about": f"zeros before the first view, then what the last call returned; at most {max_views} views, no more",
-                "arrays": [_described(name, leaf.shape, str(leaf.dtype), "") for name, leaf in memory.items()],
-            },
-            _described("depth", [side, side], "float32", "radii along the optical axis; 0 where nothing is hit"),
-            _described("pose", [4, 4], "float32", "of the camera, to the object's frame"),
-            _described("reachable", [views], "bool", "viewpoints that the camera can go to"),
-            _described("cost", [views], "float32", "subtracted from the scores of the viewpoints"),
-            _described("seed", [], "uint32", "of random policies"),
-            *_radius_input(system, []),
-        ],
-        "outputs": [
-            {"name": "memory", "about": "after this view"},
-            _described("probabilities", [len(system.classes)], "float32", "calibrated, of the classes"),
-            _described("strangeness", [], "float32", "share of known objects that look less strange; NaN if unknown"),
-            _described("next", [], "int32", "index of the next viewpoint; -1 if none is left"),
-            _described(
-                "gains", [views], "float32", "expected gain of each viewpoint in nats; NaN where it is not known"
-            ),
-        ],
-    }
-    return decide, arguments, about
+    before = f"zeros before the first view, then what the last call returned; at most {max_views} views, no more"
+    arrays = [_array(name, leaf.shape, "", str(leaf.dtype)) for name, leaf in zip(names, leaves, strict=True)]
+    inputs = [
+        {"name": "memory", "about": before, "arrays": arrays},
+        _array("depth", [side, side], "radii along the optical axis; 0 where nothing is hit"),
+        _array("pose", [4, 4], "of the camera, to the object's frame"),
+        _array("reachable", [views], "viewpoints that the camera can go to", "bool"),
+        _array("cost", [views], "subtracted from the scores of the viewpoints"),
+        _array("seed", [], "of random policies", "uint32"),
+        *_radius(system, []),
+    ]
+    outputs = [
+        {"name": "memory", "about": "after this view"},
+        _array("probabilities", [len(system.classes)], "calibrated, of the classes"),
+        _array("strangeness", [], "share of known objects that look less strange; NaN if unknown"),
+        _array("next", [], "index of the next viewpoint; -1 if none is left", "int32"),
+        _array("gains", [views], "expected gain of each viewpoint in nats; NaN where it is not known"),
+    ]
+    return decide, inputs, outputs

@@ -26,7 +26,8 @@ from jaxtyping import Array, Bool, Float
 from mevs_jax.arrays import AnyArray, AnyVector
 from mevs_jax.beliefs.entropy import DEPTH_SCALE, DEPTH_STEP
 from mevs_jax.geometry.cameras import ViewCamera, look_at_origin, pixel_directions
-from mevs_jax.geometry.source_view import MARGIN, Window, why_empty, window_of
+from mevs_jax.geometry.source_view import MARGIN, DepthImage, Window, why_empty, window_of
+from mevs_jax.geometry.sphere import Sphere
 
 _STRIDE = 1.0
 """Distance, in samples of the source, of the points along a ray that are compared with it."""
@@ -106,15 +107,23 @@ def canonical_view(
         ValueError: for an argument out of its range, a camera inside the object's sphere, or an image that shows nothing inside
             the sphere.
     """
-    window = window_of(depth, K, T_world_camera, center, radius, up, mask, floor, _grid(camera.resolution))
+    sphere = Sphere(center, radius, up)
+    if floor is not None:
+        floor = float(floor + sphere.position @ sphere.axis)
+    return convert(DepthImage(depth, K, T_world_camera, mask, floor), sphere, camera)
+
+
+def convert(image: DepthImage, sphere: Sphere, camera: ViewCamera) -> CanonicalView:
+    """`canonical_view` of an image with its camera, around an object at a place, whose yaw is not used."""
+    window = window_of(image, sphere, _grid(camera.resolution))
     with jax.default_matmul_precision("highest"):  # accelerators round more, by pixels
         inverse = _without_small_holes(*_inverse_depth(window), window.rays)
-        image, known, pose, in_image, unknown = jax.device_get(_render(window, inverse, camera))
-    if not image.any():
+        depth, known, pose, in_image, unknown = jax.device_get(_render(window, inverse, camera))
+    if not depth.any():
         raise ValueError(why_empty(window))
-    image = np.round(image * DEPTH_SCALE) * DEPTH_STEP  # to the bit as the data set's views are read
+    depth = np.round(depth * DEPTH_SCALE) * DEPTH_STEP  # to the bit as the data set's views are read
     direction = np.asarray(window.eye / np.linalg.norm(window.eye), np.float32)
-    return CanonicalView(image, known, pose, direction, float(in_image), float(unknown))
+    return CanonicalView(depth, known, pose, direction, float(in_image), float(unknown))
 
 
 def _grid(resolution: int) -> int:

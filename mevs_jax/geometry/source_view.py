@@ -6,15 +6,67 @@
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float
 
 from mevs_jax.arrays import AnyArray, AnyVector
+from mevs_jax.geometry.sphere import Sphere, upright
 
 MARGIN = 0.02
 """Points up to this far outside the unit sphere belong to the object, since depth is measured with noise."""
+
+
+@dataclass(frozen=True, eq=False)
+class DepthImage:
+    """The image of a depth camera, and where the camera was.
+
+    Attributes:
+        depth: (height, width) metres along the optical axis, of a floating type. 0 or NaN where unknown; +inf where nothing is
+            hit, which is known to be background.
+        K: (3, 3) intrinsics in pixels; the centres of pixels are at whole numbers, as in OpenCV.
+        pose: (4, 4) `T_world_camera`, camera to world, in metres. The camera's axes are x right, y down, z forward.
+        mask: (height, width) True at the pixels of the object. The others are known not to be the object.
+        floor: height of the supporting surface in the world along the object's upward direction, in metres; what lies below is
+            not the object. It should be a little above the true height, by the depth camera's error.
+
+    Raises:
+        ValueError: for arrays that no depth image, intrinsics or pose can be; the message says what to check.
+    """
+
+    depth: AnyArray
+    K: AnyArray
+    pose: AnyArray
+    mask: AnyArray | None = None
+    floor: float | None = None
+
+    def __post_init__(self) -> None:
+        _check_images(np.asarray(self.depth), None if self.mask is None else np.asarray(self.mask))
+        _check_intrinsics(_finite(self.K, "K", (3, 3)))
+        checked_pose(self.pose)
+        if self.floor is not None:
+            _finite(self.floor, "floor", ())
+
+    def copy(self) -> DepthImage:
+        """An image that does not change when a driver writes the next one into the same arrays."""
+        mask = None if self.mask is None else np.array(self.mask)
+        return DepthImage(np.array(self.depth), np.array(self.K), np.array(self.pose), mask, self.floor)
+
+    @property
+    def measured(self) -> Bool[np.ndarray, "height width"]:
+        """Where a depth was measured."""
+        depth = np.asarray(self.depth)
+        return (depth > 0) & np.isfinite(depth)
+
+    def points(self) -> Float[np.ndarray, "points 3"]:
+        """The points that it shows, within the mask, in the world, in metres."""
+        shown = self.measured if self.mask is None else self.measured & np.asarray(self.mask, bool)
+        rows, columns = np.nonzero(shown)
+        pose = np.asarray(self.pose, float)
+        rays = np.stack([columns, rows, np.ones(len(rows))], axis=1) @ np.linalg.inv(np.asarray(self.K, float)).T
+        return (rays * np.asarray(self.depth)[rows, columns, None]) @ pose[:3, :3].T + pose[:3, 3]
 
 
 class Window(NamedTuple):
@@ -42,60 +94,40 @@ class Window(NamedTuple):
     floor: Float[AnyArray, ""]
 
 
-def window_of(
-    depth: AnyArray,
-    K: AnyArray,
-    T_world_camera: AnyArray,
-    center: AnyVector,
-    radius: float,
-    up: AnyVector,
-    mask: AnyArray | None,
-    floor: float | None,
-    grid: int,
-) -> Window:
-    """Returns the part of a source image that contains the object's sphere.
-
-    Args:
-        depth, K, T_world_camera, center, radius, up, mask, floor: as in `mevs_jax.geometry.canonical.canonical_view`.
-        grid: number of samples along each side of the window.
+def window_of(image: DepthImage, sphere: Sphere, grid: int) -> Window:
+    """Returns the part of a source image that contains the object's sphere, in `grid` samples along each side.
 
     Raises:
-        ValueError: for an argument out of its range, a camera inside the object's sphere, or a sphere outside the image.
+        ValueError: for a camera inside the object's sphere, or a sphere outside the image.
     """
-    image, inside = _checked_images(depth, mask)
-    K, pose = _checked_intrinsics(K), checked_pose(T_world_camera)
-    center, turn = _checked_sphere(center, radius), upright(up)
+    K, pose, radius = np.asarray(image.K, float), np.asarray(image.pose, float), float(sphere.radius)
+    turn = upright(sphere.up)
     axes = turn @ pose[:3, :3]
-    eye = turn @ (pose[:3, 3] - center) / radius
+    eye = turn @ (pose[:3, 3] - sphere.position) / radius
     distance = np.linalg.norm(eye)
     if distance <= 1:
         raise ValueError(
             f"the camera is {distance * radius:.3g} m from the object's center, inside its sphere of radius {radius:.3g} m; "
             "check the poses' units (metres), or give a smaller radius"
         )
-    height, width = image.shape
-    spans = _sphere_in_image(-eye @ axes, K, (width, height))
+    size = np.shape(image.depth)[::-1]
+    spans = _sphere_in_image(-eye @ axes, K, size)
     steps = [-(-(last - first) // grid) for first, last in spans]
     (columns, rows) = (slice(first, last, step) for (first, last), step in zip(spans, steps, strict=True))
     samples, marks = np.full((grid, grid), np.nan, np.float32), np.ones((grid, grid), bool)
-    part = image[rows, columns]
+    part = np.asarray(image.depth)[rows, columns]
     samples[: part.shape[0], : part.shape[1]] = part
-    if inside is not None:
-        marks[: part.shape[0], : part.shape[1]] = inside[rows, columns]
-    to_pixels = np.array([[steps[0], 0, columns.start], [0, steps[1], rows.start], [0, 0, 1.0]])
-    rays = axes @ np.linalg.inv(K) @ to_pixels
-    borders = [((edge - 0.5) - span[0]) / step for span, step, size in zip(spans, steps, (width, height), strict=True)
-               for edge in (0, size)]  # fmt: skip
-    lowest = -np.inf if floor is None else _finite(floor, "floor", ()) / radius
+    if image.mask is not None:
+        marks[: part.shape[0], : part.shape[1]] = np.asarray(image.mask, bool)[rows, columns]
+    rays = axes @ np.linalg.inv(K) @ np.array([[steps[0], 0, columns.start], [0, steps[1], rows.start], [0, 0, 1.0]])
+    borders = [
+        ((edge - 0.5) - span[0]) / step
+        for span, step, pixels in zip(spans, steps, size, strict=True)
+        for edge in (0, pixels)
+    ]
+    lowest = -np.inf if image.floor is None else (image.floor - sphere.position @ sphere.axis) / radius
     f32 = [np.asarray(array, np.float32) for array in (rays, np.linalg.inv(rays), eye, borders, radius, lowest)]
     return Window(samples, marks, *f32)
-
-
-def check_source(depth: AnyArray, K: AnyArray, T_world_camera: AnyArray, mask: AnyArray | None) -> None:
-    """Raises `ValueError` unless depth image, intrinsics, pose and mask are such as `window_of` takes."""
-    _checked_images(depth, mask)
-    _checked_intrinsics(K)
-    checked_pose(T_world_camera)
 
 
 def why_empty(window: Window) -> str:
@@ -114,11 +146,7 @@ def why_empty(window: Window) -> str:
 
 
 def _finite(value: AnyVector | float, name: str, shape: tuple[int, ...]) -> np.ndarray:
-    """Returns a float64 array of the given shape.
-
-    Raises:
-        ValueError: for another shape, or numbers that are not finite.
-    """
+    """The value as a float64 array of a shape."""
     array = np.asarray(value, np.float64)
     if array.shape != shape:
         raise ValueError(f"{name} has shape {array.shape}, not {shape}")
@@ -127,13 +155,7 @@ def _finite(value: AnyVector | float, name: str, shape: tuple[int, ...]) -> np.n
     return array
 
 
-def _checked_images(depth: AnyArray, mask: AnyArray | None) -> tuple[np.ndarray, np.ndarray | None]:
-    """Returns depth and mask as arrays.
-
-    Raises:
-        ValueError: for a type or shape that a depth image does not have.
-    """
-    image = np.asarray(depth)
+def _check_images(image: np.ndarray, mask: np.ndarray | None) -> None:
     if not np.issubdtype(image.dtype, np.floating):
         raise ValueError(
             f"depth has type {image.dtype}, not metres of a floating type; convert it, "
@@ -141,29 +163,18 @@ def _checked_images(depth: AnyArray, mask: AnyArray | None) -> tuple[np.ndarray,
         )
     if image.ndim != 2 or 0 in image.shape:
         raise ValueError(f"depth has shape {image.shape}, not (height, width)")
-    if mask is None:
-        return image, None
-    inside = np.asarray(mask)
-    if inside.dtype.kind == "f" and np.isnan(inside).any():
+    if mask is not None and mask.dtype.kind == "f" and np.isnan(mask).any():
         raise ValueError("mask has NaN; give True for the pixels of the object and False for the others")
-    if inside.shape != image.shape:
-        raise ValueError(f"mask has shape {inside.shape}, depth {image.shape}; they must be equal")
-    return image, inside.astype(bool)
+    if mask is not None and mask.shape != image.shape:
+        raise ValueError(f"mask has shape {mask.shape}, depth {image.shape}; they must be equal")
 
 
-def _checked_intrinsics(K: AnyArray) -> np.ndarray:
-    """Returns the intrinsics in float64.
-
-    Raises:
-        ValueError: unless they are an upper triangular matrix with positive focal lengths, whose last row is (0, 0, 1).
-    """
-    array = _finite(K, "K", (3, 3))
-    if array[1, 0] != 0 or (array[2] != (0, 0, 1)).any() or array[0, 0] <= 0 or array[1, 1] <= 0:
+def _check_intrinsics(K: np.ndarray) -> None:
+    if K[1, 0] != 0 or (K[2] != (0, 0, 1)).any() or K[0, 0] <= 0 or K[1, 1] <= 0:
         raise ValueError(
             "K is not [[fx, s, cx], [0, fy, cy], [0, 0, 1]] in pixels with positive fx and fy; check that it is not transposed, "
-            f"got {array.tolist()}"
+            f"got {K.tolist()}"
         )
-    return array
 
 
 def checked_pose(T_world_camera: AnyArray) -> np.ndarray:
@@ -190,45 +201,9 @@ def checked_pose(T_world_camera: AnyArray) -> np.ndarray:
     return pose
 
 
-def _checked_sphere(center: AnyVector, radius: float) -> np.ndarray:
-    """Returns the center in float64.
-
-    Raises:
-        ValueError: for a center that is not three finite numbers, or a radius that is not positive.
-    """
-    if not (math.isfinite(radius) and radius > 0):
-        raise ValueError(f"radius is {radius}; it must be a positive number of metres")
-    return _finite(center, "center", (3,))
-
-
-def upright(up: AnyVector) -> np.ndarray:
-    """Returns the smallest rotation that takes `up` to z.
-
-    Raises:
-        ValueError: for a vector of length 0.
-    """
-    vector = _finite(up, "up", (3,))
-    length = np.linalg.norm(vector)
-    if length == 0:
-        raise ValueError("up is a vector of length 0; give the object's upward direction in the world")
-    x, y, z = vector / length
-    if z < -1 + 1e-12:
-        return np.diag([1.0, -1.0, -1.0])
-    axis = np.array([[0, 0, -x], [0, 0, -y], [x, y, 0]])
-    return np.eye(3) + axis + axis @ axis / (1 + z)
-
-
 def _sphere_in_image(center: np.ndarray, K: np.ndarray, size: tuple[int, int]) -> list[tuple[int, int]]:
-    """Returns the columns and rows (first, end) of an image that contain the unit sphere, with its margin.
-
-    Args:
-        center: of the sphere, in the camera's frame.
-        K: intrinsics.
-        size: width and height of the image.
-
-    Raises:
-        ValueError: if the sphere is outside the image.
-    """
+    """Returns the columns and rows (first, end) of an image of a size (width, height) that contain the unit sphere around a
+    center in the camera's frame, with its margin."""
     tangents = []
     for across in center[:2]:
         away = math.hypot(across, center[2])

@@ -1,12 +1,14 @@
-"""The sphere around an object, from the points that were observed of it."""
+"""The sphere around an object: where it is, which way is up; and its estimate from the points that were observed of it."""
 
 from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from jaxtyping import Float
 
 from mevs_jax.arrays import AnyArray, AnyVector
-from mevs_jax.geometry.source_view import upright
 
 _NEIGHBOURS = 8
 """A point is an outlier if its distance to this many neighbours is unusual."""
@@ -16,6 +18,70 @@ _SPARSE = 6.0
 
 _MOST_POINTS = 20_000
 """Points are reduced to this number at random before outliers are searched for."""
+
+
+@dataclass(frozen=True, eq=False)
+class Sphere:
+    """Where an object is.
+
+    Attributes:
+        center: (3,) of its bounding box, in the world, in metres.
+        radius: distance of its furthest point from there, in metres.
+        up: (3,) the object's upward direction in the world, of any length. It becomes z by the smallest rotation.
+        yaw: how far the object is turned about `up` against the objects of the data set, in radians, after the smallest rotation
+            from z to `up`; None if this is unknown.
+
+    Raises:
+        ValueError: for numbers out of their range.
+    """
+
+    center: AnyVector
+    radius: float
+    up: AnyVector = (0.0, 0.0, 1.0)
+    yaw: float | None = None
+
+    def __post_init__(self) -> None:
+        if self.position.shape != (3,) or not np.isfinite(self.position).all():
+            raise ValueError(f"center must be three finite numbers, got {np.asarray(self.center).tolist()}")
+        if not 0 < float(self.radius) < np.inf:
+            raise ValueError(f"radius must be positive, in metres, got {self.radius}")
+        upright(self.up)
+        if self.yaw is not None and not np.isfinite(self.yaw):
+            raise ValueError(f"yaw must be a finite angle in radians, or None, got {self.yaw}")
+
+    @cached_property
+    def position(self) -> Float[np.ndarray, " 3"]:
+        """The center, in float64."""
+        return np.array(self.center, float).reshape(-1)
+
+    @cached_property
+    def rotation(self) -> Float[np.ndarray, "3 3"]:
+        """From the object's frame to the world; an unknown yaw counts as 0."""
+        cosine, sine = np.cos(self.yaw or 0.0), np.sin(self.yaw or 0.0)
+        return upright(self.up).T @ np.array([[cosine, -sine, 0], [sine, cosine, 0], [0, 0, 1]])
+
+    @property
+    def axis(self) -> Float[np.ndarray, " 3"]:
+        """The upward direction as a unit vector."""
+        return self.rotation[:, 2]
+
+
+def upright(up: AnyVector) -> Float[np.ndarray, "3 3"]:
+    """Returns the smallest rotation that takes `up` to z.
+
+    Raises:
+        ValueError: for anything but a vector of a length.
+    """
+    vector = np.asarray(up, float).reshape(-1)
+    if vector.shape != (3,) or not np.isfinite(vector).all() or np.linalg.norm(vector) < 1e-9:
+        raise ValueError(
+            f"up must be a direction of three finite numbers, the object's upward one in the world, got {np.asarray(up).tolist()}"
+        )
+    x, y, z = vector / np.linalg.norm(vector)
+    if z < -1 + 1e-12:
+        return np.diag([1.0, -1.0, -1.0])
+    axis = np.array([[0, 0, -x], [0, 0, -y], [x, y, 0]])
+    return np.eye(3) + axis + axis @ axis / (1 + z)
 
 
 def estimate_sphere(points: AnyArray, *, up: AnyVector = (0.0, 0.0, 1.0)) -> tuple[Float[np.ndarray, " 3"], float]:

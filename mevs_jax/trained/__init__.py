@@ -2,9 +2,11 @@
 
 from mevs_jax.beliefs.strangeness import Strangeness, fit_strangeness
 from mevs_jax.trained.description import CloudInput, DataDescription, Description, ImageInput
-from mevs_jax.trained.files import UnreadableSystem, from_pretrained, load, save, verify
+from mevs_jax.trained.files import UnreadableSystem, from_pretrained, load, verify
 from mevs_jax.trained.parts import Network, Parts
 from mevs_jax.trained.system import TrainedSystem
+
+save = TrainedSystem.save
 
 __all__ = [
     "CloudInput",

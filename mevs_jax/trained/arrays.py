@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from typing import Any
 
 import flax.traverse_util
@@ -19,43 +20,47 @@ from mevs_jax.trained.parts import Network, Parts
 
 DESCRIPTION, WEIGHTS = "trained.json", "weights.safetensors"
 """Names of the files that describe them and that hold them."""
+QUANTILES = "strangeness.quantiles"
 _MOST_DEGREE = 16
 """Of expected views; the time to load them grows with its square."""
 
 
 def arrays_of(parts: Parts) -> dict[str, Any]:
     """All arrays by names joined with dots; those of a network by their place in it."""
-    found: dict[str, Any] = {"viewpoints": parts.viewpoints, "neighbours": parts.neighbours, "single": parts.single}
-    networks = {"encoder": parts.encoder, "entropy": parts.entropy, "pose": parts.pose}
-    networks |= {f"view_policies.{name}": network for name, network in parts.view_policies.items()}
-    for name, network in networks.items():
-        if network is not None:
-            found |= _flat(name, network.weights)
-    if parts.fusion:
-        found |= _flat("fusion.weights", parts.fusion["posed"].weights)
-        found["fusion.prior"] = parts.fusion["posed"].prior
-        found |= {f"fusion.temperatures.{name}": fusion.temperatures for name, fusion in parts.fusion.items()}
-    if parts.knowledge is not None:
-        if parts.knowledge.order is None or parts.knowledge.by_pose is not None:
-            raise ValueError("the knowledge of a trained system is an order of its viewpoints and a class × view table")
-        found["knowledge.order"] = parts.knowledge.order
-        if (
-            parts.expected is None and parts.knowledge.expected_logits is not None
-        ):  # else it follows from expected views
-            found["knowledge.expected_logits"] = parts.knowledge.expected_logits
-    found |= {f"temperatures.{name}": values for name, values in parts.temperatures.items()}
-    if parts.expected is not None:
-        found["expected"] = parts.expected.coefficients
-    if parts.size is not None:
-        found["size"] = parts.size
-    if parts.strangeness is not None:
-        found["strangeness.quantiles"] = parts.strangeness.quantiles
-    return found
+    known, fusion = parts.knowledge, parts.fusion.get("posed")
+    if known is not None and (known.order is None or known.by_pose is not None):
+        raise ValueError("the knowledge of a trained system is an order of its viewpoints and a class × view table")
+    return _flat(
+        "",
+        {
+            "viewpoints": parts.viewpoints,
+            "neighbours": parts.neighbours,
+            "single": parts.single,
+            "encoder": parts.encoder,
+            "entropy": parts.entropy,
+            "pose": parts.pose,
+            "view_policies": parts.view_policies,
+            "fusion.weights": fusion and fusion.weights,
+            "fusion.prior": fusion and fusion.prior,
+            "fusion.temperatures": {name: fusion.temperatures for name, fusion in parts.fusion.items()},
+            "knowledge.order": known and known.order,
+            # With expected views, the table follows from them.
+            "knowledge.expected_logits": known.expected_logits if known and parts.expected is None else None,
+            "temperatures": parts.temperatures,
+            "expected": parts.expected and parts.expected.coefficients,
+            "size": parts.size,
+            QUANTILES: parts.strangeness and parts.strangeness.quantiles,
+        },
+    )
 
 
-def _flat(name: str, weights: nnx.State) -> dict[str, Any]:
-    flat = flax.traverse_util.flatten_dict(nnx.to_pure_dict(weights))
-    return {".".join(map(str, (name, *place))): value for place, value in flat.items()}
+def _flat(name: str, part: Any) -> dict[str, Any]:
+    if isinstance(part, Network | nnx.State):
+        part = nnx.to_pure_dict(part.weights if isinstance(part, Network) else part)
+    if isinstance(part, dict):
+        inner = [_flat(f"{name}.{key}".lstrip("."), value) for key, value in part.items()]
+        return {place: array for arrays in inner for place, array in arrays.items()}
+    return {} if part is None else {name: part}
 
 
 class _Arrays:
@@ -78,6 +83,13 @@ class _Arrays:
             raise ValueError(f"{name} in {WEIGHTS} has numbers that are not finite")
         self.left.discard(name)
         return jnp.asarray(array.astype(dtype))
+
+    def positive(self, name: str, shape: tuple[int | None, ...]) -> jax.Array:
+        """Temperatures."""
+        temperatures = self.take(name, shape)
+        if not bool(jnp.all(temperatures > 0)):
+            raise ValueError("a temperature is not positive")
+        return temperatures
 
     def network(self, name: str, make: Any) -> Network:
         """A network with its weights; `make` is a function of `nnx.Rngs`, which is not computed."""
@@ -103,69 +115,72 @@ def parts_of(description: Description, arrays: dict[str, np.ndarray]) -> Parts:
     Raises:
         ValueError: if an array is missing, is left over, has another shape than is described, or is impossible.
     """
-    take = _Arrays(arrays)
-    classes = len(description.classes)
+    of, take = description, _Arrays(arrays)
+    classes, features = len(of.classes), 8 * of.encoder.width
     viewpoints = take.take("viewpoints", (None, 3))
-    views = len(viewpoints)
-    if views < 2 or float(jnp.abs(jnp.linalg.norm(viewpoints, axis=1) - 1).max()) > 1e-3:
+    if len(viewpoints) < 2 or float(jnp.abs(jnp.linalg.norm(viewpoints, axis=1) - 1).max()) > 1e-3:
         raise ValueError("viewpoints are not at least two unit vectors")
-    features = 8 * description.encoder.width
-    fusion = {}
-    if (shape := description.fusion) is not None:
-        network = take.network("fusion.weights", lambda rngs: shape.network(features, classes, rngs))
-        prior, single = take.take("fusion.prior", (classes,)), take.take("single", ())
-        for name in ("posed", "unposed"):
-            temperatures = _positive(take.take(f"fusion.temperatures.{name}", (None,)))
-            fusion[name] = CalibratedFusion(
-                network.structure, network.weights, prior, temperatures, single, name == "posed"
-            )
-    pose, entropy, knowledge, expected, strangeness = None, None, None, None, None
-    if (of_pose := description.pose) is not None:
-        pose = take.network("pose", lambda rngs: of_pose.network(features, classes, rngs))
-    if (of_entropy := description.entropy) is not None:
-        entropy = take.network("entropy", lambda rngs: of_entropy.network(views, rngs))
-    if "expected" in arrays:
-        expected = ExpectedViews(take.take("expected", (classes, None, classes)))
-        terms = expected.coefficients.shape[1]
-        if (expected.degree + 1) ** 2 != terms or expected.degree > _MOST_DEGREE:
-            raise ValueError(f"expected in {WEIGHTS} has {terms} terms, not the square of 1 to {_MOST_DEGREE + 1}")
-    elif pose is not None or "expected_views" in (description.best, description.best_unposed):
-        raise ValueError(f"{WEIGHTS} lacks expected")
-    if pose is None and description.best_unposed == "expected_views":
-        raise ValueError("without a pose, expected views cannot be used for an unknown yaw")
-    if "knowledge.order" in arrays:
-        table = None if expected is None else expected.at(viewpoints)
-        if "knowledge.expected_logits" in arrays:
-            table = take.take("knowledge.expected_logits", (classes, views, classes))
-        knowledge = Knowledge(take.take("knowledge.order", (views,)), table)
-    if "strangeness.quantiles" in arrays:
-        strangeness = Strangeness(take.take("strangeness.quantiles", (None, LEVELS)))
-    names = sorted(name for name in arrays if name.startswith("temperatures."))
-    if "temperatures.random" not in names:
-        raise ValueError(f"{WEIGHTS} lacks temperatures.random")
+    expected = _expected(of, take)
     parts = Parts(
-        encoder=take.network("encoder", lambda rngs: description.encoder.network(classes, rngs)),
+        encoder=take.network("encoder", partial(of.encoder.network, classes)),
         viewpoints=viewpoints,
-        neighbours=take.take("neighbours", (views, views), bool),
-        single=_positive(take.take("single", ())),
-        size=None if description.size is None else take.take("size", (description.size.steps, features)),
-        entropy=entropy,
-        fusion=fusion,
-        pose=pose,
+        neighbours=take.take("neighbours", (len(viewpoints), len(viewpoints)), bool),
+        single=take.positive("single", ()),
+        size=None if of.size is None else take.take("size", (of.size.steps, features)),
+        entropy=None if of.entropy is None else take.network("entropy", partial(of.entropy.network, len(viewpoints))),
+        fusion=_fusion(of, take),
+        pose=None if of.pose is None else take.network("pose", partial(of.pose.network, features, classes)),
         expected=expected,
         view_policies={
-            name: take.network(f"view_policies.{name}", lambda rngs, of=of: of.network(classes, rngs))
-            for name, of in description.view_policies.items()
+            name: take.network(f"view_policies.{name}", partial(shape.network, classes))
+            for name, shape in of.view_policies.items()
         },
-        knowledge=knowledge,
-        temperatures={name.partition(".")[2]: _positive(take.take(name, (None,))) for name in names},
-        strangeness=strangeness,
+        knowledge=_knowledge(take, classes, viewpoints, expected),
+        temperatures=_temperatures(take),
+        strangeness=Strangeness(take.take(QUANTILES, (None, LEVELS))) if QUANTILES in arrays else None,
     )
     take.finish()
     return parts
 
 
-def _positive(temperatures: jax.Array) -> jax.Array:
-    if not bool(jnp.all(temperatures > 0)):
-        raise ValueError("a temperature is not positive")
-    return temperatures
+def _fusion(of: Description, take: _Arrays) -> dict[str, CalibratedFusion]:
+    if of.fusion is None:
+        return {}
+    classes, features = len(of.classes), 8 * of.encoder.width
+    network = take.network("fusion.weights", partial(of.fusion.network, features, classes))
+    prior, single = take.take("fusion.prior", (classes,)), take.take("single", ())
+    temperatures = {name: take.positive(f"fusion.temperatures.{name}", (None,)) for name in ("posed", "unposed")}
+    return {
+        name: CalibratedFusion(network.structure, network.weights, prior, values, single, name == "posed")
+        for name, values in temperatures.items()
+    }
+
+
+def _expected(of: Description, take: _Arrays) -> ExpectedViews | None:
+    if of.pose is None and of.best_unposed == "expected_views":
+        raise ValueError("without a pose, expected views cannot be used for an unknown yaw")
+    if "expected" not in take.arrays:
+        if of.pose is not None or "expected_views" in (of.best, of.best_unposed):
+            raise ValueError(f"{WEIGHTS} lacks expected")
+        return None
+    expected = ExpectedViews(take.take("expected", (len(of.classes), None, len(of.classes))))
+    terms = expected.coefficients.shape[1]
+    if (expected.degree + 1) ** 2 != terms or expected.degree > _MOST_DEGREE:
+        raise ValueError(f"expected in {WEIGHTS} has {terms} terms, not the square of 1 to {_MOST_DEGREE + 1}")
+    return expected
+
+
+def _knowledge(take: _Arrays, classes: int, viewpoints: jax.Array, expected: ExpectedViews | None) -> Knowledge | None:
+    if "knowledge.order" not in take.arrays:
+        return None
+    views, table = len(viewpoints), None if expected is None else expected.at(viewpoints)
+    if "knowledge.expected_logits" in take.arrays:
+        table = take.take("knowledge.expected_logits", (classes, views, classes))
+    return Knowledge(take.take("knowledge.order", (views,)), table)
+
+
+def _temperatures(take: _Arrays) -> dict[str, jax.Array]:
+    names = sorted(name for name in take.arrays if name.startswith("temperatures."))
+    if "temperatures.random" not in names:
+        raise ValueError(f"{WEIGHTS} lacks temperatures.random")
+    return {name.partition(".")[2]: take.positive(name, (None,)) for name in names}

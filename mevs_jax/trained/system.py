@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from functools import cached_property, partial
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import jax
@@ -22,12 +23,11 @@ from mevs_jax.policies.registry import POLICIES, policy_named
 from mevs_jax.selection.loop import Fuse, by_attention, sum_of_logits
 from mevs_jax.trained.description import Description
 from mevs_jax.trained.parts import Parts, observe
+from mevs_jax.trained.situation import SAME, Candidates, Memory, situation
+from mevs_jax.trained.writing import Programs, write
 
 if TYPE_CHECKING:
-    from pathlib import Path
-
-    from mevs_jax.agent import Agent
-
+    from mevs_jax import Agent
 
 _AND_TABLE = "learned_and_table"
 """The policy that averages the gains by the network `learned` and by what views are expected to show."""
@@ -84,12 +84,44 @@ class TrainedSystem:
         """Names of the policies that can be used with this system, for objects of known yaw."""
         own = [*self.parts.view_policies, *[_AND_TABLE] * ("learned" in self.parts.view_policies), EXPECTED_VIEWS]
         own = [name for name in own if name not in (shapes := self.description.view_policies) or shapes[name].posed]
-        return tuple(name for name in (*POLICIES, *own) if self._has_inputs_of(name))
+        return tuple(name for name in (*POLICIES, *own) if self.can_run(name, posed=True))
 
-    def _has_inputs_of(self, name: str) -> bool:
-        from mevs_jax.agent.core import can_run  # the agent knows what a policy is given
+    def can_run(self, policy: str | Policy, posed: bool) -> bool:
+        """Whether a policy can be used with this system, for objects of known or unknown yaw."""
+        return self.why_not(policy, posed, self.parts.entropy is not None and posed) is None
 
-        return can_run(self, name, posed=True)
+    def why_not(self, policy: str | Policy, posed: bool, with_entropy: bool) -> str | None:
+        """Why a policy cannot be used, with or without predicted entropies; None if it can."""
+        views, most = len(self.parts.viewpoints), 2
+
+        def trial(parts: Parts) -> Any:
+            memory = Memory.blank(self.example(with_entropy), most)
+            candidates = Candidates(
+                parts.viewpoints,
+                parts.neighbours,
+                jnp.zeros((views, views)),
+                jnp.ones(views, bool),
+                jnp.eye(views),
+                jnp.float32(SAME),
+            )
+            state, scene = situation(parts, memory, candidates, jnp.zeros(views, bool), jnp.ones(views, bool), posed)
+            run = self.policy(policy, parts, posed) if isinstance(policy, str) else policy
+            return run(jax.random.key(0), state, scene)
+
+        try:
+            scores = jax.eval_shape(trial, self.parts)
+        except (ValueError, TypeError, KeyError, AttributeError, NotImplementedError) as error:
+            return (str(error).strip() or type(error).__name__).splitlines()[0]
+        if scores.shape != (views + most,):
+            return f"it returns scores of shape {scores.shape}, not one for each of {views + most} views"
+        return None
+
+    def example(self, with_entropy: bool) -> Observation:
+        """An observation of zeros, for its shapes."""
+        classes, features = len(self.classes), 8 * self.description.encoder.width
+        entropies = jnp.zeros(len(self.parts.viewpoints)) if with_entropy else None
+        evidence = None if self.parts.pose is None else jnp.zeros(self.parts.pose.module.shape)
+        return Observation(jnp.zeros(classes), entropies, jnp.zeros(features), pose_evidence=evidence)
 
     @property
     def temperatures(self) -> dict[str, np.ndarray]:
@@ -192,12 +224,19 @@ class TrainedSystem:
 
     def agent(self, policy: str | Policy = "best", **options: Any) -> Agent:
         """Returns an agent that recognises objects with a depth camera; see `mevs_jax.Agent` for the options."""
-        from mevs_jax.agent import Agent
+        from mevs_jax import Agent  # the public name, since an agent is built on systems and not the other way round
 
         return Agent(self, policy, **options)
 
-    def save(self, folder: str | Path) -> None:
-        """Writes the system into a folder, which `mevs_jax.load` reads; see `mevs_jax.trained.files.save`."""
-        from mevs_jax.trained.files import save
+    def save(self, folder: str | Path, *, half: bool = False, programs: Programs | None = None) -> None:
+        """Writes the system into a folder, which `mevs_jax.load` reads; an existing one is replaced as a whole.
 
-        save(self, folder)
+        Args:
+            folder: where to; a folder that holds anything but a trained system is refused.
+            half: whether networks are stored in float16, which halves the file. They compute in float32 all the same.
+            programs: `mevs_jax.export.export`, to write the compiled programs too.
+
+        Raises:
+            FileExistsError: for a folder that holds something else.
+        """
+        write(self.description, self.parts, Path(folder), half, None if programs is None else partial(programs, self))

@@ -20,7 +20,8 @@ from data_pipeline.objects.mesh import normalise
 from data_pipeline.objects.sources import mesh_zip
 from data_pipeline.objects.voxels import voxel_archive
 from mevs_jax.trained import UnreadableSystem, load, save
-from mevs_jax.trained.files import DESCRIPTION, WEIGHTS, _hash_of
+from mevs_jax.trained.arrays import DESCRIPTION, WEIGHTS
+from mevs_jax.trained.writing import hash_of
 from tests.data_pipeline.objects import making
 from tests.mevs_jax.trained import making as systems
 from tests.train.weights import making as weights
@@ -107,7 +108,7 @@ def _read_system(content: bytes) -> None:
     """Reads a description beside sound weights, with a hash that fits it if it is JSON."""
     try:
         described = json.loads(content)
-        described["sha256"] = _hash_of(described)
+        described["sha256"] = hash_of(described)
         content = json.dumps(described).encode()
     except (ValueError, TypeError, AttributeError, RecursionError):
         pass

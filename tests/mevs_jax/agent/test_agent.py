@@ -10,7 +10,7 @@ import pytest
 import mevs_jax
 from mevs_jax.agent import Agent, load_history, replay
 from mevs_jax.agent.candidates import candidates_of
-from mevs_jax.agent.frames import points_of, pose_towards, rotation_to_world
+from mevs_jax.agent.frames import pose_towards
 from mevs_jax.beliefs.fusing import running_sum
 from mevs_jax.selection.loop import ViewTable, by_attention, select_from_table
 from tests.mevs_jax.trained import making
@@ -60,7 +60,7 @@ def walk(agent, views, first, **reset):
     """Views and probabilities of a walk in metres, around an object away from the origin."""
     reset = {"yaw": 0.0} | reset
     agent.reset(center=CENTER, radius=RADIUS, **reset)
-    rotation = rotation_to_world(reset.get("up", (0, 0, 1)), reset["yaw"] or 0.0)
+    rotation = mevs_jax.Sphere(CENTER, RADIUS, **reset).rotation
     seen, found, index = [], [], first
     while True:
         found.append(agent.observe(*in_metres(*views[index], rotation)).probabilities)
@@ -197,7 +197,7 @@ def test_an_unknown_sphere_is_estimated_and_refined(classifier):
         shots.append((depth, pose))
     known, unknown = (Agent(classifier, stop=2, max_views=5) for _ in range(2))
     known.reset(center=ball, radius=radius, yaw=0.0)
-    unknown.reset_from_points(points_of(shots[0][0], K, shots[0][1]), yaw=0.0)
+    unknown.reset_from_points(mevs_jax.DepthImage(shots[0][0], K, shots[0][1]).points(), yaw=0.0)
     first = np.linalg.norm(unknown.center - ball)
     buffer = np.zeros_like(shots[0][0])  # which a driver fills again and again
     for depth, pose in shots:
@@ -290,7 +290,7 @@ def test_beliefs_do_not_depend_on_an_unknown_yaw(recogniser):
     views = [views_of(recogniser)[index] for index in (0, 3, 5)]
 
     def beliefs(yaw: float, told: float | None) -> np.ndarray:
-        agent, rotation = Agent(recogniser, stop=2, max_views=4), rotation_to_world((0, 0, 1), yaw)
+        agent, rotation = Agent(recogniser, stop=2, max_views=4), mevs_jax.Sphere(CENTER, RADIUS, yaw=yaw).rotation
         agent.reset(center=CENTER, radius=RADIUS, yaw=told)
         return np.stack([agent.observe(*in_metres(*view, rotation)).probabilities for view in views])
 
@@ -373,11 +373,11 @@ def test_a_policy_of_ones_own(classifier):
 
 def test_the_smallest_rotation_takes_z_to_up():
     for up in ((0, 0, 1), (0, 0, -3), (1, 2, 3), (0, -1, 0)):
-        rotation = rotation_to_world(up, 0.0)
+        rotation = mevs_jax.Sphere(CENTER, RADIUS, up).rotation
         np.testing.assert_allclose(rotation @ rotation.T, np.eye(3), atol=1e-12)
         np.testing.assert_allclose(np.linalg.det(rotation), 1)
         np.testing.assert_allclose(rotation[:, 2], np.asarray(up) / np.linalg.norm(up), atol=1e-12)
-    np.testing.assert_allclose(rotation_to_world((0, 0, 1), np.pi / 2)[:, 0], [0, 1, 0], atol=1e-12)
+    np.testing.assert_allclose(mevs_jax.Sphere(CENTER, RADIUS, yaw=np.pi / 2).rotation[:, 0], [0, 1, 0], atol=1e-12)
 
 
 def test_size_is_told_unless_it_is_not_true():

@@ -9,6 +9,7 @@ from mevs_jax.agent import Agent
 from mevs_jax.agent.frames import aimed, mask_of, pose_towards
 from mevs_jax.agent.looking import Frames, look_at_frames
 from mevs_jax.geometry.inputs import check_depth
+from mevs_jax.geometry.sphere import Sphere
 from tests.mevs_jax.agent.test_agent import CENTER, RADIUS, K, views_of
 from tests.mevs_jax.trained import making
 
@@ -131,12 +132,12 @@ def test_frames_that_cannot_be_used_are_left_out_by_name(system):
     shots = [shot(system, view) for view in range(6)]
     depth, poses = np.stack([one[0] for one in shots]), np.stack([one[1] for one in shots])
     depth[3] = 0
-    frames = Frames(depth, np.stack([K] * 6), poses, CENTER, RADIUS, UP, None, None, 0.0)
+    frames = Frames(depth, np.stack([K] * 6), poses, Sphere(CENTER, RADIUS, yaw=0.0))
     walk = look_at_frames(Agent(system, "farthest", stop=2, max_views=8, max_candidates=12), frames)
     assert sorted(walk.views) == [0, 1, 2, 4, 5]
     assert list(walk.left_out) == [3]
     assert "view   3: left out, depth has no measured pixel" in str(walk)
-    nothing = Frames(np.zeros_like(depth), np.stack([K] * 6), poses, CENTER, RADIUS, UP, None, None, 0.0)
+    nothing = Frames(np.zeros_like(depth), np.stack([K] * 6), poses, Sphere(CENTER, RADIUS, yaw=0.0))
     with pytest.raises(ValueError, match="no measured pixel"):
         look_at_frames(Agent(system, "farthest", stop=2, max_views=8, max_candidates=12), nothing)
 

@@ -14,7 +14,8 @@ import pytest
 
 import mevs_jax
 from mevs_jax.trained import UnreadableSystem, load, save, verify
-from mevs_jax.trained.files import DESCRIPTION, WEIGHTS, _hash_of
+from mevs_jax.trained.arrays import DESCRIPTION, WEIGHTS
+from mevs_jax.trained.writing import hash_of
 from tests.mevs_jax.trained import making
 
 
@@ -100,7 +101,7 @@ def damaged(folder, tmp_path, change):
     shutil.copytree(folder, copy)
     content = json.loads((copy / DESCRIPTION).read_text())
     change(content)
-    content["sha256"] = _hash_of(content)
+    content["sha256"] = hash_of(content)
     (copy / DESCRIPTION).write_text(json.dumps(content))
     return copy
 
@@ -163,7 +164,7 @@ def restamped(folder, weights):
     (folder / WEIGHTS).write_bytes(weights)
     content = json.loads((folder / DESCRIPTION).read_text())
     content["weights"] = {"sha256": hashlib.sha256(weights).hexdigest(), "bytes": len(weights)}
-    content["sha256"] = _hash_of(content)
+    content["sha256"] = hash_of(content)
     (folder / DESCRIPTION).write_text(json.dumps(content))
 
 
