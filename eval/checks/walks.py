@@ -176,27 +176,41 @@ class Walker:
         return jax.lax.map(around, (jnp.arange(len(tables.label)), tables), batch_size=_AT_ONCE)
 
 
-def rows_of(walks: dict[str, Walks], views: Sequence[int]) -> list[dict[str, Any]]:
-    """Accuracy of each policy after some numbers of views, and its difference from random selection, with 95 % intervals.
+@dataclass(frozen=True)
+class AccuracyRow:
+    """Accuracy of a policy after some views, and its difference from random selection, paired by object.
 
-    The difference is paired by object.
+    Attributes:
+        policy: its name.
+        views: number of views.
+        accuracy: over all objects and walks.
+        interval: of the accuracy, 95 % over objects.
+        gain: accuracy less that of random selection.
+        gain_interval: of the gain, 95 % over objects.
     """
+
+    policy: str
+    views: int
+    accuracy: float
+    interval: list[float]
+    gain: float
+    gain_interval: list[float]
+
+
+def rows_of(walks: dict[str, Walks], views: Sequence[int]) -> list[AccuracyRow]:
+    """Accuracies after some numbers of views, and after the last view of the walks."""
     rows = []
     for name, found in walks.items():
         for count in _within(found, views):
             right = found.accuracy[:, count - 1]
             gain = right - walks[BASELINE].accuracy[:, count - 1]
-            rows.append(
-                {
-                    "policy": name,
-                    "views": count,
-                    "accuracy": float(right.mean()),
-                    "interval": intervals(right),
-                    "gain": float(gain.mean()),
-                    "gain_interval": intervals(gain),
-                }
-            )
+            rows.append(AccuracyRow(name, count, *with_interval(right), *with_interval(gain)))
     return rows
+
+
+def with_interval(values: Float[np.ndarray, " objects"]) -> tuple[float, list[float]]:
+    """The mean over objects, and its 95 % interval."""
+    return float(values.mean()), intervals(values)
 
 
 def _within(walks: Walks, views: Sequence[int]) -> list[int]:
