@@ -58,14 +58,10 @@ class StoppingRow:
     """Walks that stop at a calibrated probability.
 
     Attributes:
-        stop: the probability.
-        promised_error: 1 − stop.
-        error: share of the walks that stop which are wrong; 0 where none stops.
-        excess: share of all walks that stop and are wrong, less the promised share of those that stop; 95 % interval over
-            objects.
+        error: share of wrong answers among the walks that stop; 0 where none does.
+        excess: 95 % interval over objects of the share of walks that stop and are wrong, less the share that is promised.
         stopped: share of walks that stop.
-        views: mean number of views of all walks.
-        accuracy: of all walks.
+        views, accuracy: of all walks.
     """
 
     stop: float
@@ -79,14 +75,10 @@ class StoppingRow:
 
 @dataclass(frozen=True)
 class CameraRow:
-    """Single views of random cameras at a distance, beside images of the data set's camera from the same directions.
+    """Single views of random cameras at a distance in radii, beside images of the data set's camera from the same directions.
 
-    Attributes:
-        distance: in radii.
-        views: number of views; the next six are those of `eval.checks.camera.summary`.
-        accuracy, own_accuracy: of these views, and of the data set's own.
-        difference: of the two.
-        interval: of the difference, 95 % over objects.
+    `own_accuracy` is that of the data set's camera; `interval`, 95 % over objects, is of the difference. For the others see
+    `eval.checks.camera.summary`.
     """
 
     distance: float
@@ -114,15 +106,7 @@ class Latency:
 
 @dataclass(frozen=True)
 class AgentPromises:
-    """What an agent promises, measured; `agent.json`.
-
-    Attributes:
-        walks: by policy, walks of an agent beside those on view tables.
-        stopping: by policy.
-        camera: by distance.
-        latency_ms: of decisions.
-        settings: of the check.
-    """
+    """What an agent promises, measured; `agent.json`. `walks`, beside those on view tables, and `stopping` are by policy."""
 
     walks: dict[str, Agreement]
     stopping: dict[str, list[StoppingRow]]

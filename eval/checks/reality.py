@@ -20,7 +20,7 @@ from data_pipeline.progress import console, progress_bar
 from eval.checks.records import named
 from eval.checks.scenes import CONDITIONS, UPPER, Condition, Placed, reachable_in, version, views_in
 from eval.checks.transfer import STRANGER, matched
-from eval.checks.walks import BASELINE, Observer, Walker, Walks, with_interval
+from eval.checks.walks import BASELINE, AccuracyRow, Observer, Walker, Walks, with_interval
 from eval.numbers.confidence import stopping
 from mevs_jax.agent.core import can_run
 from mevs_jax.selection.loop import ViewTable
@@ -65,28 +65,18 @@ class Stop:
 
 
 @dataclass(frozen=True)
-class SceneRow:
-    """Accuracy of a policy in a condition, with 95 % intervals over objects.
+class SceneRow(AccuracyRow):
+    """Accuracy in a condition of a policy, by its part in the table: random, thesis or best.
 
     Attributes:
-        condition: its name.
-        policy: the policy's part in the table: random, thesis or best.
         name: of the policy.
-        views: number of views.
-        accuracy, gain: accuracy, and its difference from random selection.
-        stop: of the policy's whole walks.
+        stop: of its whole walks.
         loss: against perfect images and all views; None where the policy cannot run there.
         loss_there: against perfect images of the views that can be reached.
     """
 
     condition: str
-    policy: str
     name: str
-    views: int
-    accuracy: float
-    interval: list[float]
-    gain: float
-    gain_interval: list[float]
     stop: Stop
     loss: float | None = named(omitted=True)
     loss_interval: list[float] | None = named(omitted=True)
@@ -110,13 +100,10 @@ class Reality:
     """Trained systems in scenes; `reality.json`.
 
     Attributes:
-        data: the objects.
         objects, strangers: number of objects that were seen, and of those of classes that the systems do not know.
         left_out: reasons by name.
-        notes: on the data.
         conditions: titles by name.
-        systems: rows by system.
-        won_back: rows of all systems but the first.
+        systems, won_back: by system, the latter of all but the first.
     """
 
     data: str
@@ -317,8 +304,8 @@ def _rows(system: TrainedSystem, walks: dict[str, dict[str, Walks]], conditions:
                     with_interval(base.accuracy[:, views - 1] - right) if base else (None, None)
                     for base in (perfect, there)
                 ]
-                known = one.name, part, names[not one.turned][part], views
-                rows.append(SceneRow(*known, *with_interval(right), *with_interval(gain), stop, *losses[0], *losses[1]))
+                shown = *with_interval(right), *with_interval(gain), one.name, names[not one.turned][part], stop
+                rows.append(SceneRow(part, views, *shown, *losses[0], *losses[1]))
     return rows
 
 

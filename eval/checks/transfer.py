@@ -94,7 +94,6 @@ class StrangerRow:
     """How well strangeness tells objects of unknown classes from the others after some random views.
 
     Attributes:
-        views: number of views.
         auroc: area under the ROC curve (½ is chance, 1 perfect) of one walk of each object, averaged over draws.
         unknown_found, known_refused: shares of unknown and of known objects that are stranger than 95 % of the validation
             objects.
@@ -136,17 +135,13 @@ class Transfer:
     """A trained system on objects of any makers; `transfer.json`.
 
     Attributes:
-        system, data: which.
         posed: whether the yaw of the objects is known.
         metres: in one unit of the files; None where sizes are unknown.
         best: the policy that the system names as its best.
         objects, known, strangers: number of all objects, of those of known and of unknown classes.
-        classes: number of objects by class of the data.
-        known_as: the system's class, by class of the data.
+        classes, known_as: number of objects, and the system's class, by class of the data.
         left_out: reasons by name.
-        notes: on the data.
-        single_view, policies, by_class, calibration, stopping, answers: of the objects of known classes.
-        unknown_objects: None where there are none, or the system does not know how strange they are.
+        unknown_objects: None where there are none, or the system cannot tell them; all that follows on walks is of known ones.
     """
 
     system: str

@@ -178,16 +178,7 @@ class Walker:
 
 @dataclass(frozen=True)
 class AccuracyRow:
-    """Accuracy of a policy after some views, and its difference from random selection, paired by object.
-
-    Attributes:
-        policy: its name.
-        views: number of views.
-        accuracy: over all objects and walks.
-        interval: of the accuracy, 95 % over objects.
-        gain: accuracy less that of random selection.
-        gain_interval: of the gain, 95 % over objects.
-    """
+    """Accuracy of a policy after some views, and its gain over random selection, paired by object; with 95 % intervals."""
 
     policy: str
     views: int
