@@ -24,7 +24,6 @@ from data_pipeline.files import check_of_file, read_json, write_json
 from data_pipeline.objects.sources import load_object
 from data_pipeline.progress import console
 from eval.checks.agent import AgentPromises, compare_walks, latency, recognised, stopping
-from eval.checks.records import as_json
 from eval.consistency import check_classifier, check_evaluated_with, check_made_with
 from eval.numbers.policies import csv_of
 from eval.numbers.study import reachable_views, run_study
@@ -48,6 +47,7 @@ from train.results.chance import warn_of_chance
 from train.results.finite import place_not_finite
 from train.results.identity import made_by, summary_of, why_other
 from train.results.kept import keep_beside, kept, kept_json
+from train.results.records import as_json
 from train.running.devices import Layout, check_batch, device_mesh
 from train.running.log import read_history
 from train.step import Task

@@ -17,7 +17,6 @@ from data_pipeline.objects.formats import Up
 from data_pipeline.objects.mesh import Mesh, ObjectEntry
 from data_pipeline.objects.sources import load_object, objects_to_test
 from data_pipeline.progress import console, progress_bar
-from eval.checks.records import named
 from eval.checks.scenes import CONDITIONS, UPPER, Condition, Placed, reachable_in, version, views_in
 from eval.checks.transfer import STRANGER, matched
 from eval.checks.walks import BASELINE, AccuracyRow, Observer, Walker, Walks, with_interval
@@ -25,6 +24,7 @@ from eval.numbers.confidence import stopping
 from mevs_jax.agent.core import can_run
 from mevs_jax.selection.loop import ViewTable
 from mevs_jax.trained import TrainedSystem
+from train.results.records import named
 
 VIEWS = (1, 2, 4)
 """Numbers of views after which accuracy is reported."""

@@ -20,7 +20,6 @@ from data_pipeline.objects.names import plain_class
 from data_pipeline.objects.sources import load_object, objects_to_test
 from data_pipeline.progress import progress_bar
 from eval.checks.agent import STOPS
-from eval.checks.records import named
 from eval.checks.walks import BASELINE, AccuracyRow, Observer, Walker, Walks, rows_of, with_interval
 from eval.numbers.confidence import stopping
 from eval.system import USABLE
@@ -28,6 +27,7 @@ from mevs_jax.agent.core import can_run
 from mevs_jax.geometry.cameras import pixel_directions
 from mevs_jax.selection.loop import ViewTable
 from mevs_jax.trained import TrainedSystem
+from train.results.records import named
 
 VIEWS = (1, 2, 3, 4, 8)
 """Numbers of views after which accuracy is reported."""
@@ -272,11 +272,10 @@ def check_transfer(
         raise DataError(f"{data} has no object left of a class that the system knows; {len(objects.left_out)} left out")
     of_known = jax.tree.map(lambda leaf: leaf[known], objects.tables)
     best = system.description.best if posed else system.description.best_unposed
-    walker, walks = Walker(system), {}
-    for name in dict.fromkeys((BASELINE, *USABLE, best)):
-        if can_run(system, name, posed):
-            times = draws if name == BASELINE else 1
-            walks[name] = walker.walk(of_known, name, max_views, posed=posed, draws=times)
+    walker = Walker(system)
+    policies = [name for name in dict.fromkeys((BASELINE, *USABLE, best)) if can_run(system, name, posed)]
+    times = {name: draws if name == BASELINE else 1 for name in policies}
+    walks = {name: walker.walk(of_known, name, max_views, posed=posed, draws=times[name]) for name in policies}
     return Transfer(
         system=system.name,
         data=data,

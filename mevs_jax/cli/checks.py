@@ -59,9 +59,9 @@ def agent(call: Invocation) -> None:
 def transfer(options: TransferOptions) -> None:
     """Measures a trained system on other objects."""
     from data_pipeline.files import write_json
-    from eval.checks.records import as_json
     from eval.checks.transfer import check_transfer
     from mevs_jax.cli.tools import load_system
+    from train.results.records import as_json
 
     if options.max_views < 1 or options.draws < 1:
         raise Unusable("--max-views and --draws must be at least 1")
@@ -147,8 +147,8 @@ def reality(options: RealityOptions) -> None:
     from data_pipeline.files import write_json
     from data_pipeline.lock import locked
     from eval.checks.reality import RealityConfig, check_reality
-    from eval.checks.records import as_json
     from mevs_jax.cli.tools import load_system
+    from train.results.records import as_json
 
     if options.objects < 0 or options.objects == 1 or options.draws < 1:
         raise Unusable("--objects must be at least 2, or 0 for all, and --draws at least 1")

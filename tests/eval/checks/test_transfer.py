@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import json
+
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -10,9 +12,10 @@ import mevs_jax
 from data_pipeline.errors import DataError
 from data_pipeline.objects.recipes import FurniturePiece
 from data_pipeline.objects.sources import objects_to_test
-from eval.checks.transfer import STRANGER, auroc, check_transfer, matched, strangers
+from eval.checks.transfer import STRANGER, Transfer, auroc, check_transfer, matched, strangers
 from mevs_jax.selection.loop import ViewTable
 from tests.mevs_jax.trained import making
+from train.results.records import as_json, from_json
 
 
 def write_off(path, vertices, faces) -> None:
@@ -51,6 +54,13 @@ def test_objects_are_matched_counted_and_named(found):
     assert list(found.left_out) == ["spikes/two.off"]
     assert found.classes == {"Chairs": 2, "couch": 2, "spikes": 1}
     assert [row.name for row in found.by_class] == ["chair", "sofa"]
+
+
+def test_results_are_what_json_keeps_of_them(found):
+    kept = json.loads(json.dumps(as_json(found)))
+    assert as_json(from_json(Transfer, kept, "transfer.json")) == kept
+    assert [row["class"] for row in kept["by_class"]] == ["chair", "sofa"]
+    assert len(kept["by_class"][0]["chosen"]) == 3
 
 
 def test_other_furniture_of_known_kinds_is_recognised(found):
