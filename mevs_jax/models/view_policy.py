@@ -9,6 +9,9 @@ predicts the change of that class's log-odds if the object is of that class. The
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import reduce
+from itertools import combinations_with_replacement
+from operator import mul
 from typing import Any, Literal
 
 import jax
@@ -40,16 +43,9 @@ def utility_of(
 
 def direction_features(directions: Float[AnyArray, "*batch 3"]) -> Float[Array, "*batch 19"]:
     """All monomials of degree 1 to 3 of a unit vector: a linear layer on them can tell top from side and corner from face."""
-    directions = jnp.asarray(directions)
-    found = [directions[..., i] for i in range(3)]
-    for i in range(3):
-        for j in range(i, 3):
-            found.append(directions[..., i] * directions[..., j])
-    for i in range(3):
-        for j in range(i, 3):
-            for k in range(j, 3):
-                found.append(directions[..., i] * directions[..., j] * directions[..., k])
-    return jnp.stack(found, axis=-1)
+    coordinates = [jnp.asarray(directions)[..., axis] for axis in range(3)]
+    factors = (these for degree in (1, 2, 3) for these in combinations_with_replacement(coordinates, degree))
+    return jnp.stack([reduce(mul, these) for these in factors], axis=-1)
 
 
 def _without_azimuth(directions: Float[Array, "*batch candidates 3"]) -> Float[Array, "*batch candidates 3"]:
