@@ -7,6 +7,7 @@ the camera. Gradients are computed in forward mode by default, which suits two p
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 
 import flax.struct
 import jax
@@ -59,7 +60,8 @@ class _Walk:
     def valued(self, value: Array) -> _Walk:
         """With the objective at its pose, which is kept if it is the best, and until the path's end."""
         better = value > self.best_value
-        return self.replace(  # type: ignore[attr-defined]
+        return replace(
+            self,
             best=jnp.where(better, self.pose, self.best),
             best_value=jnp.where(better, value, self.best_value),
             path_values=jnp.where(jnp.arange(len(self.path_values)) >= self.step, value, self.path_values),
@@ -100,9 +102,8 @@ def ascend(
         update, moments = optimiser.update(-slope, walk.moments)
         gain = value - walk.best_value > tolerance * jnp.abs(value)
         pose = orbit(walk.pose, update)
-        return walk.valued(
-            value
-        ).replace(  # type: ignore[attr-defined]
+        return replace(
+            walk.valued(value),
             pose=pose,
             moments=moments,
             calm=jnp.where(gain, 0, walk.calm + 1),
