@@ -22,7 +22,7 @@ from data_pipeline.errors import DataError, Diverged, Unreadable
 from data_pipeline.files import check_of_file, read_json, write_json
 from data_pipeline.objects.sources import load_object
 from data_pipeline.progress import console
-from eval.checks.agent import compare_walks, latency, recognised, stopping
+from eval.checks.agent import AgentPromises, compare_walks, latency, recognised, stopping
 from eval.consistency import check_classifier, check_evaluated_with, check_made_with
 from eval.numbers.policies import csv_of
 from eval.numbers.study import reachable_views, run_study
@@ -45,6 +45,7 @@ from train.results.chance import warn_of_chance
 from train.results.finite import place_not_finite
 from train.results.identity import made_by, summary_of, why_other
 from train.results.kept import keep_beside, kept, kept_json
+from train.results.records import as_json
 from train.running.devices import Layout, check_batch, device_mesh
 from train.running.log import read_history
 from train.step import Task
@@ -340,7 +341,7 @@ def check_live(settings: Settings, out: Path) -> dict[str, Agreement]:
     return found
 
 
-def check_agent(settings: Settings, out: Path) -> dict[str, Any]:
+def check_agent(settings: Settings, out: Path) -> AgentPromises:
     """Measures what an agent with the run's system promises, on test objects; writes `agent.json`."""
     folder, config = make_system(settings, out), settings.agent
     if min(config.objects, config.shots, config.calls, config.max_views) < 1:
@@ -355,17 +356,14 @@ def check_agent(settings: Settings, out: Path) -> dict[str, Any]:
         )
     meshes = [(load_object(entries[tables.names[index]]), int(tables.labels[index])) for index in chosen]
     policies = [name for name in USABLE if name in system.policies]
-    found = {
-        "walks": {name: asdict(walks) for name, walks in compare_walks(system, out / "data", config, policies).items()},
-        "stopping": {
-            name: stopping(system, tables, name, config.max_views)
-            for name in dict.fromkeys((system.description.best, "random"))
-        },
-        "camera": recognised(system, meshes, config),
-        "latency_ms": latency(system, out / "data", config.calls),
-        "settings": asdict(config),
+    walks = compare_walks(system, out / "data", config, policies)
+    stops = {
+        name: stopping(system, tables, name, config.max_views)
+        for name in dict.fromkeys((system.description.best, "random"))
     }
-    write_json(out / "agent.json", found)
+    camera, times = recognised(system, meshes, config), latency(system, out / "data", config.calls)
+    found = AgentPromises(walks, stops, camera, times, config)
+    write_json(out / "agent.json", as_json(found))
     return found
 
 

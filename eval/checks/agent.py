@@ -25,10 +25,10 @@ from data_pipeline.errors import DataError
 from data_pipeline.objects.mesh import Mesh
 from data_pipeline.progress import progress_bar
 from eval.checks.camera import Pair, pairs, summary
-from eval.checks.walks import Walker, as_table, beliefs_along
-from eval.numbers.comparison import intervals
+from eval.checks.walks import Walker, as_table, beliefs_along, with_interval
 from eval.numbers.confidence import stopping as by_risk
 from eval.tables import ViewTables
+from eval.walks.live import Agreement
 from mevs_jax.agent import Agent
 from mevs_jax.selection.loop import ViewTable, select_from_table
 from mevs_jax.trained import TrainedSystem
@@ -54,18 +54,65 @@ class AgentConfig:
 
 
 @dataclass(frozen=True)
-class WalkAgreement:
-    """Walks of an agent beside those of the selection loop on tables.
+class StoppingRow:
+    """Walks that stop at a calibrated probability.
 
     Attributes:
-        walks: number of walks.
-        same: how many visit the same views.
-        largest_difference: of the probabilities, along the walks that are the same.
+        error: share of wrong answers among the walks that stop; 0 where none does.
+        excess: 95 % interval over objects of the share of walks that stop and are wrong, less the share that is promised.
+        stopped: share of walks that stop.
+        views, accuracy: of all walks.
     """
 
-    walks: int
-    same: int
-    largest_difference: float
+    stop: float
+    promised_error: float
+    error: float
+    excess: list[float]
+    stopped: float
+    views: float
+    accuracy: float
+
+
+@dataclass(frozen=True)
+class CameraRow:
+    """Single views of random cameras at a distance in radii, beside images of the data set's camera from the same directions.
+
+    `own_accuracy` is that of the data set's camera; `interval`, 95 % over objects, is of the difference. For the others see
+    `eval.checks.camera.summary`.
+    """
+
+    distance: float
+    views: int
+    overlap_median: float
+    overlap_low: float
+    error_median: float
+    unknown_median: float
+    visible_median: float
+    visible_low: float
+    accuracy: float
+    own_accuracy: float
+    difference: float
+    interval: list[float]
+
+
+@dataclass(frozen=True)
+class Latency:
+    """Time in ms from a 640×480 depth image to the next pose, its 50th and 99th percentile, and the number of compilations."""
+
+    p50: float
+    p99: float
+    compilations: float
+
+
+@dataclass(frozen=True)
+class AgentPromises:
+    """What an agent promises, measured; `agent.json`. `walks`, beside those on view tables, and `stopping` are by policy."""
+
+    walks: dict[str, Agreement]
+    stopping: dict[str, list[StoppingRow]]
+    camera: list[CameraRow]
+    latency_ms: Latency
+    settings: AgentConfig
 
 
 def placed(pose: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, "4 4"]:
@@ -114,7 +161,7 @@ def table_of(system: TrainedSystem, depth: Float[np.ndarray, "views side side"],
 
 def compare_walks(
     system: TrainedSystem, data: Path, config: AgentConfig, policies: Sequence[str]
-) -> dict[str, WalkAgreement]:
+) -> dict[str, Agreement]:
     """Walks test objects by an agent and on tables, object i from view i modulo the number of views."""
     source = open_split(data, "test")
     objects = min(config.objects, len(source))
@@ -141,12 +188,13 @@ def compare_walks(
                 expected = probabilities_along(system, table, views, name)
                 found[name].append((same, float(np.abs(probabilities - expected).max())))
             bar.advance(line)
-    return {
-        name: WalkAgreement(
-            len(rows), sum(same for same, _ in rows), max((gap for same, gap in rows if same), default=0.0)
-        )
-        for name, rows in found.items()
-    }
+    return {name: _agreement(rows) for name, rows in found.items()}
+
+
+def _agreement(rows: Sequence[tuple[bool, float]]) -> Agreement:
+    """Of walks: whether each is the same, and how far its probabilities are apart."""
+    gaps = [gap for same, gap in rows if same]
+    return Agreement(len(rows), len(gaps), max(gaps, default=0.0))
 
 
 def probabilities_along(system: TrainedSystem, table: ViewTable, views: Sequence[int], policy: str) -> np.ndarray:
@@ -158,42 +206,26 @@ def probabilities_along(system: TrainedSystem, table: ViewTable, views: Sequence
 
 def stopping(
     system: TrainedSystem, tables: ViewTables, policy: str, max_views: int, stops: Sequence[float] = STOPS
-) -> list[dict[str, Any]]:
+) -> list[StoppingRow]:
     """How often the walks that stop at a calibrated probability are wrong, over all test objects and start views.
 
     Only for systems that add logits, whose beliefs follow from view tables.
-
-    Returns:
-        For each probability: the promised and the measured error with its 95 % interval over objects, the share of walks that
-        stopped, their mean number of views, and the accuracy of all walks.
     """
     walks = Walker(system).walk(tables.stacked(), policy, max_views)
     rows = by_risk(walks.confidence, walks.right, [1 - stop for stop in stops])
     return [
-        {
-            "stop": stop,
-            "promised_error": row["risk"],
-            "error": row["error"] or 0.0,  # none stopped
-            "excess": row["excess"],
-            "stopped": row["sure"],
-            "views": row["views"],
-            "accuracy": row["accuracy"],
-        }
+        StoppingRow(stop, row["risk"], row["error"] or 0.0, row["excess"], row["sure"], row["views"], row["accuracy"])
         for stop, row in zip(stops, rows, strict=True)
     ]
 
 
-def recognised(system: TrainedSystem, meshes: Sequence[tuple[Mesh, int]], config: AgentConfig) -> list[dict[str, Any]]:
-    """Single views of random cameras, beside images of the data set's camera from the same directions.
+def recognised(system: TrainedSystem, meshes: Sequence[tuple[Mesh, int]], config: AgentConfig) -> list[CameraRow]:
+    """Recognises objects in single views of random cameras.
 
     Args:
         system: that recognises them.
         meshes: objects with their labels.
         config: how many cameras, and how far away.
-
-    Returns:
-        For each distance: overlap of the masks and error of depth (`eval.checks.camera.summary`), accuracy by the camera and by
-        the data set's own, and the 95 % interval over objects of their difference.
     """
     camera, rows = system.description.camera, []
     if any(not 1 < distance < 100 for distance in config.distances):
@@ -210,15 +242,16 @@ def recognised(system: TrainedSystem, meshes: Sequence[tuple[Mesh, int]], config
                     answers = [label_of(*images) for images in _images(taken, config.shots)]
                     right[:, number] = (np.stack(answers) == label)[:, : len(taken)].mean(axis=1)
                 bar.advance(line)
+        difference, interval = with_interval(right[0] - right[1])
         rows.append(
-            {"distance": distance}
-            | summary(found)
-            | {
-                "accuracy": float(right[0].mean()),
-                "own_accuracy": float(right[1].mean()),
-                "difference": float((right[0] - right[1]).mean()),
-                "interval": intervals(right[0] - right[1]),
-            }
+            CameraRow(
+                distance,
+                **summary(found),
+                accuracy=float(right[0].mean()),
+                own_accuracy=float(right[1].mean()),
+                difference=difference,
+                interval=interval,
+            )
         )
     return rows
 
@@ -230,8 +263,8 @@ def _images(taken: Sequence[Pair], shots: int) -> list[tuple[np.ndarray, np.ndar
     return [(np.stack(depth), poses) for depth in zip(*((pair.view.depth, pair.truth) for pair in filled), strict=True)]
 
 
-def latency(system: TrainedSystem, data: Path, calls: int = 200, policy: str = "best") -> dict[str, float]:
-    """Time in ms from a 640×480 depth image to the next pose: 50th and 99th percentile, and the number of compilations."""
+def latency(system: TrainedSystem, data: Path, calls: int = 200, policy: str = "best") -> Latency:
+    """Measures the time of decisions; the images are those of a test object."""
     agent = system.agent(policy, stop=2.0, max_views=8)
     agent.warm_up()
     example = open_split(data, "test")[0]
@@ -262,5 +295,4 @@ def latency(system: TrainedSystem, data: Path, calls: int = 200, policy: str = "
         agent.decide()
         times.append(1e3 * (time.perf_counter() - begun))
     jax.monitoring.unregister_event_duration_listener(listen)
-    p50, p99 = np.percentile(times, (50, 99))
-    return {"p50": float(p50), "p99": float(p99), "compilations": float(len(compiled))}
+    return Latency(*map(float, np.percentile(times, (50, 99))), float(len(compiled)))

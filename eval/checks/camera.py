@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -212,17 +213,11 @@ def pairs(
 
 
 def agreements(
-    meshes: Iterable[Mesh],
-    distance: float,
-    *,
-    shots: int = 20,
-    camera: ViewCamera = CAMERA,
-    size: tuple[int, int] | None = None,
-    seed: int = 0,
+    meshes: Iterable[Mesh], distance: float, *, camera: ViewCamera = CAMERA, seed: int = 0, **options: Any
 ) -> Iterator[Agreement]:
     """Compares canonical views of random cameras with the truth; arguments as of `pairs`."""
     for number, mesh in enumerate(meshes):
-        for pair in pairs(mesh, distance, shots=shots, camera=camera, size=size, seed=(seed, number)):
+        for pair in pairs(mesh, distance, camera=camera, seed=(seed, number), **options):
             yield pair.agreement(camera)
 
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from jaxtyping import Float
@@ -20,11 +19,11 @@ from data_pipeline.objects.sources import load_object, objects_to_test
 from data_pipeline.progress import console, progress_bar
 from eval.checks.scenes import CONDITIONS, UPPER, Condition, Placed, reachable_in, version, views_in
 from eval.checks.transfer import STRANGER, matched
-from eval.checks.walks import BASELINE, Observer, Walker, Walks
-from eval.numbers.comparison import intervals
+from eval.checks.walks import BASELINE, AccuracyRow, Observer, Walker, Walks, with_interval
 from eval.numbers.confidence import stopping
 from mevs_jax.selection.loop import ViewTable
 from mevs_jax.trained import TrainedSystem
+from train.results.records import named
 
 VIEWS = (1, 2, 4)
 """Numbers of views after which accuracy is reported."""
@@ -54,6 +53,68 @@ class RealityConfig:
     seed: int = 0
 
 
+@dataclass(frozen=True)
+class Stop:
+    """Walks that stop at a calibrated probability: how often they are wrong (None if none stops), their share, and views."""
+
+    at: float
+    error: float | None
+    stopped: float
+    views: float
+
+
+@dataclass(frozen=True)
+class SceneRow(AccuracyRow):
+    """Accuracy in a condition of a policy, by its part in the table: random, thesis or best.
+
+    Attributes:
+        name: of the policy.
+        stop: of its whole walks.
+        loss: against perfect images and all views; None where the policy cannot run there.
+        loss_there: against perfect images of the views that can be reached.
+    """
+
+    condition: str
+    name: str
+    stop: Stop
+    loss: float | None = named(omitted=True)
+    loss_interval: list[float] | None = named(omitted=True)
+    loss_there: float | None = named(omitted=True)
+    loss_there_interval: list[float] | None = named(omitted=True)
+
+
+@dataclass(frozen=True)
+class WonRow:
+    """Accuracy of a system less that of the first one, on the same images, with its 95 % interval over objects."""
+
+    condition: str
+    policy: str
+    views: int
+    difference: float
+    interval: list[float]
+
+
+@dataclass(frozen=True)
+class Reality:
+    """Trained systems in scenes; `reality.json`.
+
+    Attributes:
+        objects, strangers: number of objects that were seen, and of those of classes that the systems do not know.
+        left_out: reasons by name.
+        conditions: titles by name.
+        systems, won_back: by system, the latter of all but the first.
+    """
+
+    data: str
+    objects: int
+    strangers: int
+    left_out: dict[str, str]
+    notes: list[str]
+    conditions: dict[str, str]
+    systems: dict[str, list[SceneRow]]
+    won_back: dict[str, list[WonRow]]
+
+
 def conditions_of(names: Sequence[str]) -> tuple[Condition, ...]:
     """Returns the conditions of these names, and perfect images, which all are compared with.
 
@@ -74,7 +135,7 @@ def check_reality(
     folder: Path,
     config: RealityConfig,
     up: Up = "auto",
-) -> dict[str, Any]:
+) -> Reality:
     """Measures systems on test objects in every condition; all see the same images.
 
     Args:
@@ -108,16 +169,16 @@ def check_reality(
     for name, system in systems.items():
         walker = Walker(system)
         walks[name] = {one.name: _walks(walker, tables[name][one.name], one, config) for one in conditions}
-    return {
-        "data": data,
-        "objects": len(meshes),
-        "strangers": len(source.entries) - len(entries),
-        "left_out": left_out,
-        "notes": [*source.notes, *source.said],
-        "conditions": {one.name: one.title for one in conditions},
-        "systems": {name: _rows(system, walks[name], conditions) for name, system in systems.items()},
-        "won_back": {name: _won_back(systems, walks, conditions, name) for name in list(systems)[1:]},
-    }
+    return Reality(
+        data=data,
+        objects=len(meshes),
+        strangers=len(source.entries) - len(entries),
+        left_out=left_out,
+        notes=[*source.notes, *source.said],
+        conditions={one.name: one.title for one in conditions},
+        systems={name: _rows(system, walks[name], conditions) for name, system in systems.items()},
+        won_back={name: _won_back(walks[next(iter(systems))], walks[name]) for name in list(systems)[1:]},
+    )
 
 
 def meshes_of(entries: Sequence[ObjectEntry], most: int) -> tuple[list[tuple[ObjectEntry, Mesh]], dict[str, str]]:
@@ -228,62 +289,35 @@ def _walks(walker: Walker, tables: ViewTable, condition: Condition, config: Real
     return walks
 
 
-def _rows(
-    system: TrainedSystem, walks: dict[str, dict[str, Walks]], conditions: Sequence[Condition]
-) -> list[dict[str, Any]]:
-    """Accuracy, gain over random selection, loss against perfect images, and error of those who stop; with 95 % intervals.
-
-    `loss` is against perfect images and all views, `loss_there` against perfect images of the views that can be reached.
-    """
+def _rows(system: TrainedSystem, walks: dict[str, dict[str, Walks]], conditions: Sequence[Condition]) -> list[SceneRow]:
     rows, names = [], {posed: _policies(system, posed) for posed in (True, False)}
     for one in conditions:
         for part, found in walks[one.name].items():
-            bases = {"loss": walks["clean"].get(part), "loss_there": walks["upper" if one.upper else "clean"].get(part)}
+            perfect, there = walks["clean"].get(part), walks["upper" if one.upper else "clean"].get(part)
             (stops,) = stopping(found.confidence, found.right, [1 - STOP])
-            for views in (views for views in VIEWS if views <= found.right.shape[-1]):
+            stop = Stop(STOP, stops["error"], stops["sure"], stops["views"])
+            for views in _numbers(found):
                 right = found.accuracy[:, views - 1]
                 gain = right - walks[one.name][BASELINE].accuracy[:, views - 1]
-                row = {
-                    "condition": one.name,
-                    "policy": part,
-                    "name": names[not one.turned][part],
-                    "views": views,
-                    "accuracy": float(right.mean()),
-                    "interval": intervals(right),
-                    "gain": float(gain.mean()),
-                    "gain_interval": intervals(gain),
-                    "stop": {"at": STOP, "error": stops["error"], "stopped": stops["sure"], "views": stops["views"]},
-                }
-                for key, base in bases.items():
-                    if base is not None:
-                        lost = base.accuracy[:, views - 1] - right
-                        row |= {key: float(lost.mean()), f"{key}_interval": intervals(lost)}
-                rows.append(row)
+                losses = [
+                    with_interval(base.accuracy[:, views - 1] - right) if base else (None, None)
+                    for base in (perfect, there)
+                ]
+                shown = *with_interval(right), *with_interval(gain), one.name, names[not one.turned][part], stop
+                rows.append(SceneRow(part, views, *shown, *losses[0], *losses[1]))
     return rows
 
 
-def _won_back(
-    systems: Mapping[str, TrainedSystem],
-    walks: Mapping[str, dict[str, dict[str, Walks]]],
-    conditions: Sequence[Condition],
-    name: str,
-) -> list[dict[str, Any]]:
-    """Accuracy of a system less that of the first one, on the same images, with 95 % intervals over objects."""
-    base, rows = next(iter(systems)), []
-    for one in conditions:
-        for part in walks[name][one.name]:
-            before = walks[base][one.name].get(part)
-            if before is None:
-                continue
-            for views in (views for views in VIEWS if views <= before.right.shape[-1]):
-                gain = walks[name][one.name][part].accuracy[:, views - 1] - before.accuracy[:, views - 1]
-                rows.append(
-                    {
-                        "condition": one.name,
-                        "policy": part,
-                        "views": views,
-                        "difference": float(gain.mean()),
-                        "interval": intervals(gain),
-                    }
-                )
-    return rows
+def _numbers(walks: Walks) -> list[int]:
+    return [views for views in VIEWS if views <= walks.right.shape[-1]]
+
+
+def _won_back(base: dict[str, dict[str, Walks]], walks: dict[str, dict[str, Walks]]) -> list[WonRow]:
+    """What a system wins over the first one, by walks of both by condition and policy."""
+    return [
+        WonRow(condition, part, views, *with_interval((found.accuracy - before.accuracy)[:, views - 1]))
+        for condition, by_part in walks.items()
+        for part, found in by_part.items()
+        if (before := base[condition].get(part)) is not None
+        for views in _numbers(before)
+    ]

@@ -5,12 +5,11 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Int
+from jaxtyping import Float, Int
 
 from data_pipeline.capture.casting import Rig, capture
 from data_pipeline.dataset.inputs import metric_depth
@@ -21,13 +20,13 @@ from data_pipeline.objects.names import plain_class
 from data_pipeline.objects.sources import load_object, objects_to_test
 from data_pipeline.progress import progress_bar
 from eval.checks.agent import STOPS
-from eval.checks.walks import BASELINE, Observer, Walker, Walks, rows_of
-from eval.numbers.comparison import intervals
+from eval.checks.walks import BASELINE, AccuracyRow, Observer, Walker, Walks, rows_of, with_interval
 from eval.numbers.confidence import stopping
 from eval.system import USABLE
 from mevs_jax.geometry.cameras import pixel_directions
 from mevs_jax.selection.loop import ViewTable
 from mevs_jax.trained import TrainedSystem
+from train.results.records import named
 
 VIEWS = (1, 2, 3, 4, 8)
 """Numbers of views after which accuracy is reported."""
@@ -52,6 +51,117 @@ class Objects:
     labels: Int[np.ndarray, " objects"]
     tables: ViewTable
     left_out: dict[str, str]
+
+
+@dataclass(frozen=True)
+class ClassRow:
+    """Accuracy for the objects of one known class, from single views and by the best policy after 1, 2, 3 and 4 views."""
+
+    name: str = named("class")
+    objects: int
+    single: float
+    chosen: Float[np.ndarray, " views"]
+
+
+@dataclass(frozen=True)
+class CalibrationRow:
+    """Mean calibrated probability beside accuracy; `interval` is of `too_sure`, their difference, 95 % over objects."""
+
+    policy: str
+    views: int
+    confidence: float
+    accuracy: float
+    too_sure: float
+    interval: list[float]
+
+
+@dataclass(frozen=True)
+class StoppingRow:
+    """Walks that stop at the probability `stop`, 1 − risk; as `eval.numbers.confidence.stopping` has it."""
+
+    risk: float
+    sure: float
+    error: float | None
+    excess: list[float]
+    accuracy: float
+    views: float
+    stop: float
+
+
+@dataclass(frozen=True)
+class StrangerRow:
+    """How well strangeness tells objects of unknown classes from the others after some random views.
+
+    Attributes:
+        auroc: area under the ROC curve (½ is chance, 1 perfect) of one walk of each object, averaged over draws.
+        unknown_found, known_refused: shares of unknown and of known objects that are stranger than 95 % of the validation
+            objects.
+    """
+
+    views: int
+    auroc: float
+    unknown_found: float
+    known_refused: float
+
+
+@dataclass(frozen=True)
+class Strangers:
+    """Number of objects of unknown classes, and how well they are told from the others."""
+
+    objects: int
+    after: list[StrangerRow]
+
+
+@dataclass(frozen=True)
+class Answer:
+    """How often one known object was right after one random view, and at the end of the best policy's walks."""
+
+    object: str
+    single: float
+    last: float
+
+
+@dataclass(frozen=True)
+class SingleView:
+    """Accuracy of single views, and its 95 % interval over objects."""
+
+    accuracy: float
+    interval: list[float]
+
+
+@dataclass(frozen=True)
+class Transfer:
+    """A trained system on objects of any makers; `transfer.json`.
+
+    Attributes:
+        posed: whether the yaw of the objects is known.
+        metres: in one unit of the files; None where sizes are unknown.
+        best: the policy that the system names as its best.
+        objects, known, strangers: number of all objects, of those of known and of unknown classes.
+        classes, known_as: number of objects, and the system's class, by class of the data.
+        left_out: reasons by name.
+        unknown_objects: None where there are none, or the system cannot tell them; all that follows on walks is of known ones.
+    """
+
+    system: str
+    data: str
+    posed: bool
+    metres: float | None
+    best: str
+    objects: int
+    known: int
+    strangers: int
+    classes: dict[str, int]
+    known_as: dict[str, str]
+    left_out: dict[str, str]
+    notes: list[str]
+    single_view: SingleView
+    policies: list[AccuracyRow]
+    by_class: list[ClassRow]
+    calibration: list[CalibrationRow]
+    stopping: list[StoppingRow]
+    unknown_objects: Strangers | None
+    answers: list[Answer]
 
 
 def matched(classes: Sequence[str], known: Sequence[str], renamed: Mapping[str, str]) -> dict[str, int]:
@@ -136,7 +246,7 @@ def check_transfer(
     metres: float = np.nan,
     max_views: int = 8,
     draws: int = 4,
-) -> dict[str, Any]:
+) -> Transfer:
     """Measures a system on other objects.
 
     Args:
@@ -150,9 +260,6 @@ def check_transfer(
         max_views: number of views of each walk.
         draws: random walks from each first view.
 
-    Returns:
-        What `transfer.json` holds: counts, accuracies, differences from random selection, calibration, classes, strangers.
-
     Raises:
         DataError: if the data cannot be used.
     """
@@ -164,90 +271,68 @@ def check_transfer(
         raise DataError(f"{data} has no object left of a class that the system knows; {len(objects.left_out)} left out")
     of_known = jax.tree.map(lambda leaf: leaf[known], objects.tables)
     best = system.description.best if posed else system.description.best_unposed
+    walker = Walker(system)
     policies = [name for name in dict.fromkeys((BASELINE, *USABLE, best)) if system.can_run(name, posed)]
-    walker, walks = Walker(system), {}
-    for name in policies:
-        times = draws if name == BASELINE else 1
-        walks[name] = walker.walk(of_known, name, max_views, posed=posed, draws=times)
-    single = walks[BASELINE].accuracy[:, 0]
-    return {
-        "system": system.name,
-        "data": data,
-        "posed": posed,
-        "metres": None if np.isnan(metres) or system.description.size is None else metres,
-        "best": best,
-        "objects": len(objects.names),
-        "known": int(known.sum()),
-        "strangers": int((~known).sum()),
-        "classes": dict(Counter(objects.folders)),
-        "known_as": {folder: system.classes[label] for folder, label in labels.items() if label != STRANGER},
-        "left_out": objects.left_out,
-        "notes": [*source.notes, *source.said],
-        "single_view": {"accuracy": float(single.mean()), "interval": intervals(single)},
-        "policies": rows_of(walks, VIEWS),
-        "by_class": _by_class(objects, known, system.classes, walks, best),
-        "calibration": _calibration(walks, (BASELINE, best)),
-        "stopping": [row | {"stop": 1 - row["risk"]} for row in _stops(walks[best])],
-        "unknown_objects": strangers(system, objects.tables, known),
-        "answers": _answers(objects, known, walks[best]),
-    }
+    times = {name: draws if name == BASELINE else 1 for name in policies}
+    walks = {name: walker.walk(of_known, name, max_views, posed=posed, draws=times[name]) for name in policies}
+    return Transfer(
+        system=system.name,
+        data=data,
+        posed=posed,
+        metres=None if np.isnan(metres) or system.description.size is None else metres,
+        best=best,
+        objects=len(objects.names),
+        known=int(known.sum()),
+        strangers=int((~known).sum()),
+        classes=dict(Counter(objects.folders)),
+        known_as={folder: system.classes[label] for folder, label in labels.items() if label != STRANGER},
+        left_out=objects.left_out,
+        notes=[*source.notes, *source.said],
+        single_view=SingleView(*with_interval(walks[BASELINE].accuracy[:, 0])),
+        policies=rows_of(walks, VIEWS),
+        by_class=_by_class(objects.labels[known], system.classes, walks[BASELINE].accuracy, walks[best].accuracy),
+        calibration=[row for name in dict.fromkeys((BASELINE, best)) for row in _calibration(name, walks[name])],
+        stopping=_stops(walks[best]),
+        unknown_objects=strangers(system, objects.tables, known),
+        answers=_answers(objects, known, walks[best]),
+    )
 
 
-def _stops(walks: Walks) -> list[dict[str, Any]]:
-    return stopping(walks.confidence, walks.right, [1 - stop for stop in STOPS])
+def _stops(walks: Walks) -> list[StoppingRow]:
+    rows = stopping(walks.confidence, walks.right, [1 - stop for stop in STOPS])
+    return [StoppingRow(**row, stop=1 - row["risk"]) for row in rows]
 
 
 def _by_class(
-    objects: Objects, known: np.ndarray, classes: Sequence[str], walks: dict[str, Walks], best: str
-) -> list[dict[str, Any]]:
-    """Accuracy of each known class from single views, and by the best policy after up to four views."""
-    labels, rows = objects.labels[known], []
-    for label in np.unique(labels):
-        single, chosen = walks[BASELINE].accuracy[labels == label], walks[best].accuracy[labels == label]
-        row = {"class": classes[label], "objects": len(single), "single": float(single[:, 0].mean())}
-        rows.append(row | {"chosen": chosen[:, :4].mean(axis=0).tolist()})
-    return rows
-
-
-def _calibration(walks: dict[str, Walks], names: Sequence[str]) -> list[dict[str, Any]]:
-    """Mean calibrated probability beside accuracy, and the 95 % interval over objects of their difference."""
+    labels: Int[np.ndarray, " objects"], classes: Sequence[str], single: np.ndarray, chosen: np.ndarray
+) -> list[ClassRow]:
+    """Accuracy of each known class, from accuracies by object and number of random and of chosen views."""
     rows = []
-    for name in dict.fromkeys(names):
-        found = walks[name]
-        confidence = found.confidence.mean(axis=1)
-        for count in (count for count in VIEWS if count <= confidence.shape[1]):
-            gap = confidence[:, count - 1] - found.accuracy[:, count - 1]
-            rows.append(
-                {
-                    "policy": name,
-                    "views": count,
-                    "confidence": float(confidence[:, count - 1].mean()),
-                    "accuracy": float(found.accuracy[:, count - 1].mean()),
-                    "too_sure": float(gap.mean()),
-                    "interval": intervals(gap),
-                }
-            )
+    for label in np.unique(labels):
+        of_class = labels == label
+        after = chosen[of_class, :4].mean(axis=0)
+        rows.append(ClassRow(classes[label], int(of_class.sum()), float(single[of_class, 0].mean()), after))
     return rows
 
 
-def _answers(objects: Objects, known: np.ndarray, walks: Walks) -> list[dict[str, Any]]:
-    """For each known object: how often it was right after one view, and at the end of the best policy's walks."""
+def _calibration(policy: str, walks: Walks) -> list[CalibrationRow]:
+    rows, confidences = [], walks.confidence.mean(axis=1)
+    for count in (count for count in VIEWS if count <= confidences.shape[1]):
+        confidence, accuracy = confidences[:, count - 1], walks.accuracy[:, count - 1]
+        means = float(confidence.mean()), float(accuracy.mean())
+        rows.append(CalibrationRow(policy, count, *means, *with_interval(confidence - accuracy)))
+    return rows
+
+
+def _answers(objects: Objects, known: np.ndarray, walks: Walks) -> list[Answer]:
     names = [name for name, is_known in zip(objects.names, known, strict=True) if is_known]
-    right = walks.accuracy
-    return [
-        {"object": name, "single": float(of[0]), "last": float(of[-1])} for name, of in zip(names, right, strict=True)
-    ]
+    return [Answer(name, float(row[0]), float(row[-1])) for name, row in zip(names, walks.accuracy, strict=True)]
 
 
 def strangers(
     system: TrainedSystem, tables: ViewTable, known: np.ndarray, draws: int = 32, seed: int = 0
-) -> dict[str, Any] | None:
-    """How well strangeness tells objects of unknown classes from the others, on random walks; None if one kind is missing.
-
-    Returns:
-        For 1, 2, 4 views: the area under the ROC curve (½ is chance, 1 perfect) of one walk of each object, averaged over
-        draws, and the shares of unknown and of known objects that are stranger than 95 % of the validation objects.
-    """
+) -> Strangers | None:
+    """How well strangeness tells objects of unknown classes from the others, on random walks; None if one kind is missing."""
     if system.parts.strangeness is None or known.all() or not known.any():
         return None
     views, measure, rows = tables.logits.shape[1], jax.jit(jax.vmap(system.parts.strangeness.of)), []
@@ -260,15 +345,9 @@ def strangers(
             areas.append(auroc(np.take_along_axis(energy, chosen, axis=1).mean(axis=1), ~known))
             logits = jnp.asarray(np.take_along_axis(all_logits, chosen[..., None], axis=1))
             beyond += (np.asarray(measure(logits, jnp.ones((len(known), count), bool))) > 0.95) / draws
-        rows.append(
-            {
-                "views": count,
-                "auroc": float(np.mean(areas)),
-                "unknown_found": float(beyond[~known].mean()),
-                "known_refused": float(beyond[known].mean()),
-            }
-        )
-    return {"objects": int((~known).sum()), "after": rows}
+        refused = float(beyond[~known].mean()), float(beyond[known].mean())
+        rows.append(StrangerRow(count, float(np.mean(areas)), *refused))
+    return Strangers(int((~known).sum()), rows)
 
 
 def auroc(scores: np.ndarray, positive: np.ndarray) -> float:

@@ -163,27 +163,32 @@ class Walker:
         return around
 
 
-def rows_of(walks: dict[str, Walks], views: Sequence[int]) -> list[dict[str, Any]]:
-    """Accuracy of each policy after some numbers of views, and its difference from random selection, with 95 % intervals.
+@dataclass(frozen=True)
+class AccuracyRow:
+    """Accuracy of a policy after some views, and its gain over random selection, paired by object; with 95 % intervals."""
 
-    The difference is paired by object.
-    """
+    policy: str
+    views: int
+    accuracy: float
+    interval: list[float]
+    gain: float
+    gain_interval: list[float]
+
+
+def rows_of(walks: dict[str, Walks], views: Sequence[int]) -> list[AccuracyRow]:
+    """Accuracies after some numbers of views, and after the last view of the walks."""
     rows = []
     for name, found in walks.items():
         for count in _within(found, views):
             right = found.accuracy[:, count - 1]
             gain = right - walks[BASELINE].accuracy[:, count - 1]
-            rows.append(
-                {
-                    "policy": name,
-                    "views": count,
-                    "accuracy": float(right.mean()),
-                    "interval": intervals(right),
-                    "gain": float(gain.mean()),
-                    "gain_interval": intervals(gain),
-                }
-            )
+            rows.append(AccuracyRow(name, count, *with_interval(right), *with_interval(gain)))
     return rows
+
+
+def with_interval(values: Float[np.ndarray, " objects"]) -> tuple[float, list[float]]:
+    """The mean over objects, and its 95 % interval."""
+    return float(values.mean()), intervals(values)
 
 
 def _within(walks: Walks, views: Sequence[int]) -> list[int]:

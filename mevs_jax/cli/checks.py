@@ -6,12 +6,14 @@ import json
 import math
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from mevs_jax.cli.failure import Unusable
 from mevs_jax.cli.parsing import Invocation
 
 if TYPE_CHECKING:
+    from eval.checks.reality import Reality, SceneRow, Stop
+    from eval.checks.transfer import Transfer
     from mevs_jax.cli.options import RealityOptions, TransferOptions
 
 
@@ -31,26 +33,26 @@ def agent(call: Invocation) -> None:
     from eval import stages
 
     found = stages.check_agent(call.settings, call.out)
-    for policy, walks in found["walks"].items():
+    for policy, walks in found.walks.items():
         print(
-            f"{policy}: {walks['same']} of {walks['walks']} walks are those on view tables (probabilities within "
-            f"{walks['largest_difference']:.1e})"
+            f"{policy}: {walks.same} of {walks.walks} walks are those on view tables (probabilities within "
+            f"{walks.largest_difference:.1e})"
         )
-        for row in found["stopping"].get(policy, []):
+        for row in found.stopping.get(policy, []):
             print(
-                f"  stops at {row['stop']:g}: wrong {100 * row['error']:.2f} % (promised {100 * row['promised_error']:g} %), "
-                f"{100 * row['stopped']:.0f} % of walks stop, {row['views']:.1f} views"
+                f"  stops at {row.stop:g}: wrong {100 * row.error:.2f} % (promised {100 * row.promised_error:g} %), "
+                f"{100 * row.stopped:.0f} % of walks stop, {row.views:.1f} views"
             )
-    for row in found["camera"]:
+    for camera in found.camera:
         print(
-            f"any camera at {row['distance']:g} radii: overlap {row['overlap_median']:.3f} (5th percentile "
-            f"{row['overlap_low']:.3f}), depth within {100 * row['error_median']:.2f} % of the radius, accuracy "
-            f"{100 * row['accuracy']:.1f} % (own camera {100 * row['own_accuracy']:.1f} %)"
+            f"any camera at {camera.distance:g} radii: overlap {camera.overlap_median:.3f} (5th percentile "
+            f"{camera.overlap_low:.3f}), depth within {100 * camera.error_median:.2f} % of the radius, accuracy "
+            f"{100 * camera.accuracy:.1f} % (own camera {100 * camera.own_accuracy:.1f} %)"
         )
-    time = found["latency_ms"]
+    time = found.latency_ms
     print(
-        f"640×480 image to next pose: {time['p50']:.1f} ms (99th percentile {time['p99']:.1f}), "
-        f"{time['compilations']:.0f} compilations"
+        f"640×480 image to next pose: {time.p50:.1f} ms (99th percentile {time.p99:.1f}), "
+        f"{time.compilations:.0f} compilations"
     )
 
 
@@ -59,6 +61,7 @@ def transfer(options: TransferOptions) -> None:
     from data_pipeline.files import write_json
     from eval.checks.transfer import check_transfer
     from mevs_jax.cli.tools import load_system
+    from train.results.records import as_json
 
     if options.max_views < 1 or options.draws < 1:
         raise Unusable("--max-views and --draws must be at least 1")
@@ -82,8 +85,8 @@ def transfer(options: TransferOptions) -> None:
         draws=options.draws,
     )
     if options.to is not None:
-        write_json(options.to, found)
-    print(json.dumps(found) if options.json else transfer_text(found))
+        write_json(options.to, as_json(found))
+    print(json.dumps(as_json(found)) if options.json else transfer_text(found))
 
 
 def renamed(names: Sequence[str]) -> tuple[tuple[str, str], ...]:
@@ -107,35 +110,34 @@ def check_file(path: Path) -> None:
         raise Unusable(f"cannot write {path} ({error.strerror}); choose another file") from error
 
 
-def transfer_text(found: dict[str, Any]) -> str:
+def transfer_text(found: Transfer) -> str:
     """The figures of `check_transfer`, for a terminal."""
-    classes, known_as = found["classes"], found["known_as"]
     named = {
-        known: [f"{name} ({classes[name]})" for name in classes if (name in known_as) == known]
+        known: [f"{name} ({count})" for name, count in found.classes.items() if (name in found.known_as) == known]
         for known in (True, False)
     }
-    lines = [f"{found['known']} objects of known classes: {', '.join(named[True])}"]
-    if found["strangers"]:
-        lines.append(f"{found['strangers']} objects of unknown classes: {', '.join(named[False])}")
-    lines += [f"left out: {name}: {reason}" for name, reason in found["left_out"].items()]
-    lines += [*found["notes"], "", *_policy_lines(found)]
+    lines = [f"{found.known} objects of known classes: {', '.join(named[True])}"]
+    if found.strangers:
+        lines.append(f"{found.strangers} objects of unknown classes: {', '.join(named[False])}")
+    lines += [f"left out: {name}: {reason}" for name, reason in found.left_out.items()]
+    lines += [*found.notes, "", *_policy_lines(found)]
     lines += ["", "By class: accuracy of single views, and after 2 and 4 views by the best policy:"]
-    for row in found["by_class"]:
-        shares = [row["single"], *(row["chosen"][count - 1] for count in (2, 4) if count <= len(row["chosen"]))]
-        lines.append(f"  {row['class']:20}{row['objects']:>5}" + "".join(f"{_percent(share):>9}" for share in shares))
+    for row in found.by_class:
+        shares = [row.single, *(row.chosen[count - 1] for count in (2, 4) if count <= len(row.chosen))]
+        lines.append(f"  {row.name:20}{row.objects:>5}" + "".join(f"{_percent(share):>9}" for share in shares))
     lines += ["", "Calibration: mean probability less accuracy, in points (above 0: too sure):"]
-    for row in found["calibration"]:
-        lines.append(f"  {row['policy']:20}{row['views']:>3}  {_percent(row['too_sure'], row['interval'], '+')}")
-    for row in found["stopping"]:
-        error = "none stopped" if row["error"] is None else f"wrong {100 * row['error']:.1f} %"
+    for read in found.calibration:
+        lines.append(f"  {read.policy:20}{read.views:>3}  {_percent(read.too_sure, read.interval, '+')}")
+    for stop in found.stopping:
+        error = "none stopped" if stop.error is None else f"wrong {100 * stop.error:.1f} %"
         lines.append(
-            f"  stops at {row['stop']:g}: {error} (promised {100 * row['risk']:g} %), "
-            f"{100 * row['sure']:.0f} % of walks stop, {row['views']:.1f} views"
+            f"  stops at {stop.stop:g}: {error} (promised {100 * stop.risk:g} %), "
+            f"{100 * stop.sure:.0f} % of walks stop, {stop.views:.1f} views"
         )
-    for row in (found["unknown_objects"] or {"after": []})["after"]:
+    for seen in found.unknown_objects.after if found.unknown_objects else []:
         lines.append(
-            f"unknown objects, {row['views']} seen: AUROC {row['auroc']:.3f}; stranger than 95 % of validation objects: "
-            f"{100 * row['unknown_found']:.0f} % of the unknown, {100 * row['known_refused']:.0f} % of the known"
+            f"unknown objects, {seen.views} seen: AUROC {seen.auroc:.3f}; stranger than 95 % of validation objects: "
+            f"{100 * seen.unknown_found:.0f} % of the unknown, {100 * seen.known_refused:.0f} % of the known"
         )
     return "\n".join(lines)
 
@@ -146,6 +148,7 @@ def reality(options: RealityOptions) -> None:
     from data_pipeline.lock import locked
     from eval.checks.reality import RealityConfig, check_reality
     from mevs_jax.cli.tools import load_system
+    from train.results.records import as_json
 
     if options.objects < 0 or options.objects == 1 or options.draws < 1:
         raise Unusable("--objects must be at least 2, or 0 for all, and --draws at least 1")
@@ -161,55 +164,58 @@ def reality(options: RealityOptions) -> None:
     check_file(options.to / "reality.json")
     with locked(options.to, "mevs check reality"):
         found = check_reality(systems, options.data, options.to / "views", config, options.up)
-        write_json(options.to / "reality.json", found)
-    print(json.dumps(found) if options.json else reality_text(found))
+        write_json(options.to / "reality.json", as_json(found))
+    print(json.dumps(as_json(found)) if options.json else reality_text(found))
 
 
-def reality_text(found: dict[str, Any]) -> str:
+def reality_text(found: Reality) -> str:
     """The figures of `check_reality`, for a terminal."""
-    strangers = f", {found['strangers']} of classes that the systems do not know are not used" * bool(
-        found["strangers"]
-    )
-    lines = [f"{found['objects']} objects{strangers}", *found["notes"]]
-    lines += [f"left out: {name}: {why}" for name, why in found["left_out"].items()]
-    width = max(map(len, found["conditions"].values()))
-    for name, rows in found["systems"].items():
-        cells = {(row["condition"], row["policy"], row["views"]): row for row in rows}
-        policies = list(dict.fromkeys(row["policy"] for row in rows))
-        lines += ["", f"{name}: accuracy in %, with 95 % intervals over objects; in brackets the loss against perfect"]
-        lines[-1] += " images and all views; last how often the walks that stop at 95 % are wrong"
-        for count in sorted({row["views"] for row in rows}):
-            heading = f"after {count} view{'s' * (count > 1)}"
-            lines.append(f"{heading:{width}}" + "".join(f"{policy:>28}" for policy in policies))
-            for condition, title in found["conditions"].items():
-                row_of = (cells.get((condition, policy, count)) for policy in policies)
-                lines.append(f"{title:{width}}" + "".join(f"{_cost(row):>28}" for row in row_of))
-        for condition, title in found["conditions"].items():
-            stops = {
-                policy: cells[condition, policy, 1]["stop"] for policy in policies if (condition, policy, 1) in cells
-            }
-            said = (f"{policy} {_wrong(stop)}" for policy, stop in stops.items())
-            lines.append(f"{title:{width}}  wrong when sure: {', '.join(said)}")
-    for name, rows in found["won_back"].items():
-        lines += ["", f"{name} less {next(iter(found['systems']))}, in points, on the same images:"]
-        for row in rows:
-            title = found["conditions"][row["condition"]]
-            shown = _percent(row["difference"], row["interval"], "+")
-            lines.append(f"{title:{width}}  {row['policy']:8}{row['views']:>2}  {shown}")
+    strangers = f", {found.strangers} of classes that the systems do not know are not used" if found.strangers else ""
+    lines = [f"{found.objects} objects{strangers}", *found.notes]
+    lines += [f"left out: {name}: {why}" for name, why in found.left_out.items()]
+    width = max(map(len, found.conditions.values()))
+    for name, rows in found.systems.items():
+        lines += ["", *_scene_lines(name, rows, found.conditions, width)]
+    for name, won in found.won_back.items():
+        lines += ["", f"{name} less {next(iter(found.systems))}, in points, on the same images:"]
+        for row in won:
+            shown = _percent(row.difference, row.interval, "+")
+            lines.append(f"{found.conditions[row.condition]:{width}}  {row.policy:8}{row.views:>2}  {shown}")
     return "\n".join(lines)
 
 
-def _wrong(stop: dict[str, Any]) -> str:
-    if stop["error"] is None:
+def _scene_lines(name: str, rows: Sequence[SceneRow], conditions: dict[str, str], width: int) -> list[str]:
+    """The table of one system, by number of views."""
+    cells = {(row.condition, row.policy, row.views): row for row in rows}
+    policies = list(dict.fromkeys(row.policy for row in rows))
+    lines = [
+        f"{name}: accuracy in %, with 95 % intervals over objects; in brackets the loss against perfect images and all views; "
+        "last how often the walks that stop at 95 % are wrong"
+    ]
+    for count in sorted({row.views for row in rows}):
+        heading = f"after {count} view{'s' * (count > 1)}"
+        lines.append(f"{heading:{width}}" + "".join(f"{policy:>28}" for policy in policies))
+        for condition, title in conditions.items():
+            shown = (_cost(cells.get((condition, policy, count))) for policy in policies)
+            lines.append(f"{title:{width}}" + "".join(f"{cell:>28}" for cell in shown))
+    for condition, title in conditions.items():
+        stops = {policy: cells[condition, policy, 1].stop for policy in policies if (condition, policy, 1) in cells}
+        said = ", ".join(f"{policy} {_wrong(stop)}" for policy, stop in stops.items())
+        lines.append(f"{title:{width}}  wrong when sure: {said}")
+    return lines
+
+
+def _wrong(stop: Stop) -> str:
+    if stop.error is None:
         return "– (none is sure)"
-    return f"{100 * stop['error']:.1f} % of the {100 * stop['stopped']:.0f} % that stop"
+    return f"{100 * stop.error:.1f} % of the {100 * stop.stopped:.0f} % that stop"
 
 
-def _cost(row: dict[str, Any] | None) -> str:
+def _cost(row: SceneRow | None) -> str:
     if row is None:
         return "–"
-    lost = f" ({-100 * row['loss']:+.1f})" if row.get("loss") else ""
-    return _percent(row["accuracy"], row["interval"]) + lost
+    lost = f" ({-100 * row.loss:+.1f})" if row.loss else ""
+    return _percent(row.accuracy, row.interval) + lost
 
 
 def _percent(share: float, interval: list[float] | None = None, sign: str = "") -> str:
@@ -217,10 +223,10 @@ def _percent(share: float, interval: list[float] | None = None, sign: str = "") 
     return f"{100 * share:{sign}.1f}{ends}"
 
 
-def _policy_lines(found: dict[str, Any]) -> list[str]:
-    counts = sorted({row["views"] for row in found["policies"]})
-    cells = {(row["policy"], row["views"]): row for row in found["policies"]}
-    policies = dict.fromkeys(row["policy"] for row in found["policies"])
+def _policy_lines(found: Transfer) -> list[str]:
+    counts = sorted({row.views for row in found.policies})
+    cells = {(row.policy, row.views): row for row in found.policies}
+    policies = dict.fromkeys(row.policy for row in found.policies)
     width = max(map(len, policies)) + len(" (best)")
     lines = [
         "Accuracy in % after each number of views, from all first views, with 95 % intervals over objects;",
@@ -229,8 +235,8 @@ def _policy_lines(found: dict[str, Any]) -> list[str]:
     ]
     for name in policies:
         rows = [cells[name, count] for count in counts]
-        mark = " (best)" if name == found["best"] else ""
-        lines.append(f"{name + mark:{width}}" + "".join(f"{_percent(r['accuracy'], r['interval']):>23}" for r in rows))
+        mark = " (best)" if name == found.best else ""
+        lines.append(f"{name + mark:{width}}" + "".join(f"{_percent(row.accuracy, row.interval):>23}" for row in rows))
         if name != "random":
-            lines.append(" " * width + "".join(f"{_percent(r['gain'], r['gain_interval'], '+'):>23}" for r in rows))
+            lines.append(" " * width + "".join(f"{_percent(row.gain, row.gain_interval, '+'):>23}" for row in rows))
     return lines

@@ -14,8 +14,8 @@ class Command:
     Attributes:
         title: what it does, in a line.
         options: the class of its options in `mevs_jax.cli.options`, which is imported when needed.
-        settings: groups of settings that it uses, fields of `eval.settings.Settings`.
         function: `module:function` that runs it, given an `Invocation`.
+        settings: groups of settings that it uses, fields of `eval.settings.Settings`.
         out: default of `--out`, where `{preset}` is the preset.
         writes_run: whether its settings become those of the run, in `run.json`.
         tries: groups of settings that it only tries: where a network was trained, they do not become those of the run.
@@ -26,14 +26,14 @@ class Command:
 
     title: str
     options: str
-    settings: tuple[str, ...]
     function: str
+    settings: tuple[str, ...] = ()
     out: str = "runs/{preset}"
     writes_run: bool = True
+    tries: tuple[str, ...] = ()
     locks: bool = True
     tool: bool = False
     needs_study: bool = True
-    tries: tuple[str, ...] = ()
 
     def load(self) -> Callable:
         module, name = self.function.split(":")
@@ -44,38 +44,31 @@ COMMANDS = {
     "run": Command(
         "data, train, eval and report; skips what is done",
         "RunOptions",
-        ("dataset", "classifier", "entropy", "evaluation"),
         "stages:run",
+        ("dataset", "classifier", "entropy", "evaluation"),
     ),
     "data": Command(
         "capture objects from every viewpoint; write a sharded TFDS data set",
         "DataOptions",
-        ("dataset",),
         "stages:data",
+        ("dataset",),
     ),
     "train": Command(
-        "train the classifier and the entropy predictor",
-        "TrainOptions",
-        ("classifier", "entropy"),
-        "stages:train",
+        "train the classifier and the entropy predictor", "TrainOptions", "stages:train", ("classifier", "entropy")
     ),
     "sweep": Command(
         "train many configurations of one network as one program",
         "SweepOptions",
-        ("sweep", "classifier", "entropy", "learned"),
         "stages:sweep",
+        ("sweep", "classifier", "entropy", "learned"),
         tries=("classifier", "entropy", "learned"),
     ),
     "eval": Command(
-        "run every policy on every test object from every start view",
-        "EvalOptions",
-        ("evaluation",),
-        "stages:evaluate",
+        "run every policy on every test object from every start view", "EvalOptions", "stages:evaluate", ("evaluation",)
     ),
     "look": Command(
         "recognise one object by chosen views, with a trained system",
         "LookOptions",
-        (),
         "tools:look",
         tool=True,
         needs_study=False,
@@ -83,70 +76,67 @@ COMMANDS = {
     "export": Command(
         "write the trained system of a run into a folder of its own",
         "ExportOptions",
-        (),
         "tools:export",
         tool=True,
         needs_study=False,
     ),
-    "report": Command("write report/index.html", "Options", (), "stages:report", writes_run=False),
+    "report": Command("write report/index.html", "Options", "stages:report", writes_run=False),
     "study thesis": Command(
         "every network, table and figure of the thesis, beside its own numbers",
         "ThesisOptions",
-        ("dataset", "classifier", "entropy", "evaluation", "thesis"),
         "studies:thesis",
-        "runs/thesis-{preset}",
+        ("dataset", "classifier", "entropy", "evaluation", "thesis"),
+        out="runs/thesis-{preset}",
     ),
     "study learned": Command(
         "learn to fuse views and to choose them; compare with all policies",
         "LearnedOptions",
-        ("dataset", "learned"),
         "studies:learned",
+        ("dataset", "learned"),
     ),
     "study rendering": Command(
         "policies by differentiable rendering; evaluate and report again",
         "StudyOptions",
-        ("dataset", "rendering", "evaluation"),
         "studies:rendering",
+        ("dataset", "rendering", "evaluation"),
     ),
     "study published-code": Command(
         "what the thesis's published code changes; evaluate and report again",
         "WithWeights",
-        ("classifier", "evaluation"),
         "studies:published_code",
+        ("classifier", "evaluation"),
     ),
     "check live": Command(
         "walk with the networks in the loop; compare with the view tables",
         "WithPolicies",
-        ("live",),
         "checks:live",
+        ("live",),
         writes_run=False,
     ),
     "check agent": Command(
         "what an agent promises, on test objects: walks, stopping, any camera, time",
         "WithViews",
-        ("dataset", "agent"),
         "checks:agent",
+        ("dataset", "agent"),
         writes_run=False,
     ),
     "check transfer": Command(
         "how a trained system does on objects that it has never seen, of any makers",
         "TransferOptions",
-        (),
         "checks:transfer",
         tool=True,
     ),
     "check reality": Command(
         "what noise, tables, wrong centres and other objects cost trained systems",
         "RealityOptions",
-        (),
         "checks:reality",
         tool=True,
     ),
     "draw ascent": Command(
         "ascend to the best view of one object by a renderer's gradient; draw it",
         "WithViews",
-        ("dataset", "ascent"),
         "drawings:ascent",
+        ("dataset", "ascent"),
         writes_run=False,
         locks=False,
     ),

@@ -15,7 +15,7 @@ import zlib
 from contextlib import nullcontext, redirect_stdout
 from importlib.util import find_spec
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NoReturn
 
 from mevs_jax.cli.commands import COMMANDS, Command, find, help_text
 
@@ -29,20 +29,11 @@ _COMPILED_BYTES = 2**30
 """Size of the cache of compiled programs."""
 
 
-def _fail(message: str, code: int = 2) -> None:
+def _fail(message: str, code: int = 2) -> NoReturn:
     print(f"mevs: {message}", file=sys.stderr)
     if (distributed := sys.modules.get("data_pipeline.distributed")) is not None:
         distributed.leave(code)
     sys.exit(code)
-
-
-def _require_checkout() -> None:
-    """Ends with a sentence where only the library is installed: the wheel has no studies."""
-    if not has_checkout():
-        _fail(
-            "the installed package holds the library alone; studies run from a checkout of the project: clone it, run "
-            "`make demo` there, and then use .venv/bin/mevs"
-        )
 
 
 def has_checkout() -> bool:
@@ -207,8 +198,9 @@ def _kind_of_cpu() -> int:
 
 def _say_and_end(error: Exception) -> None:
     """Ends the program for an error that a person can act on; returns for any other."""
-    if isinstance(error, ModuleNotFoundError) and error.name and not _is_ours(error.name):
-        _fail(f"the package {error.name} is not installed; install the study's packages: pip install -e '.[study]'")
+    missing = (error.name or "") if isinstance(error, ModuleNotFoundError) else ""
+    if missing and missing.split(".")[0] not in ("mevs_jax", "data_pipeline", "train", "eval"):
+        _fail(f"the package {missing} is not installed; install the study's packages: pip install -e '.[study]'")
     from mevs_jax.cli.failure import Unusable
 
     if isinstance(error, Unusable):
@@ -266,10 +258,6 @@ def _why_no_device() -> str | None:
     return None
 
 
-def _is_ours(module: str) -> bool:
-    return module.split(".")[0] in ("mevs_jax", "data_pipeline", "train", "eval")
-
-
 def _output_is_closed() -> bool:
     """Whether the reader of the standard output has closed it, as `| head` does."""
     poll = select.poll()
@@ -315,7 +303,6 @@ def _main(arguments: list[str]) -> None:
         name, rest, note = find(arguments)
     except ValueError as error:
         _fail(str(error))
-        return
     if any(argument in _HELP for argument in rest):
         from mevs_jax.cli.parsing import show_options
 
@@ -324,8 +311,11 @@ def _main(arguments: list[str]) -> None:
     _keep_compiled()
     if note:
         print(f"mevs: {note}", file=sys.stderr)
-    if COMMANDS[name].needs_study:
-        _require_checkout()
+    if COMMANDS[name].needs_study and not has_checkout():
+        _fail(
+            "the installed package holds the library alone; studies run from a checkout of the project: clone it, run "
+            "`make demo` there, and then use .venv/bin/mevs"
+        )
     os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "2")
     # Tracing leaves many small objects that live: looking through them as often as Python does takes a twentieth of a short job.
     gc.set_threshold(100_000, 50, 100)

@@ -16,6 +16,11 @@ def _arg(metavar: str, default: str = "") -> Any:
     return tyro.conf.arg(metavar=metavar, help_behavior_hint=f"(default: {default})" if default else "")
 
 
+Flag = Annotated[tyro.conf.FlagCreatePairsOff[bool], _arg("")]
+Up = Annotated[Literal["auto", "z", "y"], _arg("auto|z|y", "auto: y for glTF, as declared for DAE, else z")]
+System = Annotated[str, _arg("PATH|NAME", "furniture10, which comes with the package")]
+
+
 @dataclass(frozen=True)
 class Options:
     """What every command takes."""
@@ -24,7 +29,7 @@ class Options:
     """folder of the run: everything is written there, and a run continues there"""
     preset: Annotated[Preset | None, _arg("small|best|thesis|tiny", "that of the run, or small")] = None
     """defaults of all settings; a run that was begun keeps its own (run.json)"""
-    print_config: Annotated[tyro.conf.FlagCreatePairsOff[bool], _arg("")] = False
+    print_config: Flag = False
     """print the resolved configuration as JSON and stop"""
 
 
@@ -40,7 +45,7 @@ class WithSeed(Options):
 class WithOthers(Options):
     """Commands that several processes may run together."""
 
-    distributed: Annotated[tyro.conf.FlagCreatePairsOff[bool], _arg("")] = False
+    distributed: Flag = False
     """this is one of several processes that share the work (docs/scaling.md)"""
 
 
@@ -52,7 +57,7 @@ class SweepOptions(WithSeed, WithOthers):
     """all combinations of these values instead of drawn ones, as learning-rate=1e-4,3e-4 weight-decay=0.01,0.05"""
     seeds: Annotated[int | None, _arg("K", "1")] = None
     """train each configuration from K seeds"""
-    adopt: Annotated[tyro.conf.FlagCreatePairsOff[bool], _arg("")] = False
+    adopt: Flag = False
     """make the best network that of the run, and its hyper-parameters those of the run's settings"""
 
 
@@ -87,11 +92,13 @@ class WithWeights(WithSeed):
 
 
 @dataclass(frozen=True)
-class WithEncoder(Options):
-    """Commands that train the classifier of a run."""
+class WithNetworks(WithSeeds, WithWeights):
+    """Commands that train the networks of a run."""
 
     encoder: Annotated[str | None, _arg("MODULE:FUNCTION", "a ResNet")] = None
     """train a network of your own as the classifier: module:function or path/to/file.py:function (docs/own.md)"""
+    seeds_at_once: Annotated[int, _arg("N", "0, all")] = 0
+    """train at most N seeds together, which bounds memory"""
 
 
 @dataclass(frozen=True)
@@ -134,11 +141,8 @@ class DataOptions(WithViews, WithOthers):
 
 
 @dataclass(frozen=True)
-class RunOptions(WithViews, WithSeeds, WithWeights, WithEncoder, WithPolicies):
+class RunOptions(WithViews, WithNetworks, WithPolicies):
     """Options of `mevs run`."""
-
-    seeds_at_once: Annotated[int, _arg("N", "0, all")] = 0
-    """train at most N seeds together, which bounds memory"""
 
 
 @dataclass(frozen=True)
@@ -150,15 +154,12 @@ class ThesisOptions(WithData, WithWeights):
 
 
 @dataclass(frozen=True)
-class TrainOptions(WithSeeds, WithWeights, WithEncoder, WithOthers):
+class TrainOptions(WithNetworks, WithOthers):
     """Options of `mevs train`."""
-
-    seeds_at_once: Annotated[int, _arg("N", "0, all")] = 0
-    """train at most N seeds together, which bounds memory"""
 
     model_devices: Annotated[int, _arg("N", "1")] = 1
     """devices that share one copy of a network's weights; batches are split over the others"""
-    plan: Annotated[tyro.conf.FlagCreatePairsOff[bool], _arg("")] = False
+    plan: Flag = False
     """print what this command would do, or why it cannot, and train nothing (docs/scaling.md)"""
     plan_devices: Annotated[int | None, _arg("N", "those that are here")] = None
     """with --plan: devices to plan for, of all processes together"""
@@ -166,7 +167,7 @@ class TrainOptions(WithSeeds, WithWeights, WithEncoder, WithOthers):
     """with --plan --distributed: processes to plan for"""
     plan_objects: Annotated[int | None, _arg("N", "the run's data set")] = None
     """with --plan: plan for a data set of so many training objects that is not made yet"""
-    json: Annotated[tyro.conf.FlagCreatePairsOff[bool], _arg("")] = False
+    json: Flag = False
     """with --plan: print the plan as JSON, in bytes and operations"""
 
 
@@ -174,7 +175,7 @@ class TrainOptions(WithSeeds, WithWeights, WithEncoder, WithOthers):
 class LookOptions:
     """Options of `mevs look`."""
 
-    system: Annotated[str, _arg("PATH|NAME", "furniture10, which comes with the package")] = "furniture10"
+    system: System = "furniture10"
     """the trained system: a folder, a run, a name that comes with the package, or owner/name on the Hugging Face hub"""
     mesh: Annotated[Path | None, _arg("FILE")] = None
     """a mesh to recognise: .off, .obj, .stl, .ply, .glb, .gltf, .dae or .3mf; it is rendered from the views that are chosen"""
@@ -191,53 +192,57 @@ class LookOptions:
     """largest number of views"""
     unknown: Annotated[float | None, _arg("Q", "no such answer")] = None
     """answer "unknown object" for an object that is stranger than this share of the known ones, as 0.99"""
-    up: Annotated[Literal["auto", "z", "y"], _arg("auto|z|y", "auto: y for glTF, as declared for DAE, else z")] = "auto"
+    up: Up = "auto"
     """the upward axis of the mesh"""
     metres: Annotated[float, _arg("M", "0, its size is unknown")] = 0.0
     """metres in one unit of the mesh, for a system that was trained to use sizes"""
-    json: Annotated[tyro.conf.FlagCreatePairsOff[bool], _arg("")] = False
+    json: Flag = False
     """print the walk as JSON"""
     draw: Annotated[Path | None, _arg("FILE")] = None
     """draw the walk into this image, .png or .svg"""
     save: Annotated[Path | None, _arg("FILE")] = None
     """save the walk's history, which can be repeated, into this .npz"""
-    view: Annotated[tyro.conf.FlagCreatePairsOff[bool], _arg("")] = False
+    view: Flag = False
     """show the walk in a browser, in 3-D, until Ctrl-C (needs the extra `view`)"""
 
 
-@dataclass(frozen=True)
-class TransferOptions:
-    """Options of `mevs check transfer`."""
+@dataclass(frozen=True, kw_only=True)
+class WithObjects:
+    """Checks of trained systems on other objects."""
 
     data: Annotated[str, _arg("SOURCE")]
     """objects: a folder or zip of meshes in class folders, or an .npz of voxel grids; those for testing where the folders name a
     split, else all"""
-    system: Annotated[str, _arg("PATH|NAME", "furniture10, which comes with the package")] = "furniture10"
-    """the trained system, as for mevs look"""
-    up: Annotated[Literal["auto", "z", "y"], _arg("auto|z|y", "auto: y for glTF, as declared for DAE, else z")] = "auto"
+    up: Up = "auto"
     """the upward axis of the meshes"""
     names: Annotated[tuple[str, ...], _arg("FOLDER=CLASS ...")] = ()
     """what the system calls classes that have another name in the data; classes that it does not know are strangers"""
-    unknown_yaw: Annotated[tyro.conf.FlagCreatePairsOff[bool], _arg("")] = False
+    draws: Annotated[int, _arg("N", "4")] = 4
+    """random walks from each first view"""
+    json: Flag = False
+    """print all figures as JSON"""
+
+
+@dataclass(frozen=True, kw_only=True)
+class TransferOptions(WithObjects):
+    """Options of `mevs check transfer`."""
+
+    system: System = "furniture10"
+    """the trained system, as for mevs look"""
+    unknown_yaw: Flag = False
     """do not tell the system which way the objects face; else they face as in their files"""
     metres: Annotated[float, _arg("M", "0, sizes are unknown")] = 0.0
     """metres in one unit of the files, for a system that was trained to use sizes"""
     max_views: Annotated[int, _arg("N", "8")] = 8
     """number of views of each walk"""
-    draws: Annotated[int, _arg("N", "4")] = 4
-    """random walks from each first view"""
     to: Annotated[Path | None, _arg("FILE")] = None
     """write all figures into this .json file"""
-    json: Annotated[tyro.conf.FlagCreatePairsOff[bool], _arg("")] = False
-    """print all figures as JSON"""
 
 
-@dataclass(frozen=True)
-class RealityOptions:
+@dataclass(frozen=True, kw_only=True)
+class RealityOptions(WithObjects):
     """Options of `mevs check reality`."""
 
-    data: Annotated[str, _arg("SOURCE")]
-    """objects of the systems' classes, as for mevs check transfer"""
     to: Annotated[Path, _arg("FOLDER")]
     """where images and figures (reality.json) are written; an interrupted check goes on there"""
     system: Annotated[tuple[str, ...], _arg("PATH|NAME ...", "furniture10")] = ("furniture10",)
@@ -247,16 +252,8 @@ class RealityOptions:
     together"""
     objects: Annotated[int, _arg("N", "0, all")] = 0
     """number of objects, spread over all: about 20 s for every ten, on two cores"""
-    names: Annotated[tuple[str, ...], _arg("FOLDER=CLASS ...")] = ()
-    """what the systems call classes that have another name in the data"""
-    up: Annotated[Literal["auto", "z", "y"], _arg("auto|z|y", "auto: y for glTF, as declared for DAE, else z")] = "auto"
-    """the upward axis of the meshes"""
-    draws: Annotated[int, _arg("N", "4")] = 4
-    """random walks from each first view"""
     seed: Annotated[int, _arg("N", "0")] = 0
     """seed of noise, wrong centres, and random walks"""
-    json: Annotated[tyro.conf.FlagCreatePairsOff[bool], _arg("")] = False
-    """print all figures as JSON"""
 
 
 @dataclass(frozen=True)
@@ -269,7 +266,7 @@ class ExportOptions:
     """folder of a run, whose trained system is made first if it is not there"""
     system: Annotated[str | None, _arg("PATH|NAME")] = None
     """or a trained system, as for mevs look"""
-    half: Annotated[tyro.conf.FlagCreatePairsOff[bool], _arg("")] = False
+    half: Flag = False
     """store the networks in float16, which halves the folder"""
-    stablehlo: Annotated[tyro.conf.FlagCreatePairsOff[bool], _arg("")] = False
+    stablehlo: Flag = False
     """also write the compiled programs for CPU, CUDA and TPU, which need JAX and NumPy alone"""

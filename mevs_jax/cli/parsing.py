@@ -46,19 +46,21 @@ def tool_options(name: str, arguments: list[str]) -> Any:
     Raises:
         SystemExit: for options that tyro refuses, after its message.
     """
+    return _parsed(_class_of(COMMANDS[name]), name, arguments)
+
+
+def _parsed(kind: Any, name: str, arguments: list[str], about: str = "") -> Any:
+    """The options that a command is given; ends with their list where it is asked for."""
     arguments = ["--help" if argument == "--help-all" else argument for argument in arguments]
-    return tyro.cli(
-        _class_of(COMMANDS[name]), prog=f"mevs {name}", description=f"{COMMANDS[name].title}.", args=arguments
-    )
+    return tyro.cli(kind, prog=f"mevs {name}", description=f"{COMMANDS[name].title}.{about}", args=arguments)
 
 
 def show_options(name: str) -> None:
     """Prints the options of a command, without its settings, and exits."""
     command = COMMANDS[name]
-    about = f"{command.title}."
-    if command.settings:
-        about += f" Settings (listed by --help-all): {', '.join(f'--{group}.*' for group in command.settings)}."
-    tyro.cli(_class_of(command), prog=f"mevs {name}", description=about, args=["--help"])
+    groups = ", ".join(f"--{group}.*" for group in command.settings)
+    about = f" Settings (listed by --help-all): {groups}." if groups else ""
+    _parsed(_class_of(command), name, ["--help"], about)
 
 
 def _class_of(command: Command) -> Any:
@@ -112,8 +114,7 @@ def parse(name: str, arguments: list[str]) -> Invocation:
     others = _other_groups(groups, arguments) if run is not None else []
     shorts = _short_options(command, arguments) if run is not None or made_before_run_json else []
     kind = _options_with_settings(command, {group: getattr(base, group) for group in (*groups, *others)}, shorts)
-    arguments = ["--help" if argument == "--help-all" else argument for argument in arguments]
-    options: Any = tyro.cli(kind, prog=f"mevs {name}", description=f"{command.title}.", args=arguments)
+    options = _parsed(kind, name, arguments)
     settings = settings_of(options, groups, base)
     given = replace(settings, **{group: getattr(options, group) for group in others})
     _check_unchanged(base, given, groups, f"mevs {name}", folder)
@@ -198,15 +199,18 @@ def keep_settings(call: Invocation) -> None:
     if run is None:
         save_run(call.out, call.preset, call.settings, call.arguments)
     else:
-        made = {group: ("config.json", "metrics.json") for group in COMMANDS[call.name].tries}
-        tried = [group for group, files in made.items() if any((call.out / group / file).exists() for file in files)]
-        groups = [group for group in call.groups if group not in tried]
-        settings = replace(run.settings, **{group: getattr(call.settings, group) for group in groups})
+        made = [folder for folder in COMMANDS[call.name].tries if _is_made(call.out / folder)]
+        own = {group: getattr(call.settings, group) for group in call.groups if group not in made}
+        settings = replace(run.settings, **own)
         if hasattr(call.options, "policy"):
             settings = replace(settings, policies=call.settings.policies)
         if hasattr(call.options, "seeds") and not {"sweep", "learned"} & set(call.groups):
             settings = replace(settings, seeds=call.settings.seeds)
         save_run(call.out, run.preset, settings, call.arguments)
+
+
+def _is_made(folder: Path) -> bool:
+    return any((folder / file).exists() for file in ("config.json", "metrics.json"))
 
 
 def _options_with_settings(command: Command, groups: dict[str, Any], shorts: list[str]) -> type:
@@ -221,43 +225,37 @@ def settings_of(options: Any, groups: list[str], base: Settings) -> Settings:
     from data_pipeline.capture.viewpoints import is_file
     from train.own_code import absolute
 
-    settings = replace(base, **{group: getattr(options, group) for group in groups})
+    given = {name: value for name, value in vars(options).items() if value not in (None, ())}
+    settings = replace(base, **{group: given[group] for group in groups})
     dataset = settings.dataset
-    if getattr(options, "data", None) is not None:
-        dataset = replace(dataset, source=options.data)
-    if getattr(options, "archive", None) is not None:
-        dataset = replace(dataset, archive=options.archive)
-    if getattr(options, "views", None) is not None:
-        dataset = replace(dataset, capture=replace(dataset.capture, views=options.views))
-    capture = dataset.capture
+    capture = replace(dataset.capture, views=given.get("views", dataset.capture.views))
     if is_file(capture.lattice) and capture.lattice != base.dataset.capture.lattice:
-        dataset = replace(dataset, capture=_with_own_viewpoints(capture, options, base))
-    settings = replace(settings, dataset=dataset, policies=_policies(options, base))
-    settings = _with_seeds(settings, options, groups)
-    encoder = absolute(getattr(options, "encoder", None) or settings.classifier.encoder)
-    settings = replace(settings, classifier=replace(settings.classifier, encoder=encoder))
-    seed = getattr(options, "seed", None)
-    if seed is None:
+        capture = _with_own_viewpoints(capture, given, base)
+    source, archive = given.get("data", dataset.source), given.get("archive", dataset.archive)
+    encoder = absolute(given.get("encoder") or settings.classifier.encoder)
+    settings = replace(
+        settings,
+        dataset=replace(dataset, source=source, archive=archive, capture=capture),
+        classifier=replace(settings.classifier, encoder=encoder),
+        policies=_policies(given, base),
+    )
+    settings = _with_seeds(settings, given, groups)
+    if "seed" not in given:
         return settings
     seeded = [group for group in groups if group != "dataset"]
-    return replace(settings, **{group: with_seed(getattr(settings, group), seed) for group in seeded})
+    return replace(settings, **{group: with_seed(getattr(settings, group), given["seed"]) for group in seeded})
 
 
-def _with_seeds(settings: Settings, options: Any, groups: list[str]) -> Settings:
+def _with_seeds(settings: Settings, given: dict[str, Any], groups: list[str]) -> Settings:
     """The settings with the number of seeds of `--seeds`, and the grid of `--grid`, of what the command trains."""
-    seeds = getattr(options, "seeds", None)
-    if "sweep" in groups:
-        sweep = settings.sweep
-        sweep = replace(sweep, grid=getattr(options, "grid", ()) or sweep.grid)
-        return replace(settings, sweep=sweep if seeds is None else replace(sweep, seeds=seeds))
-    if seeds is None:
-        return settings
-    if "learned" in groups:
-        return replace(settings, learned=replace(settings.learned, seeds=seeds))
-    return replace(settings, seeds=seeds)
+    training = next((group for group in ("sweep", "learned") if group in groups), None)
+    if training is None:
+        return replace(settings, seeds=given.get("seeds", settings.seeds))
+    changed = {name: given[name] for name in ("seeds", "grid") if name in given}
+    return replace(settings, **{training: replace(getattr(settings, training), **changed)})
 
 
-def _with_own_viewpoints(capture: CaptureConfig, options: Any, base: Settings) -> CaptureConfig:
+def _with_own_viewpoints(capture: CaptureConfig, given: dict[str, Any], base: Settings) -> CaptureConfig:
     """The capture with as many views as the file of its viewpoints has.
 
     Raises:
@@ -266,19 +264,20 @@ def _with_own_viewpoints(capture: CaptureConfig, options: Any, base: Settings) -
     from data_pipeline.capture.viewpoints import FILE, absolute_lattice, read_viewpoints, viewpoints_of
 
     capture = replace(capture, lattice=absolute_lattice(capture.lattice))
-    if getattr(options, "views", None) is None and capture.views == base.dataset.capture.views:
+    if "views" not in given and capture.views == base.dataset.capture.views:
         views = len(read_viewpoints(Path(capture.lattice.removeprefix(FILE))).points)
         return replace(capture, views=views)
     viewpoints_of(capture)
     return capture
 
 
-def _policies(options: Any, base: Settings) -> tuple[str, ...]:
+def _policies(given: dict[str, Any], base: Settings) -> tuple[str, ...]:
     """The policies of `--policy`: those that are given, or those of the run; `none` is for no policy."""
     from train.own_code import absolute
 
-    given = getattr(options, "policy", ())
-    return tuple(absolute(one) for one in given if one != "none") if given else base.policies
+    if "policy" not in given:
+        return base.policies
+    return tuple(absolute(one) for one in given["policy"] if one != "none")
 
 
 def with_seed(settings: Any, seed: int) -> Any:

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 from mevs_jax.cli.failure import Unusable
 from mevs_jax.cli.parsing import Invocation
+from mevs_jax.cli.stages import weights_of
 
 if TYPE_CHECKING:
     from train.running.devices import Layout
@@ -33,15 +34,13 @@ def plan(call: Invocation) -> None:
 
         jax.config.update("jax_platforms", "cpu")
     from eval import stages
-    from train.tasks.classifier import starting_weights
 
     if call.settings.seeds != 1:
         raise Unusable(
             f"a plan is of one training, and --seeds is {call.settings.seeds}; add --seeds 1 to plan for each"
         )
-    layout, classifier = layout_of(options), call.settings.classifier
-    start = starting_weights(options.pretrained, classifier.network, classifier.encoder)
-    found = stages.plan_training(call.settings, call.out, start, layout, options.plan_objects)
+    layout = layout_of(options)
+    found = stages.plan_training(call.settings, call.out, weights_of(call), layout, options.plan_objects)
     print(json.dumps(found) if options.json else plan_text(found))
 
 

@@ -18,21 +18,27 @@ def run(call: Invocation) -> None:
     from eval import seeds, stages
     from eval.walks.own_policies import load_policies
     from train.own_code import load_own
-    from train.tasks.classifier import starting_weights
 
-    classifier = call.settings.classifier
-    start = starting_weights(call.options.pretrained, classifier.network, classifier.encoder)
+    start, encoder = weights_of(call), call.settings.classifier.encoder
     load_policies(call.settings.policies)  # so that an error in a policy is found before anything is computed
-    if classifier.encoder:
-        load_own(classifier.encoder, "--encoder")
+    if encoder:
+        load_own(encoder, "--encoder")
     seeds.check_seeds(call.settings)
     stages.check_batches(call.settings, call.out)
     stages.policies_of(call.settings, stages.make_data(call.settings, call.out))
     _train(call, start)
     evaluate(call)
-    if not call.settings.classifier.encoder:  # of which no trained system can be made
+    if not encoder:  # of which no trained system can be made
         print(f"Trained system: {stages.make_system(call.settings, call.out).absolute()}")
     report(call)
+
+
+def weights_of(call: Invocation) -> StartingWeights | None:
+    """The weights of `--pretrained`, from which classifiers start."""
+    from train.tasks.classifier import starting_weights
+
+    classifier = call.settings.classifier
+    return starting_weights(call.options.pretrained, classifier.network, classifier.encoder)
 
 
 def _train(call: Invocation, start: StartingWeights | None, mesh: Mesh | None = None) -> None:
@@ -62,11 +68,8 @@ def data(call: Invocation) -> None:
 def train(call: Invocation) -> None:
     """The networks."""
     from train.running.devices import device_mesh
-    from train.tasks.classifier import starting_weights
 
-    classifier = call.settings.classifier
-    start = starting_weights(call.options.pretrained, classifier.network, classifier.encoder)
-    _train(call, start, device_mesh(call.options.model_devices))
+    _train(call, weights_of(call), device_mesh(call.options.model_devices))
 
 
 def sweep(call: Invocation) -> None:

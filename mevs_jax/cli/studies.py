@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from mevs_jax.cli.parsing import Invocation
-from mevs_jax.cli.stages import evaluate, report
+from mevs_jax.cli.stages import evaluate, report, weights_of
 
 
 def thesis(call: Invocation) -> None:
@@ -33,10 +33,7 @@ def rendering(call: Invocation) -> None:
 def published_code(call: Invocation) -> None:
     """What the published code does otherwise than the thesis's text."""
     from eval import stages
-    from train.tasks.classifier import starting_weights
 
-    classifier = call.settings.classifier
-    start = starting_weights(call.options.pretrained, classifier.network, classifier.encoder)
-    stages.train_by_view(call.settings, call.out, start)
+    stages.train_by_view(call.settings, call.out, weights_of(call))
     evaluate(call)
     report(call)

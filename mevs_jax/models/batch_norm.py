@@ -75,17 +75,14 @@ class BatchNorm(nnx.Module):
     def _update(self, mean: Array, variance: Array, count: int, momentum: float | Array) -> None:
         unbiased = variance * (count / max(count - 1, 1))
         try:
-            self._write(mean, unbiased, momentum)
+            self.mean[...] = (1 - momentum) * self.mean[...] + momentum * mean
+            self.variance[...] = (1 - momentum) * self.variance[...] + momentum * unbiased
+            self.batches[...] = self.batches[...] + 1
         except TraceContextError as error:
             raise ValueError(
                 "batch norm in training updates its statistics, which is not possible inside jax.vmap or jax.lax.map: give the "
                 "network the whole batch in one call"
             ) from error
-
-    def _write(self, mean: Array, unbiased: Array, momentum: float | Array) -> None:
-        self.mean[...] = (1 - momentum) * self.mean[...] + momentum * mean
-        self.variance[...] = (1 - momentum) * self.variance[...] + momentum * unbiased
-        self.batches[...] = self.batches[...] + 1
 
 
 @partial(jax.custom_vjp, nondiff_argnums=(3,))

@@ -113,10 +113,6 @@ def _tap_by_tap(x: Array, kernel: Array, stride: int) -> Array:
     return out
 
 
-def _tap_by_tap_forwards(x: Array, kernel: Array, stride: int) -> tuple[Array, tuple[Array, Array]]:
-    return _tap_by_tap(x, kernel, stride), (x, kernel)
-
-
 def _tap_by_tap_backwards(stride: int, residuals: tuple[Array, Array], cotangent: Array) -> tuple[Array, Array]:
     x, kernel = residuals
     size, (_, height, width, inputs), (rows, columns) = kernel.shape[0], x.shape, cotangent.shape[1:3]
@@ -131,7 +127,7 @@ def _tap_by_tap_backwards(stride: int, residuals: tuple[Array, Array], cotangent
     return of_x, jnp.stack(of_taps).reshape(kernel.shape)
 
 
-_tap_by_tap.defvjp(_tap_by_tap_forwards, _tap_by_tap_backwards)
+_tap_by_tap.defvjp(lambda x, kernel, stride: (_tap_by_tap(x, kernel, stride), (x, kernel)), _tap_by_tap_backwards)
 
 
 def _patches(x: Array, size: int, stride: int) -> Float[Array, "places patch"]:
@@ -162,10 +158,6 @@ def _shifted(x: Array, size: int, stride: int) -> list[Array]:
 def _convolve_on_cpu(x: Array, kernel: Array, stride: int) -> Array:
     """`_convolve` with the gradient of the weights as matrix products of patches, some images at a time."""
     return _convolve(x, kernel, stride)
-
-
-def _forwards(x: Array, kernel: Array, stride: int) -> tuple[Array, tuple[Array, Array]]:
-    return _convolve(x, kernel, stride), (x, kernel)
 
 
 def _backwards(stride: int, residuals: tuple[Array, Array], cotangent: Array) -> tuple[Array, Array]:
@@ -204,7 +196,7 @@ def _sum_over_parts(of: Callable[[Array, Array], Any], x: Array, cotangent: Arra
     return jax.lax.scan(lambda total, part: (jax.tree.map(jnp.add, total, of(*part)), None), nothing, parts)[0]
 
 
-_convolve_on_cpu.defvjp(_forwards, _backwards)
+_convolve_on_cpu.defvjp(lambda x, kernel, stride: (_convolve(x, kernel, stride), (x, kernel)), _backwards)
 
 
 _OF_INPUTS = ((1, 0, -1, 0), (0, 1, 1, 0), (0, -1, 1, 0), (0, 1, 0, -1))
@@ -257,10 +249,6 @@ def _tiled(x: Array, kernel: Array) -> Array:
     return _from_tiles(x, _in_both(_OF_KERNEL, [[kernel[i, j] for j in range(3)] for i in range(3)]), 0)
 
 
-def _tiled_forwards(x: Array, kernel: Array) -> tuple[Array, tuple[Array, Array]]:
-    return _tiled(x, kernel), (x, kernel)
-
-
 def _tiled_backwards(residuals: tuple[Array, Array], cotangent: Array) -> tuple[Array, Array]:
     x, kernel = residuals
     flipped = _in_both(_OF_KERNEL, [[kernel[2 - i, 2 - j] for j in range(3)] for i in range(3)])
@@ -280,7 +268,7 @@ def _of_transformed(x: Array, cotangent: Array) -> list[Array]:
     return [jnp.matmul(jnp.stack(tiles).mT, jnp.stack(products)) for tiles, products in rows]
 
 
-_tiled.defvjp(_tiled_forwards, _tiled_backwards)
+_tiled.defvjp(lambda x, kernel: (_tiled(x, kernel), (x, kernel)), _tiled_backwards)
 
 
 def pool(x: Float[Array, "batch height width channels"]) -> Float[Array, "batch rows columns channels"]:

@@ -14,6 +14,7 @@ from flax import nnx
 from jaxtyping import Array, Bool, Float
 
 from mevs_jax.arrays import AnyArray
+from mevs_jax.models.set_fusion import dropped
 
 
 class PoseHead(nnx.Module):
@@ -56,10 +57,7 @@ class PoseHead(nnx.Module):
             height: of the camera: the vertical component, in [−1, 1], of the unit vector from the object to it.
             key: PRNG key for dropout in training; no dropout without.
         """
-        normed = self.norm(jnp.asarray(features))
-        if key is not None and self.dropout:
-            kept = jax.random.bernoulli(key, 1 - self.dropout, normed.shape)
-            normed = jnp.where(kept, normed / (1 - self.dropout), 0.0)
+        normed = dropped(key, self.dropout, self.norm(jnp.asarray(features)))
         hidden = jax.nn.gelu(self.layer1(jnp.concatenate([normed, jnp.asarray(height)[..., None]], axis=-1)))
         logits = self.layer2(hidden)
         return jax.nn.log_softmax(logits.reshape(*logits.shape[:-1], *self.shape), axis=-1)

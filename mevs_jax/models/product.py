@@ -20,10 +20,6 @@ def _multiply(x: Array, kernel: Array) -> Array:
     return jnp.matmul(x, kernel.astype(x.dtype), preferred_element_type=jnp.promote_types(x.dtype, kernel.dtype))
 
 
-def _forward(x: Array, kernel: Array) -> tuple[Array, tuple[Array, Array]]:
-    return _multiply(x, kernel), (x, kernel)
-
-
 def _backward(residuals: tuple[Array, Array], cotangent: Array) -> tuple[Array, Array]:
     x, kernel = residuals
     cotangent = cotangent.astype(x.dtype)
@@ -34,4 +30,4 @@ def _backward(residuals: tuple[Array, Array], cotangent: Array) -> tuple[Array, 
     return of_x, jnp.matmul(rows.T, cotangent, preferred_element_type=kernel.dtype)
 
 
-product.defvjp(_forward, _backward)
+product.defvjp(lambda x, kernel: (_multiply(x, kernel), (x, kernel)), _backward)

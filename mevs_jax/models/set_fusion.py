@@ -10,20 +10,35 @@ from jaxtyping import Array, Bool, Float
 from mevs_jax.arrays import AnyArray
 
 
-def _dropout(key: Array | None, rate: float, x: Array) -> Array:
+def dropped(key: Array | None, rate: float, x: Array) -> Array:
     """Dropout with a `rate` in [0, 1); without a key, returns `x` unchanged."""
     if key is None or not rate:
         return x
     return jnp.where(jax.random.bernoulli(key, 1 - rate, x.shape), x / (1 - rate), 0.0)
 
 
-class _Block(nnx.Module):
-    """A pre-norm transformer block: self-attention, then a two-layer perceptron on each token, both with residuals."""
+def with_own_token(present: Bool[Array, "*batch views"]) -> Bool[Array, "*batch tokens"]:
+    """Which tokens can be attended to: a learned one, which comes first, and those of the views that are present."""
+    return jnp.concatenate([jnp.ones((*present.shape[:-1], 1), bool), present], axis=-1)
 
-    def __init__(self, width: int, heads: int, dropout: float, *, rngs: nnx.Rngs):
+
+class TransformerBlock(nnx.Module):
+    """The layers of a pre-norm transformer block: attention, then a two-layer perceptron on each token."""
+
+    def __init__(self, width: int, heads: int, *, rngs: nnx.Rngs):
         self.norm1, self.norm2 = nnx.LayerNorm(width, rngs=rngs), nnx.LayerNorm(width, rngs=rngs)
         self.attention = nnx.MultiHeadAttention(heads, width, decode=False, rngs=rngs)
         self.layer1, self.layer2 = nnx.Linear(width, 2 * width, rngs=rngs), nnx.Linear(2 * width, width, rngs=rngs)
+
+    def perceptron(self, x: Array) -> Array:
+        return self.layer2(jax.nn.gelu(self.layer1(x)))
+
+
+class _Block(TransformerBlock):
+    """Self-attention and perceptron, both with residuals and dropout."""
+
+    def __init__(self, width: int, heads: int, dropout: float, *, rngs: nnx.Rngs):
+        super().__init__(width, heads, rngs=rngs)
         self.dropout = dropout
 
     def __call__(self, x: Array, present: Array, key: Array | None, asked: int) -> Array:
@@ -31,9 +46,8 @@ class _Block(nnx.Module):
         mask = present[..., None, None, :]  # the same for all heads and queries
         keys = (None, None) if key is None else jax.random.split(key)
         normed, x = self.norm1(x), x[..., :asked, :]
-        x = x + _dropout(keys[0], self.dropout, self.attention(normed[..., :asked, :], normed, mask=mask))
-        hidden = self.layer2(jax.nn.gelu(self.layer1(self.norm2(x))))
-        return x + _dropout(keys[1], self.dropout, hidden)
+        x = x + dropped(keys[0], self.dropout, self.attention(normed[..., :asked, :], normed, mask=mask))
+        return x + dropped(keys[1], self.dropout, self.perceptron(self.norm2(x)))
 
 
 def has_azimuth(directions: Float[AnyArray, "*batch views 3"]) -> Bool[Array, "*batch views"]:
@@ -126,13 +140,12 @@ class SetFusion(nnx.Module):
         if not posed:
             directions = relative_to_first(directions, present)[0]
         keys = [None] * (len(self.blocks) + 1) if key is None else list(jax.random.split(key, len(self.blocks) + 1))
-        normed = _dropout(keys[-1], self.dropout, self.norm(jnp.where(present[..., None], features, 0.0)))
+        normed = dropped(keys[-1], self.dropout, self.norm(jnp.where(present[..., None], features, 0.0)))
         tokens = self.view(normed) + self.direction(directions)
         own = self.object[...] if posed else self.unposed[...]
         own = jnp.broadcast_to(own, (*tokens.shape[:-2], 1, tokens.shape[-1]))
         x = jnp.concatenate([own, tokens], axis=-2)
-        attended = jnp.concatenate([jnp.ones((*present.shape[:-1], 1), bool), present], axis=-1)
-        last = len(self.blocks) - 1
+        attended, last = with_own_token(present), len(self.blocks) - 1
         for number, (block, block_key) in enumerate(zip(self.blocks, keys[:-1], strict=True)):
             asked = 1 if number == last else x.shape[-2]  # the head reads the first token only
             x = block(x, attended, block_key, asked)

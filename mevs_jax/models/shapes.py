@@ -11,7 +11,9 @@ from mevs_jax.models.pointnet2 import Abstraction, PointNet2
 from mevs_jax.models.pose import PoseHead
 from mevs_jax.models.resnet import ResNet
 from mevs_jax.models.set_fusion import SetFusion
-from mevs_jax.models.view_policy import Utility, ViewPolicy
+from mevs_jax.models.view_policy import ViewPolicyShape
+
+__all__ = ["PointNet2Shape", "PoseShape", "ResNetShape", "SetFusionShape", "ViewPolicyShape"]
 
 
 @dataclass(frozen=True)
@@ -26,15 +28,7 @@ class ResNetShape:
 
     def network(self, classes: int, rngs: nnx.Rngs) -> ResNet:
         """Returns a network of this shape with random weights."""
-        return ResNet(
-            depth=self.depth,
-            classes=classes,
-            channels=self.channels,
-            width=self.width,
-            standardise=self.standardise,
-            stem=self.stem,
-            rngs=rngs,
-        )
+        return ResNet(classes=classes, rngs=rngs, **vars(self))
 
 
 @dataclass(frozen=True)
@@ -47,14 +41,7 @@ class PointNet2Shape:
 
     def network(self, views: int, rngs: nnx.Rngs) -> PointNet2:
         """Returns a network of this shape with random weights, without dropout."""
-        return PointNet2(
-            views=views,
-            abstractions=self.abstractions,
-            global_layers=self.global_layers,
-            head_layers=self.head_layers,
-            dropout=0.0,
-            rngs=rngs,
-        )
+        return PointNet2(views=views, dropout=0.0, rngs=rngs, **vars(self))
 
 
 @dataclass(frozen=True)
@@ -67,8 +54,7 @@ class SetFusionShape:
 
     def network(self, features: int, classes: int, rngs: nnx.Rngs) -> SetFusion:
         """Returns a network of this shape with random weights, without dropout."""
-        shape = {"width": self.width, "heads": self.heads, "blocks": self.blocks}
-        return SetFusion(features, classes, **shape, dropout=0.0, rngs=rngs)
+        return SetFusion(features, classes, dropout=0.0, rngs=rngs, **vars(self))
 
 
 @dataclass(frozen=True)
@@ -80,29 +66,4 @@ class PoseShape:
 
     def network(self, features: int, classes: int, rngs: nnx.Rngs) -> PoseHead:
         """Returns a network of this shape with random weights, without dropout."""
-        return PoseHead(features, classes, poses=self.poses, width=self.width, dropout=0.0, rngs=rngs)
-
-
-@dataclass(frozen=True)
-class ViewPolicyShape:
-    """Arguments of `ViewPolicy`, without embeddings of clouds."""
-
-    width: int
-    heads: int
-    blocks: int
-    posed: bool
-    utility: Utility
-    floor: float
-
-    def network(self, classes: int, rngs: nnx.Rngs) -> ViewPolicy:
-        """Returns a network of this shape with random weights."""
-        return ViewPolicy(
-            classes,
-            width=self.width,
-            heads=self.heads,
-            blocks=self.blocks,
-            posed=self.posed,
-            utility=self.utility,
-            floor=self.floor,
-            rngs=rngs,
-        )
+        return PoseHead(features, classes, dropout=0.0, rngs=rngs, **vars(self))

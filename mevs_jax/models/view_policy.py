@@ -8,7 +8,11 @@ predicts the change of that class's log-odds if the object is of that class. The
 
 from __future__ import annotations
 
-from typing import Literal
+from dataclasses import dataclass, replace
+from functools import reduce
+from itertools import combinations_with_replacement
+from operator import mul
+from typing import Any, Literal
 
 import jax
 import jax.numpy as jnp
@@ -16,7 +20,7 @@ from flax import nnx
 from jaxtyping import Array, Bool, Float
 
 from mevs_jax.arrays import AnyArray
-from mevs_jax.models.set_fusion import has_azimuth, relative_to_first
+from mevs_jax.models.set_fusion import TransformerBlock, has_azimuth, relative_to_first, with_own_token
 
 Utility = Literal["probability", "log"]
 """The utility of a belief: the probability of the true class, or its logarithm."""
@@ -39,16 +43,9 @@ def utility_of(
 
 def direction_features(directions: Float[AnyArray, "*batch 3"]) -> Float[Array, "*batch 19"]:
     """All monomials of degree 1 to 3 of a unit vector: a linear layer on them can tell top from side and corner from face."""
-    directions = jnp.asarray(directions)
-    found = [directions[..., i] for i in range(3)]
-    for i in range(3):
-        for j in range(i, 3):
-            found.append(directions[..., i] * directions[..., j])
-    for i in range(3):
-        for j in range(i, 3):
-            for k in range(j, 3):
-                found.append(directions[..., i] * directions[..., j] * directions[..., k])
-    return jnp.stack(found, axis=-1)
+    coordinates = [jnp.asarray(directions)[..., axis] for axis in range(3)]
+    factors = (these for degree in (1, 2, 3) for these in combinations_with_replacement(coordinates, degree))
+    return jnp.stack([reduce(mul, these) for these in factors], axis=-1)
 
 
 def _without_azimuth(directions: Float[Array, "*batch candidates 3"]) -> Float[Array, "*batch candidates 3"]:
@@ -57,20 +54,44 @@ def _without_azimuth(directions: Float[Array, "*batch candidates 3"]) -> Float[A
     return jnp.stack([level, jnp.zeros_like(level), directions[..., 2]], axis=-1)
 
 
-class _CrossBlock(nnx.Module):
-    """A pre-norm transformer block with cross-attention from queries to the known tokens.
+class _CrossBlock(TransformerBlock):
+    """Cross-attention from queries to the known tokens.
 
     Queries do not attend to each other, so the score of a candidate does not depend on the other candidates.
     """
 
-    def __init__(self, width: int, heads: int, *, rngs: nnx.Rngs):
-        self.norm1, self.norm2 = nnx.LayerNorm(width, rngs=rngs), nnx.LayerNorm(width, rngs=rngs)
-        self.attention = nnx.MultiHeadAttention(heads, width, decode=False, rngs=rngs)
-        self.layer1, self.layer2 = nnx.Linear(width, 2 * width, rngs=rngs), nnx.Linear(2 * width, width, rngs=rngs)
-
     def __call__(self, queries: Array, known: Array, present: Array) -> Array:
         queries = queries + self.attention(self.norm1(queries), known, mask=present[..., None, None, :])
-        return queries + self.layer2(jax.nn.gelu(self.layer1(self.norm2(queries))))
+        return queries + self.perceptron(self.norm2(queries))
+
+
+@dataclass(frozen=True)
+class ViewPolicyShape:
+    """Arguments of `ViewPolicy`, without embeddings of clouds.
+
+    Attributes:
+        width: of queries and tokens.
+        heads: number of attention heads.
+        blocks: number of cross-attention blocks.
+        posed: whether directions are in the object's own frame; if not, in one rotated about the vertical axis by an unknown
+            angle.
+        utility: whose gain is predicted; see `utility_of`.
+        floor: of that utility.
+    """
+
+    width: int
+    heads: int
+    blocks: int
+    posed: bool
+    utility: Utility
+    floor: float
+
+    def network(self, classes: int, rngs: nnx.Rngs) -> ViewPolicy:
+        """Returns a network of this shape with random weights."""
+        return ViewPolicy(classes, rngs=rngs, **vars(self))
+
+
+_SHAPE = ViewPolicyShape(width=96, heads=4, blocks=2, posed=True, utility="log", floor=0.01)
 
 
 class ViewPolicy(nnx.Module):
@@ -78,35 +99,20 @@ class ViewPolicy(nnx.Module):
 
     Args:
         classes: number of classes of the belief.
-        width: of queries and tokens.
-        heads: number of attention heads.
-        blocks: number of cross-attention blocks.
         cloud: length of PointNet++'s embedding of the partial cloud of each view; 0 for none.
-        posed: whether directions are in the object's own frame; if not, in one rotated about the vertical axis by an unknown
-            angle.
-        utility: whose gain is predicted; see `utility_of`.
-        floor: of that utility.
         rngs: source of the initial weights.
+        shape: the attributes of `ViewPolicyShape`: width 96, heads 4, blocks 2, posed, the utility `log` and its floor 0.01 by
+            default.
     """
 
-    def __init__(
-        self,
-        classes: int,
-        *,
-        width: int = 96,
-        heads: int = 4,
-        blocks: int = 2,
-        cloud: int = 0,
-        posed: bool = True,
-        utility: Utility = "log",
-        floor: float = 0.01,
-        rngs: nnx.Rngs,
-    ):
-        self.classes, self.posed, self.utility, self.floor = classes, posed, utility, floor
+    def __init__(self, classes: int, *, cloud: int = 0, rngs: nnx.Rngs, **shape: Any):
+        chosen = replace(_SHAPE, **shape)
+        width = chosen.width
+        self.classes, self.posed, self.utility, self.floor = classes, chosen.posed, chosen.utility, chosen.floor
         self.direction = nnx.Linear(19, width, rngs=rngs)
         self.view, self.belief = nnx.Linear(classes, width, rngs=rngs), nnx.Linear(classes + 1, width, rngs=rngs)
         self.token1, self.token2 = nnx.Linear(width, 2 * width, rngs=rngs), nnx.Linear(2 * width, width, rngs=rngs)
-        self.blocks = nnx.List([_CrossBlock(width, heads, rngs=rngs) for _ in range(blocks)])
+        self.blocks = nnx.List([_CrossBlock(width, chosen.heads, rngs=rngs) for _ in range(chosen.blocks)])
         self.known_norm, self.last_norm = nnx.LayerNorm(width, rngs=rngs), nnx.LayerNorm(width, rngs=rngs)
         zeros = nnx.initializers.zeros_init()  # an untrained network predicts no gain
         self.gain = nnx.Linear(width, 1, kernel_init=zeros, rngs=rngs)
@@ -159,7 +165,7 @@ class ViewPolicy(nnx.Module):
         own = self.belief(jnp.concatenate([jnp.maximum(belief, least), count], axis=-1))
         tokens = jnp.concatenate([own[..., None, :], tokens], axis=-2)
         tokens = self.known_norm(tokens + self.token2(jax.nn.gelu(self.token1(tokens))))
-        attended = jnp.concatenate([jnp.ones((*present.shape[:-1], 1), bool), present], axis=-1)
+        attended = with_own_token(present)
         queries = self.direction(direction_features(candidates)) + own[..., None, :]
         for block in self.blocks:
             queries = block(queries, tokens, attended)

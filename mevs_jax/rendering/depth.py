@@ -15,7 +15,7 @@ import flax.struct
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int, UInt32
+from jaxtyping import Array, Float, Int, Shaped, UInt32
 
 from mevs_jax.arrays import AnyArray
 from mevs_jax.geometry.cameras import Camera
@@ -70,11 +70,14 @@ def render_depth(triangles: Float[AnyArray, "faces 3 3"], camera: Camera) -> Ren
     rows, columns = (axis.reshape(-1) for axis in jnp.meshgrid(corner, corner, indexing="ij"))
     nearness, face = jax.vmap(tile)(rows, columns)
 
-    def whole(of_tiles: Array) -> Array:
-        image = of_tiles.reshape(tiles, tiles, _TILE, _TILE).swapaxes(1, 2)
-        return image.reshape(tiles * _TILE, -1)[:side, :side]
+    return Rendering(image_of_tiles(1 / nearness, _TILE, side), image_of_tiles(face, _TILE, side))
 
-    return Rendering(whole(1 / nearness), whole(face))
+
+def image_of_tiles(pixels: Shaped[Array, "tiles pixels"], tile: int, side: int) -> Shaped[Array, "{side} {side}"]:
+    """The image of `side` by `side` pixels from those of square tiles, `tile` pixels wide, row by row."""
+    across = -(-side // tile)
+    image = pixels.reshape(across, across, tile, tile).swapaxes(1, 2)
+    return image.reshape(across * tile, -1)[:side, :side]
 
 
 def _planes(corners: Float[Array, "faces 3 3"]) -> Float[Array, "faces 4 3"]:

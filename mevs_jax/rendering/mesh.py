@@ -20,6 +20,7 @@ from jaxtyping import Array, Float, Int
 
 from mevs_jax.arrays import AnyArray
 from mevs_jax.geometry.cameras import Camera
+from mevs_jax.rendering.depth import image_of_tiles
 from mevs_jax.rendering.piecewise import limited, smaller
 
 _NEAREST = 1e-3  # least depth of a corner of a visible face
@@ -108,7 +109,7 @@ def render_mesh(
     """
     triangles = jnp.asarray(triangles)
     corners = (triangles - camera.pose[:3, 3]) @ camera.pose[:3, :3]
-    side, focal = camera.resolution, camera.focal_length
+    side = camera.resolution
     tile, at_once = _pieces(side)
     listed, counts = _near_tiles(jax.lax.stop_gradient(corners), camera, _FAR * softness.edge, tile)
     listed = jnp.pad(listed, ((0, 0), (0, -len(corners) % at_once)), constant_values=len(corners))
@@ -116,49 +117,62 @@ def render_mesh(
     pixel = jnp.arange(tile, dtype=corners.dtype) + 0.5 - side / 2
     rows, columns = jnp.meshgrid(pixel, pixel, indexing="ij")
     within = jnp.stack([columns.reshape(-1), rows.reshape(-1)])
-    none = jnp.zeros_like(within[0])
+    edge = jnp.arange(0, side, tile, dtype=corners.dtype)
+    corner = jnp.stack(jnp.meshgrid(edge, edge, indexing="xy"), axis=-1).reshape(-1, 2)
 
     def of_tile(arguments: tuple[Array, Array, Array]) -> tuple[Array, Array]:
         faces, count, corner = arguments
-        at = within + corner[:, None]
+        chunks, at = faces.reshape(-1, at_once), within + corner[:, None]
+        return _tile(corners, chunks, count, at, camera.focal_length, softness)
 
-        def add(carry: tuple[Array, ...], chunk: Float[Array, "faces 3 3"]) -> tuple[Array, ...]:
-            empty, largest, total, *seen = carry
-            # The barriers keep XLA from recomputing all of this for each of the sums.
-            cover, nearness, normal = jax.lax.optimization_barrier(_faces(chunk, at, focal, softness.edge))
-            spread = _softplus(cover)
-            empty = empty - jnp.sum(spread, axis=0)  # log(1 − sigmoid(x)) = −softplus(x)
-            # log(sigmoid(x)) = x − softplus(x). The lower limit: with less coverage a face is invisible at any nearness, and
-            # adding a larger number would round off differences of nearness.
-            hidden = limited(cover - spread + math.log(2), _LEAST, 0.0)
-            weight = jnp.where(cover > _NOWHERE, (hidden + nearness) / softness.nearness, -jnp.inf)
-            now = jax.lax.stop_gradient(jnp.maximum(largest, jnp.max(weight, axis=0)))
-            weight, before = jax.lax.optimization_barrier((jnp.exp(weight - now), jnp.exp(largest - now)))
-            # No matrix products here, since an accelerator might lower their precision.
-            here = [weight / nearness, *(weight * normal[:, axis, None] for axis in range(3))]
-            seen = [before * sofar + jnp.sum(part, axis=0) for sofar, part in zip(seen, here, strict=True)]
-            return empty, now, before * total + jnp.sum(weight, axis=0), *seen
-
-        @jax.checkpoint
-        def some(carry: tuple[Array, ...], chunk: tuple[Array, Array]) -> tuple[tuple[Array, ...], None]:
-            first, chosen = chunk
-            return jax.lax.cond(first < count, lambda: add(carry, corners[chosen]), lambda: carry), None
-
-        start = (none, jnp.full_like(none, -1e30), *[none] * 5)
-        chunks = jnp.arange(0, len(faces), at_once), faces.reshape(-1, at_once)
-        (empty, _, total, *seen), _ = jax.lax.scan(some, start, chunks)
-        return empty, jnp.stack(seen) / jnp.where(total > 0, total, 1.0)
-
-    edge = jnp.arange(0, side, tile, dtype=corners.dtype)
-    corner = jnp.stack(jnp.meshgrid(edge, edge, indexing="xy"), axis=-1).reshape(-1, 2)
     empty, seen = jax.lax.map(of_tile, (listed, counts, corner))
+    depth, *normal = (image_of_tiles(seen[:, channel], tile, side) for channel in range(4))
+    return SoftRendering(-jnp.expm1(image_of_tiles(empty, tile, side)), depth, jnp.stack(normal, axis=-1))
 
-    def image(tiles: Float[Array, "tiles pixels"]) -> Float[Array, "side side"]:
-        whole = tiles.reshape(len(edge), len(edge), tile, tile).swapaxes(1, 2)
-        return whole.reshape(len(edge) * tile, -1)[:side, :side]
 
-    depth, *normal = (image(seen[:, channel]) for channel in range(4))
-    return SoftRendering(-jnp.expm1(image(empty)), depth, jnp.stack(normal, axis=-1))
+def _tile(
+    corners: Float[Array, "faces 3 3"],
+    chunks: Int[Array, "chunks faces_at_once"],
+    count: Int[Array, ""],
+    at: Float[Array, "2 pixels"],
+    focal: float,
+    softness: Softness,
+) -> tuple[Float[Array, " pixels"], Float[Array, "4 pixels"]]:
+    """The log-transmittance of the pixels of a tile, and their depth and normal, from the first `count` of the faces listed."""
+
+    @jax.checkpoint
+    def some(carry: tuple[Array, ...], chunk: tuple[Array, Array]) -> tuple[tuple[Array, ...], None]:
+        first, chosen = chunk
+        seen = jax.lax.cond(
+            first < count, lambda: _with_faces(carry, corners[chosen], at, focal, softness), lambda: carry
+        )
+        return seen, None
+
+    none = jnp.zeros_like(at[0])
+    start = (none, jnp.full_like(none, -1e30), *[none] * 5)
+    (empty, _, total, *seen), _ = jax.lax.scan(some, start, (jnp.arange(0, chunks.size, chunks.shape[1]), chunks))
+    return empty, jnp.stack(seen) / jnp.where(total > 0, total, 1.0)
+
+
+def _with_faces(
+    carry: tuple[Array, ...], faces: Float[Array, "faces 3 3"], at: Array, focal: float, softness: Softness
+) -> tuple[Array, ...]:
+    """The sums over faces with some more: log-transmittance, largest weight, sums of weights, depths and normals."""
+    empty, largest, total, *seen = carry
+    # The barriers keep XLA from recomputing all of this for each of the sums.
+    cover, nearness, normal = jax.lax.optimization_barrier(_faces(faces, at, focal, softness.edge))
+    spread = _softplus(cover)
+    empty = empty - jnp.sum(spread, axis=0)  # log(1 − sigmoid(x)) = −softplus(x)
+    # log(sigmoid(x)) = x − softplus(x). The lower limit: with less coverage a face is invisible at any nearness, and adding a
+    # larger number would round off differences of nearness.
+    hidden = limited(cover - spread + math.log(2), _LEAST, 0.0)
+    weight = jnp.where(cover > _NOWHERE, (hidden + nearness) / softness.nearness, -jnp.inf)
+    now = jax.lax.stop_gradient(jnp.maximum(largest, jnp.max(weight, axis=0)))
+    weight, before = jax.lax.optimization_barrier((jnp.exp(weight - now), jnp.exp(largest - now)))
+    # No matrix products here, since an accelerator might lower their precision.
+    here = [weight / nearness, *(weight * normal[:, axis, None] for axis in range(3))]
+    seen = [before * sofar + jnp.sum(part, axis=0) for sofar, part in zip(seen, here, strict=True)]
+    return empty, now, before * total + jnp.sum(weight, axis=0), *seen
 
 
 def _faces(

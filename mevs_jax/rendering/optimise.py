@@ -7,6 +7,7 @@ the camera. Gradients are computed in forward mode by default, which suits two p
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 
 import flax.struct
 import jax
@@ -50,6 +51,22 @@ class _Walk:
     path: Array
     path_values: Array
 
+    @classmethod
+    def begun(cls, start: Array, moments: optax.OptState, steps: int) -> _Walk:
+        none, path = jnp.int32(0), jnp.broadcast_to(start[:3, 3], (steps + 1, 3))
+        worst = jnp.array(-jnp.inf, start.dtype)
+        return cls(start, moments, start, worst, none, none, path, jnp.zeros(steps + 1, start.dtype))
+
+    def valued(self, value: Array) -> _Walk:
+        """With the objective at its pose, which is kept if it is the best, and until the path's end."""
+        better = value > self.best_value
+        return replace(
+            self,
+            best=jnp.where(better, self.pose, self.best),
+            best_value=jnp.where(better, value, self.best_value),
+            path_values=jnp.where(jnp.arange(len(self.path_values)) >= self.step, value, self.path_values),
+        )
+
 
 def ascend(
     objective: Objective,
@@ -75,63 +92,45 @@ def ascend(
         forwards: whether to compute gradients in forward mode; False for objectives that have reverse-mode gradients only, such
             as those on `render_silhouette`.
     """
-    rates = optax.cosine_decay_schedule(rate, steps, 0.1)
-    optimiser = optax.adam(rates, b1=0.8, b2=0.95)
+    optimiser = optax.adam(optax.cosine_decay_schedule(rate, steps, 0.1), b1=0.8, b2=0.95)
     here = jnp.zeros(2, starts.dtype)
+    value_and_slope = _forward_slope if forwards else jax.value_and_grad
 
-    def value_and_slope(pose: Array) -> tuple[Array, Array]:
-        if not forwards:
-            return jax.value_and_grad(lambda step: objective(orbit(pose, step)))(here)
-        along = lambda push: jax.jvp(lambda step: objective(orbit(pose, step)), (here,), (push,))  # noqa: E731
-        return jax.vmap(along, out_axes=(None, 0))(jnp.eye(2, dtype=here.dtype))
-
-    def one(start: Array) -> _Walk:
-        def unfinished(walk: _Walk) -> Bool[Array, ""]:
-            return (walk.step < steps) & (walk.calm < patience)
-
-        def climb(walk: _Walk) -> _Walk:
-            value, slope = value_and_slope(walk.pose)
-            # The scale of slopes differs between objectives. Adam normalises it, and a slope of zero stays zero.
-            update, moments = optimiser.update(-slope, walk.moments)
-            gain = value - walk.best_value > tolerance * jnp.abs(value)
-            better = value > walk.best_value
-            pose = orbit(walk.pose, update)
-            return _Walk(
-                pose=pose,
-                moments=moments,
-                best=jnp.where(better, walk.pose, walk.best),
-                best_value=jnp.where(better, value, walk.best_value),
-                calm=jnp.where(gain, 0, walk.calm + 1),
-                step=walk.step + 1,
-                path=jnp.where(jnp.arange(steps + 1)[:, None] > walk.step, pose[:3, 3], walk.path),
-                path_values=jnp.where(jnp.arange(steps + 1) >= walk.step, value, walk.path_values),
-            )
-
-        walk = _Walk(
-            pose=start,
-            moments=optimiser.init(here),
-            best=start,
-            best_value=jnp.array(-jnp.inf, start.dtype),
-            calm=jnp.int32(0),
-            step=jnp.int32(0),
-            path=jnp.broadcast_to(start[:3, 3], (steps + 1, 3)),
-            path_values=jnp.zeros(steps + 1, start.dtype),
+    def climb(walk: _Walk) -> _Walk:
+        value, slope = value_and_slope(lambda step: objective(orbit(walk.pose, step)))(here)
+        # The scale of slopes differs between objectives. Adam normalises it, and a slope of zero stays zero.
+        update, moments = optimiser.update(-slope, walk.moments)
+        gain = value - walk.best_value > tolerance * jnp.abs(value)
+        pose = orbit(walk.pose, update)
+        return replace(
+            walk.valued(value),
+            pose=pose,
+            moments=moments,
+            calm=jnp.where(gain, 0, walk.calm + 1),
+            step=walk.step + 1,
+            path=jnp.where(jnp.arange(steps + 1)[:, None] > walk.step, pose[:3, 3], walk.path),
         )
-        walk = jax.lax.while_loop(unfinished, climb, walk)
-        # The objective at the last pose has not been evaluated yet.
-        last = objective(walk.pose)
-        better = last > walk.best_value
-        return walk.replace(  # type: ignore[attr-defined]
-            best=jnp.where(better, walk.pose, walk.best),
-            best_value=jnp.where(better, last, walk.best_value),
-            path_values=jnp.where(jnp.arange(steps + 1) >= walk.step, last, walk.path_values),
-        )
+
+    def climb_from(start: Array) -> _Walk:
+        begun = _Walk.begun(start, optimiser.init(here), steps)
+        walk = jax.lax.while_loop(lambda walk: (walk.step < steps) & (walk.calm < patience), climb, begun)
+        return walk.valued(objective(walk.pose))  # the objective at the last pose has not been evaluated yet
 
     if at_once is None:
         at_once = 1 if jax.default_backend() == "cpu" else len(starts)
     # A batch of one is a `vmap` too, in which both branches of a `cond` are computed; None avoids that.
-    walks = jax.lax.map(one, starts, batch_size=at_once if at_once > 1 else None)
+    walks = jax.lax.map(climb_from, starts, batch_size=at_once if at_once > 1 else None)
     return Ascent(walks.best, walks.best_value, walks.path, walks.path_values, walks.step)
+
+
+def _forward_slope(function: Callable[[Array], Array]) -> Callable[[Array], tuple[Array, Array]]:
+    """As `jax.value_and_grad`, in forward mode."""
+
+    def value_and_slope(here: Array) -> tuple[Array, Array]:
+        along = lambda push: jax.jvp(function, (here,), (push,))  # noqa: E731
+        return jax.vmap(along, out_axes=(None, 0))(jnp.eye(len(here), dtype=here.dtype))
+
+    return value_and_slope
 
 
 def distinct_optima(

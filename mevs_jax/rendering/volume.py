@@ -127,8 +127,8 @@ def _march_back(cells: Array, rays: tuple[Array, Array], steps: int, absorption:
 
 
 def _march_back_forward(cells: Array, rays: tuple[Array, Array], steps: int, absorption: float):
-    transmitted, depth = _march(cells, rays, steps, absorption)
-    return (transmitted, depth), (cells, rays, transmitted)
+    marched = _march(cells, rays, steps, absorption)
+    return marched, (cells, rays, marched[0])
 
 
 def _march_back_backward(steps: int, absorption: float, residuals: tuple, cotangents: tuple[Array, Array]):

@@ -50,13 +50,8 @@ class ViewTable:
 
     def observe(self, view: Int[Array, ""]) -> Observation:
         """Returns the observation of one view."""
-        return Observation(
-            self.logits[view],
-            None if self.predicted_entropy is None else self.predicted_entropy[view],
-            None if self.features is None else self.features[view],
-            None if self.clouds is None else self.clouds[view],
-            None if self.pose_evidence is None else self.pose_evidence[view],
-        )
+        whole = Observation(self.logits, self.predicted_entropy, self.features, self.clouds, self.pose_evidence)
+        return jax.tree.map(lambda values: values[view], whole)
 
     def scene(
         self, graph: ViewGraph, knowledge: Knowledge | None = None, reachable: Bool[Array, " views"] | None = None
@@ -174,23 +169,9 @@ def select_views(
 
     def step(carry: tuple[SelectionState, Episode]) -> tuple[SelectionState, Episode]:
         state, episode = carry
-        latest = observed(state.view)
-        state = replace(
-            state,
-            count=state.count + 1,
-            attempted=state.attempted | (jnp.arange(views) == state.view),
-            latest=latest,
-            views=_put(state.views, state.count, state.view),
-            seen=jax.tree.map(lambda history, now: _put(history, state.count, now), state.seen, latest),
-        )
-        belief = fuse(state, scene).astype(jnp.float32)
-        state = replace(state, belief=belief)
-        episode = Episode(
-            views=state.views,
-            predictions=_put(episode.predictions, state.count - 1, jnp.argmax(belief).astype(jnp.int32)),
-            confidences=_put(episode.confidences, state.count - 1, confidence(belief).astype(jnp.float32)),
-            count=state.count,
-        )
+        state = _with_observation(state, _observed(observe, state.view))
+        state = replace(state, belief=fuse(state, scene).astype(jnp.float32))
+        episode = _with_prediction(episode, state)
 
         def next_view() -> Int[Array, ""]:
             scores = policy(jax.random.fold_in(key, state.count), state, scene)
@@ -199,20 +180,30 @@ def select_views(
         # After the last view nothing is chosen.
         return replace(state, view=jax.lax.cond(state.count < limit, next_view, lambda: state.view)), episode
 
-    def observed(view: Int[Array, ""]) -> Observation:
-        """The observation of a view, with logits in float32."""
-        found = observe(view)
-        return replace(found, logits=found.logits.astype(jnp.float32))
+    return jax.lax.while_loop(unsure, step, _begun(_blank(observe, start), start, views, max_views))[1]
 
+
+def _observed(observe: Callable[[Int[Array, ""]], Observation], view: Int[Array, ""]) -> Observation:
+    """The observation of a view, with logits in float32."""
+    found = observe(view)
+    return replace(found, logits=found.logits.astype(jnp.float32))
+
+
+def _blank(observe: Callable[[Int[Array, ""]], Observation], view: Int[Array, ""]) -> Observation:
+    """An observation of zeros, of the shapes that `observe` returns."""
     structures = []  # receives the tree structure of an observation when `observe` is traced
 
     def leaves_of(view: Int[Array, ""]) -> list[Array]:
-        leaves, structure = jax.tree.flatten(observed(view))
+        leaves, structure = jax.tree.flatten(_observed(observe, view))
         structures.append(structure)
         return leaves
 
-    shapes = jax.eval_shape(leaves_of, start)
-    blank = jax.tree.unflatten(structures[0], [jnp.zeros(shape.shape, shape.dtype) for shape in shapes])
+    shapes = jax.eval_shape(leaves_of, view)
+    return jax.tree.unflatten(structures[0], [jnp.zeros(shape.shape, shape.dtype) for shape in shapes])
+
+
+def _begun(blank: Observation, start: Int[Array, ""], views: int, max_views: int) -> tuple[SelectionState, Episode]:
+    """State and episode before the first view is observed."""
     unset = jnp.full(max_views, -1, jnp.int32)
     state = SelectionState(
         count=jnp.int32(0),
@@ -223,8 +214,30 @@ def select_views(
         views=unset,
         seen=jax.tree.map(lambda leaf: jnp.zeros((max_views, *leaf.shape), leaf.dtype), blank),
     )
-    episode = Episode(unset, unset, jnp.zeros(max_views, jnp.float32), jnp.int32(0))
-    return jax.lax.while_loop(unsure, step, (state, episode))[1]
+    return state, Episode(unset, unset, jnp.zeros(max_views, jnp.float32), jnp.int32(0))
+
+
+def _with_observation(state: SelectionState, latest: Observation) -> SelectionState:
+    """The state after the observation of `state.view`, with the belief before it."""
+    return replace(
+        state,
+        count=state.count + 1,
+        attempted=state.attempted | (jnp.arange(len(state.attempted)) == state.view),
+        latest=latest,
+        views=_put(state.views, state.count, state.view),
+        seen=jax.tree.map(lambda history, now: _put(history, state.count, now), state.seen, latest),
+    )
+
+
+def _with_prediction(episode: Episode, state: SelectionState) -> Episode:
+    """The episode with the latest belief's prediction and confidence."""
+    step, prediction = state.count - 1, jnp.argmax(state.belief).astype(jnp.int32)
+    return Episode(
+        views=state.views,
+        predictions=_put(episode.predictions, step, prediction),
+        confidences=_put(episode.confidences, step, confidence(state.belief).astype(jnp.float32)),
+        count=state.count,
+    )
 
 
 def _put(history: Array, index: Int[Array, ""], value: Array) -> Array:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import signal
 import subprocess
 import sys
@@ -14,8 +15,12 @@ from mevs_jax.cli import main as cli
 MEVS = [sys.executable, "-m", "mevs_jax"]
 
 
-def mevs(*arguments: str | Path, cwd: Path | None = None) -> subprocess.CompletedProcess:
-    return subprocess.run([*MEVS, *map(str, arguments)], capture_output=True, text=True, cwd=cwd, timeout=600)
+def one_after_another(*commands: tuple[str | Path, ...], **environment: str) -> subprocess.CompletedProcess:
+    """Commands in one process of their own, whose environment is another."""
+    calls = [["mevs_jax", *map(str, command)] for command in commands]
+    script = f"import sys\nfrom mevs_jax.cli.main import main\nfor sys.argv in {calls!r}: main()"
+    environment = os.environ | environment
+    return subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, timeout=600, env=environment)
 
 
 @pytest.fixture
@@ -43,6 +48,12 @@ def at_once(monkeypatch, capfd):
 def refuses(at_once):
     """The sentence with which it refuses something."""
     return lambda *arguments: refused(at_once(*arguments))
+
+
+def ended(result: subprocess.CompletedProcess) -> str:
+    """What a command that did not fail says."""
+    assert result.returncode == 0, result.stderr
+    return result.stdout
 
 
 def refused(result: subprocess.CompletedProcess, code: int = 2) -> str:

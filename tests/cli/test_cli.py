@@ -18,7 +18,7 @@ import pytest
 from eval.learned.stage import learn_to_choose
 from eval.settings import TINY
 from eval.stages import ascend_on_objects, report
-from tests.cli.conftest import MEVS, mevs, refused
+from tests.cli.conftest import MEVS, ended, one_after_another, refused
 from tests.conftest import open3d_or_skip
 from tests.reference.leaks import LEARNED
 
@@ -51,21 +51,19 @@ def test_the_job_leaves_a_report_and_metrics(whole):
 
 
 @pytest.mark.slow
-def test_a_run_that_diverges_ends_with_one_sentence(data, tmp_path):
+def test_a_run_that_diverges_ends_with_one_sentence(data, tmp_path, at_once):
     """A learning rate at which the loss stays finite, and results from the classifier's outputs do not."""
     (tmp_path / "data").symlink_to(data)
     rate = ("--classifier.optimiser.learning-rate", "1e6", "--entropy.optimiser.epochs", "1")
-    ended = refused(mevs("run", "--preset", "tiny", "--out", tmp_path, *rate), code=3)
+    ended = refused(at_once("run", "--preset", "tiny", "--out", tmp_path, *rate), code=3)
     assert re.search(r"not finite.*; to train it again, lower --classifier.optimiser.learning-rate, and delete", ended)
     assert not (tmp_path / "metrics.json").exists()
 
 
-def test_a_second_run_redoes_nothing(whole, tmp_path):
-    out = tmp_path / "run"
-    shutil.copytree(whole, out)
+def test_a_second_run_redoes_nothing(whole, tmp_path, at_once):
+    out = shutil.copytree(whole, tmp_path / "run")
     before = {path: path.stat().st_mtime_ns for path in out.rglob("*") if path.is_file()}
-    result = mevs("run", "--preset", "tiny", "--out", out)
-    assert result.returncode == 0
+    ended(at_once("run", "--preset", "tiny", "--out", out))
     assert before == {path: path.stat().st_mtime_ns for path in out.rglob("*") if path.is_file()}
 
 
@@ -102,14 +100,14 @@ def test_learning_writes_a_page_and_is_not_repeated(studied, tmp_path):
 
 
 @pytest.mark.slow
-def test_published_code_and_ascents_fill_their_tables(whole, tmp_path):
+def test_published_code_and_ascents_fill_their_tables(whole, tmp_path, at_once):
     """One evaluation of what `mevs study published-code` and `mevs study rendering` add to a run."""
     open3d_or_skip()
     out = tmp_path / "run"
     shutil.copytree(whole, out)
     assert "mevs study published-code" in (out / "report" / "index.html").read_text()
     ascend_on_objects(TINY, out)
-    assert mevs("compat", "--preset", "tiny", "--out", out).returncode == 0
+    ended(at_once("compat", "--preset", "tiny", "--out", out))
     metrics = json.loads((out / "metrics.json").read_text())
     made = metrics["compatibility"]
     assert all(row["difference"] is not None for row in made["rows"].values())
@@ -123,6 +121,9 @@ def test_published_code_and_ascents_fill_their_tables(whole, tmp_path):
     assert before["compatibility"]["rows"]["text"] == made["rows"]["text"]
 
 
+LIVE = ("check", "live", "--live.objects", "6")
+
+
 @pytest.mark.parametrize(
     "policies",
     [
@@ -133,19 +134,8 @@ def test_published_code_and_ascents_fill_their_tables(whole, tmp_path):
 )
 def test_live_walks_what_the_tables_say(policies, whole, tmp_path, at_once, refuses):
     shutil.copytree(whole, tmp_path / "run")
-    arguments = (
-        "check",
-        "live",
-        "--preset",
-        "tiny",
-        "--live.objects",
-        "6",
-        "--out",
-        tmp_path / "run",
-        "--live.policies",
-    )
-    result = at_once(*arguments, *policies)
-    assert result.returncode == 0, result.stderr
+    arguments = (*LIVE, "--preset", "tiny", "--out", tmp_path / "run", "--live.policies")
+    ended(at_once(*arguments, *policies))
     found = json.loads((tmp_path / "run" / "live.json").read_text())
     assert set(found) == set(policies)
     for policy, agreement in found.items():
@@ -154,20 +144,17 @@ def test_live_walks_what_the_tables_say(policies, whole, tmp_path, at_once, refu
 
 
 @pytest.mark.slow
-def test_many_devices_say_what_one_does(whole, tmp_path, monkeypatch):
+def test_many_devices_say_what_one_does(whole, tmp_path):
     """View tables and live walks on four simulated devices, whose number divides neither the objects nor the chunks."""
     out = tmp_path / "run"
     shutil.copytree(whole, out)
     shutil.rmtree(out / "tables")
     (out / "metrics.json").unlink()
-    monkeypatch.setenv("JAX_NUM_CPU_DEVICES", "4")
-    result = mevs("eval", "--preset", "tiny", "--out", out)
-    assert result.returncode == 0, result.stderr
+    evaluate, walk = ("eval", "--out", out), (*LIVE, "--out", out, "--live.policies", "random")
+    ended(one_after_another(evaluate, walk, JAX_NUM_CPU_DEVICES="4"))
     with np.load(out / "tables" / "test.npz") as mine, np.load(whole / "tables" / "test.npz") as theirs:
         for name in ("logits", "predicted_entropy"):
             np.testing.assert_allclose(mine[name], theirs[name], rtol=1e-4, atol=1e-5)
-    result = mevs("check", "live", "--preset", "tiny", "--live.objects", "6", "--out", out, "--live.policies", "random")
-    assert result.returncode == 0, result.stderr
     agreement = json.loads((out / "live.json").read_text())["random"]
     assert agreement["walks"] == agreement["same"] == 6
 
@@ -179,22 +166,19 @@ def test_a_sweep_without_members_is_refused(whole, tmp_path, refuses):
 
 
 @pytest.mark.slow
-def test_a_sweep_is_made_by_command(whole, tmp_path):
+def test_a_sweep_is_made_by_command(whole, tmp_path, at_once):
     (tmp_path / "data").symlink_to(whole / "data")
-    result = mevs("sweep", "--preset", "tiny", "--out", tmp_path, "--sweep.members", "3")
-    assert result.returncode == 0, result.stderr
-    assert "Best of 3: validation loss" in result.stdout
+    said = ended(at_once("sweep", "--preset", "tiny", "--out", tmp_path, "--sweep.members", "3"))
+    assert "Best of 3: validation loss" in said
     assert len(json.loads((tmp_path / "sweep" / "entropy" / "members.json").read_text())) == 3
     grid = ("--grid", "learning-rate=1e-4,1e-3", "--seeds", "2", "--adopt", "--sweep.network", "classifier")
-    result = mevs("sweep", "--out", tmp_path, *grid)
-    assert result.returncode == 0, result.stderr
-    assert "Best of 4: validation loss" in result.stdout
-    assert f"The run has it now: {tmp_path / 'classifier'}" in result.stdout
+    said = ended(at_once("sweep", "--out", tmp_path, *grid))
+    assert "Best of 4: validation loss" in said
+    assert f"The run has it now: {tmp_path / 'classifier'}" in said
     kept = json.loads((tmp_path / "run.json").read_text())["settings"]
     assert kept["classifier"]["optimiser"]["learning_rate"] in (1e-4, 1e-3)
     assert kept["seeds"] == 1
-    result = mevs("train", "--out", tmp_path)  # trains the other network alone
-    assert result.returncode == 0, result.stderr
+    ended(at_once("train", "--out", tmp_path))  # trains the other network alone
 
 
 def test_a_reach_that_leaves_nothing_is_refused(whole, refuses):
@@ -220,10 +204,8 @@ def kill_when(out: Path, ready, sign: int) -> int:
     return process.returncode
 
 
-def ends_like(out: Path, whole: Path) -> None:
-    """The job in `out`, begun again, ends with the results of the job that was never interrupted."""
-    result = mevs("run", "--preset", "tiny", "--out", out)
-    assert result.returncode == 0, result.stderr
+def is_like(out: Path, whole: Path) -> None:
+    """The job in `out`, which was begun again, ended with the results of the job that was never interrupted."""
     assert json.loads((out / "metrics.json").read_text()) == json.loads((whole / "metrics.json").read_text())
     with np.load(out / "tables" / "test.npz") as a, np.load(whole / "tables" / "test.npz") as b:
         np.testing.assert_array_equal(a["logits"], b["logits"])
@@ -236,24 +218,25 @@ def has_trained_an_epoch(out: Path) -> bool:
 
 
 @pytest.mark.slow
-def test_an_interrupted_training_ends_as_one_that_was_not(whole, tmp_path):
+def test_an_interrupted_training_ends_as_one_that_was_not(whole, tmp_path, at_once):
     """Interrupted after an epoch; the slow test below compares whole jobs."""
     shutil.copytree(whole / "data", tmp_path / "data")
     shutil.copytree(whole / "entropy", tmp_path / "entropy")
     assert kill_when(tmp_path, has_trained_an_epoch, signal.SIGINT) == 130
     assert not (tmp_path / "classifier" / "summary.json").exists()
-    assert mevs("train", "--preset", "tiny", "--out", tmp_path).returncode == 0
+    ended(at_once("train", "--preset", "tiny", "--out", tmp_path))
     mine, theirs = (json.loads((out / "classifier" / "summary.json").read_text()) for out in (tmp_path, whole))
     assert mine | {"seconds": 0} == theirs | {"seconds": 0}
     assert list(tmp_path.rglob("*.partial*")) == []
 
 
 @pytest.mark.slow
-def test_a_job_that_is_killed_again_and_again_ends_with_the_same_metrics(whole, tmp_path):
+def test_a_job_that_is_killed_again_and_again_ends_with_the_same_metrics(whole, tmp_path, at_once):
     for ready, sign, code in (
         (lambda out: len(list((out / "data" / "captures").glob("*.npz"))) > 5, signal.SIGKILL, -signal.SIGKILL),
         (has_trained_an_epoch, signal.SIGINT, 130),
         (lambda out: (out / "entropy" / "config.json").exists(), signal.SIGKILL, -signal.SIGKILL),
     ):
         assert kill_when(tmp_path, ready, sign) == code
-    ends_like(tmp_path, whole)
+    ended(at_once("run", "--preset", "tiny", "--out", tmp_path))
+    is_like(tmp_path, whole)

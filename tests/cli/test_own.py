@@ -8,7 +8,7 @@ import shutil
 import pytest
 
 from mevs_jax import POLICIES, ViewGraph, fibonacci_sphere
-from tests.cli.conftest import mevs
+from tests.cli.conftest import ended
 
 POLICY = """
 import jax
@@ -74,11 +74,6 @@ def test_a_policy_enters_the_evaluation_and_the_report(whole, tmp_path, file, at
     assert metrics_of(out) == before
 
 
-def ended(result) -> str:
-    assert result.returncode == 0, result.stderr
-    return result.stdout
-
-
 def test_a_policy_that_cannot_be_used_is_refused_before_anything_is_made(tmp_path, file, refuses):
     out = tmp_path / "new"
     command = ("run", "--preset", "tiny", "--out", out, "--policy")
@@ -90,10 +85,10 @@ def test_a_policy_that_cannot_be_used_is_refused_before_anything_is_made(tmp_pat
 
 
 @pytest.mark.slow
-def test_a_policy_is_walked_live(whole, tmp_path, file):
+def test_a_policy_is_walked_live(whole, tmp_path, file, at_once):
     out = tmp_path / "run"
     shutil.copytree(whole, out)
-    ended(mevs("check", "live", "--out", out, "--live.policies", "random", "--policy", f"{file}:drawn"))
+    ended(at_once("check", "live", "--out", out, "--live.policies", "random", "--policy", f"{file}:drawn"))
     found = json.loads((out / "live.json").read_text())
     assert set(found) == {"random", "drawn"}
     assert all(agreement["walks"] == agreement["same"] for agreement in found.values())

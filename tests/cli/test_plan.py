@@ -13,7 +13,7 @@ import yaml
 
 import train.planning.plan
 from mevs_jax.cli.planning import plan_text
-from tests.cli.conftest import refused
+from tests.cli.conftest import ended, refused
 
 SCALING = Path(__file__).resolve().parents[2] / "docs" / "scaling.md"
 POD = ("--distributed", "--plan", "--plan-devices", "64", "--plan-processes", "16")
@@ -59,11 +59,10 @@ def test_a_pod_and_a_million_objects_are_planned_from_any_machine(preset, at_onc
 
 def test_the_data_set_that_is_there_is_planned_for(data, at_once, tmp_path):
     (tmp_path / "data").symlink_to(data)
-    found = at_once("train", "--preset", "tiny", "--plan", "--out", tmp_path)
-    assert found.returncode == 0, found.stderr
-    assert "data set: 30 objects to train on, 10 for validation, 10 classes, 6 views of 32×32" in found.stdout
-    assert re.search(r"of an object +[\d.]+ kB, measured +[\d.]+ kB, measured", found.stdout)
-    assert "8 an epoch, 16 in 2 epochs" in found.stdout
+    said = ended(at_once("train", "--preset", "tiny", "--plan", "--out", tmp_path))
+    assert "data set: 30 objects to train on, 10 for validation, 10 classes, 6 views of 32×32" in said
+    assert re.search(r"of an object +[\d.]+ kB, measured +[\d.]+ kB, measured", said)
+    assert "8 an epoch, 16 in 2 epochs" in said
     assert [path.name for path in tmp_path.iterdir()] == ["data"]
 
 

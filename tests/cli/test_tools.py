@@ -18,7 +18,7 @@ from eval.checks.scenes import CONDITIONS
 from mevs_jax.agent import load_history, viewing
 from mevs_jax.cli.options import RealityOptions
 from mevs_jax.trained import load, save
-from tests.cli.conftest import mevs, refused
+from tests.cli.conftest import ended
 from tests.mevs_jax.trained import making
 
 
@@ -63,9 +63,7 @@ def frames(tmp_path_factory):
 def test_a_mesh_is_looked_at(system, chair, at_once, tmp_path):
     picture, kept = tmp_path / "walk.png", tmp_path / "walk.npz"
     options = ["--system", system, "--mesh", chair, "--up", "y", "--max-views", 3, "--stop", 2, "--first", 4]
-    result = at_once("look", *options, "--json", "--draw", picture, "--save", kept)
-    assert result.returncode == 0, result.stderr
-    walk = json.loads(result.stdout)
+    walk = json.loads(ended(at_once("look", *options, "--json", "--draw", picture, "--save", kept)))
     assert walk["object"] == "chair.obj"
     assert walk["views"][0] == 4
     assert len(set(walk["views"])) == len(walk["beliefs"]) == 3
@@ -81,9 +79,8 @@ def test_a_mesh_is_looked_at(system, chair, at_once, tmp_path):
 
 
 def test_recorded_images_are_looked_at(system, frames, at_once):
-    result = at_once("look", "--system", system, "--depth", frames[0], "--stop", 2, "--policy", "farthest")
-    assert result.returncode == 0, result.stderr
-    lines = result.stdout.splitlines()
+    said = at_once("look", "--system", system, "--depth", frames[0], "--stop", 2, "--policy", "farthest")
+    lines = ended(said).splitlines()
     assert lines[0] == "frames.npz"
     assert lines[-1].endswith("after 6 views (budget)")
     assert sorted(int(line.split(":")[0].split()[1]) for line in lines[1:-1]) == list(range(6))
@@ -171,17 +168,16 @@ def test_what_cannot_be_exported_is_one_sentence(system, refuses, tmp_path):
 
 
 @pytest.mark.slow
-def test_what_an_agent_promises_is_measured(whole, tmp_path):
+def test_what_an_agent_promises_is_measured(whole, tmp_path, at_once, refuses):
     run = shutil.copytree(whole, tmp_path / "run")
-    result = mevs("check", "agent", "--out", run)
-    assert result.returncode == 0, result.stderr
+    said = ended(at_once("check", "agent", "--out", run))
     found = json.loads((run / "agent.json").read_text())
     assert all(walks["same"] == walks["walks"] == 3 for walks in found["walks"].values())
     assert all(walks["largest_difference"] < 1e-4 for walks in found["walks"].values())
     assert found["latency_ms"]["compilations"] == 0
     assert found["camera"][0]["overlap_median"] > 0.9
-    assert "information_gain: 3 of 3 walks are those on view tables" in result.stdout
-    assert refused(mevs("check", "agent", "--out", run, "--agent.objects", 0))
+    assert "information_gain: 3 of 3 walks are those on view tables" in said
+    assert "must be at least 1" in refuses("check", "agent", "--out", run, "--agent.objects", 0)
 
 
 def test_the_conditions_are_those_that_the_help_names():
@@ -194,23 +190,12 @@ def test_a_system_meets_other_objects(system, chair, tmp_path, at_once, refuses)
         (tmp_path / "others" / place).parent.mkdir(parents=True)
         shutil.copy(chair, tmp_path / "others" / place)
     (tmp_path / "others" / "lamp" / "c.obj").write_text("v 0 0 0\n")
-    command = (
-        "check",
-        "transfer",
-        "--system",
-        system,
-        "--data",
-        tmp_path / "others",
-        "--draws",
-        "1",
-        "--max-views",
-        "2",
-    )
+    brief = ("--draws", "1", "--max-views", "2")
+    command = ("check", "transfer", "--system", system, "--data", tmp_path / "others", *brief)
     named = f"seat={load(system).classes[0]}"
-    shown = at_once(*command, "--names", named, "--up", "y", "--to", tmp_path / "found.json")
-    assert shown.returncode == 0, shown.stderr
-    assert "1 objects of known classes: seat (1)\n1 objects of unknown classes: lamp (1)" in shown.stdout
-    assert "left out: lamp/c.obj: mesh has no faces" in shown.stdout
+    shown = ended(at_once(*command, "--names", named, "--up", "y", "--to", tmp_path / "found.json"))
+    assert "1 objects of known classes: seat (1)\n1 objects of unknown classes: lamp (1)" in shown
+    assert "left out: lamp/c.obj: mesh has no faces" in shown
     assert json.loads((tmp_path / "found.json").read_text())["known_as"] == {"seat": load(system).classes[0]}
     assert "none of the classes lamp, seat is one that the system knows" in refuses(*command)
     assert "--names seat is not FOLDER=CLASS" in refuses(*command, "--names", "seat")

@@ -63,10 +63,10 @@ def test_stopping_counts_those_who_were_sure_and_wrong():
     logits[..., 0] = 2
     tables = tables_of(logits, np.arange(8) % 2)
     never, always = stopping(system, tables, "farthest", 3, stops=(0.9999, 0.3))
-    assert (never["stopped"], never["views"], never["error"]) == (0.0, 3.0, 0.0)
-    assert (always["stopped"], always["views"], always["error"], always["accuracy"]) == (1.0, 1.0, 0.5, 0.5)
-    assert always["promised_error"] == pytest.approx(0.7)
-    low, high = always["excess"]
+    assert (never.stopped, never.views, never.error) == (0.0, 3.0, 0.0)
+    assert (always.stopped, always.views, always.error, always.accuracy) == (1.0, 1.0, 0.5, 0.5)
+    assert always.promised_error == pytest.approx(0.7)
+    low, high = always.excess
     assert low < 0.5 - 0.7 < high
 
 

@@ -16,7 +16,7 @@ import eval.checks.transfer as transfer
 from data_pipeline.objects.mesh import ObjectEntry, ObjectSource
 from data_pipeline.objects.recipes import FurniturePiece
 from eval.checks.reality import RealityConfig, check_reality
-from eval.checks.transfer import STRANGER, Objects, check_transfer, strangers
+from eval.checks.transfer import STRANGER, Objects, Transfer, check_transfer, strangers
 from eval.checks.walks import BASELINE, Walker, Walks
 from mevs_jax.selection.loop import ViewTable
 from mevs_jax.trained import TrainedSystem
@@ -70,7 +70,7 @@ class Seen:
         return Walks(right, np.random.default_rng(len(policy)).random(found.shape).astype(np.float32), found)
 
 
-def transfer_with(patch: pytest.MonkeyPatch, seen: Seen, labels: np.ndarray, **options: Any) -> dict[str, Any]:
+def transfer_with(patch: pytest.MonkeyPatch, seen: Seen, labels: np.ndarray, **options: Any) -> Transfer:
     """The check of other objects, four of which are of no known class."""
     labels = np.where(np.arange(OBJECTS) < OBJECTS - 4, labels, STRANGER)
     folders = [FOLDERS[label] for label in labels]
@@ -93,14 +93,14 @@ def test_transfer_uses_the_policies_that_the_system_names(posed, monkeypatch):
         found.append(transfer_with(monkeypatch, seen, labels, posed=posed))
         asked.append(seen.asked)
         won = float(winner == best)
-        assert [row["last"] for row in found[-1]["answers"]] == [won] * (OBJECTS - 4)
-        assert {tuple(row["chosen"]) for row in found[-1]["by_class"]} == {(0.0, won, won, won)}
+        assert [row.last for row in found[-1].answers] == [won] * (OBJECTS - 4)
+        assert {tuple(row.chosen) for row in found[-1].by_class} == {(0.0, won, won, won)}
     for one, policies in zip(found, asked, strict=True):
-        assert one["best"] == best
-        assert {row["policy"] for row in one["calibration"]} == {BASELINE, best}
+        assert one.best == best
+        assert {row.policy for row in one.calibration} == {BASELINE, best}
         check_fitted(policies, asked[0])
         # How often walks stop follows from the system's calibration, not from labels.
-        check_fitted([row["sure"] for row in one["stopping"]], [row["sure"] for row in found[0]["stopping"]])
+        check_fitted([row.sure for row in one.stopping], [row.sure for row in found[0].stopping])
 
 
 def test_reality_uses_the_policies_that_the_system_names(monkeypatch, tmp_path):
@@ -118,12 +118,12 @@ def test_reality_uses_the_policies_that_the_system_names(monkeypatch, tmp_path):
             found = check_reality(systems, "tested", tmp_path, RealityConfig(("roll", "turned", "upper")))
         asked.append(seen.asked)
         named = {
-            name: {(row["policy"], row["condition"] == "turned"): row["name"] for row in rows}
-            for name, rows in found["systems"].items()
+            name: {(row.policy, row.condition == "turned"): row.name for row in rows}
+            for name, rows in found.systems.items()
         }
         assert named["one"]["best", False] == "information_gain"
         assert named["one"]["best", True] == named["other"]["best", True] == named["other"]["best", False] == "farthest"
-        accuracies = {row["accuracy"] for row in found["systems"]["other"] if row["policy"] == "best"}
+        accuracies = {row.accuracy for row in found.systems["other"] if row.policy == "best"}
         assert accuracies == ({0.0, 1.0} if winner == "farthest" else {0.0})
         assert {id(walked) for walked in seen.systems} == {id(walked) for walked in systems.values()}
     check_fitted(*asked)
@@ -152,5 +152,5 @@ def test_strangeness_is_compared_with_the_objects_that_the_system_was_fitted_on(
     )
     found = strangers(replace(of, parts=moved), tables_of(LABELS), np.arange(OBJECTS) < 10, draws=1)
     assert found is not None
-    for row in found["after"]:
-        assert row["unknown_found"] == row["known_refused"] == (shift < 0)
+    for row in found.after:
+        assert row.unknown_found == row.known_refused == (shift < 0)

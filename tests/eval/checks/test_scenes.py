@@ -154,18 +154,17 @@ def test_systems_are_compared_on_the_same_images_which_are_kept(tmp_path):
         write_off(data / name / "1.off", *FurniturePiece("chair", number).load())
     config, systems = RealityConfig(("stereo",), draws=1), {"one": system, "two": making.system(seed=1)}
     found = check_reality(systems, str(data), folder, config)
-    assert found["objects"] == 2
-    assert list(found["conditions"]) == ["clean", "stereo"]
+    assert found.objects == 2
+    assert list(found.conditions) == ["clean", "stereo"]
     cells = {
-        name: {(row["condition"], row["policy"], row["views"]): row for row in rows}
-        for name, rows in found["systems"].items()
+        name: {(row.condition, row.policy, row.views): row for row in rows} for name, rows in found.systems.items()
     }
-    for row in found["won_back"]["two"]:
-        key = row["condition"], row["policy"], row["views"]
-        assert row["difference"] == pytest.approx(cells["two"][key]["accuracy"] - cells["one"][key]["accuracy"])
+    for row in found.won_back["two"]:
+        key = row.condition, row.policy, row.views
+        assert row.difference == pytest.approx(cells["two"][key].accuracy - cells["one"][key].accuracy)
     for (_, policy, views), row in cells["one"].items():
         perfect = cells["one"]["clean", policy, views]
-        assert row["loss"] == pytest.approx(perfect["accuracy"] - row["accuracy"], abs=1e-6)
+        assert row.loss == pytest.approx(perfect.accuracy - row.accuracy, abs=1e-6)
 
     images = sorted(folder.rglob("*.npz"))
     before = [(path.read_bytes(), path.stat().st_mtime_ns) for path in images]

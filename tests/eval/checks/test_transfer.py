@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import json
+
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -10,9 +12,10 @@ import mevs_jax
 from data_pipeline.errors import DataError
 from data_pipeline.objects.recipes import FurniturePiece
 from data_pipeline.objects.sources import objects_to_test
-from eval.checks.transfer import STRANGER, auroc, check_transfer, matched, strangers
+from eval.checks.transfer import STRANGER, Transfer, auroc, check_transfer, matched, strangers
 from mevs_jax.selection.loop import ViewTable
 from tests.mevs_jax.trained import making
+from train.results.records import as_json, from_json
 
 
 def write_off(path, vertices, faces) -> None:
@@ -46,33 +49,40 @@ def found(others):
 
 
 def test_objects_are_matched_counted_and_named(found):
-    assert (found["known"], found["strangers"]) == (4, 1)
-    assert found["known_as"] == {"Chairs": "chair", "couch": "sofa"}
-    assert list(found["left_out"]) == ["spikes/two.off"]
-    assert found["classes"] == {"Chairs": 2, "couch": 2, "spikes": 1}
-    assert [row["class"] for row in found["by_class"]] == ["chair", "sofa"]
+    assert (found.known, found.strangers) == (4, 1)
+    assert found.known_as == {"Chairs": "chair", "couch": "sofa"}
+    assert list(found.left_out) == ["spikes/two.off"]
+    assert found.classes == {"Chairs": 2, "couch": 2, "spikes": 1}
+    assert [row.name for row in found.by_class] == ["chair", "sofa"]
+
+
+def test_results_are_what_json_keeps_of_them(found):
+    kept = json.loads(json.dumps(as_json(found)))
+    assert as_json(from_json(Transfer, kept, "transfer.json")) == kept
+    assert [row["class"] for row in kept["by_class"]] == ["chair", "sofa"]
+    assert len(kept["by_class"][0]["chosen"]) == 3
 
 
 def test_other_furniture_of_known_kinds_is_recognised(found):
-    rows = {(row["policy"], row["views"]): row for row in found["policies"]}
+    rows = {(row.policy, row.views): row for row in found.policies}
     assert {views for _, views in rows} == {1, 2, 3}
-    assert rows["random", 1]["accuracy"] == found["single_view"]["accuracy"] > 0.6
-    assert rows["random", 2]["gain_interval"] == [0, 0]
+    assert rows["random", 1].accuracy == found.single_view.accuracy > 0.6
+    assert rows["random", 2].gain_interval == [0, 0]
     for (policy, views), row in rows.items():
-        assert row["gain"] == pytest.approx(row["accuracy"] - rows["random", views]["accuracy"])
+        assert row.gain == pytest.approx(row.accuracy - rows["random", views].accuracy)
         if views == 1:  # the same first views
-            assert row["accuracy"] == rows["random", 1]["accuracy"], policy
-    assert [row["views"] for row in found["unknown_objects"]["after"]] == [1, 2, 4]
-    assert found["unknown_objects"]["objects"] == 1
-    single = np.mean([answer["single"] for answer in found["answers"]])
-    assert single == pytest.approx(found["single_view"]["accuracy"])
+            assert row.accuracy == rows["random", 1].accuracy, policy
+    assert [row.views for row in found.unknown_objects.after] == [1, 2, 4]
+    assert found.unknown_objects.objects == 1
+    single = np.mean([answer.single for answer in found.answers])
+    assert single == pytest.approx(found.single_view.accuracy)
 
 
 def test_walks_without_yaw_use_policies_that_need_none(others):
     system = mevs_jax.load("furniture10")
     found = check_transfer(system, str(others), renamed={"couch": "sofa"}, posed=False, max_views=2, draws=1)
-    assert found["best"] == system.description.best_unposed
-    assert "information_gain" not in {row["policy"] for row in found["policies"]}
+    assert found.best == system.description.best_unposed
+    assert "information_gain" not in {row.policy for row in found.policies}
 
 
 def test_names_of_classes(tmp_path):
@@ -106,11 +116,11 @@ def test_strangers_are_told_apart_by_as_many_views_as_the_row_says(random):
     known = np.arange(40) < 25
     logits = random.normal(0, 3, (40, views, len(system.classes))) + 2.0 * known[:, None, None]
     table = ViewTable(jnp.asarray(logits, jnp.float32), None, None, jnp.zeros(40, jnp.int32))
-    found = strangers(system, table, known)["after"]
+    found = strangers(system, table, known).after
     energy = -np.log(np.exp(logits).sum(axis=-1))
     pairs = np.mean(energy[~known].reshape(-1, 1) > energy[known].reshape(1, -1))
-    assert found[0]["auroc"] == pytest.approx(pairs, abs=0.03)
-    assert found[0]["auroc"] + 0.03 < found[1]["auroc"] < found[2]["auroc"]
+    assert found[0].auroc == pytest.approx(pairs, abs=0.03)
+    assert found[0].auroc + 0.03 < found[1].auroc < found[2].auroc
 
 
 def test_area_under_the_curve(random):

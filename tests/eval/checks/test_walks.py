@@ -77,4 +77,4 @@ def test_draws_differ_and_repeat_with_the_seed(system, tables):
 
 def test_rows_hold_the_last_number_of_views(system, tables):
     walks = {"random": Walker(system).walk(tables, "random", 3)}
-    assert [row["views"] for row in rows_of(walks, (1, 2, 8))] == [1, 2, 3]
+    assert [row.views for row in rows_of(walks, (1, 2, 8))] == [1, 2, 3]
