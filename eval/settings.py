@@ -14,15 +14,15 @@ from eval.walks.grid import GridConfig
 from eval.walks.live import LiveConfig
 from mevs_jax.models import Abstraction
 from train.choosing.config import LearnedConfig
-from train.choosing.features import SetFusionConfig
 from train.choosing.policy import PolicyConfig
 from train.choosing.variants import ABLATIONS
 from train.many.sweep import SweepConfig
+from train.many.thesis import ThesisConfig
 from train.optimiser import OptimiserConfig
 from train.tasks.classifier import ClassifierConfig, ResNetConfig
 from train.tasks.entropy import EntropyConfig, PointNet2Config
 from train.tasks.recogniser import RecogniserConfig
-from train.tasks.thesis_networks import ThesisConfig
+from train.tasks.set_fusion import SetFusionConfig
 
 
 @dataclass(frozen=True)

@@ -41,5 +41,7 @@ def cycles(graph: dict[str, set[str]]) -> list[list[str]]:
             more = set().union(targets, *(reached[target] for target in targets))
             changed |= more != targets
             reached[name] = more
-    groups = {frozenset(other for other in reached[name] if name in reached[other]) for name in graph if name in reached[name]}
+    groups = {
+        frozenset(other for other in reached[name] if name in reached[other]) for name in graph if name in reached[name]
+    }
     return sorted(sorted(group) for group in groups)

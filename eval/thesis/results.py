@@ -20,7 +20,7 @@ from eval.walks.grid import FIRST_MV, THRESHOLDS, GridConfig, Results, run_grid
 from eval.walks.ladder import SCRAMBLED, Rung, ladder
 from mevs_jax.geometry.viewpoints import ViewGraph
 from mevs_jax.selection.loop import ViewTable
-from train.tasks.thesis_networks import BACKBONES, FRAMES, PIPELINE, Frame
+from train.many.thesis import BACKBONES, FRAMES, PIPELINE, Frame
 
 ORACLE_MV = 5
 """The largest limit on views of the thesis's oracle (Table 15)."""

@@ -12,7 +12,7 @@ import numpy as np
 
 from eval.numbers.comparison import interval_of_both, intervals
 from eval.thesis.layout import Row, ThesisTable
-from train.tasks.thesis_networks import BACKBONES, FRAMES, VIEWS, ThesisFolder
+from train.many.thesis import BACKBONES, FRAMES, VIEWS, ThesisFolder
 
 _GAINS = {
     "text": "PointNet++ minus random",

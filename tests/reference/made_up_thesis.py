@@ -12,7 +12,7 @@ from data_pipeline.objects.furniture import CLASSES
 from eval.thesis.results import LatticeTables, all_results, machine
 from eval.walks.grid import GridConfig
 from mevs_jax.geometry.viewpoints import fibonacci_sphere
-from train.tasks.thesis_networks import BACKBONES, VIEWS
+from train.many.thesis import BACKBONES, VIEWS
 
 OBJECTS = 10
 

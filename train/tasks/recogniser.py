@@ -24,10 +24,10 @@ from mevs_jax.geometry.inputs import SizeInput
 from mevs_jax.models import Recogniser, ResNet
 from mevs_jax.models.pose import PoseHead, azimuth_of, azimuth_weights
 from mevs_jax.models.rotation import ROTATIONS, rotation_weights, seen_rotations
-from train.choosing.features import SetFusionConfig, new_fusion, random_sets
 from train.optimiser import OptimiserConfig
 from train.step import Batch, Hyperparameters, Metrics
 from train.tasks.classifier import ResNetConfig
+from train.tasks.set_fusion import SetFusionConfig, new_fusion, random_sets
 from train.tasks.size import SizeConfig, radii_for_training, used_size
 
 
