@@ -40,7 +40,7 @@ from train.choosing import averaged
 from train.choosing.features import Features
 from train.choosing.policy import Lesson, train_policies
 from train.loop import fit, steps_of_an_epoch
-from train.many.members import SweepTask, member_of
+from train.many.members import Group, SweepTask, member_of
 from train.many.trainers import TRAINERS, AtOnce, Trainer, Way
 from train.many.training import train_members
 from train.running.devices import device_mesh
@@ -89,7 +89,7 @@ def batches_of(each: list[SweepTask], data: Path) -> dict[str, np.ndarray]:
 def compare(task: SweepTask, data: Path, out: Path) -> dict[str, Any]:
     """Times in seconds of four networks, by how they are trained; and of a step of all four."""
     statistics, each, mesh = load_statistics(data), from_seeds(task, SEEDS), device_mesh()
-    members = [member_of(one) for one in each]
+    group = Group(task, [member_of(one) for one in each], data, statistics)
     found: dict[str, Any] = {"steps_of_an_epoch": steps_of_an_epoch(task, statistics)}
     found["separate"] = seconds_of(
         lambda: [fit(one, data, statistics, out / f"alone_{seed}") for seed, one in enumerate(each)]
@@ -97,8 +97,8 @@ def compare(task: SweepTask, data: Path, out: Path) -> dict[str, Any]:
     batch, training = batches_of(each, data), np.ones(SEEDS, bool)
     trainers = {}
     for way in WAYS:
-        found[way] = seconds_of(partial(train_members, task, members, data, statistics, out / way, mesh, way, way))
-        trainers[way] = TRAINERS[way](task, members, mesh, STEPS, True)
+        found[way] = seconds_of(partial(train_members, group, out / way, mesh, way, way))
+        trainers[way] = TRAINERS[way](group, mesh)
         jax.block_until_ready(trainers[way].train(training, batch))
     steps: dict[str, list[float]] = {way: [] for way in WAYS}
     for _ in range(STEPS):  # alternately, since other programs may run beside them
@@ -141,7 +141,8 @@ def _step(trainer: Trainer, training: np.ndarray, batch: dict[str, np.ndarray]) 
 def talk(task: SweepTask, data: Path, devices: int) -> list[str]:
     """The collective operations in a step of as many seeds as there are devices."""
     each = from_seeds(task, devices)
-    trainer = AtOnce(task, [member_of(one) for one in each], device_mesh(), STEPS, True)
+    group = Group(task, [member_of(one) for one in each], data, load_statistics(data))
+    trainer = AtOnce(group, device_mesh())
     program = trainer.program(np.ones(devices, bool), batches_of(each, data))
     return sorted(set(COLLECTIVES.findall(program)))
 

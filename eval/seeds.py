@@ -23,7 +23,6 @@ from eval.numbers.trainings import csv_over_trainings, rows_over_trainings, walk
 from eval.run_file import save_run
 from eval.settings import Settings
 from train.many.seeds import check_networks, train_seeds
-from train.optimiser import OptimiserConfig
 from train.results.chance import warn_of_chance
 from train.results.identity import made_by
 from train.results.kept import keep_beside, kept_json
@@ -41,12 +40,8 @@ def seed_folder(out: Path, number: int) -> Path:
 
 def seed_settings(settings: Settings, number: int) -> Settings:
     """The settings of the run of a seed."""
-
-    def shifted(config: OptimiserConfig) -> OptimiserConfig:
-        return replace(config, seed=config.seed + number, data_seed=config.data_seed + number)
-
-    classifier = replace(settings.classifier, optimiser=shifted(settings.classifier.optimiser))
-    entropy = replace(settings.entropy, optimiser=shifted(settings.entropy.optimiser))
+    classifier = replace(settings.classifier, optimiser=settings.classifier.optimiser.shifted(number))
+    entropy = replace(settings.entropy, optimiser=settings.entropy.optimiser.shifted(number))
     return replace(settings, classifier=classifier, entropy=entropy, seeds=1)
 
 

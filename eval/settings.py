@@ -17,12 +17,12 @@ from train.choosing.config import LearnedConfig
 from train.choosing.policy import PolicyConfig
 from train.choosing.variants import ABLATIONS
 from train.many.sweep import SweepConfig
+from train.many.thesis import ThesisConfig
 from train.optimiser import OptimiserConfig
 from train.tasks.classifier import ClassifierConfig, ResNetConfig
 from train.tasks.entropy import EntropyConfig, PointNet2Config
-from train.tasks.fusion import SetFusionConfig
 from train.tasks.recogniser import RecogniserConfig
-from train.tasks.thesis_networks import ThesisConfig
+from train.tasks.set_fusion import SetFusionConfig
 
 
 @dataclass(frozen=True)

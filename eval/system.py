@@ -213,6 +213,7 @@ def classifier_system(
         jnp.asarray(validation.logits).reshape(-1, classes), jnp.repeat(jnp.asarray(labels), statistics.views)
     )
     shape, cloud = pointnet2_shape(predict)
+    assert isinstance(classify.network_config, ResNetConfig)  # of an encoder of the user's no system is made
     channels = classify.network_config.channels
     description = Description(
         form=FORM,

@@ -8,8 +8,7 @@ are then, and ends with the same weights: batches and random keys depend only on
 from __future__ import annotations
 
 import time
-from collections import deque
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -40,6 +39,7 @@ from train.running.checkpoints import Checkpoints, drop_damaged
 from train.running.devices import (
     DATA,
     Layout,
+    Lead,
     check_batch,
     device_mesh,
     parameter_sharding,
@@ -52,263 +52,6 @@ from train.running.preemption import Preempted, Preemption
 from train.step import Task, TrainState, abstract_state, evaluate_step_of, initial_state, train_step_of
 from train.validation import ValidationSet
 from train.weights.starting import StartingWeights
-
-
-class Lead:
-    """Limits how many steps the host dispatches ahead of the devices.
-
-    A few steps keep the devices busy; with more, errors would be reported late.
-    """
-
-    def __init__(self, steps: int = 4):
-        self._steps, self._running = steps, deque[jax.Array]()
-
-    def limit(self, result: jax.Array) -> int:
-        """Takes a result of the newest step, and waits for that of `steps` steps earlier; returns how many steps have ended."""
-        self._running.append(result)
-        if len(self._running) <= self._steps:
-            return 0
-        self._running.popleft().block_until_ready()
-        return 1
-
-    def end(self) -> int:
-        """Waits for all steps; returns how many have ended that were not counted yet."""
-        ended = len(self._running)
-        while self._running:
-            self._running.popleft().block_until_ready()
-        return ended
-
-
-def steps_of_an_epoch(task: Task, statistics: DatasetStatistics) -> int:
-    """Returns the number of steps between two validations: enough for `epoch_views` views (or all) of each training object."""
-    config, objects = task.optimiser, statistics.objects_of(training_splits(task.batches))
-    objects = len(objects_kept(objects, task.batches))
-    return steps_per_epoch(objects * (config.epoch_views or statistics.views) // config.views_per_object, task.batches)
-
-
-def weighted_means(found: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
-    """Returns the mean of every metric from the sums that `evaluate_step_of` returns for each batch."""
-    sums = {name: np.sum([part[name] for part in found], axis=0, dtype=np.float64) for name in found[0]}
-    return {name: total / sums["views"] for name, total in sums.items() if name != "views"}
-
-
-def validate(evaluate_step: Callable, state: TrainState, batches: Iterable, mesh: Mesh) -> dict[str, float]:
-    """Returns the mean of every metric over the validation views of all processes."""
-    found = [evaluate_step(state.parameters, state.statistics, *place_batch(mesh, batch)) for batch in batches]
-    return {name: float(mean) for name, mean in weighted_means(found).items()}
-
-
-def identity_of(task: Task, statistics: DatasetStatistics, start: StartingWeights | None = None) -> dict[str, Any]:
-    """Returns what identifies a run, as stored in its `config.json`: task, data set, starting weights."""
-    return as_read({"task": content_of(task), "data": statistics.fingerprint, "start": start and start.name})
-
-
-def check_training(task: Task, statistics: DatasetStatistics, layout: Layout) -> None:
-    """Raises `DataError` if a network cannot be trained on a data set by these devices and processes."""
-    config = task.optimiser
-    check_batch(task.name, config, layout, task.group)
-    by_view = config.validation_by == "view"
-    trainable = statistics.views - (len(views_aside(statistics.views, 0, config.data_seed)) if by_view else 0)
-    if config.views_per_object > trainable:
-        raise DataError(
-            f"{task.name}: {config.views_per_object} views of an object in a batch are more than the {trainable} that an object "
-            f"has for training; choose a smaller optimiser.views-per-object"
-        )
-
-
-def check_launch(
-    task: Task, statistics: DatasetStatistics, folder: Path, start: StartingWeights | None, layout: Layout
-) -> bool:
-    """Returns whether a network has still to be trained in `folder`, once nothing was found that forbids it.
-
-    Several networks are checked so before the first of them is trained.
-
-    Raises:
-        DataError: as `fit` does, if the folder holds a run with another configuration, or the devices cannot share a batch.
-    """
-    identity = identity_of(task, statistics, start)
-    if not goes_on_with(folder, identity):
-        check_config(folder, identity, "a network trained")
-        if (folder / "summary.json").exists():
-            return False
-    check_training(task, statistics, layout)
-    return True
-
-
-class _Training:
-    """One training while it runs: its compiled programs, its state and its progress.
-
-    Attributes:
-        state: the state after the last step, spread over the devices.
-        step: number of steps done.
-        progress: what checkpoints hold beside the state: `epoch`, `best_loss`, `best_epoch`, `best` and `seconds`.
-        rate_option: the option that sets the learning rate, for messages.
-    """
-
-    def __init__(
-        self,
-        task: Task,
-        data: Path,
-        statistics: DatasetStatistics,
-        folder: Path,
-        start: StartingWeights | None,
-        mesh: Mesh,
-        rate_option: str,
-    ):
-        self.task, self.config, self.folder, self.mesh, self.rate_option = (
-            task,
-            task.optimiser,
-            folder,
-            mesh,
-            rate_option,
-        )
-        self.epoch_steps = steps_of_an_epoch(task, statistics)
-        self.rate = learning_rate(self.config, self.epoch_steps * self.config.epochs)
-        self.hyper = task.hyperparameters
-        structure, state = initial_state(task, self.config.seed, start)
-        where = parameter_sharding(mesh, state)
-        self.state = place(state, where)
-        # The old state is donated to the step, so that the new one takes its memory and keeps its placement.
-        self._train_step = jax.jit(
-            train_step_of(task, structure, self.epoch_steps), donate_argnums=0, out_shardings=(where, None)
-        )
-        self._evaluate_step = jax.jit(summed_over(mesh, evaluate_step_of(task, structure)))
-        self._all_finite = jax.jit(all_finite, out_shardings=NamedSharding(mesh, PartitionSpec()))
-        self._validation = ValidationSet(task, data, statistics, mesh.shape[DATA])
-        self._lead = Lead()
-        self.step = 0
-        self.progress: dict[str, Any] = {"epoch": 0, "best_loss": None, "best_epoch": 0, "seconds": 0.0}
-
-    @property
-    def is_finished(self) -> bool:
-        epoch = self.progress["epoch"]
-        return epoch >= self.config.epochs or epoch - self.progress["best_epoch"] >= self.config.patience
-
-    def resume(self, checkpoints: Checkpoints) -> None:
-        """Continues from the latest checkpoint, if there is one.
-
-        Raises:
-            Diverged: if its weights are not finite; versions before 0.2 saved such weights.
-        """
-        if (saved := checkpoints.resume(self.state, self.epoch_steps)) is not None:
-            self.state, self.progress = saved
-            epoch, best = self.progress["epoch"], self.progress["best_loss"]
-            if not self._has_finite_weights():
-                raise Diverged(
-                    f"the checkpoint of the {self.task.name} after epoch {epoch} in {self.folder} has weights that are not "
-                    f"finite; {self._way_out()}"
-                )
-            if best is not None and not np.isfinite(best):  # saved as best by a version before 0.2: any epoch is better
-                self.progress |= {"best_loss": None, "best_epoch": epoch}
-            console.print(f"{self.task.name}: resuming after epoch {epoch}, step {int(self.state.step)}")
-        self.step = int(self.state.step)
-
-    def train_epoch(
-        self, batches: Iterator[dict[str, np.ndarray]], checkpoints: Checkpoints, preemption: Preemption, bar: Callable
-    ) -> dict[str, float]:
-        """Trains to the end of the epoch; returns the mean of every metric over its steps.
-
-        Args:
-            bar: called with the number of steps that have ended since the last call.
-
-        Raises:
-            Preempted: after SIGTERM, once the state is saved.
-            Diverged: after SIGTERM, if the state cannot be saved because it is not finite.
-        """
-        started, end = time.perf_counter(), (self.progress["epoch"] + 1) * self.epoch_steps
-        while self.step < end:
-            self.state, loss = self._train_step(self.state, place_batch(self.mesh, next(batches)), self.hyper)
-            self.step += 1
-            bar(self._lead.limit(loss))
-            if preemption.after_step() and self.step < end:
-                self.progress["seconds"] += time.perf_counter() - started
-                self._check({f"sum of the training {k}": float(total) for k, total in self.state.sums.items()})
-                checkpoints.save("latest", self.step, self.state, self.progress)
-                raise Preempted(f"{self.task.name} was asked to end after step {self.step}")
-        bar(self._lead.end())
-        return {name: float(total) / self.epoch_steps for name, total in self.state.sums.items()}
-
-    def finish_epoch(
-        self, started: float, means: dict[str, float], checkpoints: Checkpoints, log: MetricsLog
-    ) -> dict[str, float]:
-        """Validates, saves and logs the state after an epoch; returns the validation metrics.
-
-        Args:
-            started: time at which the epoch began.
-            means: result of `train_epoch`.
-
-        Raises:
-            Diverged: if a metric or a weight is not finite; then nothing is saved.
-        """
-        checked = validate(self._evaluate_step, self.state, self._validation, self.mesh)
-        self._check(
-            {f"training {name}": mean for name, mean in means.items()}
-            | {f"validation {name}": mean for name, mean in checked.items()}
-        )
-        progress = self.progress
-        progress["epoch"] += 1
-        progress["seconds"] += time.perf_counter() - started
-        if progress["best_loss"] is None or checked["loss"] < progress["best_loss"]:
-            progress |= {"best_loss": checked["loss"], "best_epoch": progress["epoch"], "best": checked}
-            checkpoints.save("best", self.step, self.state, progress)
-        rates = {
-            "epoch": progress["epoch"],
-            "learning_rate": float(self.rate(self.state.step, self.hyper.learning_rate)),
-            "seconds": progress["seconds"],
-        }
-        log.write(
-            self.step,
-            rates | {f"train/{k}": v for k, v in means.items()} | {f"val/{k}": v for k, v in checked.items()},
-        )
-        # Saved after the log is written: resuming can remove lines beyond the checkpoint, but cannot restore a missing one.
-        checkpoints.save("latest", self.step, self.state, progress)
-        return checked
-
-    def summary(self, start: StartingWeights | None) -> dict[str, Any]:
-        """Returns what `summary.json` holds of the finished training.
-
-        Raises:
-            Diverged: if no epoch was saved as best, which can only be in a folder of a version before 0.2.
-        """
-        if self.progress["epoch"] and self.progress["best_loss"] is None:
-            raise Diverged(
-                f"no epoch of the {self.task.name} in {self.folder} has a validation loss that is finite; {self._way_out()}"
-            )
-        return self.progress | {
-            "steps": self.step,
-            "start": start.name if start else "random weights",
-            "stopped_early": self.progress["epoch"] < self.config.epochs,
-            **({"encoder": encoder} if (encoder := getattr(self.task, "encoder", None)) else {}),
-        }
-
-    def _has_finite_weights(self) -> bool:
-        return bool(self._all_finite((self.state.parameters, self.state.statistics)))
-
-    def _check(self, metrics: dict[str, float]) -> None:
-        """Raises `Diverged` if a metric or a weight is not finite."""
-        bad = not_finite(metrics) or ["weights"] * (not self._has_finite_weights())
-        if not bad:
-            return
-        epoch = self.progress["epoch"]
-        verb = "are" if bad[0] == "weights" else "is"
-        kept = f"the checkpoint after epoch {epoch} is kept in {self.folder}" if epoch else "no epoch was saved"
-        raise Diverged(
-            f"the {self.task.name} diverged in epoch {epoch + 1}, by step {self.step}: its {bad[0]} {verb} not finite; "
-            f"{kept}; {self._way_out()}"
-        )
-
-    def _way_out(self) -> str:
-        return (
-            f"to train again, lower {self.rate_option} ({self.config.learning_rate:g} in this run), and delete {self.folder} "
-            f"or choose another --out"
-        )
-
-
-def _begin(folder: Path, identity: dict[str, Any]) -> None:
-    """Says in the folder what is trained there from now on."""
-    if is_first():
-        (folder / "summary.json").unlink(missing_ok=True)
-        keep_json(folder / "config.json", identity)
 
 
 def fit(
@@ -347,48 +90,267 @@ def fit(
             return made
     mesh = mesh or device_mesh()
     check_training(task, statistics, Layout.of_mesh(mesh))
-    if changed:
+
+    def begin() -> None:
+        """Says in the folder what is trained there from now on."""
+        if is_first():
+            (folder / "summary.json").unlink(missing_ok=True)
+            keep_json(folder / "config.json", identity)
+
+    if changed:  # what is there stays as it is until an epoch was trained with these settings
         console.print(f"{task.name}: goes on with other settings than it began with ({in_words(changed)})")
     else:
-        _begin(folder, identity)
+        begin()
     drop_damaged(folder)
-    training, config = _Training(task, data, statistics, folder, start, mesh, rate_option), task.optimiser
-    with Checkpoints(folder) as checkpoints, progress_bar("views") as bar, Preemption() as preemption:
+    training = _Training(task, data, statistics, folder, start, mesh, rate_option)
+    _train(training, begin)
+    if changed:
+        begin()
+    if training.epoch and training.progress["best_loss"] is None:  # only in a folder of a version before 0.2
+        raise training.diverged(f"no epoch of the {task.name} in {folder} has a validation loss that is finite")
+    summary = summary_after(task, training.progress, training.step, start)
+    if is_first():
+        keep_summary(folder, summary)
+    return summary
+
+
+def _train(training: _Training, begin: Callable[[], None]) -> None:
+    """Trains until an epoch is the last one; saves and logs after each epoch.
+
+    Args:
+        begin: called after each epoch's last step, before its results are stored.
+    """
+    task, config, epoch_steps = training.task, training.task.optimiser, training.epoch_steps
+    with Checkpoints(training.folder) as checkpoints, progress_bar("views") as bar, Preemption() as preemption:
         training.resume(checkpoints)
-        log = MetricsLog(folder, training.step)
-        batches = train_batches(data, task.batches, first_step=training.step)
-        line = bar.add_task(
-            f"Training {task.name}",
-            total=training.epoch_steps * config.epochs * config.batch_size,
-            completed=training.step * config.batch_size,
-            note="",
-        )
-
-        def advance(steps: int) -> None:
-            bar.advance(line, steps * config.batch_size)
-
+        log, lead = MetricsLog(training.folder, training.step), Lead()
+        batches = train_batches(training.data, task.batches, first_step=training.step)
+        views, total = config.batch_size, epoch_steps * config.epochs
+        line = bar.add_task(f"Training {task.name}", total=total * views, completed=training.step * views, note="")
         while not training.is_finished:
             started = time.perf_counter()
-            means = training.train_epoch(batches, checkpoints, preemption, advance)
-            if changed:  # what was there stays as it was until an epoch was trained with these
-                _begin(folder, identity)
-                changed = {}
-            checked = training.finish_epoch(started, means, checkpoints, log)
+            while training.step < (training.epoch + 1) * epoch_steps:
+                bar.advance(line, lead.limit(training.take_step(next(batches))) * views)
+                if preemption.after_step() and training.step % epoch_steps:
+                    training.save_within_epoch(checkpoints, started)
+                    raise Preempted(f"{task.name} was asked to end after step {training.step}")
+            bar.advance(line, lead.end() * views)
+            begin()
+            means, checked = training.finish_epoch(checkpoints, log, started)
             note = ", ".join(f"{name} {value:.4f}" for name, value in checked.items())
             bar.update(line, note=f"val {note}")
             console.print(
-                f"{task.name} epoch {training.progress['epoch']}/{config.epochs}: train loss {means['loss']:.4f}, val {note}"
+                f"{task.name} epoch {training.epoch}/{config.epochs}: train loss {means['loss']:.4f}, val {note}"
             )
             if preemption.asked:
                 raise Preempted(f"{task.name} was asked to end after step {training.step}")
     log.close()
-    if changed:  # it was long enough already
-        _begin(folder, identity)
-    summary = training.summary(start)
-    if is_first():
-        keep_checks(folder, {"metrics.jsonl": check_of_file(folder / "metrics.jsonl")})
-        keep_json(folder / "summary.json", summary)
-    return summary
+
+
+class _Training:
+    """One training while it runs: its compiled programs, its state and its progress.
+
+    Attributes:
+        state: the state after the last step, spread over the devices.
+        step: number of steps done.
+        progress: what checkpoints hold beside the state: `epoch`, `best_loss`, `best_epoch`, `best` and `seconds`.
+    """
+
+    def __init__(
+        self,
+        task: Task,
+        data: Path,
+        statistics: DatasetStatistics,
+        folder: Path,
+        start: StartingWeights | None,
+        mesh: Mesh,
+        rate_option: str,
+    ):
+        self.task, self.data, self.folder, self._mesh, self._rate_option = task, data, folder, mesh, rate_option
+        self.epoch_steps = steps_of_an_epoch(task, statistics)
+        structure, state = initial_state(task, task.optimiser.seed, start)
+        where = parameter_sharding(mesh, state)
+        self.state, self.step = place(state, where), 0
+        # The old state is donated to the step, so that the new one takes its memory and keeps its placement.
+        self._train_step = jax.jit(
+            train_step_of(task, structure, self.epoch_steps), donate_argnums=0, out_shardings=(where, None)
+        )
+        self._evaluate_step = jax.jit(summed_over(mesh, evaluate_step_of(task, structure)))
+        self._all_finite = jax.jit(all_finite, out_shardings=NamedSharding(mesh, PartitionSpec()))
+        self._validation = ValidationSet(task, data, statistics, mesh.shape[DATA])
+        self.progress: dict[str, Any] = {"epoch": 0, "best_loss": None, "best_epoch": 0, "seconds": 0.0}
+
+    @property
+    def epoch(self) -> int:
+        """Number of epochs done."""
+        return self.progress["epoch"]
+
+    @property
+    def is_finished(self) -> bool:
+        config = self.task.optimiser
+        return self.epoch >= config.epochs or self.epoch - self.progress["best_epoch"] >= config.patience
+
+    def resume(self, checkpoints: Checkpoints) -> None:
+        """Continues from the latest checkpoint, if there is one.
+
+        Raises:
+            Diverged: if its weights are not finite; versions before 0.2 saved such weights.
+        """
+        if (saved := checkpoints.resume(self.state, self.epoch_steps)) is None:
+            return
+        self.state, self.progress = saved
+        self.step, best = int(self.state.step), self.progress["best_loss"]
+        if not self._has_finite_weights():
+            raise self.diverged(
+                f"the checkpoint of the {self.task.name} after epoch {self.epoch} in {self.folder} has weights that are not "
+                f"finite"
+            )
+        if best is not None and not np.isfinite(best):  # saved as best by a version before 0.2: any epoch is better
+            self.progress |= {"best_loss": None, "best_epoch": self.epoch}
+        console.print(f"{self.task.name}: resuming after epoch {self.epoch}, step {self.step}")
+
+    def take_step(self, batch: dict[str, np.ndarray]) -> jax.Array:
+        """Trains on a batch, this process's part of it; returns the loss."""
+        self.state, loss = self._train_step(self.state, place_batch(self._mesh, batch), self.task.hyperparameters)
+        self.step += 1
+        return loss
+
+    def save_within_epoch(self, checkpoints: Checkpoints, started: float) -> None:
+        """Saves the state; raises `Diverged` if it is not finite."""
+        self.progress["seconds"] += time.perf_counter() - started
+        self._check({f"sum of the training {name}": float(total) for name, total in self.state.sums.items()})
+        checkpoints.save("latest", self.step, self.state, self.progress)
+
+    def finish_epoch(
+        self, checkpoints: Checkpoints, log: MetricsLog, started: float
+    ) -> tuple[dict[str, float], dict[str, float]]:
+        """Validates, saves and logs the state after an epoch; returns the mean training and validation metrics.
+
+        Args:
+            started: time at which the epoch began.
+
+        Raises:
+            Diverged: if a metric or a weight is not finite; then nothing is saved.
+        """
+        means = {name: float(total) / self.epoch_steps for name, total in self.state.sums.items()}
+        checked = validate(self._evaluate_step, self.state, self._validation, self._mesh)
+        self._check(_prefixed("training ", means) | _prefixed("validation ", checked))
+        progress = self.progress
+        progress["epoch"] += 1
+        progress["seconds"] += time.perf_counter() - started
+        if progress["best_loss"] is None or checked["loss"] < progress["best_loss"]:
+            progress |= {"best_loss": checked["loss"], "best_epoch": self.epoch, "best": checked}
+            checkpoints.save("best", self.step, self.state, progress)
+        config, first = self.task.optimiser, self.task.hyperparameters.learning_rate
+        rate = float(learning_rate(config, self.epoch_steps * config.epochs)(self.state.step, first))
+        entry = {"epoch": self.epoch, "learning_rate": rate, "seconds": progress["seconds"]}
+        log.write(self.step, entry | _prefixed("train/", means) | _prefixed("val/", checked))
+        # Saved after the log is written: resuming can remove lines beyond the checkpoint, but cannot restore a missing one.
+        checkpoints.save("latest", self.step, self.state, progress)
+        return means, checked
+
+    def _has_finite_weights(self) -> bool:
+        return bool(self._all_finite(self.state.weights))
+
+    def _check(self, metrics: dict[str, float]) -> None:
+        """Raises `Diverged` if a metric or a weight is not finite."""
+        bad = not_finite(metrics) or ["weights"] * (not self._has_finite_weights())
+        if bad:
+            verb = "are" if bad[0] == "weights" else "is"
+            kept = (
+                f"the checkpoint after epoch {self.epoch} is kept in {self.folder}"
+                if self.epoch
+                else "no epoch was saved"
+            )
+            raise self.diverged(
+                f"the {self.task.name} diverged in epoch {self.epoch + 1}, by step {self.step}: its {bad[0]} {verb} not finite; "
+                f"{kept}"
+            )
+
+    def diverged(self, what: str) -> Diverged:
+        """Returns the error that says what is not finite, and the way out."""
+        rate = self.task.optimiser.learning_rate
+        return Diverged(
+            f"{what}; to train again, lower {self._rate_option} ({rate:g} in this run), and delete {self.folder} or choose "
+            f"another --out"
+        )
+
+
+def _prefixed(prefix: str, metrics: Mapping[str, float]) -> dict[str, float]:
+    return {f"{prefix}{name}": value for name, value in metrics.items()}
+
+
+def summary_after(task: Task, progress: dict[str, Any], steps: int, start: StartingWeights | None) -> dict[str, Any]:
+    """Returns what `summary.json` holds of a finished training."""
+    encoder = getattr(task, "encoder", None)
+    return progress | {
+        "steps": steps,
+        "start": start.name if start else "random weights",
+        "stopped_early": progress["epoch"] < task.optimiser.epochs,
+        **({"encoder": encoder} if encoder else {}),
+    }
+
+
+def keep_summary(folder: Path, summary: dict[str, Any]) -> None:
+    """Stores what says that the training in a folder is finished."""
+    keep_checks(folder, {"metrics.jsonl": check_of_file(folder / "metrics.jsonl")})
+    keep_json(folder / "summary.json", summary)
+
+
+def weighted_means(found: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+    """Returns the mean of every metric from the sums that `evaluate_step_of` returns for each batch."""
+    sums = {name: np.sum([part[name] for part in found], axis=0, dtype=np.float64) for name in found[0]}
+    return {name: total / sums["views"] for name, total in sums.items() if name != "views"}
+
+
+def validate(evaluate_step: Callable, state: TrainState, batches: Iterable, mesh: Mesh) -> dict[str, float]:
+    """Returns the mean of every metric over the validation views of all processes."""
+    found = [evaluate_step(state.parameters, state.statistics, *place_batch(mesh, batch)) for batch in batches]
+    return {name: float(mean) for name, mean in weighted_means(found).items()}
+
+
+def steps_of_an_epoch(task: Task, statistics: DatasetStatistics) -> int:
+    """Returns the number of steps between two validations: enough for `epoch_views` views (or all) of each training object."""
+    config, objects = task.optimiser, statistics.objects_of(training_splits(task.batches))
+    objects = len(objects_kept(objects, task.batches))
+    return steps_per_epoch(objects * (config.epoch_views or statistics.views) // config.views_per_object, task.batches)
+
+
+def identity_of(task: Task, statistics: DatasetStatistics, start: StartingWeights | None = None) -> dict[str, Any]:
+    """Returns what identifies a run, as stored in its `config.json`: task, data set, starting weights."""
+    return as_read({"task": content_of(task), "data": statistics.fingerprint, "start": start and start.name})
+
+
+def check_training(task: Task, statistics: DatasetStatistics, layout: Layout) -> None:
+    """Raises `DataError` if a network cannot be trained on a data set by these devices and processes."""
+    config = task.optimiser
+    check_batch(task.name, config, layout, task.group)
+    by_view = config.validation_by == "view"
+    trainable = statistics.views - (len(views_aside(statistics.views, 0, config.data_seed)) if by_view else 0)
+    if config.views_per_object > trainable:
+        raise DataError(
+            f"{task.name}: {config.views_per_object} views of an object in a batch are more than the {trainable} that an object "
+            f"has for training; choose a smaller optimiser.views-per-object"
+        )
+
+
+def check_launch(
+    task: Task, statistics: DatasetStatistics, folder: Path, start: StartingWeights | None, layout: Layout
+) -> bool:
+    """Returns whether a network has still to be trained in `folder`, once nothing was found that forbids it.
+
+    Several networks are checked so before the first of them is trained.
+
+    Raises:
+        DataError: as `fit` does, if the folder holds a run with another configuration, or the devices cannot share a batch.
+    """
+    identity = identity_of(task, statistics, start)
+    if not goes_on_with(folder, identity):
+        check_config(folder, identity, "a network trained")
+        if (folder / "summary.json").exists():
+            return False
+    check_training(task, statistics, layout)
+    return True
 
 
 def load_best(task: Task, folder: Path) -> nnx.Module:

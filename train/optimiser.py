@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import jax
@@ -49,6 +49,10 @@ class OptimiserConfig:
     """seed of initial weights, augmentation and dropout"""
     data_seed: int = 0
     """seed of the batches"""
+
+    def shifted(self, number: int) -> OptimiserConfig:
+        """Returns the settings of seed number `number`, counted from these."""
+        return replace(self, seed=self.seed + number, data_seed=self.data_seed + number)
 
 
 _SMALLEST_MUON = (

@@ -110,6 +110,11 @@ class TrainState:
     moments: optax.OptState
     sums: Metrics
 
+    @property
+    def weights(self) -> tuple[nnx.State, nnx.State]:
+        """What makes a network: parameters and statistics."""
+        return self.parameters, self.statistics
+
 
 def initial_state(
     task: Task, seed: jax.Array | int, start: StartingWeights | None = None

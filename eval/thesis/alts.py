@@ -9,7 +9,7 @@ import numpy as np
 
 from eval.thesis.figures import FigureInputs
 from mevs_jax.geometry.viewpoints import local_maxima
-from train.tasks.thesis_networks import BACKBONES, FRAMES
+from train.many.thesis import BACKBONES, FRAMES
 
 
 def _extremes(values: Sequence[float] | np.ndarray, names: Sequence[str], form: str = "{:.0f}") -> str:

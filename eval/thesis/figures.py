@@ -20,7 +20,7 @@ from eval.projections import mercator, mercator_ordinate
 from eval.report import figures
 from eval.thesis.results import LatticeTables
 from mevs_jax.geometry.viewpoints import ViewGraph, local_maxima
-from train.tasks.thesis_networks import BACKBONES, FRAMES, Frame, ThesisFolder
+from train.many.thesis import BACKBONES, FRAMES, Frame, ThesisFolder
 
 _MEDIAN = {"color": figures.INK, "linewidth": 2}
 _RING: dict[str, Any] = {"facecolors": "none", "edgecolors": "#dc2626", "linewidths": 1.6}

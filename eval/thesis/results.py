@@ -19,7 +19,7 @@ from eval.walks.ladder import SCRAMBLED, ladder
 from mevs_jax.geometry.viewpoints import ViewGraph
 from mevs_jax.policies.registry import PolicyRecord, policy_record
 from mevs_jax.selection.loop import ViewTable
-from train.tasks.thesis_networks import BACKBONES, FRAMES, PIPELINE, Frame
+from train.many.thesis import BACKBONES, FRAMES, PIPELINE, Frame
 
 ORACLE_MV = 5
 """The largest limit on views of the thesis's oracle (Table 15)."""

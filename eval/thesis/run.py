@@ -33,14 +33,7 @@ from eval.thesis.page import write_thesis_report
 from eval.thesis.results import LatticeTables, all_results
 from eval.thesis.seeds import csv_of, folders_of, over_trainings, table_of
 from train.loop import load_best
-from train.results.finite import check_results
-from train.results.identity import made_by
-from train.results.kept import keep_beside, kept_array, kept_json
-from train.results.outputs import network_outputs
-from train.running.log import read_history
-from train.tasks.classifier import ClassifierTask
-from train.tasks.entropy import EntropyTask
-from train.tasks.thesis_networks import (
+from train.many.thesis import (
     BACKBONES,
     FRAMES,
     PIPELINE,
@@ -54,6 +47,13 @@ from train.tasks.thesis_networks import (
     first_weights,
     train_thesis,
 )
+from train.results.finite import check_results
+from train.results.identity import made_by
+from train.results.kept import keep_beside, kept_array, kept_json, made_by
+from train.results.outputs import network_outputs
+from train.running.log import read_history
+from train.tasks.classifier import ClassifierTask
+from train.tasks.entropy import EntropyTask
 
 
 def make_thesis_data(settings: Settings, folder: ThesisFolder) -> None:

@@ -10,9 +10,9 @@ import numpy as np
 
 from eval.numbers.comparison import interval_of_both, intervals
 from eval.thesis.layout import Row, ThesisTable
+from train.many.thesis import BACKBONES, FRAMES, VIEWS, ThesisFolder
 from train.results.records import csv_of as rows_as_csv
 from train.results.records import ends, numbered
-from train.tasks.thesis_networks import BACKBONES, FRAMES, VIEWS, ThesisFolder
 
 _GAINS = {
     "text": "PointNet++ minus random",

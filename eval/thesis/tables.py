@@ -12,7 +12,7 @@ from eval.rendering.ascent import FACES
 from eval.thesis.layout import Cell, Row, ThesisTable, thesis_numbers
 from eval.thesis.results import ORACLE_MV
 from mevs_jax.markdown import markdown_table
-from train.tasks.thesis_networks import BACKBONES, FRAMES, PIPELINE
+from train.many.thesis import BACKBONES, FRAMES, PIPELINE
 
 
 def _percent(values: Any) -> list[float]:

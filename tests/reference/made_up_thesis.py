@@ -13,7 +13,7 @@ from eval.machine import machine
 from eval.thesis.results import LatticeTables, all_results
 from eval.walks.grid import GridConfig
 from mevs_jax.geometry.viewpoints import fibonacci_sphere
-from train.tasks.thesis_networks import BACKBONES, VIEWS
+from train.many.thesis import BACKBONES, VIEWS
 
 OBJECTS = 10
 

@@ -25,10 +25,11 @@ from data_pipeline.dataset.statistics import load_statistics
 from data_pipeline.errors import DataError, Diverged
 from eval.settings import TINY
 from eval.stages import tasks
-from train.loop import Lead, fit, load_best, steps_of_an_epoch
+from train.loop import fit, load_best, steps_of_an_epoch
 from train.optimiser import OptimiserConfig, _as_matrix, descent, learning_rate
 from train.results.identity import config_of
 from train.running.checkpoints import Checkpoints
+from train.running.devices import Lead
 from train.running.preemption import Preempted
 from train.step import abstract_state, samples_before
 from train.tasks.entropy import EntropyTask

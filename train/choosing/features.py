@@ -1,4 +1,4 @@
-"""Features of the recogniser for every view of some objects, and random sets of views."""
+"""Features of the recogniser for every view of some objects, and sets of views of one size."""
 
 from __future__ import annotations
 

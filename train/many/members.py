@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import json
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -15,18 +16,21 @@ from jax.sharding import Mesh
 
 from data_pipeline.dataset.statistics import DatasetStatistics
 from data_pipeline.distributed import is_first, wait_for_all
-from data_pipeline.files import check_of_file, keep_checks, keep_json, write_text
-from train.loop import identity_of
+from data_pipeline.files import keep_json, write_text
+from train.loop import identity_of, keep_summary, steps_of_an_epoch, summary_after
 from train.results.finite import not_finite
 from train.running.checkpoints import Checkpoints
 from train.running.devices import parameter_sharding, place
-from train.step import Task, initial_state
+from train.step import TrainState, initial_state
 from train.tasks.classifier import ClassifierTask
 from train.tasks.entropy import EntropyTask
 from train.tasks.recogniser import RecogniserTask
 from train.weights.starting import StartingWeights
 
 SweepTask = ClassifierTask | EntropyTask | RecogniserTask
+Configuration = tuple[float, float, float, float]
+Starts = Sequence[StartingWeights | None]
+"""Initial weights of each member; random where None, or where there are none."""
 
 
 @dataclass(frozen=True)
@@ -54,6 +58,10 @@ class Member:
     dropped: bool = False
 
     @property
+    def configuration(self) -> Configuration:
+        return self.learning_rate, self.weight_decay, self.dropout, self.augmentation
+
+    @property
     def loss(self) -> float:
         """Validation loss of the best epoch, by which members are compared; infinite if it diverged."""
         return self.best["loss"] if self.best and not self.diverged else float("inf")
@@ -76,32 +84,75 @@ def member_of(task: SweepTask) -> Member:
     )
 
 
-def by_configurations(members: Sequence[Member]) -> dict[tuple[float, ...], list[Member]]:
+def by_configurations(members: Sequence[Member]) -> dict[Configuration, list[Member]]:
     """Returns the members of each configuration, which differ in their seeds alone."""
-    found: dict[tuple[float, ...], list[Member]] = {}
+    found: dict[Configuration, list[Member]] = {}
     for member in members:
-        key = (member.learning_rate, member.weight_decay, member.dropout, member.augmentation)
-        found.setdefault(key, []).append(member)
+        found.setdefault(member.configuration, []).append(member)
     return found
+
+
+def mean_losses(members: Sequence[Member]) -> dict[Configuration, float]:
+    """Returns the mean loss of each configuration."""
+    return {key: float(np.mean([one.loss for one in own])) for key, own in by_configurations(members).items()}
 
 
 def task_of(task: SweepTask, member: Member) -> SweepTask:
     """Returns the task with which `train.loop.fit` trains the same network alone."""
-    optimiser = replace(
-        task.optimiser,
-        learning_rate=member.learning_rate,
-        weight_decay=member.weight_decay,
-        seed=member.seed,
-        data_seed=member.data_seed,
-    )
+    own = {name: getattr(member, name) for name in ("learning_rate", "weight_decay", "seed", "data_seed")}
+    task = replace(task, optimiser=replace(task.optimiser, **own))
     if isinstance(task, RecogniserTask):
-        return replace(task, optimiser=optimiser)
-    if isinstance(task, ClassifierTask):
-        image = replace(task.augmentation, strength=member.augmentation)
-        return replace(task, optimiser=optimiser, augmentation=image)
-    cloud = replace(task.augmentation, strength=member.augmentation)
-    network = replace(task.network_config, dropout=member.dropout)
-    return replace(task, optimiser=optimiser, augmentation=cloud, network_config=network)
+        return task
+    if isinstance(task, EntropyTask):
+        task = replace(task, network_config=replace(task.network_config, dropout=member.dropout))
+    return replace(task, augmentation=replace(task.augmentation, strength=member.augmentation))  # type: ignore[arg-type]
+
+
+@dataclass(frozen=True)
+class Group:
+    """Networks that are trained as one job.
+
+    Attributes:
+        task: the training of one of them; each member changes its hyper-parameters and seeds.
+        members: what they differ in.
+        data: folder of the data set.
+        statistics: those of the data set.
+        starts: their initial weights.
+    """
+
+    task: SweepTask
+    members: Sequence[Member]
+    data: Path
+    statistics: DatasetStatistics
+    starts: Starts = ()
+
+    @cached_property
+    def tasks(self) -> list[SweepTask]:
+        """The task with which each member is trained alone."""
+        return [task_of(self.task, member) for member in self.members]
+
+    @property
+    def own_batches(self) -> bool:
+        """Whether members have batches of their own, since their seeds of the data differ."""
+        return len({member.data_seed for member in self.members}) > 1
+
+    @property
+    def epoch_steps(self) -> int:
+        return steps_of_an_epoch(self.task, self.statistics)
+
+    def start_of(self, index: int) -> StartingWeights | None:
+        return self.starts[index] if self.starts else None
+
+    def initial_states(self) -> list[TrainState]:
+        """Returns the states with which the members begin when trained alone.
+
+        They are not made by a compiled program, which would round some weights otherwise: after a few hundred steps that is
+        enough to make it another training.
+        """
+        states = (
+            initial_state(self.task, member.seed, self.start_of(index)) for index, member in enumerate(self.members)
+        )
+        return [state for _, state in states]
 
 
 @dataclass
@@ -114,23 +165,23 @@ class Together:
         epoch: number of epochs done.
         seconds: training time so far.
         histories: of each member, the metrics of every epoch.
-        best: weights and statistics of each member's best epoch, with a leading axis of members.
-        epoch_steps: number of steps of an epoch.
     """
 
     members: list[Member]
-    epoch_steps: int
+    histories: list[list[dict[str, float]]]
     step: int = 0
     epoch: int = 0
     seconds: float = 0.0
-    histories: list[list[dict[str, float]]] = field(default_factory=list)
-    best: Any = None
 
-    def progress(self) -> dict[str, Any]:
-        """What a checkpoint holds beside arrays."""
-        members = [asdict(member) for member in self.members]
-        done = {"step": self.step, "epoch": self.epoch, "seconds": self.seconds}
-        return done | {"histories": self.histories, "members": members}
+    @classmethod
+    def of(cls, progress: dict[str, Any], epoch_steps: int) -> Together:
+        """Returns what was saved as `asdict`; version 0.1 saved at ends of epochs alone, without the step."""
+        members = [Member(**member) for member in progress["members"]]
+        return cls(**{"step": progress["epoch"] * epoch_steps} | progress | {"members": members})
+
+    def training(self, patience: int) -> np.ndarray:
+        """Returns which members are still trained, (members,)."""
+        return np.array([member.is_training(patience) for member in self.members])
 
     def after_epoch(
         self, training: np.ndarray, means: dict[str, Any], checked: dict[str, Any], finite: np.ndarray
@@ -160,62 +211,44 @@ class Together:
 
     def halve(self) -> None:
         """Drops the worse half of the configurations that are not dropped yet, by their mean loss."""
-        left = {
-            key: float(np.mean([member.loss for member in own]))
-            for key, own in by_configurations(self.members).items()
-            if not own[0].dropped
-        }
-        worse = set(sorted(left, key=lambda key: left[key])[-(-len(left) // 2) :])
-        for key, own in by_configurations(self.members).items():
-            for member in own if key in worse else ():
-                self.members[self.members.index(member)] = replace(member, dropped=True)
+        means = mean_losses([member for member in self.members if not member.dropped])
+        worse = set(sorted(means, key=means.__getitem__)[-(-len(means) // 2) :])
+        self.members = [
+            replace(member, dropped=member.dropped or member.configuration in worse) for member in self.members
+        ]
 
 
-def export_member(
-    task: Task,
-    of: Together,
-    index: int,
-    statistics: DatasetStatistics,
-    out: Path,
-    mesh: Mesh,
-    start: StartingWeights | None = None,
-) -> dict[str, Any]:
+def export_member(group: Group, of: Together, best: Any, index: int, out: Path, mesh: Mesh) -> dict[str, Any]:
     """Writes a trained member in the form in which `train.loop.fit` stores a run; returns its summary.
 
     Args:
-        task: with which it would be trained alone.
-        of: all members.
+        group: all members before their training; `of`: after it.
+        best: weights and statistics of each member's best epoch, with a leading axis of members.
         index: of the member.
-        statistics: those of the data set.
         out: folder of the run.
         mesh: devices of all processes, each of which writes its part.
-        start: weights with which it began; random if None.
     """
-    member, steps = of.members[index], of.epoch_steps
+    task, start = group.tasks[index], group.start_of(index)
+    member, steps = of.members[index], group.epoch_steps
     _, state = initial_state(task, member.seed)
-    parameters, rest = jax.tree.map(lambda leaf: jnp.asarray(leaf[index]), of.best)
+    parameters, rest = jax.tree.map(lambda leaf: jnp.asarray(leaf[index]), best)
     step = member.best_epoch * steps
     state = replace(state, step=jnp.int32(step), parameters=parameters, statistics=rest)
-    summary = {
+    progress = {
         "epoch": member.epochs,
         "best_loss": member.loss,
         "best_epoch": member.best_epoch,
         "best": member.best,
         "seconds": of.seconds / len(of.members),
-        "steps": member.epochs * steps,
-        "start": start.name if start else "random weights",
-        "stopped_early": member.epochs < task.optimiser.epochs,
-        **({"encoder": encoder} if (encoder := getattr(task, "encoder", None)) else {}),
     }
+    summary = summary_after(task, progress, member.epochs * steps, start)
     if is_first():
-        keep_json(out / "config.json", identity_of(task, statistics, start))
+        keep_json(out / "config.json", identity_of(task, group.statistics, start))
     wait_for_all("a member is exported")
     with Checkpoints(out) as checkpoints:
         checkpoints.save("best", step, place(state, parameter_sharding(mesh, state)), summary)
-    if not is_first():
-        return summary
-    lines = [entry | {"step": entry["epoch"] * steps} for entry in of.histories[index]]
-    write_text(out / "metrics.jsonl", "".join(json.dumps(line) + "\n" for line in lines))
-    keep_checks(out, {"metrics.jsonl": check_of_file(out / "metrics.jsonl")})
-    keep_json(out / "summary.json", summary)
+    if is_first():
+        lines = [entry | {"step": entry["epoch"] * steps} for entry in of.histories[index]]
+        write_text(out / "metrics.jsonl", "".join(json.dumps(line) + "\n" for line in lines))
+        keep_summary(out, summary)
     return summary

@@ -16,8 +16,7 @@ from data_pipeline.errors import DataError, Diverged, Unreadable
 from data_pipeline.files import keep_json, read_json
 from data_pipeline.progress import console
 from train.loop import check_training, fit, identity_of
-from train.many.members import SweepTask, export_member, member_of
-from train.many.trainers import Starts
+from train.many.members import Group, Starts, SweepTask, export_member, member_of
 from train.many.training import train_members
 from train.results.networks import check_config, finished
 from train.running.checkpoints import has_save
@@ -30,14 +29,39 @@ def number_together(networks: int, mesh: Mesh) -> int:
     return together if together > 1 else 0
 
 
-def _interrupted(work: Path, identities: Sequence[dict[str, Any]]) -> list[int] | None:
-    """Returns which networks an interrupted training in `work` trains together; None if there is none of these networks alone."""
+def _planned(
+    identities: Sequence[Any], missing: Sequence[int], folders: Sequence[Path], work: Path, mesh: Mesh
+) -> tuple[list[int], bool]:
+    """Returns which networks are trained together, those that were begun so or the most; and whether they were begun.
+
+    Args:
+        missing: the networks that are not finished.
+    """
     try:
         stored = read_json(work / "config.json")["networks"]
     except (FileNotFoundError, Unreadable, KeyError, TypeError):
-        return None
-    found = [index for index, identity in enumerate(identities) if identity in stored]
-    return found if has_save(work / "latest") and len(found) == len(stored) else None
+        stored = []
+    begun = [index for index, identity in enumerate(identities) if identity in stored]
+    if not missing or not stored or len(begun) != len(stored) or not has_save(work / "latest"):
+        fresh = [index for index in missing if not has_save(folders[index] / "latest")]  # `fit` trains others alone
+        return fresh[: number_together(len(fresh), mesh)], False
+    if jax.process_count() > 1 and len(begun) % mesh.size:
+        raise DataError(
+            f"{work} holds an interrupted training of {len(begun)} networks together, which {mesh.size} devices of "
+            f"{jax.process_count()} processes cannot share equally; use a number that divides them, or delete {work}"
+        )
+    return begun, True
+
+
+def _identities(
+    tasks: Sequence[SweepTask], statistics: DatasetStatistics, folders: Sequence[Path], starts: Starts
+) -> list[dict[str, Any]]:
+    """Returns what identifies each network; raises `DataError` if its folder holds another."""
+    every = starts or [None] * len(tasks)
+    identities = [identity_of(task, statistics, start) for task, start in zip(tasks, every, strict=True)]
+    for folder, identity in zip(folders, identities, strict=True):
+        check_config(folder, identity, "a network trained")
+    return identities
 
 
 def check_networks(
@@ -49,31 +73,13 @@ def check_networks(
     mesh: Mesh,
 ) -> None:
     """Raises `DataError` if `train_seeds` would: folders hold something else, or batches cannot be shared."""
-    identities = _identities(tasks, statistics, starts)
-    for folder, identity in zip(folders, identities, strict=True):
-        check_config(folder, identity, "a network trained")
+    identities = _identities(tasks, statistics, folders, starts)
     missing = [index for index, folder in enumerate(folders) if not (folder / "summary.json").exists()]
-    begun = _interrupted(work, identities) if missing else None
-    together = _together_of(missing, begun, folders, work, mesh)
+    together, _ = _planned(identities, missing, folders, work, mesh)
     if together:
         check_training(tasks[0], statistics, Layout())  # a batch is that of one device
     if set(missing) - set(together):
         check_training(tasks[0], statistics, Layout.of_mesh(mesh))
-
-
-def _together_of(
-    missing: Sequence[int], begun: list[int] | None, folders: Sequence[Path], work: Path, mesh: Mesh
-) -> list[int]:
-    """Returns which of the networks that are missing are trained together: those `begun` together, or the most."""
-    if begun is None:
-        fresh = [index for index in missing if not has_save(folders[index] / "latest")]  # `fit` trains others alone
-        return fresh[: number_together(len(fresh), mesh)]
-    if jax.process_count() > 1 and len(begun) % mesh.size:
-        raise DataError(
-            f"{work} holds an interrupted training of {len(begun)} networks together, which {mesh.size} devices of "
-            f"{jax.process_count()} processes cannot share equally; use a number that divides them, or delete {work}"
-        )
-    return begun
 
 
 def train_seeds(
@@ -107,40 +113,27 @@ def train_seeds(
         Preempted: after SIGTERM, once everything is saved.
         Diverged: if a network diverged; the others are finished then.
     """
-    mesh = mesh or device_mesh()
-    identities = _identities(tasks, statistics, starts)
-    for folder, identity in zip(folders, identities, strict=True):
-        check_config(folder, identity, "a network trained")
+    mesh, every = mesh or device_mesh(), starts or [None] * len(tasks)
+    identities = _identities(tasks, statistics, folders, every)
     missing = [index for index, folder in enumerate(folders) if finished(folder) is None]
-    begun = _interrupted(work, identities) if missing else None
-    together = _together_of(missing, begun, folders, work, mesh)
+    together, begun = _planned(identities, missing, folders, work, mesh)
     wait_for_all("seeds are looked at")
-    if missing and begun is None and work.exists() and is_first():
+    if missing and not begun and work.exists() and is_first():
         if has_save(work / "latest"):
             console.print(f"{work} holds an interrupted training of other networks, which is given up", markup=False)
         shutil.rmtree(work)
     wait_for_all("seeds begin")
-    every = starts or [None] * len(tasks)
     if len(together) > 1:
-        _together(
-            [tasks[index] for index in together],
-            [folders[index] for index in together],
-            [every[index] for index in together],
-            data,
-            statistics,
-            work,
-            shared_equally(mesh, len(together)),
-            rate_option,
-        )
+        if is_first():
+            keep_json(work / "config.json", {"networks": [identities[index] for index in together]})
+        members, own_starts = [member_of(tasks[index]) for index in together], [every[index] for index in together]
+        group = Group(tasks[together[0]], members, data, statistics, own_starts)
+        own_folders = [folders[index] for index in together]
+        _train_together(group, own_folders, work, shared_equally(mesh, len(together)), rate_option)
     return [
         fit(task, data, statistics, folder, start, mesh, rate_option)
         for task, folder, start in zip(tasks, folders, every, strict=True)
     ]
-
-
-def _identities(tasks: Sequence[SweepTask], statistics: DatasetStatistics, starts: Starts) -> list[dict[str, Any]]:
-    every = starts or [None] * len(tasks)
-    return [identity_of(task, statistics, start) for task, start in zip(tasks, every, strict=True)]
 
 
 def shared_equally(mesh: Mesh, networks: int) -> Mesh:
@@ -149,28 +142,15 @@ def shared_equally(mesh: Mesh, networks: int) -> Mesh:
     return mesh if count == mesh.size else Mesh(mesh.devices.reshape(-1)[:count].reshape(-1, 1), mesh.axis_names)
 
 
-def _together(
-    tasks: Sequence[SweepTask],
-    folders: Sequence[Path],
-    starts: Starts,
-    data: Path,
-    statistics: DatasetStatistics,
-    work: Path,
-    mesh: Mesh,
-    rate_option: str,
-) -> None:
-    members = [member_of(task) for task in tasks]
-    if is_first():
-        keep_json(work / "config.json", {"networks": _identities(tasks, statistics, starts)})
-    of = train_members(tasks[0], members, data, statistics, work, mesh, f"{len(tasks)} seeds", starts=starts)
-    for index, (task, folder, start) in enumerate(zip(tasks, folders, starts, strict=True)):
-        if not of.members[index].diverged and not agreed(finished(folder) is not None):
-            export_member(task, of, index, statistics, folder, mesh, start)
-    lost = [task.optimiser.seed for task, member in zip(tasks, of.members, strict=True) if member.diverged]
-    if lost:
+def _train_together(group: Group, folders: Sequence[Path], work: Path, mesh: Mesh, rate_option: str) -> None:
+    of, best = train_members(group, work, mesh, f"{len(folders)} seeds")
+    for index, (member, folder) in enumerate(zip(of.members, folders, strict=True)):
+        if not member.diverged and not agreed(finished(folder) is not None):
+            export_member(group, of, best, index, folder, mesh)
+    if lost := [member.seed for member in of.members if member.diverged]:
         raise Diverged(
-            f"the {tasks[0].name} diverged from seed {', '.join(map(str, lost))}; to train again, choose another --out and lower "
-            f"{rate_option} ({tasks[0].optimiser.learning_rate:g} in this run)"
+            f"the {group.task.name} diverged from seed {', '.join(map(str, lost))}; to train again, choose another --out and "
+            f"lower {rate_option} ({group.task.optimiser.learning_rate:g} in this run)"
         )
     wait_for_all("seeds are written")
     if is_first():

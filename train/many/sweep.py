@@ -19,7 +19,16 @@ from data_pipeline.distributed import agreed, is_first, wait_for_all
 from data_pipeline.errors import DataError, Diverged, Unreadable, reason_of
 from data_pipeline.files import as_read, keep_json, read_json, write_text
 from data_pipeline.progress import console
-from train.many.members import Member, SweepTask, Together, by_configurations, export_member, member_of, task_of
+from train.many.members import (
+    Group,
+    Member,
+    SweepTask,
+    Together,
+    by_configurations,
+    export_member,
+    mean_losses,
+    member_of,
+)
 from train.many.training import train_members
 from train.results.identity import content_of, why
 from train.results.networks import check_config
@@ -114,10 +123,8 @@ def drawn_of(config: SweepConfig, task: SweepTask) -> list[dict[str, float]]:
 
 def names_of(task: SweepTask) -> tuple[str, ...]:
     """Returns the hyper-parameters of a network that can be swept."""
-    names = ("learning_rate", "weight_decay")
-    if isinstance(task, EntropyTask):
-        return (*names, "dropout", "augmentation")
-    return names if isinstance(task, RecogniserTask) else (*names, "augmentation")
+    more = ("dropout", "augmentation") if isinstance(task, EntropyTask) else ("augmentation",)
+    return ("learning_rate", "weight_decay", *(() if isinstance(task, RecogniserTask) else more))
 
 
 def grid_of(grid: Sequence[str], task: SweepTask) -> list[dict[str, float]]:
@@ -216,20 +223,18 @@ def sweep(
     wait_for_all("a sweep begins")
     if is_first():
         keep_json(folder / "config.json", identity)
-    title = f"Sweep of {len(members)}"
-    of = train_members(task, members, data, statistics, folder, mesh, title, halving=config.halving)
+    group = Group(task, members, data, statistics)
+    of, weights = train_members(group, folder, mesh, f"Sweep of {len(members)}", halving=config.halving)
     best = best_of(of.members)
     if isinstance(task, RecogniserTask):  # a study's recogniser has the study's seed
-        own = (best.learning_rate, best.weight_decay, best.dropout, best.augmentation)
-        best = by_configurations(of.members)[own][0]
-    index = of.members.index(best)
+        best = by_configurations(of.members)[best.configuration][0]
     if best.best is None or best.diverged:
         low, high = (end(member.learning_rate for member in members) for end in (min, max))
         raise Diverged(
             f"every member of the sweep in {folder} diverged, with learning rates from {low:.2g} to {high:.2g}, and no "
             f"network is kept; to sweep again, lower --sweep.learning-rate, and delete {folder} or choose another --out"
         )
-    export_member(task_of(task, best), of, index, statistics, folder / "network", mesh)
+    export_member(group, of, weights, of.members.index(best), folder / "network", mesh)
     if is_first():
         write_text(folder / "epochs.csv", csv_of_epochs(of))
         keep_json(folder / "members.json", [asdict(member) for member in of.members])
@@ -258,9 +263,8 @@ def _identity(config: SweepConfig, task: SweepTask) -> dict[str, Any]:
 
 def best_of(members: Sequence[Member]) -> Member:
     """Returns the member with the lowest loss of the configuration with the lowest mean loss."""
-    by_configuration = by_configurations(members)
-    means = {key: float(np.mean([member.loss for member in own])) for key, own in by_configuration.items()}
-    return min(by_configuration[min(means, key=lambda key: means[key])], key=lambda member: member.loss)
+    means = mean_losses(members)
+    return min(by_configurations(members)[min(means, key=means.__getitem__)], key=lambda member: member.loss)
 
 
 def _finished(folder: Path) -> list[Member] | None:

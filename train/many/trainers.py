@@ -7,91 +7,27 @@ one by one (`benchmarks/members.py`).
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from typing import Any, Literal, Protocol
+from collections.abc import Callable
+from typing import Any, Literal
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
-from train.many.members import Member, SweepTask, task_of
+from train.many.members import Group
 from train.results.finite import all_finite
 from train.running.devices import DATA, on_host, place, place_batch
-from train.step import (
-    Hyperparameters,
-    TrainState,
-    abstract_state,
-    evaluate_step_of,
-    initial_state,
-    train_step_of,
-)
-from train.weights.starting import StartingWeights
+from train.step import Hyperparameters, TrainState, abstract_state, evaluate_step_of, train_step_of
 
 Way = Literal["at once", "in turn"]
-Starts = Sequence[StartingWeights | None]
-"""Initial weights of each member; random where None, or where there are none."""
+Batches = dict[str, np.ndarray]
+"""A batch; where members have batches of their own, with a leading axis of the members in a trainer's `places`."""
 
 
 def way_for(mesh: Mesh) -> Way:
     """Returns how members are trained on these devices."""
     return "in turn" if mesh.size == 1 and mesh.devices.flat[0].platform == "cpu" else "at once"
-
-
-class Trainer(Protocol):
-    """The states of all members, and what changes them."""
-
-    @property
-    def places(self) -> np.ndarray:
-        """The members whose batches, where each has its own, this process gives: a batch has a leading axis of these."""
-
-    def __init__(
-        self,
-        task: SweepTask,
-        members: Sequence[Member],
-        mesh: Mesh,
-        epoch_steps: int,
-        own_batches: bool,
-        starts: Starts = (),
-    ) -> None: ...
-
-    def begin(self, training: np.ndarray) -> None:
-        """Begins an epoch, or the rest of one, of those members that are training, which changes `places`."""
-
-    def train(self, training: np.ndarray, batch: dict[str, np.ndarray]) -> jax.Array:
-        """One step of those members that are training; returns an array to wait for."""
-
-    def sums(self) -> dict[str, np.ndarray]:
-        """Sums of the training metrics over this epoch, each (members,); those of members that are not training mean nothing."""
-
-    def evaluate(self, batch: dict[str, np.ndarray], weights: np.ndarray) -> dict[str, np.ndarray]:
-        """Weighted sums of the metrics of a validation batch, each (members,), likewise; batches are as in training."""
-
-    def finite(self) -> np.ndarray:
-        """Whether all weights of each member are finite, (members,), likewise."""
-
-    def keep(self, better: np.ndarray) -> None:
-        """Keeps the weights of those members that are better than before."""
-
-    def saved(self) -> tuple[Any, Any]:
-        """States and best weights, with a leading axis of members."""
-
-    def resume(self, saved: tuple[Any, Any]) -> None:
-        """Takes what `saved` returned."""
-
-
-def _hyper(task: SweepTask, members: Sequence[Member]) -> Hyperparameters:
-    return jax.tree.map(lambda *numbers: np.stack(numbers), *(task_of(task, one).hyperparameters for one in members))
-
-
-def _initial_states(task: SweepTask, members: Sequence[Member], starts: Starts) -> list[TrainState]:
-    """Returns the states with which the members begin when trained alone.
-
-    They are not made by a compiled program, which would round some weights otherwise: after a few hundred steps that is enough to
-    make it another training.
-    """
-    each = starts or [None] * len(members)
-    return [initial_state(task, member.seed, start)[1] for member, start in zip(members, each, strict=True)]
 
 
 def _stacked(*leaves: jax.Array) -> jax.Array | np.ndarray:
@@ -102,37 +38,32 @@ def _stacked(*leaves: jax.Array) -> jax.Array | np.ndarray:
 class AtOnce:
     """All members in one program, which the devices share, also those of several processes.
 
-    Once half of the members have stopped, the others are moved together, so that no device computes for nothing.
+    Once half of the members have stopped, the others are moved together, so that no device computes for nothing. Results of
+    members that are not training mean nothing.
     """
 
-    def __init__(
-        self,
-        task: SweepTask,
-        members: Sequence[Member],
-        mesh: Mesh,
-        epoch_steps: int,
-        own_batches: bool,
-        starts: Starts = (),
-    ) -> None:
-        structure, _ = abstract_state(task)
-        step, self._mesh, self._own_batches = train_step_of(task, structure, epoch_steps), mesh, own_batches
-        self._slots = np.arange(len(members))  # the member in each place of the program
-        self._count = len(members)
-        self._whole_hyper = _hyper(task, members)
+    def __init__(self, group: Group, mesh: Mesh) -> None:
+        structure, _ = abstract_state(group.task)
+        step, own = train_step_of(group.task, structure, group.epoch_steps), group.own_batches
+        self._mesh, self._own_batches, self._count = mesh, own, len(group.members)
+        self._slots = np.arange(self._count)  # the member in each place of the program
+        self._whole_hyper = jax.tree.map(
+            lambda *all_of: np.stack(all_of), *(one.hyperparameters for one in group.tasks)
+        )
         self._hyper = self._placed(self._whole_hyper, DATA)
 
         def step_if(training: jax.Array, state: TrainState, batch: Any, hyper: Hyperparameters):
             after, loss = step(state, batch, hyper)
             return jax.tree.map(lambda new, old: jnp.where(training, new, old), after, state), loss
 
-        self._train = self._over_members(step_if, "mmmm" if own_batches else "mmsm", donate_argnums=1)
-        self._evaluate = self._over_members(evaluate_step_of(task, structure), "mmms" if own_batches else "mmss")
-        self._finite = self._over_members(all_finite, "m")
-        self._keep = self._over_members(
-            lambda better, new, old: jax.tree.map(lambda a, b: jnp.where(better, a, b), new, old), "mmm"
-        )
-        self._state = self._placed(jax.tree.map(_stacked, *_initial_states(task, members, starts)), DATA)
-        self._best = jax.tree.map(jnp.copy, (self._state.parameters, self._state.statistics))
+        def best_of(better: jax.Array, new: Any, old: Any) -> Any:
+            return jax.tree.map(lambda new, old: jnp.where(better, new, old), new, old)
+
+        self._train = self._over_members(step_if, "mmmm" if own else "mmsm", donate_argnums=1)
+        self._evaluate = self._over_members(evaluate_step_of(group.task, structure), "mmms" if own else "mmss")
+        self._finite, self._keep = self._over_members(all_finite, "m"), self._over_members(best_of, "mmm")
+        self._state = self._placed(jax.tree.map(_stacked, *group.initial_states()), DATA)
+        self._best = jax.tree.map(jnp.copy, self._state.weights)
         self._all: tuple[Any, Any] | None = None  # of all members, where `_state` and `_best` are of some
 
         spread = NamedSharding(mesh, PartitionSpec(DATA))
@@ -145,6 +76,7 @@ class AtOnce:
 
     @property
     def places(self) -> np.ndarray:
+        """The members whose batches, where each has its own, this process gives."""
         own = len(self._slots) // jax.process_count()
         return self._slots[jax.process_index() * own :][:own]
 
@@ -165,13 +97,13 @@ class AtOnce:
         sharding = NamedSharding(self._mesh, PartitionSpec(*axes))
         return place(tree, jax.tree.map(lambda _: sharding, tree))
 
-    def _placed_batch(self, batch: dict[str, np.ndarray]) -> Any:
+    def _placed_batch(self, batch: Batches) -> Any:
         return place_batch(self._mesh, batch) if self._own_batches else self._placed(batch)
 
     def begin(self, training: np.ndarray) -> None:
-        """Moves the members together that are training, once they need at most half of the places."""
+        """Begins an epoch, or the rest of one, of those members that are training, which changes `places`."""
         needed = -(-int(training.sum()) // self._mesh.size) * self._mesh.size
-        if 2 * needed > len(self._slots):
+        if 2 * needed > len(self._slots):  # else they are moved together
             return
         self._all, order = self.saved(), np.argsort(~training, kind="stable")  # those that are training first
         self._slots = np.sort(order[:needed])
@@ -185,71 +117,65 @@ class AtOnce:
         values[self._slots] = own
         return values
 
-    def train(self, training: np.ndarray, batch: dict[str, np.ndarray]) -> jax.Array:
+    def train(self, training: np.ndarray, batch: Batches) -> jax.Array:
+        """One step of those members that are training; returns an array to wait for."""
         training = self._placed(training[self._slots], DATA)
         self._state, loss = self._train(training, self._state, self._placed_batch(batch), self._hyper)
         return loss
 
-    def program(self, training: np.ndarray, batch: dict[str, np.ndarray]) -> str:
+    def program(self, training: np.ndarray, batch: Batches) -> str:
         """The compiled step as text."""
         given = self._placed(training, DATA), self._state, self._placed_batch(batch), self._hyper
         return self._train.lower(*given).compile().as_text()
 
     def sums(self) -> dict[str, np.ndarray]:
+        """Returns the sums of the training metrics over this epoch, each (members,)."""
         return {name: self._of_all(sums) for name, sums in self._state.sums.items()}
 
-    def evaluate(self, batch: dict[str, np.ndarray], weights: np.ndarray) -> dict[str, np.ndarray]:
+    def evaluate(self, batch: Batches, weights: np.ndarray) -> dict[str, np.ndarray]:
+        """Returns the weighted sums of the metrics of a validation batch, each (members,)."""
         given = self._placed_batch(batch), self._placed(weights)
-        found = self._evaluate(self._state.parameters, self._state.statistics, *given)
+        found = self._evaluate(*self._state.weights, *given)
         return {name: self._of_all(sums) for name, sums in found.items()}
 
     def finite(self) -> np.ndarray:
-        return self._of_all(self._finite((self._state.parameters, self._state.statistics)))
+        """Returns whether all weights of each member are finite, (members,)."""
+        return self._of_all(self._finite(self._state.weights))
 
     def keep(self, better: np.ndarray) -> None:
+        """Keeps the weights of those members that are better than before."""
         better = self._placed(better[self._slots], DATA)
-        self._best = self._keep(better, (self._state.parameters, self._state.statistics), self._best)
+        self._best = self._keep(better, self._state.weights, self._best)
 
     def saved(self) -> tuple[Any, Any]:
+        """Returns the states and best weights, with a leading axis of members."""
         if self._all is None:
             return self._state, self._best
         self._all = self._put_back(self._all, self._slots, (self._state, self._best))
         return self._all
 
     def resume(self, saved: tuple[Any, Any]) -> None:
+        """Takes what `saved` returned."""
         (self._state, self._best), self._all, self._slots = saved, None, np.arange(self._count)
         self._hyper = self._placed(self._whole_hyper, DATA)
 
 
 class InTurn:
-    """One compiled step, called for one member after the other; by one process."""
+    """One compiled step, called for one member after the other; by one process. Its methods are those of `AtOnce`."""
 
-    def __init__(
-        self,
-        task: SweepTask,
-        members: Sequence[Member],
-        mesh: Mesh,
-        epoch_steps: int,
-        own_batches: bool,
-        starts: Starts = (),
-    ) -> None:
+    def __init__(self, group: Group, mesh: Mesh) -> None:
         del mesh  # of one device
-        structure, _ = abstract_state(task)
-        self._train = jax.jit(train_step_of(task, structure, epoch_steps), donate_argnums=0)
-        self._evaluate, self._is_finite = jax.jit(evaluate_step_of(task, structure)), jax.jit(all_finite)
-        self._hyper = [task_of(task, member).hyperparameters for member in members]
-        self._states = _initial_states(task, members, starts)
-        self._best = [jax.tree.map(jnp.copy, (state.parameters, state.statistics)) for state in self._states]
-        self._own_batches, self._places = own_batches, np.arange(len(members))
-
-    @property
-    def places(self) -> np.ndarray:
-        return self._places
+        structure, _ = abstract_state(group.task)
+        self._train = jax.jit(train_step_of(group.task, structure, group.epoch_steps), donate_argnums=0)
+        self._evaluate, self._is_finite = jax.jit(evaluate_step_of(group.task, structure)), jax.jit(all_finite)
+        self._hyper, self._states = [task.hyperparameters for task in group.tasks], group.initial_states()
+        self._best = [jax.tree.map(jnp.copy, state.weights) for state in self._states]
+        self._own_batches, self.places = group.own_batches, np.arange(len(group.members))
 
     def begin(self, training: np.ndarray) -> None:
-        self._places = np.flatnonzero(training)
+        self.places = np.flatnonzero(training)
 
-    def train(self, training: np.ndarray, batch: dict[str, np.ndarray]) -> jax.Array:
+    def train(self, training: np.ndarray, batch: Batches) -> jax.Array:
         loss = jnp.zeros(())
         for row, index in enumerate(map(int, self.places)):
             if training[index]:
@@ -257,28 +183,26 @@ class InTurn:
                 self._states[index], loss = self._train(self._states[index], *given)
         return loss
 
-    def _own(self, batch: dict[str, np.ndarray], row: int) -> dict[str, np.ndarray]:
+    def _own(self, batch: Batches, row: int) -> Batches:
         return {name: array[row] for name, array in batch.items()} if self._own_batches else batch
 
     def sums(self) -> dict[str, np.ndarray]:
         return {name: np.array([float(one.sums[name]) for one in self._states]) for name in self._states[0].sums}
 
-    def evaluate(self, batch: dict[str, np.ndarray], weights: np.ndarray) -> dict[str, np.ndarray]:
+    def evaluate(self, batch: Batches, weights: np.ndarray) -> dict[str, np.ndarray]:
         found: dict[str, np.ndarray] = {}
         for row, index in enumerate(map(int, self.places)):
-            state = self._states[index]
-            own = self._evaluate(state.parameters, state.statistics, self._own(batch, row), weights)
+            own = self._evaluate(*self._states[index].weights, self._own(batch, row), weights)
             for name, value in own.items():
                 found.setdefault(name, np.zeros(len(self._states), np.float32))[index] = float(value)
         return found
 
     def finite(self) -> np.ndarray:
-        return np.array([bool(self._is_finite((state.parameters, state.statistics))) for state in self._states])
+        return np.array([bool(self._is_finite(state.weights)) for state in self._states])
 
     def keep(self, better: np.ndarray) -> None:
         for index in map(int, np.flatnonzero(better)):
-            state = self._states[index]
-            self._best[index] = jax.tree.map(jnp.copy, (state.parameters, state.statistics))
+            self._best[index] = jax.tree.map(jnp.copy, self._states[index].weights)
 
     def saved(self) -> tuple[Any, Any]:
         return tuple(jax.tree.map(lambda *leaves: jnp.stack(leaves), *trees) for trees in (self._states, self._best))
@@ -290,4 +214,5 @@ class InTurn:
         )
 
 
+Trainer = AtOnce | InTurn
 TRAINERS: dict[Way, type[Trainer]] = {"at once": AtOnce, "in turn": InTurn}

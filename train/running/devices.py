@@ -7,6 +7,7 @@ their last axis. The compiler derives the rest.
 from __future__ import annotations
 
 import math
+from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
@@ -100,31 +101,26 @@ def check_batch(name: str, config: OptimiserConfig, layout: Layout, group: int =
         name: of the network.
         group: number of successive views that stay in one part.
     """
-    for option, value in (
-        ("batch-size", config.batch_size),
-        ("parts", config.parts),
-        ("views-per-object", config.views_per_object),
-    ):
-        if value < 1:
-            raise DataError(f"{name}: optimiser.{option} must be at least 1, and is {value}")
+    for option in ("batch_size", "parts", "views_per_object"):
+        if (value := getattr(config, option)) < 1:
+            raise DataError(f"{name}: optimiser.{option.replace('_', '-')} must be at least 1, and is {value}")
     unit = math.lcm(layout.data * config.parts, config.parts * group, config.views_per_object * layout.processes)
     fits = f"such as {unit * -(-config.batch_size // unit)}"
-    if config.batch_size % (layout.data * config.parts):
-        parts = f" in {config.parts} parts" if config.parts != 1 else ""
+    batch, parts = f"{name}: a batch of {config.batch_size} views", config.parts
+    if config.batch_size % (layout.data * parts):
         raise DataError(
-            f"{name}: a batch of {config.batch_size} views{parts} cannot be shared equally by {layout.data} devices; "
-            f"choose another optimiser.batch-size ({fits}) or optimiser.parts, or use fewer devices"
+            f"{batch}{f' in {parts} parts' if parts != 1 else ''} cannot be shared equally by {layout.data} devices; choose "
+            f"another optimiser.batch-size ({fits}) or optimiser.parts, or use fewer devices"
         )
-    if config.batch_size % (config.parts * group):
+    if config.batch_size % (parts * group):
         raise DataError(
-            f"{name}: a batch of {config.batch_size} views, {group} of an object, cannot be cut into {config.parts} parts of "
-            f"whole objects; choose another optimiser.batch-size ({fits}), optimiser.parts or optimiser.views-per-object"
+            f"{batch}, {group} of an object, cannot be cut into {parts} parts of whole objects; choose another "
+            f"optimiser.batch-size ({fits}), optimiser.parts or optimiser.views-per-object"
         )
     if config.batch_size % (config.views_per_object * layout.processes):
         raise DataError(
-            f"{name}: a batch of {config.batch_size} views, {config.views_per_object} of an object, cannot be read "
-            f"equally by {layout.processes} processes; choose another optimiser.batch-size ({fits}) or "
-            f"optimiser.views-per-object"
+            f"{batch}, {config.views_per_object} of an object, cannot be read equally by {layout.processes} processes; "
+            f"choose another optimiser.batch-size ({fits}) or optimiser.views-per-object"
         )
 
 
@@ -185,3 +181,28 @@ def summed_over(mesh: Mesh, function: Callable) -> Callable:
 
     whole, split = PartitionSpec(), PartitionSpec(DATA)
     return jax.shard_map(own, mesh=mesh, in_specs=(whole, whole, split, split), out_specs=whole, check_vma=False)
+
+
+class Lead:
+    """Limits how many steps the host dispatches ahead of the devices.
+
+    A few steps keep the devices busy; with more, errors would be reported late.
+    """
+
+    def __init__(self, steps: int = 4):
+        self._steps, self._running = steps, deque[jax.Array]()
+
+    def limit(self, result: jax.Array) -> int:
+        """Takes a result of the newest step, and waits for that of `steps` steps earlier; returns how many steps have ended."""
+        self._running.append(result)
+        if len(self._running) <= self._steps:
+            return 0
+        self._running.popleft().block_until_ready()
+        return 1
+
+    def end(self) -> int:
+        """Waits for all steps; returns how many have ended that were not counted yet."""
+        ended = len(self._running)
+        while self._running:
+            self._running.popleft().block_until_ready()
+        return ended

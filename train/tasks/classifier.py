@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any, Literal
@@ -22,6 +22,7 @@ from mevs_jax.geometry.inputs import depth_image
 from mevs_jax.models import ResNet
 from train.optimiser import OptimiserConfig
 from train.step import Batch, Hyperparameters, Metrics
+from train.tasks.own_encoder import OwnEncoderConfig, own_encoder
 from train.weights.starting import StartingWeights, weights_from_torch
 
 
@@ -76,23 +77,11 @@ class ClassifierConfig:
     optimiser: OptimiserConfig = OptimiserConfig(weight_decay=1e-4)
 
 
-def reality_of(config: ClassifierConfig) -> RealityAugmentation | None:
-    """Returns the errors of training images; None if there are none.
-
-    Raises:
-        DataError: if they are not valid, or the images are not of depth.
-    """
-    reality = used_reality(config.reality, "--classifier.reality")
-    if reality and config.images != "depth":
-        raise DataError("--classifier.reality is for images of depth; leave out --classifier.images image")
-    return reality
-
-
 @dataclass(frozen=True)
 class ClassifierTask:
-    """Training of the classifier by cross-entropy on single views."""
+    """Training of the classifier, or of a network of the user's in its place, by cross-entropy on single views."""
 
-    network_config: ResNetConfig
+    network_config: ResNetConfig | OwnEncoderConfig
     classes: int
     images: Literal["depth", "image"]
     camera: CaptureConfig
@@ -103,12 +92,23 @@ class ClassifierTask:
 
     @classmethod
     def of(cls, config: ClassifierConfig, classes: int, camera: CaptureConfig) -> ClassifierTask:
-        if config.encoder:
-            from train.tasks.own_encoder import OwnEncoderTask  # which needs this module
+        """Returns the task.
 
-            return OwnEncoderTask.of_encoder(config, classes, camera)
-        reality = reality_of(config)
-        return cls(config.network, classes, config.images, camera, config.augmentation, config.optimiser, reality)
+        Raises:
+            DataError: if the encoder cannot be loaded or used, or the errors of images are not valid, or are not for its images.
+        """
+        network: ResNetConfig | OwnEncoderConfig = config.network
+        if config.encoder:
+            if config.optimiser.compute != "float32":
+                raise DataError(
+                    f"--classifier.optimiser.compute {config.optimiser.compute} is for this project's own networks; an "
+                    f"--encoder decides itself in which precision it computes: leave the option out"
+                )
+            network = own_encoder(config.encoder, classes, config.network.channels, camera.resolution)
+        reality = used_reality(config.reality, "--classifier.reality")
+        if reality and config.images != "depth":
+            raise DataError("--classifier.reality is for images of depth; leave out --classifier.images image")
+        return cls(network, classes, config.images, camera, config.augmentation, config.optimiser, reality)
 
     @property
     def batches(self) -> ViewBatches:
@@ -133,8 +133,15 @@ class ClassifierTask:
     def hyperparameters(self) -> Hyperparameters:
         return Hyperparameters.of(self.optimiser, 0.0, self.augmentation.strength)
 
-    def network(self, rngs: nnx.Rngs) -> ResNet:
+    @property
+    def encoder(self) -> dict[str, Any] | None:
+        """What identifies a user's encoder, for `summary.json`."""
+        return asdict(self.network_config) if isinstance(self.network_config, OwnEncoderConfig) else None
+
+    def network(self, rngs: nnx.Rngs) -> Any:
         shape = self.network_config
+        if isinstance(shape, OwnEncoderConfig):
+            return shape.network(self.classes, self.camera.resolution, rngs)
         return ResNet(
             depth=shape.depth,
             classes=self.classes,

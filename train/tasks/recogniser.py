@@ -27,7 +27,7 @@ from mevs_jax.models.rotation import ROTATIONS, rotation_weights, seen_rotations
 from train.optimiser import OptimiserConfig
 from train.step import Batch, Hyperparameters, Metrics
 from train.tasks.classifier import ResNetConfig
-from train.tasks.fusion import SetFusionConfig, new_fusion, random_sets
+from train.tasks.set_fusion import SetFusionConfig, new_fusion, random_sets
 from train.tasks.size import SizeConfig, radii_for_training, used_size
 
 

@@ -18,7 +18,7 @@ from safetensors import deserialize
 
 from data_pipeline.errors import DataError, reason_of
 from data_pipeline.objects.names import shown
-from train.weights.pickle_format import LONGEST_NAME, MOST_BYTES, Tensor, WeightsUnpickler
+from train.weights.pickle_format import LONGEST_NAME, MOST_BYTES, BoundedReader, Tensor, WeightsUnpickler
 
 LARGEST_FILE = 1 << 30
 """Largest size of a file of weights in bytes."""
@@ -105,23 +105,9 @@ def _checked(name: Any) -> str:
 # -------------------------------------------------------------------------------------------------------------- PyTorch
 
 
-class _BoundedReader(io.BufferedReader):
-    """A file whose reads are bounded until `bound` is None: `zipfile` reads a list of contents of any size at once."""
-
-    bound: int | None = LARGEST_DIRECTORY
-
-    def read(self, size: int | None = -1, /) -> bytes:
-        if self.bound is None:
-            return super().read(size)
-        count = self.bound if size is None or size < 0 else size
-        if count > self.bound:
-            raise ValueError(f"its list of contents is larger than {self.bound >> 20} MB")
-        return super().read(count)
-
-
 def _zip_state(file: io.BufferedReader, size: int) -> tuple[dict[str, Tensor], dict[str, bytes]]:
-    bounded = _BoundedReader(io.FileIO(file.fileno(), closefd=False))
-    with zipfile.ZipFile(bounded) as archive:
+    bounded = BoundedReader(file, LARGEST_DIRECTORY)
+    with zipfile.ZipFile(bounded) as archive:  # it reads a list of contents of any size at once
         bounded.bound = None
         members = {info.filename: info for info in archive.infolist()}
         if sum(info.file_size for info in members.values()) > MOST_TIMES * size + _MARGIN:
@@ -157,7 +143,8 @@ def _zip_state(file: io.BufferedReader, size: int) -> tuple[dict[str, Tensor], d
 
 
 def _legacy_state(file: io.BufferedReader, size: int) -> tuple[dict[str, Tensor], dict[str, bytes]]:
-    unpickler = WeightsUnpickler(file)
+    bounded = BoundedReader(file, MOST_BYTES)
+    unpickler = WeightsUnpickler(bounded)
     if unpickler.load() != _LEGACY_MAGIC or unpickler.load() != _LEGACY_VERSION:
         raise ValueError("it does not begin as a file of weights does")
     unpickler.load()  # the writer's machine
@@ -166,18 +153,18 @@ def _legacy_state(file: io.BufferedReader, size: int) -> tuple[dict[str, Tensor]
     keys = unpickler.load()
     if type(keys) is not list or not all(type(key) is str and key in unpickler.storages for key in keys):
         raise ValueError("its list of storages has others than its tensors refer to")
-    storages = {}
+    bounded.bound, storages = None, {}
     for key in keys:
-        (count,) = struct.unpack("<q", file.read(8))
+        (count,) = struct.unpack("<q", bounded.read(8))
         nbytes = count * unpickler.storages[key].itemsize
-        if not 0 <= nbytes <= size - file.tell():
+        if not 0 <= nbytes <= size - bounded.tell():
             raise ValueError(f"it ends within a storage of {count} numbers")
         if key not in used:  # of an optimiser, beside the state dict
-            file.seek(nbytes, io.SEEK_CUR)
+            bounded.seek(nbytes, io.SEEK_CUR)
         elif key in storages:
             raise ValueError("it has two storages of one key")
         else:
-            storages[key] = file.read(nbytes)
+            storages[key] = bounded.read(nbytes)
     if used - storages.keys():
         raise ValueError("it lacks the numbers of a tensor")
     return tensors, storages

@@ -1,18 +1,19 @@
 """The part of the pickle format that PyTorch's files of weights use.
 
-Unpickling as Python does it can run any code, and a short pickle can take gigabytes or hours. The reader here knows only the
-instructions of a state dict, makes only plain values and descriptions of tensors, and bounds what a pickle may take.
+Unpickling as Python does it can run any code, and a short pickle can take gigabytes or hours. The reader here takes the
+instructions apart with `pickletools`, which executes nothing. It knows only those of a state dict, makes only plain values and
+descriptions of tensors, and bounds what a pickle may take.
 """
 
 from __future__ import annotations
 
 import io
-import struct
-from collections.abc import Callable
+import pickletools
+from collections.abc import Iterable
 from dataclasses import dataclass
 from enum import Enum
 from math import prod
-from typing import Any, no_type_check
+from typing import Any
 
 import ml_dtypes
 import numpy as np
@@ -87,34 +88,41 @@ class _Function(Enum):
     PARAMETER = ("torch._utils", "_rebuild_parameter")
 
 
-@dataclass(frozen=True)
-class _StorageType:
-    dtype: np.dtype
+class BoundedReader(io.BufferedReader):
+    """A file of which one call reads at most `bound` bytes: standard libraries reserve memory for any size that a file names.
+
+    Attributes:
+        bound: None removes the bound.
+    """
+
+    bound: int | None
+
+    def __init__(self, file: io.BufferedReader, bound: int) -> None:
+        super().__init__(io.FileIO(file.fileno(), closefd=False))
+        self.seek(0)
+        self.bound = bound
+
+    def read(self, size: int | None = -1, /) -> bytes:
+        if self.bound is None:
+            return super().read(size)
+        count = self.bound if size is None or size < 0 else size
+        if count > self.bound:
+            raise ValueError(f"it has a part that is larger than {self.bound >> 20} MB")
+        return super().read(count)
+
+    def readline(self, size: int | None = -1, /) -> bytes:
+        return super().readline(LONGEST_NAME + 1)
 
 
-def _is_count(value: Any) -> bool:
-    return type(value) is int and 0 <= value < 1 << 63
+_IGNORED = {"PROTO", "FRAME"}
+_VALUES = {"NONE": None, "NEWTRUE": True, "NEWFALSE": False, "EMPTY_TUPLE": ()}
+_ARGUMENTS = {"BININT", "BININT1", "BININT2", "LONG1", "BINFLOAT", "BINUNICODE", "SHORT_BINUNICODE"} | {
+    "BINSTRING",  # of Python 2
+    "SHORT_BINSTRING",
+}
+"""Instructions that put their argument on the stack."""
 
 
-def _are_counts(values: Any) -> bool:
-    return type(values) is tuple and len(values) <= MOST_AXES and all(map(_is_count, values))
-
-
-def _tensor(arguments: tuple[Any, ...]) -> Tensor:
-    storage, offset, size, stride = arguments[:4]
-    sound = isinstance(storage, Storage) and _is_count(offset) and _are_counts(size) and _are_counts(stride)
-    if not sound or len(size) != len(stride):
-        raise ValueError("it describes a tensor whose offset, size or strides are not usable")
-    return Tensor(storage, offset, size, stride)
-
-
-def _parameter(arguments: tuple[Any, ...]) -> Tensor:
-    if not isinstance(arguments[0], Tensor):
-        raise ValueError("it describes a parameter that is not a tensor")
-    return arguments[0]
-
-
-@no_type_check  # several calls an instruction: the tests' type checks take a hundred times as long as the calls
 class WeightsUnpickler:
     """Reads pickles of plain values and tensors, one after another, from a file.
 
@@ -122,11 +130,10 @@ class WeightsUnpickler:
         storages: the types of the storages that the pickles refer to, by key.
     """
 
-    def __init__(self, file: io.BufferedIOBase):
+    def __init__(self, file: io.BytesIO | BoundedReader):
         self.storages: dict[str, np.dtype] = {}
         self._file = file
         self._left = 0
-        self._bytes_left = 0
         self._stack: list[Any] = []
         self._marks: list[int] = []
         self._memo: dict[int, Any] = {}
@@ -137,14 +144,16 @@ class WeightsUnpickler:
         Raises:
             ValueError: if it is damaged, too large, or contains what no state dict needs.
         """
-        self._stack, self._marks, self._memo = [], [], {}
-        self._left, self._bytes_left = MOST_INSTRUCTIONS, MOST_BYTES
+        self._stack, self._marks, self._memo, self._left = [], [], {}, MOST_INSTRUCTIONS
+        end = self._file.tell() + MOST_BYTES
         try:
-            while (code := self._read(1)) != b".":
+            for instruction, argument, place in pickletools.genops(self._file):
+                if place is not None and place > end:
+                    raise ValueError(f"its pickle is larger than {MOST_BYTES >> 20} MB")
+                if instruction.name == "STOP":
+                    break
                 self._spend(1)
-                if code not in _INSTRUCTIONS:
-                    raise ValueError(f"its pickle has the instruction {code!r}, which no file of weights needs")
-                _INSTRUCTIONS[code](self)
+                self._follow(instruction.name, argument)
             return self._stack.pop()
         except (IndexError, KeyError) as error:  # of the stack, the marks or the memo
             raise ValueError("its pickle is damaged") from error
@@ -154,34 +163,61 @@ class WeightsUnpickler:
         if self._left < 0:
             raise ValueError(f"its pickle has more than {MOST_INSTRUCTIONS} instructions")
 
-    # ---------------------------------------------------------------------------------------------------- bytes
+    def _follow(self, name: str, argument: Any) -> None:
+        stack = self._stack
+        if name in _IGNORED:
+            return
+        match name:
+            case _ if name in _VALUES:
+                stack.append(_VALUES[name])
+            case _ if name in _ARGUMENTS:
+                stack.append(argument)
+            case "MARK":
+                self._marks.append(len(stack))
+            case "TUPLE1" | "TUPLE2" | "TUPLE3":
+                stack.append(tuple(self._last(int(name[-1]))))
+            case "TUPLE":
+                stack.append(tuple(self._since_mark()))
+            case "EMPTY_LIST":
+                stack.append([])
+            case "APPEND":
+                self._extend(self._last(1))
+            case "APPENDS":
+                self._extend(self._since_mark())
+            case "EMPTY_DICT":
+                stack.append({})
+            case "SETITEM":
+                self._set(self._last(2))
+            case "SETITEMS":
+                self._set(self._since_mark())
+            case "BINPUT" | "LONG_BINPUT":
+                self._memo[argument] = stack[-1]
+            case "MEMOIZE":
+                self._memo[len(self._memo)] = stack[-1]
+            case "BINGET" | "LONG_BINGET":
+                stack.append(self._memo[argument])
+            case "GLOBAL":
+                stack.append(_named(*argument.split(" ", 1)))
+            case "STACK_GLOBAL":
+                stack.append(_named(*self._last(2)))
+            case "REDUCE":
+                stack.append(self._called(*self._last(2)))
+            case "BUILD":  # drops the attributes of a dictionary: PyTorch's `_metadata`, the versions of its layers
+                stack.pop()
+                if type(stack[-1]) is not dict:
+                    raise ValueError("its pickle sets attributes of what is not a dictionary")
+            case "BINPERSID":
+                stack.append(self._storage(stack.pop()))
+            case _:
+                raise ValueError(f"its pickle has the instruction {name}, which no file of weights needs")
 
-    def _read(self, size: int) -> bytes:
-        self._bytes_left -= size
-        if self._bytes_left < 0:
-            raise ValueError(f"its pickle is larger than {MOST_BYTES >> 20} MB")
-        content = self._file.read(size)
-        if len(content) < size:
-            raise ValueError("its pickle ends early")
-        return content
-
-    def _number(self, layout: str) -> Any:
-        return struct.unpack(layout, self._read(struct.calcsize(layout)))[0]
-
-    def _line(self) -> str:
-        line = self._file.readline(LONGEST_NAME + 1)
-        self._bytes_left -= len(line)
-        if not line.endswith(b"\n"):
-            raise ValueError("its pickle has a name without an end")
-        return line[:-1].decode()
-
-    def _text(self, layout: str, encoding: str = "utf-8") -> None:
-        self._stack.append(self._read(self._number(layout)).decode(encoding))
-
-    # ---------------------------------------------------------------------------------------------------- values
-
-    def _put(self, value: Any) -> None:
-        self._stack.append(value)
+    def _last(self, count: int) -> list[Any]:
+        """Takes so many values from the stack."""
+        if len(self._stack) < count:
+            raise IndexError
+        items = self._stack[-count:]
+        del self._stack[-count:]
+        return items
 
     def _since_mark(self) -> list[Any]:
         at = self._marks.pop()
@@ -189,146 +225,82 @@ class WeightsUnpickler:
         del self._stack[at:]
         return items
 
-    def _tuple(self, count: int) -> None:
-        if len(self._stack) < count:
-            raise IndexError
-        items = tuple(self._stack[-count:])
-        del self._stack[-count:]
-        self._stack.append(items)
-
     def _extend(self, items: list[Any]) -> None:
-        values = self._stack[-1]
-        if type(values) is not list:
+        if type(self._stack[-1]) is not list:
             raise ValueError("its pickle appends to what is not a list")
-        values += items
+        self._stack[-1] += items
 
     def _set(self, items: list[Any]) -> None:
         values = self._stack[-1]
         if type(values) is not dict or len(items) % 2:
             raise ValueError("its pickle sets entries of what is not a dictionary")
-        for key, value in zip(items[::2], items[1::2], strict=True):
-            # Other keys could take any time to compare; optimisers count their parameters.
-            if type(key) is not str and not (type(key) is int and 0 <= key < 1 << 31):
-                raise ValueError("its pickle has a dictionary whose keys are not names")
-            values[key] = value
+        values |= _entries(zip(items[::2], items[1::2], strict=True))
 
-    def _one_item(self) -> None:
-        value = self._stack.pop()
-        key = self._stack.pop()
-        self._set([key, value])
-
-    def _appended(self) -> None:
-        value = self._stack.pop()
-        self._extend([value])
-
-    def _remember(self, index: int) -> None:
-        self._memo[index] = self._stack[-1]
-
-    # ---------------------------------------------------------------------------------------------------- names
-
-    def _name(self, module: Any, name: Any) -> None:
-        texts = type(module) is str and type(name) is str and module.isprintable() and name.isprintable()
-        if not texts or len(module) + len(name) > LONGEST_NAME:
-            raise ValueError("its pickle names a class by what is not a name")
-        if module in ("torch", "torch.storage") and name in DTYPES:
-            self._stack.append(_StorageType(DTYPES[name]))
-            return
-        try:
-            self._stack.append(_Function((module, name)))
-        except ValueError:
-            raise ValueError(f"it holds a {module}.{name}, which no file of weights needs") from None
-
-    def _stacked_name(self) -> None:
-        name = self._stack.pop()
-        module = self._stack.pop()
-        self._name(module, name)
-
-    def _call(self) -> None:
-        arguments, function = self._stack.pop(), self._stack.pop()
+    def _called(self, function: Any, arguments: Any) -> Any:
         if not isinstance(function, _Function) or type(arguments) is not tuple:
             raise ValueError("its pickle calls what is not a function")
         if function is _Function.ORDERED_DICT:
-            self._stack.append({})
-            for pair in self._pairs(arguments):
-                self._set(list(pair))
-        elif function is _Function.TENSOR and len(arguments) >= 4:
-            self._stack.append(_tensor(arguments))
-        elif function is _Function.PARAMETER and arguments:
-            self._stack.append(_parameter(arguments))
-        else:
-            raise ValueError("its pickle calls a function with too few arguments")
+            # Without an argument; or, as Python 2 wrote them, with a list of pairs.
+            pairs = arguments[0] if len(arguments) == 1 else list(arguments)
+            self._spend(len(pairs) if type(pairs) is list else 0)
+            if type(pairs) is not list or not all(type(pair) in (list, tuple) and len(pair) == 2 for pair in pairs):
+                raise ValueError("its pickle makes a dictionary from what is not a list of pairs")
+            return _entries(pairs)
+        if function is _Function.TENSOR and len(arguments) >= 4:
+            return _tensor(*arguments[:4])
+        if function is _Function.PARAMETER and arguments and isinstance(arguments[0], Tensor):
+            return arguments[0]
+        raise ValueError("its pickle calls a function with arguments that it does not take")
 
-    def _pairs(self, arguments: tuple[Any, ...]) -> list[Any]:
-        """Returns the entries of an ordered dictionary: none, or, as Python 2 wrote them, a list of pairs."""
-        if not arguments:
-            return []
-        pairs = arguments[0]
-        if len(arguments) > 1 or type(pairs) is not list:
-            raise ValueError("its pickle makes a dictionary from what is not a list of pairs")
-        self._spend(len(pairs))
-        if not all(type(pair) in (list, tuple) and len(pair) == 2 for pair in pairs):
-            raise ValueError("its pickle makes a dictionary from what is not a list of pairs")
-        return pairs
-
-    def _build(self) -> None:
-        """Drops the attributes of a dictionary: PyTorch's `_metadata`, the versions of its layers."""
-        self._stack.pop()
-        if type(self._stack[-1]) is not dict:
-            raise ValueError("its pickle sets attributes of what is not a dictionary")
-
-    def _storage(self) -> None:
-        """Puts the storage that a persistent id describes: kind, type, key, device, count, view of another storage."""
-        pid = self._stack.pop()
+    def _storage(self, pid: Any) -> Storage:
+        """Returns the storage that a persistent id describes: kind, type, key, device, count, view of another storage."""
         if type(pid) is not tuple or len(pid) not in (5, 6) or type(pid[0]) is not str:
             raise ValueError("it refers to something outside the file")
         kind, dtype, key = pid[:3]
         if kind != "storage":
             raise ValueError(f"it refers to {kind[:LONGEST_NAME]!r} outside the file")
-        if not isinstance(dtype, _StorageType) or type(key) is not str or len(key) > LONGEST_NAME:
+        if not isinstance(dtype, np.dtype) or type(key) is not str or len(key) > LONGEST_NAME:
             raise ValueError("it refers to a storage without a type or a key")
         if pid[5:] not in ((), (None,)):
             raise ValueError("it has a storage that is a part of another, as no PyTorch since 0.4 writes it")
-        if self.storages.setdefault(key, dtype.dtype) != dtype.dtype:
+        if self.storages.setdefault(key, dtype) != dtype:
             raise ValueError("it has a storage of two types")
-        self._stack.append(Storage(key, dtype.dtype))
+        return Storage(key, dtype)
 
 
-_INSTRUCTIONS: dict[bytes, Callable[[WeightsUnpickler], Any]] = {
-    b"\x80": lambda self: self._read(1),  # the protocol, of which nothing depends
-    b"\x95": lambda self: self._read(8),  # the length of a frame
-    b"(": lambda self: self._marks.append(len(self._stack)),
-    b"N": lambda self: self._put(None),
-    b"\x88": lambda self: self._put(True),
-    b"\x89": lambda self: self._put(False),
-    b"J": lambda self: self._put(self._number("<i")),
-    b"K": lambda self: self._put(self._number("<B")),
-    b"M": lambda self: self._put(self._number("<H")),
-    b"\x8a": lambda self: self._put(int.from_bytes(self._read(self._number("<B")), "little", signed=True)),
-    b"G": lambda self: self._put(self._number(">d")),
-    b"X": lambda self: self._text("<I"),
-    b"\x8c": lambda self: self._text("<B"),
-    b"T": lambda self: self._text("<I", "ascii"),  # of Python 2
-    b"U": lambda self: self._text("<B", "ascii"),
-    b")": lambda self: self._put(()),
-    b"\x85": lambda self: self._tuple(1),
-    b"\x86": lambda self: self._tuple(2),
-    b"\x87": lambda self: self._tuple(3),
-    b"t": lambda self: self._put(tuple(self._since_mark())),
-    b"]": lambda self: self._put([]),
-    b"a": lambda self: self._appended(),
-    b"e": lambda self: self._extend(self._since_mark()),
-    b"}": lambda self: self._put({}),
-    b"s": lambda self: self._one_item(),
-    b"u": lambda self: self._set(self._since_mark()),
-    b"q": lambda self: self._remember(self._number("<B")),
-    b"r": lambda self: self._remember(self._number("<I")),
-    b"\x94": lambda self: self._remember(len(self._memo)),
-    b"h": lambda self: self._put(self._memo[self._number("<B")]),
-    b"j": lambda self: self._put(self._memo[self._number("<I")]),
-    b"c": lambda self: self._name(self._line(), self._line()),
-    b"\x93": lambda self: self._stacked_name(),
-    b"R": lambda self: self._call(),
-    b"b": lambda self: self._build(),
-    b"Q": lambda self: self._storage(),
-}
-"""What each instruction does, by its byte."""
+def _named(module: Any, name: Any) -> np.dtype | _Function:
+    """Returns what a pickle refers to by the name of a class or function."""
+    texts = type(module) is str and type(name) is str and module.isprintable() and name.isprintable()
+    if not texts or len(module) + len(name) > LONGEST_NAME:
+        raise ValueError("its pickle names a class by what is not a name")
+    if module in ("torch", "torch.storage") and name in DTYPES:
+        return DTYPES[name]
+    try:
+        return _Function((module, name))
+    except ValueError:
+        raise ValueError(f"it holds a {module}.{name}, which no file of weights needs") from None
+
+
+def _entries(pairs: Iterable[Any]) -> dict[str | int, Any]:
+    entries = {}
+    for key, value in pairs:
+        # Other keys could take any time to compare; optimisers count their parameters.
+        if type(key) is not str and not (type(key) is int and 0 <= key < 1 << 31):
+            raise ValueError("its pickle has a dictionary whose keys are not names")
+        entries[key] = value
+    return entries
+
+
+def _tensor(storage: Any, offset: Any, size: Any, stride: Any) -> Tensor:
+    sound = isinstance(storage, Storage) and _are_counts((offset,)) and _are_counts(size) and _are_counts(stride)
+    if not sound or len(size) != len(stride):
+        raise ValueError("it describes a tensor whose offset, size or strides are not usable")
+    return Tensor(storage, offset, size, stride)
+
+
+def _are_counts(values: Any) -> bool:
+    return (
+        type(values) is tuple
+        and len(values) <= MOST_AXES
+        and all(type(value) is int and 0 <= value < 1 << 63 for value in values)
+    )

@@ -8,7 +8,7 @@ import pytest
 @pytest.fixture(scope="package")
 def lattices():
     from tests.reference.made_up_thesis import made_up_lattice
-    from train.tasks.thesis_networks import VIEWS
+    from train.many.thesis import VIEWS
 
     return {views: made_up_lattice(views, views) for views in VIEWS}
 
@@ -31,7 +31,7 @@ def results(lattices, statistics):
 def inputs(lattices, statistics, results, tmp_path):
     """What the figures show."""
     from eval.thesis.figures import FigureInputs
-    from train.tasks.thesis_networks import BACKBONES, FRAMES, VIEWS, ThesisFolder
+    from train.many.thesis import BACKBONES, FRAMES, VIEWS, ThesisFolder
 
     history = [{"epoch": e, "train/loss": 1 / e, "val/loss": 1.2 / e} for e in (1, 2, 3)]
     names = [backbone.name for backbone in BACKBONES] + [f"entropy_{v}_{frame}" for v in VIEWS for frame in FRAMES]

@@ -27,9 +27,9 @@ from tests.reference.leaks import (
     walk_grid_anyhow,
     without_bootstrap,
 )
+from train.many.thesis import FRAMES, PIPELINE, ThesisFolder
+from train.many.thesis import VIEWS as LATTICES
 from train.tasks.entropy import EntropyTask
-from train.tasks.thesis_networks import FRAMES, PIPELINE, ThesisFolder
-from train.tasks.thesis_networks import VIEWS as LATTICES
 
 SETTINGS = replace(TINY, evaluation=GridConfig(max_views=5, draws=1))
 STATISTICS = replace(some_statistics(some_tables()), capture={"resolution": 32, "views": VIEWS})

@@ -17,7 +17,7 @@ from flax import nnx
 from matplotlib.figure import Figure
 
 import eval.thesis.run as thesis_run
-import train.tasks.thesis_networks as thesis_networks
+import train.many.thesis as thesis_networks
 from data_pipeline.dataset.builder import open_split
 from data_pipeline.dataset.statistics import load_statistics
 from data_pipeline.files import write_json
@@ -35,8 +35,8 @@ from mevs_jax.geometry.viewpoints import ViewGraph, fibonacci_sphere
 from tests.reference.made_up_thesis import OBJECTS
 from tests.reference.policies import maxima_first
 from tests.reference.weights import untrained
+from train.many.thesis import BACKBONES, FRAMES, PIPELINE, backbone_task, entropy_task
 from train.tasks.entropy import EntropyTask
-from train.tasks.thesis_networks import BACKBONES, FRAMES, PIPELINE, backbone_task, entropy_task
 
 # ------------------------------------------------------------------------------------------------------ the printed numbers
 

@@ -14,7 +14,7 @@ from mevs_jax.models.set_fusion import SetFusion
 from train.choosing.averaged import AveragedConfig, Fitting, fit_together
 from train.choosing.calibrated import calibrated
 from train.choosing.features import Features, sets_of_size
-from train.tasks.fusion import SetFusionConfig, new_fusion, random_sets
+from train.tasks.set_fusion import SetFusionConfig, new_fusion, random_sets
 
 
 def test_training_sets_have_every_size_small_ones_more_often_and_views_as_often():

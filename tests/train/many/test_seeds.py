@@ -23,7 +23,7 @@ from eval.stages import tasks
 from tests.train.scaling_worker import SETTINGS
 from tests.train.test_training import lines
 from train.loop import fit, load_best
-from train.many.members import Member, member_of, task_of
+from train.many.members import Group, Member, member_of, task_of
 from train.many.seeds import shared_equally, train_seeds
 from train.many.trainers import TRAINERS
 from train.many.training import _Batches
@@ -44,6 +44,10 @@ def of_seeds(data, name: str, seeds=(3, 4)):
         task = tasks(SETTINGS, statistics)[("classifier", "entropy").index(name)]
     task = replace(task, optimiser=replace(task.optimiser, epochs=2))
     return [replace(task, optimiser=replace(task.optimiser, seed=seed, data_seed=seed)) for seed in seeds]
+
+
+def group_of(each, data):
+    return Group(each[0], [member_of(task) for task in each], data, load_statistics(data))
 
 
 @pytest.mark.slow
@@ -76,7 +80,7 @@ def test_every_seed_ends_as_it_does_alone(name, request, tmp_path):
 def test_a_member_draws_the_batches_of_its_epoch_wherever_it_trains(data):
     """Members move to other processes once others have stopped."""
     each = of_seeds(data, "entropy")
-    batches = _Batches(each[0], [member_of(task) for task in each], data, load_statistics(data), own=True)
+    batches = _Batches(group_of(each, data))
     batches.begin(np.array([0]), 0)
     for _ in range(2):
         batches.next(np.array([0]))
@@ -92,10 +96,11 @@ def test_a_member_draws_the_batches_of_its_epoch_wherever_it_trains(data):
 def test_both_ways_of_training_members_take_the_same_steps(data):
     """Twenty steps of two members, each on its own batches; the second stops half way, and its place is given up."""
     each = of_seeds(data, "entropy")
-    members, mesh = [member_of(task) for task in each], device_mesh()
+    group, mesh = group_of(each, data), device_mesh()
+    assert group.own_batches
     found = []
     for way in ("at once", "in turn"):
-        trainer = TRAINERS[way](each[0], members, mesh, 10, True)
+        trainer = TRAINERS[way](group, mesh)
         streams = [train_batches(data, task.batches) for task in each]
         for step in range(20):
             training = np.array([True, step < 10])
@@ -135,11 +140,11 @@ def test_an_interrupted_training_of_seeds_goes_on(data, tmp_path, monkeypatch):
     monkeypatch.undo()
     written = []
 
-    def export(task, of, index, *rest):
+    def export(group, of, best, index, *rest):
         if written:
             raise KeyboardInterrupt
         written.append(of.members[index])
-        return train.many.members.export_member(task, of, index, *rest)
+        return train.many.members.export_member(group, of, best, index, *rest)
 
     monkeypatch.setattr(train.many.seeds, "export_member", export)
     with pytest.raises(KeyboardInterrupt):
@@ -231,11 +236,10 @@ import json, sys
 import jax
 jax.config.update("jax_num_cpu_devices", 4)
 import numpy as np
-from tests.train.many.test_seeds import of_seeds
+from tests.train.many.test_seeds import group_of, of_seeds
 from tests.train.scaling_worker import COLLECTIVES
 from data_pipeline.dataset.batches import train_batches
 from train.running.devices import device_mesh
-from train.many.members import member_of
 from train.many.trainers import AtOnce, way_for
 from pathlib import Path
 
@@ -243,7 +247,7 @@ data = Path(sys.argv[1])
 each = of_seeds(data, "entropy", seeds=range(4))
 mesh = device_mesh()
 assert way_for(mesh) == "at once"
-trainer = AtOnce(each[0], [member_of(task) for task in each], mesh, 10, True)
+trainer = AtOnce(group_of(each, data), mesh)
 streams = [train_batches(data, task.batches) for task in each]
 losses = []
 for step in range(4):
@@ -265,7 +269,7 @@ def test_devices_train_a_seed_each_and_say_nothing_to_each_other(data):
     found = json.loads(done.stdout)
     assert found["said"] == []
     each = of_seeds(data, "entropy", seeds=range(4))
-    trainer = TRAINERS["in turn"](each[2], [member_of(each[2])], device_mesh(), 10, False)
+    trainer = TRAINERS["in turn"](group_of(each[2:3], data), device_mesh())
     stream = train_batches(data, each[2].batches)
     alone = [float(trainer.train(np.ones(1, bool), next(stream))) for _ in range(4)]
     np.testing.assert_allclose([losses[2] for losses in found["losses"]], alone, rtol=1e-4)

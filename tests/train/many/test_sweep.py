@@ -30,6 +30,7 @@ from train.loop import fit, load_best, steps_of_an_epoch, validate
 from train.many.members import Member, Together, by_configurations, task_of
 from train.many.sweep import SweepConfig, best_of, draw_members, sweep
 from train.results.identity import summary_of
+from train.running.checkpoints import Checkpoints
 from train.running.devices import device_mesh
 from train.running.preemption import Preempted
 from train.step import TrainState, evaluate_step_of, initial_state
@@ -92,16 +93,13 @@ def test_a_sweep_of_version_0_1_goes_on_after_its_last_epoch(out, tmp_path, monk
     statistics, task = load_statistics(out / "data"), task_named("entropy", out)
     task = replace(task, optimiser=replace(task.optimiser, patience=5, epochs=2))
     whole = sweep(task, out / "data", statistics, tmp_path / "whole", SWEEP)
-    real_progress, real_print = Together.progress, train.many.training._print_epoch
+    real_save = Checkpoints.save
 
-    def stopped(*arguments):
-        real_print(*arguments)
+    def stopped(self, slot, step, state, progress):
+        real_save(self, slot, step, state, {name: value for name, value in progress.items() if name != "step"})
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(
-        Together, "progress", lambda self: {k: v for k, v in real_progress(self).items() if k != "step"}
-    )
-    monkeypatch.setattr(train.many.training, "_print_epoch", stopped)
+    monkeypatch.setattr(Checkpoints, "save", stopped)
     with pytest.raises(KeyboardInterrupt):
         sweep(task, out / "data", statistics, tmp_path / "before", SWEEP)
     monkeypatch.undo()
@@ -167,7 +165,7 @@ def test_members_that_diverge_late_are_never_the_best():
     ]
     means = {"loss": np.ones(4), "accuracy": np.array([1, np.nan, 1, 1])}
     checked = {"loss": np.array([0.01, 0.01, np.inf, 0.35])}
-    together = Together(members, epoch_steps=1, epoch=2, histories=[[] for _ in members])
+    together = Together(members, [[] for _ in members], epoch=2)
     finite = np.array([False, True, True, True])
     better = together.after_epoch(np.ones(4, bool), means, checked, finite)
     after = together.members
@@ -256,7 +254,7 @@ def test_halving_drops_the_worse_half_of_the_configurations():
         for seed, loss in enumerate(pair)
     ]
     assert best_of(members).learning_rate == 1e-3
-    together = Together(members, epoch_steps=1)
+    together = Together(members, [])
     left = []
     for _ in range(3):
         together.halve()

@@ -74,9 +74,10 @@ def _shared(depth: int) -> bytes:
 
 HOSTILE_PICKLES: dict[str, tuple[bytes, str]] = {
     "memo of gigabytes": (b"\x80\x02]r\xff\xff\xff\xff.", "not a state dict"),
-    "bytearray of gigabytes": (b"\x80\x05\x96" + struct.pack("<Q", 1 << 34) + b".", "instruction"),
-    "bytes of gigabytes": (b"\x80\x03B\xff\xff\xff\xff.", "instruction"),
-    "text of gigabytes": (b"\x80\x02X\xff\xff\xff\xffabc.", "larger than 32 MB"),
+    "bytearray of gigabytes": (b"\x80\x05\x96" + struct.pack("<Q", 1 << 34) + b".", "larger than 32 MB|only 1 remain"),
+    "bytes of gigabytes": (b"\x80\x03B\xff\xff\xff\xff.", "larger than 32 MB|only 1 remain"),
+    "bytes": (b"\x80\x03C\x01a.", "instruction SHORT_BINBYTES"),
+    "text of gigabytes": (b"\x80\x02X\xff\xff\xff\xffabc.", "larger than 32 MB|only 4 remain"),
     "frame of gigabytes": (b"\x80\x04\x95" + b"\xff" * 8 + b"].", "not a state dict"),
     "key that takes ages": (b"\x80\x02}" + _shared(60) + b"K\x01s.", "keys are not names"),
     "kind that takes ages": (b"\x80\x02(" + _shared(60) + b"NNNNtQ.", "outside the file"),
@@ -98,7 +99,7 @@ HOSTILE_PICKLES: dict[str, tuple[bytes, str]] = {
     "attributes of a class": (b"\x80\x02ctorch\nFloatStorage\n}b.", "not a dictionary"),
     "call of a type": (b"\x80\x02ctorch\nFloatStorage\nK\x7f\x85R.", "not a function"),
     "call of nothing": (b"\x80\x02NNR.", "not a function"),
-    "long name": (b"\x80\x02c" + b"x" * 100_000 + b"\ny\n.", "name without an end"),
+    "long name": (b"\x80\x02c" + b"x" * 100_000 + b"\ny\n.", "no newline|not a name"),
     "name of two lines": (b"\x80\x04" + text("a\nb") + text("c") + b"\x93.", "not a name"),
     "empty stack": (b"\x80\x02.", "pickle is damaged"),
     "no memo": (b"\x80\x02h\x07.", "pickle is damaged"),

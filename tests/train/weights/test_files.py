@@ -211,7 +211,7 @@ def _zips() -> dict[str, tuple[bytes, str]]:
         "encrypted": (_changed(sound, 8, b"\x01"), "encrypted"),
         "damaged": (sound[:with_pickle] + b"x" + sound[with_pickle + 1 :], "CRC"),
         "directory of gigabytes": (sound[: directory + 12] + b"\0\0\0\x7f" + sound[directory + 16 :], "directory"),
-        "many members": (many, "list of contents is larger than 4 MB"),
+        "many members": (many, "larger than 4 MB"),
         "without numbers": (zipped(state({"a": tensor()}), {}), "no data/0"),
         "other content": (zipped(b".").replace(b"data.pkl", b"data.txt"), "not of weights"),
         "pickle of gigabytes": (_changed(zipped(b".", {}), 24, struct.pack("<I", 1 << 20)), "data.pkl ends early"),

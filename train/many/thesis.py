@@ -10,6 +10,7 @@ from typing import Literal
 from data_pipeline.dataset.statistics import DatasetStatistics, load_statistics
 from data_pipeline.files import read_json
 from train.loop import check_training, load_best
+from train.many.members import SweepTask
 from train.many.seeds import train_seeds
 from train.optimiser import OptimiserConfig
 from train.results.chance import warn_of_chance
@@ -154,21 +155,25 @@ class ThesisSettings:
 
     def shifted(self, number: int) -> ThesisSettings:
         """Returns the settings of seed number `number`, counted from these."""
-
-        def of(config: OptimiserConfig) -> OptimiserConfig:
-            return replace(config, seed=config.seed + number, data_seed=config.data_seed + number)
-
-        thesis = self.thesis
+        configs = {name: getattr(self.thesis, name).shifted(number) for name in ("resnet18", "resnet34", "fine_tuning")}
         return ThesisSettings(
-            replace(self.classifier, optimiser=of(self.classifier.optimiser)),
-            replace(self.entropy, optimiser=of(self.entropy.optimiser)),
-            replace(
-                thesis,
-                resnet18=of(thesis.resnet18),
-                resnet34=of(thesis.resnet34),
-                fine_tuning=of(thesis.fine_tuning),
-            ),
+            replace(self.classifier, optimiser=self.classifier.optimiser.shifted(number)),
+            replace(self.entropy, optimiser=self.entropy.optimiser.shifted(number)),
+            replace(self.thesis, **configs),
         )
+
+    def networks(self, folder: ThesisFolder) -> list[tuple[str, DatasetStatistics, SweepTask]]:
+        """Returns the name, the statistics of the data and the task of each network, backbones first."""
+        of_views = {views: folder.statistics(views) for views in VIEWS}
+        backbones: list[tuple[str, DatasetStatistics, SweepTask]] = [
+            (one.name, of_views[one.views], backbone_task(one, self.classifier, self.thesis, of_views[one.views]))
+            for one in BACKBONES
+        ]
+        return backbones + [
+            (f"entropy_{views}_{frame}", of_views[views], entropy_task(frame, self.entropy, of_views[views]))
+            for views in VIEWS
+            for frame in FRAMES
+        ]
 
 
 def train_thesis(
@@ -180,47 +185,34 @@ def train_thesis(
         folders: of each seed; all have the data sets of the first.
         settings: of each seed.
         first: the result of `first_weights`.
+
+    Raises:
+        DataError: if a network that is missing cannot be trained by these devices, before the first is trained.
     """
-    _check_all(folders[0], settings[0])
-    for backbone in BACKBONES:
-        statistics, data = folders[0].statistics(backbone.views), folders[0].data(backbone.views)
-        tasks = [backbone_task(backbone, own.classifier, own.thesis, statistics) for own in settings]
-        starts = [
-            _weights_before(backbone, folder, own) if backbone.start else first[backbone.name]
-            for folder, own in zip(folders, settings, strict=True)
-        ]
-        option = f"--thesis.{'fine-tuning' if backbone.start else f'resnet{backbone.depth}'}.learning-rate"
-        trained = [folder.backbone(backbone.name) for folder in folders]
-        work = folders[0].out / "seeds" / f"{backbone.name}_together"
-        summaries = train_seeds(tasks, data, statistics, trained, work, starts, rate_option=option)
+    layout, backbones = Layout.of_mesh(device_mesh()), {backbone.name: backbone for backbone in BACKBONES}
+    for name, statistics, task in settings[0].networks(folders[0]):
+        if not (folders[0].networks()[name] / "summary.json").exists():
+            check_training(task, statistics, layout)
+    for same in zip(*(own.networks(folders[0]) for own in settings), strict=True):
+        (name, statistics, _), tasks = same[0], [task for _, _, task in same]
+        backbone, starts, option = backbones.get(name), list[StartingWeights | None](), "entropy.optimiser"
+        if backbone is not None:
+            starts = [
+                _weights_before(backbone, folder, own) if backbone.start else first[name]
+                for folder, own in zip(folders, settings, strict=True)
+            ]
+            option = f"thesis.{'fine-tuning' if backbone.start else f'resnet{backbone.depth}'}"
+        summaries = train_seeds(
+            tasks,
+            folders[0].data(statistics.views),
+            statistics,
+            [folder.networks()[name] for folder in folders],
+            folders[0].out / "seeds" / f"{name}_together",
+            starts,
+            rate_option=f"--{option}.learning-rate",
+        )
         for task, summary in zip(tasks, summaries, strict=True):
             warn_of_chance(task, summary, statistics)
-    for views in VIEWS:
-        statistics, data = folders[0].statistics(views), folders[0].data(views)
-        for frame in FRAMES:
-            train_seeds(
-                [entropy_task(frame, own.entropy, statistics) for own in settings],
-                data,
-                statistics,
-                [folder.entropy(views, frame) for folder in folders],
-                folders[0].out / "seeds" / f"entropy_{views}_{frame}_together",
-                rate_option="--entropy.optimiser.learning-rate",
-            )
-
-
-def _check_all(folder: ThesisFolder, settings: ThesisSettings) -> None:
-    """Raises `DataError` if a network that is missing cannot be trained by these devices, before the first is trained."""
-    layout = Layout.of_mesh(device_mesh())
-    for backbone in BACKBONES:
-        if not (folder.backbone(backbone.name) / "summary.json").exists():
-            statistics = folder.statistics(backbone.views)
-            task = backbone_task(backbone, settings.classifier, settings.thesis, statistics)
-            check_training(task, statistics, layout)
-    for views in VIEWS:
-        statistics = folder.statistics(views)
-        for frame in FRAMES:
-            if not (folder.entropy(views, frame) / "summary.json").exists():
-                check_training(entropy_task(frame, settings.entropy, statistics), statistics, layout)
 
 
 def _weights_before(backbone: Backbone, folder: ThesisFolder, settings: ThesisSettings) -> StartingWeights:

@@ -1,9 +1,9 @@
-"""The set fusion of a recogniser: its shape, and the sets of views that it is trained on."""
+"""The set fusion that is trained with the recogniser, and the random sets of views on which it is trained."""
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 
 import jax
 import jax.numpy as jnp
@@ -27,16 +27,8 @@ class SetFusionConfig:
     """dropout rate within the blocks and of the features"""
 
 
-def new_fusion(shape: SetFusionConfig, features: int, classes: int, rngs: nnx.Rngs) -> SetFusion:
-    return SetFusion(
-        features,
-        classes,
-        width=shape.width,
-        heads=shape.heads,
-        blocks=shape.blocks,
-        dropout=shape.dropout,
-        rngs=rngs,
-    )
+def new_fusion(config: SetFusionConfig, features: int, classes: int, rngs: nnx.Rngs) -> SetFusion:
+    return SetFusion(features, classes, **asdict(config), rngs=rngs)
 
 
 def random_sets(key: Array, objects: int, views: int, largest: int) -> Bool[Array, "objects views"]:
