@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from mevs_jax.agent.looking import Walk
+from mevs_jax.agent.viewing import way_around
 from mevs_jax.trained.system import TrainedSystem
 
 _INK, _GREY, _MARK = "#1b2a41", "#9aa5b1", "#c1440e"
@@ -73,7 +74,7 @@ def _draw_cameras(axes, walk: Walk, system: TrainedSystem, count: int) -> None:
     taken = np.stack([pose[:3, 3] / np.linalg.norm(pose[:3, 3]) for pose in walk.history.poses[:count]])
     axes.scatter(*points.T, s=10, color=_GREY, depthshade=True)
     for start, end in pairwise(taken):
-        axes.plot(*_arc(start, end).T, color=_MARK, lw=1.5)
+        axes.plot(*way_around(start, end).T, color=_MARK, lw=1.5)
     axes.scatter(*taken.T, s=36, color=_MARK, depthshade=False)
     for number, point in enumerate(taken, 1):
         axes.text(*(1.15 * point), str(number), color=_INK, fontsize=11, ha="center", va="center")
@@ -81,11 +82,3 @@ def _draw_cameras(axes, walk: Walk, system: TrainedSystem, count: int) -> None:
     axes.text(0, 0, 0.7, "up", color=_INK, fontsize=9, ha="center")
     axes.set_box_aspect((1, 1, 1))
     axes.set_axis_off()
-
-
-def _arc(start: np.ndarray, end: np.ndarray, steps: int = 24) -> np.ndarray:
-    """Points on the great circle between two unit vectors."""
-    shares = np.linspace(0, 1, steps)[:, None]
-    points = (1 - shares) * start + shares * end
-    lengths = np.linalg.norm(points, axis=1, keepdims=True)
-    return points / np.maximum(lengths, 1e-6)

@@ -36,10 +36,11 @@ class Programs:
         self._system, self._policy, self._posed = system, policy, posed
         self._entropy, self._most = entropy, most
         self._temperatures_of = system.calibrated_as(policy if isinstance(policy, str) else "random", posed)
+        # Compiled once for all agents of a system that need the same.
+        self._see = system.compiled.setdefault(("see", entropy, posed, most), jax.jit(self.see_view))
         self.choose = jax.jit(self.choose_next)
-        # Compiled once for all policies of a system that need the same.
-        shared = system.__dict__.setdefault("programs", {})
-        self._see = shared.setdefault((entropy, posed, most), jax.jit(self.see_view))
+        if isinstance(policy, str):
+            self.choose = system.compiled.setdefault(("choose", policy, posed, most), self.choose)
 
     def see(self, parts: Parts, memory: Memory, depth: np.ndarray, pose: np.ndarray, radius: float) -> Any:
         """`see_view`, compiled, with the temperatures of the policy."""
@@ -68,9 +69,7 @@ class Programs:
             radius: of the object in metres; NaN if its size is unknown.
             temperatures: of the belief after 1, 2, … views; the last one holds for more.
         """
-        of = self._system.description
-        cloud = of.cloud if self._entropy else None
-        seen = observe(parts, depth, pose, radius, image=of.image, size=of.size, cloud=cloud, camera=of.camera)
+        seen = observe(parts, depth, pose, radius, self._system.description, self._entropy)
         direction = pose[:3, 3] / jnp.linalg.norm(pose[:3, 3])
         memory = remember(memory, seen, direction, self._system.fuse(parts, self._posed))
         at = jnp.clip(memory.count, 1, len(temperatures)) - 1

@@ -117,7 +117,7 @@ def _add_views(server: viser.ViserServer, history: History, system: TrainedSyste
         )
         server.scene.add_label(f"/cameras/{number}/number", str(number))
         if number > 1:
-            way = _way(history.poses[number - 2][:3, 3], pose[:3, 3])
+            way = way_around(history.poses[number - 2][:3, 3], pose[:3, 3])
             server.scene.add_spline_catmull_rom(f"/ways/{number}", way, thickness=0.012, color=_PATH)
 
 
@@ -179,7 +179,9 @@ def _quaternion(rotation: Float[np.ndarray, "3 3"]) -> Float[np.ndarray, " 4"]:
     return Rotation.from_matrix(np.asarray(rotation, float)).as_quat()[[3, 0, 1, 2]]
 
 
-def _way(start: Float[np.ndarray, " 3"], end: Float[np.ndarray, " 3"], steps: int = 17) -> Float[np.ndarray, "steps 3"]:
+def way_around(
+    start: Float[np.ndarray, " 3"], end: Float[np.ndarray, " 3"], steps: int = 17
+) -> Float[np.ndarray, "steps 3"]:
     """Points on the shortest way around the object from one camera to another."""
     away, last = np.linalg.norm(start), np.linalg.norm(end)
     first, other = start / away, end / last

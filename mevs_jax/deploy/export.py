@@ -132,7 +132,7 @@ def _recognise(system: TrainedSystem) -> _Program:
 
     def recognise(depth: Array, radius: Array | float = jnp.nan) -> dict[str, Array]:
         radii = jnp.broadcast_to(jnp.asarray(radius), depth.shape[:1])
-        features = features_of(parts, depth, radii, image=of.image, size=of.size, camera=of.camera)
+        features = features_of(parts, depth, radii, of)
         logits = logits_of(parts, parts.encoder.module, features) / parts.single
         return {"features": features, "probabilities": jax.nn.softmax(logits, axis=-1)}
 

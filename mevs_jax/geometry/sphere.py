@@ -41,8 +41,9 @@ class Sphere:
     yaw: float | None = None
 
     def __post_init__(self) -> None:
-        if self.position.shape != (3,) or not np.isfinite(self.position).all():
-            raise ValueError(f"center must be three finite numbers, got {np.asarray(self.center).tolist()}")
+        center = np.asarray(self.center, float)
+        if center.size != 3 or not np.isfinite(center).all():
+            raise ValueError(f"center must be three finite numbers, got {center.tolist()}")
         if not 0 < float(self.radius) < np.inf:
             raise ValueError(f"radius must be positive, in metres, got {self.radius}")
         upright(self.up)

@@ -13,12 +13,11 @@ from jaxtyping import Array, Float, Int
 
 from mevs_jax.beliefs.fusing import CalibratedFusion
 from mevs_jax.beliefs.strangeness import Strangeness
-from mevs_jax.geometry.cameras import ViewCamera
-from mevs_jax.geometry.inputs import SizeInput, depth_and_normals, depth_image, view_cloud
+from mevs_jax.geometry.inputs import depth_and_normals, depth_image, view_cloud
 from mevs_jax.models.expected_views import ExpectedViews
 from mevs_jax.models.pose import yaw_evidence
 from mevs_jax.policies.base import Knowledge, Observation
-from mevs_jax.trained.description import CloudInput, ImageInput
+from mevs_jax.trained.description import Description
 
 
 @flax.struct.dataclass
@@ -100,13 +99,11 @@ def sample_pixels(depth: Float[Array, "side side"], points: int) -> Int[Array, "
     return order[jnp.arange(points) % jnp.maximum(jnp.sum(flat > 0), 1)].astype(jnp.int32)
 
 
-def image_of(
-    depth: Float[Array, "side side"], image: ImageInput, camera: ViewCamera
-) -> Float[Array, "side side channels"]:
+def image_of(depth: Float[Array, "side side"], of: Description) -> Float[Array, "side side channels"]:
     """The input of the encoder for a depth image in radii, 0 where nothing is hit."""
-    if image.content == "depth_and_normals":
-        return depth_and_normals(depth, camera)
-    return depth_image(depth, camera, image.channels)
+    if of.image.content == "depth_and_normals":
+        return depth_and_normals(depth, of.camera)
+    return depth_image(depth, of.camera, of.image.channels)
 
 
 def logits_of(parts: Parts, encoder: Any, features: Float[Array, "*batch features"]) -> Float[Array, "*batch classes"]:
@@ -116,18 +113,12 @@ def logits_of(parts: Parts, encoder: Any, features: Float[Array, "*batch feature
 
 
 def features_of(
-    parts: Parts,
-    depth: Float[Array, "*batch side side"],
-    radius: Float[Array, "*batch"],
-    *,
-    image: ImageInput,
-    size: SizeInput | None,
-    camera: ViewCamera,
+    parts: Parts, depth: Float[Array, "*batch side side"], radius: Float[Array, "*batch"], of: Description
 ) -> Float[Array, "*batch features"]:
     """The features of single views; arguments as of `observe`."""
-    images = jnp.vectorize(lambda one: image_of(one, image, camera), signature="(h,w)->(h,w,c)")(depth)
+    images = jnp.vectorize(lambda one: image_of(one, of), signature="(h,w)->(h,w,c)")(depth)
     features = parts.encoder.module.features(images)
-    return features if size is None or parts.size is None else features + size.code(radius) @ parts.size
+    return features if of.size is None or parts.size is None else features + of.size.code(radius) @ parts.size
 
 
 def observe(
@@ -135,11 +126,8 @@ def observe(
     depth: Float[Array, "side side"],
     pose: Float[Array, "4 4"],
     radius: Float[Array, ""],
-    *,
-    image: ImageInput,
-    size: SizeInput | None,
-    cloud: CloudInput | None,
-    camera: ViewCamera,
+    of: Description,
+    with_entropy: bool = True,
 ) -> Observation:
     """What the networks compute from one view.
 
@@ -148,18 +136,15 @@ def observe(
         depth: along the optical axis, in radii of the object; 0 where nothing is hit.
         pose: from the camera to the object's frame, whose unit is the radius.
         radius: of the object in metres; NaN if it is unknown.
-        image: input of the encoder.
-        size: how the radius is used; None if not.
-        cloud: input of the entropy predictor; None if its predictions are not needed.
-        camera: of the view.
+        of: the description of the system.
+        with_entropy: whether predicted entropies are needed, if it has them.
     """
-    features = features_of(parts, depth, radius, image=image, size=size, camera=camera)
-    entropies = None
-    if cloud is not None and parts.entropy is not None:
+    features = features_of(parts, depth, radius, of)
+    cloud, entropies, evidence = of.cloud, None, None
+    if with_entropy and cloud is not None and parts.entropy is not None:
         pixels = sample_pixels(depth, cloud.points)
-        seen = view_cloud(pixels, depth.reshape(-1)[pixels], pose, camera, cloud.frame, cloud.directions)
+        seen = view_cloud(pixels, depth.reshape(-1)[pixels], pose, of.camera, cloud.frame, cloud.directions)
         entropies = parts.entropy.module(seen)
-    evidence = None
     if parts.pose is not None:
         direction = pose[:3, 3] / jnp.linalg.norm(pose[:3, 3])
         evidence = yaw_evidence(parts.pose.module(features, direction[2]), direction)

@@ -50,6 +50,8 @@ class TrainedSystem:
     description: Description
     parts: Parts = field(repr=False)
     name: str = ""
+    compiled: dict[Any, Any] = field(default_factory=dict, init=False, repr=False, compare=False)
+    """What was compiled for it, by those who use it."""
 
     @property
     def classes(self) -> tuple[str, ...]:
@@ -169,8 +171,7 @@ class TrainedSystem:
 
     @cached_property
     def _observe(self) -> Any:
-        of = self.description
-        return jax.jit(partial(observe, image=of.image, size=of.size, cloud=of.cloud, camera=of.camera))
+        return jax.jit(partial(observe, of=self.description))
 
     def observe(
         self,

@@ -2,20 +2,28 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+from functools import cache
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 import mevs_jax
 from mevs_jax.agent import Agent, load_history, replay
 from mevs_jax.agent.candidates import candidates_of
 from mevs_jax.agent.frames import pose_towards
+from mevs_jax.agent.looking import Frames, look_at_frames
 from mevs_jax.beliefs.fusing import running_sum
 from mevs_jax.selection.loop import ViewTable, by_attention, select_from_table
 from tests.mevs_jax.trained import making
 
 K = np.array([[16 / np.tan(np.pi / 6), 0, 15.5], [0, 16 / np.tan(np.pi / 6), 15.5], [0, 0, 1]])
+CENTER, RADIUS, UP, YAW = np.array([0.5, -0.2, 0.8]), 0.3, np.array([0.3, -1.0, 0.2]), 0.7
+LYING = mevs_jax.Sphere(CENTER, RADIUS, UP, YAW)
+"""Where objects are, unless a test says otherwise: away from the origin, tilted, and turned."""
 
 
 @pytest.fixture(scope="module")
@@ -28,13 +36,19 @@ def recogniser():
     return making.system("recogniser")
 
 
-def pose_at(direction) -> np.ndarray:
-    return np.asarray(mevs_jax.look_at_origin(jnp.asarray(direction, jnp.float32) * 2), float)
+@cache
+def pose_at(x: float, y: float, z: float) -> np.ndarray:
+    return np.asarray(mevs_jax.look_at_origin(jnp.array([x, y, z], jnp.float32) * 2), float)
 
 
-def views_of(system, **ball):
+@cache
+def _views(points: tuple[tuple[float, float, float], ...]) -> list[tuple[np.ndarray, np.ndarray]]:
+    return [(making.depth_of_ball(np.array(point)), pose_at(*point)) for point in points]
+
+
+def views_of(system):
     """Depth images and poses of all viewpoints."""
-    return [(making.depth_of_ball(point, **ball), pose_at(point)) for point in system.viewpoints]
+    return _views(tuple(map(tuple, system.viewpoints.tolist())))
 
 
 def table_of(system, views) -> ViewTable:
@@ -46,29 +60,43 @@ def table_of(system, views) -> ViewTable:
     return ViewTable(logits, entropies, None, jnp.int32(0), features=features, pose_evidence=evidence)
 
 
-CENTER, RADIUS = np.array([0.5, -0.2, 0.8]), 0.3
+def rotation_of(sphere) -> np.ndarray:
+    """From the object's frame to the world, by another way than the library's."""
+    up = np.asarray(sphere.up, float) / np.linalg.norm(sphere.up)
+    axis, angle = np.cross([0, 0, 1], up), np.arccos(up[2])
+    lifted = Rotation.from_rotvec(angle * axis / max(np.linalg.norm(axis), 1e-12))
+    return (lifted * Rotation.from_rotvec([0, 0, sphere.yaw or 0.0])).as_matrix()
 
 
-def in_metres(depth, pose, rotation):
-    """A depth image and its camera, around an object that is turned by the rotation, away from the origin."""
-    placed = np.eye(4)
-    placed[:3, :3], placed[:3, 3] = rotation @ pose[:3, :3], CENTER + RADIUS * rotation @ pose[:3, 3]
-    return np.where(depth > 0, RADIUS * depth, np.inf).astype(np.float32), K, placed
+def in_metres(depth, pose, sphere=LYING):
+    """A depth image in radii and its camera, around an object in the world."""
+    placed, rotation = np.eye(4), rotation_of(sphere)
+    placed[:3, :3] = rotation @ pose[:3, :3]
+    placed[:3, 3] = sphere.position + sphere.radius * rotation @ pose[:3, 3]
+    return np.where(depth > 0, sphere.radius * depth, np.inf).astype(np.float32), K, placed
 
 
-def walk(agent, views, first, **reset):
-    """Views and probabilities of a walk in metres, around an object away from the origin."""
-    reset = {"yaw": 0.0} | reset
-    agent.reset(center=CENTER, radius=RADIUS, **reset)
-    rotation = mevs_jax.Sphere(CENTER, RADIUS, **reset).rotation
-    seen, found, index = [], [], first
+def begun(system, policy="best", sphere=LYING, **options) -> Agent:
+    """An agent that is never sure, with an object."""
+    agent = Agent(system, policy, **{"stop": 2} | options)
+    agent.begin(sphere)
+    return agent
+
+
+def walk(agent, views, first, sphere=LYING):
+    """Views and probabilities of a walk around an object, whose images are taken where the agent says."""
+    agent.begin(sphere)
+    seen, beliefs, index = [], [], first
     while True:
-        found.append(agent.observe(*in_metres(*views[index], rotation)).probabilities)
+        beliefs.append(agent.observe(*in_metres(*views[index], sphere)).probabilities)
         seen.append(index)
         step = agent.decide()
         if step.done:
-            return seen, np.stack(found), step.reason
-        index = step.index
+            return seen, np.stack(beliefs), step.reason
+        index, there = step.index, in_metres(*views[step.index], sphere)[2]
+        if sphere.yaw is not None:
+            np.testing.assert_allclose(step.T_world_camera[:3, 2:], there[:3, 2:], atol=1e-5)  # where it is and looks
+            np.testing.assert_allclose(step.direction, -there[:3, 2], atol=1e-5)
 
 
 @pytest.mark.parametrize(
@@ -87,7 +115,7 @@ def walk(agent, views, first, **reset):
     ],
 )
 def test_walks_are_those_of_the_selection_loop_on_tables(request, kind, policy):
-    """From one view of an upright object, and from another of one that lies somewhere in the world."""
+    """From one view of an upright object, and from another of one that lies somewhere."""
     system = request.getfixturevalue(kind)
     views = views_of(system)
     table, graph = table_of(system, views), system.graph
@@ -102,8 +130,9 @@ def test_walks_are_those_of_the_selection_loop_on_tables(request, kind, policy):
         return select_from_table(key, table, scene, run, first, max_views=6, fuse=fuse)
 
     agent = Agent(system, policy, stop=2, max_views=6)
-    for first, placed in ((0, {}), (7, {"up": (0.3, -1.0, 0.2), "yaw": 0.7})):
-        seen, probabilities, reason = walk(agent, views, first, **placed | ({} if posed else {"yaw": None}))
+    for first, up, yaw in ((0, (0, 0, 1), 0.0), (7, UP, YAW)):
+        sphere = mevs_jax.Sphere(CENTER, RADIUS, up, yaw if posed else None)
+        seen, probabilities, reason = walk(agent, views, first, sphere)
         episode = by_table(agent.key, first)
         assert seen == list(map(int, episode.views))
         assert reason == "budget"
@@ -124,97 +153,148 @@ def test_random_views_differ_between_objects_and_repeat_with_the_seed(classifier
     assert len(set(orders[0])) == 3
 
 
-def test_it_stops_when_it_is_sure(classifier):
+def test_it_stops_when_it_is_sure_or_has_spent_its_budget(classifier):
     views = views_of(classifier)
-    seen, probabilities, reason = walk(Agent(classifier, "farthest", stop=0.3, max_views=6), views, 0)
+    _, probabilities, reason = walk(Agent(classifier, "farthest", stop=0.3, max_views=6), views, 0)
     assert reason == "sure"
     assert (probabilities[:-1].max(axis=1) < 0.3).all()
     assert probabilities[-1].max() >= 0.3
-    seen, _, reason = walk(Agent(classifier, "farthest", stop=2, max_views=3), views, 0)
-    assert (len(seen), reason) == (3, "budget")
+    for most in (1, 3):
+        seen, _, reason = walk(Agent(classifier, "farthest", stop=2, max_views=most), views, 0)
+        assert (len(seen), reason) == (most, "budget")
 
 
 def test_the_first_view_is_that_of_the_fixed_order(classifier):
-    agent = Agent(classifier)
-    agent.reset(center=CENTER, radius=RADIUS, yaw=0.0)
+    agent = begun(classifier, gain_per_cost=1.0)
     step = agent.decide()
     assert step.index == int(np.argmax(classifier.parts.knowledge.order))
-    expected = pose_towards(classifier.viewpoints[step.index].astype(float), CENTER, 2 * RADIUS, np.array([0, 0, 1.0]))
-    np.testing.assert_allclose(step.T_world_camera, expected, atol=1e-6)
-    np.testing.assert_allclose(step.direction, classifier.viewpoints[step.index], atol=1e-6)
-    only = agent.decide(reachable=[4]).index
-    assert only == 4
-    agent = Agent(classifier, gain_per_cost=1.0)
-    agent.reset(center=CENTER, radius=RADIUS, yaw=0.0)
+    there = in_metres(*views_of(classifier)[step.index])[2]
+    np.testing.assert_allclose(step.T_world_camera, there, atol=1e-6)
+    np.testing.assert_allclose(step.direction, -there[:3, 2], atol=1e-6)
+    assert agent.decide(reachable=[4]).index == 4
     assert agent.decide(cost=np.where(np.arange(making.VIEWS) == step.index, 9.0, 0.0)).index != step.index
 
 
+def test_without_a_fixed_order_the_first_view_is_from_thirty_degrees_above(classifier):
+    """Above the object, which may lie: heights are along its own upward direction."""
+    agent = begun(classifier, sphere=mevs_jax.Sphere(CENTER, RADIUS, UP))
+    heights = classifier.viewpoints[:, 2]
+    assert agent.decide().index == int(np.argmin(np.abs(heights - 0.5)))
+    candidates = agent.poses[[int(np.argmin(heights)), int(np.argmax(heights)), int(np.argmin(np.abs(heights + 0.5)))]]
+    assert agent.decide(candidates=candidates).index == 1
+
+
 def test_what_cannot_be_reached_or_failed_is_not_chosen(classifier):
-    views = views_of(classifier)
-    agent = Agent(classifier, "information_gain", stop=2)
-    agent.reset(center=CENTER, radius=RADIUS, yaw=0.0)
-    agent.observe_view(*views[0])
+    agent = begun(classifier, "information_gain")
+    agent.observe_view(*views_of(classifier)[0])
     best = agent.decide()
     agent.mark_failed(best)
     second = agent.decide()
     assert second.index not in (0, best.index)
-    above = np.flatnonzero(2 * RADIUS * classifier.viewpoints[:, 2] > 0.15)
+    agent.mark_failed(second.T_world_camera)
+    assert agent.decide().index not in (0, best.index, second.index)
+    above = np.flatnonzero((2 * RADIUS * classifier.viewpoints @ rotation_of(LYING).T)[:, 2] > 0.15)
     assert agent.decide(reachable=lambda pose: pose[2, 3] > CENTER[2] + 0.15).index in above
-    step = agent.decide(reachable=[0, best.index])
-    assert (step.done, step.reason, step.index, step.T_world_camera) == (True, "nothing reachable", -1, None)
-    mask = np.zeros(making.VIEWS, bool)
-    assert agent.decide(reachable=mask).reason == "nothing reachable"
-    mask = jnp.ones(making.VIEWS, bool)
-    assert agent.decide(reachable=mask).index == second.index
+    for none in ([0, best.index], np.zeros(making.VIEWS, bool), lambda pose: False):
+        step = agent.decide(reachable=none)
+        assert (step.done, step.reason, step.index, step.T_world_camera) == (True, "nothing reachable", -1, None)
     mine = np.ones(making.VIEWS, bool)
     agent.decide(reachable=mine, cost=np.where(np.arange(making.VIEWS) == 3, np.inf, 0.0))
     assert mine.all()
+    assert agent.decide(reachable=jnp.ones(making.VIEWS, bool)).index == agent.decide().index
 
 
-def test_costs_change_the_choice(classifier):
-    views = views_of(classifier)
-    agent = Agent(classifier, "information_gain", stop=2, gain_per_cost=1.0)
-    agent.reset(center=CENTER, radius=RADIUS, yaw=0.0)
-    agent.observe_view(*views[0])
+def test_costs_change_the_choice_by_what_a_unit_is_worth(classifier):
+    """A cost that takes half of the lead from the best view does not change the choice; one that takes twice the lead does."""
+    agent = begun(classifier, "information_gain", gain_per_cost=0.25)
+    agent.observe_view(*views_of(classifier)[0])
     free = agent.decide()
-    cost = np.zeros(making.VIEWS)
-    cost[free.index] = 100.0
-    assert agent.decide(cost=cost).index != free.index
-    cost[:] = np.inf
+    gains = np.array(agent.history.events[-1]["gains"])
+    gains[0] = -np.inf  # it was seen
+    best, second = np.argsort(-gains)[:2]
+    assert (best, np.isfinite(free.expected_gain)) == (free.index, True)
+    lead = gains[best] - gains[second]
+    for share, chosen in ((0.5, best), (2.0, second)):
+        cost = np.where(np.arange(making.VIEWS) == best, share * lead / 0.25, 0.0)
+        assert agent.decide(cost=cost).index == chosen
+    cost = np.full(making.VIEWS, np.inf)
     cost[3] = 5.0
     assert agent.decide(cost=cost).index == 3
-    assert np.isfinite(free.expected_gain)
 
 
-def test_an_unknown_sphere_is_estimated_and_refined(classifier):
-    """Of a ball whose first view shows half: the belief at the end is that of the ball's own sphere."""
-    directions = classifier.viewpoints[[2, 6, 9, 11]]
-    ball, radius = CENTER + np.array([0.05, 0.02, -0.01]), 0.2
+HEIGHT, WALL = -0.5, 4.0
+"""Of a table below the ball, in radii of the object; and how far a wall is from the camera."""
+
+
+def on_a_table(system, index):
+    """A view of the ball on a table before a wall, in radii: everything is measured."""
+    depth, pose = views_of(system)[index]
+    rays = np.asarray(mevs_jax.pixel_directions(system.description.camera.at(pose)))
+    down = np.where(rays[..., 2] < 0, (HEIGHT - pose[2, 3]) / np.minimum(rays[..., 2], -1e-9), WALL)
+    return np.where(depth > 0, depth, np.minimum(down, WALL)).astype(np.float32), pose
+
+
+FLOOR = float(CENTER @ UP / np.linalg.norm(UP)) + RADIUS * (HEIGHT + 0.01)
+FROM_ABOVE = [1, 2, 4, 7]
+
+
+def test_a_floor_is_where_the_object_stands_in_the_world(classifier):
+    table, alone, without = (begun(classifier, max_views=5) for _ in range(3))
+    assert (classifier.viewpoints[FROM_ABOVE, 2] > 0.2).all()
+    for index in FROM_ABOVE:
+        seen = in_metres(*on_a_table(classifier, index))
+        beliefs = table.observe(*seen, floor=FLOOR), alone.observe(*in_metres(*views_of(classifier)[index]))
+        without.observe(*seen)
+        np.testing.assert_allclose(beliefs[0].probabilities, beliefs[1].probabilities, atol=0.02)
+    off = [np.abs(np.array(other.history.depths) - alone.history.depths) > 0.01 for other in (table, without)]
+    assert off[0].mean() < 0.01
+    assert off[1].mean() > 0.05
+
+
+@pytest.mark.parametrize("told", ["mask", "floor"])
+def test_recorded_frames_tell_the_object_from_its_table(classifier, told):
+    table = [in_metres(*on_a_table(classifier, index)) for index in FROM_ABOVE]
+    alone = [in_metres(*views_of(classifier)[index]) for index in FROM_ABOVE]
+    frames, bare = (Frames(*map(np.stack, zip(*shots, strict=True)), LYING) for shots in (table, alone))
+    tells = {"mask": np.isfinite(bare.depth)} if told == "mask" else {"floor": FLOOR}
+    agents = [Agent(classifier, "farthest", stop=2, max_views=4) for _ in range(3)]
+    walks = [look_at_frames(agents[0], replace(frames, **tells)), look_at_frames(agents[1], bare)]
+    assert sorted(walks[0].views) == sorted(walks[1].views) == [0, 1, 2, 3]
+    images = [dict(zip(one.views, one.history.depths, strict=True)) for one in walks]
+    assert all((np.abs(images[0][index] - images[1][index]) > 0.01).mean() < 0.01 for index in range(4))
+    shown = look_at_frames(agents[2], frames).history.depths[0]
+    assert (np.abs(shown - images[1][0]) > 0.01).mean() > 0.05
+
+
+@pytest.mark.parametrize("told", ["mask", "floor"])
+def test_an_unknown_sphere_is_estimated_and_refined(classifier, told):
+    """Of a ball whose first view shows half, on a table before a wall: the belief at the end is that of the ball's own sphere."""
+    ball = mevs_jax.Sphere(CENTER + RADIUS * rotation_of(LYING) @ (0.1, -0.2, 0.15), 0.6 * RADIUS, UP, YAW)
     shots = []
-    for direction in directions:
-        pose = pose_towards(direction.astype(float), CENTER, 0.9, np.array([0, 0, 1.0]))
-        depth = making.depth_of_ball(direction, centre=(ball - CENTER) / 0.45, radius=radius / 0.45, notch=False) * 0.45
-        shots.append((depth, pose))
-    known, unknown = (Agent(classifier, stop=2, max_views=5) for _ in range(2))
-    known.reset(center=ball, radius=radius, yaw=0.0)
-    unknown.reset_from_points(mevs_jax.DepthImage(shots[0][0], K, shots[0][1]).points(), yaw=0.0)
-    first = np.linalg.norm(unknown.center - ball)
+    for index in FROM_ABOVE:
+        whole = making.depth_of_ball(classifier.viewpoints[index], notch=False)
+        depth, K, pose = in_metres(*on_a_table(classifier, index))
+        shots.append((np.where(whole > 0, RADIUS * whole, depth).astype(np.float32), K, pose, whole > 0))
+    known = begun(classifier, sphere=ball, max_views=5)
+    unknown = Agent(classifier, stop=2, max_views=5)
+    unknown.reset_from_points(mevs_jax.DepthImage(*shots[0]).points(), up=UP, yaw=YAW)
+    first = np.linalg.norm(unknown.center - ball.center)
     buffer = np.zeros_like(shots[0][0])  # which a driver fills again and again
-    for depth, pose in shots:
-        expected = known.observe(depth, K, pose)
+    for depth, K, pose, mask in shots:
+        expected = known.observe(depth, K, pose, mask=mask)
         buffer[:] = depth
-        belief = unknown.observe(buffer, K, pose, mask=buffer > 0)
-        before = unknown.center, unknown.radius
+        belief = unknown.observe(buffer, K, pose, **({"mask": mask} if told == "mask" else {"floor": FLOOR}))
+        before = unknown.center
         with pytest.raises(ValueError, match="needs a mask of its pixels or a floor"):
             unknown.observe(depth, K, pose)
         with pytest.raises(ValueError, match="is seen by observe alone"):
             unknown.observe_view(depth, pose)
         with pytest.raises(ValueError, match=r"no measured pixel|no pixel shows"):
-            unknown.observe(np.zeros_like(depth), K, pose, mask=depth > 0)
-        np.testing.assert_array_equal(unknown.center, before[0])
+            unknown.observe(np.zeros_like(depth), K, pose, mask=mask)
+        np.testing.assert_array_equal(unknown.center, before)
     assert first > 0.05
-    assert np.linalg.norm(unknown.center - ball) < 0.1 * first + 0.01
-    np.testing.assert_allclose(unknown.radius, radius, rtol=0.05)
+    assert np.linalg.norm(unknown.center - ball.center) < 0.1 * first + 0.01
+    np.testing.assert_allclose(unknown.radius, ball.radius, rtol=0.05)
     np.testing.assert_allclose(belief.probabilities, expected.probabilities, atol=0.1)
     assert belief.views == unknown.history.views == 4
     again = replay(unknown.history, Agent(classifier, stop=2, max_views=5))
@@ -223,38 +303,61 @@ def test_an_unknown_sphere_is_estimated_and_refined(classifier):
 
 def test_candidates_may_be_any_poses(classifier):
     views = views_of(classifier)
-    agent = Agent(classifier, "information_gain", stop=2)
-    agent.reset(center=CENTER, radius=RADIUS, yaw=0.0)
+    agent = begun(classifier, "information_gain")
     agent.observe_view(*views[2])
     by_index = agent.decide().index
-    poses = agent.poses
     order = np.random.default_rng(0).permutation(making.VIEWS)
-    assert order[agent.decide(candidates=poses[order]).index] == by_index  # the same poses, in another order
-    random = np.random.default_rng(1)
-    free = random.normal(size=(30, 3))
+    assert order[agent.decide(candidates=agent.poses[order]).index] == by_index  # the same poses, in another order
+    directions = agent.history.events[-1]["directions"]
+    np.testing.assert_allclose(directions, classifier.viewpoints[order], atol=1e-5)  # in the object's own frame
+    free = np.random.default_rng(1).normal(size=(30, 3))
     free[:, 2] = np.abs(free[:, 2])
     free /= np.linalg.norm(free, axis=1, keepdims=True)
-    around = np.stack([pose_towards(one, CENTER, 0.9, np.array([0, 0, 1.0])) for one in free])
+    around = np.stack([pose_towards(one, CENTER, 0.9, UP) for one in free])
     step = agent.decide(candidates=around)
     np.testing.assert_array_equal(step.T_world_camera, around[step.index])
     assert agent.decide(candidates=around[:1]).index == 0
-    beside = views[2][1][:3, 3] / 2 + np.array([0.01, 0, 0])
-    near = pose_towards(beside / np.linalg.norm(beside), CENTER, 0.9, np.array([0, 0, 1.0]))
+    beside = rotation_of(LYING) @ (views[2][1][:3, 3] / 2 + np.array([0.01, 0, 0]))
+    near = pose_towards(beside / np.linalg.norm(beside), CENTER, 0.9, UP)
     assert agent.decide(candidates=near[None]).reason == "nothing reachable"  # it was seen from there
     with pytest.raises(ValueError, match="make it with max_candidates=200"):
         agent.decide(candidates=np.repeat(around[:1], 200, axis=0))
 
 
-def test_views_may_be_between_the_viewpoints(classifier):
+@pytest.mark.parametrize("policy", ["information_gain", "farthest", "predicted_entropy"])
+def test_views_may_be_between_the_viewpoints(classifier, policy):
     direction = classifier.viewpoints[0] + 0.6 * classifier.viewpoints[1]
     direction /= np.linalg.norm(direction)
-    for policy in ("information_gain", "farthest", "predicted_entropy"):
-        agent = Agent(classifier, policy, stop=2)
-        agent.reset(center=CENTER, radius=RADIUS, yaw=0.0)
-        agent.observe_view(making.depth_of_ball(direction), pose_at(direction))
-        index = agent.decide().index
-        if policy == "farthest":
-            assert index == int(np.argmin(classifier.viewpoints @ direction))
+    agent = begun(classifier, policy)
+    agent.observe_view(making.depth_of_ball(direction), pose_at(*direction.tolist()))
+    index = agent.decide().index
+    if policy == "farthest":
+        assert index == int(np.argmin(classifier.viewpoints @ direction))
+
+
+@pytest.mark.parametrize(("apart", "views"), [(0.01, 1), (0.03, 2)])
+def test_a_view_within_a_degree_is_taken_again(classifier, apart, views):
+    agent = begun(classifier)
+    direction = classifier.viewpoints[3].astype(float)
+    aside = np.cross(direction, [0, 0, 1])
+    aside /= np.linalg.norm(aside)
+    for angle in (0.0, apart):
+        turned = np.cos(angle) * direction + np.sin(angle) * aside
+        belief = agent.observe_view(making.depth_of_ball(turned), pose_at(*turned.tolist()))
+    assert belief.views == views
+
+
+def test_candidates_on_one_side_are_no_neighbours_across_its_border(classifier):
+    """The hull of candidates is closed below by long edges, between opposite views of a hemisphere."""
+    points = mevs_jax.fibonacci_sphere(60, "equation8")
+    points = points[points[:, 2] > 0.1]
+    made = candidates_of(classifier, points, 40)
+    distances = np.asarray(made.distances)[: len(points), : len(points)]
+    neighbours = np.asarray(made.neighbours)
+    assert neighbours[: len(points), : len(points)].any(axis=1).all()
+    assert not neighbours[len(points) :].any()
+    assert distances[neighbours[: len(points), : len(points)]].max() < 1.0
+    np.testing.assert_array_equal(neighbours, neighbours.T)
 
 
 def test_values_between_viewpoints_are_interpolated(classifier):
@@ -270,18 +373,18 @@ def test_values_between_viewpoints_are_interpolated(classifier):
 def test_the_yaw_may_be_unknown(recogniser, classifier):
     views = views_of(recogniser)
     known, unknown = (Agent(recogniser, stop=2, max_views=4) for _ in range(2))
-    turned = {"yaw": 1.1}
-    first = walk(unknown, views, 0, yaw=None)
-    np.testing.assert_allclose(first[1], walk(unknown, views, 0, yaw=None, up=(0, 0, 2))[1], atol=1e-5)
-    assert walk(known, views, 0, **turned)[0] == walk(known, views, 0)[0]
+    places = [mevs_jax.Sphere(CENTER, RADIUS, up, None) for up in ((0, 0, 1), (0, 0, 2))]
+    first, again = (walk(unknown, views, 0, place)[1] for place in places)
+    np.testing.assert_allclose(first, again, atol=1e-5)
+    turned = [walk(known, views, 0, mevs_jax.Sphere(CENTER, RADIUS, yaw=yaw))[0] for yaw in (0.0, 1.1)]
+    assert turned[0] == turned[1]
     agent = Agent(classifier, "information_gain")
     with pytest.raises(
         ValueError, match=r"cannot be used here for an object of unknown yaw: this policy needs Scene\.knowledge"
     ):
         agent.reset(center=CENTER, radius=RADIUS, yaw=None)
-    agent = Agent(classifier, stop=2)
-    agent.reset(center=CENTER, radius=RADIUS, yaw=None)
-    agent.observe_view(*views_of(classifier)[0])
+    agent = begun(classifier, sphere=places[0])
+    agent.observe_view(*views[0])
     assert agent.decide().index == int(np.argmin(classifier.viewpoints @ classifier.viewpoints[0]))  # farthest
 
 
@@ -290,24 +393,32 @@ def test_beliefs_do_not_depend_on_an_unknown_yaw(recogniser):
     views = [views_of(recogniser)[index] for index in (0, 3, 5)]
 
     def beliefs(yaw: float, told: float | None) -> np.ndarray:
-        agent, rotation = Agent(recogniser, stop=2, max_views=4), mevs_jax.Sphere(CENTER, RADIUS, yaw=yaw).rotation
-        agent.reset(center=CENTER, radius=RADIUS, yaw=told)
-        return np.stack([agent.observe(*in_metres(*view, rotation)).probabilities for view in views])
+        truth, agent = mevs_jax.Sphere(CENTER, RADIUS, UP, yaw), Agent(recogniser, stop=2, max_views=4)
+        agent.begin(mevs_jax.Sphere(CENTER, RADIUS, UP, told))
+        return np.stack([agent.observe(*in_metres(*view, truth)).probabilities for view in views])
 
+    upright = beliefs(0.0, None), beliefs(0.0, 0.0)
     for yaw in (0.7, -2.5):
-        np.testing.assert_allclose(beliefs(yaw, None), beliefs(0.0, None), atol=1e-5)
-        np.testing.assert_allclose(beliefs(yaw, yaw), beliefs(0.0, 0.0), atol=1e-5)
-        assert np.abs(beliefs(yaw, 0.0) - beliefs(0.0, 0.0)).max() > 1e-3
+        np.testing.assert_allclose(beliefs(yaw, None), upright[0], atol=1e-5)
+        np.testing.assert_allclose(beliefs(yaw, yaw), upright[1], atol=1e-5)
+        assert np.abs(beliefs(yaw, 0.0) - upright[1]).max() > 1e-3
 
 
-def test_strange_objects_are_unknown(classifier):
+def test_strange_objects_are_unknown_when_the_agent_would_stop(classifier):
+    """Its features were random numbers, so every object is strange."""
     views = views_of(classifier)
-    agent = Agent(classifier, stop=2, max_views=2, unknown=0.9)
-    agent.reset(center=CENTER, radius=RADIUS, yaw=0.0)
-    beliefs = [agent.observe_view(*views[index]) for index in (0, 5)]
-    assert all(belief.strangeness > 0.9 and not belief.known for belief in beliefs)  # its features were random numbers
+    agent = begun(classifier, max_views=2, unknown=0.9)
+    for index, reason in ((0, ""), (5, "unknown object")):
+        belief = agent.observe_view(*views[index])
+        assert belief.strangeness > 0.9
+        assert not belief.known
+        step = agent.decide()
+        assert (step.done, step.reason) == (bool(reason), reason)
+    agent.begin(LYING)
+    agent.stop = 1e-9  # sure of every view
+    agent.observe_view(*views[0])
     assert agent.decide().reason == "unknown object"
-    assert Agent(classifier, stop=2, max_views=1).unknown is None
+    assert Agent(classifier, stop=2, max_views=2).unknown is None
 
 
 def test_nothing_is_compiled_after_the_warm_up(recogniser):
@@ -335,6 +446,10 @@ def test_nothing_is_compiled_after_the_warm_up(recogniser):
                 agent.decide()
                 agent.decide(reachable=[1, 2], cost=np.ones(making.VIEWS))
                 agent.decide(candidates=agent.poses[:7])
+        further = Agent(recogniser, stop=2, max_views=5)  # of the same policy
+        further.begin(mevs_jax.Sphere(CENTER, RADIUS, yaw=0.0))
+        further.observe_view(*views[0])
+        further.decide()
         assert events == []
     finally:
         jax.monitoring.unregister_event_duration_listener(listen)
@@ -343,24 +458,27 @@ def test_nothing_is_compiled_after_the_warm_up(recogniser):
 def test_a_history_is_saved_and_repeated(classifier, tmp_path):
     views = views_of(classifier)
     agent = Agent(classifier, "information_gain", stop=2, max_views=4)
-    _, probabilities, _ = walk(agent, views, 3, up=(0, 1, 0), yaw=0.4)
+    _, probabilities, _ = walk(agent, views, 3)
     agent.history.save(tmp_path / "walk.npz")
     history = load_history(tmp_path / "walk.npz")
     assert [event["call"] for event in history.events] == ["observe", "decide"] * 4
-    assert history.options["reset"]["yaw"] == 0.4
+    assert history.options["reset"]["yaw"] == YAW
     again = replay(history, Agent(classifier, "information_gain", stop=2, max_views=4))
     np.testing.assert_allclose([belief.probabilities for belief in again], probabilities, atol=1e-6)
     (tmp_path / "other.npz").write_bytes(b"nothing")
     with pytest.raises(ValueError, match="is no history of an agent"):
         load_history(tmp_path / "other.npz")
+    with np.load(tmp_path / "walk.npz") as stored:
+        np.savez(tmp_path / "newer.npz", **dict(stored) | {"form": np.array(2)})
+    with pytest.raises(ValueError, match=r"is no history of an agent \(it is of another version"):
+        load_history(tmp_path / "newer.npz")
 
 
 def test_a_policy_of_ones_own(classifier):
     def lowest(key, state, scene):
         return -scene.graph.points[:, 2]
 
-    agent = Agent(classifier, lowest, stop=2)
-    agent.reset(center=CENTER, radius=RADIUS, yaw=0.0)
+    agent = begun(classifier, lowest)
     agent.observe_view(*views_of(classifier)[0])
     assert agent.decide().index == int(np.argmin(classifier.viewpoints[:, 2]))
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from mevs_jax.agent import load_history
-from mevs_jax.agent.viewing import _way, after, clouds_of, view
+from mevs_jax.agent.viewing import after, clouds_of, view, way_around
 from tests.mevs_jax.trained import making
 
 
@@ -62,7 +62,7 @@ def test_views_show_points_of_the_ball(system, history):
 @pytest.mark.parametrize("end", [(0, 3, 0), (-2, 0, 0), (2, 0, 0), (-2, 0.01, 0.02)])
 def test_the_way_is_evenly_around_the_object(end):
     start = np.array([2.0, 0, 0])
-    way = _way(start, np.array(end, float))
+    way = way_around(start, np.array(end, float))
     np.testing.assert_allclose(way[[0, -1]], [start, end], atol=1e-2)
     radius, steps = (
         np.linalg.norm(way, axis=1),
