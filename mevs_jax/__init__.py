@@ -15,8 +15,8 @@ __version__ = "0.2.0"
 
 _STUB = Path(__file__).with_suffix(".pyi").read_text(encoding="utf-8")
 _HOMES = {name: module for module, name in re.findall(r"^from (\S+) import \S+ as (\S+)$", _STUB, re.MULTILINE)}
-"""The module of each public name, from the stub for type checkers. It is imported when one of its names is first used (PEP 562), so
-that importing the package takes a moment and needs no JAX. Modules and folders of the package are reached the same way."""
+"""The module of each public name, from the stub for type checkers. It is imported when one of its names is first used (PEP 562),
+so that importing the package takes a moment and needs no JAX. Modules and folders of the package are reached the same way."""
 
 __all__ = sorted(_HOMES)
 

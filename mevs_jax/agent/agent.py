@@ -214,14 +214,19 @@ class Agent:
         return self._add(view.depth, of.placed(self.system, view), view.unknown, begun)
 
     @property
+    def sphere(self) -> Sphere:
+        """Where the present object is, as it is given or estimated by now."""
+        return self._current.sphere
+
+    @property
     def center(self) -> Float[np.ndarray, " 3"]:
-        """Centre of the present object in the world, in metres, as it is given or estimated by now."""
-        return self._current.sphere.position.copy()
+        """Centre of `sphere`."""
+        return self.sphere.position.copy()
 
     @property
     def radius(self) -> float:
-        """Radius of the present object in metres, as it is given or estimated by now."""
-        return self._current.sphere.radius
+        """Radius of `sphere`."""
+        return self.sphere.radius
 
     def observe_view(self, depth: Float[np.ndarray, "side side"], pose: Float[np.ndarray, "4 4"]) -> Belief:
         """Adds a view that the system's own camera has taken, as it is in the data set.

@@ -15,31 +15,26 @@ _NEAREST = 3
 
 
 def candidates_of(system: TrainedSystem, directions: Float[np.ndarray, "candidates 3"] | None, size: int) -> Candidates:
-    """Candidates for the compiled steps.
+    """Candidates for the compiled steps, in arrays of a length `size`.
 
     Args:
         system: whose viewpoints are the candidates where no directions are given.
         directions: unit vectors from the object, in its frame.
-        size: length of the arrays.
 
     Raises:
         ValueError: for more candidates than `size`, or none.
     """
-    own = directions is None
     points = np.asarray(system.viewpoints if directions is None else directions, np.float64)
     number = len(points)
     if not 1 <= number <= size:
         raise ValueError(
             f"{number} candidates do not fit the agent's {size}; make it with max_candidates={number} or more"
         )
-    if own:
-        graph = system.graph
-        neighbours, distances = np.asarray(graph.neighbours), np.asarray(graph.distances)
-    else:
-        distances = great_circle_distances(points)
-        neighbours = _neighbours(points, distances)
-    apart = distances + 10 * np.eye(number)
-    spacing = float(np.median(apart.min(axis=1))) if number > 1 else 1.0
+    own = directions is None
+    distances = np.asarray(system.graph.distances) if own else great_circle_distances(points)
+    nearest = (distances + 10 * np.eye(number)).min(axis=1)
+    neighbours = np.asarray(system.graph.neighbours) if own else _neighbours(points, distances, nearest)
+    spacing = float(np.median(nearest)) if number > 1 else 1.0
 
     def padded(array: np.ndarray, axes: int, fill: float = 0) -> np.ndarray:
         """The array with its first axes filled up to `size`."""
@@ -55,21 +50,20 @@ def candidates_of(system: TrainedSystem, directions: Float[np.ndarray, "candidat
     )
 
 
-def _neighbours(points: np.ndarray, distances: np.ndarray) -> np.ndarray:
+def _neighbours(points: np.ndarray, distances: np.ndarray, nearest: np.ndarray) -> np.ndarray:
     """Neighbours on the sphere: edges of the convex hull that are not much longer than the distance to the nearest point.
 
     Without the last rule, the hull of candidates on a part of the sphere would join views of its opposite borders.
     """
-    number = len(points)
-    if number <= 4:
-        return ~np.eye(number, dtype=bool)
+    everything = ~np.eye(len(points), dtype=bool)
+    if len(points) <= 4:
+        return everything
     from scipy.spatial import QhullError  # imported late: SciPy takes a fifth of a second
 
     try:
         neighbours = hull_edges(points)
     except QhullError:  # all in one plane
-        neighbours = ~np.eye(number, dtype=bool)
-    nearest = (distances + 10 * np.eye(number)).min(axis=1)
+        neighbours = everything
     return neighbours & (distances <= 3 * np.maximum(nearest[:, None], nearest[None]))
 
 
@@ -81,6 +75,6 @@ def _weights(points: np.ndarray, viewpoints: np.ndarray) -> Float[np.ndarray, "c
     of_near = np.take_along_axis(apart, near, axis=1)
     weight = 1 / np.maximum(of_near, 1e-9) ** 2
     weight[of_near[:, 0] < SAME] = np.eye(1, near.shape[1])
-    found = np.zeros(apart.shape, np.float32)
-    np.put_along_axis(found, near, (weight / weight.sum(axis=1, keepdims=True)).astype(np.float32), axis=1)
-    return found
+    weights = np.zeros(apart.shape, np.float32)
+    np.put_along_axis(weights, near, (weight / weight.sum(axis=1, keepdims=True)).astype(np.float32), axis=1)
+    return weights

@@ -88,15 +88,15 @@ def look(
     views = len(system.viewpoints)
     if first is not None and not 0 <= first < views:
         raise ValueError(f"first must be a view from 0 to {views - 1}, got {first}")
-    corners, radius = _centred(vertices, faces)
-    triangles = pad_triangles((corners / radius).astype(np.float32))
+    triangles, radius = _centred(vertices, faces)
+    padded = jnp.asarray(pad_triangles(triangles))
     camera = system.description.camera
     known = 1.0 if metres is None else radius * metres
     agent.reset(center=(0.0, 0.0, 0.0), radius=known, yaw=0.0, true_size=metres is not None)
 
     def take(index: int) -> Belief:
         pose = np.asarray(look_at_origin(jnp.asarray(system.viewpoints[index]) * camera.distance))
-        return agent.observe_view(np.asarray(_depth(jnp.asarray(triangles), jnp.asarray(pose), camera)), pose)
+        return agent.observe_view(np.asarray(_depth(padded, jnp.asarray(pose), camera)), pose)
 
     return _walk(agent, agent.decide().index if first is None else first, take, agent.decide)
 
@@ -130,14 +130,13 @@ def unit_triangles(
     Raises:
         ValueError: for a mesh without faces, with indices out of range, with corners that are not finite, or without a size.
     """
-    corners, radius = _centred(vertices, faces)
-    return (corners / radius).astype(np.float32)
+    return _centred(vertices, faces)[0]
 
 
 def _centred(
     vertices: Float[np.ndarray, "vertices 3"], faces: Int[np.ndarray, "faces 3"]
 ) -> tuple[Float[np.ndarray, "faces 3 3"], float]:
-    """Triangles of a mesh, centred on its bounding box, and the distance of the furthest corner from there."""
+    """`unit_triangles`, and the distance of the furthest corner from the centre."""
     vertices, faces = np.asarray(vertices, np.float64), np.asarray(faces)
     if vertices.ndim != 2 or vertices.shape[1] != 3 or faces.ndim != 2 or faces.shape[1] != 3 or not len(faces):
         raise ValueError(
@@ -153,7 +152,7 @@ def _centred(
     radius = np.linalg.norm(corners, axis=-1).max()
     if not 0 < radius < np.inf:
         raise ValueError("the mesh is a single point")
-    return corners, float(radius)
+    return (corners / radius).astype(np.float32), float(radius)
 
 
 @dataclass(frozen=True)

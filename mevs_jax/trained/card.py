@@ -10,77 +10,71 @@ _INPUTS = {
     "depth_and_normals": "depth as (far − depth) / (far − near), and the unit normal in the camera's frame; background 0",
     "image": "grey levels in [0, 1], background 0",
 }
+_KINDS = {
+    "recogniser": "a network fuses the features of all views (recogniser)",
+    "classifier": "the logits of all views are added, with a temperature for each number of views (classifier)",
+}
+
+
+_CARD = """---
+library_name: mevs_jax
+tags: [active-recognition, next-best-view, depth, jax]
+---
+
+# Recognition of {count} classes by chosen views
+
+```python
+import mevs_jax
+
+system = mevs_jax.load("PATH OF THIS FOLDER")
+agent = system.agent()
+```
+
+* Classes: {classes}.
+* Data: {data.source} ({objects} objects; fingerprint {data.fingerprint}).
+* Camera: {camera.resolution}×{camera.resolution} pixels, field of view {camera.field_of_view:g}°, {camera.distance:g} radii \
+from the object's centre, z up in the image.
+* Image: {image}; {channels}.
+{size}* Kind: {kind}.
+* Policy by default: `{of.best}` ({of.chosen_by}); with unknown yaw `{of.best_unposed}`.
+* Weights: {megabytes:.1f} MB. Made with {versions}.
+
+{figures}## Limits
+
+* Only these classes are known. Detection of objects of other classes was not measured for this system.
+* The figures are of perfect depth. Noise, missing depth and wrong centres cost accuracy.
+* Confidence is calibrated on validation objects of the same source.
+"""
 
 
 def model_card(description: Description, size: int) -> str:
-    """Returns the card as Markdown.
-
-    Args:
-        description: of the system.
-        size: of its weights, in bytes.
-    """
-    camera, data = description.camera, description.data
-    objects = ", ".join(f"{count} {split}" for split, count in data.objects.items())
-    channels = f"{description.image.channels} channel{'s' * (description.image.channels > 1)}"
-    lines = [
-        "---",
-        "library_name: mevs_jax",
-        "tags: [active-recognition, next-best-view, depth, jax]",
-        "---",
-        "",
-        f"# Recognition of {len(description.classes)} classes by chosen views",
-        "",
-        "```python",
-        "import mevs_jax",
-        "",
-        'system = mevs_jax.load("PATH OF THIS FOLDER")',
-        "agent = system.agent()",
-        "```",
-        "",
-        f"* Classes: {', '.join(description.classes)}.",
-        f"* Data: {data.source} ({objects} objects; fingerprint {data.fingerprint}).",
-        f"* Camera: {camera.resolution}×{camera.resolution} pixels, field of view {camera.field_of_view:g}°, "
-        f"{camera.distance:g} radii from the object's centre, z up in the image.",
-        f"* Image: {_INPUTS[description.image.content]}; {channels}.",
-        *_size(description),
-        f"* Kind: {_kind(description)}.",
-        f"* Policy by default: `{description.best}` ({description.chosen_by}); with unknown yaw `{description.best_unposed}`.",
-        f"* Weights: {size / 1e6:.1f} MB. Made with "
-        + ", ".join(f"{name} {version}" for name, version in description.made_with.items())
-        + ".",
-        "",
-        *_figures(description),
-        "## Limits",
-        "",
-        "* Only these classes are known. Detection of objects of other classes was not measured for this system.",
-        "* The figures are of perfect depth. Noise, missing depth and wrong centres cost accuracy.",
-        "* Confidence is calibrated on validation objects of the same source.",
-        "",
-    ]
-    return "\n".join(lines)
+    """Returns the card as Markdown, for weights of `size` bytes."""
+    of, sizes = description, description.size
+    told = "* Size: the object's radius, where it is told, from {0.smallest:g} to {0.largest:g} m.\n"
+    return _CARD.format(
+        of=of,
+        data=of.data,
+        camera=of.camera,
+        count=len(of.classes),
+        classes=", ".join(of.classes),
+        objects=", ".join(f"{count} {split}" for split, count in of.data.objects.items()),
+        image=_INPUTS[of.image.content],
+        channels=f"{of.image.channels} channel{'s' * (of.image.channels > 1)}",
+        size="" if sizes is None else told.format(sizes),
+        kind=_KINDS[of.kind],
+        megabytes=size / 1e6,
+        versions=", ".join(f"{name} {version}" for name, version in of.made_with.items()),
+        figures=_figures(of),
+    )
 
 
-def _size(description: Description) -> list[str]:
-    size = description.size
-    if size is None:
-        return []
-    return [f"* Size: the object's radius, where it is told, from {size.smallest:g} to {size.largest:g} m."]
-
-
-def _kind(description: Description) -> str:
-    if description.kind == "recogniser":
-        return "a network fuses the features of all views (recogniser)"
-    return "the logits of all views are added, with a temperature for each number of views (classifier)"
-
-
-def _figures(description: Description) -> list[str]:
+def _figures(description: Description) -> str:
     after = description.evaluation.get("after_views")
     if not isinstance(after, dict) or not after:
-        return []
+        return ""
     most = max(map(len, after.values()))
     head = ["", *(f"{count} view{'s' * (count > 1)}" for count in range(1, most + 1))]
     rows = [["`" + name + "`", *(f"{100 * share:.1f}" for share in shares)] for name, shares in after.items()]
-    about = (
-        f"Share of {description.evaluation.get('objects', 'the')} test objects recognised, in %, from all first views:"
-    )
-    return ["## Evaluation", "", about, "", markdown_table(head, rows), ""]
+    objects = description.evaluation.get("objects", "the")
+    about = f"Share of {objects} test objects recognised, in %, from all first views:"
+    return f"## Evaluation\n\n{about}\n\n{markdown_table(head, rows)}\n\n"
