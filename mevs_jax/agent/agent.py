@@ -78,6 +78,7 @@ class Agent:
         _check(distance is None or 0 < distance < np.inf, f"distance must be positive, in metres, got {distance}")
         shaded = self.system.description.image.content == "image"
         _check(not shaded, "this system reads shaded images, which a depth camera does not give; train one on depth")
+        self.max_views = int(most)
         self.size = max(len(self.system.viewpoints), 128 if self.max_candidates is None else int(self.max_candidates))
         self._resets, self.key = 0, jax.random.key(self.seed)
         self._programs: dict[bool, Programs] = {}

@@ -37,11 +37,6 @@ def aimed(
 ) -> tuple[Float[np.ndarray, "candidates 3"], Bool[np.ndarray, " candidates"]]:
     """Directions of candidate cameras from an object, in the world; and which of them are outside its sphere and look at it.
 
-    Args:
-        poses: (candidates, 4, 4) `T_world_camera`.
-        center: of the object, in metres.
-        radius: of the object, in metres.
-
     Raises:
         ValueError: for another shape, a matrix that is no pose, a camera at the centre, or if none looks at the object.
     """
@@ -82,6 +77,6 @@ def mask_of(reachable: AnyArray | Sequence[int] | None, number: int) -> Bool[np.
         raise ValueError(f"reachable must be a boolean mask of {number} candidates, or indices from 0 to {number - 1}")
     if given.size > 1 and len(np.unique(given)) < given.size:
         raise ValueError("reachable repeats an index; a mask of zeros and ones must be boolean: reachable.astype(bool)")
-    found = np.zeros(number, bool)
-    found[given.astype(int).reshape(-1)] = True
-    return found
+    mask = np.zeros(number, bool)
+    mask[given.astype(int).reshape(-1)] = True
+    return mask

@@ -216,11 +216,7 @@ class Frames:
         return cls(depth, K, poses, Sphere(center, radius, up, yaw), mask, _number(stored, "floor"))
 
     def image(self, index: int) -> DepthImage:
-        """One of them.
-
-        Raises:
-            ValueError: for an image that cannot be used.
-        """
+        """One of them; raises `ValueError` if it cannot be used."""
         mask = None if self.mask is None else self.mask[index]
         return DepthImage(self.depth[index], self.K[index], self.T_world_camera[index], mask, self.floor)
 

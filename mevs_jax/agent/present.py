@@ -64,11 +64,7 @@ class Present:
         return (np.asarray(where.directions) @ failed.T > np.cos(float(where.same))).any(axis=1)
 
     def seen(self, system: TrainedSystem, image: DepthImage) -> CanonicalView:
-        """A new image as the data set's camera would have taken it.
-
-        Raises:
-            ValueError: for an image that shows too little of the object.
-        """
+        """A new image as the data set's camera would have taken it; raises `ValueError` if it shows too little of the object."""
         view = convert(image, self.sphere, system.description.camera)
         if view.in_image < _LEAST:
             raise ValueError(

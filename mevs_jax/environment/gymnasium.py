@@ -121,11 +121,11 @@ class ActiveRecognitionVectorEnv(ap_gym.ActiveClassificationVectorEnv):
     def _step(self, action: Any, prediction: Any) -> tuple[dict, np.ndarray, np.ndarray, np.ndarray, dict, np.ndarray]:
         count = self.num_envs
         _check(action, prediction, self.environment, (count,))
-        index = start = np.zeros(count, np.int64)
+        begin = np.zeros(count, np.int64), np.zeros(count, np.int64)
         if self._ended.any():
-            index, start = _drawn(self.environment, self.np_random, (count,), None)
+            begin = _drawn(self.environment, self.np_random, (count,), None)
         self._state, observation, done, info, target = _move_all(
-            self.environment, self._state, np.asarray(action, np.int32), self._ended, index, start
+            self.environment, self._state, np.asarray(action, np.int32), self._ended, begin
         )
         self._ended = np.array(done)
         info = {name: np.array(value) for name, value in info.items()}
@@ -210,26 +210,17 @@ def _moved(environment: ActiveRecognition, state: EnvironmentState, action: jax.
 
 
 @jax.jit
-def _move_all(
-    environment: ActiveRecognition,
-    states: EnvironmentState,
-    actions: jax.Array,
-    ended: jax.Array,
-    index: jax.Array,
-    start: jax.Array,
-) -> _Moved:
-    """Moves all episodes that have not ended, and begins the others with the objects `index` at the views `start`."""
+def _move_all(environment: ActiveRecognition, states: Any, actions: Any, ended: Any, begin: Any) -> _Moved:
+    """Moves all episodes that have not ended, and begins the others with the objects and at the views `begin`."""
 
-    def one(state: EnvironmentState, action: jax.Array, ended: jax.Array, index: jax.Array, start: jax.Array) -> _Moved:
-        moved, observation, done, info, target = _moved(environment, state, action)
-        begun = _start_of(environment, index, start)
+    def one(state: EnvironmentState, action: jax.Array, ended: jax.Array, begin: tuple[jax.Array, jax.Array]) -> _Moved:
+        *after, done, info, target = _moved(environment, state, action)
         info["base_reward"] = jax.numpy.where(ended, 0, info["base_reward"])
-        moved, observation = jax.tree.map(
-            lambda new, old: jax.numpy.where(ended, new, old), begun, (moved, observation)
-        )
-        return moved, observation, done & ~ended, info | {"index": moved.object_index}, target
+        begun = _start_of(environment, *begin)
+        moved, seen = jax.tree.map(lambda new, old: jax.numpy.where(ended, new, old), begun, tuple(after))
+        return moved, seen, done & ~ended, info | {"index": moved.object_index}, target
 
-    return jax.vmap(one)(states, actions, ended, index, start)
+    return jax.vmap(one)(states, actions, ended, begin)
 
 
 _begin = jax.jit(_start_of)

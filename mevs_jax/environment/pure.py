@@ -146,11 +146,8 @@ class ActiveRecognition:
 
     def tree_flatten(self) -> tuple[tuple[Any, ...], tuple[Any, ...]]:
         """The arrays, and what is fixed when a program is compiled."""
-        return (self.tables, self.graph, self.reachable, self.movement_cost), (
-            self.max_views,
-            self.normalised,
-            self.fuse,
-        )
+        arrays = self.tables, self.graph, self.reachable, self.movement_cost
+        return arrays, (self.max_views, self.normalised, self.fuse)
 
     @classmethod
     def tree_unflatten(cls, fixed: tuple[Any, ...], arrays: tuple[Any, ...]) -> ActiveRecognition:

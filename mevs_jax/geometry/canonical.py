@@ -29,6 +29,10 @@ from mevs_jax.geometry.cameras import ViewCamera, look_at_origin, pixel_directio
 from mevs_jax.geometry.source_view import MARGIN, DepthImage, Window, why_empty, window_of
 from mevs_jax.geometry.sphere import Sphere
 
+_LEAST_SAMPLES = 512
+"""Of the source image along each side. For 64 pixels, 256 took 1.9 ms, not 3.4, but the median overlap of masks was 0.989, not
+0.993 (`benchmarks/canonical.py`)."""
+
 _STRIDE = 1.0
 """Distance, in samples of the source, of the points along a ray that are compared with it."""
 
@@ -115,7 +119,7 @@ def canonical_view(
 
 def convert(image: DepthImage, sphere: Sphere, camera: ViewCamera) -> CanonicalView:
     """`canonical_view` of an image with its camera, around an object at a place, whose yaw is not used."""
-    window = window_of(image, sphere, _grid(camera.resolution))
+    window = window_of(image, sphere, max(_LEAST_SAMPLES, 2 * camera.resolution))
     with jax.default_matmul_precision("highest"):  # accelerators round more, by pixels
         inverse = _without_small_holes(*_inverse_depth(window), window.rays)
         depth, known, pose, in_image, unknown = jax.device_get(_render(window, inverse, camera))
@@ -126,22 +130,8 @@ def convert(image: DepthImage, sphere: Sphere, camera: ViewCamera) -> CanonicalV
     return CanonicalView(depth, known, pose, direction, float(in_image), float(unknown))
 
 
-def _grid(resolution: int) -> int:
-    """Returns the number of samples of the source image along each side. For 64 pixels, 256 took 1.9 ms, not 3.4, but the median
-    overlap of masks was 0.989, not 0.993 (`benchmarks/canonical.py`)."""
-    return max(512, 2 * resolution)
-
-
 @partial(jax.jit, static_argnames="camera")
-def _render(
-    window: Window, inverse: Float[Array, "grid grid"], camera: ViewCamera
-) -> tuple[
-    Float[Array, "resolution resolution"],
-    Bool[Array, "resolution resolution"],
-    Float[Array, "4 4"],
-    Float[Array, ""],
-    Float[Array, ""],
-]:
+def _render(window: Window, inverse: Float[Array, "grid grid"], camera: ViewCamera) -> tuple[Array, ...]:
     """Returns depth, known, pose, in_image and unknown of a `CanonicalView`."""
     surface = _surface(inverse, window.rays)
     pose = look_at_origin(camera.distance * window.eye / jnp.linalg.norm(window.eye))
@@ -250,13 +240,7 @@ def _meet(
     near: Float[Array, " rays"],
     far: Float[Array, " rays"],
 ) -> tuple[Float[Array, " rays"], Bool[Array, " rays"]]:
-    """Where rays first meet the measured surface.
-
-    Args:
-        surface: see `_surface`.
-        window: where the source's camera is.
-        origin, directions: of the rays.
-        near, far: the parts of the rays that are searched.
+    """Where rays first meet the measured surface, between `near` and `far`.
 
     Returns:
         The distance along each ray in units of its direction, 0 where it meets nothing; and whether this is certain: until it

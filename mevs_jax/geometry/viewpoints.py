@@ -19,15 +19,7 @@ from jaxtyping import Array, Bool, Float
 from mevs_jax.arrays import AnyArray
 
 Lattice = Literal[
-    "golden_angle",
-    "equation8",
-    "nested",
-    "rings",
-    "tetrahedron",
-    "octahedron",
-    "cube",
-    "icosahedron",
-    "dodecahedron",
+    "golden_angle", "equation8", "nested", "rings", "tetrahedron", "octahedron", "cube", "icosahedron", "dodecahedron"
 ]
 SOLIDS = {"tetrahedron": 4, "octahedron": 6, "cube": 8, "icosahedron": 12, "dodecahedron": 20}
 """The number of corners of each Platonic solid."""
@@ -48,18 +40,14 @@ def fibonacci_sphere(n: int, variant: str = "golden_angle") -> Float[np.ndarray,
     """
     if n < 2:
         raise ValueError(f"a view lattice needs at least 2 viewpoints, got {n}")
-    i = np.arange(n)
-    if variant == "golden_angle":
-        height = 1 - 2 * i / (n - 1)
-        angle = i * np.pi * (3 - np.sqrt(5))
-        ring = np.sqrt(np.maximum(1 - height**2, 0))
-        return np.stack([height, ring * np.cos(angle), ring * np.sin(angle)], axis=1)
-    if variant == "equation8":
-        height = 1 - 2 * i / n
-        angle = 2 * np.pi * i / ((1 + np.sqrt(5)) / 2)
-        ring = np.sqrt(np.maximum(1 - height**2, 0))
-        return np.stack([ring * np.cos(angle), ring * np.sin(angle), height], axis=1)
-    raise ValueError(f"unknown lattice {variant!r}: it is 'golden_angle' or 'equation8'")
+    i, published = np.arange(n), variant == "golden_angle"
+    if not published and variant != "equation8":
+        raise ValueError(f"unknown lattice {variant!r}: it is 'golden_angle' or 'equation8'")
+    height = 1 - 2 * i / (n - 1 if published else n)
+    angle = i * np.pi * (3 - np.sqrt(5)) if published else 2 * np.pi * i / ((1 + np.sqrt(5)) / 2)
+    ring = np.sqrt(np.maximum(1 - height**2, 0))
+    x, y = ring * np.cos(angle), ring * np.sin(angle)
+    return np.stack([height, x, y] if published else [x, y, height], axis=1)
 
 
 def platonic_solid(name: str) -> Float[np.ndarray, "corners 3"]:
@@ -220,11 +208,7 @@ class ViewGraph:
             # an object have no face beyond 75°, unless they are very few.
             widest = np.inf if count < 6 else -0.25
             near = hull_edges(array, widest)
-        return cls(
-            points=jnp.asarray(array, jnp.float32),
-            neighbours=jnp.asarray(near),
-            distances=jnp.asarray(distances, jnp.float32),
-        )
+        return cls(jnp.asarray(array, jnp.float32), jnp.asarray(near), jnp.asarray(distances, jnp.float32))
 
 
 def local_maxima(

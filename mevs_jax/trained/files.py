@@ -15,8 +15,6 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from mevs_jax.plain import from_plain
 from mevs_jax.policies.registry import POLICIES
 from mevs_jax.trained.arrays import DESCRIPTION, WEIGHTS, parts_of
@@ -130,10 +128,17 @@ def verify(folder: str | Path) -> Description:
 
 
 def _read(folder: Path, name: str) -> TrainedSystem:
+    from safetensors import SafetensorError
+    from safetensors.numpy import load as from_safetensors
+
     description, of_weights = _read_description(folder)
     content = _read_weights(folder / WEIGHTS, of_weights)
+    try:
+        arrays = from_safetensors(content)
+    except (SafetensorError, ValueError, TypeError, LookupError, ArithmeticError) as error:
+        raise _unreadable(f"{folder / WEIGHTS} is no safetensors file") from error
     with _sound(folder):
-        return TrainedSystem(description, parts_of(description, _arrays_in(content, folder / WEIGHTS)), name)
+        return TrainedSystem(description, parts_of(description, arrays), name)
 
 
 @contextmanager
@@ -227,13 +232,3 @@ def _read_weights(path: Path, expected: Any) -> bytes:
     if hashlib.sha256(content).hexdigest() != expected["sha256"]:
         raise _unreadable(f"{path} is damaged, since its hash differs")
     return content
-
-
-def _arrays_in(content: bytes, path: Path) -> dict[str, np.ndarray]:
-    from safetensors import SafetensorError
-    from safetensors.numpy import load as from_safetensors
-
-    try:
-        return from_safetensors(content)
-    except (SafetensorError, ValueError, TypeError, LookupError, ArithmeticError) as error:
-        raise _unreadable(f"{path} is no safetensors file") from error

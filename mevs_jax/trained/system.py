@@ -98,15 +98,10 @@ class TrainedSystem:
 
         def trial(parts: Parts) -> Any:
             memory = Memory.blank(self.example(with_entropy), most)
-            candidates = Candidates(
-                parts.viewpoints,
-                parts.neighbours,
-                jnp.zeros((views, views)),
-                jnp.ones(views, bool),
-                jnp.eye(views),
-                jnp.float32(SAME),
-            )
-            state, scene = situation(parts, memory, candidates, jnp.zeros(views, bool), jnp.ones(views, bool), posed)
+            all_views, apart = jnp.ones(views, bool), jnp.zeros((views, views))
+            graph = parts.viewpoints, parts.neighbours, apart
+            candidates = Candidates(*graph, all_views, jnp.eye(views), jnp.float32(SAME))
+            state, scene = situation(parts, memory, candidates, ~all_views, all_views, posed)
             run = self.policy(policy, parts, posed) if isinstance(policy, str) else policy
             return run(jax.random.key(0), state, scene)
 

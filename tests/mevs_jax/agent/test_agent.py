@@ -271,7 +271,7 @@ def test_an_unknown_sphere_is_estimated_and_refined(classifier, told):
     """Of a ball whose first view shows half, on a table before a wall: the belief at the end is that of the ball's own sphere."""
     ball = mevs_jax.Sphere(CENTER + RADIUS * rotation_of(LYING) @ (0.1, -0.2, 0.15), 0.6 * RADIUS, UP, YAW)
     shots = []
-    for index in FROM_ABOVE:
+    for index in (1, 4, 8, 11):  # from all sides, and as low as the table allows
         whole = making.depth_of_ball(classifier.viewpoints[index], notch=False)
         depth, K, pose = in_metres(*on_a_table(classifier, index))
         shots.append((np.where(whole > 0, RADIUS * whole, depth).astype(np.float32), K, pose, whole > 0))
