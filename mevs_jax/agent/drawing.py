@@ -66,7 +66,7 @@ def draw_walk(walk: Walk, system: TrainedSystem, path: str | Path, title: str = 
 def _shown(walk: Walk, system: TrainedSystem, most: int = 6) -> list[int]:
     """The classes that were ever the likeliest, by their largest probability."""
     largest = np.max([belief.probabilities for belief in walk.beliefs], axis=0)
-    return [int(label) for label in np.argsort(-largest)[: min(most, len(system.classes))]]
+    return np.argsort(-largest)[: min(most, len(system.classes))].tolist()
 
 
 def _draw_cameras(axes, walk: Walk, system: TrainedSystem, count: int) -> None:

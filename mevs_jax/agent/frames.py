@@ -14,12 +14,9 @@ from mevs_jax.geometry.source_view import checked_pose
 def pose_towards(
     direction: Float[np.ndarray, " 3"], center: Float[np.ndarray, " 3"], distance: float, up: Float[np.ndarray, " 3"]
 ) -> Float[np.ndarray, "4 4"]:
-    """Pose of a camera that looks at `center` from a direction, with `up` upwards in its image.
+    """Pose of a camera at a distance from `center`, in a direction from there, that looks at it with `up` upwards in its image.
 
-    Args:
-        direction: unit vector from the centre to the camera, in the world.
-        distance: of the camera from the centre, in metres.
-        up: upwards, in the world; where the camera looks along it, any direction across it is used.
+    Where it looks along `up`, any direction across it is upwards.
     """
     forward = -direction
     right = np.cross(forward, up)
@@ -61,11 +58,7 @@ def aimed(
 
 
 def mask_of(reachable: AnyArray | Sequence[int] | None, number: int) -> Bool[np.ndarray, " candidates"]:
-    """A mask of candidates from what a caller gives: None for all, a boolean mask, or indices.
-
-    Raises:
-        ValueError: for a mask of another length, or indices out of range.
-    """
+    """A mask of candidates from what a caller gives: None for all, a boolean mask, or indices."""
     if reachable is None:
         return np.ones(number, bool)
     given = np.asarray(reachable)

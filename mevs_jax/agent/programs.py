@@ -65,9 +65,7 @@ class Programs:
     ) -> tuple[Memory, tuple[Array, Array]]:
         """The memory after a view; calibrated probabilities and strangeness.
 
-        Args:
-            radius: of the object in metres; NaN if its size is unknown.
-            temperatures: of the belief after 1, 2, … views; the last one holds for more.
+        The radius is in metres, NaN if the size is unknown. The last of the temperatures holds for more views.
         """
         seen = observe(parts, depth, pose, radius, self._system.description, self._entropy)
         direction = pose[:3, 3] / jnp.linalg.norm(pose[:3, 3])

@@ -123,15 +123,11 @@ def _add_views(server: viser.ViserServer, history: History, system: TrainedSyste
 
 def _show_views(server: viser.ViserServer, history: History, step: int) -> None:
     for number in range(1, history.views + 1):
-        for name, shown in (
-            ("new", number == step),
-            ("seen", number < step),
-            ("cameras", number <= step),
-            ("ways", 1 < number <= step),
-        ):
+        shown = {"new": number == step, "seen": number < step, "cameras": number <= step, "ways": 1 < number <= step}
+        for name, visible in shown.items():
             handle = server.scene.get_handle_by_name(f"/{name}/{number}")
             if handle is not None:
-                handle.visible = shown
+                handle.visible = visible
 
 
 def _show_candidates(server: viser.ViserServer, system: TrainedSystem, history: History, step: int) -> None:

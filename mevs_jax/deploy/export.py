@@ -78,9 +78,8 @@ def export(
         "programs": {},
     }
     for name, (function, inputs, outputs) in programs.items():
-        (b,) = jax.export.symbolic_shape("b")
         with portable():
-            exported = jax.export.export(jax.jit(function), platforms=list(platforms))(*_arguments(inputs, b))
+            exported = jax.export.export(jax.jit(function), platforms=list(platforms))(*_arguments(inputs))
         content = bytes(exported.serialize())
         (folder / f"{name}.stablehlo").write_bytes(content)
         manifest["programs"][name] = {
@@ -108,8 +107,9 @@ def _array(name: str, shape: Sequence[Any], about: str, dtype: str = "float32") 
     return {"name": name, "shape": list(shape), "dtype": dtype, "about": about}
 
 
-def _arguments(inputs: Sequence[dict[str, Any]], b: Any) -> list[Any]:
+def _arguments(inputs: Sequence[dict[str, Any]]) -> list[Any]:
     """The shapes of inputs, for any extent `b`."""
+    (b,) = jax.export.symbolic_shape("b")
 
     def of(one: dict[str, Any]) -> Any:
         if "arrays" in one:

@@ -95,11 +95,7 @@ class Window(NamedTuple):
 
 
 def window_of(image: DepthImage, sphere: Sphere, grid: int) -> Window:
-    """Returns the part of a source image that contains the object's sphere, in `grid` samples along each side.
-
-    Raises:
-        ValueError: for a camera inside the object's sphere, or a sphere outside the image.
-    """
+    """The part of a source image that contains the object's sphere, in `grid` samples along each side."""
     K, pose, radius = np.asarray(image.K, float), np.asarray(image.pose, float), float(sphere.radius)
     turn = upright(sphere.up)
     axes = turn @ pose[:3, :3]
@@ -178,11 +174,7 @@ def _check_intrinsics(K: np.ndarray) -> None:
 
 
 def checked_pose(T_world_camera: AnyArray) -> np.ndarray:
-    """Returns the pose in float64.
-
-    Raises:
-        ValueError: unless it is a rotation and a translation, with the last row (0, 0, 0, 1).
-    """
+    """The pose in float64; raises `ValueError` unless it is a rotation and a translation, with the last row (0, 0, 0, 1)."""
     pose = _finite(T_world_camera, "T_world_camera", (4, 4))
     if not np.allclose(pose[3], (0, 0, 0, 1), atol=1e-6):
         raise ValueError(

@@ -68,11 +68,7 @@ class Sphere:
 
 
 def upright(up: AnyVector) -> Float[np.ndarray, "3 3"]:
-    """Returns the smallest rotation that takes `up` to z.
-
-    Raises:
-        ValueError: for anything but a vector of a length.
-    """
+    """The smallest rotation that takes `up` to z."""
     vector = np.asarray(up, float).reshape(-1)
     if vector.shape != (3,) or not np.isfinite(vector).all() or np.linalg.norm(vector) < 1e-9:
         raise ValueError(

@@ -140,11 +140,9 @@ def great_circle_distances(points: Float[np.ndarray, "views 3"]) -> Float[np.nda
 
 
 def hull_edges(points: Float[np.ndarray, "views 3"], widest: float = np.inf) -> Bool[np.ndarray, "views views"]:
-    """Whether two points are joined by an edge of their convex hull.
+    """Whether two points, which are not all in one plane, are joined by an edge of their convex hull.
 
-    Args:
-        points: not all in one plane.
-        widest: faces whose offset, minus their distance from the origin, is not below this are left out.
+    Faces whose offset, minus their distance from the origin, is not below `widest` are left out.
     """
     from scipy.spatial import ConvexHull  # imported late: SciPy takes a fifth of a second
 

@@ -110,11 +110,7 @@ class _Arrays:
 
 
 def parts_of(description: Description, arrays: dict[str, np.ndarray]) -> Parts:
-    """The parts that a description and the arrays of a file make.
-
-    Raises:
-        ValueError: if an array is missing, is left over, has another shape than is described, or is impossible.
-    """
+    """The parts that a description and the arrays of a file make, all of which must be as described."""
     of, take = description, _Arrays(arrays)
     classes, features = len(of.classes), 8 * of.encoder.width
     viewpoints = take.take("viewpoints", (None, 3))

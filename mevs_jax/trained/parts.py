@@ -73,11 +73,7 @@ class Parts:
     strangeness: Strangeness | None = None
 
     def knowledge_by_pose(self, directions: Float[Array, "views 3"]) -> Knowledge | None:
-        """What is known about views in directions of the world for objects of unknown yaw; None if nothing is.
-
-        Args:
-            directions: unit vectors from the object to the cameras.
-        """
+        """What is known about views in directions of the world for objects of unknown yaw; None if nothing is."""
         if self.expected is None or self.pose is None:
             return None
         return Knowledge(by_pose=self.expected.by_yaw(directions, self.pose.module.shape[1]))
