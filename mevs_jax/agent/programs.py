@@ -13,6 +13,7 @@ from jaxtyping import Array, Float
 from mevs_jax.geometry.viewpoints import ViewGraph
 from mevs_jax.policies.base import Observation, Policy, Scene, SelectionState
 from mevs_jax.policies.informed import information_gain
+from mevs_jax.policies.registry import POLICIES
 from mevs_jax.selection.loop import Fuse, best_view
 from mevs_jax.trained.parts import Parts, observe
 from mevs_jax.trained.situation import Candidates, Memory, angles, situation
@@ -40,7 +41,8 @@ class Programs:
         self._see = system.compiled.setdefault(("see", entropy, posed, most), jax.jit(self.see_view))
         self.choose = jax.jit(self.choose_next)
         if isinstance(policy, str):
-            self.choose = system.compiled.setdefault(("choose", policy, posed, most), self.choose)
+            key = "choose", policy, POLICIES.get(policy), posed, most
+            self.choose = system.compiled.setdefault(key, self.choose)
 
     def see(self, parts: Parts, memory: Memory, depth: np.ndarray, pose: np.ndarray, radius: float) -> Any:
         """`see_view`, compiled, with the temperatures of the policy."""

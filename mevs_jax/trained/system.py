@@ -94,6 +94,14 @@ class TrainedSystem:
 
     def why_not(self, policy: str | Policy, posed: bool, with_entropy: bool) -> str | None:
         """Why a policy cannot be used, with or without predicted entropies; None if it can."""
+        if not isinstance(policy, str):
+            return self._try(policy, posed, with_entropy)
+        key = "why_not", policy, POLICIES.get(policy), posed, with_entropy  # one of this name may be registered later
+        if key not in self.compiled:
+            self.compiled[key] = self._try(policy, posed, with_entropy)
+        return self.compiled[key]
+
+    def _try(self, policy: str | Policy, posed: bool, with_entropy: bool) -> str | None:
         views, most = len(self.parts.viewpoints), 2
 
         def trial(parts: Parts) -> Any:

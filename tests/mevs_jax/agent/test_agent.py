@@ -26,16 +26,6 @@ LYING = mevs_jax.Sphere(CENTER, RADIUS, UP, YAW)
 """Where objects are, unless a test says otherwise: away from the origin, tilted, and turned."""
 
 
-@pytest.fixture(scope="module")
-def classifier():
-    return making.system("classifier")
-
-
-@pytest.fixture(scope="module")
-def recogniser():
-    return making.system("recogniser")
-
-
 @cache
 def pose_at(x: float, y: float, z: float) -> np.ndarray:
     return np.asarray(mevs_jax.look_at_origin(jnp.array([x, y, z], jnp.float32) * 2), float)
@@ -425,7 +415,6 @@ def test_nothing_is_compiled_after_the_warm_up(recogniser):
     agent = Agent(recogniser, stop=0.01, max_views=5)  # sure of the first view, also while it warms up
     agent.warm_up()
     agent.stop = 2
-    further = Agent(recogniser, stop=2, max_views=5)  # of the same policy, which shares the programs
     views, events = views_of(recogniser), []
 
     def listen(event, *_, **__):
@@ -447,6 +436,7 @@ def test_nothing_is_compiled_after_the_warm_up(recogniser):
                 agent.decide()
                 agent.decide(reachable=[1, 2], cost=np.ones(making.VIEWS))
                 agent.decide(candidates=agent.poses[:7])
+        further = Agent(recogniser, stop=2, max_views=5)  # of the same policy, which shares the programs
         further.begin(mevs_jax.Sphere(CENTER, RADIUS, yaw=0.0))
         further.observe_view(*views[0])
         further.decide()

@@ -16,11 +16,6 @@ from tests.mevs_jax.trained import making
 UP = np.array([0, 0, 1.0])
 
 
-@pytest.fixture(scope="module")
-def system():
-    return making.system("classifier")
-
-
 @pytest.fixture
 def agent(system):
     made = Agent(system, stop=2, max_views=3, unknown=None)

@@ -13,11 +13,6 @@ from tests.mevs_jax.trained import making
 
 
 @pytest.fixture(scope="module")
-def system():
-    return making.system()
-
-
-@pytest.fixture(scope="module")
 def history(system, tmp_path_factory):
     """A walk of three views around a ball, saved and loaded."""
     agent = system.agent(stop=2, max_views=3)
