@@ -126,12 +126,8 @@ class Agent:
         """Begins with a new object.
 
         Args:
-            center: (3,) of its bounding box, in the world, in metres.
-            radius: distance of its furthest point from there, in metres.
-            up: (3,) the object's upward direction in the world.
-            yaw: how far the object is turned about `up` against the objects of the data set, in radians, after the smallest
-                rotation from z to `up`; None if this is unknown. Then policies that need the object's own frame cannot be used,
-                and `best` is the system's best without it.
+            center, radius, up, yaw: as of `Sphere`. Without a yaw, policies that need the object's own frame cannot be used, and
+                `best` is the system's best without it.
             true_size: False for a model of an object at another scale, whose radius says nothing about its class. This matters
                 for systems that use the size alone (`system.description.size`).
 
@@ -185,11 +181,8 @@ class Agent:
         """Adds a view of the object, taken from anywhere, by any depth camera.
 
         Args:
-            depth: (height, width) metres along the optical axis, 0 or NaN where unknown.
-            K: (3, 3) intrinsics in pixels, centres of pixels at whole numbers.
-            T_world_camera: (4, 4) pose of the camera at the time of the image.
-            mask: (height, width) True for the pixels of the object; without, all that is inside its sphere belongs to it.
-            floor: height of the supporting surface in the world along `up`, in metres; what is below is not the object.
+            depth, K, T_world_camera: as of `DepthImage`, whose `pose` is that of the camera at the time of the image.
+            mask, floor: as of `DepthImage`; without, all that is inside the object's sphere belongs to it.
 
         Returns:
             The belief after this view.

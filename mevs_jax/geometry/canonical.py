@@ -95,15 +95,9 @@ def canonical_view(
     source image.
 
     Args:
-        depth: (height, width) metres along the optical axis, of a floating type. 0 or NaN where unknown; +inf where nothing is
-            hit, which is known to be background.
-        K: (3, 3) intrinsics in pixels; the centres of pixels are at whole numbers, as in OpenCV.
-        T_world_camera: (4, 4) pose, camera to world, in metres. The camera's axes are x right, y down, z forward.
-        center: (3,) centre of the object's sphere in the world, in metres.
-        radius: of the object's sphere, in metres.
-        up: (3,) the object's upward direction in the world, of any length. It becomes z by the smallest rotation.
+        depth, K, T_world_camera, mask: as of `DepthImage`, whose `pose` is `T_world_camera`.
+        center, radius, up: as of `Sphere`.
         camera: the data set's camera.
-        mask: (height, width) True at the pixels of the object. The others are known not to be the object.
         floor: height of the supporting surface above `center` along `up`, in metres, so usually negative; what lies below is not
             the object. It should be a little above the true height, by the depth camera's error.
 
