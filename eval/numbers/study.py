@@ -25,11 +25,13 @@ from eval.walks.own_policies import check_scores, checked
 from mevs_jax.beliefs.metrics import accuracy, class_accuracy, confusion_matrix
 from mevs_jax.geometry.viewpoints import ViewGraph
 from mevs_jax.policies.base import Knowledge, with_movement
-from mevs_jax.policies.registry import PolicyRecord
+from mevs_jax.policies.registry import PolicyRecord, policy_record
 
 HEADLINE_CT, HEADLINE_MV = 0.99, 4
 """The cell of the grid used in the thesis's first test and confusion matrices (§5.3)."""
 BASELINE = "random"
+_SWITCHED = ("random", "random_with_repetition", "predicted_entropy")
+"""Policies that are walked by the classifier validated by view too."""
 CONFIDENCE_OF = ("random", "predicted_entropy", "information_gain")
 """Policies whose confidence is evaluated."""
 MOVING = ("predicted_entropy", "information_gain")
@@ -268,6 +270,11 @@ def _policies(
     return dict(zip(shown, by_threads(of, list(shown.values())), strict=True))
 
 
+def _entry(policy: PolicyRecord, own: bool) -> dict[str, Any]:
+    source = {"own": dict(policy.code or {})} if own else {}
+    return {"policy": policy.name, "title": policy.title, "knows": policy.knows} | source
+
+
 def run_study(
     tables: ViewTables,
     validation: ViewTables,
@@ -293,20 +300,14 @@ def run_study(
     """
     setting = Setting.of(statistics.graph, validation, config)
     config, can_reach = setting.config, setting.can_reach
-
     own = checked(own, setting.graph, len(statistics.classes))
     policies = ladder(own)
     console.print(f"Walking {len(tables.labels)} test objects from {can_reach.sum()} views by {len(policies)} policies")
     results, exact = setting.with_random(tables, (*policies, SCRAMBLED))
     shown = {policy.name: results[policy.name] for policy in policies}
     check_own(own, results, tables, setting)
+    other = None if by_view is None else setting.with_random(by_view, [*map(policy_record, _SWITCHED), SCRAMBLED])[0]
 
-    other = None
-    if by_view is not None:
-        wanted = ("random", "random_with_repetition", "predicted_entropy")
-        other, _ = setting.with_random(by_view, [*(one for one in policies if one.name in wanted), SCRAMBLED])
-
-    sources = {policy.name: {"own": dict(policy.code or {})} for policy in own}
     mv = min(HEADLINE_MV, config.max_views)
     return {
         "objects": len(tables.labels),
@@ -322,10 +323,7 @@ def run_study(
         "headline": {"threshold": HEADLINE_CT, "max_views": mv},
         "single_view": single_view(tables, len(statistics.classes), can_reach),
         "entropy": entropy_errors(tables, statistics),
-        "ladder": [
-            {"policy": policy.name, "title": policy.title, "knows": policy.knows} | sources.get(policy.name, {})
-            for policy in policies
-        ],
+        "ladder": [_entry(policy, policy in own) for policy in policies],
         "policies": _policies(setting, tables, shown, mv, THRESHOLDS.index(HEADLINE_CT)),
         "against_random": {
             name: difference(result, shown[BASELINE]) for name, result in shown.items() if name != BASELINE

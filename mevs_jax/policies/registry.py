@@ -45,7 +45,7 @@ class PolicyRecord:
             structure.
         title: its name in reports.
         knows: the information that it uses.
-        needs: what it must be given besides the views seen; evaluations give it nothing else.
+        needs: what it must be given besides the views seen.
         random: whether its scores depend on the key.
         called: how messages call a user's policy.
         code: what identifies the source of a user's policy, if it is known.

@@ -238,22 +238,12 @@ np.savez(sys.argv[2], devices=jax.device_count(), **{f"{p}_{n}": getattr(r, n) f
                 np.testing.assert_allclose(values, eight[f"{policy}_{name}"], atol=1e-6)
 
 
-def test_the_class_view_table_is_a_mean_and_the_order_is_greedy(tables):
+def test_the_class_view_table_is_a_mean(tables):
     found = learn(jnp.asarray(tables.logits), jnp.asarray(tables.labels))
     for label in range(CLASSES):
         for view in range(VIEWS):
             mean = tables.logits[tables.labels == label, view].mean(axis=0)
             np.testing.assert_allclose(found.expected_logits[label, view], mean, atol=1e-5)
-    order = np.argsort(-np.asarray(found.order)).tolist()
-    chosen: list[int] = []
-    for best in order[:4]:
-        shares = {}
-        for view in sorted(set(range(VIEWS)) - set(chosen)):
-            sets = [sorted({start, view, *chosen}) for start in range(VIEWS)]
-            answers = [tables.logits[:, seen].sum(axis=1).argmax(-1) == tables.labels for seen in sets]
-            shares[view] = np.mean(answers)
-        assert shares[best] >= max(shares.values()) - 1e-6
-        chosen.append(best)
 
 
 @pytest.mark.slow
