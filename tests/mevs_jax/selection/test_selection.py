@@ -26,7 +26,7 @@ from mevs_jax import (
     select_views,
     with_movement,
 )
-from mevs_jax.policies import policy_entry, policy_named, register_policy
+from mevs_jax.policies import policy_named, policy_record, register_policy
 from mevs_jax.policies.informed import expected_views
 from tests.reference import numpy_rules, policies
 
@@ -362,7 +362,7 @@ def test_policies_are_registered_by_call_or_decorator_and_no_name_twice():
 
         assert register_policy("called", decorated) is decorated
         assert list(POLICIES)[-2:] == ["decorated", "called"]
-        entries = [policy_entry(name) for name in ("decorated", "called", "predicted_entropy")]
+        entries = [policy_record(name) for name in ("decorated", "called", "predicted_entropy")]
         assert [(entry.title, entry.knows) for entry in entries] == [
             ("a title", "truth"),
             ("called", "networks"),
