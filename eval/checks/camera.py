@@ -221,7 +221,7 @@ def agreements(
             yield pair.agreement(camera)
 
 
-def summary(found: Sequence[Agreement]) -> dict[str, float]:
+def summary(found: Sequence[Agreement]) -> dict[str, Any]:
     """Returns the median and 5th percentile of the overlap and of the share that is visible, and the medians of the error and
     of the share that is unknown."""
     overlap = np.array([one.overlap for one in found])
