@@ -13,7 +13,7 @@ from data_pipeline.dataset.statistics import load_statistics
 from eval.stages import tasks
 from mevs_jax.cli.parsing import parse
 from tests.reference.processes import start
-from tests.train.test_training import lines
+from tests.reference.quick import lines
 from train.loop import fit
 
 pytestmark = pytest.mark.usefixtures("named")
