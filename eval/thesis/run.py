@@ -49,7 +49,7 @@ from train.many.thesis import (
 )
 from train.results.finite import check_results
 from train.results.identity import made_by
-from train.results.kept import keep_beside, kept_array, kept_json, made_by
+from train.results.kept import keep_beside, kept_array, kept_json
 from train.results.outputs import network_outputs
 from train.running.log import read_history
 from train.tasks.classifier import ClassifierTask
