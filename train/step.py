@@ -53,6 +53,11 @@ class Hyperparameters:
         )
 
 
+def view_batches(config: OptimiserConfig, **what: Any) -> ViewBatches:
+    """Returns the batches of a training; `what` views hold is as in `ViewBatches`."""
+    return ViewBatches(config.batch_size, config.views_per_object, seed=config.data_seed, **what)
+
+
 @runtime_checkable
 class Task(Protocol):
     """What training needs to know of one kind of network."""

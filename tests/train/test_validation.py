@@ -12,6 +12,7 @@ import train.validation
 from data_pipeline.dataset.statistics import load_statistics
 from eval.settings import TINY
 from eval.stages import tasks
+from tests.reference.quick import quick_tasks
 from train.loop import fit
 from train.tasks.recogniser import RecogniserTask
 from train.validation import ValidationSet
@@ -56,11 +57,9 @@ def test_many_processes_have_equally_many_batches(data, monkeypatch):
         assert sum(seen) == statistics.objects_of(["val"]) * statistics.views
 
 
-@pytest.mark.slow
 def test_training_is_the_same_with_views_that_are_read_again(data, tmp_path, monkeypatch):
     statistics = load_statistics(data)
-    task = tasks(TINY, statistics)[1]
-    task = replace(task, optimiser=replace(task.optimiser, epochs=1, epoch_views=2))
+    task = quick_tasks(statistics, epochs=1)[1]
     kept = fit(task, data, statistics, tmp_path / "kept")
     monkeypatch.setattr(train.validation.ValidationSet.__init__, "__defaults__", (0,))
     read = fit(task, data, statistics, tmp_path / "read")

@@ -72,16 +72,12 @@ class Member:
 
 
 def member_of(task: SweepTask) -> Member:
-    """Returns the member that trains as `task` says."""
-    hyper, optimiser = task.hyperparameters, task.optimiser
-    return Member(
-        learning_rate=float(optimiser.learning_rate),
-        weight_decay=float(optimiser.weight_decay),
-        dropout=float(hyper.dropout),
-        augmentation=float(hyper.augmentation),
-        seed=optimiser.seed,
-        data_seed=optimiser.data_seed,
-    )
+    """Returns the member that trains as `task` says; `task_of` gives this task again, to the last digit."""
+    config, hyper = task.optimiser, task.hyperparameters
+    dropout = task.network_config.dropout if isinstance(task, EntropyTask) else float(hyper.dropout)
+    augmentation = 1.0 if isinstance(task, RecogniserTask) else float(task.augmentation.strength)
+    rates = float(config.learning_rate), float(config.weight_decay)
+    return Member(*rates, dropout, augmentation, config.seed, data_seed=config.data_seed)
 
 
 def by_configurations(members: Sequence[Member]) -> dict[Configuration, list[Member]]:

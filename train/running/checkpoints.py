@@ -21,10 +21,7 @@ from data_pipeline.files import check_of_file, damage_in, files_in, keep_checks
 from data_pipeline.progress import console
 from train.running.preemption import interrupts_held
 
-for _name in (
-    "absl",
-    "asyncio",
-):  # Orbax logs every step of every save, and the errors of its threads, which it raises as well
+for _name in ("absl", "asyncio"):  # Orbax logs every step, and the errors of its threads, which it raises as well
     logging.getLogger(_name).setLevel(logging.CRITICAL)
 
 
@@ -50,19 +47,10 @@ def has_save(slot: Path) -> bool:
 
 def damage_of(slot: Path) -> str | None:
     """Returns what is damaged in the save that the folder of a slot holds; None if it is sound by its checks or has none."""
-    if not slot.exists():
-        return f"{slot} is missing"
     if not slot.is_dir():
-        return f"{slot} is no folder"
-    steps = _steps(slot)
-    if not steps:
-        return f"{slot} is empty"
-    for step in steps:
-        if not step.is_dir():
-            return f"{step} is no folder"
-        if (damage := damage_in(step)) is not None:
-            return damage
-    return None
+        return f"{slot} is no folder" if slot.exists() else f"{slot} is missing"
+    found = [damage_in(step) if step.is_dir() else f"{step} is no folder" for step in _steps(slot) or ()]
+    return next((damage for damage in found if damage), None) if found else f"{slot} is empty"
 
 
 def drop_damaged(folder: Path, consequence: str = "so training goes on from what is sound") -> None:
@@ -108,10 +96,8 @@ class Checkpoints:
         if manager.latest_step() == step:
             return
         self._finish()  # `best` must be complete before a `latest` that refers to it
-        manager.save(
-            step,
-            args=args.Composite(state=args.StandardSave(state), progress=args.JsonSave(deepcopy(progress))),
-        )
+        saved = args.Composite(state=args.StandardSave(state), progress=args.JsonSave(deepcopy(progress)))
+        manager.save(step, args=saved)
         self._unchecked.add(slot)
 
     def _finish(self) -> None:
@@ -166,9 +152,8 @@ class Checkpoints:
             try:
                 found[slot] = self.restore(slot, like)
             except Unreadable as error:
-                _remove(
-                    self._folder / slot, f"{error.path} cannot be read ({error.reason})", "so training goes on without"
-                )
+                damage = f"{error.path} cannot be read ({error.reason})"
+                _remove(self._folder / slot, damage, "so training goes on without")
                 self._slots[slot].reload()
         latest, best = found.get("latest"), found.get("best")
         if latest is None or not latest[1]["best_epoch"] or self._slots["best"].latest_step() is not None:
@@ -203,7 +188,6 @@ class Checkpoints:
         return self
 
     def __exit__(self, kind: type | None, error: BaseException | None, trace: TracebackType | None) -> None:
-        if error is None or not is_lost_process(
-            error
-        ):  # with a lost process, waiting for its part of a save would never end
+        # With a lost process, waiting for its part of a save would never end.
+        if error is None or not is_lost_process(error):
             self.close()

@@ -21,7 +21,7 @@ from data_pipeline.errors import DataError
 from mevs_jax.geometry.inputs import depth_image
 from mevs_jax.models import ResNet
 from train.optimiser import OptimiserConfig
-from train.step import Batch, Hyperparameters, Metrics
+from train.step import Batch, Hyperparameters, Metrics, view_batches
 from train.tasks.own_encoder import OwnEncoderConfig, own_encoder
 from train.weights.starting import StartingWeights, weights_from_torch
 
@@ -112,14 +112,7 @@ class ClassifierTask:
 
     @property
     def batches(self) -> ViewBatches:
-        config = self.optimiser
-        return ViewBatches(
-            config.batch_size,
-            config.views_per_object,
-            images=self.images,
-            seed=config.data_seed,
-            validation_by=config.validation_by,
-        )
+        return view_batches(self.optimiser, images=self.images, validation_by=self.optimiser.validation_by)
 
     @property
     def group(self) -> int:

@@ -16,7 +16,7 @@ from data_pipeline.dataset.batches import ViewBatches
 from data_pipeline.dataset.inputs import cloud_input
 from mevs_jax.models import THESIS_ABSTRACTIONS, Abstraction, PointNet2
 from train.optimiser import OptimiserConfig
-from train.step import Batch, Hyperparameters, Metrics
+from train.step import Batch, Hyperparameters, Metrics, view_batches
 
 
 @dataclass(frozen=True)
@@ -67,13 +67,7 @@ class EntropyTask:
     @property
     def batches(self) -> ViewBatches:
         config = self.optimiser
-        return ViewBatches(
-            config.batch_size,
-            config.views_per_object,
-            points=self.network_config.points,
-            seed=config.data_seed,
-            validation_by=config.validation_by,
-        )
+        return view_batches(config, points=self.network_config.points, validation_by=config.validation_by)
 
     @property
     def group(self) -> int:

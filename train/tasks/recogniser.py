@@ -25,7 +25,7 @@ from mevs_jax.models import Recogniser, ResNet
 from mevs_jax.models.pose import PoseHead, azimuth_of, azimuth_weights
 from mevs_jax.models.rotation import ROTATIONS, rotation_weights, seen_rotations
 from train.optimiser import OptimiserConfig
-from train.step import Batch, Hyperparameters, Metrics
+from train.step import Batch, Hyperparameters, Metrics, view_batches
 from train.tasks.classifier import ResNetConfig
 from train.tasks.set_fusion import SetFusionConfig, new_fusion, random_sets
 from train.tasks.size import SizeConfig, radii_for_training, used_size
@@ -104,15 +104,7 @@ class RecogniserTask:
 
     @property
     def batches(self) -> ViewBatches:
-        config = self.optimiser
-        return ViewBatches(
-            config.batch_size,
-            config.views_per_object,
-            images="depth",
-            seed=config.data_seed,
-            fold=self.fold,
-            balanced=self.balanced,
-        )
+        return view_batches(self.optimiser, images="depth", fold=self.fold, balanced=self.balanced)
 
     @property
     def group(self) -> int:

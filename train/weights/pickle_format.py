@@ -114,13 +114,7 @@ class BoundedReader(io.BufferedReader):
         return super().readline(LONGEST_NAME + 1)
 
 
-_IGNORED = {"PROTO", "FRAME"}
 _VALUES = {"NONE": None, "NEWTRUE": True, "NEWFALSE": False, "EMPTY_TUPLE": ()}
-_ARGUMENTS = {"BININT", "BININT1", "BININT2", "LONG1", "BINFLOAT", "BINUNICODE", "SHORT_BINUNICODE"} | {
-    "BINSTRING",  # of Python 2
-    "SHORT_BINSTRING",
-}
-"""Instructions that put their argument on the stack."""
 
 
 class WeightsUnpickler:
@@ -165,12 +159,14 @@ class WeightsUnpickler:
 
     def _follow(self, name: str, argument: Any) -> None:
         stack = self._stack
-        if name in _IGNORED:
-            return
         match name:
-            case _ if name in _VALUES:
+            case "PROTO" | "FRAME":
+                pass  # nothing depends on them
+            case "NONE" | "NEWTRUE" | "NEWFALSE" | "EMPTY_TUPLE":
                 stack.append(_VALUES[name])
-            case _ if name in _ARGUMENTS:
+            case "BININT" | "BININT1" | "BININT2" | "LONG1" | "BINFLOAT" | "BINUNICODE" | "SHORT_BINUNICODE":
+                stack.append(argument)
+            case "BINSTRING" | "SHORT_BINSTRING":  # of Python 2
                 stack.append(argument)
             case "MARK":
                 self._marks.append(len(stack))

@@ -19,9 +19,7 @@ from data_pipeline.dataset.batches import train_batches
 from data_pipeline.dataset.statistics import load_statistics
 from data_pipeline.errors import DataError, Diverged
 from eval.settings import TINY
-from eval.stages import tasks
-from tests.train.scaling_worker import SETTINGS
-from tests.train.test_training import lines
+from tests.reference.quick import lines, quick_tasks
 from train.loop import fit, load_best
 from train.many.members import Group, Member, member_of, task_of
 from train.many.seeds import shared_equally, train_seeds
@@ -38,11 +36,10 @@ def of_seeds(data, name: str, seeds=(3, 4)):
     """The same task from several seeds."""
     statistics = load_statistics(data)
     if name == "recogniser":
-        optimiser = replace(TINY.learned.recogniser.optimiser, learning_rate=1e-4)
+        optimiser = replace(TINY.learned.recogniser.optimiser, learning_rate=1e-4, epochs=2)
         task = RecogniserTask.of(replace(TINY.learned.recogniser, optimiser=optimiser), 10, statistics.camera)
     else:
-        task = tasks(SETTINGS, statistics)[("classifier", "entropy").index(name)]
-    task = replace(task, optimiser=replace(task.optimiser, epochs=2))
+        task = quick_tasks(statistics, epochs=2)[("classifier", "entropy").index(name)]
     return [replace(task, optimiser=replace(task.optimiser, seed=seed, data_seed=seed)) for seed in seeds]
 
 
@@ -50,8 +47,7 @@ def group_of(each, data):
     return Group(each[0], [member_of(task) for task in each], data, load_statistics(data))
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("name", ["entropy", "classifier", "recogniser"])
+@pytest.mark.parametrize("name", ["entropy", "classifier", pytest.param("recogniser", marks=pytest.mark.slow)])
 def test_every_seed_ends_as_it_does_alone(name, request, tmp_path):
     data = request.getfixturevalue("turned" if name == "recogniser" else "data")
     statistics, each = load_statistics(data), of_seeds(data, name)
@@ -92,7 +88,6 @@ def test_a_member_draws_the_batches_of_its_epoch_wherever_it_trains(data):
             np.testing.assert_array_equal(drawn[name][place], values, err_msg=name)
 
 
-@pytest.mark.slow
 def test_both_ways_of_training_members_take_the_same_steps(data):
     """Twenty steps of two members, each on its own batches; the second stops half way, and its place is given up."""
     each = of_seeds(data, "entropy")
@@ -125,7 +120,6 @@ def test_both_ways_of_training_members_take_the_same_steps(data):
         np.testing.assert_allclose(mine[0], theirs[0], rtol=1e-4, atol=step if np.ndim(mine[0]) < 2 else 0.1 * step)
 
 
-@pytest.mark.slow
 def test_an_interrupted_training_of_seeds_goes_on(data, tmp_path, monkeypatch):
     """Interrupted after the first epoch, and once more while the networks are written."""
     statistics, each = load_statistics(data), of_seeds(data, "entropy", seeds=(0, 1))
@@ -165,7 +159,6 @@ def _until(batches, steps: int):
         yield batch
 
 
-@pytest.mark.slow
 def test_a_seed_that_diverges_is_named_and_the_others_are_kept(data, tmp_path, monkeypatch):
     statistics, each = load_statistics(data), of_seeds(data, "entropy", seeds=(0, 1))
     folders = [tmp_path / "0", tmp_path / "1"]
@@ -177,7 +170,6 @@ def test_a_seed_that_diverges_is_named_and_the_others_are_kept(data, tmp_path, m
     assert not folders[1].exists()
 
 
-@pytest.mark.slow
 def test_what_others_left_is_given_up_and_a_member_is_not_lengthened(data, tmp_path, monkeypatch, capsys):
     """An interrupted training of more seeds; then fewer. A member's optimiser is not kept, so that it cannot go on."""
     statistics, each = load_statistics(data), of_seeds(data, "entropy", seeds=(0, 1, 2))
@@ -193,17 +185,10 @@ def test_what_others_left_is_given_up_and_a_member_is_not_lengthened(data, tmp_p
     capsys.readouterr()
     train_seeds(each[:2], data, statistics, folders[:2], tmp_path / "work")
     assert "of other networks, which is given up" in " ".join(capsys.readouterr().err.split())
-    optimiser = replace(each[0].optimiser, schedule="constant")
-    longer = replace(each[0], optimiser=replace(optimiser, epochs=3))
-    folder = tmp_path / "constant"
-    constant = [
-        replace(each[0], optimiser=optimiser),
-        replace(each[1], optimiser=replace(optimiser, seed=1, data_seed=1)),
-    ]
-    train_seeds(constant, data, statistics, [folder, tmp_path / "other"], tmp_path / "work")
+    longer = replace(each[0], optimiser=replace(each[0].optimiser, epochs=3))
     with pytest.raises(DataError, match="other settings"):
-        fit(longer, data, statistics, folder)
-    assert (folder / "summary.json").exists()
+        fit(longer, data, statistics, folders[0])
+    assert (folders[0] / "summary.json").exists()
 
 
 def test_as_many_devices_as_share_the_networks_train_them():
@@ -237,7 +222,7 @@ import jax
 jax.config.update("jax_num_cpu_devices", 4)
 import numpy as np
 from tests.train.many.test_seeds import group_of, of_seeds
-from tests.train.scaling_worker import COLLECTIVES
+from tests.train.running.scaling_worker import COLLECTIVES
 from data_pipeline.dataset.batches import train_batches
 from train.running.devices import device_mesh
 from train.many.trainers import AtOnce, way_for

@@ -24,7 +24,8 @@ from eval.report.sweep import sweep_table
 from eval.settings import TINY
 from eval.stages import tasks
 from eval.sweeping import adopt, train_sweep
-from tests.train.scaling_worker import SETTINGS
+from tests.reference.quick import quick_tasks
+from tests.train.running.scaling_worker import SETTINGS
 from train.choosing.stages import Stages
 from train.loop import fit, load_best, steps_of_an_epoch, validate
 from train.many.members import Member, Together, by_configurations, task_of
@@ -36,8 +37,7 @@ from train.running.preemption import Preempted
 from train.step import TrainState, evaluate_step_of, initial_state
 from train.validation import ValidationSet
 
-SWEEP = SweepConfig(members=4, learning_rate=(1e-5, 3e-4))
-"""Low rates: what rounding does to a rectified unit grows with the rate."""
+SWEEP = SweepConfig(members=4, learning_rate=(1e-4, 1e-2))
 
 
 @pytest.fixture(scope="module")
@@ -47,26 +47,29 @@ def out(tmp_path_factory, data) -> Path:
     return folder
 
 
-def task_named(name: str, out: Path):
-    settings = replace(
-        SETTINGS,
-        classifier=replace(SETTINGS.classifier, optimiser=replace(SETTINGS.classifier.optimiser, patience=1)),
-        entropy=replace(SETTINGS.entropy, optimiser=replace(SETTINGS.entropy.optimiser, patience=1)),
-    )
-    return tasks(settings, load_statistics(out / "data"))[("classifier", "entropy").index(name)]
+def task_named(name: str, out: Path, **changed):
+    """A quick task; `epochs` are three."""
+    return quick_tasks(load_statistics(out / "data"), **changed)[("classifier", "entropy").index(name)]
 
 
-@pytest.mark.slow
+@pytest.fixture(scope="module")
+def whole(out) -> tuple[Path, list[Member]]:
+    """A sweep that was never stopped."""
+    members = sweep(task_named("entropy", out), out / "data", load_statistics(out / "data"), out / "whole", SWEEP)
+    return out / "whole", members
+
+
 def test_members_end_as_separate_runs_do(out, tmp_path):
     """Some stop early, and are left alone while others continue."""
-    statistics, task = load_statistics(out / "data"), task_named("entropy", out)
-    members = sweep(task, out / "data", statistics, tmp_path / "sweep", SWEEP)
+    statistics, task = load_statistics(out / "data"), task_named("entropy", out, patience=1)
+    config = SweepConfig(grid=("learning-rate=1e-4,1e-3,10,100",))  # the last ones get worse by each epoch
+    members = sweep(task, out / "data", statistics, tmp_path / "sweep", config)
     for index, member in enumerate(members):
         alone = fit(task_of(task, member), out / "data", statistics, tmp_path / str(index))
         assert (alone["epoch"], alone["best_epoch"]) == (member.epochs, member.best_epoch)
         for metric, value in alone["best"].items():
             assert member.best[metric] == pytest.approx(value, rel=1e-4), metric
-    assert min(member.epochs for member in members) < task.optimiser.epochs
+    assert min(member.epochs for member in members) < max(member.epochs for member in members) == task.optimiser.epochs
     assert len({member.best["loss"] for member in members}) == 4
 
     best = min(members, key=lambda member: member.loss)
@@ -87,12 +90,9 @@ def metrics_of(folder: Path) -> list[dict[str, str]]:
     return list(csv.DictReader((folder / "epochs.csv").open()))
 
 
-@pytest.mark.slow
-def test_a_sweep_of_version_0_1_goes_on_after_its_last_epoch(out, tmp_path, monkeypatch):
+def test_a_sweep_of_version_0_1_goes_on_after_its_last_epoch(out, whole, tmp_path, monkeypatch):
     """It kept the number of epochs alone."""
     statistics, task = load_statistics(out / "data"), task_named("entropy", out)
-    task = replace(task, optimiser=replace(task.optimiser, patience=5, epochs=2))
-    whole = sweep(task, out / "data", statistics, tmp_path / "whole", SWEEP)
     real_save = Checkpoints.save
 
     def stopped(self, slot, step, state, progress):
@@ -103,16 +103,13 @@ def test_a_sweep_of_version_0_1_goes_on_after_its_last_epoch(out, tmp_path, monk
     with pytest.raises(KeyboardInterrupt):
         sweep(task, out / "data", statistics, tmp_path / "before", SWEEP)
     monkeypatch.undo()
-    assert sweep(task, out / "data", statistics, tmp_path / "before", SWEEP) == whole
-    assert metrics_of(tmp_path / "before") == metrics_of(tmp_path / "whole")
+    assert sweep(task, out / "data", statistics, tmp_path / "before", SWEEP) == whole[1]
+    assert metrics_of(tmp_path / "before") == metrics_of(whole[0])
 
 
-@pytest.mark.slow
-def test_a_stopped_sweep_ends_as_if_it_had_not_been(out, tmp_path, monkeypatch):
+def test_a_stopped_sweep_ends_as_if_it_had_not_been(out, whole, tmp_path, monkeypatch):
     """Told to end within an epoch."""
     statistics, task = load_statistics(out / "data"), task_named("entropy", out)
-    task = replace(task, optimiser=replace(task.optimiser, patience=5, epochs=3))
-    whole = sweep(task, out / "data", statistics, tmp_path / "whole", SWEEP)
     epoch = steps_of_an_epoch(task, statistics)
     assert epoch > 1
     after = epoch + 1
@@ -130,18 +127,16 @@ def test_a_stopped_sweep_ends_as_if_it_had_not_been(out, tmp_path, monkeypatch):
     monkeypatch.undo()
     assert not (tmp_path / "stopped" / "members.json").exists()
     assert (tmp_path / "stopped" / "latest" / str(after)).exists()
-    assert sweep(task, out / "data", statistics, tmp_path / "stopped", SWEEP) == whole
-    assert metrics_of(tmp_path / "stopped") == metrics_of(tmp_path / "whole")
-    assert sweep(task, out / "data", statistics, tmp_path / "stopped", SWEEP) == whole  # not trained again
+    assert sweep(task, out / "data", statistics, tmp_path / "stopped", SWEEP) == whole[1]
+    assert metrics_of(tmp_path / "stopped") == metrics_of(whole[0])
+    assert sweep(task, out / "data", statistics, tmp_path / "stopped", SWEEP) == whole[1]  # not trained again
     with pytest.raises(DataError, match="other settings"):
         sweep(task, out / "data", statistics, tmp_path / "stopped", replace(SWEEP, members=2))
 
 
-@pytest.mark.slow
 def test_a_member_whose_loss_is_no_number_leaves_the_others_alone(out, tmp_path, monkeypatch):
-    statistics, task = load_statistics(out / "data"), task_named("classifier", out)
-    task = replace(task, optimiser=replace(task.optimiser, schedule="constant", epochs=1))
-    chosen = [Member(rate, 1e-3, 0.0, 1.0, 7) for rate in (1e-4, 1e30)]
+    statistics, task = load_statistics(out / "data"), task_named("classifier", out, epochs=1)
+    chosen = [Member(rate, 1e-3, 0.0, 1.0, 7) for rate in (1e-4, 1e38)]
     monkeypatch.setattr(train.many.sweep, "draw_members", lambda *_: chosen)
     members = sweep(task, out / "data", statistics, tmp_path / "sweep", SWEEP)
     assert [member.diverged for member in members] == [False, True]
@@ -152,7 +147,7 @@ def test_a_member_whose_loss_is_no_number_leaves_the_others_alone(out, tmp_path,
     chosen[0] = chosen[1]
     for _ in range(2):  # the second time from its checkpoint
         with pytest.raises(
-            Diverged, match=r"every member .* diverged, with learning rates from 1e.30 to 1e.30, .* delete"
+            Diverged, match=r"every member .* diverged, with learning rates from 1e.38 to 1e.38, .* delete"
         ):
             sweep(task, out / "data", statistics, tmp_path / "none", SWEEP)
     assert not (tmp_path / "none" / "members.json").exists()
@@ -264,7 +259,7 @@ def test_halving_drops_the_worse_half_of_the_configurations():
 
 
 @pytest.mark.slow
-def test_a_halved_sweep_trains_the_best_to_the_end_and_the_run_adopts_it(out, tmp_path):
+def test_a_halved_sweep_trains_the_best_to_the_end_is_shown_and_adopted(out, tmp_path):
     shutil.copytree(out / "data", tmp_path / "data")
     entropy = replace(SETTINGS.entropy, optimiser=replace(SETTINGS.entropy.optimiser, epochs=4))
     config = SweepConfig(grid=("learning-rate=1e-7,1e-3,1e-6,3e-6",), halving=True)
@@ -272,7 +267,12 @@ def test_a_halved_sweep_trains_the_best_to_the_end_and_the_run_adopts_it(out, tm
     folder, members = train_sweep(settings, tmp_path)
     assert [one.epochs for one in members] == [1, 4, 1, 2]
     assert best_of(members) is members[1]
-    rows = list(csv.DictReader((folder / "epochs.csv").open()))
+    table, best = (folder / "members.md").read_text().splitlines(), min(members, key=lambda member: member.loss)
+    assert len(table) == 2 + len(members)
+    assert table[2].startswith(f"| {members.index(best)} | {best.learning_rate:.2e}")
+    assert (folder / "parallel_coordinates.png").stat().st_size > 5000
+    assert [Member(**member) for member in json.loads((folder / "members.json").read_text())] == members
+    rows = metrics_of(folder)
     assert len(rows) == sum(one.epochs for one in members)
     assert {"member", "epoch", "train/loss", "val/loss"} <= set(rows[0])
     there, adopted = adopt(settings, tmp_path)
@@ -307,15 +307,3 @@ def test_the_recogniser_is_swept_too(turned, data, tmp_path):
     study = Stages(adopted.learned, adopted.dataset, tmp_path, 0)
     study.train_recogniser()  # it is trained
     assert summary_of(there)["best_loss"] == best_of(members).loss
-
-
-@pytest.mark.slow
-def test_the_command_leaves_table_plot_and_network(out):
-    settings = replace(SETTINGS, sweep=SWEEP)
-    folder, members = train_sweep(settings, out)
-    table = (folder / "members.md").read_text().splitlines()
-    assert len(table) == 2 + len(members)
-    best = min(members, key=lambda member: member.loss)
-    assert table[2].startswith(f"| {members.index(best)} | {best.learning_rate:.2e}")
-    assert (folder / "parallel_coordinates.png").stat().st_size > 5000
-    assert [Member(**member) for member in json.loads((folder / "members.json").read_text())] == members

@@ -9,7 +9,6 @@ import signal
 import sys
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import jax
 from jax.sharding import Mesh
@@ -19,6 +18,7 @@ from data_pipeline.dataset.batches import train_batches
 from data_pipeline.dataset.statistics import load_statistics
 from eval.settings import TINY
 from eval.stages import tasks
+from tests.reference.quick import quick_tasks
 from train.running.devices import DATA, MODEL, device_mesh, parameter_sharding, place, place_batch
 from train.running.preemption import Preempted
 from train.step import initial_state, train_step_of
@@ -37,44 +37,31 @@ whether a rectified unit is on, and what follows from that grows with the rate."
 COLLECTIVES = re.compile(r"\b(all-reduce|all-gather|all-to-all|reduce-scatter|collective-permute)(?:-start)?\(")
 
 
-STRETCH = 10
-"""Steps in a row. Each stretch begins where one device was then, before rounding has grown into another training altogether."""
+def losses(data: Path, mesh: Mesh, steps: int) -> tuple[dict[str, list[float]], dict[str, list[str]]]:
+    """The training loss of the first steps, and how devices talk in a step, by network.
 
-States = dict[tuple[str, int], Any]
-
-
-def losses(
-    data: Path, mesh: Mesh, steps: int, of_one: States
-) -> tuple[dict[str, list[float]], dict[str, list[str]], States]:
-    """The training loss of the first steps, how devices talk in a step, and the state at each stretch's beginning, by network.
-
-    Both networks, and PointNet++ alone where weights are split. Stretches begin with the states `of_one` device, if given.
+    Both networks, and PointNet++ alone where weights are split.
     """
-    out, talk, begins = {}, {}, {}
+    out, talk = {}, {}
     for task in tasks(SETTINGS, load_statistics(data))[0 if mesh.shape["model"] == 1 else -1 :]:
         structure, state = initial_state(task, task.optimiser.seed)
         where = parameter_sharding(mesh, state)
         state = place(state, where)
         step = jax.jit(train_step_of(task, structure, steps), donate_argnums=0, out_shardings=(where, None))
         batches = train_batches(data, task.batches)
-        found = []
-        program = step.lower(
-            state, place_batch(mesh, next(train_batches(data, task.batches))), task.hyperparameters
-        ).compile()
-        talk[task.name] = sorted(set(COLLECTIVES.findall(program.as_text())))
-        for number in range(steps):
-            if number % STRETCH == 0:
-                begins[task.name, number] = jax.device_get(state)
-                if of_one:
-                    state = place(of_one[task.name, number], where)
-            state, loss = program(state, place_batch(mesh, next(batches)), task.hyperparameters)
+        program, found = None, []
+        for _ in range(steps):
+            batch = place_batch(mesh, next(batches))
+            program = program or step.lower(state, batch, task.hyperparameters).compile()
+            state, loss = program(state, batch, task.hyperparameters)
             found.append(loss)
+        talk[task.name] = sorted(set(COLLECTIVES.findall(program.as_text())))
         out[task.name] = [float(loss) for loss in found]
-    return out, talk, begins
+    return out, talk
 
 
 def fit_until(data: Path, out: Path, stop_at: int) -> None:
-    """Trains PointNet++; at the batch of number `stop_at` the process is told to end."""
+    """Trains the quick predictor; at the batch of number `stop_at` the process is told to end."""
     real = train.loop.train_batches
 
     def batches(*arguments, first_step: int = 0):
@@ -85,7 +72,7 @@ def fit_until(data: Path, out: Path, stop_at: int) -> None:
 
     train.loop.train_batches = batches
     statistics = load_statistics(data)
-    task = tasks(SETTINGS, statistics)[1]
+    task = quick_tasks(statistics)[1]
     try:
         train.loop.fit(task, data, statistics, out)
     except Preempted:
@@ -102,10 +89,6 @@ if __name__ == "__main__":
     jax.config.update("jax_num_cpu_devices", asked["devices"])
     assert len(jax.devices()) == asked["devices"]
     if "steps" in asked:
-        found, of_one = {}, {}
-        for name, mesh in meshes().items():
-            *found[name], begins = losses(Path(asked["data"]), mesh, asked["steps"], of_one)
-            of_one = of_one or begins
-        print(json.dumps(found))
+        print(json.dumps({name: losses(Path(asked["data"]), mesh, asked["steps"]) for name, mesh in meshes().items()}))
     else:
         fit_until(Path(asked["data"]), Path(asked["out"]), asked["stop_at"])

@@ -13,7 +13,7 @@ from data_pipeline.dataset.statistics import load_statistics
 from eval.stages import tasks
 from mevs_jax.cli.parsing import parse
 from tests.reference.processes import start
-from tests.train.test_training import lines
+from tests.reference.quick import lines
 from train.loop import fit
 
 pytestmark = pytest.mark.usefixtures("named")
@@ -22,9 +22,10 @@ NETWORKS = ("classifier", "entropy")
 
 
 def slowly(out: Path) -> list[str]:
-    """The options of `mevs train` that train both networks slowly."""
-    rates = [f"--{network}.optimiser.learning-rate=1e-4" for network in NETWORKS]
-    return ["--preset", "tiny", "--out", str(out), *rates]
+    """The options of `mevs train` that train both networks slowly, for one epoch."""
+    slow = (("learning-rate", "1e-4"), ("epochs", "1"))
+    options = [f"--{network}.optimiser.{name}={value}" for network in NETWORKS for name, value in slow]
+    return ["--preset", "tiny", "--out", str(out), *options]
 
 
 def ended(process: subprocess.Popen, code: int) -> str:

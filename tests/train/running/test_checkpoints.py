@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import json
 import shutil
-from dataclasses import replace
+import signal
+from collections.abc import Iterator
 from pathlib import Path
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from flax import nnx
@@ -15,17 +17,14 @@ from flax import nnx
 from data_pipeline.dataset.statistics import load_statistics
 from data_pipeline.errors import DataError
 from data_pipeline.files import CHECKS
-from eval.settings import TINY
-from eval.stages import tasks
+from tests.reference.quick import quick_tasks
 from train.loop import fit, load_best
-from train.optimiser import OptimiserConfig
 from train.results.networks import trained_once
 from train.running.checkpoints import Checkpoints, damage_of
 
 
 def task_of(statistics):
-    optimiser = OptimiserConfig(epochs=2, batch_size=16, views_per_object=2, epoch_views=2, learning_rate=1e-2)
-    return replace(tasks(TINY, statistics)[1], optimiser=optimiser)
+    return quick_tasks(statistics, epochs=2)[1]
 
 
 @pytest.fixture(scope="module")
@@ -120,3 +119,34 @@ def test_a_stored_network_is_trained_again_where_it_is_damaged(tmp_path, capsys)
 def test_a_slot_that_never_held_a_save_is_not_damaged(tmp_path):
     with Checkpoints(tmp_path) as checkpoints:
         assert checkpoints.resume({"a": np.zeros(3)}, 1) is None
+
+
+@pytest.fixture
+def interruptible() -> Iterator[None]:
+    """Jobs in the background may have been started with interrupts ignored."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, before)
+
+
+@pytest.mark.usefixtures("interruptible")
+def test_an_interrupt_waits_for_the_checkpoint(tmp_path, monkeypatch):
+    """One that falls into Orbax would leave its threads waiting for each other, and the program with them."""
+    state = {"weights": jnp.arange(4.0)}
+    with Checkpoints(tmp_path) as checkpoints:
+        manager = checkpoints._slots["latest"]
+        save = manager.save
+
+        def interrupted(*arguments, **named):
+            signal.raise_signal(signal.SIGINT)
+            return save(*arguments, **named)
+
+        monkeypatch.setattr(manager, "save", interrupted)
+        with pytest.raises(KeyboardInterrupt):
+            checkpoints.save("latest", 1, state, {"epoch": 1})
+        restored = checkpoints.restore("latest", state)
+        assert restored is not None
+        assert restored[1] == {"epoch": 1}
+        np.testing.assert_array_equal(restored[0]["weights"], state["weights"])
+    with pytest.raises(KeyboardInterrupt):
+        signal.raise_signal(signal.SIGINT)

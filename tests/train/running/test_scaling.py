@@ -1,0 +1,75 @@
+"""One program, from one device to several processes: the same numbers, and nothing lost on the way."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import jax
+import numpy as np
+import pytest
+from flax import nnx
+
+from data_pipeline.dataset.statistics import load_statistics
+from eval.stages import tasks
+from tests.reference.processes import CPU
+from tests.reference.quick import lines, quick_tasks
+from tests.train.running.scaling_worker import SETTINGS
+from train.loop import fit, load_best
+
+
+def work(**asked) -> subprocess.CompletedProcess:
+    asked = {key: str(value) if isinstance(value, Path) else value for key, value in asked.items()}
+    return subprocess.run(
+        [sys.executable, "-m", "tests.train.running.scaling_worker", json.dumps(asked)],
+        capture_output=True,
+        text=True,
+        env=os.environ | CPU,
+        timeout=600,
+    )
+
+
+@pytest.mark.slow
+def test_steps_on_many_devices_equal_those_on_one(data):
+    """Dropout and augmentation on; both networks, and PointNet++ with its weights split in two as well.
+
+    Ten steps: after some dozens rounding decides whether a rectified unit is on, and how far the curves then part depends on the
+    processor. Batches and activations stay where they are: devices add up sums, and that is all they say to each other, unless
+    weights are split.
+    """
+    steps = 10
+    done = work(data=data, devices=8, steps=steps)
+    assert done.returncode == 0, done.stderr
+    found = json.loads(done.stdout)
+    alone, silent = found.pop("1")
+    assert len(alone) == len(tasks(SETTINGS, load_statistics(data))) == 2
+    assert all(not said for said in silent.values())
+    assert found["all"][1] == {name: ["all-reduce"] for name in alone}
+    for mesh, (curve, _) in found.items():
+        for name, losses in curve.items():
+            assert len(losses) == steps
+            assert np.std(losses) > 1e-3
+            np.testing.assert_allclose(losses, alone[name], rtol=1e-5, err_msg=f"{name} on {mesh}")
+
+
+@pytest.mark.slow
+def test_a_run_goes_on_with_fewer_devices(data, tmp_path):
+    """Four devices, told to end at a batch; then two, told to end; then one: as if one had done it all."""
+    whole, moved = tmp_path / "whole", tmp_path / "moved"
+    for devices, stop_at in ((4, 5), (2, 19)):
+        done = work(data=data, devices=devices, out=moved, stop_at=stop_at)
+        assert done.returncode == 143, done.stderr
+    statistics = load_statistics(data)
+    task = quick_tasks(statistics)[1]
+    for folder in (whole, moved):
+        fit(task, data, statistics, folder)
+    for mine, theirs in zip(lines(moved), lines(whole), strict=True):
+        assert mine.keys() == theirs.keys()
+        for key in set(mine) - {"seconds"}:
+            assert mine[key] == pytest.approx(theirs[key], rel=1e-4, abs=1e-7), key
+    states = [nnx.state(load_best(task, folder), nnx.Param) for folder in (moved, whole)]
+    for mine, theirs in zip(*map(jax.tree.leaves, states), strict=True):
+        np.testing.assert_allclose(mine, theirs, rtol=1e-3, atol=2e-4)
