@@ -12,7 +12,8 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
-from data_pipeline.capture.casting import CaptureConfig, rig_for
+from data_pipeline.capture.casting import rig_for
+from data_pipeline.capture.settings import CaptureConfig
 from data_pipeline.capture.workers import capture_entry, left_out_of, say_damaged, still_to_capture
 from data_pipeline.errors import DataError
 from data_pipeline.objects.mesh import ObjectEntry

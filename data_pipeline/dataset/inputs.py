@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int, Integer
 
-from data_pipeline.capture.casting import CaptureConfig
+from data_pipeline.capture.settings import CaptureConfig
 from mevs_jax.beliefs.entropy import DEPTH_STEP
 from mevs_jax.geometry import inputs
 from mevs_jax.geometry.cameras import ViewCamera

@@ -148,11 +148,7 @@ def hidden(key: Array, depth: Float[Array, "side side"], most: float | Array) ->
 
 
 def without_floor(
-    key: Array,
-    depth: Float[Array, "side side"],
-    pose: Float[Array, "4 4"],
-    camera: ViewCamera,
-    most: float | Array,
+    key: Array, depth: Float[Array, "side side"], pose: Float[Array, "4 4"], camera: ViewCamera, most: float | Array
 ) -> Float[Array, "side side"]:
     """Removes the lowest part of what the image shows, as happens where a table is removed with a margin.
 

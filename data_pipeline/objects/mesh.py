@@ -7,8 +7,8 @@ from typing import Protocol, runtime_checkable
 
 import numpy as np
 
-from data_pipeline.errors import DamagedMesh, EmptyMesh
-from data_pipeline.objects.checks import check_indices
+from data_pipeline.errors import DamagedMesh, EmptyMesh, naming
+from data_pipeline.objects.formats.polygons import check_indices
 
 MODELNET10_CLASSES = ("bathtub", "bed", "chair", "desk", "dresser", "monitor", "night_stand", "sofa", "table", "toilet")
 """The classes of ModelNet10 and of furniture10, in alphabetical order, which is the order of labels."""
@@ -93,7 +93,8 @@ def normalise(vertices: np.ndarray, faces: np.ndarray, where: str) -> Mesh:
         raise EmptyMesh("mesh has no faces")
     if len(faces) == 0:
         raise EmptyMesh(f"mesh has no faces: it is a point cloud of {len(vertices)} points")
-    check_indices(faces, len(vertices), where)
+    with naming(where):
+        check_indices(faces, len(vertices))
     used, compact = np.unique(faces, return_inverse=True)
     vertices, faces = vertices[used], compact.reshape(faces.shape)
     if not np.isfinite(vertices).all():

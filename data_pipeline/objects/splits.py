@@ -37,9 +37,8 @@ def divide(found: Sequence[Found], option: str, seed: int, where: str) -> list[F
     except ValueError:
         return _by_list(found, Path(option).expanduser())
     if not 0 < share < 1:
-        raise DataError(
-            f"--dataset.split {option} is no share of training objects; give a number between 0 and 1, such as 0.8"
-        )
+        advice = "give a number between 0 and 1, such as 0.8"
+        raise DataError(f"--dataset.split {option} is no share of training objects; {advice}")
     return _by_share(found, share, seed, where)
 
 
@@ -125,9 +124,8 @@ def _read_list(path: Path) -> Mapping[str, str]:
         DataError: if the file cannot be read, has another form, or has a name in two splits.
     """
     if path.suffix.lower() not in (".json", ".csv"):
-        raise DataError(
-            f"--dataset.split {path} is neither a share such as 0.8 nor a .json or .csv list; give one of them"
-        )
+        kinds = "a share such as 0.8 nor a .json or .csv list"
+        raise DataError(f"--dataset.split {path} is neither {kinds}; give one of them")
     try:
         text = path.read_text(encoding="utf-8-sig")
         pairs = _json_pairs(json.loads(text)) if path.suffix.lower() == ".json" else _csv_pairs(text)

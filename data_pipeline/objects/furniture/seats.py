@@ -136,9 +136,7 @@ def _sofa_body(
         parts.append(box(cushion - 0.02, depth - thick, 0.14, x, -thick / 2, seat - 0.12))
         if random.random() < 0.9:
             parts += tilt(
-                [box(cushion - 0.03, 0.14, back * 0.85, x, depth / 2 - thick, seat)],
-                0.15,
-                (x, depth / 2 - thick, seat),
+                [box(cushion - 0.03, 0.14, back * 0.85, x, depth / 2 - thick, seat)], 0.15, (x, depth / 2 - thick, seat)
             )
     parts.append(box(width, thick, seat + back - feet, 0, depth / 2 - thick / 2, feet))
     if arms:

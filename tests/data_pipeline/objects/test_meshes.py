@@ -11,7 +11,7 @@ import pytest
 import trimesh
 
 from data_pipeline.errors import DamagedMesh, DataError, EmptyMesh
-from data_pipeline.objects.formats import parse_mesh, parse_off
+from data_pipeline.objects.formats import parse_mesh
 from data_pipeline.objects.furniture import CLASSES, VARIANTS, furniture
 from data_pipeline.objects.mesh import normalise
 from data_pipeline.objects.sources import load_object, open_source
@@ -60,14 +60,14 @@ def mesh_folder(root: Path, classes=("cup", "jug"), suffix: str = "off") -> Path
     ids=["plain", "joined", "one-line", "comments", "windows", "blank-lines", "colours"],
 )
 def test_off_quirks_are_read(text):
-    vertices, faces = parse_off(text.encode(), "cube.off")
+    vertices, faces = parse_mesh(text.encode(), ".off", "cube.off")
     np.testing.assert_allclose(vertices, CUBE.vertices, atol=1e-6)
     np.testing.assert_array_equal(faces, CUBE.faces)
 
 
 def test_polygons_become_fans():
     text = "OFF\n5 2 0\n0 0 0\n1 0 0\n1 1 0\n0 1 0\n0 0 1\n4 0 1 2 3\n3 0 1 4\n"
-    _, faces = parse_off(text.encode(), "square.off")
+    _, faces = parse_mesh(text.encode(), ".off", "square.off")
     np.testing.assert_array_equal(faces, [[0, 1, 2], [0, 2, 3], [0, 1, 4]])
 
 
@@ -85,7 +85,7 @@ def test_polygons_become_fans():
 )
 def test_damaged_off_files_are_described(content, message):
     with pytest.raises(DamagedMesh, match=message) as caught:
-        parse_off(content, "bad.off")
+        parse_mesh(content, ".off", "bad.off")
     assert "bad.off" in str(caught.value)
     assert "\n" not in str(caught.value)
 
@@ -207,9 +207,9 @@ def test_real_voxels_have_the_official_split(real_voxels):
 
 def test_original_modelnet_meshes_are_read(real_meshes):
     for path in sorted(real_meshes.glob("*.off")):
-        mesh = normalise(*parse_off(path.read_bytes(), path.name), path.name)
+        mesh = normalise(*parse_mesh(path.read_bytes(), ".off", path.name), path.name)
         assert np.linalg.norm(mesh.vertices, axis=1).max() == pytest.approx(1, abs=1e-6)
-        ours = parse_off(path.read_bytes(), path.name)
+        ours = parse_mesh(path.read_bytes(), ".off", path.name)
         text = path.read_text()
         if text.startswith("OFF\n"):
             theirs = trimesh.load(io.StringIO(text), file_type="off", process=False)
