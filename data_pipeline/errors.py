@@ -49,6 +49,16 @@ def naming(where: str, kind: type[DataError] = DamagedMesh) -> Iterator[None]:
         raise kind(f"{where} {damage}") from damage
 
 
+def causes_of(error: BaseException) -> list[BaseException]:
+    """Returns an error, what it was raised for, and so on."""
+    chain: list[BaseException] = []
+    link: BaseException | None = error
+    while link is not None and link not in chain:
+        chain.append(link)
+        link = link.__cause__ or link.__context__
+    return chain
+
+
 class Diverged(ArithmeticError):
     """Numbers that are infinite or NaN: in a training, a network's outputs, or results computed from them.
 

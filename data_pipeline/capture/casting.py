@@ -17,7 +17,6 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
-from typing import Protocol, runtime_checkable
 
 import numpy as np
 
@@ -129,11 +128,8 @@ Cast = Callable[[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]
 """Maps origins and directions (rays, 3) to depths (rays,), inf for a miss, and the indices of the triangles hit (rays,)."""
 
 
-@runtime_checkable
-class Caster(Protocol):
-    """Prepares a mesh for ray casting."""
-
-    def __call__(self, mesh: Mesh) -> Cast: ...
+Caster = Callable[[Mesh], Cast]
+"""Prepares a mesh for ray casting."""
 
 
 def cast_open3d(mesh: Mesh) -> Cast:

@@ -59,9 +59,8 @@ def capture_entry(entry: ObjectEntry, rig: Rig, folder: Path, backend: str, skip
     try:
         seen = _BACKENDS[backend](load_object(entry), rig.around(entry.name))
         if not seen.depth.any():
-            raise EmptyMesh(
-                f"no view shows it: it is thinner than the pixels of {seen.depth.shape[1]}×{seen.depth.shape[2]} views"
-            )
+            pixels = f"{seen.depth.shape[1]}×{seen.depth.shape[2]}"
+            raise EmptyMesh(f"no view shows it: it is thinner than the pixels of {pixels} views")
         save_capture(capture_path(folder, entry), seen)
     except (EmptyMesh, DamagedMesh) as reason:
         if isinstance(reason, DamagedMesh) and not skip_damaged:

@@ -22,11 +22,7 @@ _rig_for = functools.cache(rig_for)
 
 
 def beam_options(options: str) -> Any:
-    """Returns Beam's pipeline options from a string such as `--runner=FlinkRunner --flink_master=host:8081`.
-
-    Raises:
-        DataError: if Beam is not installed.
-    """
+    """Returns Beam's pipeline options from a string such as `--runner=FlinkRunner --flink_master=host:8081`."""
     try:
         from apache_beam.options.pipeline_options import PipelineOptions
     except ImportError as error:

@@ -354,8 +354,11 @@ def _made(config: DataConfig, folder: Path, identity: dict[str, Any], beam: Any)
         folder.mkdir(parents=True, exist_ok=True)
         keep_json(made_with, identity)
     wait_for_all("captures begin")
-    if beam is None:
-        left_out = _capture(source.entries, config, captures)
+    if beam is None:  # several processes share the objects
+        own = [source.entries[index] for index in own_share(len(source.entries))]
+        capture_all(own, config.capture, captures, skip_damaged=config.skip_damaged)
+        wait_for_all("captures end")
+        left_out = left_out_of(source.entries, captures)
     else:
         left_out = capture_by_beam(source.entries, config.capture, captures, beam, skip_damaged=config.skip_damaged)
     split = split_objects(
@@ -374,14 +377,6 @@ def _made(config: DataConfig, folder: Path, identity: dict[str, Any], beam: Any)
         shutil.rmtree(captures, ignore_errors=True)
     wait_for_all("a data set is made")
     return load_statistics(folder)
-
-
-def _capture(entries: Sequence[ObjectEntry], config: DataConfig, captures: Path) -> dict[str, str]:
-    """Captures all objects, which several processes share; returns the names of those left out, with the reasons."""
-    own = [entries[index] for index in own_share(len(entries))]
-    capture_all(own, config.capture, captures, skip_damaged=config.skip_damaged)
-    wait_for_all("captures end")
-    return left_out_of(entries, captures)
 
 
 def open_split(folder: Path, split: str, only: Sequence[str] = ()) -> Any:

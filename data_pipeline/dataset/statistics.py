@@ -108,11 +108,7 @@ class StatisticsCollector:
         self.objects: dict[str, dict[str, tuple[int, np.ndarray, np.ndarray]]] = {split: {} for split in SPLITS}
 
     def add(self, split: str, name: str, example: dict[str, Any]) -> None:
-        """Adds the object `name` with its record `example`.
-
-        Raises:
-            Diverged: if an entropy of the object is infinite or NaN.
-        """
+        """Adds the object `name` with its record `example`; raises `Diverged` if its entropies are not finite."""
         if not np.isfinite(example["entropy"]).all():
             way_out = "leave this object out of the source, or repair its mesh"
             raise Diverged(f"the depth entropies of {name} are not finite; {way_out}")

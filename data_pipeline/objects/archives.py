@@ -64,14 +64,7 @@ def _open(archive: str) -> tuple[zipfile.ZipFile, dict[str, zipfile.ZipInfo], in
 
 @dataclass(frozen=True)
 class ZipMember:
-    """A mesh file in a zip archive.
-
-    Attributes:
-        archive: path of the archive.
-        member: path of the file in it, as `_opened` gives it.
-        stamp: checksum and size of the file.
-        up: which axis of the file is up.
-    """
+    """A mesh file in a zip archive by its path as `_opened` gives it; its checksum and size, and which axis is up."""
 
     archive: str
     member: str
@@ -167,9 +160,8 @@ def list_zip(archive: Path, up: Up = "auto") -> Listing:
     for name, info in members.items():
         parts = PurePosixPath(name).parts
         if name.startswith("/") or ".." in parts or (parts and ":" in parts[0]):
-            raise DataError(
-                f"{where} contains {shown(info.filename)!r}, a path that leaves its folder; do not trust this archive"
-            )
+            leaves = f"{shown(info.filename)!r}, a path that leaves its folder"
+            raise DataError(f"{where} contains {leaves}; do not trust this archive")
         hidden = next((part for part in parts if is_ignored(part)), None)
         if hidden is not None:
             ignored[kind_of_ignored(hidden)] += 1

@@ -33,13 +33,7 @@ class FurniturePiece:
 
 @dataclass(frozen=True)
 class MeshFile:
-    """A mesh file on disk.
-
-    Attributes:
-        path: path of the file.
-        stamp: state of the file when it was found, see `stamp_of`.
-        up: which axis of the file is up.
-    """
+    """A mesh file on disk, its state when it was found (`stamp_of`), and which of its axes is up."""
 
     path: str
     stamp: str = ""

@@ -35,6 +35,8 @@ from data_pipeline.objects.recipes import FurniturePiece, MeshFile
 from data_pipeline.objects.splits import divide
 from data_pipeline.objects.voxels import voxel_archive
 
+_LAID_OUT = "<class>/train/*.off and <class>/test/*.off"
+
 
 @dataclass(frozen=True)
 class Reading:
@@ -85,18 +87,12 @@ def furniture10(train_per_class: int, test_per_class: int) -> ObjectSource:
 
 
 def _arranged(listing: Listing, name: str, where: str, reading: Reading) -> ObjectSource:
-    """Returns the source that the files of a folder or zip make.
-
-    Raises:
-        DataError: if they have no known layout, a class has no meshes for a split, or there are fewer than two classes.
-    """
+    """Returns the source that the files of a folder or zip make."""
     found = list(listing.found)
     if not any(one.recipe is not None for one in found):
         unread = f" ({len(found)} files cannot be read: {found[0].path} {found[0].reason})" if found else ""
-        raise DataError(
-            f"{where} has no meshes laid out as <class>/train/*.off and <class>/test/*.off "
-            f"(or {', '.join(MESH_SUFFIXES[1:])}){unread}; pass --data a folder that has"
-        )
+        others = f"(or {', '.join(MESH_SUFFIXES[1:])}){unread}"
+        raise DataError(f"{where} has no meshes laid out as {_LAID_OUT} {others}; pass --data a folder that has")
     with_splits = has_split_folders(found)
     placed = by_split_folders(found) if with_splits else by_class_folders(found)
     notes: tuple[str, ...] = ()
@@ -106,10 +102,9 @@ def _arranged(listing: Listing, name: str, where: str, reading: Reading) -> Obje
         placed = divide(placed, reading.split, reading.seed, where)
     elif not with_splits:
         folders = {one.class_name for one in placed if one.class_name}
-        raise DataError(
-            f"{where} has {len(found)} meshes in {len(folders)} class folders and no meshes laid out as <class>/train/*.off and "
-            f"<class>/test/*.off; add --dataset.split 0.8 to train on 80 % of each class, or a .json or .csv list of splits"
-        )
+        there = f"{len(found)} meshes in {len(folders)} class folders and no meshes laid out as {_LAID_OUT}"
+        advice = "add --dataset.split 0.8 to train on 80 % of each class, or a .json or .csv list of splits"
+        raise DataError(f"{where} has {there}; {advice}")
     placed = sorted(without_copies(placed), key=lambda one: (one.class_name, one.split, one.parts))
     members = [one for one in placed if one.recipe is not None and one.class_name and one.split]
     _check_classes(placed, members, where, all_tested=reading.all_tested)
@@ -146,9 +141,8 @@ def _check_classes(placed: list[Found], members: list[Found], where: str, *, all
     for name in classes:
         if not any(there[name, split] for split in set(SPLIT_FOLDERS.values())):
             first = next(one for one in placed if one.class_name == name)
-            raise DataError(
-                f"{where}: no file of class {name} can be read ({first.path} {first.reason}); mend or remove the class"
-            )
+            why = f"no file of class {name} can be read ({first.path} {first.reason})"
+            raise DataError(f"{where}: {why}; mend or remove the class")
     if all_tested and members:
         return
     if len(classes) < 2:
@@ -261,8 +255,7 @@ def open_source(
         normalise(vertices, faces, str(path))
     except EmptyMesh as reason:
         raise DataError(f"{data} cannot be used: {reason}; --data takes a folder of meshes with faces") from reason
-    laid_out = "a folder laid out as <class>/train/*.off and <class>/test/*.off"
-    raise DataError(f"{data} is a single mesh; --data takes {laid_out}")
+    raise DataError(f"{data} is a single mesh; --data takes a folder laid out as {_LAID_OUT}")
 
 
 def together(sources: Sequence[ObjectSource]) -> ObjectSource:

@@ -1,4 +1,4 @@
-"""Text of mesh files: its encoding, its lines and its numbers."""
+"""Text of mesh files: its encoding, its lines and its numbers. A `ValueError` says which word is no number."""
 
 from __future__ import annotations
 
@@ -24,9 +24,6 @@ def text_of(content: bytes, kind: str) -> str:
 
     A byte order mark is removed. Without one, every byte is one character (Latin-1), since comments may have any encoding and
     all else is ASCII.
-
-    Raises:
-        Damage: if the file holds bytes that are not text.
     """
     if content.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
         text = content.decode("utf-16", errors="replace")
@@ -43,11 +40,7 @@ def without_comments(text: str) -> str:
 
 
 def number(word: str) -> float:
-    """Returns the number that a word spells, in any spelling of NaN.
-
-    Raises:
-        ValueError: if it spells none.
-    """
+    """Returns the number that a word spells, in any spelling of NaN."""
     try:
         return float(word)
     except ValueError:
@@ -57,20 +50,12 @@ def number(word: str) -> float:
 
 
 def whole_numbers(words: Iterable[str]) -> np.ndarray:
-    """Returns the integers that words spell, int64; those of more than 62 bits become smaller.
-
-    Raises:
-        ValueError: if a word is not an integer.
-    """
+    """Returns the integers that words spell, int64; those of more than 62 bits become smaller."""
     return np.array([int(word) for word in words], object).clip(-(2**62), 2**62).astype(np.int64)
 
 
 def numbers(text: str, kind: type = np.float64) -> np.ndarray:
-    """Returns all numbers of a text, separated by white space, as float64 or int64.
-
-    Raises:
-        ValueError: if a word is not a number of this kind.
-    """
+    """Returns all numbers of a text, separated by white space, as float64 or int64."""
     if not text or text.isspace():
         return np.zeros(0, kind)
     with warnings.catch_warnings():
@@ -82,11 +67,7 @@ def numbers(text: str, kind: type = np.float64) -> np.ndarray:
 
 
 def columns(lines: list[str], wanted: int) -> np.ndarray:
-    """Returns the first `wanted` numbers of every line, (lines, wanted) float64; further words of a line are ignored.
-
-    Raises:
-        ValueError: if a line has fewer words, or one of the wanted words is not a number.
-    """
+    """Returns the first `wanted` numbers of every line, (lines, wanted) float64; further words of a line are ignored."""
     with suppress(ValueError):  # words after the wanted ones may be anything
         values = numbers("\n".join(lines))
         if len(values) == wanted * len(lines) and all(len(lines[at].split()) == wanted for at in (0, -1) if lines):
