@@ -25,7 +25,7 @@ import numpy as np
 from data_pipeline.errors import Damage, DataError, reason_of
 from data_pipeline.objects.formats import MESH_SUFFIXES, Up
 from data_pipeline.objects.layout import Found, Listing
-from data_pipeline.objects.names import is_ignored, kind_of_ignored, shown, unread_reason
+from data_pipeline.objects.names import kind_of_ignored, shown, unread_reason
 from data_pipeline.objects.recipes import read_with
 
 LARGEST_MEMBER = 256 << 20
@@ -162,9 +162,8 @@ def list_zip(archive: Path, up: Up = "auto") -> Listing:
         if name.startswith("/") or ".." in parts or (parts and ":" in parts[0]):
             leaves = f"{shown(info.filename)!r}, a path that leaves its folder"
             raise DataError(f"{where} contains {leaves}; do not trust this archive")
-        hidden = next((part for part in parts if is_ignored(part)), None)
-        if hidden is not None:
-            ignored[kind_of_ignored(hidden)] += 1
+        if hidden := next(filter(None, map(kind_of_ignored, parts)), ""):
+            ignored[hidden] += 1
             continue
         place, identity = tuple(shown(part) for part in parts), (name,)
         if PurePosixPath(name).suffix.lower() in MESH_SUFFIXES:

@@ -30,7 +30,7 @@ from data_pipeline.objects.layout import (
     without_copies,
 )
 from data_pipeline.objects.mesh import MODELNET10_CLASSES, SOURCE_SPLITS, Mesh, ObjectEntry, ObjectSource, normalise
-from data_pipeline.objects.names import is_ignored, plain_class, say_ignored, shown
+from data_pipeline.objects.names import kind_of_ignored, plain_class, say_ignored, shown
 from data_pipeline.objects.recipes import FurniturePiece, MeshFile
 from data_pipeline.objects.splits import divide
 from data_pipeline.objects.voxels import voxel_archive
@@ -174,7 +174,7 @@ def mesh_folder(folder: Path, reading: Reading = Reading()) -> ObjectSource:
     listing = list_folder(folder, reading.up)
     inside = {one.parts[:2] for one in listing.found}
     for child in sorted(folder.iterdir()):
-        if is_ignored(child.name) or not child.is_dir():
+        if kind_of_ignored(child.name) or not child.is_dir():
             continue
         if not any(child.iterdir()):
             raise DataError(f"class folder {child} is empty; put meshes into its train and test folders, or remove it")
