@@ -34,10 +34,10 @@ from data_pipeline.dataset.origin import open_objects as open_objects
 from data_pipeline.dataset.proof import (
     SHARDS,
     SOURCE_STATE,
-    Objects,
     damage_of_settings,
     found_in,
     keep_checks_of_shards,
+    open_split,
     state_before,
 )
 from data_pipeline.dataset.statistics import SPLITS, SUMMARY, DatasetStatistics, StatisticsCollector, load_statistics
@@ -377,15 +377,3 @@ def _made(config: DataConfig, folder: Path, identity: dict[str, Any], beam: Any)
         shutil.rmtree(captures, ignore_errors=True)
     wait_for_all("a data set is made")
     return load_statistics(folder)
-
-
-def open_split(folder: Path, split: str, only: Sequence[str] = ()) -> Any:
-    """Returns a random-access source of the objects of one split: `source[i]` is a dictionary of NumPy arrays.
-
-    Args:
-        only: keys of that dictionary; only these, where the data set has them, are decoded. All by default.
-
-    Raises:
-        DataError: if there are no shards, or damaged ones.
-    """
-    return Objects(folder, split, only)
