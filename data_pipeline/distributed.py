@@ -15,7 +15,7 @@ import jax
 import numpy as np
 from jax.experimental import multihost_utils
 
-from data_pipeline.errors import DataError
+from data_pipeline.errors import DataError, causes_of
 
 
 def join_processes() -> None:
@@ -122,8 +122,5 @@ _LOST = ("gloo", "coordination service", "heartbeat", "connection closed by peer
 
 def is_lost_process(error: BaseException) -> bool:
     """Returns whether an error of JAX's runtime means that another process of this training has ended or is unreachable."""
-    chain, link = [], error
-    while link is not None and link not in chain:
-        chain.append(link)
-        link = link.__cause__ or link.__context__  # type: ignore[assignment]
-    return jax.process_count() > 1 and any(sign in str(link).lower() for link in chain for sign in _LOST)
+    said = [str(link).lower() for link in causes_of(error)]
+    return jax.process_count() > 1 and any(sign in words for words in said for sign in _LOST)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 
@@ -27,6 +29,34 @@ class DamagedMesh(DataError):
 
     The summary of a data set stores the messages of objects left out, so they are part of its fingerprint.
     """
+
+
+class Damage(Exception):
+    """What is wrong with a file: the message of an error without the name of the file, with which it begins."""
+
+
+def cut_short(there: str) -> Damage:
+    """Returns the damage of a file that ends early; `there` says what of it is there."""
+    return Damage(f"is cut short: {there}; fetch or export it again")
+
+
+@contextmanager
+def naming(where: str, kind: type[DataError] = DamagedMesh) -> Iterator[None]:
+    """Raises an error of this kind with the name of a file in place of `Damage`."""
+    try:
+        yield
+    except Damage as damage:
+        raise kind(f"{where} {damage}") from damage
+
+
+def causes_of(error: BaseException) -> list[BaseException]:
+    """Returns an error, what it was raised for, and so on."""
+    chain: list[BaseException] = []
+    link: BaseException | None = error
+    while link is not None and link not in chain:
+        chain.append(link)
+        link = link.__cause__ or link.__context__
+    return chain
 
 
 class Diverged(ArithmeticError):

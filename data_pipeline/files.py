@@ -20,7 +20,7 @@ from typing import Any
 
 import numpy as np
 
-from data_pipeline.errors import DataError, Unreadable
+from data_pipeline.errors import DataError, Unreadable, causes_of
 
 CHECKS = "checks.json"
 """File name of the checks of the files in a folder."""
@@ -58,11 +58,7 @@ def why_not_written(error: BaseException) -> str | None:
 
     Libraries raise their own kinds of errors, with the system's words in their messages, so the causes are looked through too.
     """
-    chain: list[BaseException] = []
-    link: BaseException | None = error
-    while link is not None and link not in chain:
-        chain.append(link)
-        link = link.__cause__ or link.__context__
+    chain = causes_of(error)
     for link in chain:
         if isinstance(link, OSError) and (sentence := _sentence(link, link.filename)):
             return sentence

@@ -16,7 +16,6 @@ from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Executor, ProcessPoolExecutor, ThreadPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
-from functools import partial
 from io import FileIO
 from pathlib import Path
 from typing import Any, TypeVar
@@ -26,9 +25,6 @@ from data_pipeline.progress import console
 
 Job = TypeVar("Job")
 Result = TypeVar("Result")
-
-_note: FileIO | None = None
-"""In a worker process, the file that names what it works on."""
 
 
 def usable_cpus() -> int:
@@ -45,30 +41,32 @@ def _end_with_parent() -> None:
     os._exit(1)
 
 
-_GIVEN = "given"
-"""File of the folder of notes that holds what a worker process is started with.
+_TASK = "task"
+"""File of the folder of notes that holds what worker processes do: the work, what it is given, and how jobs are named.
 
 Python writes the arguments of a new process into a pipe before the process reads them. More than the pipe holds (64 KB on Linux)
 would block this process for ever if the new one dies first.
 """
 
+_task: tuple[Callable[..., Any], tuple, Callable[[Any], str], FileIO]
+"""The same in a worker process, and the file that names what it works on."""
+
 
 def _begin(notes: Path) -> None:
     """Starts a worker process."""
-    global _note
+    global _task
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent handles Ctrl-C and ends its workers
     threading.Thread(target=_end_with_parent, daemon=True).start()  # a parent that is killed cannot
-    _note = FileIO(notes / str(os.getpid()), "w")
-    start, given = pickle.loads((notes / _GIVEN).read_bytes())
-    start(*given)
+    note = FileIO(notes / str(os.getpid()), "w")
+    _task = *pickle.loads((notes / _TASK).read_bytes()), note
 
 
-def _noted(work: Callable[[Job], Result], name_of: Callable[[Job], str], job: Job) -> Result:
-    if _note is not None:
-        _note.seek(0)
-        _note.truncate()
-        _note.write(name_of(job).encode("utf-8", "replace"))
-    return work(job)
+def _noted(job: Any) -> Any:
+    work, given, name_of, note = _task
+    note.seek(0)
+    note.truncate()
+    note.write(name_of(job).encode("utf-8", "replace"))
+    return work(job, *given)
 
 
 def _death(children: Sequence[Any], notes: Path) -> DataError:
@@ -105,26 +103,37 @@ def _is_broken(pool: Executor) -> bool:
     return False
 
 
+def _pool(workers: int, notes: Path, task: tuple) -> Executor | None:
+    """Returns a pool of processes, or None, with a message, where they cannot be started.
+
+    Semaphores cannot be made in `/dev/shm`, or the folder for temporary files is full.
+    """
+    try:
+        (notes / _TASK).write_bytes(pickle.dumps(task))
+        return ProcessPoolExecutor(workers, multiprocessing.get_context("spawn"), _begin, (notes,))
+    except OSError as error:
+        reason = f"{error.strerror}; are /dev/shm and {notes} writable?"
+        console.print(f"Worker processes cannot be started ({reason}), so one process does the work", markup=False)
+        return None
+
+
 @contextmanager
 def shared(
-    work: Callable[[Job], Result],
+    work: Callable[..., Result],
     jobs: Sequence[Job],
     *,
-    workers: int,
-    start: Callable[..., None],
     given: tuple,
+    workers: int,
     name_of: Callable[[Job], str],
     threads: bool = False,
     chunk: int = 4,
 ) -> Iterator[Iterator[Result]]:
-    """Yields an iterator over the results of `work` for all jobs, in order.
+    """Yields an iterator over the results of `work(job, *given)` for all jobs, in order.
 
-    Where processes cannot be started, because semaphores cannot be made in `/dev/shm` or the folder for temporary files is full,
-    this process does the work.
+    Where processes cannot be started, this process does the work.
 
     Args:
         workers: number of processes or threads.
-        start: called first in each of them, with the arguments `given`.
         name_of: returns the name of a job, for the message if its process dies.
         threads: whether to use threads.
         chunk: number of jobs that a process is given at a time.
@@ -132,45 +141,49 @@ def shared(
     Raises:
         DataError: if a process dies.
     """
-    with tempfile.TemporaryDirectory(prefix="mevs-", ignore_cleanup_errors=True) as folder:
-        notes, children = Path(folder), list[Any]()
-        pool: Executor | None = None
-        try:
-            if threads:
-                pool = ThreadPoolExecutor(workers, initializer=start, initargs=given)
-            else:
-                spawn = multiprocessing.get_context("spawn")
-                (notes / _GIVEN).write_bytes(pickle.dumps((start, given)))
-                pool = ProcessPoolExecutor(workers, spawn, _begin, (notes,))
-        except OSError as error:
-            where = f"are /dev/shm and {folder} writable?"
-            console.print(
-                f"Worker processes cannot be started ({error.strerror}; {where}), so one process does the work",
-                markup=False,
-            )
-        if pool is None:
-            start(*given)
-            yield map(work, jobs)
-            return
-        before = set(multiprocessing.active_children())
 
-        def begun() -> list[Any]:
-            return [child for child in multiprocessing.active_children() if child not in before]
+    def do(job: Job) -> Result:
+        return work(job, *given)
 
+    if threads:
+        some = ThreadPoolExecutor(workers)
         try:
-            try:
-                results = pool.map(partial(_noted, work, name_of), jobs, chunksize=chunk)
-            except BrokenPipeError as error:  # a process died before Python had given it its work
-                raise _death(begun(), notes) from error
-            children = begun()
-            yield results
-        except BaseException as error:
-            if isinstance(error, Exception) and _is_broken(pool):
-                raise _death(children, notes) from error
-            raise
+            yield some.map(do, jobs)
         finally:
-            # Idle processes are ended, too: if one were killed now, others would wait for ever for a lock that it held.
-            running = begun()
-            for child in running:
-                child.terminate()
-            pool.shutdown(wait=bool(children or running), cancel_futures=True)
+            some.shutdown(wait=False, cancel_futures=True)
+        return
+    with tempfile.TemporaryDirectory(prefix="mevs-", ignore_cleanup_errors=True) as folder:
+        pool = _pool(workers, Path(folder), (work, given, name_of))
+        if pool is None:
+            yield map(do, jobs)
+            return
+        with _mapped(pool, jobs, Path(folder), chunk) as results:
+            yield results
+
+
+@contextmanager
+def _mapped(pool: Executor, jobs: Sequence[Any], notes: Path, chunk: int) -> Iterator[Iterator[Any]]:
+    """Yields an iterator over the results of a pool of processes, which end afterwards."""
+    before = set(multiprocessing.active_children())
+
+    def begun() -> list[Any]:
+        return [child for child in multiprocessing.active_children() if child not in before]
+
+    children: list[Any] = []
+    try:
+        try:
+            results = pool.map(_noted, jobs, chunksize=chunk)
+        except BrokenPipeError as error:  # a process died before Python had given it its work
+            raise _death(begun(), notes) from error
+        children = begun()
+        yield results
+    except Exception as error:
+        if _is_broken(pool):
+            raise _death(children, notes) from error
+        raise
+    finally:
+        # Idle processes are ended, too: if one were killed now, others would wait for ever for a lock that it held.
+        running = begun()
+        for child in running:
+            child.terminate()
+        pool.shutdown(wait=bool(children or running), cancel_futures=True)

@@ -17,50 +17,21 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
-from typing import Literal, Protocol, runtime_checkable
 
 import numpy as np
 
-from data_pipeline.errors import DataError
+from data_pipeline.capture.settings import DEPTH_SCALE, CaptureConfig, check_camera
+from data_pipeline.capture.viewpoints import viewpoints_of
 from data_pipeline.files import npz_bytes, write_bytes
 from data_pipeline.objects.mesh import Mesh
 from data_pipeline.objects.open3d_parts import load_open3d
 
-DEPTH_SCALE = 10_000
-"""Stored depth units per metric unit. Equal to that of `mevs_jax.beliefs.entropy`, which imports JAX; a test compares them."""
-
 AMBIENT = 0.25
 """Grey level, in [0, 1], of a surface seen edge-on."""
-
-LARGEST_RESOLUTION = 4096
-"""Largest number of pixels along each side of a view."""
 
 _RAYS_PER_BATCH = 100_000
 _ROUNDING = 1e-3
 """Radii by which a hit may be outside of the unit sphere."""
-
-
-@dataclass(frozen=True)
-class CaptureConfig:
-    """How objects are captured."""
-
-    views: int = 40
-    """number of candidate viewpoints, at least 2"""
-    lattice: str = "golden_angle"
-    """their arrangement: the Fibonacci lattice of the thesis's published code (golden_angle) or of its eq. (8) (equation8),
-    nested (the 10 views are among the 40), five rings, or the corners of a Platonic solid (tetrahedron, octahedron, cube,
-    icosahedron, dodecahedron); or your own: file:PATH, directions as JSON or CSV (docs/own.md)"""
-    turned: bool = False
-    """rotate the lattice at random for each object, so that training sees a different set of directions with every object"""
-    resolution: int = 224
-    """pixels along each side of a view"""
-    distance: float = 2.0
-    """distance of the camera from the object's centre, in radii of the object"""
-    field_of_view: float = 60.0
-    """field of view in degrees"""
-    backend: Literal["raycast", "rasterise", "visualizer"] = "raycast"
-    """renderer: ray casting on the CPU, rasterisation by a JAX program that can run on an accelerator, or the thesis's method,
-    an Open3D window, which needs a display"""
 
 
 @dataclass(frozen=True)
@@ -126,28 +97,6 @@ class Capture:
     radius: float = np.nan
 
 
-def check_camera(config: CaptureConfig) -> None:
-    """Checks the numbers of a capture, apart from the number of views, which depends on the lattice.
-
-    Raises:
-        DataError: if a number is out of its range, or the depth of some object would not fit 16 bits.
-    """
-    farthest = 65535 / DEPTH_SCALE - 1  # the unit sphere ends one radius behind its centre
-    if not 1 < config.distance <= farthest:
-        raise DataError(
-            f"--dataset.capture.distance {config.distance:g} is not above 1 (the radius of an object) and at most "
-            f"{farthest:.2f}, since depth is stored in 16 bits, up to {farthest + 1:.2f} radii; choose another"
-        )
-    if not 0 < config.field_of_view < 180:
-        raise DataError(
-            f"--dataset.capture.field-of-view {config.field_of_view:g} is not between 0 and 180 degrees; choose another"
-        )
-    if not 1 <= config.resolution <= LARGEST_RESOLUTION:
-        raise DataError(
-            f"--dataset.capture.resolution {config.resolution} is not from 1 to {LARGEST_RESOLUTION} pixels; choose another"
-        )
-
-
 def rig_for(config: CaptureConfig) -> Rig:
     """Returns the cameras that `config` describes.
 
@@ -158,7 +107,6 @@ def rig_for(config: CaptureConfig) -> Rig:
     check_camera(config)
     import jax
 
-    from data_pipeline.capture.viewpoints import viewpoints_of  # which needs this module
     from mevs_jax.geometry.cameras import cameras_at, pixel_directions
 
     cameras = cameras_at(
@@ -180,11 +128,8 @@ Cast = Callable[[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]
 """Maps origins and directions (rays, 3) to depths (rays,), inf for a miss, and the indices of the triangles hit (rays,)."""
 
 
-@runtime_checkable
-class Caster(Protocol):
-    """Prepares a mesh for ray casting."""
-
-    def __call__(self, mesh: Mesh) -> Cast: ...
+Caster = Callable[[Mesh], Cast]
+"""Prepares a mesh for ray casting."""
 
 
 def cast_open3d(mesh: Mesh) -> Cast:

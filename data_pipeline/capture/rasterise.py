@@ -11,7 +11,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from data_pipeline.capture.casting import AMBIENT, DEPTH_SCALE, Capture, Rig, face_normals
+from data_pipeline.capture.casting import AMBIENT, Capture, Rig, face_normals
+from data_pipeline.capture.settings import DEPTH_SCALE
 from data_pipeline.objects.mesh import Mesh
 from mevs_jax.geometry.cameras import Camera, pixel_directions
 from mevs_jax.rendering import pad_triangles, render_depth

@@ -111,7 +111,6 @@ def sense(
         key: of this image.
         depth: along the optical axis, in radii, 0 where nothing is hit.
         pose: camera to object.
-        camera: that took the image.
         config: the sensor; its distance gives the size of a radius in metres.
         strength: overrides `config.strength`.
         surface: key of the object's dark areas, the same for all of its views; other areas in every view if left out.

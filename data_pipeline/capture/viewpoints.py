@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from data_pipeline.capture.casting import CaptureConfig
+from data_pipeline.capture.settings import CaptureConfig
 from data_pipeline.errors import DataError
 from data_pipeline.files import short_hash
 

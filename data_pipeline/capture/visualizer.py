@@ -16,6 +16,7 @@ from data_pipeline.capture.casting import Capture, Rig, store_depth
 from data_pipeline.errors import DataError
 from data_pipeline.objects.mesh import Mesh
 from data_pipeline.objects.open3d_parts import load_open3d
+from data_pipeline.objects.reconstruction import surface_of
 
 
 def capture_with_visualizer(mesh: Mesh, rig: Rig) -> Capture:
@@ -27,21 +28,18 @@ def capture_with_visualizer(mesh: Mesh, rig: Rig) -> Capture:
     try:
         open3d = load_open3d()
     except (ImportError, OSError) as error:
-        raise DataError(
-            f"the visualizer backend needs Open3D, which cannot be loaded here ({error}); use --dataset.capture.backend raycast"
-        ) from error
+        reason = f"which cannot be loaded here ({error})"
+        way_out = "use --dataset.capture.backend raycast"
+        raise DataError(f"the visualizer backend needs Open3D, {reason}; {way_out}") from error
 
     views, side = rig.directions.shape[:2]
     focal = side / 2 / math.tan(rig.field_of_view / 2)
     visualizer = open3d.visualization.Visualizer()
     if not visualizer.create_window(width=side, height=side, visible=False):
-        raise DataError(
-            "the visualizer backend needs a display; run it under xvfb-run -a, or use --dataset.capture.backend raycast"
-        )
+        way_out = "run it under xvfb-run -a, or use --dataset.capture.backend raycast"
+        raise DataError(f"the visualizer backend needs a display; {way_out}")
     try:
-        surface = open3d.geometry.TriangleMesh(
-            open3d.utility.Vector3dVector(mesh.vertices.astype(np.float64)), open3d.utility.Vector3iVector(mesh.faces)
-        )
+        surface = surface_of(mesh)
         surface.compute_triangle_normals()
         visualizer.add_geometry(surface)
         options = visualizer.get_render_option()
@@ -52,9 +50,8 @@ def capture_with_visualizer(mesh: Mesh, rig: Rig) -> Capture:
         for view in range(views):
             camera = open3d.camera.PinholeCameraParameters()
             # Open3D accepts only this principal point, half a pixel off; its images are centred all the same.
-            camera.intrinsic = open3d.camera.PinholeCameraIntrinsic(
-                side, side, focal, focal, side / 2 - 0.5, side / 2 - 0.5
-            )
+            middle = side / 2 - 0.5
+            camera.intrinsic = open3d.camera.PinholeCameraIntrinsic(side, side, focal, focal, middle, middle)
             camera.extrinsic = np.linalg.inv(rig.poses[view].astype(np.float64))
             if not control.convert_from_pinhole_camera_parameters(camera, allow_arbitrary=True):
                 raise DataError(f"Open3D's window rejected a camera of {side}×{side} pixels; use another resolution")

@@ -6,11 +6,13 @@ Worker processes import this module, so neither it nor the modules it imports ma
 from __future__ import annotations
 
 import hashlib
+import operator
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
 
-from data_pipeline.capture.casting import Capture, CaptureConfig, Rig, capture, rig_for, save_capture
+from data_pipeline.capture.casting import Capture, Rig, capture, rig_for, save_capture
+from data_pipeline.capture.settings import CaptureConfig
 from data_pipeline.capture.visualizer import capture_with_visualizer
 from data_pipeline.errors import DamagedMesh, EmptyMesh
 from data_pipeline.files import PARTIAL, npz_of, write_text
@@ -57,9 +59,8 @@ def capture_entry(entry: ObjectEntry, rig: Rig, folder: Path, backend: str, skip
     try:
         seen = _BACKENDS[backend](load_object(entry), rig.around(entry.name))
         if not seen.depth.any():
-            raise EmptyMesh(
-                f"no view shows it: it is thinner than the pixels of {seen.depth.shape[1]}×{seen.depth.shape[2]} views"
-            )
+            pixels = f"{seen.depth.shape[1]}×{seen.depth.shape[2]}"
+            raise EmptyMesh(f"no view shows it: it is thinner than the pixels of {pixels} views")
         save_capture(capture_path(folder, entry), seen)
     except (EmptyMesh, DamagedMesh) as reason:
         if isinstance(reason, DamagedMesh) and not skip_damaged:
@@ -88,40 +89,6 @@ def left_out_of(entries: Sequence[ObjectEntry], folder: Path) -> dict[str, str]:
 _FEW_OBJECTS = 64
 """Up to this many objects are captured without worker processes. A worker needs about five seconds to start, in which this
 process captures one or two hundred small meshes."""
-
-_settings: tuple[Rig, Path, str, bool] | None = None
-"""The arguments of `capture_entry` after the entry, in a worker."""
-
-
-def _start_worker(rig: Rig, folder: Path, backend: str, skip_damaged: bool) -> None:
-    global _settings
-    _settings = rig, folder, backend, skip_damaged
-
-
-def _work(entry: ObjectEntry) -> str | None:
-    assert _settings is not None
-    return capture_entry(entry, *_settings)
-
-
-@contextmanager
-def _captured(
-    todo: Sequence[ObjectEntry], workers: int, rig: Rig, folder: Path, backend: str, skip_damaged: bool
-) -> Iterator[Iterator[str | None]]:
-    """Yields an iterator over what `capture_entry` returns for each object, in order."""
-    settings = rig, folder, backend, skip_damaged
-    if workers == 1 and backend == "raycast":
-        yield (capture_entry(entry, *settings) for entry in todo)
-        return
-    # Rasterisation is one program on one device; its threads read meshes and write captures.
-    threads = backend == "rasterise"
-    with shared(
-        _work, todo, workers=workers, start=_start_worker, given=settings, name_of=_name_of, threads=threads
-    ) as captured:
-        yield captured
-
-
-def _name_of(entry: ObjectEntry) -> str:
-    return entry.name
 
 
 def say_damaged(damage: str) -> DamagedMesh:
@@ -153,10 +120,17 @@ def capture_all(
     todo = still_to_capture(entries, folder)
     if todo:
         workers = workers or (1 if len(todo) <= _FEW_OBJECTS else usable_cpus())
-        settings = rig_for(config), folder, config.backend, skip_damaged
-        with progress_bar("objects") as bar, _captured(todo, min(workers, len(todo)), *settings) as captured:
+        workers, given = min(workers, len(todo)), (rig_for(config), folder, config.backend, skip_damaged)
+        captured: AbstractContextManager[Iterator[str | None]]
+        if workers == 1 and config.backend == "raycast":
+            captured = nullcontext(capture_entry(entry, *given) for entry in todo)
+        else:
+            # Rasterisation is one program on one device; its threads read meshes and write captures.
+            threads, name_of = config.backend == "rasterise", operator.attrgetter("name")
+            captured = shared(capture_entry, todo, given=given, workers=workers, name_of=name_of, threads=threads)
+        with progress_bar("objects") as bar, captured as damages:
             task = bar.add_task("Capturing", total=len(entries), completed=len(entries) - len(todo), note="")
-            for damage in captured:
+            for damage in damages:
                 if damage:
                     raise say_damaged(damage)
                 bar.advance(task)

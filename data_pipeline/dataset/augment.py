@@ -14,7 +14,7 @@ import jax.numpy as jnp
 from jax.scipy.spatial.transform import Rotation
 from jaxtyping import Array, Float, Int
 
-from data_pipeline.capture.casting import CaptureConfig
+from data_pipeline.capture.settings import CaptureConfig
 from mevs_jax.geometry.cameras import Camera, look_at_origin, pixel_directions
 
 

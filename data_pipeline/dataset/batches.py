@@ -50,9 +50,8 @@ class ViewBatches:
 
     def __post_init__(self) -> None:
         if self.fold is not None and self.validation_by == "view":
-            raise ValueError(
-                "folds are parts of the objects; with validation by view, an object of each part is trained on"
-            )
+            why = "with validation by view, an object of each part is trained on"
+            raise ValueError(f"folds are parts of the objects; {why}")
 
 
 VIEWS_ASIDE = 0.2
@@ -211,9 +210,8 @@ def objects_per_batch(config: ViewBatches) -> int:
         ValueError: if the batch size is not a multiple of the views per object.
     """
     if config.batch_size % config.views_per_object:
-        raise ValueError(
-            f"batch size {config.batch_size} is not a multiple of {config.views_per_object} views per object; change either"
-        )
+        views = f"{config.views_per_object} views per object"
+        raise ValueError(f"batch size {config.batch_size} is not a multiple of {views}; change either")
     return config.batch_size // config.views_per_object
 
 
@@ -236,9 +234,8 @@ def train_batches(
     index, processes = (0, 1) if whole else (jax.process_index(), jax.process_count())
     per_batch = objects_per_batch(config)
     if per_batch % processes:
-        raise ValueError(
-            f"{per_batch} objects per batch cannot be shared by {processes} processes; choose another batch size"
-        )
+        share = f"{per_batch} objects per batch cannot be shared by {processes} processes"
+        raise ValueError(f"{share}; choose another batch size")
     import grain  # imported late: it takes a sixth of a second
 
     # The order is drawn anew for every epoch, and a batch may contain objects of two successive epochs.

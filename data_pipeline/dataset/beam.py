@@ -12,7 +12,8 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
-from data_pipeline.capture.casting import CaptureConfig, rig_for
+from data_pipeline.capture.casting import rig_for
+from data_pipeline.capture.settings import CaptureConfig
 from data_pipeline.capture.workers import capture_entry, left_out_of, say_damaged, still_to_capture
 from data_pipeline.errors import DataError
 from data_pipeline.objects.mesh import ObjectEntry
@@ -21,11 +22,7 @@ _rig_for = functools.cache(rig_for)
 
 
 def beam_options(options: str) -> Any:
-    """Returns Beam's pipeline options from a string such as `--runner=FlinkRunner --flink_master=host:8081`.
-
-    Raises:
-        DataError: if Beam is not installed.
-    """
+    """Returns Beam's pipeline options from a string such as `--runner=FlinkRunner --flink_master=host:8081`."""
     try:
         from apache_beam.options.pipeline_options import PipelineOptions
     except ImportError as error:

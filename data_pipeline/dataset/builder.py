@@ -22,34 +22,28 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from data_pipeline.capture.casting import Capture, CaptureConfig, Rig, check_camera, load_capture, rig_for
+from data_pipeline.capture.casting import Capture, Rig, load_capture, rig_for
+from data_pipeline.capture.settings import CaptureConfig, check_camera
 from data_pipeline.capture.viewpoints import identified, viewpoints_of
 from data_pipeline.capture.workers import capture_all, capture_entry, capture_path, left_out_of, say_damaged
 from data_pipeline.dataset.beam import beam_options, capture_by_beam, examples_by_beam
 from data_pipeline.dataset.config import DataConfig as DataConfig
 from data_pipeline.dataset.config import check_viewpoints, identity_of
+from data_pipeline.dataset.origin import changes_between, state_of
 from data_pipeline.dataset.origin import open_objects as open_objects
-from data_pipeline.dataset.origin import state_of
 from data_pipeline.dataset.proof import (
     SHARDS,
     SOURCE_STATE,
-    Objects,
     damage_of_settings,
     found_in,
     keep_checks_of_shards,
+    open_split,
     state_before,
 )
-from data_pipeline.dataset.statistics import (
-    SPLITS,
-    SUMMARY,
-    DatasetStatistics,
-    StatisticsCollector,
-    load_statistics,
-)
+from data_pipeline.dataset.statistics import SPLITS, SUMMARY, DatasetStatistics, StatisticsCollector, load_statistics
 from data_pipeline.distributed import agreed, is_first, own_share, wait_for_all
 from data_pipeline.errors import DataError, reason_of
 from data_pipeline.files import check_of_file, keep_checks, keep_json
-from data_pipeline.objects.changes import changes_between
 from data_pipeline.objects.mesh import SOURCE_SPLITS, ObjectEntry, ObjectSource
 from data_pipeline.progress import console, progress_bar
 from mevs_jax.beliefs.entropy import level_entropy
@@ -253,12 +247,16 @@ def _write_shards(
     )
 
 
+def _changes(config: DataConfig, folder: Path) -> str:
+    """Returns how the source has changed since the data set in `folder` was made; empty if it has not, or it is not known."""
+    before = state_before(folder)
+    now = None if before is None else state_of(config)
+    return "" if before is None or now is None else changes_between(before, now)
+
+
 def _say_changes(config: DataConfig, folder: Path) -> None:
     """Prints a sentence if the source has changed since the data set in `folder` was made."""
-    before = state_before(folder)
-    if before is None or (now := state_of(config)) is None:
-        return
-    if changes := changes_between(before, now):
+    if changes := _changes(config, folder):
         console.print(
             f"{config.source} has changed since its data set was made ({changes}); {folder} keeps the objects as they were: "
             f"delete it, or choose another --out, to capture them again",
@@ -299,8 +297,7 @@ def _reasons(source: ObjectSource, left_out: dict[str, str]) -> dict[str, dict[s
 def _check_source(config: DataConfig, folder: Path, damage: str) -> None:
     """Raises DataError if a damaged data set cannot be made again, since its source is gone or has changed."""
     try:
-        before, now = state_before(folder), state_of(config)
-        changes = before is not None and now is not None and changes_between(before, now)
+        changes = _changes(config, folder)
         open_objects(config)
     except DataError as error:
         raise DataError(f"{damage}, and the data set cannot be made again: {error}") from error
@@ -327,9 +324,8 @@ def prepare(config: DataConfig, folder: Path, beam: str | None = None) -> Datase
     check_camera(config.capture)
     check_viewpoints(config.capture, (folder / SUMMARY).exists())
     if not 0 <= config.validation_share < 1:
-        raise DataError(
-            f"--dataset.validation-share {config.validation_share:g} is not at least 0 and below 1; choose another"
-        )
+        share = f"--dataset.validation-share {config.validation_share:g}"
+        raise DataError(f"{share} is not at least 0 and below 1; choose another")
     identity = identity_of(config, folder)
     damage = damage_of_settings(folder, identity)
     if agreed((folder / SUMMARY).exists()):
@@ -358,8 +354,11 @@ def _made(config: DataConfig, folder: Path, identity: dict[str, Any], beam: Any)
         folder.mkdir(parents=True, exist_ok=True)
         keep_json(made_with, identity)
     wait_for_all("captures begin")
-    if beam is None:
-        left_out = _capture(source.entries, config, captures)
+    if beam is None:  # several processes share the objects
+        own = [source.entries[index] for index in own_share(len(source.entries))]
+        capture_all(own, config.capture, captures, skip_damaged=config.skip_damaged)
+        wait_for_all("captures end")
+        left_out = left_out_of(source.entries, captures)
     else:
         left_out = capture_by_beam(source.entries, config.capture, captures, beam, skip_damaged=config.skip_damaged)
     split = split_objects(
@@ -378,23 +377,3 @@ def _made(config: DataConfig, folder: Path, identity: dict[str, Any], beam: Any)
         shutil.rmtree(captures, ignore_errors=True)
     wait_for_all("a data set is made")
     return load_statistics(folder)
-
-
-def _capture(entries: Sequence[ObjectEntry], config: DataConfig, captures: Path) -> dict[str, str]:
-    """Captures all objects, which several processes share; returns the names of those left out, with the reasons."""
-    own = [entries[index] for index in own_share(len(entries))]
-    capture_all(own, config.capture, captures, skip_damaged=config.skip_damaged)
-    wait_for_all("captures end")
-    return left_out_of(entries, captures)
-
-
-def open_split(folder: Path, split: str, only: Sequence[str] = ()) -> Any:
-    """Returns a random-access source of the objects of one split: `source[i]` is a dictionary of NumPy arrays.
-
-    Args:
-        only: keys of that dictionary; only these, where the data set has them, are decoded. All by default.
-
-    Raises:
-        DataError: if there are no shards, or damaged ones.
-    """
-    return Objects(folder, split, only)

@@ -6,7 +6,7 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from data_pipeline.capture.casting import CaptureConfig
+from data_pipeline.capture.settings import CaptureConfig
 from data_pipeline.capture.viewpoints import FILE, identified, is_file, viewpoints_of
 from data_pipeline.dataset.statistics import SUMMARY, load_statistics
 from data_pipeline.differences import differences, in_words

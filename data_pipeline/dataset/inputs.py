@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int, Integer
 
-from data_pipeline.capture.casting import CaptureConfig
+from data_pipeline.capture.settings import CaptureConfig
 from mevs_jax.beliefs.entropy import DEPTH_STEP
 from mevs_jax.geometry import inputs
 from mevs_jax.geometry.cameras import ViewCamera
@@ -52,13 +52,5 @@ def cloud_input(
     frame: str,
     directions: bool = False,
 ) -> Float[Array, "points 3"] | Float[Array, "points 6"]:
-    """Returns the points at the sampled pixels of one stored view, as `mevs_jax.geometry.inputs.view_cloud`.
-
-    Args:
-        pixels: flat pixel indices.
-        pixel_depth: stored depth at these pixels.
-        pose: camera to world.
-        frame: `world` or `camera`, as in `mevs_jax.geometry.cameras.unproject`.
-        directions: append to each point the unit vector towards the camera.
-    """
+    """Returns the points at the sampled pixels of one stored view, as `mevs_jax.geometry.inputs.view_cloud`."""
     return inputs.view_cloud(pixels, metric_depth(pixel_depth), pose, view_camera(camera), frame, directions)

@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
+import os
+import zipfile
+import zlib
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
 from data_pipeline.dataset.config import DataConfig
 from data_pipeline.errors import DataError
-from data_pipeline.objects.changes import source_state
 from data_pipeline.objects.downloads import ARCHIVES, download, download_folder, local
+from data_pipeline.objects.folders import list_folder
 from data_pipeline.objects.mesh import SOURCE_SPLITS, ObjectSource
+from data_pipeline.objects.names import shown
 from data_pipeline.objects.sources import Reading, mesh_zip, open_source, together
 from data_pipeline.progress import console
 
@@ -39,10 +43,8 @@ def _check_apart(every: Sequence[str]) -> None:
     for index, path in enumerate(paths):
         for number, other in enumerate(paths):
             if number != index and (path == other or other in path.parents):
-                raise DataError(
-                    f"{every[max(index, number)]} is given twice, as --data or in --dataset.more, or lies in another of them; "
-                    "leave one out"
-                )
+                twice = "is given twice, as --data or in --dataset.more, or lies in another of them"
+                raise DataError(f"{every[max(index, number)]} {twice}; leave one out")
 
 
 def _alone(config: DataConfig, data: str) -> DataConfig:
@@ -102,3 +104,39 @@ def state_of(config: DataConfig) -> dict[str, str] | None:
         if (more := None if one in ARCHIVES else source_state(one)) is not None:
             found = (found or {}) | {f"{one}: {name}": stamp for name, stamp in more.items()}
     return found
+
+
+def source_state(data: str, split: str = "") -> dict[str, str] | None:
+    """Returns the state of each file of a source: size and time of files, checksum and size of members of archives.
+
+    Args:
+        data: path of a folder, .zip or .npz.
+        split: path of a list of splits, or anything else.
+
+    Returns:
+        the states by path; None if there are no files, or they cannot be read.
+    """
+    path = Path(os.path.expanduser(data))
+    try:
+        if path.is_dir():
+            found = {one.path: getattr(one.recipe, "stamp", "") for one in list_folder(path).found}
+            # The last part, the time of the last change of any kind, differs between copies of one file.
+            state = {name: stamp.rsplit("-", 1)[0] for name, stamp in found.items()}
+        elif path.suffix.lower() in (".zip", ".npz"):
+            with zipfile.ZipFile(path) as archive:
+                state = {shown(info.filename): f"{info.CRC:08x}-{info.file_size}" for info in archive.infolist()}
+        else:
+            return None
+        if split.lower().endswith((".json", ".csv")):
+            state["the list of --dataset.split"] = f"{zlib.crc32(Path(split).expanduser().read_bytes()):08x}"
+    except (OSError, DataError, ValueError, NotImplementedError, zipfile.BadZipFile):
+        return None
+    return state
+
+
+def changes_between(before: dict[str, str], now: dict[str, str]) -> str:
+    """Returns how many files changed, came and went, with an example; empty if none did."""
+    changed = sorted(name for name in before.keys() & now.keys() if before[name] != now[name])
+    new, gone = sorted(now.keys() - before.keys()), sorted(before.keys() - now.keys())
+    counts = [f"{len(names)} {kind}" for names, kind in ((changed, "changed"), (new, "new"), (gone, "gone")) if names]
+    return f"{', '.join(counts)}, such as {(changed + new + gone)[0]}" if counts else ""

@@ -82,17 +82,20 @@ def _unusable(folder: Path, damage: str) -> DataError:
     return DataError(f"{damage}; delete {folder / SHARDS}, and make it again with: mevs data --out {out}")
 
 
-class Objects:
-    """Random access to the objects of one split: `objects[i]` is a dictionary of NumPy arrays.
+def open_split(folder: Path, split: str, only: Sequence[str] = ()) -> Any:
+    """Returns a random-access source of the objects of one split: `source[i]` is a dictionary of NumPy arrays.
 
     Args:
-        folder: of the data set.
-        split: name of the split.
         only: keys of that dictionary; only these, where the data set has them, are decoded. All by default.
 
     Raises:
-        DataError: when shards that are damaged are opened or read.
+        DataError: if there are no shards, or damaged ones.
     """
+    return Objects(folder, split, only)
+
+
+class Objects:
+    """The objects of one split, see `open_split`."""
 
     def __init__(self, folder: Path, split: str, only: Sequence[str] = ()):
         import tensorflow_datasets as tfds

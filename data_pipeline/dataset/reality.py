@@ -53,9 +53,8 @@ def used_reality(config: RealityAugmentation, option: str) -> RealityAugmentatio
     limits = {"strength": (0, 4), "sphere": (0, 0.5), "floor": (0, 1), "hidden": (0, 0.9), "distance": (0.1, 10)}
     for name, (least, most) in limits.items():
         if not least <= getattr(config, name) <= most:
-            raise DataError(
-                f"{option}.{name} {getattr(config, name):g} is not from {least:g} to {most:g}; choose another"
-            )
+            given = f"{option}.{name} {getattr(config, name):g}"
+            raise DataError(f"{given} is not from {least:g} to {most:g}; choose another")
     if config.strength * config.sphere > 0.5 or config.strength * config.floor > 1:
         raise DataError(
             f"{option}.strength {config.strength:g} times .sphere {config.sphere:g} is above 0.5, or times .floor "
@@ -73,10 +72,7 @@ def realistic_views(
     sensors, all images of a batch have one or the other.
 
     Args:
-        key: of the batch.
         batch: with `depth` and `pose`, the views of an object one after another.
-        camera: that took them.
-        config: the errors.
         views: number of views of each object in the batch.
 
     Returns:
@@ -112,9 +108,6 @@ def as_in_reality(
         of_object: key of what all views of the object share: strength, sphere, dark areas.
         depth: in radii, 0 where nothing is hit.
         pose: camera to object.
-        camera: that took the image.
-        config: the errors.
-        kind: of the sensor.
     """
     hide, cut, noise = jax.random.split(key, 3)
     amount, surface, where, size = jax.random.split(of_object, 4)
@@ -148,11 +141,7 @@ def hidden(key: Array, depth: Float[Array, "side side"], most: float | Array) ->
 
 
 def without_floor(
-    key: Array,
-    depth: Float[Array, "side side"],
-    pose: Float[Array, "4 4"],
-    camera: ViewCamera,
-    most: float | Array,
+    key: Array, depth: Float[Array, "side side"], pose: Float[Array, "4 4"], camera: ViewCamera, most: float | Array
 ) -> Float[Array, "side side"]:
     """Removes the lowest part of what the image shows, as happens where a table is removed with a margin.
 

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from data_pipeline.capture.casting import CaptureConfig
+from data_pipeline.capture.settings import CaptureConfig
 from data_pipeline.errors import DataError, Diverged
 from data_pipeline.files import digest_of, read_json
 from data_pipeline.progress import console
@@ -108,15 +108,10 @@ class StatisticsCollector:
         self.objects: dict[str, dict[str, tuple[int, np.ndarray, np.ndarray]]] = {split: {} for split in SPLITS}
 
     def add(self, split: str, name: str, example: dict[str, Any]) -> None:
-        """Adds the object `name` with its record `example`.
-
-        Raises:
-            Diverged: if an entropy of the object is infinite or NaN.
-        """
+        """Adds the object `name` with its record `example`; raises `Diverged` if its entropies are not finite."""
         if not np.isfinite(example["entropy"]).all():
-            raise Diverged(
-                f"the depth entropies of {name} are not finite; leave this object out of the source, or repair its mesh"
-            )
+            way_out = "leave this object out of the source, or repair its mesh"
+            raise Diverged(f"the depth entropies of {name} are not finite; {way_out}")
         points = np.count_nonzero(example["depth"], axis=(1, 2))
         self.objects[split][name] = int(example["label"]), example["entropy"], points
 
@@ -172,11 +167,10 @@ def load_statistics(folder: Path) -> DatasetStatistics:
 
 def report_left_out(statistics: DatasetStatistics) -> None:
     """Prints the size of a data set, and which objects were left out and why."""
-    objects = sum(sum(by_class.values()) for by_class in statistics.counts.values())
+    objects = statistics.objects_of(tuple(statistics.counts))
     sizes = ", ".join(f"{sum(by_class.values())} {split}" for split, by_class in statistics.counts.items())
-    console.print(
-        f"Data set: {objects} objects ({sizes}), {statistics.views} views each, {statistics.left_out_count} left out"
-    )
+    views = f"{statistics.views} views each, {statistics.left_out_count} left out"
+    console.print(f"Data set: {objects} objects ({sizes}), {views}")
     for by_name in statistics.left_out.values():
         for name, reason in by_name.items():
             console.print(f"  left out: {name}: {reason}", style="dim", soft_wrap=True, markup=False)

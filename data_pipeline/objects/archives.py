@@ -22,11 +22,11 @@ from pathlib import Path, PurePosixPath
 
 import numpy as np
 
-from data_pipeline.errors import DamagedMesh, DataError, reason_of
-from data_pipeline.objects.formats import MESH_SUFFIXES, Up, parse_mesh
+from data_pipeline.errors import Damage, DataError, reason_of
+from data_pipeline.objects.formats import MESH_SUFFIXES, Up
 from data_pipeline.objects.layout import Found, Listing
-from data_pipeline.objects.names import is_ignored, kind_of_ignored, shown, unread_reason
-from data_pipeline.objects.recipes import within
+from data_pipeline.objects.names import kind_of_ignored, shown, unread_reason
+from data_pipeline.objects.recipes import read_with
 
 LARGEST_MEMBER = 256 << 20
 """Largest unpacked size of a member in bytes. A small archive can declare, and unpack to, any size."""
@@ -64,14 +64,7 @@ def _open(archive: str) -> tuple[zipfile.ZipFile, dict[str, zipfile.ZipInfo], in
 
 @dataclass(frozen=True)
 class ZipMember:
-    """A mesh file in a zip archive.
-
-    Attributes:
-        archive: path of the archive.
-        member: path of the file in it, as `_opened` gives it.
-        stamp: checksum and size of the file.
-        up: which axis of the file is up.
-    """
+    """A mesh file in a zip archive by its path as `_opened` gives it; its checksum and size, and which axis is up."""
 
     archive: str
     member: str
@@ -80,30 +73,22 @@ class ZipMember:
 
     def load(self) -> tuple[np.ndarray, np.ndarray]:
         where = f"{shown(self.member)} in {shown(self.archive)}"
-        content = self._content(self.member, where)
-        return parse_mesh(content, PurePosixPath(self.member).suffix.lower(), where, up=self.up, sibling=self._sibling)
+        return read_with(self._content, self.member, where, self.up)
 
-    def _sibling(self, name: str) -> bytes:
-        where = f"{shown(self.member)} in {shown(self.archive)} needs {shown(name)!r}, which"
-        return self._content(posixpath.normpath(str(PurePosixPath(self.member).parent / within(name, where))), where)
-
-    def _content(self, member: str, where: str) -> bytes:
+    def _content(self, member: str) -> bytes:
         try:
             opened, members, _ = _open(self.archive)
-            info = members.get(member)
-            if info is None:
-                raise DamagedMesh(f"{where} is not in the archive; pack it again")
-            if reason := unreadable(info):
-                raise DamagedMesh(f"{where} {reason}")
+            info = members.get(posixpath.normpath(member))
+            reason = "is not in the archive; pack it again" if info is None else unreadable(info)
+            if info is None or reason:
+                raise Damage(reason)
             content = _unpacked(opened, info)
-        except DataError:
+        except Damage:
             raise
         except Exception as error:  # damaged streams raise errors of zipfile, zlib, lzma, struct and others
-            raise DamagedMesh(
-                f"{where} cannot be unpacked ({reason_of(error)}); download or pack the archive again"
-            ) from error
+            raise Damage(f"cannot be unpacked ({reason_of(error)}); download or pack the archive again") from error
         if len(content) > LARGEST_MEMBER:
-            raise DamagedMesh(f"{where} {_too_large()}")
+            raise Damage(_too_large())
         return content
 
 
@@ -175,12 +160,10 @@ def list_zip(archive: Path, up: Up = "auto") -> Listing:
     for name, info in members.items():
         parts = PurePosixPath(name).parts
         if name.startswith("/") or ".." in parts or (parts and ":" in parts[0]):
-            raise DataError(
-                f"{where} contains {shown(info.filename)!r}, a path that leaves its folder; do not trust this archive"
-            )
-        hidden = next((part for part in parts if is_ignored(part)), None)
-        if hidden is not None:
-            ignored[kind_of_ignored(hidden)] += 1
+            leaves = f"{shown(info.filename)!r}, a path that leaves its folder"
+            raise DataError(f"{where} contains {leaves}; do not trust this archive")
+        if hidden := next(filter(None, map(kind_of_ignored, parts)), ""):
+            ignored[hidden] += 1
             continue
         place, identity = tuple(shown(part) for part in parts), (name,)
         if PurePosixPath(name).suffix.lower() in MESH_SUFFIXES:

@@ -18,15 +18,7 @@ _TIMEOUT = 20.0
 
 @dataclass(frozen=True)
 class Archive:
-    """A published data set in one file.
-
-    Attributes:
-        name: name of the data set.
-        url: address of the file.
-        sha256: checksum of the file.
-        size: size in bytes; None if only the server knows it.
-        classes, train, test: numbers of classes, training objects and test objects.
-    """
+    """A published data set in one file, of `size` bytes, or None if only the server knows it; and how much is in it."""
 
     name: str
     url: str
@@ -89,9 +81,8 @@ def download(archive: Archive, folder: Path) -> Path:
         with urllib.request.urlopen(urllib.request.Request(archive.url, method="HEAD"), timeout=_TIMEOUT) as response:
             size = archive.size or int(response.headers["Content-Length"])
         tfds.disable_progress_bar()
-        console.print(
-            f"Downloading {archive.name}, {size / 1e6:,.0f} MB, to {folder}; it is for academic research only"
-        )
+        what = f"{archive.name}, {size / 1e6:,.0f} MB"
+        console.print(f"Downloading {what}, to {folder}; it is for academic research only")
         manager = tfds.download.DownloadManager(
             download_dir=folder,
             dataset_name=archive.name.lower(),
@@ -100,9 +91,8 @@ def download(archive: Archive, folder: Path) -> Path:
         )
         return Path(manager.download(archive.url))
     except NonMatchingChecksumError as error:
-        raise DataError(
-            f"the file at {archive.url} is not {archive.name}: its size or SHA-256 differs; {advice}"
-        ) from error
+        differs = f"is not {archive.name}: its size or SHA-256 differs"
+        raise DataError(f"the file at {archive.url} {differs}; {advice}") from error
     except (urllib.error.URLError, requests.RequestException, OSError, TypeError) as error:
         reason = str(getattr(error, "reason", error)).splitlines()[0]
         raise DataError(f"{archive.name} could not be downloaded ({reason}); {advice}") from error
@@ -119,7 +109,6 @@ def local(archive: Archive, path: Path) -> Path:
     except OSError as error:
         raise DataError(f"--archive {path} cannot be read: {error.strerror}") from error
     if digest != archive.sha256:
-        console.print(
-            f"{path} is not the official {archive.name} (SHA-256 {digest[:16]}…); it is used unchanged", style="dim"
-        )
+        other = f"is not the official {archive.name} (SHA-256 {digest[:16]}…)"
+        console.print(f"{path} {other}; it is used unchanged", style="dim")
     return path

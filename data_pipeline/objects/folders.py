@@ -11,7 +11,7 @@ from data_pipeline.errors import DataError
 from data_pipeline.files import short_hash
 from data_pipeline.objects.formats import MESH_SUFFIXES, Up
 from data_pipeline.objects.layout import Found, Listing
-from data_pipeline.objects.names import is_ignored, kind_of_ignored, shown, unread_reason
+from data_pipeline.objects.names import kind_of_ignored, shown, unread_reason
 from data_pipeline.objects.recipes import MeshFile, Unreadable, stamp_of
 
 _MOST_VISITS = 32
@@ -45,8 +45,8 @@ def list_folder(root: Path, up: Up = "auto") -> Listing:
         buffers = _state_of_buffers(entries) if has_gltf else ""
         for entry in entries:
             place, is_link = (*parts, shown(entry.name)), linked or entry.is_symlink()
-            if is_ignored(entry.name):
-                ignored[kind_of_ignored(entry.name)] += 1
+            if hidden := kind_of_ignored(entry.name):
+                ignored[hidden] += 1
                 continue
             try:
                 status = entry.stat()

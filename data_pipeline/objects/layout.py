@@ -77,25 +77,17 @@ def has_split_folders(found: Sequence[Found]) -> bool:
 
 def by_split_folders(found: Sequence[Found]) -> list[Found]:
     """Returns the files with class and split where their path has both."""
-    places = [_split_at(one.parts) for one in found]
-    meshes = [
-        (one.parts, at) for one, at in zip(found, places, strict=True) if at is not None and one.recipe is not None
-    ]
-    if _class_follows(meshes):
-        classes = [
-            at + 1 if at is not None and at + 2 < len(one.parts) else None
-            for one, at in zip(found, places, strict=True)
-        ]
-    else:
-        classes = [at - 1 if at else None for at in places]
-    placed = []
-    for one, at, class_at in zip(found, places, classes, strict=True):
-        if at is None or class_at is None:
-            placed.append(one)
-        else:
-            split = SPLIT_FOLDERS[one.parts[at].lower()]
-            placed.append(replace(one, class_name=one.parts[class_at], split=split, head=min(at, class_at)))
-    return placed
+    places = [(one.parts, _split_at(one.parts)) for one in found if one.recipe is not None]
+    follows = _class_follows([(parts, at) for parts, at in places if at is not None])
+
+    def placed(one: Found) -> Found:
+        at = _split_at(one.parts)
+        if at is None or not 0 <= (class_at := at + 1 if follows else at - 1) < len(one.parts) - 1:
+            return one
+        split = SPLIT_FOLDERS[one.parts[at].lower()]
+        return replace(one, class_name=one.parts[class_at], split=split, head=min(at, class_at))
+
+    return [placed(one) for one in found]
 
 
 def _class_follows(places: list[tuple[tuple[str, ...], int]]) -> bool:
@@ -131,8 +123,8 @@ def by_class_folders(found: Sequence[Found]) -> list[Found]:
     ):
         depth += 1
         inside = [one for one in inside if len(one.parts) > depth + 1]
-    classed = {id(one) for one in inside}
-    return [replace(one, class_name=one.parts[depth], head=depth) if id(one) in classed else one for one in found]
+    lies = depth + 1
+    return [replace(one, class_name=one.parts[depth], head=depth) if len(one.parts) > lies else one for one in found]
 
 
 def without_copies(found: Sequence[Found]) -> list[Found]:

@@ -7,8 +7,8 @@ from typing import Protocol, runtime_checkable
 
 import numpy as np
 
-from data_pipeline.errors import DamagedMesh, EmptyMesh
-from data_pipeline.objects.checks import check_indices
+from data_pipeline.errors import DamagedMesh, EmptyMesh, naming
+from data_pipeline.objects.formats.polygons import check_indices
 
 MODELNET10_CLASSES = ("bathtub", "bed", "chair", "desk", "dresser", "monitor", "night_stand", "sofa", "table", "toilet")
 """The classes of ModelNet10 and of furniture10, in alphabetical order, which is the order of labels."""
@@ -61,9 +61,7 @@ class ObjectSource:
     """A list of objects.
 
     Attributes:
-        name: name of the source.
         classes: names of the classes, in the order of the labels.
-        entries: the objects.
         left_out: files left out when the source was listed, by split and name, with the reasons. Files without a split are under
             `other`.
         notes: sentences on how files were read, for the summary of the data set.
@@ -93,14 +91,13 @@ def normalise(vertices: np.ndarray, faces: np.ndarray, where: str) -> Mesh:
         raise EmptyMesh("mesh has no faces")
     if len(faces) == 0:
         raise EmptyMesh(f"mesh has no faces: it is a point cloud of {len(vertices)} points")
-    check_indices(faces, len(vertices), where)
+    with naming(where):
+        check_indices(faces, len(vertices))
     used, compact = np.unique(faces, return_inverse=True)
     vertices, faces = vertices[used], compact.reshape(faces.shape)
     if not np.isfinite(vertices).all():
-        bad = int((~np.isfinite(vertices).all(axis=1)).sum())
-        raise DamagedMesh(
-            f"{where} has {bad} vertices that are not finite (NaN or infinite); repair it or take it away"
-        )
+        bad = f"{int((~np.isfinite(vertices).all(axis=1)).sum())} vertices that are not finite (NaN or infinite)"
+        raise DamagedMesh(f"{where} has {bad}; repair it or take it away")
     if np.abs(vertices).max() > LARGEST_COORDINATE:
         raise DamagedMesh(f"{where} has coordinates beyond {LARGEST_COORDINATE:g}; repair it or take it away")
     low, high = vertices.min(axis=0), vertices.max(axis=0)

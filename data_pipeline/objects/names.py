@@ -13,18 +13,13 @@ _PACKED = (".gz", ".bz2", ".xz", ".zst")
 
 def shown(name: str) -> str:
     """Returns a path as printable text: bytes that are not UTF-8 and control characters become escapes such as `\\xfc`."""
-    text = os.fsencode(name).decode("utf-8", "backslashreplace") if not _is_unicode(name) else name
-    if text.isprintable():
-        return text
-    return "".join(c if c.isprintable() else c.encode("unicode_escape").decode("ascii") for c in text)
-
-
-def _is_unicode(name: str) -> bool:
     try:
         name.encode()
     except UnicodeEncodeError:
-        return False
-    return True
+        name = os.fsencode(name).decode("utf-8", "backslashreplace")
+    if name.isprintable():
+        return name
+    return "".join(c if c.isprintable() else c.encode("unicode_escape").decode("ascii") for c in name)
 
 
 def plain_class(name: str) -> str:
@@ -36,9 +31,16 @@ def plain_class(name: str) -> str:
     return letters.removesuffix("s") if len(letters) > 3 else letters
 
 
-def is_ignored(name: str) -> bool:
-    """Returns whether a file or folder is ignored by rule: what macOS adds to folders and archives, and hidden files."""
-    return name.startswith(".") or name == "__MACOSX"
+def kind_of_ignored(name: str) -> str:
+    """Returns the kind under which a file or folder is counted that is ignored by rule; empty for others.
+
+    What macOS adds to folders and archives is ignored, and hidden files.
+    """
+    if name in (".DS_Store", "__MACOSX"):
+        return name
+    if name.startswith("._"):
+        return "._*"
+    return "hidden" if name.startswith(".") else ""
 
 
 def unread_reason(name: str) -> str | None:
@@ -59,10 +61,3 @@ def say_ignored(ignored: Counter[str]) -> tuple[str, ...]:
         return ()
     kinds = ", ".join(f"{count} × {kind}" for kind, count in sorted(ignored.items()))
     return (f"ignored by rule: {kinds}",)
-
-
-def kind_of_ignored(name: str) -> str:
-    """Returns the kind under which an ignored file or folder is counted."""
-    if name in (".DS_Store", "__MACOSX") or name.startswith("._"):
-        return name if not name.startswith("._") else "._*"
-    return "hidden"

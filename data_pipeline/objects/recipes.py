@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 
 import numpy as np
 
-from data_pipeline.errors import DamagedMesh
+from data_pipeline.errors import Damage, DamagedMesh, naming
 from data_pipeline.objects.formats import MESH_SUFFIXES, Up, parse_mesh
 from data_pipeline.objects.names import shown
 
@@ -32,26 +33,14 @@ class FurniturePiece:
 
 @dataclass(frozen=True)
 class MeshFile:
-    """A mesh file on disk.
-
-    Attributes:
-        path: path of the file.
-        stamp: state of the file when it was found, see `stamp_of`.
-        up: which axis of the file is up.
-    """
+    """A mesh file on disk, its state when it was found (`stamp_of`), and which of its axes is up."""
 
     path: str
     stamp: str = ""
     up: Up = "auto"
 
     def load(self) -> tuple[np.ndarray, np.ndarray]:
-        where = shown(self.path)
-        content = _content(self.path, where)
-        return parse_mesh(content, Path(self.path).suffix.lower(), where, up=self.up, sibling=self._sibling)
-
-    def _sibling(self, name: str) -> bytes:
-        where = f"{shown(self.path)} needs {shown(name)!r}, which"
-        return _content(os.path.join(os.path.dirname(self.path), within(name, where)), where)
+        return read_with(_content, self.path, shown(self.path), self.up)
 
 
 def read_mesh(path: str | Path, up: Up = "auto") -> tuple[np.ndarray, np.ndarray]:
@@ -65,34 +54,46 @@ def read_mesh(path: str | Path, up: Up = "auto") -> tuple[np.ndarray, np.ndarray
         DataError: if it is not a mesh that can be read.
     """
     if Path(path).suffix.lower() not in MESH_SUFFIXES:
-        known = ", ".join(MESH_SUFFIXES)
-        raise DamagedMesh(
-            f"{shown(str(path))} has no suffix of a mesh that is read here ({known}); convert it to one of them"
-        )
+        known = f"a mesh that is read here ({', '.join(MESH_SUFFIXES)})"
+        raise DamagedMesh(f"{shown(str(path))} has no suffix of {known}; convert it to one of them")
     return MeshFile(str(path), up=up).load()
 
 
-def _content(path: str, where: str) -> bytes:
-    try:
-        if os.path.getsize(path) > LARGEST_FILE:
-            raise DamagedMesh(f"{where} is larger than {LARGEST_FILE >> 30} GB; export a simpler mesh")
-        return Path(path).read_bytes()
-    except OSError as error:
-        raise DamagedMesh(f"{where} cannot be read: {error.strerror}") from error
-    except ValueError as error:  # a name with a NUL character
-        raise DamagedMesh(f"{where} cannot be read: {error}") from error
+def read_with(content_of: Callable[[str], bytes], path: str, where: str, up: Up) -> tuple[np.ndarray, np.ndarray]:
+    """Returns the vertices (n, 3), z up, and triangles (m, 3) of a mesh file, which may need others of its folder.
 
-
-def within(name: str, where: str) -> str:
-    """Returns a relative path inside the folder of a mesh file, with slashes.
+    Args:
+        content_of: returns the content of a file by its path, or raises `Damage`.
+        path: of the mesh file.
+        where: its name for error messages.
+        up: which axis of the file is up.
 
     Raises:
-        DamagedMesh: if the path leaves the folder, or is an address.
+        DamagedMesh: if it, or a file that it needs, cannot be read.
     """
-    path = PurePosixPath(name.replace("\\", "/"))
-    if path.is_absolute() or ".." in path.parts or ":" in name:
-        raise DamagedMesh(f"{where} is outside of its folder; put both into one folder, or export as .glb")
-    return str(path)
+    folder = path.removesuffix(os.path.basename(path))
+
+    def sibling(name: str) -> bytes:
+        with naming(f"{where} needs {shown(name)!r}, which"):
+            inside = PurePosixPath(name.replace("\\", "/"))
+            if inside.is_absolute() or ".." in inside.parts or ":" in name:
+                raise Damage("is outside of its folder; put both into one folder, or export as .glb")
+            return content_of(f"{folder}{inside}")
+
+    with naming(where):
+        content = content_of(path)
+    return parse_mesh(content, PurePosixPath(path).suffix.lower(), where, up=up, sibling=sibling)
+
+
+def _content(path: str) -> bytes:
+    try:
+        if os.path.getsize(path) > LARGEST_FILE:
+            raise Damage(f"is larger than {LARGEST_FILE >> 30} GB; export a simpler mesh")
+        return Path(path).read_bytes()
+    except OSError as error:
+        raise Damage(f"cannot be read: {error.strerror}") from error
+    except ValueError as error:  # a name with a NUL character
+        raise Damage(f"cannot be read: {error}") from error
 
 
 def stamp_of(status: os.stat_result) -> str:

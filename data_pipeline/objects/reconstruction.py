@@ -35,7 +35,8 @@ def require_open3d() -> None:
         raise DataError(f"reconstruction and voxelisation need Open3D, but {reason}")
 
 
-def _surface(mesh: Mesh) -> Any:
+def surface_of(mesh: Mesh) -> Any:
+    """Returns a mesh as Open3D has it."""
     utility = load_open3d().utility
     return load_open3d().geometry.TriangleMesh(
         utility.Vector3dVector(mesh.vertices.astype(np.float64)), utility.Vector3iVector(mesh.faces)
@@ -50,7 +51,7 @@ def decimate(mesh: Mesh, faces: int) -> Mesh:
     """Returns the mesh simplified to about `faces` triangles, or unchanged if it has no more than that."""
     if len(mesh.faces) <= faces:
         return mesh
-    surface = _surface(mesh)
+    surface = surface_of(mesh)
     surface.merge_close_vertices(1e-6)  # the faces of a CAD model often share no vertices and could not be simplified
     simpler = surface.simplify_quadric_decimation(faces)
     vertices, faces_left = np.asarray(simpler.vertices, np.float32), np.asarray(simpler.triangles, np.int32)
@@ -100,10 +101,8 @@ def reconstruct(points: np.ndarray, normals: np.ndarray, faces: int, *, depth: i
 
 def voxelise(mesh: Mesh, nodes: int = 32) -> np.ndarray:
     """Returns the density (nodes, nodes, nodes), float32: 1 in every voxel of [−1, 1]³ that the surface intersects, else 0."""
-    surface = _surface(mesh)
-    grid = load_open3d().geometry.VoxelGrid.create_from_triangle_mesh_within_bounds(
-        surface, 2 / nodes, -np.ones(3), np.ones(3)
-    )
+    voxel_grid, low = load_open3d().geometry.VoxelGrid, -np.ones(3)
+    grid = voxel_grid.create_from_triangle_mesh_within_bounds(surface_of(mesh), 2 / nodes, low, -low)
     return _density([voxel.grid_index for voxel in grid.get_voxels()], nodes)
 
 

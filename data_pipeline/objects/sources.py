@@ -30,10 +30,12 @@ from data_pipeline.objects.layout import (
     without_copies,
 )
 from data_pipeline.objects.mesh import MODELNET10_CLASSES, SOURCE_SPLITS, Mesh, ObjectEntry, ObjectSource, normalise
-from data_pipeline.objects.names import is_ignored, plain_class, say_ignored, shown
+from data_pipeline.objects.names import kind_of_ignored, plain_class, say_ignored, shown
 from data_pipeline.objects.recipes import FurniturePiece, MeshFile
 from data_pipeline.objects.splits import divide
 from data_pipeline.objects.voxels import voxel_archive
+
+_LAID_OUT = "<class>/train/*.off and <class>/test/*.off"
 
 
 @dataclass(frozen=True)
@@ -73,32 +75,24 @@ def furniture10(train_per_class: int, test_per_class: int) -> ObjectSource:
         DataError: if there are fewer than 2 training pieces or no test pieces per class.
     """
     if train_per_class < 2 or test_per_class < 1:
-        raise DataError(
-            f"furniture10 needs at least 2 training pieces and 1 test piece per class, got {train_per_class} and {test_per_class}"
-        )
-    entries = []
-    for label, name in enumerate(MODELNET10_CLASSES):
-        for split, count, first in (("train", train_per_class, 0), ("test", test_per_class, 1_000_000)):
-            for seed in range(first, first + count):
-                entries.append(
-                    ObjectEntry(f"{name}_{split}_{seed - first:04d}", label, split, FurniturePiece(name, seed))
-                )
+        needed = "at least 2 training pieces and 1 test piece per class"
+        raise DataError(f"furniture10 needs {needed}, got {train_per_class} and {test_per_class}")
+    entries = (
+        ObjectEntry(f"{name}_{split}_{index:04d}", label, split, FurniturePiece(name, first + index))
+        for label, name in enumerate(MODELNET10_CLASSES)
+        for split, count, first in (("train", train_per_class, 0), ("test", test_per_class, 1_000_000))
+        for index in range(count)
+    )
     return ObjectSource("furniture10", MODELNET10_CLASSES, tuple(entries))
 
 
 def _arranged(listing: Listing, name: str, where: str, reading: Reading) -> ObjectSource:
-    """Returns the source that the files of a folder or zip make.
-
-    Raises:
-        DataError: if they have no known layout, a class has no meshes for a split, or there are fewer than two classes.
-    """
+    """Returns the source that the files of a folder or zip make."""
     found = list(listing.found)
     if not any(one.recipe is not None for one in found):
         unread = f" ({len(found)} files cannot be read: {found[0].path} {found[0].reason})" if found else ""
-        raise DataError(
-            f"{where} has no meshes laid out as <class>/train/*.off and <class>/test/*.off "
-            f"(or {', '.join(MESH_SUFFIXES[1:])}){unread}; pass --data a folder that has"
-        )
+        others = f"(or {', '.join(MESH_SUFFIXES[1:])}){unread}"
+        raise DataError(f"{where} has no meshes laid out as {_LAID_OUT} {others}; pass --data a folder that has")
     with_splits = has_split_folders(found)
     placed = by_split_folders(found) if with_splits else by_class_folders(found)
     notes: tuple[str, ...] = ()
@@ -108,10 +102,9 @@ def _arranged(listing: Listing, name: str, where: str, reading: Reading) -> Obje
         placed = divide(placed, reading.split, reading.seed, where)
     elif not with_splits:
         folders = {one.class_name for one in placed if one.class_name}
-        raise DataError(
-            f"{where} has {len(found)} meshes in {len(folders)} class folders and no meshes laid out as <class>/train/*.off and "
-            f"<class>/test/*.off; add --dataset.split 0.8 to train on 80 % of each class, or a .json or .csv list of splits"
-        )
+        there = f"{len(found)} meshes in {len(folders)} class folders and no meshes laid out as {_LAID_OUT}"
+        advice = "add --dataset.split 0.8 to train on 80 % of each class, or a .json or .csv list of splits"
+        raise DataError(f"{where} has {there}; {advice}")
     placed = sorted(without_copies(placed), key=lambda one: (one.class_name, one.split, one.parts))
     members = [one for one in placed if one.recipe is not None and one.class_name and one.split]
     _check_classes(placed, members, where, all_tested=reading.all_tested)
@@ -148,9 +141,8 @@ def _check_classes(placed: list[Found], members: list[Found], where: str, *, all
     for name in classes:
         if not any(there[name, split] for split in set(SPLIT_FOLDERS.values())):
             first = next(one for one in placed if one.class_name == name)
-            raise DataError(
-                f"{where}: no file of class {name} can be read ({first.path} {first.reason}); mend or remove the class"
-            )
+            why = f"no file of class {name} can be read ({first.path} {first.reason})"
+            raise DataError(f"{where}: {why}; mend or remove the class")
     if all_tested and members:
         return
     if len(classes) < 2:
@@ -180,18 +172,15 @@ def mesh_folder(folder: Path, reading: Reading = Reading()) -> ObjectSource:
         DataError: if the layout is not known, a class has no meshes for a split, or there are fewer than two classes.
     """
     listing = list_folder(folder, reading.up)
+    inside = {one.parts[:2] for one in listing.found}
     for child in sorted(folder.iterdir()):
-        if is_ignored(child.name) or not child.is_dir():
+        if kind_of_ignored(child.name) or not child.is_dir():
             continue
         if not any(child.iterdir()):
             raise DataError(f"class folder {child} is empty; put meshes into its train and test folders, or remove it")
         for part in child.iterdir():
-            inside = (shown(child.name), shown(part.name))
-            if (
-                part.name.lower() in SPLIT_FOLDERS
-                and part.is_dir()
-                and not any(one.parts[:2] == inside for one in listing.found)
-            ):
+            is_split = part.name.lower() in SPLIT_FOLDERS and part.is_dir()
+            if is_split and (shown(child.name), shown(part.name)) not in inside:
                 raise DataError(f"class folder {part} is empty; add meshes, or remove the class folder")
     return _arranged(listing, shown(folder.name), shown(str(folder)), reading)
 
@@ -205,11 +194,18 @@ def mesh_zip(archive: Path, reading: Reading = Reading()) -> ObjectSource:
     return _arranged(list_zip(archive, reading.up), shown(archive.stem), shown(str(archive)), reading)
 
 
-def _of_meshes(path: Path, reading: Reading) -> ObjectSource | None:
-    """The objects of a folder or zip of meshes; None for anything else."""
+def _of_meshes(data: str, reading: Reading, known: str) -> ObjectSource | None:
+    """Returns the objects of a folder or zip of meshes; None for anything else that exists."""
+    path = Path(os.path.expanduser(data))
+    if data != "furniture10" and not os.path.exists(path):
+        raise DataError(f"no such file or folder: {data}; --data takes {known}")
     if path.is_dir():
         return mesh_folder(path.resolve(), reading)
     return mesh_zip(path.resolve(), reading) if path.suffix.lower() == ".zip" else None
+
+
+def _is_made_or_voxels(data: str) -> bool:
+    return data == "furniture10" or data.lower().endswith(".npz")
 
 
 def objects_to_test(data: str, up: Up = "auto") -> ObjectSource:
@@ -218,15 +214,10 @@ def objects_to_test(data: str, up: Up = "auto") -> ObjectSource:
     Raises:
         DataError: as `open_source`, but one class is enough, and none needs objects for training.
     """
-    path, reading = Path(os.path.expanduser(data)), Reading(up, all_tested=True)
-    if data != "furniture10" and not os.path.exists(path):
-        raise DataError(
-            f"no such file or folder: {data}; --data takes a folder or zip of meshes in class folders, an .npz of voxel grids, "
-            f"or furniture10"
-        )
-    if (meshes := _of_meshes(path, reading)) is not None:
+    known = "a folder or zip of meshes in class folders, an .npz of voxel grids, or furniture10"
+    if (meshes := _of_meshes(data, Reading(up, all_tested=True), known)) is not None:
         return meshes
-    if up != "auto" and (data == "furniture10" or path.suffix.lower() == ".npz"):
+    if up != "auto" and _is_made_or_voxels(data):
         raise DataError(f"--up goes with meshes, not with {data}; leave it out")
     source = open_source(data, train_per_class=2, test_per_class=20)
     return replace(source, entries=tuple(entry for entry in source.entries if entry.split == "test"))
@@ -247,30 +238,24 @@ def open_source(
     Raises:
         DataError: if the file does not exist or is not usable as a data set.
     """
-    path, reading = Path(os.path.expanduser(data)), Reading(up, split, seed, keep_splits)
-    if (split or up != "auto") and (data == "furniture10" or path.suffix.lower() == ".npz"):
+    if (split or up != "auto") and _is_made_or_voxels(data):
         raise DataError(f"--dataset.split and --dataset.up go with a folder or zip of meshes, not with {data}")
     if data == "furniture10":
         return furniture10(train_per_class, test_per_class)
-    if not os.path.exists(path):
-        raise DataError(
-            f"no such file or folder: {data}; --data takes furniture10, modelnet10, modelnet40, a folder of class folders, "
-            f"a .zip or a .npz"
-        )
-    if (meshes := _of_meshes(path, reading)) is not None:
+    known = "furniture10, modelnet10, modelnet40, a folder of class folders, a .zip or a .npz"
+    if (meshes := _of_meshes(data, Reading(up, split, seed, keep_splits), known)) is not None:
         return meshes
+    path = Path(os.path.expanduser(data))
     if path.suffix.lower() == ".npz":
         return voxel_archive(path.resolve())
-    if path.suffix.lower() in MESH_SUFFIXES:
-        vertices, faces = MeshFile(str(path), up=up).load()  # raises if it is damaged
-        try:
-            normalise(vertices, faces, str(path))
-        except EmptyMesh as reason:
-            raise DataError(f"{data} cannot be used: {reason}; --data takes a folder of meshes with faces") from reason
-        raise DataError(
-            f"{data} is a single mesh; --data takes a folder laid out as <class>/train/*.off and <class>/test/*.off"
-        )
-    raise DataError(f"{data} is not a data set; --data takes a folder of class folders, a .zip or a .npz")
+    if path.suffix.lower() not in MESH_SUFFIXES:
+        raise DataError(f"{data} is not a data set; --data takes a folder of class folders, a .zip or a .npz")
+    vertices, faces = MeshFile(str(path), up=up).load()  # raises if it is damaged
+    try:
+        normalise(vertices, faces, str(path))
+    except EmptyMesh as reason:
+        raise DataError(f"{data} cannot be used: {reason}; --data takes a folder of meshes with faces") from reason
+    raise DataError(f"{data} is a single mesh; --data takes a folder laid out as {_LAID_OUT}")
 
 
 def together(sources: Sequence[ObjectSource]) -> ObjectSource:

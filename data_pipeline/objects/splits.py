@@ -16,8 +16,6 @@ from data_pipeline.errors import DataError
 from data_pipeline.objects.layout import SPLIT_FOLDERS, Found
 
 _NAME_COLUMNS = ("path", "name", "file", "filename", "object", "model", "modelid", "model_id", "id", "object_id", "uid")
-_KEYS = 5
-"""Number of keys by which a list may name a file, see `_keys`."""
 
 
 def divide(found: Sequence[Found], option: str, seed: int, where: str) -> list[Found]:
@@ -37,9 +35,8 @@ def divide(found: Sequence[Found], option: str, seed: int, where: str) -> list[F
     except ValueError:
         return _by_list(found, Path(option).expanduser())
     if not 0 < share < 1:
-        raise DataError(
-            f"--dataset.split {option} is no share of training objects; give a number between 0 and 1, such as 0.8"
-        )
+        advice = "give a number between 0 and 1, such as 0.8"
+        raise DataError(f"--dataset.split {option} is no share of training objects; {advice}")
     return _by_share(found, share, seed, where)
 
 
@@ -54,25 +51,24 @@ def _group(one: Found) -> tuple[str, ...]:
 
 def _by_share(found: Sequence[Found], share: float, seed: int, where: str) -> list[Found]:
     """Divides the objects of each class at random; all files of an object's folder go together."""
-    groups = {id(one): _group(one) for one in found if one.class_name}
     training: set[tuple[str, ...]] = set()
     random = np.random.default_rng(seed)
     for name in sorted({one.class_name for one in found if one.class_name}):
-        own = sorted({groups[id(one)] for one in found if one.class_name == name and one.recipe is not None})
+        own = sorted({_group(one) for one in found if one.class_name == name and one.recipe is not None})
         if not own:
             continue
         if len(own) < 2:
-            raise DataError(
-                f"{where}: class {name} has {len(own)} object, and --dataset.split needs 2 or more; add some, or remove the class"
-            )
+            few = f"class {name} has {len(own)} object, and --dataset.split needs 2 or more"
+            raise DataError(f"{where}: {few}; add some, or remove the class")
         count = min(max(round(share * len(own)), 1), len(own) - 1)
         training |= {own[at] for at in random.permutation(len(own))[:count]}
-    return [
-        replace(one, split="train" if groups[id(one)] in training else "test")
-        if id(one) in groups
-        else replace(one, split="")
-        for one in found
-    ]
+
+    def split_of(one: Found) -> str:
+        if not one.class_name:
+            return ""
+        return "train" if _group(one) in training else "test"
+
+    return [replace(one, split=split_of(one)) for one in found]
 
 
 def _keys(one: Found) -> list[list[str]]:
@@ -88,31 +84,27 @@ def _keys(one: Found) -> list[list[str]]:
     ]
 
 
+def _split_in(listed: Mapping[str, str], one: Found) -> str:
+    """Returns the split of a file by the first of its names that are in a list, all with one split; empty if none is."""
+    for keys in _keys(one):
+        splits = {listed[key] for key in keys if key in listed}
+        if len(splits) == 1:
+            return splits.pop()
+    return ""
+
+
 def _by_list(found: Sequence[Found], path: Path) -> list[Found]:
     listed = _read_list(path)
-    inside = [one for one in found if one.class_name]
-    keys = {id(one): _keys(one) for one in inside}
-    split: dict[int, str] = {}
-    named: set[str] = set()
-    for rank in range(_KEYS):
-        for one in inside:
-            if id(one) in split:
-                continue
-            hits = {key for key in keys[id(one)][rank] if key in listed}
-            if len({listed[key] for key in hits}) == 1:
-                split[id(one)] = listed[next(iter(hits))]
-                named |= hits
-    used = Counter(split.values())
+    splits = [_split_in(listed, one) if one.class_name else "" for one in found]
+    used = Counter(splits)
     if not used["train"] or not used["test"]:
-        raise DataError(
-            f"{path} names {used['train']} training and {used['test']} test objects of this source; list paths such as "
-            f"{inside[0].path if inside else 'class/object.off'}"
-        )
+        paths = next((one.path for one in found if one.class_name), "class/object.off")
+        names = f"names {used['train']} training and {used['test']} test objects of this source"
+        raise DataError(f"{path} {names}; list paths such as {paths}")
+    without = f"is not in {path.name}"
     return [
-        replace(one, split=split[id(one)])
-        if id(one) in split
-        else replace(one, split="", recipe=None, reason=one.reason or f"is not in {path.name}")
-        for one in found
+        replace(one, split=split) if split else replace(one, split="", recipe=None, reason=one.reason or without)
+        for one, split in zip(found, splits, strict=True)
     ]
 
 
@@ -120,25 +112,17 @@ def _read_list(path: Path) -> Mapping[str, str]:
     """Returns the split of each name in a JSON or CSV list.
 
     JSON is `{"train": [names], "test": [names]}` or `{name: split}`; CSV has a column `split` and one with names.
-
-    Raises:
-        DataError: if the file cannot be read, has another form, or has a name in two splits.
     """
     if path.suffix.lower() not in (".json", ".csv"):
-        raise DataError(
-            f"--dataset.split {path} is neither a share such as 0.8 nor a .json or .csv list; give one of them"
-        )
+        kinds = "a share such as 0.8 nor a .json or .csv list"
+        raise DataError(f"--dataset.split {path} is neither {kinds}; give one of them")
     try:
         text = path.read_text(encoding="utf-8-sig")
         pairs = _json_pairs(json.loads(text)) if path.suffix.lower() == ".json" else _csv_pairs(text)
     except (OSError, ValueError, KeyError, csv.Error, RecursionError) as error:
-        if isinstance(error, DataError):
-            raise
         reason = getattr(error, "strerror", None) or str(error).splitlines()[0]
-        raise DataError(
-            f"--dataset.split {path} cannot be read ({reason}); give a JSON object of lists train and test, or a CSV table with "
-            f"columns name and split"
-        ) from error
+        forms = "a JSON object of lists train and test, or a CSV table with columns name and split"
+        raise DataError(f"--dataset.split {path} cannot be read ({reason}); give {forms}") from error
     listed: dict[str, str] = {}
     for name, split in pairs:
         given = SPLIT_FOLDERS.get(str(split).strip().lower())

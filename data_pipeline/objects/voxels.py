@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
+import math
 import zipfile
 import zlib
-from collections.abc import Iterator
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from data_pipeline.errors import DataError, EmptyMesh, reason_of
+from data_pipeline.errors import Damage, DataError, EmptyMesh, naming, reason_of
 from data_pipeline.objects.mesh import MODELNET10_CLASSES, SOURCE_SPLITS, ObjectEntry, ObjectSource
 from data_pipeline.objects.names import shown
 
@@ -70,15 +71,23 @@ def voxel_archive(path: Path) -> ObjectSource:
             members = {info.filename.removesuffix(".npy"): info for info in archive.infolist()}
             missing = [key for key in ("X_train", "y_train", "X_test", "y_test") if key not in members]
             if missing:
-                raise DataError(
-                    f"{where} has no {', '.join(missing)}; a voxel archive has X_train, y_train, X_test and y_test"
-                )
-            named = _names(archive, members["classes"], where) if "classes" in members else None
-            labels = {split: _labels(archive, members[f"y_{split}"], where) for split in SOURCE_SPLITS}
-            classes = _classes(labels, named, where)
+                need = "a voxel archive has X_train, y_train, X_test and y_test"
+                raise DataError(f"{where} has no {', '.join(missing)}; {need}")
+
+            def read(key: str, reader: Callable[..., Any], *more: Any) -> Any:
+                with naming(f"{where}: {key}", DataError):
+                    return reader(archive, members[key], *more)
+
+            named = read("classes", _names) if "classes" in members else None
+            labels = {split: read(f"y_{split}", _labels) for split in SOURCE_SPLITS}
+            with naming(f"{where}:", DataError):
+                count = _count_of_classes(labels, named)
+            if count < 2:
+                raise DataError(f"{where} has one class only; add objects of at least one other class")
+            classes = named or (MODELNET10_CLASSES if count == 10 else tuple(f"class_{i}" for i in range(count)))
             entries = []
             for split in SOURCE_SPLITS:
-                grids = _grids(archive, members[f"X_{split}"], len(labels[split]), where)
+                grids = read(f"X_{split}", _grids, len(labels[split]))
                 for index, (recipe, label) in enumerate(zip(grids, labels[split].tolist(), strict=True)):
                     entries.append(ObjectEntry(f"{classes[label]}_{split}_{index:04d}", label, split, recipe))
     except DataError:
@@ -88,7 +97,7 @@ def voxel_archive(path: Path) -> ObjectSource:
     return ObjectSource(shown(path.stem), classes, tuple(entries))
 
 
-def _header(file: Any, what: str, where: str) -> tuple[tuple[int, ...], bool, np.dtype]:
+def _header(file: Any) -> tuple[tuple[int, ...], bool, np.dtype]:
     """Returns the shape, Fortran order and type of an array from the head of its file, which is open."""
     version = np.lib.format.read_magic(file)
     if version == (1, 0):
@@ -96,131 +105,102 @@ def _header(file: Any, what: str, where: str) -> tuple[tuple[int, ...], bool, np
     elif version == (2, 0):
         shape, fortran, kind = np.lib.format.read_array_header_2_0(file)
     else:
-        raise DataError(f"{where}: {what} has version {version} of the .npy format; save it with numpy.savez")
+        raise Damage(f"has version {version} of the .npy format; save it with numpy.savez")
     if kind.hasobject:
-        raise DataError(f"{where}: {what} holds Python objects, which are never unpickled; save numbers")
+        raise Damage("holds Python objects, which are never unpickled; save numbers")
     return shape, fortran, kind
 
 
-def _small_array(archive: zipfile.ZipFile, info: zipfile.ZipInfo, where: str) -> np.ndarray:
-    what = info.filename.removesuffix(".npy")
+def _small_array(archive: zipfile.ZipFile, info: zipfile.ZipInfo) -> np.ndarray:
     if info.file_size > LARGEST_LABELS:
-        raise DataError(f"{where}: {what} unpacks to more than {LARGEST_LABELS >> 20} MB; save it smaller")
+        raise Damage(f"unpacks to more than {LARGEST_LABELS >> 20} MB; save it smaller")
     with archive.open(info) as file:
-        shape, fortran, kind = _header(file, what, where)
+        shape, fortran, kind = _header(file)
         content = file.read(LARGEST_LABELS + 1)
-    count = _product(shape)
+    count = math.prod(shape)
     if len(content) != count * kind.itemsize:
-        raise DataError(
-            f"{where}: {what} is cut short: {len(content)} of {count * kind.itemsize} bytes; download it again"
-        )
+        raise Damage(f"is cut short: {len(content)} of {count * kind.itemsize} bytes; download it again")
     array = np.frombuffer(content, kind) if kind.itemsize else np.zeros(count, kind)
     return array.reshape(shape, order="F" if fortran else "C")
 
 
-def _product(shape: tuple[int, ...]) -> int:
-    count = 1
-    for length in shape:
-        count *= length
-    return count
-
-
-def _names(archive: zipfile.ZipFile, info: zipfile.ZipInfo, where: str) -> tuple[str, ...]:
-    names = _small_array(archive, info, where)
+def _names(archive: zipfile.ZipFile, info: zipfile.ZipInfo) -> tuple[str, ...]:
+    names = _small_array(archive, info)
     if names.dtype.kind not in "US" or names.ndim != 1:
-        raise DataError(f"{where}: classes has type {names.dtype} and shape {names.shape}; give a list of strings")
+        raise Damage(f"has type {names.dtype} and shape {names.shape}; give a list of strings")
     found = tuple(name.decode("utf-8", "replace") if isinstance(name, bytes) else name for name in names.tolist())
     if len(set(found)) < len(found) or not all(found) or not all(name.isprintable() for name in found):
-        raise DataError(f"{where}: classes has a name twice, an empty one, or one that cannot be printed; correct it")
+        raise Damage("has a name twice, an empty one, or one that cannot be printed; correct it")
     return found
 
 
-def _labels(archive: zipfile.ZipFile, info: zipfile.ZipInfo, where: str) -> np.ndarray:
+def _labels(archive: zipfile.ZipFile, info: zipfile.ZipInfo) -> np.ndarray:
     """Returns the labels of a split, (n,) int64."""
-    labels, what = _small_array(archive, info, where), info.filename.removesuffix(".npy")
-    if labels.dtype.kind in "US":
-        raise DataError(
-            f"{where}: {what} holds strings; give whole numbers from 0 on, and the names of the classes as an array `classes`"
-        )
-    if labels.ndim == 2 and labels.shape[1] > 1:
-        raise DataError(
-            f"{where}: {what} has shape {labels.shape}, as labels coded one-hot have; give one number for each object (argmax)"
-        )
-    if labels.dtype.kind not in "biuf" or labels.ndim not in (1, 2):
-        raise DataError(f"{where}: {what} has type {labels.dtype} and shape {labels.shape}; give whole numbers (n,)")
+    labels = _small_array(archive, info)
+    kind, shape = labels.dtype, labels.shape
+    whole = "give whole numbers from 0 on"
+    if kind.kind in "US":
+        raise Damage(f"holds strings; {whole}, and the names of the classes as an array `classes`")
+    if labels.ndim == 2 and shape[1] > 1:
+        raise Damage(f"has shape {shape}, as labels coded one-hot have; give one number for each object (argmax)")
+    if kind.kind not in "biuf" or labels.ndim not in (1, 2):
+        raise Damage(f"has type {kind} and shape {shape}; give whole numbers (n,)")
     labels = labels.reshape(-1)
     if not len(labels):
-        raise DataError(f"{where}: {what} is empty; a voxel archive needs training and test objects")
+        raise Damage("is empty; a voxel archive needs training and test objects")
     if len(labels) > MOST_OBJECTS:
-        raise DataError(f"{where}: {what} has {len(labels):,} labels, more than {MOST_OBJECTS:,}; divide the archive")
+        raise Damage(f"has {len(labels):,} labels, more than {MOST_OBJECTS:,}; divide the archive")
     if not np.isfinite(labels).all() or (labels != np.floor(labels)).any():
-        raise DataError(f"{where}: {what} has labels that are not whole numbers; give whole numbers from 0 on")
+        raise Damage(f"has labels that are not whole numbers; {whole}")
     if labels.min() < 0:
-        raise DataError(
-            f"{where}: {what} has the label {int(labels.min())}, and {int((labels < 0).sum())} labels below 0; take objects "
-            f"without a class out, and number the classes from 0 on"
-        )
+        below = f"the label {int(labels.min())}, and {int((labels < 0).sum())} labels below 0"
+        raise Damage(f"has {below}; take objects without a class out, and number the classes from 0 on")
     if labels.max() > 2**31:
-        raise DataError(f"{where}: {what} has the label {int(labels.max())}; number the classes from 0 on")
+        raise Damage(f"has the label {int(labels.max())}; number the classes from 0 on")
     return labels.astype(np.int64)
 
 
-def _classes(labels: dict[str, np.ndarray], named: tuple[str, ...] | None, where: str) -> tuple[str, ...]:
-    """Returns the names of the classes after a check that every class has training objects."""
+def _count_of_classes(labels: dict[str, np.ndarray], named: tuple[str, ...] | None) -> int:
+    """Returns the number of classes after a check that every class has training objects."""
     present = np.unique(labels["train"])
     count = max(int(labels[split].max()) for split in SOURCE_SPLITS) + 1
     if named is not None and count != len(named):
-        raise DataError(
-            f"{where}: classes has {len(named)} names, and the labels go up to {count - 1}; correct one of them"
-        )
+        raise Damage(f"classes has {len(named)} names, and the labels go up to {count - 1}; correct one of them")
     if len(present) < count:
         absent = next(label for label in range(count) if label >= len(present) or present[label] != label)
-        advice = (
-            "subtract 1 from all labels"
-            if absent == 0 and len(present) == count - 1
-            else "number the classes from 0 on"
-        )
-        raise DataError(
-            f"{where}: labels go up to {count - 1}, and no training object has the label {absent}; {advice}"
-        )
-    if count < 2:
-        raise DataError(f"{where} has one class only; add objects of at least one other class")
-    if named is not None:
-        return named
-    return MODELNET10_CLASSES if count == len(MODELNET10_CLASSES) else tuple(f"class_{i}" for i in range(count))
+        from_one = absent == 0 and len(present) == count - 1
+        advice = "subtract 1 from all labels" if from_one else "number the classes from 0 on"
+        raise Damage(f"labels go up to {count - 1}, and no training object has the label {absent}; {advice}")
+    return count
 
 
-def _grids(archive: zipfile.ZipFile, info: zipfile.ZipInfo, count: int, where: str) -> Iterator[VoxelGrid]:
-    """Returns the grids of a split, read in parts."""
-    what = info.filename.removesuffix(".npy")
+def _grids(archive: zipfile.ZipFile, info: zipfile.ZipInfo, count: int) -> list[VoxelGrid]:
+    """Returns the grids of a split, which are read in parts."""
+    found = []
     with archive.open(info) as file:
-        shape, fortran, kind = _header(file, what, where)
+        shape, fortran, kind = _header(file)
         if len(shape) != 4 or len(set(shape[1:])) != 1 or shape[0] != count:
-            raise DataError(
-                f"{where}: {what} has shape {shape}, expected ({count}, side, side, side) for {count} labels; correct the file"
-            )
+            expected = f"expected ({count}, side, side, side) for {count} labels"
+            raise Damage(f"has shape {shape}, {expected}; correct the file")
         if kind.kind not in "biuf":
-            raise DataError(f"{where}: {what} has type {kind}; give grids of 0 and 1")
+            raise Damage(f"has type {kind}; give grids of 0 and 1")
         side = shape[1]
         size = side**3 * kind.itemsize
         limit = LARGEST_LABELS if fortran or size > LARGEST_LABELS else LARGEST_GRIDS
         if not side or size * count > limit:
-            raise DataError(
-                f"{where}: {what} has {count} grids of {side}³ cells as {kind}, which is nothing or more than {limit >> 20} MB; "
-                f"save smaller ones as uint8"
-            )
+            grids = f"{count} grids of {side}³ cells as {kind}"
+            raise Damage(f"has {grids}, which is nothing or more than {limit >> 20} MB; save smaller ones as uint8")
         per_part = count if fortran else max(1, _BYTES_PER_PART // size)
         for first in range(0, count, per_part):
             part = min(per_part, count - first)
             content = file.read(part * size)
             if len(content) < part * size:
-                raise DataError(f"{where}: {what} is cut short: {first} of {count} grids are there; download it again")
-            grids: Any = np.frombuffer(content, kind)
-            grids = grids.reshape(shape, order="F") if fortran else grids
-            grids = grids.reshape(part, -1)
-            if kind.kind == "f" and not np.isfinite(grids).all():
-                raise DataError(f"{where}: {what} has cells that are not finite (NaN or infinite); correct the file")
-            for bits in np.packbits(grids > 0, axis=1):
-                yield VoxelGrid(bits.tobytes(), side)
+                raise Damage(f"is cut short: {first} of {count} grids are there; download it again")
+            cells = np.frombuffer(content, kind)
+            cells = (cells.reshape(shape, order="F") if fortran else cells).reshape(part, -1)
+            if kind.kind == "f" and not np.isfinite(cells).all():
+                raise Damage("has cells that are not finite (NaN or infinite); correct the file")
+            found += [VoxelGrid(bits.tobytes(), side) for bits in np.packbits(cells > 0, axis=1)]
         if file.read(1):
-            raise DataError(f"{where}: {what} is longer than its shape {shape}; save it again with numpy.savez")
+            raise Damage(f"is longer than its shape {shape}; save it again with numpy.savez")
+    return found

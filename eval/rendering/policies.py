@@ -8,7 +8,6 @@ object after another, then evaluates and reports again.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -170,7 +169,6 @@ def chosen_objects(config: RenderingConfig, objects: int) -> np.ndarray:
 
 
 _Job = tuple[int, ObjectEntry]
-_worker: Callable[[_Job], None] | None = None
 
 
 def _ascend_one(job: _Job, data: Path, statistics: DatasetStatistics, folder: Path, config: RenderingConfig) -> None:
@@ -181,16 +179,6 @@ def _ascend_one(job: _Job, data: Path, statistics: DatasetStatistics, folder: Pa
     points = jnp.array(statistics.viewpoints, jnp.float32)
     found = scores_of_object(load_object(entry), depth, example["pose"], field_of_view, points, config)
     write_npz(npz_of(folder, entry.name), **found)
-
-
-def _start_worker(data: Path, statistics: DatasetStatistics, folder: Path, config: RenderingConfig) -> None:
-    global _worker
-    _worker = partial(_ascend_one, data=data, statistics=statistics, folder=folder, config=config)
-
-
-def _work(job: _Job) -> None:
-    assert _worker is not None
-    _worker(job)
 
 
 def _name_of(job: _Job) -> str:
@@ -225,7 +213,7 @@ def ascend_objects(dataset: DataConfig, statistics: DatasetStatistics, out: Path
                 _ascend_one(job, *given)
                 bar.advance(line)
             return
-        with shared(_work, jobs, workers=workers, start=_start_worker, given=given, name_of=_name_of, chunk=1) as done:
+        with shared(_ascend_one, jobs, given=given, workers=workers, name_of=_name_of, chunk=1) as done:
             for _ in done:
                 bar.advance(line)
 

@@ -9,7 +9,6 @@ import signal
 import threading
 import time
 from contextlib import suppress
-from pathlib import Path
 
 import pytest
 
@@ -17,27 +16,20 @@ from data_pipeline import processes
 from data_pipeline.errors import DataError
 from data_pipeline.processes import shared
 
-_factor = 0
+
+def times(job: int, factor: int) -> int:
+    return factor * job
 
 
-def begin(factor: int) -> None:
-    global _factor
-    _factor = factor
-
-
-def times(job: int) -> int:
-    return _factor * job
-
-
-def dies_at_five(job: int) -> int:
+def dies_at_five(job: int, factor: int) -> int:
     if job == 5:
         os.kill(os.getpid(), signal.SIGKILL)
     return job
 
 
-def sleeps_long(job: int) -> int:
+def sleeps_long(job: int, seconds: int) -> int:
     if job:
-        time.sleep(600)
+        time.sleep(seconds)
     return job
 
 
@@ -46,13 +38,15 @@ def name_of(job: int) -> str:
 
 
 def results(work, jobs, **options) -> list[int]:
-    with shared(work, jobs, workers=2, start=begin, given=(3,), name_of=name_of, **options) as found:
+    with shared(work, jobs, workers=2, given=(3,), name_of=name_of, **options) as found:
         return list(found)
 
 
 @pytest.mark.parametrize("threads", [False, True])
-def test_results_are_in_order(threads):
+def test_results_are_in_order_and_nothing_is_left_in_the_folder_for_temporary_files(threads, tmp_path, monkeypatch):
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
     assert results(times, range(11), threads=threads) == [3 * job for job in range(11)]
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_a_killed_process_is_named(tmp_path):
@@ -71,7 +65,7 @@ def test_a_process_that_dies_while_it_starts_ends_the_job(size, monkeypatch, tmp
     monkeypatch.setattr(multiprocessing.spawn, "_python_exe", os.fsencode(dies))
     with (
         pytest.raises(DataError, match=r"a worker process was .* while it worked on nothing yet"),
-        shared(times, range(20), workers=2, start=begin, given=(bytes(size),), name_of=name_of) as found,
+        shared(times, range(20), workers=2, given=(bytes(size),), name_of=name_of) as found,
     ):
         list(found)
 
@@ -86,7 +80,7 @@ def test_a_process_that_is_killed_when_all_is_done_does_not_block_the_job(victim
             with suppress(ProcessLookupError):
                 os.kill(worker.pid, signal.SIGKILL if at == victim else signal.SIGCONT)
 
-    with shared(times, range(20), workers=2, start=begin, given=(3,), name_of=name_of) as found:
+    with shared(times, range(20), workers=2, given=(3,), name_of=name_of) as found:
         assert len(list(found)) == 20
         workers: list = multiprocessing.active_children()
         for worker in workers:
@@ -99,7 +93,7 @@ def test_a_process_that_is_killed_when_all_is_done_does_not_block_the_job(victim
 
 def test_an_interrupt_ends_the_workers_at_once():
     def interrupted() -> None:
-        with shared(sleeps_long, range(8), workers=2, start=begin, given=(1,), name_of=name_of, chunk=1) as found:
+        with shared(sleeps_long, range(8), workers=2, given=(600,), name_of=name_of, chunk=1) as found:
             assert next(found) == 0
             raise KeyboardInterrupt
 
@@ -118,12 +112,6 @@ def test_one_process_works_where_no_semaphore_can_be_made(monkeypatch, capsys):
     assert "one process does the work" in capsys.readouterr().err
 
 
-def test_nothing_is_left_in_the_folder_for_temporary_files(tmp_path, monkeypatch):
-    monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
-    results(times, range(3), threads=True)
-    assert list(Path(tmp_path).iterdir()) == []
-
-
 def test_a_process_that_dies_before_python_writes_to_it_is_named(monkeypatch):
     """Python 3.14 closes its own end of the pipe first, so that writing fails."""
 
@@ -133,6 +121,6 @@ def test_a_process_that_dies_before_python_writes_to_it_is_named(monkeypatch):
     monkeypatch.setattr(multiprocessing.get_context("spawn").Process, "start", start)
     with (
         pytest.raises(DataError, match=r"a worker process was .* while it worked on nothing yet"),
-        shared(times, range(20), workers=2, start=begin, given=(3,), name_of=name_of) as found,
+        shared(times, range(20), workers=2, given=(3,), name_of=name_of) as found,
     ):
         list(found)

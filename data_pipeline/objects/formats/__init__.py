@@ -4,16 +4,19 @@ One module reads one format. docs/data.md has a table of what each format promis
 Libraries read what they read right: pycollada COLLADA, DracoPy Draco, mapbox-earcut concave polygons. OFF, OBJ, STL, PLY and
 glTF have readers of our own, since trimesh and assimp lose or misread parts of the files of `tests/data_pipeline/objects`, or
 read truncated files without a word. Tests compare them with trimesh and with the counts that the files declare.
+
+A reader returns the vertices (n, 3) and triangles (m, 3) of a file's content. It raises `Damage`, or a `ValueError` whose message
+is the reason why the content is not of its format; readers of glTF, COLLADA and 3MF may also raise what their libraries raise.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 
-from data_pipeline.errors import DamagedMesh, DataError
+from data_pipeline.errors import Damage, DamagedMesh, DataError, kind_and_reason_of, naming
 from data_pipeline.objects.formats.dae import parse_dae
 from data_pipeline.objects.formats.gltf import parse_gltf
 from data_pipeline.objects.formats.obj import parse_obj
@@ -21,8 +24,6 @@ from data_pipeline.objects.formats.off import parse_off
 from data_pipeline.objects.formats.ply import parse_ply
 from data_pipeline.objects.formats.stl import parse_stl
 from data_pipeline.objects.formats.threemf import parse_3mf
-
-__all__ = ["AXIS_DECLARED", "MESH_SUFFIXES", "UNREAD_SUFFIXES", "Up", "parse_mesh", "parse_off"]
 
 MESH_SUFFIXES = (".off", ".obj", ".stl", ".ply", ".glb", ".gltf", ".dae", ".3mf")
 
@@ -39,20 +40,15 @@ AXIS_DECLARED = (".glb", ".gltf", ".dae")
 Up = Literal["auto", "z", "y"]
 """Which axis of a file is up: the one its format declares, else z (`auto`), or always z or y."""
 
-_TO_Z_UP = {
-    "x": np.array([[0.0, -1, 0], [0, 0, -1], [1, 0, 0]]),
-    "y": np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]]),
-}
+_TO_Z_UP = {"x": np.array([[0.0, -1, 0], [0, 0, -1], [1, 0, 0]]), "y": np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])}
 """Rotations that turn x or y up into z up, as COLLADA's and glTF's axes are defined."""
 
-_Z_UP_READERS: dict[str, Callable[[bytes, str], tuple[np.ndarray, np.ndarray]]] = {
-    ".off": parse_off,
-    ".obj": parse_obj,
-    ".stl": parse_stl,
-    ".ply": parse_ply,
-    ".3mf": parse_3mf,
+_OWN_READERS: dict[str, tuple[str, Callable[[bytes], tuple[np.ndarray, np.ndarray]]]] = {
+    ".off": ("an OFF", parse_off),
+    ".obj": ("a readable .obj", parse_obj),
+    ".stl": ("a readable .stl", parse_stl),
+    ".ply": ("a readable .ply", parse_ply),
 }
-
 
 _POINTERS = {b"version https://git-lfs.github.com/spec/": "git lfs pull", b"/annex/objects/": "git annex get"}
 """How files begin that Git LFS and git-annex leave in place of files that were not fetched, and what fetches them."""
@@ -77,23 +73,42 @@ def parse_mesh(
     Raises:
         DamagedMesh: if the file is not a readable mesh or is truncated.
     """
-    axis = "z"
-    for begin, command in _POINTERS.items():
-        if content.startswith(begin) and len(content) < 1024:
-            raise DamagedMesh(f"{where} only stands for a file that is not here; fetch it with: {command}")
-    try:
-        if suffix in (".glb", ".gltf"):
-            (vertices, triangles), axis = parse_gltf(content, where, sibling), "y"
-        elif suffix == ".dae":
-            vertices, triangles, axis = parse_dae(content, where)
-        else:
-            vertices, triangles = _Z_UP_READERS[suffix](content, where)
-    except DataError:
-        raise
-    except (MemoryError, RecursionError) as error:
-        raise DamagedMesh(f"{where} is too large or too deeply nested to be read; export a simpler mesh") from error
+    with naming(where):
+        for begin, command in _POINTERS.items():
+            if content.startswith(begin) and len(content) < 1024:
+                raise Damage(f"only stands for a file that is not here; fetch it with: {command}")
+        try:
+            if suffix in _OWN_READERS:
+                vertices, triangles, axis = *_own(content, suffix), "z"
+            else:
+                vertices, triangles, axis = _foreign(content, suffix, sibling)
+        except (MemoryError, RecursionError) as error:
+            raise Damage("is too large or too deeply nested to be read; export a simpler mesh") from error
     turn = _TO_Z_UP.get(axis if up == "auto" else up)
     if turn is not None:
         with np.errstate(all="ignore"):  # vertices that no face uses may be NaN
             vertices = vertices @ turn.T
     return vertices, triangles
+
+
+def _own(content: bytes, suffix: str) -> tuple[np.ndarray, np.ndarray]:
+    kind, read = _OWN_READERS[suffix]
+    try:
+        return read(content)
+    except ValueError as error:
+        raise Damage(f"is not {kind} mesh: {error}; repair it or take it away") from error
+
+
+def _foreign(content: bytes, suffix: str, sibling: Callable[[str], bytes]) -> Any:
+    """Returns vertices, triangles and axis of a document, whose readers may fail in many ways."""
+    try:
+        if suffix == ".dae":
+            return parse_dae(content)
+        return (*parse_3mf(content), "z") if suffix == ".3mf" else (*parse_gltf(content, sibling), "y")
+    except (Damage, DataError):
+        raise
+    except Exception as error:
+        kind = "glTF" if suffix in (".glb", ".gltf") else suffix
+        raise Damage(
+            f"is not a readable {kind} mesh ({kind_and_reason_of(error)}); repair it or take it away"
+        ) from error

@@ -18,9 +18,8 @@ from typing import Any
 
 import numpy as np
 
-from data_pipeline.errors import DamagedMesh, DataError, kind_and_reason_of
-from data_pipeline.objects.checks import check_indices
-from data_pipeline.objects.formats.polygons import fan_triangles, strip_triangles
+from data_pipeline.errors import Damage, cut_short
+from data_pipeline.objects.formats.polygons import check_indices, fan_triangles, merged, strip_triangles
 
 _COMPONENTS = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
 _WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT2": 4, "MAT3": 9, "MAT4": 16}
@@ -35,53 +34,26 @@ MOST_ELEMENTS, MOST_ZEROS, MOST_COPIES = 50_000_000, 5_000_000, 100_000
 one mesh. A small file can declare any number."""
 
 
-def parse_gltf(content: bytes, where: str, sibling: Callable[[str], bytes]) -> tuple[np.ndarray, np.ndarray]:
-    """Returns the vertices (n, 3), y up, and triangles (m, 3) of a glTF or GLB file.
-
-    Args:
-        content: content of the file.
-        where: name of the file for error messages.
-        sibling: returns the content of a file by its path relative to this one.
-
-    Raises:
-        DamagedMesh: if the file is not a readable glTF mesh, is truncated, or requires an extension that is not read.
-    """
-    try:
-        document, binary = _chunks(content, where)
-        return _Reader(document, binary, where, sibling).meshes()
-    except DataError:
-        raise
-    except (
-        KeyError,
-        IndexError,
-        TypeError,
-        ValueError,
-        AttributeError,
-        OverflowError,
-        RecursionError,
-        MemoryError,
-    ) as error:
-        # A document of another form than the specification's may fail anywhere.
-        reason = kind_and_reason_of(error)
-        raise DamagedMesh(f"{where} is not a readable glTF mesh ({reason}); repair it or take it away") from error
+def parse_gltf(content: bytes, sibling: Callable[[str], bytes]) -> tuple[np.ndarray, np.ndarray]:
+    """Reads a glTF or GLB file; `sibling` returns the content of a file by its path relative to this one."""
+    document, binary = _chunks(content)
+    return _Reader(document, binary, sibling).meshes()
 
 
-def _chunks(content: bytes, where: str) -> tuple[Any, bytes]:
+def _chunks(content: bytes) -> tuple[Any, bytes]:
     """Returns the JSON document and the binary chunk."""
     if content[:4] != b"glTF":
         return json.loads(content.decode("utf-8-sig")), b""
     if int.from_bytes(content[4:8], "little") != 2:
-        raise DamagedMesh(f"{where} is a GLB file of version {content[4]}, not 2; export it again as glTF 2.0")
+        raise Damage(f"is a GLB file of version {content[4]}, not 2; export it again as glTF 2.0")
     declared = int.from_bytes(content[8:12], "little")
     if declared > len(content):
-        raise DamagedMesh(
-            f"{where} is cut short: {len(content)} of {declared} bytes are there; fetch or export it again"
-        )
+        raise cut_short(f"{len(content)} of {declared} bytes are there")
     document, binary, at = None, b"", 12
     while at + 8 <= declared:
         length, kind = int.from_bytes(content[at : at + 4], "little"), content[at + 4 : at + 8]
         if at + 8 + length > declared:
-            raise DamagedMesh(f"{where} is not a readable glTF mesh: a chunk goes beyond its end; export it again")
+            raise Damage("is not a readable glTF mesh: a chunk goes beyond its end; export it again")
         chunk = content[at + 8 : at + 8 + length]
         if kind == b"JSON" and document is None:
             document = json.loads(chunk.decode())
@@ -94,21 +66,18 @@ def _chunks(content: bytes, where: str) -> tuple[Any, bytes]:
 class _Reader:
     """Reads the meshes of one document."""
 
-    def __init__(self, document: Any, binary: bytes, where: str, sibling: Callable[[str], bytes]):
+    def __init__(self, document: Any, binary: bytes, sibling: Callable[[str], bytes]):
         if not isinstance(document, dict) or "asset" not in document:
-            raise DamagedMesh(f"{where} is not a readable glTF mesh: it has no asset; repair it or take it away")
+            raise Damage("is not a readable glTF mesh: it has no asset; repair it or take it away")
         if not str(document["asset"].get("version", "")).startswith("2."):
-            raise DamagedMesh(
-                f"{where} is not glTF 2.0 but {document['asset'].get('version')!r}; export it as glTF 2.0"
-            )
-        self.document, self.binary, self.where, self.sibling = document, binary, where, sibling
+            raise Damage(f"is not glTF 2.0 but {document['asset'].get('version')!r}; export it as glTF 2.0")
+        self.document, self.binary, self.sibling = document, binary, sibling
         self.buffers: dict[int, bytes] = {}
         self.elements = 0
         for name in document.get("extensionsRequired", []):
             if name not in _READ and not str(name).startswith(_HARMLESS):
-                raise DamagedMesh(
-                    f"{where} requires the extension {name}, which is not read; export it without (gltf-transform, Blender)"
-                )
+                without = "export it without (gltf-transform, Blender)"
+                raise Damage(f"requires the extension {name}, which is not read; {without}")
 
     def item(self, kind: str, index: Any) -> Any:
         """Returns one entry of a list of the document, such as accessor 3."""
@@ -125,17 +94,14 @@ class _Reader:
         if uri is None and index == 0:
             content = self.binary
         elif uri is None:
-            raise DamagedMesh(f"{self.where} has no data for buffer {index}; export it again")
+            raise Damage(f"has no data for buffer {index}; export it again")
         elif uri.startswith("data:"):
             head, _, body = uri.partition(",")
             content = base64.b64decode(body) if head.endswith(";base64") else urllib.parse.unquote_to_bytes(body)
         else:
             content = self.sibling(urllib.parse.unquote(uri))
         if len(content) < entry["byteLength"]:
-            raise DamagedMesh(
-                f"{self.where} is cut short: buffer {index} has {len(content)} of {entry['byteLength']} bytes; "
-                f"fetch or export it again"
-            )
+            raise cut_short(f"buffer {index} has {len(content)} of {entry['byteLength']} bytes")
         self.buffers[index] = content
         return content
 
@@ -144,26 +110,25 @@ class _Reader:
         entry = self.item("bufferViews", index)
         for name in entry.get("extensions", {}):  # if its buffer has data all the same, these are not compressed
             if "meshopt" in name and "extensions" in self.item("buffers", entry["buffer"]):
-                raise DamagedMesh(
-                    f"{self.where} is compressed with {name}, which is not read; unpack it with: gltf-transform copy, or gltfpack"
+                raise Damage(
+                    f"is compressed with {name}, which is not read; unpack it with: gltf-transform copy, or gltfpack"
                 )
         start, length = entry.get("byteOffset", 0), entry["byteLength"]
         content = self.buffer(entry["buffer"])
         if min(start, length) < 0 or start + length > len(content):
-            raise DamagedMesh(f"{self.where} is cut short: buffer view {index} goes beyond its buffer; export it again")
+            raise Damage(f"is cut short: buffer view {index} goes beyond its buffer; export it again")
         return content[start : start + length], int(entry.get("byteStride", 0))
 
-    def _array(self, index: Any, offset: int, count: int, kind: str, width: int) -> np.ndarray:
-        """Returns `count` elements of `width` numbers from a buffer view."""
+    def _array(self, entry: Any, count: int, kind: str, width: int) -> np.ndarray:
+        """Returns `count` elements of `width` numbers from the place in a buffer view that `entry` names."""
+        index, offset = entry["bufferView"], entry.get("byteOffset", 0)
         content, stride = self.view(index)
         element = np.dtype((kind, (width,)))
         stride = stride or element.itemsize
         if offset < 0 or count < 0 or stride < element.itemsize or (
             count and offset + stride * (count - 1) + element.itemsize > len(content)
         ):  # fmt: skip
-            raise DamagedMesh(
-                f"{self.where} is cut short: an accessor goes beyond buffer view {index}; export it again"
-            )
+            raise Damage(f"is cut short: an accessor goes beyond buffer view {index}; export it again")
         return np.ndarray((count, width), kind, content, offset, (stride, np.dtype(kind).itemsize))
 
     def accessor(self, index: Any) -> np.ndarray:
@@ -172,25 +137,17 @@ class _Reader:
         kind, width, count = _COMPONENTS[entry["componentType"]], _WIDTHS[entry["type"]], entry["count"]
         if type(count) is not int or not 0 <= count <= (MOST_ELEMENTS if "bufferView" in entry else MOST_ZEROS):
             raise ValueError(f"accessor {index} has {count!r} elements")
-        if "bufferView" in entry:
-            values = self._array(entry["bufferView"], entry.get("byteOffset", 0), count, kind, width)
-        else:
-            values = np.zeros((count, width), kind)
+        values = self._array(entry, count, kind, width) if "bufferView" in entry else np.zeros((count, width), kind)
         if sparse := entry.get("sparse"):
-            at, new = sparse["indices"], sparse["values"]
-            places = self._array(
-                at["bufferView"], at.get("byteOffset", 0), sparse["count"], _COMPONENTS[at["componentType"]], 1
-            )
-            values = values.copy()
-            values[places[:, 0]] = self._array(
-                new["bufferView"], new.get("byteOffset", 0), sparse["count"], kind, width
-            )
+            at, new, values = sparse["indices"], sparse["values"], values.copy()
+            places = self._array(at, sparse["count"], _COMPONENTS[at["componentType"]], 1)
+            values[places[:, 0]] = self._array(new, sparse["count"], kind, width)
         return _unquantised(values) if entry.get("normalized") else values
 
     def _spend(self, elements: int) -> None:
         self.elements += elements
         if self.elements > MOST_ELEMENTS:
-            raise DamagedMesh(f"{self.where} unfolds to more than {MOST_ELEMENTS:,} elements; export a simpler mesh")
+            raise Damage(f"unfolds to more than {MOST_ELEMENTS:,} elements; export a simpler mesh")
 
     def primitive(self, entry: Any) -> tuple[np.ndarray, np.ndarray, dict[str, np.ndarray]] | None:
         """Returns the vertices, triangles and skin of a primitive, or None for points and lines."""
@@ -212,7 +169,7 @@ class _Reader:
             triangles = indices[: len(indices) // 3 * 3].reshape(-1, 3)
         else:
             triangles = (strip_triangles if mode == 5 else fan_triangles)(indices)
-        check_indices(triangles, len(vertices), self.where)
+        check_indices(triangles, len(vertices))
         skin = {name: self.accessor(at) for name, at in attributes.items() if name.startswith(("JOINTS_", "WEIGHTS_"))}
         return vertices.astype(np.float64), triangles, skin
 
@@ -223,16 +180,14 @@ class _Reader:
         try:
             mesh = DracoPy.decode(bytes(content))
         except Exception as error:  # DracoPy raises exceptions of its own and of Cython's
-            raise DamagedMesh(
-                f"{self.where} has a Draco mesh that cannot be decoded ({error}); export it again"
-            ) from error
+            raise Damage(f"has a Draco mesh that cannot be decoded ({error}); export it again") from error
         vertices = np.asarray(mesh.points)
         position = self.item("accessors", entry["attributes"]["POSITION"])
         if position.get("normalized") and vertices.dtype.kind in "iu":
             vertices = _unquantised(vertices.astype(_COMPONENTS[position["componentType"]]))
         faces = getattr(mesh, "faces", None)
         if faces is None:
-            raise DamagedMesh(f"{self.where} has a Draco point cloud in place of a mesh; export it again")
+            raise Damage("has a Draco point cloud in place of a mesh; export it again")
         return vertices.reshape(-1, 3), np.asarray(faces).reshape(-1)
 
     def matrix(self, node: Any) -> np.ndarray:
@@ -274,9 +229,7 @@ class _Reader:
             raise ValueError("the attributes of instances differ in their number")
         count = counts.pop()
         if count > MOST_COPIES:
-            raise DamagedMesh(
-                f"{self.where} has {count:,} copies of a mesh, more than {MOST_COPIES:,}; export a simpler mesh"
-            )
+            raise Damage(f"has {count:,} copies of a mesh, more than {MOST_COPIES:,}; export a simpler mesh")
         return _transform(
             given.get("TRANSLATION", np.zeros((count, 3))),
             given.get("ROTATION", np.tile((0.0, 0, 0, 1), (count, 1))),
@@ -304,11 +257,7 @@ class _Reader:
                     continue
                 for copy in world @ copies:
                     parts.append((vertices @ copy[:3, :3].T + copy[:3, 3], triangles))
-        if not parts:
-            return np.zeros((0, 3)), np.zeros((0, 3), np.int64)
-        first = np.cumsum([0] + [len(vertices) for vertices, _ in parts])
-        vertices = np.concatenate([vertices for vertices, _ in parts])
-        return vertices, np.concatenate([triangles + at for (_, triangles), at in zip(parts, first, strict=False)])
+        return merged(parts)
 
     def _skinned(
         self, vertices: np.ndarray, skin: dict[str, np.ndarray], entry: Any, placed: dict[int, np.ndarray]

@@ -2,18 +2,33 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import mapbox_earcut
 import numpy as np
 
-from data_pipeline.errors import DamagedMesh
-from data_pipeline.objects.checks import check_indices
+from data_pipeline.errors import Damage
 
 MOST_WORK = 600_000_000
 """Largest sum of squared numbers of corners of the concave polygons of a file. Ear clipping needs time in proportion to it if a
 polygon crosses itself; this is a few seconds."""
 
 
-def triangulate(vertices: np.ndarray, corners: np.ndarray, counts: np.ndarray, where: str) -> np.ndarray:
+def check_indices(indices: np.ndarray, vertex_count: int) -> None:
+    """Raises `Damage` if an index of a vertex is negative or beyond the last vertex."""
+    if indices.size and (indices.min() < 0 or indices.max() >= vertex_count):
+        raise Damage(f"has faces that name vertices beyond its {vertex_count}; repair it or take it away")
+
+
+def merged(parts: Sequence[tuple[np.ndarray, np.ndarray]]) -> tuple[np.ndarray, np.ndarray]:
+    """Returns the vertices and triangles of several meshes as those of one."""
+    first = np.cumsum([0, *(len(vertices) for vertices, _ in parts)])
+    moved = [triangles + at for (_, triangles), at in zip(parts, first, strict=False)]
+    vertices = np.concatenate([np.zeros((0, 3)), *(vertices for vertices, _ in parts)])
+    return vertices, np.concatenate([np.zeros((0, 3), np.int64), *moved])
+
+
+def triangulate(vertices: np.ndarray, corners: np.ndarray, counts: np.ndarray) -> np.ndarray:
     """Returns the triangles (m, 3) of polygons, in their order.
 
     A polygon becomes the fan about its first corner where that covers exactly its area. Other concave polygons are cut by ear
@@ -23,15 +38,14 @@ def triangulate(vertices: np.ndarray, corners: np.ndarray, counts: np.ndarray, w
         vertices: (n, 3).
         corners: indices of the vertices of all polygons, one polygon after the other.
         counts: number of corners of each polygon.
-        where: name of the file for error messages.
 
     Raises:
-        DamagedMesh: if a corner names a vertex that does not exist, or concave polygons have too many corners.
+        Damage: if a corner names a vertex that does not exist, or concave polygons have too many corners.
     """
     corners, counts = np.asarray(corners, np.int64), np.asarray(counts, np.int64)
     if (counts == 3).all():
         return corners.reshape(-1, 3)
-    check_indices(corners, len(vertices), where)
+    check_indices(corners, len(vertices))
     starts = np.cumsum(counts) - counts
     sizes = np.maximum(counts - 2, 0)
     offsets = np.cumsum(sizes) - sizes
@@ -40,16 +54,12 @@ def triangulate(vertices: np.ndarray, corners: np.ndarray, counts: np.ndarray, w
     for size in np.unique(counts[counts >= 3]).tolist():
         rows = np.flatnonzero(counts == size)
         polygons = corners[starts[rows, None] + np.arange(size)]
-        fans = np.stack(
-            [np.broadcast_to(polygons[:, :1], (len(rows), size - 2)), polygons[:, 1:-1], polygons[:, 2:]], -1
-        )
+        fans = fan_triangles(polygons)
         if size > 3:
             concave = np.flatnonzero(~_fan_is_exact(vertices, fans))
             work += len(concave) * size**2
             if work > MOST_WORK:
-                raise DamagedMesh(
-                    f"{where} has concave polygons of up to {size:,} corners, too many to cut; export triangles"
-                )
+                raise Damage(f"has concave polygons of up to {size:,} corners, too many to cut; export triangles")
             for at in concave:
                 fans[at] = _clipped(vertices, polygons[at], fans[at])
         triangles[offsets[rows, None] + np.arange(size - 2)] = fans
@@ -98,8 +108,6 @@ def strip_triangles(indices: np.ndarray) -> np.ndarray:
 
 
 def fan_triangles(indices: np.ndarray) -> np.ndarray:
-    """Returns the triangles (m, 3) of a triangle fan about its first vertex."""
-    middle = np.asarray(indices, np.int64)
-    if len(middle) < 3:
-        return np.zeros((0, 3), np.int64)
-    return np.stack([np.full(len(middle) - 2, middle[0]), middle[1:-1], middle[2:]], axis=-1)
+    """Returns the triangles (…, m, 3) of triangle fans about their first vertices; `indices` are (…, corners)."""
+    last = indices[..., 2:]
+    return np.stack([np.broadcast_to(indices[..., :1], last.shape), indices[..., 1:-1], last], axis=-1)

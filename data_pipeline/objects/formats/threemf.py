@@ -10,7 +10,8 @@ from xml.etree import ElementTree
 
 import numpy as np
 
-from data_pipeline.errors import DamagedMesh, DataError, kind_and_reason_of
+from data_pipeline.errors import Damage
+from data_pipeline.objects.formats.polygons import merged
 
 _CORE = "{http://schemas.microsoft.com/3dmanufacturing/core/2015/02}"
 _PATH = "{http://schemas.microsoft.com/3dmanufacturing/production/2015/06}path"
@@ -25,62 +26,47 @@ MOST_TRIANGLES = 50_000_000
 """Largest number of triangles that all copies in a file may have together."""
 
 
-def parse_3mf(content: bytes, where: str) -> tuple[np.ndarray, np.ndarray]:
-    """Returns the vertices (n, 3) and triangles (m, 3) of a 3MF file.
-
-    Raises:
-        DamagedMesh: if the file is not a readable 3MF mesh.
-    """
-    try:
-        return _parse(content, where)
-    except DataError:
-        raise
-    except Exception as error:  # zip streams and XML fail in many ways
-        reason = kind_and_reason_of(error)
-        raise DamagedMesh(f"{where} is not a readable .3mf mesh ({reason}); repair it or take it away") from error
-
-
-def _parse(content: bytes, where: str) -> tuple[np.ndarray, np.ndarray]:
-    with zipfile.ZipFile(io.BytesIO(content)) as archive:
-        names = {name.lstrip("/").lower(): name for name in archive.namelist()}
-        model = names.get("3d/3dmodel.model") or min(name for name in names.values() if name.lower().endswith(".model"))
-        if archive.getinfo(model).file_size > LARGEST:
-            raise DamagedMesh(f"{where} unpacks to more than {LARGEST >> 20} MB; export a simpler mesh")
-        text = archive.read(model)
-    if b"<!ENTITY" in text:
-        raise DamagedMesh(f"{where} defines XML entities, which are not read; export it again")
-    root = ElementTree.fromstring(text)
+def parse_3mf(content: bytes) -> tuple[np.ndarray, np.ndarray]:
+    """Reads the items of a 3MF file that are to be built."""
+    root = ElementTree.fromstring(_model(content))
     objects = {entry.get("id"): entry for entry in root.iter(f"{_CORE}object")}
-    parts: list[tuple[np.ndarray, np.ndarray]] = []
-    total = unfolded = first = 0
     todo: deque[tuple[Any, np.ndarray, tuple[str, ...]]] = deque(
         (item, np.eye(4), ()) for item in root.iter(f"{_CORE}item")
     )
     read: dict[str, tuple[np.ndarray, np.ndarray]] = {}
+    parts: list[tuple[np.ndarray, np.ndarray]] = []
+    unfolded = 0
     while todo:
         use, parent, above = todo.popleft()
         if use.get(_PATH):
-            raise DamagedMesh(
-                f"{where} keeps parts in other files of its archive, which is not read; export it as .stl"
-            )
+            raise Damage("keeps parts in other files of its archive, which is not read; export it as .stl")
         name = use.get("objectid")
-        total += 1
-        if name in above or len(above) > 50 or total > MOST_COPIES or len(todo) > MOST_COPIES:
-            raise DamagedMesh(f"{where} has an object within itself, or too many copies; export it again")
+        if name in above or len(above) > 50 or len(parts) >= MOST_COPIES or len(todo) > MOST_COPIES:
+            raise Damage("has an object within itself, or too many copies; export it again")
         entry, place = objects[name], parent @ _matrix(use.get("transform"))
         if name not in read:
             mesh = entry.find(f"{_CORE}mesh")
-            read[name] = _mesh(mesh) if mesh is not None else (np.zeros((0, 3)), np.zeros((0, 3), np.int64))
+            read[name] = _mesh(mesh) if mesh is not None else merged([])
         vertices, triangles = read[name]
         unfolded += len(triangles)
         if unfolded > MOST_TRIANGLES:
-            raise DamagedMesh(f"{where} unfolds to more than {MOST_TRIANGLES:,} triangles; export a simpler mesh")
-        parts.append((vertices @ place[:3, :3].T + place[:3, 3], triangles + first))
-        first += len(vertices)
+            raise Damage(f"unfolds to more than {MOST_TRIANGLES:,} triangles; export a simpler mesh")
+        parts.append((vertices @ place[:3, :3].T + place[:3, 3], triangles))
         todo += [(part, place, (*above, name)) for part in entry.iter(f"{_CORE}component")]
-    if not parts:
-        return np.zeros((0, 3)), np.zeros((0, 3), np.int64)
-    return np.concatenate([vertices for vertices, _ in parts]), np.concatenate([triangles for _, triangles in parts])
+    return merged(parts)
+
+
+def _model(content: bytes) -> bytes:
+    """Returns the document of the model in the archive."""
+    with zipfile.ZipFile(io.BytesIO(content)) as archive:
+        names = {name.lstrip("/").lower(): name for name in archive.namelist()}
+        model = names.get("3d/3dmodel.model") or min(name for name in names.values() if name.lower().endswith(".model"))
+        if archive.getinfo(model).file_size > LARGEST:
+            raise Damage(f"unpacks to more than {LARGEST >> 20} MB; export a simpler mesh")
+        text = archive.read(model)
+    if b"<!ENTITY" in text:
+        raise Damage("defines XML entities, which are not read; export it again")
+    return text
 
 
 def _mesh(mesh: Any) -> tuple[np.ndarray, np.ndarray]:

@@ -22,11 +22,8 @@ from data_pipeline.objects.furniture.monitors import MONITORS
 from data_pipeline.objects.furniture.seats import CHAIRS, SOFAS
 from data_pipeline.objects.furniture.solids import Parts, Random, Solid, joined
 from data_pipeline.objects.furniture.tables import DESKS, TABLES
-from data_pipeline.objects.mesh import MODELNET10_CLASSES
 
 __all__ = ["CLASSES", "VARIANTS", "furniture", "joined"]
-
-CLASSES = MODELNET10_CLASSES
 
 VARIANTS: dict[str, tuple[Callable[[Random], Parts], ...]] = {
     "bathtub": BATHTUBS,
@@ -41,6 +38,9 @@ VARIANTS: dict[str, tuple[Callable[[Random], Parts], ...]] = {
     "toilet": TOILETS,
 }
 """The functions that build the parts of a piece, by class."""
+
+CLASSES = tuple(VARIANTS)
+"""Those of ModelNet10, in the order of the labels."""
 
 
 def furniture(class_name: str, seed: int) -> Solid:

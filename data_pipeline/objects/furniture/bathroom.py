@@ -104,8 +104,7 @@ def _bowl(random: Random, height: float, foot: float) -> tuple[Parts, float, flo
     if random.random() < 0.5:  # lid down
         parts.append(
             lathe(
-                [(0, height + 0.02), (r * 1.04, height + 0.02), (r * 1.04, height + 0.05), (0, height + 0.055)],
-                stretch,
+                [(0, height + 0.02), (r * 1.04, height + 0.02), (r * 1.04, height + 0.05), (0, height + 0.055)], stretch
             )
         )
     else:  # seat with a hole, lid up

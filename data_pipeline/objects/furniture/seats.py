@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from typing import Any
+
 import numpy as np
 import trimesh
 
@@ -136,9 +139,7 @@ def _sofa_body(
         parts.append(box(cushion - 0.02, depth - thick, 0.14, x, -thick / 2, seat - 0.12))
         if random.random() < 0.9:
             parts += tilt(
-                [box(cushion - 0.03, 0.14, back * 0.85, x, depth / 2 - thick, seat)],
-                0.15,
-                (x, depth / 2 - thick, seat),
+                [box(cushion - 0.03, 0.14, back * 0.85, x, depth / 2 - thick, seat)], 0.15, (x, depth / 2 - thick, seat)
             )
     parts.append(box(width, thick, seat + back - feet, 0, depth / 2 - thick / 2, feet))
     if arms:
@@ -151,24 +152,9 @@ def _sofa_body(
     return parts, width, depth, seat
 
 
-def sofa_plain(random: Random) -> Parts:
-    """A sofa for two or three with square arms lower than the back."""
-    return _sofa_body(random, int(random.integers(2, 4)))[0]
-
-
-def sofa_round_arms(random: Random) -> Parts:
-    """A sofa with rolled arms."""
-    return _sofa_body(random, int(random.integers(2, 4)), round_arms=True)[0]
-
-
-def sofa_even(random: Random) -> Parts:
-    """A sofa whose arms are as high as the back."""
-    return _sofa_body(random, int(random.integers(2, 4)), arm_rise=1.0)[0]
-
-
-def sofa_armless(random: Random) -> Parts:
-    """A sofa without arms."""
-    return _sofa_body(random, int(random.integers(2, 4)), arms=False)[0]
+def _sofa(**shape: Any) -> Callable[[Random], Parts]:
+    """A sofa for two or three of this shape, see `_sofa_body`."""
+    return lambda random: _sofa_body(random, int(random.integers(2, 4)), **shape)[0]
 
 
 def sofa_corner(random: Random) -> Parts:
@@ -183,4 +169,4 @@ def sofa_corner(random: Random) -> Parts:
 
 
 CHAIRS = (chair_dining, chair_office, chair_cantilever, chair_tub, chair_stool_back)
-SOFAS = (sofa_plain, sofa_round_arms, sofa_even, sofa_armless, sofa_corner)
+SOFAS = (_sofa(), _sofa(round_arms=True), _sofa(arm_rise=1.0), _sofa(arms=False), sofa_corner)

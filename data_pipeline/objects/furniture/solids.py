@@ -97,14 +97,7 @@ def _handle(kind: int, width: float, x: float, y: float, z: float) -> Parts:
 
 
 def drawers(
-    random: Random,
-    width: float,
-    height: float,
-    rows: int,
-    columns: int,
-    x: float,
-    front: float,
-    z: float,
+    random: Random, width: float, height: float, rows: int, columns: int, x: float, front: float, z: float
 ) -> Parts:
     """Drawer fronts with handles, centred at `x`, standing out from the plane y = `front`.
 

@@ -219,12 +219,12 @@ from data_pipeline.objects.mesh import ObjectEntry
 from data_pipeline.objects.recipes import FurniturePiece
 from data_pipeline.objects.sources import load_object
 from pathlib import Path
-rig = rig_for(CaptureConfig(views=8, resolution=224))
+rig = rig_for(CaptureConfig(views=4, resolution=224))
 for name in sys.argv[2:]:
     mesh = load_object(ObjectEntry(name, 0, "train", FurniturePiece(name, 5)))
     save_capture(Path(sys.argv[1]) / f"{name}_drawn.npz", capture_with_visualizer(mesh, rig))
     save_capture(Path(sys.argv[1]) / f"{name}_cast.npz", capture(mesh, rig))
-    save_capture(Path(sys.argv[1]) / f"{name}_fine.npz", capture(mesh, rig_for(CaptureConfig(views=8, resolution=672))))
+    save_capture(Path(sys.argv[1]) / f"{name}_fine.npz", capture(mesh, rig_for(CaptureConfig(views=4, resolution=672))))
 """
 
 
@@ -233,7 +233,7 @@ def test_the_thesiss_visualizer_sees_what_rays_see(tmp_path):
     open3d_or_skip()
     if not os.environ.get("DISPLAY") and not shutil.which("xvfb-run"):
         pytest.skip("the visualizer needs a display, and Xvfb is not installed")
-    names = ["chair", "bathtub", "desk", "toilet"]
+    names = ["chair", "toilet"]
     result = under_xvfb(SEE_BOTH, str(tmp_path), *names)
     assert result.returncode == 0, result.stderr
     for name in names:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import partial
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -24,11 +26,15 @@ KINDS = ("structured-light", "stereo")
 FRONT = np.asarray(look_at_origin(jnp.array([0.0, 0.0, 2.0])))
 
 
-def measured(depth, config, count=60, pose=FRONT, surface=None, camera=CAMERA):
+@partial(jax.jit, static_argnames="config")
+def sensed(keys, depth, config, pose, strength, surface):
+    return jax.vmap(lambda key: sense(key, depth, pose, CAMERA, config, strength, surface))(keys)
+
+
+def measured(depth, kind, count=60, *, distance=1.0, strength=1.0, pose=FRONT, surface=None):
     """What a sensor measures of one image, so many times."""
     keys = jax.random.split(jax.random.key(1), count)
-    program = jax.jit(jax.vmap(lambda key: sense(key, depth, pose, camera, config, surface=surface)))
-    return np.asarray(program(keys))
+    return np.asarray(sensed(keys, depth, SensorConfig(kind, distance=distance), pose, strength, surface))
 
 
 def plane(tilt: float, side: int = CAMERA.resolution) -> np.ndarray:
@@ -54,8 +60,7 @@ INSIDE = (slice(8, -8), slice(8, -8))
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("distance", [0.6, 1.0, 2.0])
 def test_depth_of_a_wall_varies_as_published(kind, distance):
-    config = SensorConfig(kind, distance=distance)
-    found = measured(plane(0.0), config)[:, *INSIDE] * distance / 2
+    found = measured(plane(0.0), kind, distance=distance)[:, *INSIDE] * distance / 2
     off = found[found > 0] - distance
     if kind == "stereo":
         constant, step = REALSENSE.focal * REALSENSE.baseline, REALSENSE.step
@@ -83,14 +88,15 @@ def test_deviations_are_the_published_formulas():
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_without_strength_an_image_stays_as_it_is(kind):
-    for config in (SensorConfig(kind, strength=0.0), SensorConfig("none")):
-        np.testing.assert_allclose(measured(ball(), config, count=2), np.stack([ball()] * 2), rtol=1e-6)
+    np.testing.assert_allclose(measured(ball(), kind, strength=0.0), np.stack([ball()] * 60), rtol=1e-6)
+    none = sense(jax.random.key(0), ball(), FRONT, CAMERA, SensorConfig("none"))
+    np.testing.assert_array_equal(none, ball())
 
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_grazing_surfaces_edges_and_dark_areas_are_lost(kind):
     def lost(depth, strength=1.0, where=INSIDE):
-        found = measured(depth, SensorConfig(kind, strength=strength))
+        found = measured(depth, kind, strength=strength)
         return np.mean((found == 0)[:, *where] if isinstance(where, tuple) else (found == 0)[:, where])
 
     assert lost(plane(0.0)) == pytest.approx(0.05, abs=0.03)  # dark areas alone
@@ -105,7 +111,7 @@ def test_grazing_surfaces_edges_and_dark_areas_are_lost(kind):
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_some_pixels_at_edges_float_behind_them(kind):
-    found = measured(ball(), SensorConfig(kind)) / 2  # metres
+    found = measured(ball(), kind) / 2  # metres
     floating = (found > 0) & (found > ball() / 2 + 0.03)
     seen = ball() > 0
     inner = seen.copy()
@@ -119,30 +125,30 @@ def test_some_pixels_at_edges_float_behind_them(kind):
 @pytest.mark.parametrize("kind", KINDS)
 def test_dark_areas_belong_to_the_object(kind):
     """Two views of one surface lose the same places, and another object other ones."""
-    config = SensorConfig(kind, strength=4.0)
-    here, there = (np.mean(measured(plane(0.0), config, 40, surface=jax.random.key(k)) == 0, axis=0) for k in (3, 4))
-    again = np.mean(measured(plane(0.0), config, 40, surface=jax.random.key(3)) == 0, axis=0)
-    assert np.corrcoef(here[INSIDE].ravel(), again[INSIDE].ravel())[0, 1] > 0.9
+
+    def dark(surface, pose=FRONT):
+        found = measured(plane(0.0), kind, strength=4.0, pose=pose, surface=jax.random.key(surface))
+        return np.mean(found == 0, axis=0)
+
+    here, there = dark(3), dark(4)
     assert np.corrcoef(here[INSIDE].ravel(), there[INSIDE].ravel())[0, 1] < 0.5
     # From the other side of the plane, columns are reversed.
     behind = np.asarray(look_at_origin(jnp.array([0.0, 0.0, -2.0])))
     turned = np.linalg.inv(FRONT) @ behind
     assert turned[2, 3] == pytest.approx(4, abs=1e-5)
-    other = np.mean(measured(plane(0.0), config, 40, behind, jax.random.key(3)) == 0, axis=0)
+    other = dark(3, behind)
     flips = [other, other[:, ::-1], other[::-1], other[::-1, ::-1]]
     assert max(np.corrcoef(here[INSIDE].ravel(), flip[INSIDE].ravel())[0, 1] for flip in flips) > 0.9
 
 
-def test_images_are_finite_and_repeat():
-    poses = jax.vmap(look_at_origin)(2 * jnp.asarray(fibonacci_sphere(5), jnp.float32))
-    for kind in KINDS:
-        config = SensorConfig(kind, strength=2.0, distance=0.4)
-        program = jax.jit(jax.vmap(lambda key, pose, config=config: sense(key, ball(), pose, CAMERA, config)))
-        keys = jax.random.split(jax.random.key(0), 5)
-        found = np.asarray(program(keys, poses))
-        assert found.shape == (5, 48, 48)
+@pytest.mark.parametrize("kind", KINDS)
+def test_images_are_finite_and_repeat(kind):
+    for pose in jax.vmap(look_at_origin)(2 * jnp.asarray(fibonacci_sphere(5), jnp.float32)):
+        found = measured(ball(), kind, distance=0.6, strength=2.0, pose=pose)
+        assert found.shape == (60, 48, 48)
         assert np.isfinite(found).all()
         assert (found >= 0).all()
-        np.testing.assert_array_equal(found, program(keys, poses))
-        stronger = jax.jit(lambda key, strength, config=config: sense(key, ball(), FRONT, CAMERA, config, strength))
-        np.testing.assert_array_equal(stronger(keys[0], 2.0), program(keys, jnp.stack([jnp.asarray(FRONT)] * 5))[0])
+        np.testing.assert_array_equal(found, measured(ball(), kind, distance=0.6, strength=2.0, pose=pose))
+    stronger = SensorConfig(kind, strength=2.0, distance=0.6)
+    one = sensed(jax.random.split(jax.random.key(1), 60), ball(), stronger, FRONT, None, None)
+    np.testing.assert_allclose(one, measured(ball(), kind, distance=0.6, strength=2.0), rtol=1e-6)

@@ -160,7 +160,7 @@ def test_a_data_set_is_identified_by_its_viewpoints(tmp_path):
     """Not by the path of their file, which it does not need any more; and its statistics have the neighbours."""
     path = tmp_path / "a.json"
     path.write_text(json.dumps({"viewpoints": DIRECTIONS, "adjacency": RING}))
-    capture = CaptureConfig(views=5, lattice=f"{FILE}{path}", resolution=8, backend="rasterise")
+    capture = CaptureConfig(views=5, lattice=f"{FILE}{path}", resolution=8)
     config = DataConfig(train_per_class=2, test_per_class=1, capture=capture)
     statistics = prepare(config, tmp_path / "data")
     assert statistics.camera.lattice == f"{FILE}{read_viewpoints(path).digest}" == identified(capture).lattice
@@ -182,7 +182,7 @@ def test_viewpoints_without_a_graph_need_one(tmp_path):
     points = np.stack([np.cos(angle), np.sin(angle), np.full(6, 0.5)], axis=1).tolist()
     path = tmp_path / "ring.json"
     path.write_text(json.dumps(points))
-    capture = CaptureConfig(views=6, lattice=f"{FILE}{path}", resolution=8, backend="rasterise")
+    capture = CaptureConfig(views=6, lattice=f"{FILE}{path}", resolution=8)
     config = DataConfig(train_per_class=2, test_per_class=1, capture=capture)
     with pytest.raises(DataError, match=r"in one plane have no view graph: give the neighbours in .*ring.json"):
         prepare(config, tmp_path / "data")

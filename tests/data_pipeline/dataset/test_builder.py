@@ -87,14 +87,6 @@ def test_statistics_of_another_version_are_described(tmp_path):
         load_statistics(tmp_path)
 
 
-def test_nothing_is_left_in_the_folder_for_temporary_files(tmp_path, monkeypatch):
-    (tmp_path / "temporary").mkdir()
-    monkeypatch.setattr("tempfile.tempdir", str(tmp_path / "temporary"))
-    config = replace(CONFIG, train_per_class=2, test_per_class=1, capture=replace(CONFIG.capture, views=4))
-    prepare(config, tmp_path / "data")
-    assert list((tmp_path / "temporary").iterdir()) == []
-
-
 def test_a_data_set_is_not_made_twice_nor_mixed(data):
     before = {path: path.stat().st_mtime_ns for path in data.rglob("*") if path.is_file()}
     assert prepare(CONFIG, data) == load_statistics(data)
@@ -121,19 +113,18 @@ def test_no_tensorflow_is_imported(data):
     assert out.stdout.strip() == "none"
 
 
-def test_more_records_than_memory_are_sorted_on_disk(tmp_path, data):
+def test_more_records_than_memory_are_sorted_on_disk_and_nothing_is_left_there(tmp_path, data, monkeypatch):
     """TFDS keeps 1 GiB of records in memory; beyond that its own code wants TensorFlow, and ours must do without."""
     from tensorflow_datasets.core import shuffle
 
     from data_pipeline.dataset.builder import _builder_class
 
     _builder_class()
-    limit = shuffle.MAX_MEM_BUFFER_SIZE
-    shuffle.MAX_MEM_BUFFER_SIZE = 1
-    try:
-        prepare(CONFIG, tmp_path / "data")
-    finally:
-        shuffle.MAX_MEM_BUFFER_SIZE = limit
+    monkeypatch.setattr(shuffle, "MAX_MEM_BUFFER_SIZE", 1)
+    (tmp_path / "temporary").mkdir()
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path / "temporary"))
+    prepare(CONFIG, tmp_path / "data")
+    assert list((tmp_path / "temporary").iterdir()) == []
     spilled, kept = open_split(tmp_path / "data", "train"), open_split(data, "train")
     assert [spilled[i]["name"] for i in range(40)] == [kept[i]["name"] for i in range(40)]
     np.testing.assert_array_equal(spilled[3]["depth"], kept[3]["depth"])

@@ -118,28 +118,28 @@ def test_data_sets_of_before_are_still_found(tmp_path):
     for other in ({"up": "y"}, {"split": "0.5"}):
         with pytest.raises(DataError, match=rf"made with other settings \({next(iter(other))} "):
             prepare(replace(config, **other), tmp_path / "data")
+    further = write(tmp_path / "two", members(("mug", "rack")))
+    with pytest.raises(DataError, match=r"dataset\.more \[\], not"):
+        check_same_data(replace(config, more=(str(further),)), tmp_path / "data")
 
 
-def test_the_summary_says_which_axis_was_up(tmp_path, capsys):
+def test_the_summary_says_which_axis_was_up_and_what_is_left_out(tmp_path, capsys):
     files = members(("mug", "rack")) | {"mug/train/m.glb": glb(*box((1, 3, 1))), "other/[x].obj": b""}
+    files["mug/train/wire.off"] = off(*box((200, 1e-4, 1e-4)))
     config = DataConfig(source=str(write(tmp_path / "set", files)), capture=CAPTURE)
     statistics = prepare(config, tmp_path / "data")
     assert extents(tmp_path / "data")["mug/train/m.glb"] == [1, 1, 3]
     assert load_statistics(tmp_path / "data") == statistics
     assert statistics.notes[0].startswith("turned to z up from the axis that their format declares: 1 .glb;")
-    assert statistics.left_out["other"] == {"other/[x].obj": "lies in no folder of a class with train, val or test"}
+    assert statistics.left_out == {
+        "train": {"mug/train/wire.off": "no view shows it: it is thinner than the pixels of 16×16 views"},
+        "test": {},
+        "other": {"other/[x].obj": "lies in no folder of a class with train, val or test"},
+    }
     report_left_out(statistics)
     said = " ".join(capsys.readouterr().err.split())
     assert "left out: other/[x].obj: lies in no folder" in said
-    assert "declares: 1 .glb; the other 6 were taken as z up" in said
-
-
-def test_an_object_that_no_view_shows_is_left_out_by_name(tmp_path):
-    files = members(("mug", "rack")) | {"mug/train/wire.off": off(*box((200, 1e-4, 1e-4)))}
-    config = DataConfig(source=str(write(tmp_path / "set", files)), capture=CAPTURE)
-    statistics = prepare(config, tmp_path / "data")
-    reason = "no view shows it: it is thinner than the pixels of 16×16 views"
-    assert statistics.left_out == {"train": {"mug/train/wire.off": reason}, "test": {}}
+    assert "declares: 1 .glb; the other 7 were taken as z up" in said
 
 
 def test_a_class_without_training_objects_is_named(tmp_path):
@@ -248,11 +248,3 @@ def test_several_sources_keep_their_splits_and_their_names_apart(tmp_path):
     assert len({plain_class(name) for name in source.classes}) == len(source.classes)
     assert any("class Racks was taken as rack" in note for note in source.notes)
     assert {entry.split for entry in source.entries if entry.name.startswith("set")} == {"train", "test"}
-
-
-def test_further_sources_of_a_data_set_are_compared(tmp_path):
-    first, second = (write(tmp_path / name, members(("mug", "rack"))) for name in ("one", "two"))
-    config = DataConfig(source=str(first), more=(str(second),), capture=CAPTURE)
-    prepare(replace(config, more=()), tmp_path / "data")
-    with pytest.raises(DataError, match=r"dataset\.more \[\], not"):
-        check_same_data(config, tmp_path / "data")

@@ -2,20 +2,19 @@
 
 from __future__ import annotations
 
-import io
 import zipfile
-from pathlib import Path
 
 import numpy as np
 import pytest
 import trimesh
 
 from data_pipeline.errors import DamagedMesh, DataError, EmptyMesh
-from data_pipeline.objects.formats import parse_mesh, parse_off
+from data_pipeline.objects.formats import parse_mesh
 from data_pipeline.objects.furniture import CLASSES, VARIANTS, furniture
 from data_pipeline.objects.mesh import normalise
 from data_pipeline.objects.sources import load_object, open_source
 from data_pipeline.objects.voxels import VoxelGrid
+from tests.data_pipeline.objects.making import members, opened, write
 
 CUBE = trimesh.creation.box((1, 1, 1))
 
@@ -25,22 +24,6 @@ def off_of(mesh: trimesh.Trimesh, header: str = "OFF\n{v} {f} 0\n") -> str:
     lines += [" ".join(f"{x:.6f}" for x in vertex) for vertex in mesh.vertices]
     lines += ["3 " + " ".join(map(str, face)) for face in mesh.faces]
     return "\n".join(lines) + "\n"
-
-
-def open_data(path: Path | str):
-    return open_source(str(path), train_per_class=2, test_per_class=1)
-
-
-def mesh_folder(root: Path, classes=("cup", "jug"), suffix: str = "off") -> Path:
-    for name in classes:
-        for split in ("train", "test"):
-            folder = root / name / split
-            folder.mkdir(parents=True)
-            for index in range(2):
-                (folder / f"{name}_{index}.{suffix}").write_bytes(
-                    off_of(CUBE).encode() if suffix == "off" else CUBE.export(file_type=suffix)
-                )
-    return root
 
 
 # -------------------------------------------------------------------------------------------------------------- OFF files
@@ -60,14 +43,14 @@ def mesh_folder(root: Path, classes=("cup", "jug"), suffix: str = "off") -> Path
     ids=["plain", "joined", "one-line", "comments", "windows", "blank-lines", "colours"],
 )
 def test_off_quirks_are_read(text):
-    vertices, faces = parse_off(text.encode(), "cube.off")
+    vertices, faces = parse_mesh(text.encode(), ".off", "cube.off")
     np.testing.assert_allclose(vertices, CUBE.vertices, atol=1e-6)
     np.testing.assert_array_equal(faces, CUBE.faces)
 
 
 def test_polygons_become_fans():
     text = "OFF\n5 2 0\n0 0 0\n1 0 0\n1 1 0\n0 1 0\n0 0 1\n4 0 1 2 3\n3 0 1 4\n"
-    _, faces = parse_off(text.encode(), "square.off")
+    _, faces = parse_mesh(text.encode(), ".off", "square.off")
     np.testing.assert_array_equal(faces, [[0, 1, 2], [0, 2, 3], [0, 1, 4]])
 
 
@@ -85,24 +68,8 @@ def test_polygons_become_fans():
 )
 def test_damaged_off_files_are_described(content, message):
     with pytest.raises(DamagedMesh, match=message) as caught:
-        parse_off(content, "bad.off")
+        parse_mesh(content, ".off", "bad.off")
     assert "bad.off" in str(caught.value)
-    assert "\n" not in str(caught.value)
-
-
-@pytest.mark.parametrize("suffix", ["obj", "stl", "ply", "glb", "off"])
-def test_every_format_gives_the_same_object(suffix):
-    content = CUBE.export(file_type=suffix)
-    vertices, faces = parse_mesh(content if isinstance(content, bytes) else content.encode(), f".{suffix}", "cube")
-    mesh = normalise(vertices, faces, "cube")
-    area = trimesh.Trimesh(mesh.vertices, mesh.faces).area
-    assert area == pytest.approx(6 / (0.75), rel=1e-4)  # the unit cube's corner is √0.75 from its centre
-
-
-@pytest.mark.parametrize("suffix", [".obj", ".stl", ".ply", ".glb"])
-def test_files_that_are_no_mesh_are_described(suffix):
-    with pytest.raises(DamagedMesh, match=r"not a readable|has no faces") as caught:
-        normalise(*parse_mesh(b"this is not a mesh", suffix, f"bad{suffix}"), f"bad{suffix}")
     assert "\n" not in str(caught.value)
 
 
@@ -114,11 +81,6 @@ def test_normalised_meshes_are_centred_in_the_unit_sphere():
     assert np.linalg.norm(mesh.vertices, axis=1).max() == pytest.approx(1)
     np.testing.assert_allclose(mesh.vertices.min(0) + mesh.vertices.max(0), 0, atol=1e-6)
     np.testing.assert_allclose(mesh.extent, [4, 1, 2], rtol=1e-6)
-
-
-def test_a_vertex_that_no_face_uses_does_not_count():
-    vertices = np.concatenate([CUBE.vertices, [[100, 100, 100]]])
-    np.testing.assert_allclose(normalise(vertices, CUBE.faces, "cube").extent, [1, 1, 1])
 
 
 @pytest.mark.parametrize(
@@ -141,29 +103,6 @@ def test_unusable_meshes_are_told_apart(vertices, faces, error, message):
 # ---------------------------------------------------------------------------------------------------------------- sources
 
 
-def test_a_folder_of_meshes(tmp_path):
-    source = open_data(mesh_folder(tmp_path / "set"))
-    assert source.classes == ("cup", "jug")
-    assert len(source.entries) == 8
-    assert len({entry.name for entry in source.entries}) == 8
-    assert {entry.split for entry in source.entries} == {"train", "test"}
-    assert len(load_object(source.entries[0]).faces) == 12
-
-
-def test_a_zip_is_read_in_place(tmp_path):
-    folder = mesh_folder(tmp_path / "ModelNet2")
-    archive = tmp_path / "ModelNet2.zip"
-    with zipfile.ZipFile(archive, "w") as file:
-        for path in folder.rglob("*.off"):
-            file.write(path, path.relative_to(tmp_path))
-        file.writestr("__MACOSX/cup/train/._cup_0.off", "junk")
-    source = open_data(archive)
-    assert source.classes == ("cup", "jug")
-    assert len(source.entries) == 8
-    assert len(load_object(source.entries[-1]).faces) == 12
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["ModelNet2", "ModelNet2.zip"]
-
-
 @pytest.mark.parametrize(
     "member", ["../evil/train/a.off", "/etc/train/a.off", "cup/../../train/a.off", "C:/x/train/a.off"]
 )
@@ -172,7 +111,7 @@ def test_a_zip_whose_paths_leave_its_folder_is_refused(tmp_path, member):
     with zipfile.ZipFile(archive, "w") as file:
         file.writestr(member, off_of(CUBE))
     with pytest.raises(DataError, match="leaves its folder"):
-        open_data(archive)
+        opened(archive)
 
 
 def test_voxels_become_surfaces(tmp_path):
@@ -187,14 +126,14 @@ def test_voxels_become_surfaces(tmp_path):
     path = tmp_path / "voxels.npz"
     empty = np.zeros((2, 8, 8, 8), np.int32)
     np.savez(path, X_train=np.concatenate([grid, empty]), y_train=[0, 1, 1], X_test=grid, y_test=[1])
-    source = open_data(path)
+    source = opened(path)
     assert [entry.name for entry in source.entries][:2] == ["class_0_train_0000", "class_1_train_0001"]
     with pytest.raises(EmptyMesh, match="0 of 512 cells"):
         load_object(source.entries[1])
 
 
 def test_real_voxels_have_the_official_split(real_voxels):
-    source = open_data(real_voxels)
+    source = opened(real_voxels)
     splits = [entry.split for entry in source.entries]
     assert (splits.count("train"), splits.count("test")) == (3991, 908)
     assert source.classes == CLASSES
@@ -203,18 +142,6 @@ def test_real_voxels_have_the_official_split(real_voxels):
         filled = np.unpackbits(np.frombuffer(entry.recipe.bits, np.uint8)).sum()
         empty += filled < 5
     assert empty == 40
-
-
-def test_original_modelnet_meshes_are_read(real_meshes):
-    for path in sorted(real_meshes.glob("*.off")):
-        mesh = normalise(*parse_off(path.read_bytes(), path.name), path.name)
-        assert np.linalg.norm(mesh.vertices, axis=1).max() == pytest.approx(1, abs=1e-6)
-        ours = parse_off(path.read_bytes(), path.name)
-        text = path.read_text()
-        if text.startswith("OFF\n"):
-            theirs = trimesh.load(io.StringIO(text), file_type="off", process=False)
-            np.testing.assert_allclose(ours[0], theirs.vertices)
-            assert len(ours[1]) == len(theirs.faces)
 
 
 @pytest.mark.parametrize(
@@ -226,24 +153,24 @@ def test_original_modelnet_meshes_are_read(real_meshes):
         (lambda root: (root / "a.off").write_text("x") and root / "a.off", "does not begin with 'OFF'"),
         (lambda root: (root / "a.zip").write_text("x") and root / "a.zip", "not a readable zip"),
         (lambda root: (root / "a.npz").write_text("x") and root / "a.npz", "not a readable .npz"),
-        (lambda root: mesh_folder(root / "one", ("cup",)), "one class only"),
+        (lambda root: write(root / "one", members(("cup",))), "one class only"),
         (lambda root: (root / "empty").mkdir() or root / "empty", "no meshes laid out"),
     ],
 )
 def test_unusable_data_is_described_in_one_sentence(tmp_path, make, message):
     with pytest.raises(DataError, match=message) as caught:
-        open_data(make(tmp_path))
+        opened(make(tmp_path))
     assert "\n" not in str(caught.value)
 
 
 def test_an_empty_class_folder_is_named(tmp_path):
-    root = mesh_folder(tmp_path / "set")
+    root = write(tmp_path / "set", members())
     (root / "vase").mkdir()
     with pytest.raises(DataError, match="vase is empty"):
-        open_data(root)
+        opened(root)
     (root / "vase" / "train").mkdir()
     with pytest.raises(DataError, match="train is empty"):
-        open_data(root)
+        opened(root)
 
 
 # -------------------------------------------------------------------------------------------------------------- furniture

@@ -11,7 +11,7 @@ import pytest
 import trimesh
 
 from data_pipeline.objects.archives import ZipMember
-from data_pipeline.objects.formats import parse_off
+from data_pipeline.objects.formats import parse_mesh
 from data_pipeline.objects.mesh import normalise
 from data_pipeline.objects.voxels import FEWEST_VOXELS, voxel_archive
 from tests.conftest import beside_the_checkout
@@ -38,8 +38,12 @@ def test_modelnet_meshes_have_the_counts_of_their_headers(real_meshes):
     for path in sorted(real_meshes.glob("*.off")):
         content = path.read_bytes()
         counts = content[:64].removeprefix(b"OFF").split()[:2]
-        vertices, triangles = parse_off(content, path.name)
+        vertices, triangles = parse_mesh(content, ".off", path.name)
         assert [len(vertices), len(triangles)] == [int(count) for count in counts]
+        assert np.linalg.norm(normalise(vertices, triangles, path.name).vertices, axis=1).max() == pytest.approx(1)
+        if content.startswith(b"OFF\n"):  # as trimesh needs it
+            theirs = trimesh.load(io.BytesIO(content), file_type="off", process=False)
+            np.testing.assert_allclose(vertices, theirs.vertices)
 
 
 def test_surfaces_of_voxel_grids_are_half_a_cell_outside_of_them(real_voxels):

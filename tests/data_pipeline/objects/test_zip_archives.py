@@ -45,6 +45,7 @@ def test_names_as_other_programs_write_them(tmp_path, rename):
 def test_methods_that_python_reads(tmp_path, method):
     for entry in opened(archive_of(tmp_path, zipped(FILES, method))).entries:
         load_object(entry)
+    assert [path.name for path in tmp_path.iterdir()] == ["set.zip"]  # nothing is unpacked
 
 
 def test_of_a_member_that_is_there_twice_the_later_counts(tmp_path):
