@@ -25,13 +25,13 @@ from flax import nnx
 from jaxtyping import Float, Int
 
 from benchmarks.reporting import RESULTS, Row, Table, machine_name
-from data_pipeline.dataset.statistics import DatasetStatistics, load_statistics
+from data_pipeline.dataset.statistics import load_statistics
 from data_pipeline.files import write_text
 from eval.run_file import load_run
 from eval.settings import SMALL
 from eval.stages import tasks
 from eval.tables import objects_of
-from mevs_jax import bootstrap_interval, maxima_first
+from mevs_jax import ViewGraph, bootstrap_interval, maxima_first
 from mevs_jax.models.batch_norm import BatchNorm
 from train.loop import load_best
 from train.results.outputs import network_outputs
@@ -84,13 +84,13 @@ class Outputs:
     chosen: Int[np.ndarray, "objects views"]
 
 
-def first_choices(predicted_entropy: jax.Array, statistics: DatasetStatistics) -> jax.Array:
-    def choice(start: jax.Array, weights: jax.Array) -> jax.Array:
-        allowed = jnp.arange(statistics.views) != start
-        first = maxima_first(weights, allowed, statistics.graph.neighbours)
-        return jnp.argmax(jnp.where(allowed, first, -jnp.inf))
-
-    return jax.vmap(jax.vmap(choice), in_axes=(None, 0))(jnp.arange(statistics.views), predicted_entropy)
+def first_choices(predicted_entropy: jax.Array, graph: ViewGraph) -> jax.Array:
+    """The view that the thesis's rule chooses after each first view, (objects, views)."""
+    others = ~jnp.eye(len(graph.points), dtype=bool)
+    scores = jax.vmap(jax.vmap(partial(maxima_first, neighbours=graph.neighbours)), (0, None))(
+        predicted_entropy, others
+    )
+    return jnp.argmax(jnp.where(others, scores, -jnp.inf), axis=-1)
 
 
 def row_of(name: str, by: Outputs, first: Outputs, variance: float) -> Row:
@@ -121,7 +121,7 @@ def main(run: Annotated[Path, tyro.conf.Positional]) -> None:
         logits, predicted_entropy = outputs
         right = (logits.argmax(-1) == labels[:, None]).mean(axis=1)
         error = np.square(predicted_entropy - entropy[:, None]).mean(axis=(1, 2))
-        chosen = jax.jit(partial(first_choices, statistics=statistics))(jnp.asarray(predicted_entropy))
+        chosen = first_choices(jnp.asarray(predicted_entropy), statistics.graph)
         return Outputs(right, error, logits, predicted_entropy, np.asarray(chosen))
 
     ways = {

@@ -12,8 +12,9 @@ from scipy.spatial.transform import Rotation
 
 import mevs_jax
 from data_pipeline.capture.casting import default_caster
-from data_pipeline.objects.mesh import Mesh, normalise
+from data_pipeline.objects.mesh import normalise
 from data_pipeline.objects.recipes import FurniturePiece
+from eval.checks.camera import Shot, cast_shot
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "examples" / "ros2" / "mevs_ros"))
 from mevs_ros.recognising import (  # type: ignore[import-not-found]
@@ -34,13 +35,8 @@ class SimulatedCamera:
     """Moves to every requested pose, apart from the first `refuses` of them."""
 
     def __init__(self, kind: str, refuses: int = 0, blind: int = 0, garbled: int = -1) -> None:
-        mesh = normalise(*FurniturePiece(kind, 1_000_003).load(), kind)
-        self.cast = default_caster()(
-            Mesh((mesh.vertices * RADIUS + CENTER).astype(np.float32), mesh.faces, mesh.extent)
-        )
+        self.cast = default_caster()(normalise(*FurniturePiece(kind, 1_000_003).load(), kind))
         self.refuses, self.blind, self.garbled, self.asked = refuses, blind, garbled, []
-        rows, columns = np.mgrid[:240, :320]
-        self.rays = np.stack([columns, rows, np.ones_like(rows)], axis=-1).reshape(-1, 3) @ np.linalg.inv(K).T
 
     def wait_for(self, pose: np.ndarray, seconds: float, cancelled) -> Frame | None:
         self.asked.append(pose)
@@ -50,9 +46,8 @@ class SimulatedCamera:
             raise ValueError("depth images of encoding 'rgb8' cannot be read")
         if len(self.asked) <= self.refuses + self.blind:
             return Frame(np.zeros((240, 320), np.float32), K, pose)
-        rays = (self.rays @ pose[:3, :3].T).astype(np.float32)
-        depth, _ = self.cast(np.tile(pose[:3, 3].astype(np.float32), (len(rays), 1)), rays)
-        return Frame(depth.reshape(240, 320), K, pose)
+        depth = cast_shot(self.cast, Shot(320, 240, K, pose, CENTER, RADIUS))
+        return Frame(np.where(depth > 0, depth, np.inf), K, pose)
 
 
 def looked(camera: SimulatedCamera, **options):
