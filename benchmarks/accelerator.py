@@ -54,14 +54,8 @@ def row_of(what: str, value: float, unit: str, note: str, target: str = "") -> R
 
 @dataclass(frozen=True)
 class Sizes:
-    """How much is measured.
-
-    Attributes:
-        clouds: in a large batch.
-        images: in a batch of images, by their size in pixels.
-        seeds: of the evaluation.
-        rounds: calls that are timed.
-        objects: of the evaluation.
+    """How much is measured: clouds in a large batch, images in a batch by their size in pixels, calls that are timed (`rounds`),
+    and objects and seeds of the evaluation.
     """
 
     clouds: int
@@ -75,19 +69,20 @@ FULL = Sizes(1024, {64: 1024, 224: 256}, 10, 20, 908)
 QUICK = Sizes(8, {64: 8}, 2, 2, 20)
 
 
-def milliseconds(call: Callable[[], Any], rounds: int) -> tuple[float, str]:
-    """Median time of a call after a warm-up, and a note of its quartiles."""
+def timed(what: str, call: Callable[[], Any], rounds: int, note: str = "", target: str = "") -> Row:
+    """Milliseconds of a call."""
     low, median, high = np.quantile(take_turns([call], rounds)[0], [0.25, 0.5, 0.75])
-    return float(median), f"quartiles {low:.3g}, {high:.3g} ms"
+    notes = "; ".join(filter(None, (f"quartiles {low:.3g}, {high:.3g} ms", note)))
+    return row_of(what, float(median), "ms", notes, target)
 
 
 def rate(
     what: str, call: Callable[[], Any], count: int, unit: str, sizes: Sizes, note: str = "", target: str = ""
 ) -> Row:
     """Things a second, where a call handles `count` of them."""
-    taken, spread = milliseconds(call, sizes.rounds)
-    notes = "; ".join(part for part in (f"{taken:.3g} ms a call", spread, note) if part)
-    return row_of(what, 1000 * count / taken, f"{unit}/s", notes, target)
+    row = timed(what, call, sizes.rounds, note, target)
+    notes = f"{row['value']:.3g} ms a call; {row['note']}"
+    return row | {"value": 1000 * count / row["value"], "unit": f"{unit}/s", "note": notes}
 
 
 def on_cpu(call: Callable[..., Any], *arguments: Any) -> np.ndarray:
@@ -107,8 +102,8 @@ def point_operations(sizes: Sizes) -> Iterator[Row]:
         cloud = partial_clouds(1, points)[0]
         sample = jax.jit(partial(farthest_point_sample, k=k))
         same = _equal(sample(cloud), numpy_rules.farthest_point_sample(cloud, k))
-        taken, note = milliseconds(partial(sample, jnp.asarray(cloud)), sizes.rounds)
-        yield row_of(f"farthest points, {points} to {k}", taken, "ms", f"{note}; {same}", target)
+        call = partial(sample, jnp.asarray(cloud))
+        yield timed(f"farthest points, {points} to {k}", call, sizes.rounds, same, target)
     clouds = partial_clouds(sizes.clouds, 4096)
     sample_all = jax.jit(jax.vmap(partial(farthest_point_sample, k=512)))
     chosen = np.asarray(sample_all(clouds))
@@ -131,9 +126,8 @@ def pointnet(sizes: Sizes) -> Iterator[Row]:
         forward = jax.jit(forward_of(network))
         few = partial_clouds(4, 4096)
         difference = apart(forward(few), on_cpu(forward_of(network), few))
-        taken, note = milliseconds(partial(forward, one), sizes.rounds)
-        note = f"{note}; {difference:.0e} apart from the CPU"
-        yield row_of(f"PointNet++ forward, 1 clouds of 4,096, {name}", taken, "ms", note, "≤ 1.0")
+        what, note = f"PointNet++ forward, 1 clouds of 4,096, {name}", f"{difference:.0e} apart from the CPU"
+        yield timed(what, partial(forward, one), sizes.rounds, note, "≤ 1.0")
         count, target = sizes.clouds, "≥ 20,000" if name == "bfloat16" else ""
         call = partial(forward, jnp.asarray(partial_clouds(count, 4096)))
         yield rate(f"PointNet++ forward, {count} clouds of 4,096, {name}", call, count, "clouds", sizes, target=target)
@@ -173,8 +167,8 @@ def rendering(sizes: Sizes) -> Iterator[Row]:
 def decisions(sizes: Sizes) -> Iterator[Row]:
     graph = ViewGraph.from_points(fibonacci_sphere(VIEWS))
     choose = NextView(PointNet2(views=VIEWS, rngs=nnx.Rngs(0)), graph, columns=3)
-    taken, note = milliseconds(partial(choose.of_many, [partial_clouds(1, 4096)[0]]), 10 * sizes.rounds)
-    yield row_of("decision, cloud in memory of the host to next view", taken, "ms", note)
+    call = partial(choose.of_many, [partial_clouds(1, 4096)[0]])
+    yield timed("decision, cloud in memory of the host to next view", call, 10 * sizes.rounds)
 
 
 def evaluation(sizes: Sizes) -> Iterator[Row]:
@@ -183,9 +177,9 @@ def evaluation(sizes: Sizes) -> Iterator[Row]:
     def whole() -> Any:
         return [whole_grid(tables, seed) for seed in range(sizes.seeds)]
 
-    taken, note = milliseconds(whole, max(2, sizes.rounds // 4))
     what = f"the thesis's evaluation of {sizes.objects} objects, {sizes.seeds} seeds"
-    yield row_of(what, taken / 1000, "s", note, "≤ 2")
+    row = timed(what, whole, max(2, sizes.rounds // 4), target="≤ 2")
+    yield row | {"value": row["value"] / 1000, "unit": "s"}
 
 
 def several_seeds(sizes: Sizes) -> Iterator[Row]:

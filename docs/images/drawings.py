@@ -12,10 +12,10 @@ import numpy as np
 INK, GREY, MARK, SOFT = "#1b2a41", "#6b7785", "#c1440e", "#e8ddcf"
 AXES = {"x": "#b3261e", "y": "#2e7d32", "z": "#1565c0"}
 HEAD = (
-    '<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {width} {height}" font-family="sans-serif" font-size="15">'
+    '<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 1030 420" font-family="sans-serif" font-size="15">'
     '<defs><marker id="tip" viewBox="0 0 10 10" refX="8" refY="5" markerWidth="7" markerHeight="7" orient="auto-start-reverse">'
     '<path d="M0 0 L10 5 L0 10 z" fill="context-stroke"/></marker></defs>'
-    '<rect width="{width}" height="{height}" fill="white"/>'
+    '<rect width="1030" height="420" fill="white"/>'
 )
 Point = tuple[float, float]
 Corner = tuple[float, float, float]
@@ -24,11 +24,8 @@ Corner = tuple[float, float, float]
 class Drawing:
     """Parts of an SVG, in order."""
 
-    def __init__(self, width: int, height: int) -> None:
-        self.parts = [HEAD.format(width=width, height=height)]
-
-    def __str__(self) -> str:
-        return "\n".join([*self.parts, "</svg>\n"])
+    def __init__(self) -> None:
+        self.parts = [HEAD]
 
     def text(
         self, at: Point, words: str, colour: str = INK, anchor: str = "start", size: int = 15, more: str = ""
@@ -68,9 +65,6 @@ class Drawing:
 
     def rectangle(self, at: Point, width: float, height: float, more: str) -> None:
         self.parts.append(f'<rect x="{at[0]}" y="{at[1]}" width="{width}" height="{height}" {more}/>')
-
-    def path(self, steps: str, more: str) -> None:
-        self.parts.append(f'<path d="{steps}" fill="none" {more}/>')
 
 
 class Scene:
@@ -147,7 +141,7 @@ def side(draw: Drawing) -> None:
     reach, half = 1.95 * scale, np.radians(30)
     for sign in (-1, 1):
         draw.line((x, y), (x - reach * np.cos(half), y + sign * reach * np.sin(half)), GREY, 1.2)
-    draw.path(f"M {x - 45:.1f} {y - 26:.1f} a 52 52 0 0 0 0 52", f'stroke="{GREY}"')
+    draw.parts.append(f'<path d="M {x - 45:.1f} {y - 26:.1f} a 52 52 0 0 0 0 52" fill="none" stroke="{GREY}"/>')
     draw.text((x - 30, y - 34), "60°", GREY, "middle")
     u, v = centre[0] + 30, centre[1] - 62
     draw.polygon([(u - 62, v), (u, v), (u, v + 105), (u - 62, v + 105)], SOFT)
@@ -186,7 +180,7 @@ def image(draw: Drawing) -> None:
 
 
 if __name__ == "__main__":
-    drawing = Drawing(1030, 420)
+    drawing = Drawing()
     for part in (frames, side, image):
         part(drawing)
-    Path(__file__).with_name("geometry.svg").write_text(str(drawing))
+    Path(__file__).with_name("geometry.svg").write_text("\n".join([*drawing.parts, "</svg>\n"]))
