@@ -14,6 +14,7 @@ from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
+from unittest import mock
 
 import jax
 import jax.numpy as jnp
@@ -112,11 +113,9 @@ def compare_policies(objects: int = 200, features: int = 128) -> dict[str, Any]:
 
     lessons = [Lesson(seed, [(fusion, seen())], None, f"policy {seed}") for seed in range(SEEDS)]
     found: dict[str, Any] = {"separate": seconds_of(lambda: [train_policies(config, [lesson]) for lesson in lessons])}
-    chosen = averaged.way_for
     for way in WAYS:
-        averaged.way_for = lambda _, way=way: way
-        found[way] = seconds_of(partial(train_policies, config, lessons))
-    averaged.way_for = chosen
+        with mock.patch.object(averaged, "way_for", lambda _, way=way: way):
+            found[way] = seconds_of(partial(train_policies, config, lessons))
     return found
 
 

@@ -16,6 +16,7 @@ from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Annotated, Any, Literal
+from unittest import mock
 
 import jax
 import jax.numpy as jnp
@@ -51,21 +52,13 @@ class Unfolded(nnx.Module):
         self.network = network
 
     def __call__(self, inputs: jax.Array) -> jax.Array:
-        by_batch = BatchNorm.__call__
-
-        def by_running_statistics(
-            norm: BatchNorm, x: jax.Array, *, train: bool = False, momentum: object = None
-        ) -> jax.Array:
-            del train, momentum
+        def by_running_statistics(norm: BatchNorm, x: jax.Array, **_: object) -> jax.Array:
             return by_batch(norm, x)
 
-        BatchNorm.__call__ = by_running_statistics  # type: ignore[assignment, method-assign]
-        try:
-            if hasattr(self.network, "views"):
-                return self.network(inputs, train=True, key=jax.random.key(0), dropout=0.0)
-            return self.network(inputs, train=True)
-        finally:
-            BatchNorm.__call__ = by_batch  # type: ignore[method-assign]
+        by_batch = BatchNorm.__call__
+        options = {"key": jax.random.key(0), "dropout": 0.0} if hasattr(self.network, "views") else {}
+        with mock.patch.object(BatchNorm, "__call__", by_running_statistics):
+            return self.network(inputs, train=True, **options)
 
 
 def interval(by_object: np.ndarray) -> str:
