@@ -134,17 +134,13 @@ def point_operations(clouds: np.ndarray, torch_peer: Any, rounds: int) -> Iterat
 def matrix_products(network: PointNet2) -> Callable[[], jax.Array]:
     """Only the matrix products and maxima of the forward pass, on prepared arrays in cache-sized pieces."""
     random = np.random.default_rng(0)
-    work = []
-    for rows, pieces, group, layers in (
-        (4096, 8, 64, network.perceptrons[0].linear),
-        (4096, 2, 64, network.perceptrons[1].linear),
-        (128, 1, 128, network.whole.linear),
-    ):
-        kernels = [layer.kernel[...] for layer in layers]
-        work.append((jnp.asarray(random.normal(size=(pieces, rows, kernels[0].shape[0])), jnp.float32), kernels, group))
-
-    sizes = [group for *_, group in work]
-    arrays = [(x, kernels) for x, kernels, _ in work]
+    perceptrons = (*network.perceptrons, network.whole)
+    kernels = [[layer.kernel[...] for layer in perceptron.linear] for perceptron in perceptrons]
+    sizes, groups = ((8, 4096), (2, 4096), (1, 128)), (64, 64, 128)
+    arrays = [
+        jnp.asarray(random.normal(size=(*size, first.shape[0])), jnp.float32)
+        for size, (first, *_) in zip(sizes, kernels, strict=True)
+    ]
 
     def largest(x: jax.Array, kernels: list[jax.Array], group: int) -> jax.Array:
         for kernel in kernels:
@@ -152,18 +148,14 @@ def matrix_products(network: PointNet2) -> Callable[[], jax.Array]:
         return jnp.max(x.reshape(-1, group, x.shape[-1]), axis=1)
 
     @jax.jit
-    def products(arrays, shifts):
+    def products(arrays, kernels, shifts):
         def cloud(shift):
-            parts = []
-            for (x, kernels), group in zip(arrays, sizes, strict=True):
-                piece = partial(largest, kernels=kernels, group=group)
-                parts.append(jnp.sum(jax.lax.map(piece, x + shift)))
-            return sum(parts)
+            calls = [partial(largest, kernels=some, group=group) for some, group in zip(kernels, groups, strict=True)]
+            return sum(jnp.sum(jax.lax.map(call, x + shift)) for call, x in zip(calls, arrays, strict=True))
 
         return jax.lax.map(cloud, shifts)
 
-    shifts = jnp.arange(CLOUDS, dtype=jnp.float32)
-    return lambda: products(arrays, shifts)
+    return partial(products, arrays, kernels, jnp.arange(CLOUDS, dtype=jnp.float32))
 
 
 def networks(clouds: np.ndarray, torch_peer: Any, rounds: int, training: bool) -> Iterator[Row]:
