@@ -14,7 +14,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Callable, Iterator
 from functools import partial
-from typing import Any
+from typing import Any, Literal
 
 import jax
 import jax.numpy as jnp
@@ -147,13 +147,13 @@ def layers_of(side: int, rounds: int) -> Iterator[Row]:
         yield {"layer": shape, "work": work} | dict(zip(RATES, rates, strict=True))
 
 
-def main(guard: bool = False, layers: bool = False, sides: tuple[int, ...] = tuple(BATCHES)) -> None:
+def main(guard: bool = False, layers: bool = False, sides: tuple[Literal[64, 224], ...] = (64, 224)) -> None:
     """Measures, shows and keeps.
 
     Args:
         guard: compare ratios with the stored ones.
         layers: rates of every layer, too.
-        sides: sizes of images in pixels, of 64 and 224.
+        sides: sizes of images in pixels.
     """
     rounds, types = (3, [jnp.float32]) if guard else (11, [jnp.float32, jnp.bfloat16])
     print(f"Measured on: {machine_name()}. {UNITS}")

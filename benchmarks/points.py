@@ -160,28 +160,28 @@ def matrix_products(network: PointNet2) -> Callable[[], jax.Array]:
 
 def networks(clouds: np.ndarray, torch_peer: Any, rounds: int, training: bool) -> Iterator[Row]:
     network = PointNet2(views=40, dropout=0.0, rngs=nnx.Rngs(0))
-    peers: dict[str, Callable] = {}
-    notes = {}
+    targets = np.random.default_rng(1).uniform(0, 1, (CLOUDS, 40)).astype(np.float32)
     if torch_peer:
-        targets = np.random.default_rng(1).uniform(0, 1, (CLOUDS, 40)).astype(np.float32)
         weights, forward_peer, train_peer = torch_peer.pointnet2(clouds, targets)
         pointnet2_from_torch(network, weights)
-        largest = float(np.abs(np.asarray(forward_of(network)(clouds)) - torch_peer.array(forward_peer())).max())
+    forward = jax.jit(forward_of(network))
+    peers, notes = {}, {}
+    if torch_peer:
+        largest = float(np.abs(np.asarray(forward(clouds)) - torch_peer.array(forward_peer())).max())
         assert largest < 1e-3
         peers["PyTorch"], notes["PyTorch"] = forward_peer, f"outputs equal to {largest:.0e}"
-        if training:
-            step, shown, wanted = TrainingStep(network, entropy_loss), jnp.asarray(clouds), jnp.asarray(targets)
-            apart = abs(float(step(shown, wanted)) / train_peer().item() - 1)
-            assert apart < 1e-3
-            yield from compare(
-                "PointNet++ training step, 16 clouds",
-                lambda: step(shown, wanted),
-                {"PyTorch": train_peer},
-                max(3, rounds // 4),
-                {"PyTorch": f"first loss equal to {apart:.0e}"},
-                turns=False,
-            )
-    forward = jax.jit(forward_of(network))
+    if torch_peer and training:
+        step, shown, wanted = TrainingStep(network, entropy_loss), jnp.asarray(clouds), jnp.asarray(targets)
+        apart = abs(float(step(shown, wanted)) / train_peer().item() - 1)
+        assert apart < 1e-3
+        yield from compare(
+            "PointNet++ training step, 16 clouds",
+            lambda: step(shown, wanted),
+            {"PyTorch": train_peer},
+            max(3, rounds // 4),
+            {"PyTorch": f"first loss equal to {apart:.0e}"},
+            turns=False,
+        )
     peers[FLOOR] = matrix_products(network)
     yield from compare("PointNet++ forward, 16 clouds", lambda: forward(clouds), peers, max(3, rounds // 2), notes)
 

@@ -238,7 +238,7 @@ def policy_of(networks: Agent) -> Policy:
 def main(config: Config) -> None:
     inputs = EvaluationInputs.of_run(config.run)
     validation = replace(inputs.validation.stacked(), predicted_entropy=None)
-    of_temperatures, of_training = jax.random.split(jax.random.key(config.seed))
+    of_temperatures, of_training, _ = jax.random.split(jax.random.key(config.seed), 3)
     temperatures = jax.jit(fitted_temperatures, static_argnums=2)(of_temperatures, validation, config.max_views)
     keys = jax.random.split(of_training, config.networks)
     networks = nnx.jit(nnx.vmap(lambda key: train(config, key, validation, inputs.graph, temperatures)))(keys)
