@@ -102,7 +102,7 @@ def compared(side: int, dtype: Any, torch_peer: Any, rounds: int) -> Iterator[Ro
     what = f"{images} images of {side}×{side}, {name}"
     for training, kind, ours in ((False, "forward", forward), (True, "training step", step)):
         calls: dict[str, Callable[[], Any]] = {peer: both[training] for peer, both in peers.items()}
-        notes, mine = {}, np.asarray(ours())
+        mine, notes = np.asarray(ours()), dict[str, str]()
         for peer, call in calls.items():
             expected = torch_peer.array(call())
             apart = float(np.abs(mine - expected).max() / max(np.abs(expected).max(), 1))

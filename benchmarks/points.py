@@ -165,7 +165,8 @@ def networks(clouds: np.ndarray, torch_peer: Any, rounds: int, training: bool) -
         weights, forward_peer, train_peer = torch_peer.pointnet2(clouds, targets)
         pointnet2_from_torch(network, weights)
     forward = jax.jit(forward_of(network))
-    peers, notes = {}, {}
+    peers: dict[str, Callable] = {}
+    notes: dict[str, str] = {}
     if torch_peer:
         largest = float(np.abs(np.asarray(forward(clouds)) - torch_peer.array(forward_peer())).max())
         assert largest < 1e-3
