@@ -10,83 +10,52 @@ others go on. The table is printed and written to `benchmarks/results/accelerato
 
 from __future__ import annotations
 
-import argparse
 import sys
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
-sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # for a copy that is not installed
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+import tyro
 from flax import nnx
 
 from benchmarks import members
-from benchmarks.capture import depths, wobbly_ball
-from benchmarks.comparing import classification_loss, forward_of, machine_name, take_turns, training_step
-from benchmarks.evaluation import BACKBONES, CLASSES, COMPARED, VIEWS, made_up_tables
-from data_pipeline.capture.casting import CaptureConfig, capture, rig_for
+from benchmarks.capture import depths, rig_of, share_equal, wobbly_ball
+from benchmarks.comparing import TrainingStep, classification_loss, entropy_loss, forward_of, take_turns
+from benchmarks.evaluation import VIEWS, made_up_tables, whole_grid
+from benchmarks.points import partial_clouds
+from benchmarks.reporting import RESULTS, Row, Table, keep, machine_name
+from data_pipeline.capture.casting import capture
 from data_pipeline.dataset.builder import prepare
-from data_pipeline.files import write_json, write_text
 from eval.settings import SMALL
-from eval.walks.grid import LAST_MV, run_grid
-from mevs_jax import (
-    Knowledge,
-    NextView,
-    PointNet2,
-    ResNet,
-    ViewGraph,
-    ball_query,
-    farthest_point_sample,
-    fibonacci_sphere,
-)
-from mevs_jax.markdown import markdown_row, markdown_table
+from mevs_jax import NextView, PointNet2, ResNet, ViewGraph, ball_query, farthest_point_sample, fibonacci_sphere
 from mevs_jax.rendering import pad_triangles
 from tests.reference import numpy_rules
 
-RESULTS = Path(__file__).parent / "results"
-HEADER = ("what", "value", "unit", "target", "")
+TABLE = Table(
+    "what | value | unit | target | ",
+    "{what} | {value:,.4g} | {unit} | {target} | {note}",
+)
 TYPES = (jnp.dtype(jnp.float32), jnp.dtype(jnp.bfloat16))
 
 
-@dataclass
-class Row:
-    """A measurement.
-
-    Attributes:
-        what: its name.
-        value: its result.
-        unit: of the value.
-        target: what would be good, or nothing.
-        note: further numbers, or why there is no value.
-    """
-
-    what: str
-    value: float
-    unit: str
-    target: str = ""
-    note: str = ""
-
-    def cells(self) -> list[str]:
-        return [self.what, f"{self.value:,.4g}", self.unit, self.target, self.note]
+def row_of(what: str, value: float, unit: str, note: str, target: str = "") -> Row:
+    """A measurement: its target says what would be good, its note has further numbers, or why there is no value."""
+    return {"what": what, "value": value, "unit": unit, "target": target, "note": note}
 
 
 @dataclass(frozen=True)
 class Sizes:
-    """How much is measured.
-
-    Attributes:
-        clouds: in a large batch.
-        images: in a batch of images, by their size in pixels.
-        seeds: of the evaluation.
-        rounds: calls that are timed.
-        objects: of the evaluation.
+    """How much is measured: clouds in a large batch, images in a batch by their size in pixels, calls that are timed (`rounds`),
+    and objects and seeds of the evaluation.
     """
 
     clouds: int
@@ -100,23 +69,20 @@ FULL = Sizes(1024, {64: 1024, 224: 256}, 10, 20, 908)
 QUICK = Sizes(8, {64: 8}, 2, 2, 20)
 
 
-def milliseconds(call: Callable[[], Any], rounds: int) -> tuple[float, str]:
-    """Median time of a call after a warm-up, and a note of its quartiles."""
+def timed(what: str, call: Callable[[], Any], rounds: int, note: str = "", target: str = "") -> Row:
+    """Milliseconds of a call."""
     low, median, high = np.quantile(take_turns([call], rounds)[0], [0.25, 0.5, 0.75])
-    return float(median), f"quartiles {low:.3g}, {high:.3g} ms"
+    notes = "; ".join(filter(None, (f"quartiles {low:.3g}, {high:.3g} ms", note)))
+    return row_of(what, float(median), "ms", notes, target)
 
 
-def rate(what: str, call: Callable[[], Any], count: int, unit: str, sizes: Sizes, target: str = "") -> Row:
+def rate(
+    what: str, call: Callable[[], Any], count: int, unit: str, sizes: Sizes, note: str = "", target: str = ""
+) -> Row:
     """Things a second, where a call handles `count` of them."""
-    taken, note = milliseconds(call, sizes.rounds)
-    return Row(what, 1000 * count / taken, f"{unit}/s", target, f"{taken:.3g} ms a call; {note}")
-
-
-def clouds_of(count: int, points: int) -> np.ndarray:
-    """Partial clouds (count, points, 3) on the unit sphere's upper half."""
-    found = np.random.default_rng(0).normal(size=(count, points, 3)).astype(np.float32)
-    found[..., 2] = np.abs(found[..., 2])
-    return found / np.linalg.norm(found, axis=-1, keepdims=True)
+    row = timed(what, call, sizes.rounds, note, target)
+    notes = f"{row['value']:.3g} ms a call; {row['note']}"
+    return row | {"value": 1000 * count / row["value"], "unit": f"{unit}/s", "note": notes}
 
 
 def on_cpu(call: Callable[..., Any], *arguments: Any) -> np.ndarray:
@@ -132,71 +98,58 @@ def apart(found: Any, expected: Any) -> float:
 
 
 def point_operations(sizes: Sizes) -> Iterator[Row]:
-    for points, k in ((4096, 512), (16384, 1024)):
-        cloud = clouds_of(1, points)[0]
+    for points, k, target in ((4096, 512, "≤ 0.6"), (16384, 1024, "")):
+        cloud = partial_clouds(1, points)[0]
         sample = jax.jit(partial(farthest_point_sample, k=k))
-        right = np.array_equal(sample(cloud), numpy_rules.farthest_point_sample(cloud, k))
-        taken, note = milliseconds(partial(sample, jnp.asarray(cloud)), sizes.rounds)
-        target = "≤ 0.6" if points == 4096 else ""
-        yield Row(f"farthest points, {points} to {k}", taken, "ms", target, f"{note}; indices {_equal(right)}")
-    clouds = clouds_of(sizes.clouds, 4096)
+        same = _equal(sample(cloud), numpy_rules.farthest_point_sample(cloud, k))
+        call = partial(sample, jnp.asarray(cloud))
+        yield timed(f"farthest points, {points} to {k}", call, sizes.rounds, same, target)
+    clouds = partial_clouds(sizes.clouds, 4096)
     sample_all = jax.jit(jax.vmap(partial(farthest_point_sample, k=512)))
     chosen = np.asarray(sample_all(clouds))
     yield rate("farthest points, a batch", partial(sample_all, jnp.asarray(clouds)), len(clouds), "clouds", sizes)
     centres = np.take_along_axis(clouds, chosen[..., None], axis=1)
     query = jax.jit(jax.vmap(partial(ball_query, radius=0.2, k=64)))
-    right = np.array_equal(query(clouds, centres)[0], numpy_rules.ball_query(clouds[0], centres[0], 0.2, 64))
-    row = rate(
-        "ball query, a batch", partial(query, *map(jnp.asarray, (clouds, centres))), len(clouds), "clouds", sizes
-    )
-    yield replace(row, note=f"{row.note}; indices {_equal(right)}")
+    same = _equal(query(clouds, centres)[0], numpy_rules.ball_query(clouds[0], centres[0], 0.2, 64))
+    call = partial(query, jnp.asarray(clouds), jnp.asarray(centres))
+    yield rate("ball query, a batch", call, len(clouds), "clouds", sizes, same)
 
 
-def _equal(right: bool) -> str:
-    return "equal to the plain rule's" if right else "DIFFER from the plain rule's"
+def _equal(indices: Any, expected: np.ndarray) -> str:
+    return f"indices {'equal to' if np.array_equal(indices, expected) else 'DIFFER from'} the plain rule's"
 
 
 def pointnet(sizes: Sizes) -> Iterator[Row]:
     for dtype in TYPES:
-        name = dtype.name
+        name, one = dtype.name, jnp.asarray(partial_clouds(1, 4096))
         network = PointNet2(views=VIEWS, dropout=0.0, rngs=nnx.Rngs(0), dtype=dtype)
-        forward = forward_of(network)
-        few = clouds_of(4, 4096)
-        difference = apart(jax.jit(forward)(few), on_cpu(forward, few))
-        for count in (1, sizes.clouds):
-            clouds = jnp.asarray(clouds_of(count, 4096))
-            what = f"PointNet++ forward, {count} clouds of 4,096, {name}"
-            if count == 1:
-                taken, note = milliseconds(partial(jax.jit(forward), clouds), sizes.rounds)
-                yield Row(what, taken, "ms", "≤ 1.0", f"{note}; {difference:.0e} apart from the CPU")
-            else:
-                target = "≥ 20,000" if dtype == jnp.dtype(jnp.bfloat16) else ""
-                yield rate(what, partial(jax.jit(forward), clouds), count, "clouds", sizes, target)
-        count = min(sizes.clouds, 64)
-        clouds, wanted = jnp.asarray(clouds_of(count, 4096)), jnp.zeros((count, VIEWS))
-        step = training_step(
-            network, lambda network, x, y: jnp.mean((network(x, train=True, key=jax.random.key(0)) - y) ** 2)
-        )
-        yield rate(
-            f"PointNet++ training step, {count} clouds, {name}", partial(step, clouds, wanted), count, "clouds", sizes
-        )
+        forward = jax.jit(forward_of(network))
+        few = partial_clouds(4, 4096)
+        difference = apart(forward(few), on_cpu(forward_of(network), few))
+        what, note = f"PointNet++ forward, 1 clouds of 4,096, {name}", f"{difference:.0e} apart from the CPU"
+        yield timed(what, partial(forward, one), sizes.rounds, note, "≤ 1.0")
+        count, target = sizes.clouds, "≥ 20,000" if name == "bfloat16" else ""
+        call = partial(forward, jnp.asarray(partial_clouds(count, 4096)))
+        yield rate(f"PointNet++ forward, {count} clouds of 4,096, {name}", call, count, "clouds", sizes, target=target)
+        count = min(count, 64)
+        clouds, wanted = jnp.asarray(partial_clouds(count, 4096)), jnp.zeros((count, VIEWS))
+        call = partial(TrainingStep(network, entropy_loss), clouds, wanted)
+        yield rate(f"PointNet++ training step, {count} clouds, {name}", call, count, "clouds", sizes)
 
 
 def resnet(sizes: Sizes) -> Iterator[Row]:
     random = np.random.default_rng(0)
     for dtype in TYPES:
-        name = dtype.name
         network = ResNet(rngs=nnx.Rngs(0), dtype=dtype)
-        forward = forward_of(network)
+        forward = jax.jit(forward_of(network))
         for side, count in sizes.images.items():
             images = random.uniform(size=(count, side, side, 3)).astype(np.float32)
-            difference = apart(jax.jit(forward)(images[:4]), on_cpu(forward, images[:4]))
+            note = f"{apart(forward(images[:4]), on_cpu(forward_of(network), images[:4])):.0e} apart from the CPU"
             shown, labels = jnp.asarray(images), jnp.asarray(random.integers(0, 10, count))
-            what = f"{count} images of {side}×{side}, {name}"
-            row = rate(f"ResNet-18 forward, {what}", partial(jax.jit(forward), shown), count, "images", sizes)
-            yield replace(row, note=f"{row.note}; {difference:.0e} apart from the CPU")
-            step = training_step(network, classification_loss)
-            yield rate(f"ResNet-18 training step, {what}", partial(step, shown, labels), count, "images", sizes)
+            what = f"{count} images of {side}×{side}, {dtype.name}"
+            yield rate(f"ResNet-18 forward, {what}", partial(forward, shown), count, "images", sizes, note)
+            step = partial(TrainingStep(network, classification_loss), shown, labels)
+            yield rate(f"ResNet-18 training step, {what}", step, count, "images", sizes)
 
 
 def rendering(sizes: Sizes) -> Iterator[Row]:
@@ -204,40 +157,29 @@ def rendering(sizes: Sizes) -> Iterator[Row]:
         mesh = wobbly_ball(subdivisions)
         triangles = jnp.asarray(pad_triangles(mesh.vertices[mesh.faces]))
         for side in sizes.images:
-            rig = rig_for(CaptureConfig(views=VIEWS, resolution=side))
-            poses = jnp.asarray(rig.poses)
-            ours = np.asarray(depths(triangles, poses, side))
-            same = np.abs(np.where(np.isfinite(ours), ours, 0) * 10_000 - capture(mesh, rig).depth) < 5
-            target = "≥ 5,000" if side == 224 else ""
-            call = partial(depths, triangles, poses, side)
-            row = rate(f"depth views of {faces} faces, {side}×{side}", call, VIEWS, "views", sizes, target)
-            yield replace(row, note=f"{row.note}; {same.mean():.2%} of pixels equal to ray casting's")
+            rig = rig_of(side)
+            call = partial(depths, triangles, jnp.asarray(rig.poses), side)
+            note = f"{share_equal(call(), capture(mesh, rig).depth):.2%} of pixels equal to ray casting's"
+            what, target = f"depth views of {faces} faces, {side}×{side}", "≥ 5,000" if side == 224 else ""
+            yield rate(what, call, VIEWS, "views", sizes, note, target)
 
 
 def decisions(sizes: Sizes) -> Iterator[Row]:
-    choose = NextView(
-        PointNet2(views=VIEWS, rngs=nnx.Rngs(0)), ViewGraph.from_points(fibonacci_sphere(VIEWS)), columns=3
-    )
-    cloud = [clouds_of(1, 4096)[0]]
-    taken, note = milliseconds(partial(choose.of_many, cloud), 10 * sizes.rounds)
-    yield Row("decision, cloud in memory of the host to next view", taken, "ms", "", note)
+    graph = ViewGraph.from_points(fibonacci_sphere(VIEWS))
+    choose = NextView(PointNet2(views=VIEWS, rngs=nnx.Rngs(0)), graph, columns=3)
+    call = partial(choose.of_many, [partial_clouds(1, 4096)[0]])
+    yield timed("decision, cloud in memory of the host to next view", call, 10 * sizes.rounds)
 
 
 def evaluation(sizes: Sizes) -> Iterator[Row]:
     tables = jax.tree.map(lambda leaf: leaf[: sizes.objects], made_up_tables())
-    graph = ViewGraph.from_points(fibonacci_sphere(VIEWS))
-    nothing = Knowledge(jnp.zeros((BACKBONES, VIEWS)), jnp.zeros((BACKBONES, CLASSES, VIEWS, CLASSES)))
 
     def whole() -> Any:
-        return [
-            run_grid(jax.random.key(seed), tables, graph, nothing, COMPARED, max_views=LAST_MV)
-            for seed in range(sizes.seeds)
-        ]
+        return [whole_grid(tables, seed) for seed in range(sizes.seeds)]
 
-    taken, note = milliseconds(whole, max(2, sizes.rounds // 4))
-    yield Row(
-        f"the thesis's evaluation of {sizes.objects} objects, {sizes.seeds} seeds", taken / 1000, "s", "≤ 2", note
-    )
+    what = f"the thesis's evaluation of {sizes.objects} objects, {sizes.seeds} seeds"
+    row = timed(what, whole, max(2, sizes.rounds // 4), target="≤ 2")
+    yield row | {"value": row["value"] / 1000, "unit": "s"}
 
 
 def several_seeds(sizes: Sizes) -> Iterator[Row]:
@@ -247,15 +189,10 @@ def several_seeds(sizes: Sizes) -> Iterator[Row]:
         prepare(replace(SMALL.dataset, train_per_class=members.OBJECTS, test_per_class=2), data)
         tasks = members.networks(data)
         for name in ("PointNet++, tiny",) if sizes is QUICK else ("ResNet-18, small", "PointNet++, small"):
-            found = members.compare(tasks[name], data, Path(folder) / name)
-            ratio, steps = found["step in turn"] / found["step at once"], found["step at once"]
-            yield Row(
-                f"four seeds of {name}: time of a step in turn, divided by that at once",
-                ratio,
-                "×",
-                "",
-                f"{1000 * steps:.3g} ms",
-            )
+            taken = members.compare(tasks[name], data, Path(folder) / name)
+            what = f"four seeds of {name}: time of a step in turn, divided by that at once"
+            ratio, note = taken["step in turn"] / taken["step at once"], f"{1000 * taken['step at once']:.3g} ms"
+            yield row_of(what, ratio, "×", note)
 
 
 MEASUREMENTS = (point_operations, pointnet, resnet, rendering, decisions, evaluation, several_seeds)
@@ -268,24 +205,21 @@ def measured(sizes: Sizes) -> Iterator[Row]:
         try:
             yield from measure(sizes)
         except Exception as error:
-            yield Row(measure.__name__.replace("_", " "), float("nan"), "", "", f"FAILED: {error!r}"[:300])
+            yield row_of(measure.__name__.replace("_", " "), np.nan, "", f"FAILED: {error!r}"[:300])
         print(f"({measure.__name__.replace('_', ' ')}: {time.perf_counter() - begun:.0f} s)", file=sys.stderr)
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--quick", type=Path, help="small sizes; write to this folder")
-    folder = parser.parse_args().quick
-    machine, rows = machine_name(), []
-    print(f"{machine}\n\n{markdown_table(HEADER, [])}")
-    for row in measured(QUICK if folder else FULL):
-        rows.append(row)
-        print(markdown_row(row.cells()), flush=True)
-    path = (folder or RESULTS) / "accelerator.json"
-    write_json(path, {"machine": machine, "rows": [asdict(row) for row in rows]})
-    write_text(path.with_suffix(".md"), f"{machine}.\n\n{markdown_table(HEADER, [row.cells() for row in rows])}\n")
-    sys.exit(any(row.value != row.value or "DIFFER" in row.note for row in rows))
+def main(quick: Path | None = None) -> None:
+    """Measures, shows and keeps.
+
+    Args:
+        quick: small sizes; write to this folder.
+    """
+    print(machine_name())
+    rows = TABLE.show(measured(QUICK if quick else FULL))
+    keep((quick or RESULTS) / "accelerator.json", {"rows": rows}, "", TABLE.markdown(rows))
+    sys.exit(any(np.isnan(row["value"]) or "DIFFER" in row["note"] for row in rows))
 
 
 if __name__ == "__main__":
-    main()
+    tyro.cli(main, description=__doc__.splitlines()[0])

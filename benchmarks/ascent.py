@@ -12,28 +12,25 @@ Results are written to `benchmarks/results/ascent_METHOD.json` after each object
 
 from __future__ import annotations
 
-import sys
 import time
-from pathlib import Path
-from typing import Any
-
-sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+from typing import Annotated, Literal
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import trimesh
+import tyro
 
+from benchmarks.reporting import RESULTS, Row
 from data_pipeline.errors import EmptyMesh
 from data_pipeline.files import read_json, write_json
 from data_pipeline.objects.sources import load_object, open_source
 from eval.rendering.ascent import METHODS, ascend_on_sphere, look_everywhere
 
-RESULTS = Path(__file__).parent / "results"
 SIDE, STARTS = 64, 40
 
 
-def row_of(name: str, values: np.ndarray, grid: np.ndarray, seconds: float) -> dict[str, Any]:
+def row_of(name: str, values: np.ndarray, grid: np.ndarray, seconds: float) -> Row:
     """Result of an object: range of the grid, best value of the ascent, and shares of starts that ended near the maximum."""
     best, worst = float(grid.max()), float(grid.min())
     return {
@@ -47,7 +44,7 @@ def row_of(name: str, values: np.ndarray, grid: np.ndarray, seconds: float) -> d
     }
 
 
-def summary(rows: list[dict[str, Any]]) -> str:
+def summary(rows: list[Row]) -> str:
     parts = []
     for name in ("maximum", "range"):
         near = np.array([row[f"near_{name}"] for row in rows])
@@ -59,27 +56,31 @@ def summary(rows: list[dict[str, Any]]) -> str:
     return f"{len(rows)} objects; " + "; ".join(parts)
 
 
-def main() -> None:
-    if len(sys.argv) not in (3, 4) or sys.argv[1] not in METHODS:
-        print("usage: python benchmarks/ascent.py mesh|volume DATA [OBJECTS]", file=sys.stderr)
-        sys.exit(2)
-    method = METHODS[sys.argv[1]]
-    count = int(sys.argv[3]) if len(sys.argv) == 4 else 100
-    source = open_source(sys.argv[2], train_per_class=1, test_per_class=count // 10)
-    entries = [entry for entry in source.entries if entry.split == "test"]
-    chosen = [entries[index] for index in np.linspace(0, len(entries) - 1, count).astype(int)]
-    dense = np.asarray(trimesh.creation.icosphere(4).vertices)
-    run_ascent = jax.jit(lambda thing: ascend_on_sphere(method, thing, STARTS, SIDE))
-    evaluate_grid = jax.jit(lambda thing: look_everywhere(method, thing, dense, SIDE))
+def main(
+    method: Annotated[Literal["mesh", "volume"], tyro.conf.Positional],
+    data: Annotated[str, tyro.conf.Positional],
+    objects: Annotated[int, tyro.conf.Positional] = 100,
+) -> None:
+    """Measures, shows and keeps.
 
-    path = RESULTS / f"ascent_{sys.argv[1]}.json"
-    rows: list[dict[str, Any]] = read_json(path)["rows"] if path.exists() else []
+    Args:
+        method: mesh or volume.
+        data: any source of objects.
+        objects: how many of its test objects.
+    """
+    how, path = METHODS[method], RESULTS / f"ascent_{method}.json"
+    source = open_source(data, train_per_class=1, test_per_class=objects // 10)
+    entries = [entry for entry in source.entries if entry.split == "test"]
+    dense = np.asarray(trimesh.creation.icosphere(4).vertices)
+    run_ascent = jax.jit(lambda thing: ascend_on_sphere(how, thing, STARTS, SIDE))
+    evaluate_grid = jax.jit(lambda thing: look_everywhere(how, thing, dense, SIDE))
+    rows: list[Row] = read_json(path)["rows"] if path.exists() else []
     done, left_out = {row["object"] for row in rows}, 0
-    for entry in chosen:
+    for entry in (entries[index] for index in np.linspace(0, len(entries) - 1, objects).astype(int)):
         if entry.name in done:
             continue
         try:
-            thing = jnp.asarray(method.prepare(load_object(entry)))
+            thing = jnp.asarray(how.prepare(load_object(entry)))
         except EmptyMesh as reason:
             print(f"left out: {entry.name}: {reason}")
             left_out += 1
@@ -87,16 +88,14 @@ def main() -> None:
         if not rows:
             jax.block_until_ready(run_ascent(thing))  # compiles
         begun = time.perf_counter()
-        found = jax.block_until_ready(run_ascent(thing))
+        ends = jax.block_until_ready(run_ascent(thing))
         seconds = time.perf_counter() - begun
-        rows.append(row_of(entry.name, np.asarray(found.values), np.asarray(evaluate_grid(thing)), seconds))
+        rows.append(row_of(entry.name, np.asarray(ends.values), np.asarray(evaluate_grid(thing)), seconds))
         write_json(path, {"summary": summary(rows), "rows": rows})
-        print(
-            f"{len(rows)} {entry.name}: {rows[-1]['highest']:.4f} of {rows[-1]['best']:.4f}, {seconds:.1f} s",
-            flush=True,
-        )
+        best, highest = rows[-1]["best"], rows[-1]["highest"]
+        print(f"{len(rows)} {entry.name}: {highest:.4f} of {best:.4f}, {seconds:.1f} s", flush=True)
     print(f"{summary(rows)}; {left_out} objects left out")
 
 
 if __name__ == "__main__":
-    main()
+    tyro.cli(main, description=__doc__.splitlines()[0])

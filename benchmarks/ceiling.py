@@ -11,21 +11,15 @@ The table is written to `benchmarks/results/ceiling.md`, images of some objects 
 
 from __future__ import annotations
 
-import sys
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Literal
 
-sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
-
-import matplotlib
-
-matplotlib.use("Agg")
-import matplotlib.pyplot as plt
 import numpy as np
 import tyro
+from matplotlib.figure import Figure
 from scipy.ndimage import label as connected
 
+from benchmarks.reporting import RESULTS
 from data_pipeline.dataset.builder import open_split
 from data_pipeline.files import write_text
 from eval.numbers.comparison import intervals
@@ -36,21 +30,8 @@ from train.choosing.calibrated import beliefs_of_sets
 from train.choosing.features import Features, sets_of_size
 from train.choosing.stages import Stages
 
-RESULTS = Path(__file__).parent / "results"
 WHOLE = 0.9
 """An object is whole if at least this share of its cells is connected."""
-
-
-@dataclass(frozen=True)
-class Options:
-    run: Annotated[Path, tyro.conf.Positional]
-    """directory in which `mevs study learned` was run"""
-    archive: Annotated[Path, tyro.conf.Positional]
-    """the .npz of voxel grids that the study used"""
-    preset: Literal["small", "tiny"] = "small"
-    """preset of the study"""
-    split: Literal["test", "val"] = "test"
-    """split whose objects are evaluated"""
 
 
 def wholeness(grids: np.ndarray) -> np.ndarray:
@@ -78,86 +59,96 @@ def predictions(fusion: CalibratedFusion, data: Features, size: int, draws: int 
 
 
 def draw(path: Path, views: list[np.ndarray], titles: list[str], columns: int = 8) -> None:
-    figure, axes = plt.subplots(
-        -(-len(views) // columns), columns, figsize=(1.5 * columns, 1.8 * -(-len(views) // columns))
-    )
-    for axis in axes.flat:
-        axis.axis("off")
-    for axis, view, title in zip(axes.flat, views, titles, strict=False):
-        axis.imshow(view, cmap="gray")
-        axis.set_title(title, fontsize=6)
+    rows = -(-len(views) // columns)
+    figure = Figure(figsize=(1.5 * columns, 1.8 * rows))
+    for number, (view, title) in enumerate(zip(views, titles, strict=True), 1):
+        axes = figure.add_subplot(rows, columns, number)
+        axes.axis("off")
+        axes.imshow(view, cmap="gray")
+        axes.set_title(title, fontsize=6)
     figure.tight_layout(pad=0.3)
     figure.savefig(path, dpi=90)
 
 
-def main(options: Options) -> None:
-    settings = PRESETS[options.preset]
-    stages = Stages(settings.learned, settings.dataset, options.run)
-    classes, views = stages.statistics.classes, settings.dataset.capture.views
-    data = stages.features(f"lattice_{views}_{options.split}", options.run / "data", options.split)
-    source = open_split(options.run / "data", options.split)
-    objects = [source[index] for index in range(len(source))]
-    with np.load(options.archive) as archive:
-        train, train_labels = archive["X_train"] > 0, archive["y_train"]
-        # Validation objects are of the official training split.
-        from_split = "test" if options.split == "test" else "train"
-        grids = archive[f"X_{from_split}"] > 0
-    number = np.array([int(example["name"].decode().rsplit("_", 1)[1]) for example in objects])
-    grids, labels = grids[number], np.asarray(data.labels)
-
-    whole = wholeness(grids) >= WHOLE
+def accuracies(right: dict[int, np.ndarray], whole: np.ndarray) -> str:
+    """A table of accuracies of whole and other objects; `right` has the share of right answers by number of views, (objects,)."""
     groups = {
-        "all": np.ones(len(labels), bool),
+        "all": np.ones(len(whole), bool),
         f"in one piece (≥ {WHOLE:.0%} of the cells)": whole,
         "in pieces": ~whole,
     }
-    sizes, predicted = (1, 2, 4, views), {}
-    for size in sizes:
-        predicted[size] = predictions(stages.fusion(), data, size)
     rows = []
     for title, chosen in groups.items():
         cells = []
-        for size in sizes:
-            right = (predicted[size] == labels[:, None]).mean(axis=1)[chosen]
-            low, high = intervals(right[None])[0]
-            cells.append(f"{100 * right.mean():.1f} [{100 * low:.1f}, {100 * high:.1f}]")
+        for shares in right.values():
+            low, high = intervals(shares[None, chosen])[0]
+            cells.append(f"{100 * shares[chosen].mean():.1f} [{100 * low:.1f}, {100 * high:.1f}]")
         rows.append([title, str(chosen.sum()), *cells])
+    return markdown_table(["objects", "number", *(f"{size} view{'s' * (size > 1)}" for size in right)], rows)
 
-    final = predicted[views][:, 0]
-    wrong = np.flatnonzero(final != labels)
-    pairs, counts = np.unique(np.stack([labels[wrong], final[wrong]]), axis=1, return_counts=True)
+
+def confusions(labels: np.ndarray, answers: np.ndarray, classes: list[str]) -> str:
+    pairs, counts = np.unique(np.stack([labels, answers])[:, answers != labels], axis=1, return_counts=True)
     often = np.argsort(-counts)[:8]
-    confusions = ", ".join(f"{classes[pairs[0, i]]} for {classes[pairs[1, i]]} {counts[i]}" for i in often)
-    header = ["objects", "number", *(f"{size} views" if size > 1 else "1 view" for size in sizes)]
-    lines = [
-        f"# What holds accuracy down ({options.split} objects)",
-        "",
-        "Accuracy (%) of random views fused, 95 % intervals over objects.",
-        "",
-        markdown_table(header, rows),
-        "",
-        f"Wrong after all {views} views: {len(wrong)} of {len(labels)}. Taken the first for the second: {confusions}.",
-    ]
+    return ", ".join(f"{classes[pairs[0, i]]} for {classes[pairs[1, i]]} {counts[i]}" for i in often)
 
-    others = np.setdiff1d(np.arange(len(train)), number) if options.split == "val" else np.arange(len(train))
+
+def main(
+    run: Annotated[Path, tyro.conf.Positional],
+    archive: Annotated[Path, tyro.conf.Positional],
+    preset: Literal["small", "tiny"] = "small",
+    split: Literal["test", "val"] = "test",
+) -> None:
+    """Measures, shows and keeps.
+
+    Args:
+        run: directory in which `mevs study learned` was run.
+        archive: the .npz of voxel grids that the study used.
+        preset: of the study.
+        split: whose objects are evaluated.
+    """
+    settings = PRESETS[preset]
+    stages = Stages(settings.learned, settings.dataset, run)
+    classes, views = stages.statistics.classes, settings.dataset.capture.views
+    data = stages.features(f"lattice_{views}_{split}", run / "data", split)
+    objects = list(open_split(run / "data", split))
+    number = np.array([int(example["name"].decode().rsplit("_", 1)[1]) for example in objects])
+    with np.load(archive) as stored:
+        train, train_labels = stored["X_train"] > 0, stored["y_train"]
+        # Validation objects are of the official training split.
+        grids = (stored["X_test"] > 0 if split == "test" else train)[number]
+    labels = np.asarray(data.labels)
+    answers = {size: predictions(stages.fusion(), data, size) for size in (1, 2, 4, views)}
+    right = {size: (found == labels[:, None]).mean(axis=1) for size, found in answers.items()}
+    final = answers[views][:, 0]
+    wrong = np.flatnonzero(final != labels)
+
+    others = np.setdiff1d(np.arange(len(train)), number) if split == "val" else np.arange(len(train))
     others = others[train[others].any(axis=(1, 2, 3))]
     index, overlap = nearest(grids, train[others])
     same = train_labels[others][index] == labels
-    lines += ["", "The training grid that overlaps most has the same label:", ""]
-    for least in (0.0, 0.7, 0.8, 0.9):
-        near = overlap >= least
-        lines.append(f"* overlap of {least:.1f} and more: {100 * same[near].mean():.1f} % of {near.sum()} objects")
-    write_text(RESULTS / "ceiling.md", "\n".join(lines) + "\n")
-    print("\n".join(lines))
+    near = {least: overlap >= least for least in (0.0, 0.7, 0.8, 0.9)}
+    parts = [
+        f"# What holds accuracy down ({split} objects)",
+        "Accuracy (%) of random views fused, 95 % intervals over objects.",
+        accuracies(right, wholeness(grids) >= WHOLE),
+        f"Wrong after all {views} views: {len(wrong)} of {len(labels)}. "
+        f"Taken the first for the second: {confusions(labels, final, classes)}.",
+        "The training grid that overlaps most has the same label:",
+        "\n".join(
+            f"* overlap of {least:.1f} and more: {100 * same[chosen].mean():.1f} % of {chosen.sum()} objects"
+            for least, chosen in near.items()
+        ),
+    ]
+    text = "\n\n".join(parts)
+    write_text(RESULTS / "ceiling.md", f"{text}\n")
+    print(text)
 
     some = wrong[np.linspace(0, len(wrong) - 1, min(40, len(wrong))).astype(int)]
     from_above = int(np.argmin(np.abs(np.asarray(data.directions[0, :, 2]) - 0.45)))
-    draw(
-        RESULTS / "ceiling.png",
-        [objects[i]["image"][from_above] for i in some],
-        [f"{classes[labels[i]]},\ntaken for {classes[final[i]]}" for i in some],
-    )
+    titles = [f"{classes[labels[i]]},\ntaken for {classes[final[i]]}" for i in some]
+    draw(RESULTS / "ceiling.png", [objects[i]["image"][from_above] for i in some], titles)
 
 
 if __name__ == "__main__":
-    main(tyro.cli(Options, description=__doc__.splitlines()[0]))
+    tyro.cli(main, description=__doc__.splitlines()[0])

@@ -19,21 +19,18 @@ import json
 import re
 import sys
 from collections import defaultdict
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
-
-sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 import numpy as np
 import tyro
 
+from benchmarks.reporting import RESULTS
 from data_pipeline.dataset.builder import open_split
 from data_pipeline.files import read_json, write_bytes, write_text
 from eval.learned.comparison import BASELINES, ByObject, seeds_together
 from mevs_jax.markdown import markdown_table
 
-RESULTS = Path(__file__).parent / "results"
 METHODS = {
     "learned": "view policy",
     "expected_views": "information gain by expected views",
@@ -51,14 +48,6 @@ _KEPT = ("objects", "views", "trying_starts", "single_view")
 _KEPT_OF_EACH = ("title", "knows", "calibration_error")
 _SHOWN = (0, 1, 2, 3, 5, 7)
 """Steps of a walk that the tables show; 0 is the first view."""
-
-
-@dataclass(frozen=True)
-class Options:
-    run: Annotated[Path | None, tyro.conf.Positional] = None
-    """directory in which `mevs study learned` was run"""
-    to: str = "choices"
-    """name of the folder of all results, and of the file with their tables"""
 
 
 def keep(run: Path, folder: Path) -> None:
@@ -109,10 +98,17 @@ def kept(path: Path) -> tuple[dict[str, Any], dict[str, ByObject]]:
     return summary, each
 
 
-def _difference(difference: float, interval: list[float]) -> str:
-    low, high = interval
-    cell = f"{100 * difference:+.1f} [{100 * low:+.1f}, {100 * high:+.1f}]".replace("-", "−")
-    return f"**{cell}**" if low > 0 or high < 0 else cell
+def _differences(gains: dict[str, Any]) -> list[str]:
+    """Cells of the differences at every number of views, bold where the interval leaves out zero."""
+    cells = []
+    for difference, (low, high) in zip(gains["difference"], gains["interval"], strict=True):
+        cell = f"{100 * difference:+.1f} [{100 * low:+.1f}, {100 * high:+.1f}]".replace("-", "−")
+        cells.append(f"**{cell}**" if low > 0 or high < 0 else cell)
+    return cells
+
+
+def _shown(values: list[str]) -> list[str]:
+    return [values[step] if step < len(values) else "" for step in _SHOWN]
 
 
 def _table(header: list[str], rows: list[list[str]]) -> str:
@@ -121,31 +117,20 @@ def _table(header: list[str], rows: list[list[str]]) -> str:
 
 def tables(found: dict[str, Any]) -> str:
     """The tables of the result of `seeds_together`."""
-    policies, steps = found["policies"], [str(step + 1) for step in _SHOWN]
-
-    def shown(values: list[str]) -> list[str]:
-        return [values[step] if step < len(values) else "" for step in _SHOWN]
-
-    rows = []
+    policies, steps, rows = found["policies"], [str(step + 1) for step in _SHOWN], []
     for name, policy in policies.items():
-        closed = found["gap_closed"].get(name, [])
-        rows.append(
-            [
-                policy["title"],
-                *shown([f"{100 * share:.1f}" for share in policy["after_views"]]),
-                ", ".join("–" if share is None else f"{100 * share:.0f}" for share in closed).replace("-", "−"),
-                f"{100 * max(policy['calibration_error']):.1f}",
-            ]
-        )
+        accuracies = _shown([f"{100 * share:.1f}" for share in policy["after_views"]])
+        closed = ["–" if share is None else f"{100 * share:.0f}" for share in found["gap_closed"].get(name, [])]
+        error = f"{100 * max(policy['calibration_error']):.1f}"
+        rows.append([policy["title"], *accuracies, ", ".join(closed).replace("-", "−"), error])
     text = _table(["next view chosen by", *steps, "% of the gap, 2–4", "ECE at most"], rows)
     for method in METHODS:
         rows = []
         for base in (*BASELINES, "learned"):
-            gains = found["against"].get(base, {}).get(method)
-            if gains is not None:
-                for of, unit in ((gains, ""), (gains["likelihood"], ", nat/100")):
-                    known = [_difference(*cell) for cell in zip(of["difference"], of["interval"], strict=True)]
-                    rows.append([policies[base]["title"] + unit, *shown(known)[1:]])
+            if (gains := found["against"].get(base, {}).get(method)) is not None:
+                title = policies[base]["title"]
+                rows.append([title, *_shown(_differences(gains))[1:]])
+                rows.append([f"{title}, nat/100", *_shown(_differences(gains["likelihood"]))[1:]])
         if rows:
             text += _table([f"{METHODS[method]} above", *steps[1:]], rows)
     return text
@@ -154,44 +139,42 @@ def tables(found: dict[str, Any]) -> str:
 def novel_table(path: Path) -> str:
     """Gains over random views on classes that a policy was trained without; `path` is a stored `walks_novel.json`."""
     found = read_json(path)
-    steps = [step for step in _SHOWN[1:] if step < len(next(iter(found["gain"].values()))["difference"])]
-    rows = [
-        [title, *(_difference(gain["difference"][step], gain["interval"][step]) for step in steps)]
-        for name, title in NOVEL.items()
-        if (gain := found["gain"].get(name)) is not None
-    ]
+    gains = {title: _differences(found["gain"][name]) for name, title in NOVEL.items() if name in found["gain"]}
+    steps = [step for step in _SHOWN[1:] if step < len(next(iter(gains.values())))]
+    rows = [[title, *(cells[step] for step in steps)] for title, cells in gains.items()]
     title = f"## Classes left out, {len(found['pairs'])} pairs, {found['objects']} objects: {path.stem}\n\n"
     return title + _table(["points above random", *(str(step + 1) for step in steps)], rows)
 
 
-def main(options: Options) -> None:
-    folder = RESULTS / options.to
-    if options.run is not None:
-        keep(options.run, folder)
+def main(run: Annotated[Path | None, tyro.conf.Positional] = None, to: str = "choices") -> None:
+    """Keeps, and writes the tables.
+
+    Args:
+        run: directory in which `mevs study learned` was run.
+        to: name of the folder of all results, and of the file with their tables.
+    """
+    folder = RESULTS / to
+    if run is not None:
+        keep(run, folder)
     kinds = defaultdict(list)
     for path in sorted(folder.glob("*.npz")):
         parts = re.fullmatch(r"seed_(\d+(?:_rotated)?)_(.*)", path.stem)
         if parts is None:
-            print(
-                f"the name of {path} has no seed and candidates; rename it like seed_0_lattice_40.npz", file=sys.stderr
-            )
-            sys.exit(2)
+            sys.exit(f"the name of {path} has no seed and candidates; rename it like seed_0_lattice_40.npz")
         seed, kind = parts.groups()
         kinds[kind + "_rotated" * seed.endswith("rotated")].append((seed, *kept(path)))
     text = "Written by `benchmarks/choices.py`; accuracy in %, differences in points.\n\n"
     for kind, seeds in kinds.items():
-        numbers, found, each = zip(*seeds, strict=True)
-        text += (
-            f"## {kind}: {found[0]['views']} candidates, {found[0]['objects']} objects, seeds {', '.join(numbers)}\n\n"
-        )
-        text += tables(seeds_together(found, each, "learned"))
-        if len(seeds) > 1:
-            for number, one, own in seeds:
-                text += f"### seed {number}\n\n" + tables(seeds_together([one], [own], "learned"))
+        numbers, summaries, each = zip(*seeds, strict=True)
+        views, objects = summaries[0]["views"], summaries[0]["objects"]
+        text += f"## {kind}: {views} candidates, {objects} objects, seeds {', '.join(numbers)}\n\n"
+        text += tables(seeds_together(summaries, each, "learned"))
+        for number, one, own in seeds if len(seeds) > 1 else ():
+            text += f"### seed {number}\n\n" + tables(seeds_together([one], [own], "learned"))
     text += "".join(map(novel_table, sorted(folder.glob("*_novel.json"))))
-    write_text(folder.with_name(f"{folder.name}.md"), text)
+    write_text(RESULTS / f"{to}.md", text)
     print(text)
 
 
 if __name__ == "__main__":
-    main(tyro.cli(Options, description=__doc__.splitlines()[0]))
+    tyro.cli(main, description=__doc__.splitlines()[0])

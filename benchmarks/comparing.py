@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 import importlib.util
-import platform
 import sys
 import time
-from collections.abc import Callable
-from dataclasses import dataclass
-from functools import partial
+from collections.abc import Callable, Iterator
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -18,30 +16,19 @@ import numpy as np
 import optax
 from flax import nnx
 
+from benchmarks.reporting import Row, Table
 from data_pipeline.files import read_json
-from mevs_jax.markdown import markdown_row
 
 GUARD = 3.0
-HEADER = ("what", "ours", "peer", "theirs", "ratio", "")
-
-
-@dataclass
-class Row:
-    """An operation timed together with one peer.
-
-    Attributes:
-        what, peer: names of the operation and of the peer.
-        ours, theirs: lower quartile, median and upper quartile, in milliseconds.
-        ratio: their time divided by ours.
-        note: differences between the two results.
-    """
-
-    what: str
-    peer: str
-    ours: list[float]
-    theirs: list[float]
-    ratio: float
-    note: str = ""
+COMPARED = Table(
+    "what | ours | peer | theirs | ratio | ",
+    "{what} | {ours[1]:.3g} ({ours[0]:.3g}–{ours[2]:.3g}) | {peer} | "
+    "{theirs[1]:.3g} ({theirs[0]:.3g}–{theirs[2]:.3g}) | {ratio:.3g} | {note}",
+)
+"""Times in milliseconds: lower quartile, median and upper quartile. The ratio is their median divided by ours."""
+UNITS = "Milliseconds: median (quartiles)."
+FLOOR = "its matrix products alone"
+"""What nothing that computes the same can be faster than: a floor, not a peer."""
 
 
 def take_turns(calls: list[Callable[[], Any]], rounds: int) -> np.ndarray:
@@ -57,10 +44,15 @@ def take_turns(calls: list[Callable[[], Any]], rounds: int) -> np.ndarray:
     for turn in range(rounds):
         for number in random.permutation(len(calls)):
             _wait_for_rest()
-            start = time.perf_counter()
-            jax.block_until_ready(calls[number]())
-            taken[number, turn] = 1000 * (time.perf_counter() - start)
+            taken[number, turn] = 1000 * seconds_of(calls[number])
     return taken
+
+
+def seconds_of(call: Callable[[], Any]) -> float:
+    """Time of one call, until its result is ready."""
+    start = time.perf_counter()
+    jax.block_until_ready(call())
+    return time.perf_counter() - start
 
 
 def _wait_for_rest() -> None:
@@ -80,97 +72,72 @@ def compare(
     rounds: int,
     notes: dict[str, str] | None = None,
     turns: bool = True,
-) -> list[Row]:
+) -> Iterator[Row]:
+    """A row for each peer. Calls take turns, so that other load on the machine affects all of them, or come one after another."""
     calls = [ours, *peers.values()]
     taken = take_turns(calls, rounds) if turns else np.concatenate([take_turns([call], rounds) for call in calls])
-    quartiles = np.quantile(taken, [0.25, 0.5, 0.75], axis=1).T
-    rows = [
-        Row(what, peer, list(quartiles[0]), list(theirs), theirs[1] / quartiles[0, 1], (notes or {}).get(peer, ""))
-        for peer, theirs in zip(peers, quartiles[1:], strict=True)
-    ]
-    for row in rows:
-        print(markdown_row(row_cells(row)), flush=True)
-    return rows
+    mine, *others = np.quantile(taken, [0.25, 0.5, 0.75], axis=1).T.tolist()
+    notes = {FLOOR: "a floor, not a peer"} | (notes or {})
+    for peer, theirs in zip(peers, others, strict=True):
+        row = {"what": what, "peer": peer, "ours": mine, "theirs": theirs, "ratio": theirs[1] / mine[1]}
+        yield row | {"note": notes.get(peer, "")}
 
 
 def installed(name: str) -> bool:
-    found = importlib.util.find_spec(name) is not None
-    if not found:
+    there = importlib.util.find_spec(name) is not None
+    if not there:
         print(f"(without {name}, which is not installed)")
-    return found
+    return there
 
 
-def peer_device() -> str:
-    """Device of PyTorch: the GPU if JAX uses one and PyTorch can, otherwise the CPU."""
-    import torch
-
-    return "cuda" if jax.default_backend() == "gpu" and torch.cuda.is_available() else "cpu"
-
-
-def finished(call: Callable[[], Any]) -> Callable[[], Any]:
-    """Wraps a PyTorch call so that it returns after its device has finished."""
-    import torch
-
-    def until_done() -> Any:
-        out = call()
-        if peer_device() == "cuda":
-            torch.cuda.synchronize()
-        return out
-
-    return until_done
-
-
-def row_cells(row: Row) -> list[str]:
-    ours, theirs = (f"{m:.3g} ({low:.3g}–{high:.3g})" for low, m, high in (row.ours, row.theirs))
-    return [row.what, ours, row.peer, theirs, f"{row.ratio:.3g}", row.note]
-
-
-def slower_than_before(rows: list[Row], before: dict[str, Any]) -> list[str]:
-    """Messages about ratios below a third of the stored ones; only rows that exist in both are compared."""
-    stored = {(row["what"], row["peer"]): row["ratio"] for row in before["rows"]}
-    known = [(row, stored[row.what, row.peer]) for row in rows if (row.what, row.peer) in stored]
-    return [
-        f"{row.what}: {row.ratio:.2g} times as fast as {row.peer}, stored {ratio:.2g}"
-        for row, ratio in known
-        if row.ratio < ratio / GUARD
-    ]
+def torch_peers() -> Any:
+    """The module `benchmarks.torch_peer`, or None without PyTorch."""
+    return import_module("benchmarks.torch_peer") if installed("torch") else None
 
 
 def end_by_guard(rows: list[Row], stored: Path) -> None:
-    """Ends the program, with exit code 1 and messages if a ratio is below a third of the stored one."""
-    slower = slower_than_before(rows, read_json(stored))
-    for sentence in slower:
-        print(f"slower than before: {sentence}", file=sys.stderr)
+    """Ends the program, with exit code 1 and messages if a ratio is below a third of the one stored, if there is one."""
+    before = {(row["what"], row["peer"]): row["ratio"] for row in read_json(stored)["rows"]}
+    slower = [row for row in rows if row["ratio"] < before.get((row["what"], row["peer"]), 0) / GUARD]
+    for row in slower:
+        ratio, expected = row["ratio"], before[row["what"], row["peer"]]
+        text = f"{row['what']}: {ratio:.2g} times as fast as {row['peer']}, stored {expected:.2g}"
+        print(f"slower than before: {text}", file=sys.stderr)
     sys.exit(bool(slower))
 
 
-def training_step(network: nnx.Module, loss_of: Callable[..., jax.Array]) -> Callable[..., Any]:
-    """A compiled step of Adam on the inputs that it is called with. Every call goes on from the last, in the same memory."""
-    structure, parameters, *rest = nnx.split(network, nnx.Param, ...)
-    others = rest[0]
-    adam = optax.adam(1e-5)
-    moments = adam.init(parameters)
+class TrainingStep:
+    """A compiled step of training on the inputs that it is called with. Every call goes on from the last, in the same memory."""
 
-    @partial(jax.jit, donate_argnums=0)
-    def step(state, *inputs):
-        parameters, others, moments = state
+    def __init__(
+        self,
+        network: nnx.Module,
+        loss_of: Callable[..., jax.Array],
+        optimiser: optax.GradientTransformation = optax.adam(1e-5),  # noqa: B008
+    ) -> None:
+        structure, parameters, others = nnx.split(network, nnx.Param, ...)
 
-        def loss(parameters):
-            network = nnx.merge(structure, parameters, others, copy=True)
-            return loss_of(network, *inputs), nnx.state(network, nnx.Not(nnx.Param))
+        def step(state, *inputs):
+            parameters, others, moments = state
 
-        (value, others), gradients = jax.value_and_grad(loss, has_aux=True)(parameters)
-        updates, moments = adam.update(gradients, moments)
-        return (optax.apply_updates(parameters, updates), others, moments), value
+            def loss(parameters):
+                network = nnx.merge(structure, parameters, others, copy=True)
+                return loss_of(network, *inputs), nnx.state(network, nnx.Not(nnx.Param))
 
-    state = jax.tree.map(jnp.copy, (parameters, others, moments))
+            (value, others), gradients = jax.value_and_grad(loss, has_aux=True)(parameters)
+            updates, moments = optimiser.update(gradients, moments, parameters)
+            return (optax.apply_updates(parameters, updates), others, moments), value
 
-    def call(*inputs):
-        nonlocal state
-        state, value = step(state, *inputs)
-        return value
+        self._structure, self._step = structure, jax.jit(step, donate_argnums=0)
+        self._state = jax.tree.map(jnp.copy, (parameters, others, optimiser.init(parameters)))
 
-    return call
+    def __call__(self, *inputs: Any) -> jax.Array:
+        self._state, loss = self._step(self._state, *inputs)
+        return loss
+
+    def network(self) -> Any:
+        """As trained so far."""
+        return nnx.merge(self._structure, *self._state[:2], copy=True)
 
 
 def forward_of(network: nnx.Module) -> Callable[[jax.Array], jax.Array]:
@@ -182,5 +149,5 @@ def classification_loss(network: Callable[..., jax.Array], images: jax.Array, la
     return jnp.mean(optax.softmax_cross_entropy_with_integer_labels(network(images, train=True), labels))
 
 
-def machine_name() -> str:
-    return f"{platform.processor() or platform.machine()}, {jax.devices()[0].device_kind}, JAX {jax.__version__}"
+def entropy_loss(network: Callable[..., jax.Array], clouds: jax.Array, entropies: jax.Array) -> jax.Array:
+    return jnp.mean(jnp.square(network(clouds, train=True, key=jax.random.key(0)) - entropies))

@@ -10,41 +10,26 @@ The peers compute other observations: a glimpse of an image (CircleSquare, which
 from __future__ import annotations
 
 import os
-import platform
 import sys
-import time
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
-from pathlib import Path
+from dataclasses import dataclass, replace
 from typing import Any
 
-sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
-
 import jax
-import jax.numpy as jnp
 import numpy as np
 import tyro
 
+from benchmarks.comparing import seconds_of
+from benchmarks.evaluation import CLASSES, VIEWS, made_up_tables
+from benchmarks.reporting import RESULTS, Row, Table, machine_name
 from data_pipeline.files import write_text
-from mevs_jax import ActiveRecognition, ViewGraph, ViewTable, fibonacci_sphere
-from mevs_jax.markdown import markdown_table
+from mevs_jax import ActiveRecognition, ViewGraph, fibonacci_sphere
 
-RESULT = Path(__file__).parent / "results" / "environment.md"
-OBJECTS, VIEWS, CLASSES, MAX_VIEWS = 800, 40, 10, 9
-
-
-@dataclass(frozen=True)
-class Options:
-    """What is measured, and how often."""
-
-    episodes: int = 4096
-    """episodes at once in the pure environment"""
-    steps: int = 200
-    """steps of the pure environment in one call"""
-    vector: tuple[int, ...] = (64, 1024)
-    """episodes at once in vector environments"""
-    repeats: int = 7
-    """calls of each, whose median is taken"""
+TABLE = Table(
+    "environment | episodes at once | steps a second",
+    "{name} | {episodes:,} | {rates[1]:,.0f} ({rates[0]:,.0f}–{rates[2]:,.0f})",
+)
+OBJECTS, MAX_VIEWS = 800, 9
 
 
 @dataclass(frozen=True)
@@ -58,38 +43,32 @@ class Measured:
 
 
 def environment_of(entropies: bool) -> ActiveRecognition:
-    random = np.random.default_rng(0)
-    tables = ViewTable(
-        logits=jnp.asarray(random.normal(0, 2, (OBJECTS, VIEWS, CLASSES)), jnp.float32),
-        predicted_entropy=jnp.asarray(random.uniform(size=(OBJECTS, VIEWS, VIEWS)), jnp.float32) if entropies else None,
-        entropy=None,
-        label=jnp.asarray(random.integers(0, CLASSES, OBJECTS), jnp.int32),
-    )
+    tables = jax.tree.map(lambda leaf: leaf[:OBJECTS], made_up_tables())
+    predicted = tables.predicted_entropy if entropies else None
+    tables = replace(tables, logits=tables.logits[:, 0], predicted_entropy=predicted, entropy=None)
     return ActiveRecognition(tables, ViewGraph.from_points(fibonacci_sphere(VIEWS)), max_views=MAX_VIEWS)
 
 
-def pure(options: Options, entropies: bool) -> Measured:
+def pure(episodes: int, steps: int, entropies: bool) -> Measured:
     """The pure environment in a scan of `step_autoreset`, with random views."""
-    environment, count = environment_of(entropies), options.episodes
+    environment = environment_of(entropies)
 
     @jax.jit
     def walk(environment: ActiveRecognition, key: jax.Array) -> jax.Array:
         def step(carry: tuple[Any, Any], key: jax.Array) -> tuple[Any, jax.Array]:
             states, observations = carry
-            keys = jax.random.split(key, count + 1)
-            views = jax.random.randint(keys[-1], (count,), 0, VIEWS)
+            keys = jax.random.split(key, episodes + 1)
+            views = jax.random.randint(keys[-1], (episodes,), 0, VIEWS)
             actions = {"action": views, "prediction": observations.belief}
             found = jax.vmap(environment.step_autoreset)(keys[:-1], states, actions)
             return found[:2], found[2].mean()
 
-        keys = jax.random.split(key, options.steps + 1)
-        start = jax.vmap(environment.reset)(jax.random.split(keys[-1], count))
+        keys = jax.random.split(key, steps + 1)
+        start = jax.vmap(environment.reset)(jax.random.split(keys[-1], episodes))
         return jax.lax.scan(step, start, keys[:-1])[1]
 
     name = "`ActiveRecognition`, compiled" + (", with predicted entropies" if entropies else "")
-    return Measured(
-        name, count, count * options.steps, lambda: jax.block_until_ready(walk(environment, jax.random.key(0)))
-    )
+    return Measured(name, episodes, episodes * steps, lambda: walk(environment, jax.random.key(0)))
 
 
 def stepping(name: str, envs: Any, actions: list[Any]) -> Measured:
@@ -129,28 +108,30 @@ def vector(count: int) -> Iterator[Measured]:
     yield stepping("Gymnasium, CartPole-v1 in NumPy", poles, [random.integers(2, size=count) for _ in range(steps)])
 
 
-def main(options: Options) -> None:
-    measured = [pure(options, entropies) for entropies in (False, True)]
-    measured += [one for count in options.vector for one in vector(count)]
-    times: list[list[float]] = [[] for _ in measured]
+def main(episodes: int = 4096, steps: int = 200, vectors: tuple[int, ...] = (64, 1024), repeats: int = 7) -> None:
+    """Measures, shows and keeps.
+
+    Args:
+        episodes: at once in the pure environment.
+        steps: of the pure environment in one call.
+        vectors: episodes at once in vector environments.
+        repeats: calls of each, whose median is taken.
+    """
+    measured = [pure(episodes, steps, entropies) for entropies in (False, True)]
+    measured += [one for count in vectors for one in vector(count)]
     for one in measured:
-        one.call()  # compiles
-    for _ in range(options.repeats):
-        for one, taken in zip(measured, times, strict=True):
-            start = time.perf_counter()
-            one.call()
-            taken.append(time.perf_counter() - start)
-    rows = []
-    for one, taken in zip(measured, times, strict=True):
-        fastest, median, slowest = (one.steps / np.quantile(taken, (0.25, 0.5, 0.75))).tolist()
-        rows.append([one.name, f"{one.episodes:,}", f"{median:,.0f} ({slowest:,.0f}–{fastest:,.0f})"])
-    table = markdown_table(["environment", "episodes at once", "steps a second"], rows)
-    print(table)
-    where = (
-        f"{platform.machine()}, {len(os.sched_getaffinity(0))} cores, {jax.default_backend()}, JAX {jax.__version__}"
-    )
-    write_text(RESULT, f"{where}. Steps a second: median (quartiles) of {options.repeats} calls.\n\n{table}\n")
+        seconds_of(one.call)  # compiles
+    taken = np.array([[seconds_of(one.call) for one in measured] for _ in range(repeats)])
+
+    def row_of(one: Measured, seconds: np.ndarray) -> Row:
+        rates = np.quantile(one.steps / seconds, (0.25, 0.5, 0.75)).tolist()
+        return {"name": one.name, "episodes": one.episodes, "rates": rates}
+
+    rows = TABLE.show(map(row_of, measured, taken.T))
+    where = f"{machine_name()}, {len(os.sched_getaffinity(0))} cores"
+    head = f"{where}. Steps a second: median (quartiles) of {repeats} calls."
+    write_text(RESULTS / "environment.md", f"{head}\n\n{TABLE.markdown(rows)}\n")
 
 
 if __name__ == "__main__":
-    main(tyro.cli(Options, description=__doc__))
+    tyro.cli(main, description=__doc__.splitlines()[0])

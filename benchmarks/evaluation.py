@@ -9,28 +9,29 @@ this. The peak memory is that of the process before the loop.
 
 from __future__ import annotations
 
-import platform
 import resource
-import sys
-import time
-from pathlib import Path
-
-sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+from functools import cache
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from data_pipeline.files import write_json
+from benchmarks.comparing import seconds_of
+from benchmarks.reporting import RESULTS, Table, keep, machine_name
 from eval.walks.grid import FIRST_MV, LAST_MV, THRESHOLDS, run_grid
 from mevs_jax import Knowledge, ViewGraph, ViewTable, fibonacci_sphere
-from mevs_jax.markdown import markdown_table
 from mevs_jax.policies import policy_record
 from tests.reference import numpy_rules
 
 OBJECTS, VIEWS, CLASSES, BACKBONES = 908, 40, 10, 3
 COMPARED = tuple(map(policy_record, ("random", "predicted_entropy", "oracle_entropy")))
 SUBSET = 4
+TABLE = Table(
+    "walks | program, s | slowest of 15 | compiling, s | peak memory, GiB | loop, s (scaled) | ratio",
+    "{walks:,} | {seconds:.3f} | {slowest_seconds:.3f} | {compile_and_first_run_seconds:.1f} | "
+    "{peak_memory_gib:.2f} | {loop_seconds_scaled:,.0f} | {times_faster:,.0f}×",
+)
 
 
 def made_up_tables() -> ViewTable:
@@ -43,8 +44,19 @@ def made_up_tables() -> ViewTable:
     )
 
 
-def loop_over_objects(tables: ViewTable, neighbours: np.ndarray, objects: int) -> tuple[np.ndarray, int]:
-    """Whether each prediction is right (objects, backbones, policies, MV, CT), and the number of walks.
+@cache
+def graph_and_knowledge() -> tuple[ViewGraph, Knowledge]:
+    nothing = Knowledge(jnp.zeros((BACKBONES, VIEWS)), jnp.zeros((BACKBONES, CLASSES, VIEWS, CLASSES)))
+    return ViewGraph.from_points(fibonacci_sphere(VIEWS)), nothing
+
+
+def whole_grid(tables: ViewTable, seed: int = 0) -> dict[str, Any]:
+    """The thesis's evaluation of all objects of the tables, by one seed."""
+    return run_grid(jax.random.key(seed), tables, *graph_and_knowledge(), COMPARED, max_views=LAST_MV)
+
+
+def loop_over_objects(tables: ViewTable, neighbours: np.ndarray, objects: int) -> np.ndarray:
+    """Whether each prediction is right (objects, backbones, policies, MV, CT).
 
     As in the published code, every cell has its own walks, in plain Python on NumPy arrays. To save time, each object starts from
     only one view, as in one run of the published code.
@@ -65,76 +77,47 @@ def loop_over_objects(tables: ViewTable, neighbours: np.ndarray, objects: int) -
             logits[index, backbone], weights, graph, index % VIEWS, THRESHOLDS[threshold], FIRST_MV + limit
         )
         right[index, backbone, policy, limit, threshold] = predictions[-1] == labels[index]
-    return right, right.size
+    return right
 
 
-def main() -> None:
-    tables, graph = made_up_tables(), ViewGraph.from_points(fibonacci_sphere(VIEWS))
-    nothing = Knowledge(jnp.zeros((BACKBONES, VIEWS)), jnp.zeros((BACKBONES, CLASSES, VIEWS, CLASSES)))
-
-    def program(tables: ViewTable = tables):
-        return jax.block_until_ready(run_grid(jax.random.key(0), tables, graph, nothing, COMPARED, max_views=LAST_MV))
-
-    start = time.perf_counter()
-    results = program()
-    compiling = time.perf_counter() - start
-    times = []
-    for _ in range(15):
-        start = time.perf_counter()
-        program()
-        times.append(time.perf_counter() - start)
-    # Measured before the loop and the check below, so that they do not count. The unit on Linux is kilobytes.
-    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20
-    grid_cells = BACKBONES * len(COMPARED) * (LAST_MV - FIRST_MV + 1) * len(THRESHOLDS)
-    walks = OBJECTS * VIEWS * grid_cells
-
-    start = time.perf_counter()
-    right, looped = loop_over_objects(tables, np.asarray(graph.neighbours), SUBSET)
-    per_walk = (time.perf_counter() - start) / looped
-
-    # Compares the predictions of the program with those of the loop, on the subset and its start views.
-    views = {name: np.asarray(result.views)[0, :SUBSET, :, 0] for name, result in results.items()}
-    logits = np.asarray(tables.logits)
+def check(results: dict[str, Any], right: np.ndarray, tables: ViewTable) -> None:
+    """Compares the predictions of the program with those of the loop, on the loop's objects and start views."""
+    logits, labels = np.asarray(tables.logits), np.asarray(tables.label)
     for number, policy in enumerate(COMPARED):
         if policy.name == "random":
             continue
-        for index in range(SUBSET):
-            walk = views[policy.name][index, index % VIEWS]
-            for backbone in range(BACKBONES):
-                beliefs = np.cumsum(logits[index, backbone, walk], axis=0)
-                sure = np.array([numpy_rules.softmax_confidence(belief) for belief in beliefs])
-                for limit, column in np.ndindex(LAST_MV - FIRST_MV + 1, len(THRESHOLDS)):
-                    stops = np.flatnonzero(sure[: FIRST_MV + limit] >= THRESHOLDS[column])
-                    end = stops[0] if len(stops) else FIRST_MV + limit - 1
-                    answer = beliefs[end].argmax() == np.asarray(tables.label)[index]
-                    assert answer == right[index, backbone, number, limit, column]
+        views = np.asarray(results[policy.name].views)[0, : len(right), :, 0]
+        for index, backbone in np.ndindex(len(right), BACKBONES):
+            beliefs = np.cumsum(logits[index, backbone, views[index, index % VIEWS]], axis=0)
+            sure = np.array([numpy_rules.softmax_confidence(belief) for belief in beliefs])
+            for limit, column in np.ndindex(LAST_MV - FIRST_MV + 1, len(THRESHOLDS)):
+                stops = np.flatnonzero(sure[: FIRST_MV + limit] >= THRESHOLDS[column])
+                end = stops[0] if len(stops) else FIRST_MV + limit - 1
+                answer = beliefs[end].argmax() == labels[index]
+                assert answer == right[index, backbone, number, limit, column]
 
-    machine = f"{platform.processor() or platform.machine()}, {jax.devices()[0].device_kind}, JAX {jax.__version__}"
+
+def main() -> None:
+    tables, (graph, _) = made_up_tables(), graph_and_knowledge()
+    compiling, *times = [seconds_of(lambda: whole_grid(tables)) for _ in range(16)]
+    # Measured before the loop and the check below, so that they do not count. The unit on Linux is kilobytes.
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20
+    right: list[np.ndarray] = []
+    loop = seconds_of(lambda: right.append(loop_over_objects(tables, np.asarray(graph.neighbours), SUBSET)))
+    check(whole_grid(tables), right[0], tables)
+    walks, per_walk, seconds = OBJECTS * VIEWS * right[0][0].size, loop / right[0].size, float(np.median(times))
     row = {
         "walks": walks,
         "compile_and_first_run_seconds": compiling,
-        "seconds": float(np.median(times)),
+        "seconds": seconds,
         "slowest_seconds": max(times),
         "peak_memory_gib": peak,
         "loop_seconds_per_walk": per_walk,
         "loop_seconds_scaled": per_walk * walks,
-        "times_faster": per_walk * walks / float(np.median(times)),
+        "times_faster": per_walk * walks / seconds,
     }
-    print(f"Measured on: {machine}\n")
-    header = ("walks", "program, s", "slowest of 15", "compiling, s", "peak memory, GiB", "loop, s (scaled)", "ratio")
-    cells = [
-        f"{walks:,}",
-        f"{row['seconds']:.3f}",
-        f"{row['slowest_seconds']:.3f}",
-        f"{compiling:.1f}",
-        f"{peak:.2f}",
-        f"{row['loop_seconds_scaled']:,.0f}",
-        f"{row['times_faster']:,.0f}×",
-    ]
-    print(markdown_table(header, [cells]))
-    path = Path(__file__).parent / "results" / "evaluation.json"
-    write_json(path, {"machine": machine, "rows": [row]})
-    print(f"\nWritten to {path.relative_to(Path.cwd()) if path.is_relative_to(Path.cwd()) else path}")
+    print(f"Measured on: {machine_name()}")
+    keep(RESULTS / "evaluation.json", {"rows": TABLE.show([row])})
 
 
 if __name__ == "__main__":

@@ -8,30 +8,27 @@ simulated devices talk to each other in a step.
 
 from __future__ import annotations
 
-import argparse
-import platform
 import re
-import sys
-import time
-from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
-
-sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+from unittest import mock
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+import tyro
 from flax import nnx
 
+from benchmarks.comparing import seconds_of
+from benchmarks.reporting import RESULTS, Row, Table, machine_name
 from data_pipeline.dataset.batches import train_batches
 from data_pipeline.dataset.builder import prepare
 from data_pipeline.dataset.statistics import load_statistics
 from data_pipeline.files import write_json
-from eval.settings import SMALL, TINY, Settings
+from eval.settings import SMALL, TINY
 from eval.stages import tasks
 from mevs_jax import fibonacci_sphere
 from mevs_jax.beliefs.fusing import CalibratedFusion
@@ -41,12 +38,16 @@ from train.choosing.features import Features
 from train.choosing.policy import Lesson, train_policies
 from train.loop import fit, steps_of_an_epoch
 from train.many.members import Group, SweepTask, member_of
-from train.many.trainers import TRAINERS, AtOnce, Trainer, Way
+from train.many.trainers import TRAINERS, AtOnce, Way
 from train.many.training import train_members
 from train.running.devices import device_mesh
 from train.tasks.recogniser import RecogniserTask
 
 SEEDS, OBJECTS, STEPS = 4, 12, 8
+TABLE = Table(
+    "network | separate, s | in turn, s | ratio | at once, s | ratio | step: in turn / at once",
+    "{network} | {separate:.1f} | {in turn:.1f} | {faster in turn:.2f} | {at once:.1f} | {faster at once:.2f} | {step:.2f}",
+)
 WAYS: tuple[Way, ...] = ("in turn", "at once")
 COLLECTIVES = re.compile(r"\b(all-reduce|all-gather|all-to-all|reduce-scatter|collective-permute)(?:-start)?\(")
 
@@ -54,15 +55,12 @@ COLLECTIVES = re.compile(r"\b(all-reduce|all-gather|all-to-all|reduce-scatter|co
 def networks(data: Path) -> dict[str, SweepTask]:
     """The tasks by name, each for one epoch of a few steps."""
     statistics = load_statistics(data)
-
-    def of(settings: Settings, place: int) -> SweepTask:
-        return tasks(settings, statistics)[place]
-
+    classify, predict = tasks(SMALL, statistics)
     found: dict[str, SweepTask] = {
-        "ResNet-18, small": of(SMALL, 0),
-        "PointNet++, small": of(SMALL, 1),
+        "ResNet-18, small": classify,
+        "PointNet++, small": predict,
         "recogniser, small": RecogniserTask.of(SMALL.learned.recogniser, len(statistics.classes), statistics.camera),
-        "PointNet++, tiny": of(TINY, 1),
+        "PointNet++, tiny": tasks(TINY, statistics)[1],
     }
     return {
         name: replace(task, optimiser=replace(task.optimiser, epochs=1, epoch_views=task.optimiser.views_per_object))
@@ -72,12 +70,6 @@ def networks(data: Path) -> dict[str, SweepTask]:
 
 def from_seeds(task: SweepTask, count: int) -> list[SweepTask]:
     return [replace(task, optimiser=replace(task.optimiser, seed=seed, data_seed=seed)) for seed in range(count)]
-
-
-def seconds_of(function: Callable[[], Any]) -> float:
-    start = time.perf_counter()
-    function()
-    return time.perf_counter() - start
 
 
 def batches_of(each: list[SweepTask], data: Path) -> dict[str, np.ndarray]:
@@ -103,7 +95,7 @@ def compare(task: SweepTask, data: Path, out: Path) -> dict[str, Any]:
     steps: dict[str, list[float]] = {way: [] for way in WAYS}
     for _ in range(STEPS):  # alternately, since other programs may run beside them
         for way, trainer in trainers.items():
-            steps[way].append(seconds_of(partial(_step, trainer, training, batch)))
+            steps[way].append(seconds_of(partial(trainer.train, training, batch)))
     return found | {f"step {way}": float(np.median(taken)) for way, taken in steps.items()}
 
 
@@ -121,36 +113,32 @@ def compare_policies(objects: int = 200, features: int = 128) -> dict[str, Any]:
 
     lessons = [Lesson(seed, [(fusion, seen())], None, f"policy {seed}") for seed in range(SEEDS)]
     found: dict[str, Any] = {"separate": seconds_of(lambda: [train_policies(config, [lesson]) for lesson in lessons])}
-    chosen = averaged.way_for
     for way in WAYS:
-        averaged.way_for = partial(_always, way)
-        found[way] = seconds_of(partial(train_policies, config, lessons))
-    averaged.way_for = chosen
+        with mock.patch.object(averaged, "way_for", lambda _, way=way: way):
+            found[way] = seconds_of(partial(train_policies, config, lessons))
     return found
-
-
-def _always(way: Way, mesh: Any) -> Way:
-    del mesh
-    return way
-
-
-def _step(trainer: Trainer, training: np.ndarray, batch: dict[str, np.ndarray]) -> None:
-    jax.block_until_ready(trainer.train(training, batch))
 
 
 def talk(task: SweepTask, data: Path, devices: int) -> list[str]:
     """The collective operations in a step of as many seeds as there are devices."""
     each = from_seeds(task, devices)
     group = Group(task, [member_of(one) for one in each], data, load_statistics(data))
-    trainer = AtOnce(group, device_mesh())
-    program = trainer.program(np.ones(devices, bool), batches_of(each, data))
+    program = AtOnce(group, device_mesh()).program(np.ones(devices, bool), batches_of(each, data))
     return sorted(set(COLLECTIVES.findall(program)))
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--devices", type=int, default=1)
-    devices = parser.parse_args().devices
+def row_of(network: str, seconds: dict[str, Any]) -> Row:
+    faster = {f"faster {way}": seconds["separate"] / seconds[way] for way in WAYS}
+    step = seconds["step at once"] / seconds["step in turn"] if "step in turn" in seconds else np.nan
+    return {"network": network, **seconds, **faster, "step": step}
+
+
+def main(devices: int = 1) -> None:
+    """Measures, shows and keeps.
+
+    Args:
+        devices: simulated devices; from two on, what they say to each other is listed.
+    """
     if devices > 1:
         jax.config.update("jax_num_cpu_devices", devices)
     with TemporaryDirectory() as folder:
@@ -158,25 +146,15 @@ def main() -> None:
         prepare(replace(SMALL.dataset, train_per_class=OBJECTS, test_per_class=2), data)
         if devices > 1:
             for name, task in networks(data).items():
-                said = talk(task, data, devices)
-                print(
-                    f"{name}: a step of {devices} seeds on {devices} devices has {', '.join(said) or 'no collectives'}"
-                )
+                said = ", ".join(talk(task, data, devices)) or "no collectives"
+                print(f"{name}: a step of {devices} seeds on {devices} devices has {said}")
             return
         rows = {name: compare(task, data, Path(folder) / name) for name, task in networks(data).items()}
     rows["view policy, small"] = compare_policies()
-    print(f"\n{SEEDS} seeds, {platform.machine()}, JAX {jax.__version__}")
-    print(
-        f"{'network':20}{'separate':>11}{'in turn':>11}{'ratio':>8}{'at once':>11}{'ratio':>8}{'step: in turn / at once':>26}"
-    )
-    for name, row in rows.items():
-        print(
-            f"{name:20}{row['separate']:>9.1f} s{row['in turn']:>9.1f} s{row['separate'] / row['in turn']:>8.2f}"
-            f"{row['at once']:>9.1f} s{row['separate'] / row['at once']:>8.2f}"
-            f"{row['step at once'] / row['step in turn'] if 'step in turn' in row else np.nan:>26.2f}"
-        )
-    write_json(Path(__file__).parent / "results" / "members.json", rows)
+    print(f"\n{SEEDS} seeds, {machine_name()}")
+    TABLE.show(row_of(network, seconds) for network, seconds in rows.items())
+    write_json(RESULTS / "members.json", rows)
 
 
 if __name__ == "__main__":
-    main()
+    tyro.cli(main, description=__doc__.splitlines()[0])

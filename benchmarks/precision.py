@@ -10,32 +10,39 @@ The table is written to `benchmarks/results/precision.md`.
 
 from __future__ import annotations
 
-import platform
 import sys
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
-from typing import Any, Literal
-
-sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+from typing import Annotated, Any, Literal
+from unittest import mock
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+import tyro
 from flax import nnx
+from jaxtyping import Float, Int
 
+from benchmarks.reporting import RESULTS, Row, Table, machine_name
 from data_pipeline.dataset.statistics import load_statistics
 from data_pipeline.files import write_text
-from eval.settings import PRESETS
+from eval.run_file import load_run
+from eval.settings import SMALL
 from eval.stages import tasks
 from eval.tables import objects_of
-from mevs_jax import bootstrap_interval, maxima_first
-from mevs_jax.markdown import markdown_table
+from mevs_jax import ViewGraph, bootstrap_interval, maxima_first
 from mevs_jax.models.batch_norm import BatchNorm
 from train.loop import load_best
 from train.results.outputs import network_outputs
 
-RESULTS = Path(__file__).parent / "results" / "precision.md"
+TABLE = Table(
+    "calculated in | accuracy of single views, % | difference, points | R² of entropies | "
+    "difference of squared errors, % of variance | logits differ by at most | entropies | first choice the same",
+    "{name} | {accuracy:.2f} | {difference} | {R²:.4f} | "
+    "{difference of errors} | {logits:.1e} | {entropies:.1e} | {same:.2f} %",
+)
 
 
 class Unfolded(nnx.Module):
@@ -45,21 +52,13 @@ class Unfolded(nnx.Module):
         self.network = network
 
     def __call__(self, inputs: jax.Array) -> jax.Array:
-        by_batch = BatchNorm.__call__
-
-        def by_running_statistics(
-            norm: BatchNorm, x: jax.Array, *, train: bool = False, momentum: object = None
-        ) -> jax.Array:
-            del train, momentum
+        def by_running_statistics(norm: BatchNorm, x: jax.Array, **_: object) -> jax.Array:
             return by_batch(norm, x)
 
-        BatchNorm.__call__ = by_running_statistics  # type: ignore[assignment, method-assign]
-        try:
-            if hasattr(self.network, "views"):
-                return self.network(inputs, train=True, key=jax.random.key(0), dropout=0.0)
-            return self.network(inputs, train=True)
-        finally:
-            BatchNorm.__call__ = by_batch  # type: ignore[method-assign]
+        by_batch = BatchNorm.__call__
+        options = {"key": jax.random.key(0), "dropout": 0.0} if hasattr(self.network, "views") else {}
+        with mock.patch.object(BatchNorm, "__call__", by_running_statistics):
+            return self.network(inputs, train=True, **options)
 
 
 def interval(by_object: np.ndarray) -> str:
@@ -67,76 +66,67 @@ def interval(by_object: np.ndarray) -> str:
     return f"{by_object.mean():+.3f} [{low:+.3f}, {high:+.3f}]"
 
 
-def main() -> None:
-    if len(sys.argv) != 2 or not (Path(sys.argv[1]) / "metrics.json").exists():
-        print("usage: python benchmarks/precision.py RUN, where RUN was made by `mevs run`", file=sys.stderr)
-        sys.exit(2)
-    run = Path(sys.argv[1])
-    statistics = load_statistics(run / "data")
-    classify, predict = tasks(PRESETS["small"], statistics)
-    graph = statistics.graph
-    _, labels, entropy = objects_of(run / "data", "test", statistics)
-    variance = np.square(entropy - entropy.mean()).mean()
+@dataclass(frozen=True)
+class Outputs:
+    """What both networks say of every view of every object, calculated in one way; `chosen` are the first decisions."""
 
-    @jax.jit
-    def first_choices(predicted_entropy: jax.Array) -> jax.Array:
-        def choice(start: jax.Array, weights: jax.Array) -> jax.Array:
-            allowed = jnp.arange(statistics.views) != start
-            return jnp.argmax(jnp.where(allowed, maxima_first(weights, allowed, graph.neighbours), -jnp.inf))
+    right: Float[np.ndarray, " objects"]
+    error: Float[np.ndarray, " objects"]
+    logits: Float[np.ndarray, "objects views classes"]
+    entropy: Float[np.ndarray, "objects seen views"]
+    chosen: Int[np.ndarray, "objects views"]
 
-        return jax.vmap(jax.vmap(choice), in_axes=(None, 0))(jnp.arange(statistics.views), predicted_entropy)
 
-    found = {}
-    dtypes: list[tuple[str, Literal["float32", "bfloat16"], Callable[[Any], Any]]] = [
-        ("float32, batch norm by itself", "float32", Unfolded),
-        ("float32, folded", "float32", lambda network: network),
-        ("bfloat16, folded", "bfloat16", lambda network: network),
-    ]
-    for name, dtype, wrap in dtypes:
-        outputs = []
-        for task, folder in ((classify, "classifier"), (predict, "entropy")):
-            saved = replace(task, optimiser=replace(task.optimiser, compute=dtype))
-            network = load_best(saved, run / folder)
-            outputs.append(network_outputs(run / "data", "test", saved, wrap(network)))
-        logits, predicted_entropy = outputs
-        error = np.square(predicted_entropy - entropy[:, None]).mean(axis=(1, 2))
-        found[name] = {
-            "right": (logits.argmax(-1) == labels[:, None]).mean(axis=1),
-            "error": error,
-            "logits": logits,
-            "entropy": predicted_entropy,
-            "chosen": np.asarray(first_choices(jnp.asarray(predicted_entropy))),
-        }
-        print(name, f"{100 * found[name]['right'].mean():.2f} %, R² {1 - error.mean() / variance:.4f}", flush=True)
-    first = next(iter(found.values()))
-    columns = (
-        "calculated in",
-        "accuracy of single views, %",
-        "difference, points",
-        "R² of entropies",
-        "difference of squared errors, % of variance",
-        "logits differ by at most",
-        "entropies",
-        "first choice the same",
+def first_choices(predicted_entropy: jax.Array, graph: ViewGraph) -> jax.Array:
+    """The view that the thesis's rule chooses after each first view, (objects, views)."""
+    others = ~jnp.eye(len(graph.points), dtype=bool)
+    scores = jax.vmap(jax.vmap(partial(maxima_first, neighbours=graph.neighbours)), (0, None))(
+        predicted_entropy, others
     )
-    rows = [
-        [
-            name,
-            f"{100 * by['right'].mean():.2f}",
-            interval(100 * (by["right"] - first["right"])),
-            f"{1 - by['error'].mean() / variance:.4f}",
-            interval(100 * (by["error"] - first["error"]) / variance),
-            f"{np.abs(by['logits'] - first['logits']).max():.1e}",
-            f"{np.abs(by['entropy'] - first['entropy']).max():.1e}",
-            f"{100 * (by['chosen'] == first['chosen']).mean():.2f} %",
-        ]
-        for name, by in found.items()
-    ]
-    measured = f"{len(labels)} test objects × {statistics.views} views; {platform.machine()}, {jax.default_backend()}."
-    text = f"{measured}\n\n{markdown_table(columns, rows)}\n"
-    write_text(RESULTS, text)
-    print(text, end="")
+    return jnp.argmax(jnp.where(others, scores, -jnp.inf), axis=-1)
+
+
+def row_of(name: str, by: Outputs, first: Outputs, variance: float) -> Row:
+    return {
+        "name": name,
+        "accuracy": 100 * by.right.mean(),
+        "difference": interval(100 * (by.right - first.right)),
+        "R²": 1 - by.error.mean() / variance,
+        "difference of errors": interval(100 * (by.error - first.error) / variance),
+        "logits": np.abs(by.logits - first.logits).max(),
+        "entropies": np.abs(by.entropy - first.entropy).max(),
+        "same": 100 * (by.chosen == first.chosen).mean(),
+    }
+
+
+def main(run: Annotated[Path, tyro.conf.Positional]) -> None:
+    if not (run / "metrics.json").exists():
+        sys.exit(f"{run} was not made by `mevs run`")
+    statistics, made = load_statistics(run / "data"), load_run(run)
+    both = tasks(SMALL if made is None else made.settings, statistics)
+    _, labels, entropy = objects_of(run / "data", "test", statistics)
+
+    def calculate(dtype: Literal["float32", "bfloat16"], wrap: Callable[[Any], Any]) -> Outputs:
+        outputs = []
+        for task, folder in zip(both, ("classifier", "entropy"), strict=True):
+            saved = replace(task, optimiser=replace(task.optimiser, compute=dtype))
+            outputs.append(network_outputs(run / "data", "test", saved, wrap(load_best(saved, run / folder))))
+        logits, predicted_entropy = outputs
+        right = (logits.argmax(-1) == labels[:, None]).mean(axis=1)
+        error = np.square(predicted_entropy - entropy[:, None]).mean(axis=(1, 2))
+        chosen = first_choices(jnp.asarray(predicted_entropy), statistics.graph)
+        return Outputs(right, error, logits, predicted_entropy, np.asarray(chosen))
+
+    ways = {
+        "float32, batch norm by itself": calculate("float32", Unfolded),
+        "float32, folded": calculate("float32", lambda network: network),
+        "bfloat16, folded": calculate("bfloat16", lambda network: network),
+    }
+    variance, first = float(np.square(entropy - entropy.mean()).mean()), next(iter(ways.values()))
+    rows = TABLE.show(row_of(name, by, first, variance) for name, by in ways.items())
+    measured = f"{len(labels)} test objects × {statistics.views} views; {machine_name()}."
+    write_text(RESULTS / "precision.md", f"{measured}\n\n{TABLE.markdown(rows)}\n")
 
 
 if __name__ == "__main__":
-    main()
+    tyro.cli(main, description=__doc__.splitlines()[0])

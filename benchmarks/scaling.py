@@ -10,21 +10,21 @@
 
 from __future__ import annotations
 
-import json
 import os
 import socket
 import subprocess
 import sys
 import time
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
-
-sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 import jax
 import numpy as np
 
+from benchmarks.comparing import seconds_of
+from benchmarks.reporting import machine_name
 from data_pipeline.dataset.batches import train_batches
 from data_pipeline.dataset.builder import prepare
 from data_pipeline.dataset.statistics import DatasetStatistics, load_statistics
@@ -59,12 +59,13 @@ def train_rate(task: Task, data: Path) -> float:
     """Views per second over all processes, from the median time of some steps after the first."""
     step, state, mesh = compiled_step(task)
     batch = place_batch(mesh, next(train_batches(data, task.batches)))
-    taken = []
-    for _ in range(STEPS + 1):
-        start = time.perf_counter()
+
+    def once() -> jax.Array:
+        nonlocal state
         state, loss = step(state, batch, task.hyperparameters)
-        loss.block_until_ready()
-        taken.append(time.perf_counter() - start)
+        return loss
+
+    taken = [seconds_of(once) for _ in range(STEPS + 1)]
     return task.optimiser.batch_size / float(np.median(taken[1:]))
 
 
@@ -97,22 +98,18 @@ def costs(task: Task, data: Path) -> dict[str, float]:
 
 def rate_apart(preset: str, name: str, data: Path, *, cores: int, processes: int = 1, devices: int = 1) -> float:
     """Views per second of new processes that share `cores` cores, each with `devices` simulated devices."""
-    with socket.socket() as found:
-        found.bind(("127.0.0.1", 0))
-        address = f"127.0.0.1:{found.getsockname()[1]}"
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        address = f"127.0.0.1:{free.getsockname()[1]}"
     everywhere = os.sched_getaffinity(0)
     os.sched_setaffinity(0, sorted(everywhere)[:cores])  # inherited by the processes
-    workers = []
-    for index in range(processes):
-        environment = os.environ | {"JAX_PLATFORMS": "cpu", "JAX_NUM_CPU_DEVICES": str(devices)}
-        if processes > 1:
-            environment |= {
-                "JAX_COORDINATOR_ADDRESS": address,
-                "JAX_NUM_PROCESSES": str(processes),
-                "JAX_PROCESS_ID": str(index),
-            }
-        command = [sys.executable, __file__, "--worker", preset, name, str(data)]
-        workers.append(subprocess.Popen(command, env=environment, stdout=subprocess.PIPE, text=True))
+    several = {"JAX_COORDINATOR_ADDRESS": address, "JAX_NUM_PROCESSES": str(processes)} if processes > 1 else {}
+    environment = os.environ | several | {"JAX_PLATFORMS": "cpu", "JAX_NUM_CPU_DEVICES": str(devices)}
+    command = [sys.executable, __file__, "--worker", preset, name, str(data)]
+    workers = [
+        subprocess.Popen(command, env=environment | {"JAX_PROCESS_ID": str(index)}, stdout=subprocess.PIPE, text=True)
+        for index in range(processes)
+    ]
     os.sched_setaffinity(0, everywhere)
     outputs = [worker.communicate()[0] for worker in workers]
     if any(worker.returncode for worker in workers):
@@ -128,28 +125,29 @@ def work(preset: str, name: str, data: str) -> None:
     print(train_rate(task, Path(data)))
 
 
+def row_of(preset: str, name: str, data: Path) -> dict[str, float]:
+    task, apart = task_named(preset, name, load_statistics(data)), partial(rate_apart, preset, name, data)
+    return costs(task, data) | {
+        "read_per_second": read_rate(task, data),
+        "one_core_per_second": apart(cores=1),
+        "two_cores_per_second": apart(cores=2),
+        "two_devices_per_second": apart(cores=2, devices=2),
+        "two_processes_per_second": apart(cores=2, processes=2),
+    }
+
+
 def main() -> None:
-    print(f"{os.cpu_count()} cores, {jax.devices()[0].device_kind}, JAX {jax.__version__}")
-    found: dict[str, dict[str, float]] = {}
+    print(f"{os.cpu_count()} cores, {machine_name()}")
+    measured = {}
     for preset, settings in PRESETS.items():
         with TemporaryDirectory() as folder:
             data = Path(folder) / "data"
-            statistics = prepare(replace(settings.dataset, train_per_class=5, test_per_class=1), data)
+            prepare(replace(settings.dataset, train_per_class=5, test_per_class=1), data)
             for name in NETWORKS:
-                task = task_named(preset, name, statistics)
-                row = costs(task, data) | {
-                    "read_per_second": read_rate(task, data),
-                    "one_core_per_second": rate_apart(preset, name, data, cores=1),
-                    "two_cores_per_second": rate_apart(preset, name, data, cores=2),
-                    "two_devices_per_second": rate_apart(preset, name, data, cores=2, devices=2),
-                    "two_processes_per_second": rate_apart(preset, name, data, cores=2, processes=2),
-                }
-                found[f"{preset} {name}"] = row
-                print(
-                    json.dumps({f"{preset} {name}": {key: round(value, 2) for key, value in row.items()}}), flush=True
-                )
+                row = measured[f"{preset} {name}"] = row_of(preset, name, data)
+                print(f"{preset} {name}", {key: round(value, 2) for key, value in row.items()}, flush=True)
     if len(sys.argv) > 1:
-        write_json(Path(sys.argv[1]), found)
+        write_json(Path(sys.argv[1]), measured)
 
 
 if __name__ == "__main__":

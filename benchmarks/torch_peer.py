@@ -9,12 +9,17 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import partial
+from typing import Any
 
+import jax
 import numpy as np
 import torch
+from torch import nn
 
 from tests.reference import torch_networks
 from tests.reference.weights import made_up_weights
+
+Call = Callable[[], torch.Tensor]
 
 
 def farthest_point_sample(points: torch.Tensor, k: int) -> torch.Tensor:
@@ -61,52 +66,79 @@ class Abstraction(torch_networks.Abstraction):
         return centres, out.amax(dim=2).transpose(1, 2)
 
 
-def pointnet2(views: int) -> torch_networks.PointNet2:
-    return torch_networks.PointNet2(views, Abstraction)
+def device() -> str:
+    """The GPU if JAX uses one and PyTorch can, otherwise the CPU."""
+    return "cuda" if jax.default_backend() == "gpu" and torch.cuda.is_available() else "cpu"
 
 
-def _resnet18() -> torch_networks.ResNet:
-    network = torch_networks.ResNet(18)
-    shapes = {name: tuple(value.shape) for name, value in network.state_dict().items()}
-    network.load_state_dict({name: torch.from_numpy(value) for name, value in made_up_weights(shapes).items()})
-    return network
+def array(tensor: torch.Tensor) -> np.ndarray:
+    return tensor.detach().float().cpu().numpy()
 
 
-def resnet18_weights() -> dict[str, np.ndarray]:
-    """The weights with which the peers below begin."""
-    return {name: value.numpy() for name, value in _resnet18().state_dict().items()}
+def call(function: Callable[..., torch.Tensor], *arrays: np.ndarray, **options: Any) -> Callable[[], torch.Tensor]:
+    """A call on arrays that are on the device already, which returns after the device has finished."""
+    tensors = [torch.from_numpy(one).to(device()) for one in arrays]
+
+    def until_done() -> torch.Tensor:
+        out = function(*tensors, **options)
+        if device() == "cuda":
+            torch.cuda.synchronize()
+        return out
+
+    return until_done
+
+
+def with_weights(network: nn.Module) -> dict[str, np.ndarray]:
+    """Gives a network made-up weights, and returns them."""
+    weights = made_up_weights({name: tuple(value.shape) for name, value in network.state_dict().items()})
+    network.load_state_dict({name: torch.from_numpy(value) for name, value in weights.items()})
+    return weights
+
+
+def forward_and_step(
+    network: nn.Module, loss_of: Callable[..., torch.Tensor], dtype: str = "float32"
+) -> tuple[Callable[..., torch.Tensor], Callable[..., torch.Tensor]]:
+    """Functions of inputs, and of inputs and targets: a forward pass, and a training step of Adam, which returns the loss.
+
+    With `bfloat16` they compute with automatic mixed precision.
+    """
+    adam = torch.optim.Adam(network.parameters(), 1e-5)
+    precision = partial(torch.autocast, device(), torch.bfloat16, enabled=dtype == "bfloat16")
+
+    def forward(inputs: torch.Tensor) -> torch.Tensor:
+        with torch.no_grad(), precision():
+            return network.eval()(inputs)
+
+    def step(inputs: torch.Tensor, targets: torch.Tensor) -> torch.Tensor:
+        adam.zero_grad()
+        with precision():
+            loss = loss_of(network.train()(inputs), targets)
+        loss.backward()
+        adam.step()
+        return loss
+
+    return forward, step
+
+
+def pointnet2(clouds: np.ndarray, entropies: np.ndarray) -> tuple[dict[str, np.ndarray], Call, Call]:
+    """The weights of a PointNet++ without dropout, its forward pass, and its training step, as calls on these arrays."""
+    network = torch_networks.PointNet2(entropies.shape[1], Abstraction)
+    weights = with_weights(network)
+    forward, step = forward_and_step(network.to(device()), nn.functional.mse_loss)
+    return weights, call(forward, clouds), call(step, clouds, entropies)
 
 
 def resnet18(
-    images: np.ndarray, labels: np.ndarray, dtype: str, device: str
-) -> dict[str, tuple[Callable[[], torch.Tensor], Callable[[], torch.Tensor]]]:
-    """Forward pass and training step of ResNet-18 in PyTorch's two layouts.
-
-    Args:
-        images: (batch, height, width, 3) float32.
-        labels: class of each image.
-        dtype: `bfloat16` computes with automatic mixed precision.
-        device: where to.
-    """
-    found: dict[str, tuple[Callable[[], torch.Tensor], Callable[[], torch.Tensor]]] = {}
+    images: np.ndarray, labels: np.ndarray, dtype: str
+) -> tuple[dict[str, np.ndarray], dict[str, tuple[Call, Call]]]:
+    """The weights of a ResNet-18, and its forward pass and training step in each of PyTorch's two layouts."""
+    calls = {}
     for name, layout in (("PyTorch", torch.contiguous_format), ("PyTorch, channels-last", torch.channels_last)):
-        network = _resnet18().to(device).to(memory_format=layout)
-        shown = torch.from_numpy(images).permute(0, 3, 1, 2).to(device).contiguous(memory_format=layout)
-        wanted = torch.from_numpy(labels).to(device)
-        adam = torch.optim.Adam(network.parameters(), 1e-5)
-        precision = partial(torch.autocast, device, torch.bfloat16, enabled=dtype == "bfloat16")
-
-        def forward(network=network, shown=shown, precision=precision) -> torch.Tensor:
-            with torch.no_grad(), precision():
-                return network.eval()(shown)
-
-        def step(network=network, shown=shown, wanted=wanted, adam=adam, precision=precision) -> torch.Tensor:
-            adam.zero_grad()
-            with precision():
-                loss = torch.nn.functional.cross_entropy(network.train()(shown), wanted)
-            loss.backward()
-            adam.step()
-            return loss
-
-        found[name] = forward, step
-    return found
+        network = torch_networks.ResNet(18)
+        weights = with_weights(network)
+        network = network.to(device()).to(memory_format=layout)
+        forward, step = forward_and_step(network, nn.functional.cross_entropy, dtype)
+        shown = torch.from_numpy(images).permute(0, 3, 1, 2).to(device()).contiguous(memory_format=layout)
+        wanted = torch.from_numpy(labels).to(device())
+        calls[name] = call(partial(forward, shown)), call(partial(step, shown, wanted))
+    return weights, calls

@@ -10,13 +10,10 @@ The result is written to `benchmarks/results/whole_grids.json`.
 
 from __future__ import annotations
 
-import sys
 import time
-from dataclasses import dataclass
+from itertools import product
 from pathlib import Path
 from typing import Annotated
-
-sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 import jax
 import jax.numpy as jnp
@@ -26,25 +23,11 @@ import tyro
 from flax import nnx
 from jax import Array
 
+from benchmarks.comparing import TrainingStep, forward_of
+from benchmarks.reporting import RESULTS
 from data_pipeline.files import write_json
 from eval.machine import machine
 from eval.numbers.comparison import intervals
-
-RESULT = Path(__file__).parent / "results" / "whole_grids.json"
-
-
-@dataclass(frozen=True)
-class Options:
-    archive: Annotated[Path, tyro.conf.Positional]
-    """an .npz of 32×32×32 voxel grids"""
-    epochs: int = 40
-    """epochs; each draws as many objects as the training split has, with all classes equally often"""
-    batch_size: int = 64
-    """number of grids in a batch"""
-    learning_rate: float = 1e-3
-    """initial learning rate of AdamW, with a cosine schedule"""
-    seed: int = 0
-    """seed of weights and batches"""
 
 
 class _Convolution(nnx.Module):
@@ -55,16 +38,9 @@ class _Convolution(nnx.Module):
         self.linear = nnx.Linear(channels * size**3, filters, kernel_init=nnx.initializers.he_normal(), rngs=rngs)
 
     def __call__(self, x: Array) -> Array:
-        places = [(side - self.size) // self.stride + 1 for side in x.shape[1:4]]
-        offsets = np.ndindex((self.size,) * 3)
-
-        def at(offset: tuple[int, ...]) -> Array:
-            i, j, k = (
-                slice(o, o + self.stride * (n - 1) + 1, self.stride) for o, n in zip(offset, places, strict=True)
-            )
-            return x[:, i, j, k]
-
-        return self.linear(jnp.concatenate([at(offset) for offset in offsets], axis=-1))
+        last = x.shape[1] - self.size + 1
+        slices = [slice(start, start + last, self.stride) for start in range(self.size)]
+        return self.linear(jnp.concatenate([x[:, i, j, k] for i, j, k in product(slices, repeat=3)], axis=-1))
 
 
 class VoxNet(nnx.Module):
@@ -106,64 +82,80 @@ def drawn(random: np.random.Generator, grids: np.ndarray) -> np.ndarray:
     return found
 
 
-def main(options: Options) -> None:
-    with np.load(options.archive) as archive:
-        grids = {split: archive[f"X_{split}"] > 0 for split in ("train", "test")}
-        labels = {split: archive[f"y_{split}"].astype(np.int32) for split in ("train", "test")}
-    there = {split: grids[split].any(axis=(1, 2, 3)) for split in grids}
-    left_out = {split: int((~there[split]).sum()) for split in grids}
-    grids, labels = ({split: values[split][there[split]] for split in values} for values in (grids, labels))
-    counts = np.bincount(labels["train"])
-    chance = 1 / counts[labels["train"]]
-    steps = len(labels["train"]) // options.batch_size
-    structure, weights = nnx.split(VoxNet(len(counts), rngs=nnx.Rngs(options.seed)))
-    optimiser = optax.adamw(
-        optax.cosine_decay_schedule(options.learning_rate, steps * options.epochs), weight_decay=1e-4
-    )
+def objects_of(archive: Path) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray], dict[str, int]]:
+    """Grids and labels of each split, and how many empty grids were left out."""
+    grids, labels, left_out = {}, {}, {}
+    with np.load(archive) as arrays:
+        for split in ("train", "test"):
+            every = arrays[f"X_{split}"] > 0
+            there = every.any(axis=(1, 2, 3))
+            grids[split], labels[split] = every[there], arrays[f"y_{split}"].astype(np.int32)[there]
+            left_out[split] = int((~there).sum())
+    return grids, labels, left_out
 
-    @jax.jit
-    def step(weights, state, grids, labels, key):
-        def loss_of(weights):
-            logits = nnx.merge(structure, weights)(grids, key)
-            return jnp.mean(optax.softmax_cross_entropy_with_integer_labels(logits, labels))
 
-        loss, gradient = jax.value_and_grad(loss_of)(weights)
-        updates, state = optimiser.update(gradient, state, weights)
-        return optax.apply_updates(weights, updates), state, loss
+def probabilities(network: VoxNet, grids: np.ndarray) -> np.ndarray:
+    """Sums over rotations and mirror images, (objects, classes)."""
+    judge = jax.jit(lambda grids: jax.nn.softmax(forward_of(network)(grids)))
+    every = [changed(grids.astype(np.float32), turns, mirror) for turns in range(4) for mirror in (False, True)]
+    parts = [sum(judge(one[i : i + 100]) for one in every) for i in range(0, len(grids), 100)]
+    return np.concatenate(parts)
 
-    @jax.jit
-    def judge(weights, grids):
-        return jax.nn.softmax(nnx.merge(structure, weights)(grids))
 
-    def accuracy() -> np.ndarray:
-        """Whether each test object is classified correctly."""
-        some = grids["test"].astype(np.float32)
-        every = [changed(some, turns, mirror) for turns in range(4) for mirror in (False, True)]
-        parts = [sum(judge(weights, one[i : i + 100]) for one in every) for i in range(0, len(some), 100)]
-        return np.concatenate(parts).argmax(axis=-1) == labels["test"]
+def trained(
+    grids: np.ndarray, labels: np.ndarray, epochs: int, batch_size: int, learning_rate: float, seed: int
+) -> VoxNet:
+    """All classes are drawn equally often; the learning rate falls by a cosine schedule."""
+    counts = np.bincount(labels)
+    chance, steps = 1 / counts[labels], len(labels) // batch_size
+    schedule = optax.cosine_decay_schedule(learning_rate, steps * epochs)
 
-    random, state, started = np.random.default_rng(options.seed), optimiser.init(weights), time.perf_counter()
-    for epoch in range(options.epochs):
+    def loss_of(network: VoxNet, grids: Array, labels: Array, key: Array) -> Array:
+        return jnp.mean(optax.softmax_cross_entropy_with_integer_labels(network(grids, key), labels))
+
+    network = VoxNet(len(counts), rngs=nnx.Rngs(seed))
+    step, random = TrainingStep(network, loss_of, optax.adamw(schedule, weight_decay=1e-4)), np.random.default_rng(seed)
+    for epoch in range(epochs):
         total = 0.0
-        for chosen in random.choice(len(chance), (steps, options.batch_size), p=chance / chance.sum()):
+        for chosen in random.choice(len(chance), (steps, batch_size), p=chance / chance.sum()):
             key = jax.random.key(int(random.integers(2**31)))
-            batch = drawn(random, grids["train"][chosen]), labels["train"][chosen]
-            weights, state, loss = step(weights, state, *batch, key)
-            total += float(loss)
-        print(f"epoch {epoch + 1}/{options.epochs}: loss {total / steps:.4f}", flush=True)
-    right = accuracy()
-    found = {
+            total += float(step(drawn(random, grids[chosen]), labels[chosen], key))
+        print(f"epoch {epoch + 1}/{epochs}: loss {total / steps:.4f}", flush=True)
+    return step.network()
+
+
+def main(
+    archive: Annotated[Path, tyro.conf.Positional],
+    epochs: int = 40,
+    batch_size: int = 64,
+    learning_rate: float = 1e-3,
+    seed: int = 0,
+) -> None:
+    """Measures, shows and keeps.
+
+    Args:
+        archive: an .npz of 32×32×32 voxel grids.
+        epochs: each draws as many objects as the training split has.
+        batch_size: number of grids in a batch.
+        learning_rate: of AdamW, initially.
+        seed: of weights and batches.
+    """
+    grids, labels, left_out = objects_of(archive)
+    started = time.perf_counter()
+    network = trained(grids["train"], labels["train"], epochs, batch_size, learning_rate, seed)
+    right = probabilities(network, grids["test"]).argmax(axis=-1) == labels["test"]
+    result = {
         "accuracy": float(right.mean()),
         "interval": intervals(right),
         "objects": len(right),
         "left_out": left_out,
-        "epochs": options.epochs,
+        "epochs": epochs,
         "seconds": time.perf_counter() - started,
         "machine": machine(),
     }
-    write_json(RESULT, found)
-    print(found)
+    write_json(RESULTS / "whole_grids.json", result)
+    print(result)
 
 
 if __name__ == "__main__":
-    main(tyro.cli(Options, description=__doc__.splitlines()[0]))
+    tyro.cli(main, description=__doc__.splitlines()[0])

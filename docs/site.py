@@ -63,33 +63,8 @@ def on_page_markdown(markdown: str, page: Any, **_: Any) -> str:
     return _OUTSIDE.sub(r"`\1`", markdown)
 
 
-_STYLE = """<style>
-.md-typeset p a, .md-typeset li a, .md-typeset td a { text-decoration: underline }
-.md-typeset .headerlink { text-decoration: none }
-[data-md-color-scheme=default] {
-  --md-code-hl-comment-color: #626262; --md-code-hl-variable-color: #626262; --md-code-hl-operator-color: #626262;
-  --md-code-hl-punctuation-color: #626262; --md-code-hl-generic-color: #626262;
-}
-[data-md-color-scheme=slate][data-md-color-primary] {
-  --md-code-hl-number-color: #f08a7d; --md-code-hl-constant-color: #a99bea; --md-typeset-a-color: #7ba1e6;
-}
-.md-copyright { color: var(--md-footer-fg-color--light) }
-</style>"""
-_SCRIPT = """<script>
-// What scrolls can be scrolled by keys.
-const reach = () => document.querySelectorAll(".md-typeset__scrollwrap:not([tabindex])").forEach((box) => {
-  box.tabIndex = 0;
-  box.setAttribute("role", "group");
-  box.setAttribute("aria-label", "Table");
-});
-new MutationObserver(reach).observe(document.body, {childList: true, subtree: true});
-reach();
-</script>"""
-
-
 def on_post_page(output: str, **_: Any) -> str:
-    """Called by MkDocs with the HTML of every page; mends what keeps some people from using the theme."""
-    output = output.replace(
+    """Called by MkDocs with the HTML of every page; names the search for those who hear pages."""
+    return output.replace(
         'data-md-component="search" role="dialog"', 'data-md-component="search" role="dialog" aria-label="Search"'
     )
-    return output.replace("</head>", f"{_STYLE}</head>", 1).replace("</body>", f"{_SCRIPT}</body>", 1)

@@ -14,30 +14,21 @@ import numpy as np
 import mevs_jax
 from data_pipeline.capture.casting import default_caster
 from data_pipeline.objects.furniture import furniture
-from data_pipeline.objects.mesh import Mesh, normalise
+from data_pipeline.objects.mesh import normalise
+from eval.checks.camera import Shot, cast_shot
 
 CENTER, RADIUS = np.array([0.5, 0.1, 0.8]), 0.45  # of the desk, in metres, in the world
 K = np.array([[525.0, 0.0, 325.0], [0.0, 520.0, 236.0], [0.0, 0.0, 1.0]])
 
 
-def depth_camera():
-    """A function from poses `T_world_camera` to depth images in metres, 0 where nothing is seen."""
-    piece = furniture("desk", 900)
-    mesh = normalise(piece.vertices, piece.faces, "desk")
-    cast = default_caster()(Mesh((mesh.vertices * RADIUS + CENTER).astype(np.float32), mesh.faces, mesh.extent))
-    rows, columns = np.mgrid[:480, :640]
-    rays = np.stack([columns, rows, np.ones_like(rows)], axis=-1).reshape(-1, 3) @ np.linalg.inv(K).T
-
-    def take(T_world_camera: np.ndarray) -> np.ndarray:
-        directions = (rays @ T_world_camera[:3, :3].T).astype(np.float32)
-        origins = np.broadcast_to(T_world_camera[:3, 3].astype(np.float32), directions.shape)
-        depth, _ = cast(origins, directions)
-        return np.where(np.isfinite(depth), depth, 0).reshape(480, 640).astype(np.float32)
-
-    return take
+piece = furniture("desk", 900)
+cast = default_caster()(normalise(piece.vertices, piece.faces, "desk"))
 
 
-take = depth_camera()
+def take(T_world_camera: np.ndarray) -> np.ndarray:
+    """A depth image from a pose, in metres, 0 where nothing is seen."""
+    return cast_shot(cast, Shot(640, 480, K, T_world_camera, CENTER, RADIUS))
+
 
 system = mevs_jax.load(sys.argv[1] if len(sys.argv) > 1 else "furniture10")
 agent = system.agent(stop=0.95)

@@ -26,15 +26,20 @@ import optax
 import tyro
 from flax import nnx
 
-from data_pipeline.dataset.statistics import load_statistics
 from eval.numbers.comparison import intervals
-from eval.tables import load_view_tables
-from eval.walks.knowledge import learn
-from mevs_jax import POLICIES, ActiveRecognition, EnvironmentObservation, ViewGraph, ViewTable
+from eval.numbers.policies import EvaluationInputs, evaluate_policies
+from mevs_jax import (
+    POLICIES,
+    ActiveRecognition,
+    EnvironmentObservation,
+    Policy,
+    Scene,
+    SelectionState,
+    ViewGraph,
+    ViewTable,
+)
 from mevs_jax.beliefs.calibration import fit_exponent
-from mevs_jax.beliefs.metrics import is_right
 from mevs_jax.markdown import markdown_table
-from mevs_jax.selection.loop import best_view
 
 
 @dataclass(frozen=True)
@@ -210,67 +215,45 @@ def fitted_temperatures(key: jax.Array, tables: ViewTable, max_views: int) -> ja
     return scale * jnp.arange(1, max_views + 1) ** growth
 
 
-Choose = Callable[[jax.Array, ActiveRecognition, Any, EnvironmentObservation], jax.Array]
-"""A function of (key, environment, state, observation) that returns a score for every view."""
-
-
-def right_after_each_view(choose: Choose, environment: ActiveRecognition, key: jax.Array) -> np.ndarray:
-    """Shares of start views (steps, objects) from which an object is recognised after 1, 2, … views."""
-
-    def walk(key: jax.Array, index: jax.Array, start: jax.Array) -> jax.Array:
-        def step(carry: tuple[Any, EnvironmentObservation], key: jax.Array) -> tuple[Any, jax.Array]:
-            state, observation = carry
-            view = best_view(choose(key, environment, state, observation), ~state.attempted)
-            action = {"action": view, "prediction": observation.belief}
-            after = environment.step(key, state, action)[:2]
-            return after, is_right(state.belief, environment.tables.label[index], axis=0)
-
-        keys = jax.random.split(key, environment.max_views)
-        return jax.lax.scan(step, environment.reset(key, index, start), keys)[1]
-
-    def of_object(index: jax.Array) -> jax.Array:
-        keys = jax.random.split(jax.random.fold_in(key, index), environment.views)
-        return jax.vmap(walk, (0, None, 0))(keys, index, jnp.arange(environment.views)).mean(axis=0)
-
-    found = jax.jit(partial(jax.lax.map, of_object, batch_size=64))(jnp.arange(environment.objects))
-    return np.asarray(found).T
-
-
-def main(config: Config) -> None:
-    graph = ViewGraph.from_points(np.array(load_statistics(config.run / "data").viewpoints))
-    validation, test = (
-        replace(load_view_tables(config.run / "tables" / f"{split}.npz").stacked(), predicted_entropy=None)
-        for split in ("val", "test")
-    )
-    environment = ActiveRecognition(test, graph, max_views=config.max_views)
-    of_temperatures, of_training, of_walks = jax.random.split(jax.random.key(config.seed), 3)
-    temperatures = jax.jit(fitted_temperatures, static_argnums=2)(of_temperatures, validation, config.max_views)
-    knowledge = learn(validation.logits, validation.label)
-    keys = jax.random.split(of_training, config.networks)
-    networks = nnx.jit(nnx.vmap(lambda key: train(config, key, validation, graph, temperatures)))(keys)
+def policy_of(networks: Agent) -> Policy:
+    """The mean of the networks' probabilities, as a policy of the selection loop; their weights have a leading axis."""
     structure, weights = nnx.split(networks)
 
-    def registered(name: str) -> Choose:
-        return lambda key, environment, state, _: POLICIES[name](
-            key, environment.selection(state), environment.scene(state, knowledge)
+    def by_ppo(key: jax.Array, state: SelectionState, scene: Scene) -> jax.Array:
+        del key
+        observation = EnvironmentObservation(
+            log_probabilities=jax.nn.log_softmax(state.latest.logits),
+            belief=jax.nn.log_softmax(state.belief),
+            view=state.view,
+            direction=scene.graph.points[state.view],
+            attempted=state.attempted,
+            steps=state.count,
         )
-
-    def by_ppo(key: jax.Array, environment: ActiveRecognition, state: Any, observation: Any) -> jax.Array:
         scores = jax.vmap(lambda weights: nnx.merge(structure, weights, copy=True)(observation)[0])(weights)
         return jax.nn.softmax(scores).mean(axis=0)
 
-    policies = {name: registered(name) for name in ("random", "information_gain")} | {"PPO": by_ppo}
-    right = {name: right_after_each_view(choose, environment, of_walks) for name, choose in policies.items()}
-    rows = []
-    for name, shares in right.items():
+    return by_ppo
+
+
+def main(config: Config) -> None:
+    inputs = EvaluationInputs.of_run(config.run)
+    validation = replace(inputs.validation.stacked(), predicted_entropy=None)
+    of_temperatures, of_training, _ = jax.random.split(jax.random.key(config.seed), 3)
+    temperatures = jax.jit(fitted_temperatures, static_argnums=2)(of_temperatures, validation, config.max_views)
+    keys = jax.random.split(of_training, config.networks)
+    networks = nnx.jit(nnx.vmap(lambda key: train(config, key, validation, inputs.graph, temperatures)))(keys)
+    policies = {"information_gain": POLICIES["information_gain"], "PPO": policy_of(networks)}
+    study = evaluate_policies(inputs, policies)
+    right = {name: study.right(name)[:, : config.max_views].T for name in ("random", *policies)}
+
+    def row(title: str, shares: np.ndarray, sign: str = "") -> list[str]:
         cells = zip(100 * shares.mean(axis=1), 100 * np.array(intervals(shares)), strict=True)
-        rows.append([name, *(f"{mean:.1f} ({low:.1f} to {high:.1f})" for mean, (low, high) in cells)])
-    for name in ("random", "information_gain"):
-        gain = right["PPO"] - right[name]
-        cells = zip(100 * gain.mean(axis=1), 100 * np.array(intervals(gain)), strict=True)
-        rows.append([f"PPO − {name}", *(f"{mean:+.1f} ({low:+.1f} to {high:+.1f})" for mean, (low, high) in cells)])
+        return [title, *(f"{mean:{sign}.1f} ({low:{sign}.1f} to {high:{sign}.1f})" for mean, (low, high) in cells)]
+
+    rows = [row(name, shares) for name, shares in right.items()]
+    rows += [row(f"PPO − {name}", right["PPO"] - right[name], "+") for name in ("random", "information_gain")]
     views = [f"{count} view{'s' * (count > 1)}" for count in range(1, config.max_views + 1)]
-    print(f"Accuracy in % on {environment.objects} test objects from all start views, 95 % intervals over objects:\n")
+    print(f"Accuracy in % on {len(study.objects)} test objects from all start views, 95 % intervals over objects:\n")
     print(markdown_table(["policy", *views], rows))
 
 

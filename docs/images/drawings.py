@@ -1,4 +1,7 @@
-"""The drawings of the page on concepts. `python docs/images/drawings.py` writes `geometry.svg` and `loop.svg`."""
+"""The drawing of frames on the page on concepts: `python docs/images/drawings.py` writes `geometry.svg`.
+
+The other drawing, `loop.svg`, is its own source.
+"""
 
 from __future__ import annotations
 
@@ -9,42 +12,59 @@ import numpy as np
 INK, GREY, MARK, SOFT = "#1b2a41", "#6b7785", "#c1440e", "#e8ddcf"
 AXES = {"x": "#b3261e", "y": "#2e7d32", "z": "#1565c0"}
 HEAD = (
-    '<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {width} {height}" font-family="sans-serif" font-size="15">'
+    '<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 1030 420" font-family="sans-serif" font-size="15">'
     '<defs><marker id="tip" viewBox="0 0 10 10" refX="8" refY="5" markerWidth="7" markerHeight="7" orient="auto-start-reverse">'
     '<path d="M0 0 L10 5 L0 10 z" fill="context-stroke"/></marker></defs>'
-    '<rect width="{width}" height="{height}" fill="white"/>'
+    '<rect width="1030" height="420" fill="white"/>'
 )
 Point = tuple[float, float]
+Corner = tuple[float, float, float]
 
 
-def text(at: Point, words: str, colour: str = INK, anchor: str = "start", size: int = 15, more: str = "") -> str:
-    where = f'x="{at[0]:.1f}" y="{at[1]:.1f}" text-anchor="{anchor}"'
-    return f'<text {where} fill="{colour}" font-size="{size}" {more}>{words}</text>'
+class Drawing:
+    """Parts of an SVG, in order."""
 
+    def __init__(self) -> None:
+        self.parts = [HEAD]
 
-def line(
-    start: Point, end: Point, colour: str = INK, width: float = 1.5, arrow: bool = False, dashed: bool = False
-) -> str:
-    more = ' marker-end="url(#tip)"' if arrow else ""
-    more += ' stroke-dasharray="5 4"' if dashed else ""
-    return (
-        f'<line x1="{start[0]:.1f}" y1="{start[1]:.1f}" x2="{end[0]:.1f}" y2="{end[1]:.1f}" '
-        f'stroke="{colour}" stroke-width="{width}"{more}/>'
-    )
+    def text(
+        self, at: Point, words: str, colour: str = INK, anchor: str = "start", size: int = 15, more: str = ""
+    ) -> None:
+        where = f'x="{at[0]:.1f}" y="{at[1]:.1f}" text-anchor="{anchor}"'
+        self.parts.append(f'<text {where} fill="{colour}" font-size="{size}" {more}>{words}</text>')
 
+    def title(self, at: Point, words: str) -> None:
+        self.text(at, words, size=17, more='font-weight="bold"')
 
-def circle(centre: Point, radius: float, more: str) -> str:
-    return f'<circle cx="{centre[0]:.1f}" cy="{centre[1]:.1f}" r="{radius}" {more}/>'
+    def line(
+        self,
+        start: Point,
+        end: Point,
+        colour: str = INK,
+        width: float = 1.5,
+        arrow: bool = False,
+        dashed: bool = False,
+    ) -> None:
+        where = f'x1="{start[0]:.1f}" y1="{start[1]:.1f}" x2="{end[0]:.1f}" y2="{end[1]:.1f}"'
+        more = ' marker-end="url(#tip)"' * arrow + ' stroke-dasharray="5 4"' * dashed
+        self.parts.append(f'<line {where} stroke="{colour}" stroke-width="{width}"{more}/>')
 
+    def circle(self, centre: Point, radius: float, more: str) -> None:
+        self.parts.append(f'<circle cx="{centre[0]:.1f}" cy="{centre[1]:.1f}" r="{radius}" {more}/>')
 
-def polygon(points: list[Point], fill: str, stroke: str = GREY, width: float = 1) -> str:
-    corners = " ".join(f"{x:.1f},{y:.1f}" for x, y in points)
-    return (
-        f'<polygon points="{corners}" fill="{fill}" stroke="{stroke}" stroke-width="{width}" stroke-linejoin="round"/>'
-    )
+    def dot(self, centre: Point, radius: float, colour: str = INK) -> None:
+        self.circle(centre, radius, f'fill="{colour}"')
 
+    def sphere(self, centre: Point, radius: float) -> None:
+        self.circle(centre, radius, f'fill="#f3f6f9" stroke="{GREY}" stroke-dasharray="5 4"')
 
-SPHERE = f'fill="#f3f6f9" stroke="{GREY}" stroke-dasharray="5 4"'
+    def polygon(self, points: list[Point], fill: str, stroke: str = GREY, width: float = 1) -> None:
+        corners = " ".join(f"{x:.1f},{y:.1f}" for x, y in points)
+        edge = f'stroke="{stroke}" stroke-width="{width}" stroke-linejoin="round"'
+        self.parts.append(f'<polygon points="{corners}" fill="{fill}" {edge}/>')
+
+    def rectangle(self, at: Point, width: float, height: float, more: str) -> None:
+        self.parts.append(f'<rect x="{at[0]}" y="{at[1]}" width="{width}" height="{height}" {more}/>')
 
 
 class Scene:
@@ -57,31 +77,24 @@ class Scene:
         self.middle, self.scale = middle, scale
 
     def __call__(self, point: np.ndarray) -> Point:
-        return (
-            float(self.middle[0] + self.scale * (self.right @ point)),
-            float(self.middle[1] - self.scale * (self.up @ point)),
-        )
+        x, y = self.scale * (self.right @ point), self.scale * (self.up @ point)
+        return float(self.middle[0] + x), float(self.middle[1] - y)
 
 
-def box(scene: Scene, low: tuple[float, float, float], high: tuple[float, float, float], seen: str) -> list[str]:
+def box(draw: Drawing, scene: Scene, low: Corner, high: Corner, seen: str) -> None:
     """The sides of a box that face the reader, from the sides +x, +y, +z named in `seen`."""
-    parts = []
     shades = {"x": "#d9cbb8", "y": "#cbbca6", "z": SOFT}
-    for axis, name in enumerate("xyz"):
-        if name not in seen:
-            continue
-        others = [other for other in range(3) if other != axis]
+    for axis in map("xyz".index, seen):
+        one, other = (number for number in range(3) if number != axis)
         corners = []
         for first, second in ((0, 0), (1, 0), (1, 1), (0, 1)):
             corner = np.array(high, float)
-            corner[others[0]] = (low, high)[first][others[0]]
-            corner[others[1]] = (low, high)[second][others[1]]
+            corner[one], corner[other] = (low, high)[first][one], (low, high)[second][other]
             corners.append(scene(corner))
-        parts.append(polygon(corners, shades[name]))
-    return parts
+        draw.polygon(corners, shades["xyz"[axis]])
 
 
-def frames() -> list[str]:
+def frames(draw: Drawing) -> None:
     """The object's frame and the camera's, in space."""
     scene = Scene((130, 245), 100, azimuth=38, elevation=20)
     position = 2 * np.array([-0.42, 0.80, 0.42])
@@ -90,138 +103,84 @@ def frames() -> list[str]:
     right = np.cross(forward, [0, 0, 1])
     right /= np.linalg.norm(right)
     down = np.cross(forward, right)
-    parts = [text((20, 28), "Frames", size=17, more='font-weight="bold"')]
-    centre = scene(np.zeros(3))
-    parts.append(circle(centre, 100, SPHERE))
-    for low, high in (((-0.4, -0.4, -0.15), (0.4, 0.4, 0.0)), ((-0.4, -0.4, 0.0), (-0.25, 0.4, 0.8))):
-        for x, y in ((-0.4, -0.4), (0.25, -0.4), (-0.4, 0.25), (0.25, 0.25)) if high[2] == 0 else ():
-            parts += box(scene, (x, y, -0.75), (x + 0.15, y + 0.15, -0.15), "xy")
-        parts += box(scene, low, high, "xyz")
-    for name, axis in zip("xyz", np.eye(3), strict=True):
+    centre, camera = scene(np.zeros(3)), scene(position)
+    draw.title((20, 28), "Frames")
+    draw.sphere(centre, 100)
+    for x, y in ((-0.4, -0.4), (0.25, -0.4), (-0.4, 0.25), (0.25, 0.25)):
+        box(draw, scene, (x, y, -0.75), (x + 0.15, y + 0.15, -0.15), "xy")
+    box(draw, scene, (-0.4, -0.4, -0.15), (0.4, 0.4, 0.0), "xyz")
+    box(draw, scene, (-0.4, -0.4, 0.0), (-0.25, 0.4, 0.8), "xyz")
+    for name, axis, beside in zip("xyz", np.eye(3), ((-14, 4), (6, 4), (6, -4)), strict=True):
         end = scene(1.3 * axis)
-        parts += [line(centre, end, AXES[name], 2.2, arrow=True)]
-        parts += [text((end[0] + (6 if name != "x" else -14), end[1] + (4 if name != "z" else -4)), name, AXES[name])]
-    parts += [text((centre[0] - 98, centre[1] + 128), "object: centre, radius 1, z up", GREY, size=14)]
-    camera = scene(position)
-    for row, column in ((-1, -1), (-1, 1), (1, 1), (1, -1)):
-        corner = position + 0.42 * (forward + np.tan(np.radians(30)) * (column * right + row * down))
-        parts.append(line(camera, scene(corner), GREY, 1))
+        draw.line(centre, end, AXES[name], 2.2, arrow=True)
+        draw.text((end[0] + beside[0], end[1] + beside[1]), name, AXES[name])
+    draw.text((centre[0] - 98, centre[1] + 128), "object: centre, radius 1, z up", GREY, size=14)
     plane = [
         scene(position + 0.42 * (forward + np.tan(np.radians(30)) * (column * right + row * down)))
         for row, column in ((-1, -1), (-1, 1), (1, 1), (1, -1))
     ]
-    parts.append(polygon(plane, "#dfe7ef88", INK, 1.5))
-    parts.append(line(scene(position + 0.45 * forward), centre, GREY, 1, dashed=True))
-    for name, axis, length in (("x", right, 0.75), ("y", down, 0.75), ("z", forward, 0.75)):
-        end = scene(position + length * axis)
-        parts.append(line(camera, end, AXES[name], 2.2, arrow=True))
-        label = {"x": (6, -4), "y": (8, 6), "z": (-4, -10)}[name]
-        parts.append(text((end[0] + label[0], end[1] + label[1]), name, AXES[name]))
-    parts.append(circle(camera, 4, f'fill="{INK}"'))
-    parts.append(text((camera[0] - 70, camera[1] - 72), "camera: x right,", GREY, size=14))
-    parts.append(text((camera[0] - 70, camera[1] - 54), "y down, z forward", GREY, size=14))
-    return parts
+    for corner in plane:
+        draw.line(camera, corner, GREY, 1)
+    draw.polygon(plane, "#dfe7ef88", INK, 1.5)
+    draw.line(scene(position + 0.45 * forward), centre, GREY, 1, dashed=True)
+    for name, axis, beside in (("x", right, (6, -4)), ("y", down, (8, 6)), ("z", forward, (-4, -10))):
+        end = scene(position + 0.75 * axis)
+        draw.line(camera, end, AXES[name], 2.2, arrow=True)
+        draw.text((end[0] + beside[0], end[1] + beside[1]), name, AXES[name])
+    draw.dot(camera, 4)
+    draw.text((camera[0] - 70, camera[1] - 72), "camera: x right,", GREY, size=14)
+    draw.text((camera[0] - 70, camera[1] - 54), "y down, z forward", GREY, size=14)
 
 
-def side() -> list[str]:
+def side(draw: Drawing) -> None:
     """Distance, field of view and depth, from the side."""
-    left, top = 480.0, 235.0
-    scale = 88.0
-    centre, camera = (left + 75, top), (left + 75 + 2 * scale, top)
-    parts = [text((left + 20, 28), "Distance and depth", size=17, more='font-weight="bold"')]
-    parts.append(circle(centre, scale, SPHERE))
-    reach = 1.95 * scale
+    left, top, scale = 480.0, 235.0, 88.0
+    centre, (x, y) = (left + 75, top), (left + 75 + 2 * scale, top)
+    draw.title((left + 20, 28), "Distance and depth")
+    draw.sphere(centre, scale)
+    reach, half = 1.95 * scale, np.radians(30)
     for sign in (-1, 1):
-        end = (camera[0] - reach * np.cos(np.radians(30)), camera[1] + sign * reach * np.sin(np.radians(30)))
-        parts.append(line(camera, end, GREY, 1.2))
-    parts.append(
-        f'<path d="M {camera[0] - 45:.1f} {camera[1] - 26:.1f} a 52 52 0 0 0 0 52" fill="none" stroke="{GREY}"/>'
-    )
-    parts.append(text((camera[0] - 30, camera[1] - 34), "60°", GREY, "middle"))
-    point = (centre[0] + 30, centre[1] - 62)
-    parts.append(
-        polygon([(point[0] - 62, point[1]), point, (point[0], point[1] + 105), (point[0] - 62, point[1] + 105)], SOFT)
-    )
-    parts.append(line(camera, point, MARK, 1.5, dashed=True))
-    parts.append(text((point[0] + 44, point[1] + 4), "ray", MARK))
-    parts.append(line((camera[0], camera[1] + 118), (point[0], camera[1] + 118), AXES["z"], 2, arrow=True))
-    parts.append(line((camera[0], camera[1] + 8), (camera[0], camera[1] + 124), GREY, 0.8, dashed=True))
-    parts.append(line(point, (point[0], camera[1] + 124), GREY, 0.8, dashed=True))
-    parts.append(text(((camera[0] + point[0]) / 2, camera[1] + 138), "depth, along z", AXES["z"], "middle"))
-    parts.append(line((camera[0], top - 118), (centre[0], top - 118), INK, 1.5, arrow=True))
-    parts.append(line((centre[0], top - 118), (camera[0], top - 118), INK, 1.5, arrow=True))
-    parts.append(text(((camera[0] + centre[0]) / 2, top - 126), "2 radii", INK, "middle"))
-    parts += [circle(camera, 4, f'fill="{INK}"'), circle(point, 3.5, f'fill="{MARK}"')]
-    parts.append(circle(centre, 3, f'fill="{INK}"'))
-    return parts
+        draw.line((x, y), (x - reach * np.cos(half), y + sign * reach * np.sin(half)), GREY, 1.2)
+    draw.parts.append(f'<path d="M {x - 45:.1f} {y - 26:.1f} a 52 52 0 0 0 0 52" fill="none" stroke="{GREY}"/>')
+    draw.text((x - 30, y - 34), "60°", GREY, "middle")
+    u, v = centre[0] + 30, centre[1] - 62
+    draw.polygon([(u - 62, v), (u, v), (u, v + 105), (u - 62, v + 105)], SOFT)
+    draw.line((x, y), (u, v), MARK, 1.5, dashed=True)
+    draw.text((u + 44, v + 4), "ray", MARK)
+    draw.line((x, y + 118), (u, y + 118), AXES["z"], 2, arrow=True)
+    draw.line((x, y + 8), (x, y + 124), GREY, 0.8, dashed=True)
+    draw.line((u, v), (u, y + 124), GREY, 0.8, dashed=True)
+    draw.text(((x + u) / 2, y + 138), "depth, along z", AXES["z"], "middle")
+    draw.line((x, top - 118), (centre[0], top - 118), INK, 1.5, arrow=True)
+    draw.line((centre[0], top - 118), (x, top - 118), INK, 1.5, arrow=True)
+    draw.text(((x + centre[0]) / 2, top - 126), "2 radii", INK, "middle")
+    draw.dot((x, y), 4)
+    draw.dot((u, v), 3.5, MARK)
+    draw.dot(centre, 3)
 
 
-def image() -> list[str]:
+def image(draw: Drawing) -> None:
     """The image: the sphere in it, and where pixels have their centres."""
-    left, top, size = 815.0, 130.0, 190.0
-    parts = [text((left, 28), "Image and pixels", size=17, more='font-weight="bold"')]
-    parts.append(
-        f'<rect x="{left}" y="{top}" width="{size}" height="{size}" fill="white" stroke="{INK}" stroke-width="1.5"/>'
-    )
-    parts.append(circle((left + size / 2, top + size / 2), size / 2, SPHERE))
-    parts.append(text((left + size / 2, top + size / 2 - 4), "the unit sphere", GREY, "middle", 14))
-    parts.append(text((left + size / 2, top + size / 2 + 14), "fits exactly", GREY, "middle", 14))
-    cell = 21.0
-    for row in range(2):
-        for column in range(2):
-            x, y = left + column * cell, top + row * cell
-            parts.append(f'<rect x="{x}" y="{y}" width="{cell}" height="{cell}" fill="white" stroke="{GREY}"/>')
-            parts.append(circle((x + cell / 2, y + cell / 2), 2.4, f'fill="{MARK}"'))
-    parts.append(line((left, top - 14), (left + 95, top - 14), AXES["x"], 2, arrow=True))
-    parts.append(text((left + 101, top - 9), "u (column)", AXES["x"]))
-    parts.append(line((left - 14, top), (left - 14, top + 95), AXES["y"], 2, arrow=True))
-    parts.append(text((left - 20, top + 114), "v", AXES["y"]))
-    parts.append(text((left - 5, top - 62), "centre of the first pixel:", MARK, size=14))
-    parts.append(text((left - 5, top - 44), "K: (0, 0) · Camera: (½, ½)", MARK, size=14))
-    return parts
-
-
-def loop() -> str:
-    """The selection loop."""
-    width, height = 900, 250
-    boxes = [
-        (30, "Look", "networks on one view"),
-        (250, "Fuse", "belief over classes"),
-        (470, "Stop?", "confidence, views, reach"),
-        (690, "Choose", "policy scores the views"),
-    ]
-    parts = [HEAD.format(width=width, height=height)]
-    for x, title, what in boxes:
-        fill = "#fbeee8" if title == "Choose" else "#f3f6f9"
-        parts.append(
-            f'<rect x="{x}" y="60" width="180" height="76" rx="8" fill="{fill}" stroke="{INK}" stroke-width="1.5"/>'
-        )
-        parts.append(text((x + 90, 93), title, INK, "middle", 18, 'font-weight="bold"'))
-        parts.append(text((x + 90, 118), what, GREY, "middle", 14))
-    for x, word in ((210, "logits"), (430, ""), (650, "no")):
-        parts.append(line((x + 2, 98), (x + 38, 98), INK, 2, arrow=True))
-        parts.append(text((x + 18, 88), word, GREY, "middle", 13))
-    parts.append(
-        f'<path d="M 780 136 V 196 H 120 V 140" fill="none" stroke="{MARK}" stroke-width="2" marker-end="url(#tip)"/>'
-    )
-    parts.append(text((450, 188), "the best view that is not seen yet and can be reached", MARK, "middle", 14))
-    parts.append(line((560, 60), (560, 26), INK, 2, arrow=True))
-    parts.append(text((572, 38), "yes: name the class", INK, size=14))
-    parts.append(line((120, 26), (120, 56), INK, 2, arrow=True))
-    parts.append(text((132, 38), "first view", INK, size=14))
-    return "\n".join([*parts, "</svg>\n"])
-
-
-def geometry() -> str:
-    """The conventions of frames, distance, depth and pixels."""
-    return "\n".join([HEAD.format(width=1030, height=420), *frames(), *side(), *image(), "</svg>\n"])
-
-
-def main() -> None:
-    here = Path(__file__).parent
-    (here / "geometry.svg").write_text(geometry())
-    (here / "loop.svg").write_text(loop())
+    left, top, half, cell = 815.0, 130.0, 95.0, 21.0
+    draw.title((left, 28), "Image and pixels")
+    draw.rectangle((left, top), 2 * half, 2 * half, f'fill="white" stroke="{INK}" stroke-width="1.5"')
+    draw.sphere((left + half, top + half), half)
+    draw.text((left + half, top + half - 4), "the unit sphere", GREY, "middle", 14)
+    draw.text((left + half, top + half + 14), "fits exactly", GREY, "middle", 14)
+    for row, column in np.ndindex(2, 2):
+        x, y = left + column * cell, top + row * cell
+        draw.rectangle((x, y), cell, cell, f'fill="white" stroke="{GREY}"')
+        draw.dot((x + cell / 2, y + cell / 2), 2.4, MARK)
+    draw.line((left, top - 14), (left + 95, top - 14), AXES["x"], 2, arrow=True)
+    draw.text((left + 101, top - 9), "u (column)", AXES["x"])
+    draw.line((left - 14, top), (left - 14, top + 95), AXES["y"], 2, arrow=True)
+    draw.text((left - 20, top + 114), "v", AXES["y"])
+    draw.text((left - 5, top - 62), "centre of the first pixel:", MARK, size=14)
+    draw.text((left - 5, top - 44), "K: (0, 0) · Camera: (½, ½)", MARK, size=14)
 
 
 if __name__ == "__main__":
-    main()
+    drawing = Drawing()
+    for part in (frames, side, image):
+        part(drawing)
+    Path(__file__).with_name("geometry.svg").write_text("\n".join([*drawing.parts, "</svg>\n"]))

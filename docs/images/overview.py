@@ -66,15 +66,7 @@ def draw_cameras(axes: Any, walk: Walk, system: mevs_jax.TrainedSystem, triangle
     axes.add_collection3d(surface)
     taken = [int(view) for view in walk.views]
     others = np.setdiff1d(np.arange(len(system.viewpoints)), taken)
-    axes.scatter(
-        *system.viewpoints[others].T,
-        c=gains[others],
-        cmap="Oranges",
-        s=60,
-        edgecolor=GREY,
-        linewidths=0.6,
-        depthshade=False,
-    )
+    axes.scatter(*system.viewpoints[others].T, c=gains[others], cmap="Oranges", s=60, ec=GREY, lw=0.6, depthshade=False)
     for start, end in pairwise(system.viewpoints[taken]):
         shares = np.linspace(0, 1, 100)[:, None]
         arc = (1 - shares) * start + shares * end

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any
 
 import jax.numpy as jnp
@@ -21,7 +21,7 @@ FLOOR = 0.004
 """Metres above the table up to which everything is removed."""
 
 
-@dataclass
+@dataclass(frozen=True)
 class Looked:
     """One look.
 
@@ -38,7 +38,7 @@ class Looked:
     seconds: float
 
 
-@dataclass
+@dataclass(frozen=True)
 class Recognition:
     """How an object was recognised.
 
@@ -52,7 +52,7 @@ class Recognition:
     name: str
     reason: str
     radians: float
-    looks: list[Looked] = field(default_factory=list)
+    looks: list[Looked]
 
 
 NEAR = ", near"
@@ -73,12 +73,9 @@ def agent_of(system: TrainedSystem, policy: str, views: int, stop: float) -> Age
     Raises:
         ValueError: for a policy that the system does not have, or an option out of its range.
     """
-    options: dict[str, Any] = {"stop": stop, "max_views": views, "distance": DISTANCE}
-    if policy == "nearest":
-        return Agent(system, nearest, gain_per_cost=1.0, **options)
-    if policy.endswith(NEAR):
-        return Agent(system, policy.removesuffix(NEAR), gain_per_cost=NATS_PER_RADIAN, **options)
-    return Agent(system, policy, **options)
+    chosen: Any = nearest if policy == "nearest" else policy.removesuffix(NEAR)
+    price = 1.0 if policy == "nearest" else NATS_PER_RADIAN * policy.endswith(NEAR)
+    return Agent(system, chosen, gain_per_cost=price, stop=stop, max_views=views, distance=DISTANCE)
 
 
 def recognise(
@@ -106,10 +103,9 @@ def recognise(
         costs, paths = arm.costs(reach)
         if not seen:
             costs = np.where(np.arange(len(costs)) == first, costs, np.inf)
-        costed = agent.gain_per_cost > 0
-        step = agent.decide(
-            reachable=np.isfinite(costs), cost=np.where(np.isfinite(costs), costs, 0.0) if costed else None
-        )
+        reachable = np.isfinite(costs)
+        cost = np.where(reachable, costs, 0.0) if agent.gain_per_cost > 0 else None
+        step = agent.decide(reachable=reachable, cost=cost)
         seconds = time.perf_counter() - begun
         if step.done:
             answer = seen[-1].belief.name if seen else "nothing"

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import re
 import shlex
+from functools import cache, partial
 from pathlib import Path
 
 import numpy as np
@@ -12,8 +13,10 @@ import pytest
 import yaml
 
 import mevs_jax
-from data_pipeline.capture.casting import default_caster
+from data_pipeline.capture.casting import Cast, default_caster
 from data_pipeline.objects.furniture import furniture
+from data_pipeline.objects.mesh import normalise
+from eval.checks.camera import Shot, cast_shot
 from mevs_jax.cli.commands import ALIASES, COMMANDS
 from mevs_jax.cli.parsing import parse, tool_options
 
@@ -35,16 +38,19 @@ def commands_in(page: Path) -> list[str]:
     return [call.removesuffix('"') if call.count('"') % 2 else call for call in calls]
 
 
-COMMANDS_OF_PAGES = [(page.name, command) for page in PAGES for command in dict.fromkeys(commands_in(page))]
+COMMANDS_OF_PAGES = {command: page.name for page in reversed(PAGES) for command in commands_in(page)}
+"""The commands, each with the first page that has it."""
 
 
 def test_pages_have_commands():
     assert len(COMMANDS_OF_PAGES) > 30
-    assert {page for page, _ in COMMANDS_OF_PAGES} >= {"README.md", "start.md", "scaling.md", "robot.md", "agent.md"}
+    assert {*COMMANDS_OF_PAGES.values()} >= {"README.md", "start.md", "scaling.md", "robot.md", "agent.md"}
 
 
-@pytest.mark.parametrize(("page", "command"), COMMANDS_OF_PAGES, ids=lambda value: value[:60])
-def test_documented_commands_take_their_options(page, command, tmp_path, monkeypatch):
+@pytest.mark.parametrize(
+    "command", [pytest.param(command, id=f"{page}: {command[:60]}") for command, page in COMMANDS_OF_PAGES.items()]
+)
+def test_documented_commands_take_their_options(command, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     words = [word for word in shlex.split(command) if word != "…"]
     if words[:1] in (["COMMAND"], ["--help"]):
@@ -56,28 +62,16 @@ def test_documented_commands_take_their_options(page, command, tmp_path, monkeyp
     tool_options(name, arguments) if COMMANDS[name].tool else parse(name, arguments)
 
 
-def look_from(pose: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Depth of a chair around the centre of the documented calls, by a camera of 320×240 pixels."""
+@cache
+def chair() -> Cast:
     piece = furniture("chair", 900)
-    corners = np.asarray(piece.vertices, float)
-    corners -= (corners.min(axis=0) + corners.max(axis=0)) / 2
-    radius = LOOKED["radius"]
-    corners = (corners * radius / np.linalg.norm(corners, axis=1).max() + CENTER).astype(np.float32)
-    rows, columns = np.mgrid[:240, :320]
-    rays = np.stack([columns, rows, np.ones_like(rows)], axis=-1) @ np.linalg.inv(K).T @ pose[:3, :3].T
-    origins = np.repeat(pose[:3, 3][None], rays.size // 3, axis=0)
-    cast = default_caster()(mevs_mesh(corners, np.asarray(piece.faces, np.int32)))
-    depth, _ = cast(origins.astype(np.float32), rays.reshape(-1, 3).astype(np.float32))
-    return depth.reshape(240, 320), K
+    return default_caster()(normalise(piece.vertices, piece.faces, "chair"))
 
 
-def mevs_mesh(vertices: np.ndarray, faces: np.ndarray):
-    from data_pipeline.objects.mesh import Mesh
-
-    return Mesh(vertices, faces, np.ptp(vertices, axis=0))
-
-
-LOOKED = {"radius": RADIUS}
+def look_from(pose: np.ndarray, radius: float = RADIUS) -> tuple[np.ndarray, np.ndarray]:
+    """Depth of a chair around the centre of the documented calls, by a camera of 320×240 pixels."""
+    depth = cast_shot(chair(), Shot(320, 240, K, pose, CENTER, radius))
+    return np.where(depth > 0, depth, np.inf), K
 
 
 def world_of(page: str, whole: Path) -> dict:
@@ -86,14 +80,13 @@ def world_of(page: str, whole: Path) -> dict:
 
     from eval.tables import load_view_tables
 
-    LOOKED["radius"] = 0.45 if page == "README.md" else RADIUS
-    pose = np.asarray(mevs_jax.look_at_origin(np.array([0.3, -0.2, 0.25], np.float32)))
-    pose = np.array(pose, float)
+    look = partial(look_from, radius=0.45) if page == "README.md" else look_from
+    pose = np.array(mevs_jax.look_at_origin(np.array([0.3, -0.2, 0.25], np.float32)), float)
     pose[:3, 3] += CENTER
-    depth, _ = look_from(pose)
+    depth, _ = look(pose)
     tables = load_view_tables(whole / "tables" / "test.npz")
     return {
-        "look_from": look_from if page == "README.md" else lambda pose: (*look_from(pose), pose),
+        "look_from": look if page == "README.md" else lambda pose: (*look(pose), pose),
         "can_reach": lambda pose: pose[2, 3] > CENTER[2] - 0.2,
         "depth": depth,
         "K": K,

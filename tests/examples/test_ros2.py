@@ -12,8 +12,9 @@ from scipy.spatial.transform import Rotation
 
 import mevs_jax
 from data_pipeline.capture.casting import default_caster
-from data_pipeline.objects.mesh import Mesh, normalise
+from data_pipeline.objects.mesh import normalise
 from data_pipeline.objects.recipes import FurniturePiece
+from eval.checks.camera import Shot, cast_shot
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "examples" / "ros2" / "mevs_ros"))
 from mevs_ros.recognising import (  # type: ignore[import-not-found]
@@ -34,13 +35,8 @@ class SimulatedCamera:
     """Moves to every requested pose, apart from the first `refuses` of them."""
 
     def __init__(self, kind: str, refuses: int = 0, blind: int = 0, garbled: int = -1) -> None:
-        mesh = normalise(*FurniturePiece(kind, 1_000_003).load(), kind)
-        self.cast = default_caster()(
-            Mesh((mesh.vertices * RADIUS + CENTER).astype(np.float32), mesh.faces, mesh.extent)
-        )
+        self.cast = default_caster()(normalise(*FurniturePiece(kind, 1_000_003).load(), kind))
         self.refuses, self.blind, self.garbled, self.asked = refuses, blind, garbled, []
-        rows, columns = np.mgrid[:240, :320]
-        self.rays = np.stack([columns, rows, np.ones_like(rows)], axis=-1).reshape(-1, 3) @ np.linalg.inv(K).T
 
     def wait_for(self, pose: np.ndarray, seconds: float, cancelled) -> Frame | None:
         self.asked.append(pose)
@@ -50,9 +46,8 @@ class SimulatedCamera:
             raise ValueError("depth images of encoding 'rgb8' cannot be read")
         if len(self.asked) <= self.refuses + self.blind:
             return Frame(np.zeros((240, 320), np.float32), K, pose)
-        rays = (self.rays @ pose[:3, :3].T).astype(np.float32)
-        depth, _ = self.cast(np.tile(pose[:3, 3].astype(np.float32), (len(rays), 1)), rays)
-        return Frame(depth.reshape(240, 320), K, pose)
+        depth = cast_shot(self.cast, Shot(320, 240, K, pose, CENTER, RADIUS))
+        return Frame(np.where(depth > 0, depth, np.inf), K, pose)
 
 
 def looked(camera: SimulatedCamera, **options):
@@ -125,15 +120,18 @@ def test_depth_is_read_from_messages(encoding, kind, unit, big, random):
         depth_of(encoding, 5, 7, stored.strides[0], big, b"abc")
 
 
-def test_rotations_go_to_messages_and_back(random):
+def test_rotations_go_to_messages_and_back():
+    place = SimpleNamespace(x=1.0, y=2.0, z=3.0)
+    half = np.sqrt(0.5)
+    turned = matrix_of(
+        place, SimpleNamespace(x=0.0, y=0.0, z=2 * half, w=2 * half)
+    )  # messages are not always of length one
+    np.testing.assert_allclose(turned, [[0, -1, 0, 1], [1, 0, 0, 2], [0, 0, 1, 3], [0, 0, 0, 1]], atol=1e-12)
+    np.testing.assert_allclose(quaternion_of(turned[:3, :3]), [0, 0, half, half], atol=1e-12)
     for turn in Rotation.random(50, random_state=np.random.RandomState(0)):
-        x, y, z, w = turn.as_quat() * random.uniform(0.5, 2)  # messages are not always of length one
-        place = SimpleNamespace(x=1.0, y=2.0, z=3.0)
-        matrix = matrix_of(place, SimpleNamespace(x=x, y=y, z=z, w=w))
-        np.testing.assert_allclose(matrix[:3, :3], turn.as_matrix(), atol=1e-12)
-        np.testing.assert_array_equal(matrix[:3, 3], [1, 2, 3])
-        again = Rotation.from_quat(quaternion_of(matrix[:3, :3]))
-        np.testing.assert_allclose((again * turn.inv()).magnitude(), 0, atol=1e-7)
+        x, y, z, w = quaternion_of(turn.as_matrix())
+        again = matrix_of(place, SimpleNamespace(x=x, y=y, z=z, w=w))
+        np.testing.assert_allclose(again[:3, :3], turn.as_matrix(), atol=1e-12)
 
 
 def test_arrival_is_judged_without_roll():

@@ -47,7 +47,7 @@ class RecogniseNode(Node):
         self._busy = threading.Lock()
         self.system = mevs_jax.load(self._given("system"))
         self._agents: dict[tuple[int, float], mevs_jax.Agent] = {}
-        self._agent(self._given("max_views"), self._given("stop"))
+        self._agent()
         group = ReentrantCallbackGroup()
         self.create_subscription(Image, "depth", self._frames.on_depth, qos_profile_sensor_data, callback_group=group)
         self.create_subscription(CameraInfo, "camera_info", self._frames.on_info, 10, callback_group=group)
@@ -65,17 +65,15 @@ class RecogniseNode(Node):
     def _given(self, name: str):
         return self.get_parameter(name).value
 
-    def _agent(self, max_views: int, stop: float) -> mevs_jax.Agent:
-        """The agent with these options, which compiles for some seconds when it is first asked for."""
+    def _agent(self, max_views: int = 0, stop: float = 0.0) -> mevs_jax.Agent:
+        """The agent with these options, or the parameters' where 0; it compiles for some seconds when first asked for."""
+        max_views, stop = max_views or self._given("max_views"), stop or self._given("stop")
         if (max_views, stop) not in self._agents:
             distance = self._given("distance") or None
             agent = self.system.agent(self._given("policy"), max_views=max_views, stop=stop, distance=distance)
             agent.warm_up()
             self._agents[max_views, stop] = agent
         return self._agents[max_views, stop]
-
-    def _agent_of(self, goal: RecogniseObject.Goal) -> mevs_jax.Agent:
-        return self._agent(goal.max_views or self._given("max_views"), goal.stop or self._given("stop"))
 
     def _accept(self, goal: RecogniseObject.Goal) -> GoalResponse:
         """Refuses a goal that could not be served, with the reason in the log."""
@@ -86,7 +84,7 @@ class RecogniseNode(Node):
             if self._busy.locked():
                 raise ValueError("another goal is being served")
             wanted = self._goal_of(goal)
-            self._agent_of(goal).reset(center=wanted.center, radius=wanted.radius, yaw=wanted.yaw)
+            self._agent(goal.max_views, goal.stop).reset(center=wanted.center, radius=wanted.radius, yaw=wanted.yaw)
         except ValueError as error:
             self.get_logger().error(f"goal refused: {error}")
             return GoalResponse.REJECT
@@ -112,7 +110,7 @@ class RecogniseNode(Node):
                 handle.publish_feedback(message)
 
             found = recognise(
-                self._agent_of(goal),
+                self._agent(goal.max_views, goal.stop),
                 self._goal_of(goal),
                 self._frames,
                 tell,

@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from typing import Any, Protocol
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from mevs_jax.agent import Agent
 
@@ -138,40 +139,16 @@ def depth_of(encoding: str, height: int, width: int, step: int, is_bigendian: bo
 
 def matrix_of(translation: Any, rotation: Any) -> np.ndarray:
     """(4, 4) from a translation with x, y, z and a quaternion with x, y, z, w, as messages have them."""
-    x, y, z, w = rotation.x, rotation.y, rotation.z, rotation.w
-    scale = 2 / (x * x + y * y + z * z + w * w)
-    found = np.eye(4)
-    found[:3, :3] -= scale * np.array(
-        [
-            [y * y + z * z, z * w - x * y, -x * z - y * w],
-            [-x * y - z * w, x * x + z * z, x * w - y * z],
-            [y * w - x * z, -y * z - x * w, x * x + y * y],
-        ]
-    )
-    found[:3, 3] = translation.x, translation.y, translation.z
-    return found
+    pose = np.eye(4)
+    pose[:3, :3] = Rotation.from_quat([rotation.x, rotation.y, rotation.z, rotation.w]).as_matrix()
+    pose[:3, 3] = translation.x, translation.y, translation.z
+    return pose
 
 
 def quaternion_of(rotation: np.ndarray) -> tuple[float, float, float, float]:
-    """x, y, z, w of a rotation matrix (Shepperd 1978)."""
-    trace = np.trace(rotation)
-    parts = np.array([*np.diag(rotation), trace])
-    at = int(parts.argmax())
-    if at == 3:
-        found = [
-            rotation[2, 1] - rotation[1, 2],
-            rotation[0, 2] - rotation[2, 0],
-            rotation[1, 0] - rotation[0, 1],
-            1 + trace,
-        ]
-    else:
-        i, j, k = at, (at + 1) % 3, (at + 2) % 3
-        found = [0.0] * 4
-        found[i] = 1 - trace + 2 * rotation[i, i]
-        found[j], found[k] = rotation[j, i] + rotation[i, j], rotation[k, i] + rotation[i, k]
-        found[3] = rotation[k, j] - rotation[j, k]
-    length = float(np.linalg.norm(found))
-    return tuple(float(part) / length for part in found)  # type: ignore[return-value]
+    """x, y, z, w of a rotation matrix."""
+    x, y, z, w = Rotation.from_matrix(rotation).as_quat().tolist()
+    return x, y, z, w
 
 
 def is_at(pose: np.ndarray, wanted: np.ndarray, metres: float, radians: float) -> bool:
