@@ -40,7 +40,7 @@ def environment_of(**options) -> ActiveRecognition:
 def test_without_the_packages_one_sentence_says_what_to_install():
     ended = subprocess.run([sys.executable, "-c", WITHOUT], capture_output=True, text=True, timeout=300, check=True)
     assert ended.stdout.count("\n") == 1, ended.stderr
-    assert ended.stdout.startswith("mevs_jax.environment.gymnasium needs the packages gymnasium and ap-gym")
+    assert ended.stdout.startswith("mevs_jax.gymnasium needs the packages gymnasium and ap-gym")
     assert "pip install 'mevs-jax[gym]'" in ended.stdout
 
 
