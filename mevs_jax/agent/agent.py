@@ -15,8 +15,7 @@ import jax
 import numpy as np
 from jaxtyping import Bool, Float
 
-from mevs_jax.agent.candidates import candidates_of
-from mevs_jax.agent.frames import aimed, mask_of, pose_towards
+from mevs_jax.agent.candidates import aimed, candidates_of, mask_of, pose_towards
 from mevs_jax.agent.present import Present, sphere_of
 from mevs_jax.agent.programs import Programs
 from mevs_jax.agent.records import Belief, History, Reason, Step, plain

@@ -13,8 +13,7 @@ from scipy.spatial.transform import Rotation
 
 import mevs_jax
 from mevs_jax.agent import Agent, load_history, replay
-from mevs_jax.agent.candidates import candidates_of
-from mevs_jax.agent.frames import pose_towards
+from mevs_jax.agent.candidates import candidates_of, pose_towards
 from mevs_jax.agent.looking import Frames, look_at_frames
 from mevs_jax.beliefs.fusing import running_sum
 from mevs_jax.selection.loop import ViewTable, by_attention, select_from_table

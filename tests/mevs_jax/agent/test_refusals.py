@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from mevs_jax.agent import Agent
-from mevs_jax.agent.frames import aimed, mask_of, pose_towards
+from mevs_jax.agent.candidates import aimed, mask_of, pose_towards
 from mevs_jax.agent.looking import Frames, look_at_frames
 from mevs_jax.geometry.inputs import check_depth
 from mevs_jax.geometry.sphere import Sphere
