@@ -63,8 +63,8 @@ def fit_order(
     def worth_after(before: frozenset[int]) -> np.ndarray:
         return worth(before).astype(float)
 
-    def mean(own: Float[np.ndarray, " objects"], values: Float[np.ndarray, "objects *views"]) -> np.ndarray:
-        return np.round(own @ values / own.sum(), _DIGITS)
+    def mean(own: Float[np.ndarray, " objects"], values: np.ndarray) -> np.ndarray:
+        return np.round(own @ values / max(own.sum(), 1.0), _DIGITS)
 
     def fitted(criterion: int, own: Float[np.ndarray, " objects"], length: int) -> list[int]:
         order: list[int] = []
