@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cache
-from typing import Literal
+from typing import Any, Literal
 
 import jax
 import jax.numpy as jnp
@@ -63,7 +63,7 @@ def fit_order(
     def worth_after(before: frozenset[int]) -> np.ndarray:
         return worth(before).astype(float)
 
-    def mean(own: Float[np.ndarray, " objects"], values: np.ndarray) -> np.ndarray:
+    def mean(own: Float[np.ndarray, " objects"], values: np.ndarray) -> Any:
         return np.round(own @ values / max(own.sum(), 1.0), _DIGITS)
 
     def fitted(criterion: int, own: Float[np.ndarray, " objects"], length: int) -> list[int]:
