@@ -321,7 +321,7 @@ def novel_classes(
 def novel_metrics(
     each: Mapping[str, Float[np.ndarray, "steps objects"]],
     pairs: Sequence[tuple[int, ...]],
-    labels: Int[AnyArray, " objects"],
+    labels: Int[AnyArray, " tested"],
 ) -> dict[str, Any]:
     """The metrics of `novel_classes`; `labels` are of all test objects."""
     rows, first = [], 0

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cache
-from typing import Literal
+from typing import Any, Literal
 
 import jax
 import jax.numpy as jnp
@@ -23,6 +23,8 @@ CRITERIA: tuple[Criterion, ...] = ("accuracy", "likelihood")
 _COMPARED = 3
 """Views after the start view whose mean accuracy decides between the criteria."""
 _AT_ONCE = 16
+_DIGITS = 6
+"""Decimal places of what views are worth, so that rounding does not decide between views that are worth the same."""
 
 Worth = Callable[[frozenset[int]], Float[np.ndarray, "objects views criteria"]]
 """What each view is worth after the start view and some others, for every object and by every criterion.
@@ -55,17 +57,25 @@ def fit_order(
         weights: of the objects, such that classes have equal weights.
         most: length of the order.
     """
-    worth, weights, views = cache(worth), np.asarray(weights), len(reachable)
+    weights, views = np.asarray(weights, float), len(reachable)
+
+    @cache
+    def worth_after(before: frozenset[int]) -> np.ndarray:
+        return worth(before).astype(float)
+
+    def mean(own: Float[np.ndarray, " objects"], values: np.ndarray) -> Any:
+        return np.round(own @ values / max(own.sum(), 1.0), _DIGITS)
 
     def fitted(criterion: int, own: Float[np.ndarray, " objects"], length: int) -> list[int]:
         order: list[int] = []
         while len(order) < min(length, int(reachable.sum())):
             left = reachable & ~np.isin(np.arange(views), order)
-            order.append(int(np.argmax(np.where(left, own @ worth(frozenset(order))[..., criterion], -np.inf))))
+            value = mean(own, worth_after(frozenset(order))[..., criterion])
+            order.append(int(np.argmax(np.where(left, value, -np.inf))))
         return order
 
     def accuracy(order: list[int], own: Float[np.ndarray, " objects"]) -> float:
-        return sum(float(own @ worth(frozenset(order[:at]))[:, view, 0]) for at, view in enumerate(order))
+        return sum(float(mean(own, worth_after(frozenset(order[:at]))[:, view, 0])) for at, view in enumerate(order))
 
     halves = [np.where(np.arange(len(weights)) % 2 == part, weights, 0) for part in range(2)]
     held_out = [

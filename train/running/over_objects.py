@@ -58,7 +58,7 @@ def over_objects(
     firsts = range(0, count, size)
     own = own_share(len(firsts)) if by_all else np.arange(len(firsts))
 
-    def given(first: int) -> list[Array]:
+    def given(first: int) -> list[Any]:
         index = np.minimum(np.arange(first, first + size), count - 1)  # the last object fills up the last part
         return jax.tree.leaves((jax.tree.map(lambda leaf: leaf[index], objects), shared))
 

@@ -26,7 +26,7 @@ def worth(tables, starts, seen, weights):
             belief = tables.logits[index, sorted({int(start), *seen})].astype(np.float64).sum(axis=0)
             likelihood = belief[label] - np.log(np.exp(belief - belief.max()).sum()) - belief.max()
             found += weights[index] * np.array([belief.argmax() == label, likelihood])
-    return found
+    return np.round(found / len(starts) / max(weights.sum(), 1.0), 6)
 
 
 def greedy(tables, reachable, weights, criterion, length):
