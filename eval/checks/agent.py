@@ -295,4 +295,5 @@ def latency(system: TrainedSystem, data: Path, calls: int = 200, policy: str = "
         agent.decide()
         times.append(1e3 * (time.perf_counter() - begun))
     jax.monitoring.unregister_event_duration_listener(listen)
-    return Latency(*map(float, np.percentile(times, (50, 99))), float(len(compiled)))
+    p50, p99 = np.percentile(times, (50, 99))
+    return Latency(float(p50), float(p99), float(len(compiled)))

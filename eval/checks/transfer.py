@@ -57,10 +57,10 @@ class Objects:
 class ClassRow:
     """Accuracy for the objects of one known class, from single views and by the best policy after 1, 2, 3 and 4 views."""
 
-    name: str = named("class")
     objects: int
     single: float
     chosen: Float[np.ndarray, " views"]
+    name: str = named("class")
 
 
 @dataclass(frozen=True)
@@ -311,7 +311,7 @@ def _by_class(
     for label in np.unique(labels):
         of_class = labels == label
         after = chosen[of_class, :4].mean(axis=0)
-        rows.append(ClassRow(classes[label], int(of_class.sum()), float(single[of_class, 0].mean()), after))
+        rows.append(ClassRow(int(of_class.sum()), float(single[of_class, 0].mean()), after, classes[label]))
     return rows
 
 

@@ -54,7 +54,7 @@ def no_such_file(root: Path) -> list:
 
 
 def not_a_mesh(root: Path) -> list:
-    return ["--data", folder_with(root / "set", "hello")]
+    return [*BY_THREADS, "--data", folder_with(root / "set", "hello")]
 
 
 def truncated(root: Path) -> list:
@@ -239,7 +239,7 @@ def test_a_run_that_cannot_begin_leaves_no_settings(tmp_path, refuses):
     assert not (tmp_path / "new" / "run.json").exists()
 
 
-@pytest.mark.parametrize("arguments", [["--help"], ["run", "--help-all"]], ids=len)
+@pytest.mark.parametrize("arguments", [["--help"], ["run", "--help"]], ids=len)
 def test_a_reader_may_close_the_output(arguments):
     """As `| head` does: no traceback, no complaint. The output is buffered, as it is for users."""
     reading, writing = os.pipe()
@@ -416,12 +416,18 @@ def test_what_the_machine_lacks_is_a_sentence(error, code, said, tmp_path, at_on
     assert "Traceback" not in result.stderr
 
 
-def test_a_platform_that_is_not_there_is_a_sentence(tmp_path):
-    result = subprocess.run(
-        [*MEVS, "data", "--preset", "tiny", "--views", "3", "--out", str(tmp_path)],
-        capture_output=True,
-        text=True,
-        timeout=600,
-        env=os.environ | {"JAX_PLATFORMS": "cuda"},
-    )
+def test_a_platform_that_is_not_there_is_a_sentence():
+    script = """
+import sys
+from mevs_jax.cli import main as cli
+
+def job(*arguments):
+    import jax
+    jax.numpy.zeros(3)
+
+cli._run, sys.argv = job, ["test", "run"]
+cli.main()
+"""
+    environment = os.environ | {"JAX_PLATFORMS": "cuda"}
+    result = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, env=environment)
     assert "JAX_PLATFORMS=cuda asks for a device that cannot be used here" in refused(result)

@@ -112,7 +112,7 @@ def test_settings_of_a_later_version_are_not_compared(whole, tmp_path):
         check_made_with(TINY, out)
 
 
-def test_what_a_sweep_tries_does_not_become_the_run(whole, tmp_path, data):
+def test_what_a_sweep_tries_does_not_become_the_run(whole, tmp_path):
     for name, trained in (("with", True), ("without", False)):
         out = tmp_path / name
         save_run(out, "tiny", TINY, [])
