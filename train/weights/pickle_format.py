@@ -13,7 +13,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from enum import Enum
 from math import prod
-from typing import Any
+from typing import Any, no_type_check
 
 import ml_dtypes
 import numpy as np
@@ -117,6 +117,7 @@ class BoundedReader(io.BufferedReader):
 _VALUES = {"NONE": None, "NEWTRUE": True, "NEWFALSE": False, "EMPTY_TUPLE": ()}
 
 
+@no_type_check  # several calls an instruction: the tests' type checks take a hundred times as long as the calls
 class WeightsUnpickler:
     """Reads pickles of plain values and tensors, one after another, from a file.
 
