@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import os
+import pickle
 import shutil
 import subprocess
 import sys
-from pathlib import Path
 
 import jax.numpy as jnp
 import numpy as np
@@ -25,7 +25,7 @@ from data_pipeline.capture.casting import (
     rig_for,
     save_capture,
 )
-from data_pipeline.capture.workers import capture_all, capture_path
+from data_pipeline.capture.workers import capture_all, capture_entry, capture_path
 from data_pipeline.dataset.builder import view_entropies
 from data_pipeline.errors import DamagedMesh
 from data_pipeline.objects.mesh import Mesh, ObjectEntry, normalise
@@ -159,47 +159,24 @@ print(open3d.ml.__file__, open3d.ml.contrib.__file__)
     assert "contrib" in found.stdout
 
 
-CAPTURE_BY_WORKERS = """
-import sys
-from dataclasses import dataclass
-from multiprocessing import parent_process
+AS_A_WORKER = """
+import pickle, sys
 from pathlib import Path
-from data_pipeline.capture.casting import CaptureConfig
-from data_pipeline.capture.workers import capture_all
-from data_pipeline.errors import DamagedMesh
-from data_pipeline.objects.mesh import ObjectEntry
-from data_pipeline.objects.recipes import FurniturePiece
-from mevs_jax.cli.main import main
-
-
-@dataclass(frozen=True)
-class Checked:
-    recipe: FurniturePiece
-
-    def load(self):
-        if parent_process() is None:
-            raise DamagedMesh("was not captured by a worker")
-        if "jax" in sys.modules:
-            raise DamagedMesh("was captured by a worker that imported JAX")
-        return self.recipe.load()
-
-
-if __name__ == "__main__":
-    entries = [ObjectEntry(f"c{i}", 0, "train", Checked(FurniturePiece("chair", i))) for i in range(8)]
-    capture_all(entries, CaptureConfig(views=2, resolution=16), Path(sys.argv[1]), workers=2)
+import mevs_jax.cli.main  # which the script `mevs` imports, and so does a spawned worker
+work, job, given = pickle.loads(Path(sys.argv[1]).read_bytes())
+print(work(job, *given))
+assert "jax" not in sys.modules
 """
 
 
-def test_capture_workers_do_not_import_jax(tmp_path):
-    """JAX takes seconds to import. A spawned worker also imports the main module, here the imports of the script `mevs`."""
-    script, out = tmp_path / "script.py", tmp_path / "captures"
-    script.write_text(CAPTURE_BY_WORKERS)
-    environment = os.environ | {"PYTHONPATH": str(Path(__file__).resolve().parents[1])}
-    result = subprocess.run(
-        [sys.executable, str(script), str(out)], capture_output=True, text=True, timeout=300, env=environment
-    )
-    assert result.returncode == 0, result.stderr
-    assert len(list(out.glob("*.npz"))) == 8
+def test_capture_workers_do_not_import_jax(tmp_path, rig):
+    """JAX takes seconds to import."""
+    given = rig, tmp_path, "raycast", False
+    (tmp_path / "task").write_bytes(pickle.dumps((capture_entry, entry("c", FurniturePiece("chair", 1)), given)))
+    command = [sys.executable, "-c", AS_A_WORKER, str(tmp_path / "task")]
+    result = subprocess.run(command, capture_output=True, text=True, timeout=300)
+    assert (result.returncode, result.stdout) == (0, "None\n"), result.stderr
+    assert (tmp_path / "c.npz").exists()
 
 
 def under_xvfb(code: str, *arguments: str) -> subprocess.CompletedProcess:
@@ -255,12 +232,21 @@ def test_the_thesiss_visualizer_sees_what_rays_see(tmp_path):
         np.testing.assert_allclose(view_entropies(drawn), view_entropies(cast), atol=0.1)
 
 
-def test_without_a_display_the_visualizer_says_so(monkeypatch):
+DRAW = """
+import pickle, sys
+from pathlib import Path
+from data_pipeline.capture.visualizer import capture_with_visualizer
+capture_with_visualizer(*pickle.loads(Path(sys.argv[1]).read_bytes()))
+"""
+
+
+def test_without_a_display_the_visualizer_says_so(monkeypatch, tmp_path, rig):
     open3d_or_skip()
     monkeypatch.delenv("DISPLAY", raising=False)
     monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
-    code = SEE_BOTH.replace("import sys", "import sys; sys.argv[1:] = ['.', 'chair']", 1)
-    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=300)
+    (tmp_path / "given").write_bytes(pickle.dumps((load_object(entry("c", FurniturePiece("chair", 1))), rig)))
+    command = [sys.executable, "-c", DRAW, str(tmp_path / "given")]
+    result = subprocess.run(command, capture_output=True, text=True, timeout=300)
     assert "DataError: the visualizer backend needs a display; run it under xvfb-run -a" in result.stderr
 
 
