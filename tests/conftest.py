@@ -154,10 +154,11 @@ def otherwise_tested(tmp_path_factory) -> Path:
 
 
 @pytest.fixture(scope="session")
-def whole(tmp_path_factory) -> Path:
-    """One run of the preset `tiny` by the command line, never interrupted, for reading only."""
+def whole(tmp_path_factory, data) -> Path:
+    """One run of the preset `tiny` by the command line, with `data`, never interrupted, for reading only."""
 
     def make(folder: Path) -> None:
+        shutil.copytree(data, folder / "data")
         command = [sys.executable, "-m", "mevs_jax", "run", "--preset", "tiny", "--out", str(folder)]
         result = subprocess.run(command, capture_output=True, text=True, timeout=900)
         assert result.returncode == 0, result.stderr
