@@ -91,6 +91,7 @@ def test_oracles_and_thresholds_are_of_their_walks(adding):
     assert thresholds[0] != thresholds[1]
 
 
+@pytest.mark.slow
 def test_policies_without_classes_are_tested_on_objects_of_these(adding):
     """Objects of two classes are recognised from everywhere; they are fewer than those of the others."""
     labels = np.repeat(np.arange(CLASSES), (3, 5, 2, 6))
@@ -108,7 +109,7 @@ def test_views_to_reach_are_of_the_same_objects_as_their_target():
 
     def results(ahead: int) -> Results:
         after = jnp.asarray(level + steps + ahead / 20, jnp.float32)[None]
-        return Results(after, after, after, after, jnp.zeros(1))
+        return Results(after[..., None], after[..., None], after, after, jnp.zeros((1, 12, 1, 1, 9), jnp.int32))
 
     found = views_to_reach({"random": results(0), "same": results(0), "better": results(1)})
     assert set(found) == {"3", "5", "9"}
