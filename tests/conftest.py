@@ -54,16 +54,19 @@ REAL = Path(__file__).resolve().parents[2] / "shared"
 LONG = (
     "tests/cli/test_cli.py",
     "tests/eval/test_leaks.py",
+    "tests/eval/test_processes.py",
+    "tests/eval/thesis/test_thesis.py",
     "tests/train/many/test_seeds.py",
     "tests/train/many/test_sweep.py",
-    "tests/eval/thesis/test_thesis.py",
     "tests/train/test_training.py",
-    "tests/mevs_jax/rendering/test_soft.py",
     "tests/train/running/test_scaling.py",
+    "tests/train/choosing/test_recogniser.py",
+    "tests/train/choosing/test_together.py",
+    "tests/mevs_jax/rendering/test_soft.py",
     "tests/train/running/test_processes.py",
+    "tests/eval/learned/test_study.py",
     "tests/eval/walks/test_evaluation.py",
     "tests/eval/test_seeds.py",
-    "tests/eval/test_processes.py",
 )
 """The files that take longest. They begin first, so that no worker is left with one of them at the end."""
 
