@@ -7,7 +7,6 @@ is planted.
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -16,16 +15,20 @@ import pytest
 from flax import nnx
 
 import eval.learned.measure as measuring
-from eval.learned.study import fixed_order_scores, novel_classes, study, walk_metrics
-from eval.learned.walks import Learner, OnLattice
+from eval.learned.study import novel_classes, novel_metrics, order_of_fused, study, walk_metrics
+from eval.learned.walks import OnLattice, Walking, by_network
 from eval.numbers.comparison import views_to_reach
 from eval.numbers.confidence import stopping
 from eval.settings import TINY
+from eval.tables import save_view_tables
 from eval.walks.grid import Results
+from eval.walks.knowledge import order_of_sums
 from mevs_jax import fibonacci_sphere
 from tests.reference.choosing import CLASSES, some_policy
+from tests.reference.evaluation import some_tables
 from tests.reference.made_up_study import Study
 from train.choosing.features import Features
+from train.results.identity import VERSIONS
 
 VIEWS = 16
 """So many that oracles and costs are tried from some start views only."""
@@ -47,8 +50,13 @@ def test_a_fixed_order_serves_every_class_alike(adding):
     tells = np.zeros((len(labels), VIEWS, 1), np.float32)
     tells[labels == 0, common] = tells[labels > 0, rare] = 40
     told = data.logits + tells * np.eye(CLASSES, dtype=np.float32)[labels][:, None]
-    scores = fixed_order_scores(adding, replace(data, features=told, logits=told), 2)
-    assert np.argsort(-scores)[:2].tolist() == [rare, common]
+    assert order_of_fused(adding, replace(data, features=told, logits=told), 2).views[:2] == [rare, common]
+    found = order_of_sums(told, labels)
+    assert found.views[:2] == [rare, common]
+    reachable = np.arange(VIEWS) != rare
+    within = order_of_sums(told, labels, reachable)
+    assert within.views[0] == common
+    assert sorted(within.views) == np.flatnonzero(reachable).tolist()
 
 
 def test_temperatures_serve_every_class_alike():
@@ -79,7 +87,7 @@ def test_oracles_and_thresholds_are_of_their_walks(adding):
     for sign in (1.0, -1.0):
         policy = some_policy()
         nnx.update(policy, jax.tree.map(lambda leaf, sign=sign: sign * leaf, nnx.state(policy)))
-        policies.append(Learner("learned", "", policy))
+        policies.append(by_network("learned", "", policy, adding))
     validation, test, thresholds = objects(24), objects(20), []
     for one in policies:
         found, each = study(adding, policies[:1], validation, test, max_views=3, draws=1, apart=[one] * 2, others=False)
@@ -96,9 +104,12 @@ def test_policies_without_classes_are_tested_on_objects_of_these(adding):
     """Objects of two classes are recognised from everywhere; they are fewer than those of the others."""
     labels = np.repeat(np.arange(CLASSES), (3, 5, 2, 6))
     known = np.isin(labels, (0, 2))
-    test = features_of(labels, np.tile(known[:, None], (1, VIEWS)))
+    test = OnLattice(features_of(labels, np.tile(known[:, None], (1, VIEWS))))
+    policy = by_network("learned", "", some_policy(), adding)
     for pair, right in (((0, 2), 1.0), ((1, 3), 0.0)):
-        (row,) = novel_classes(adding, [(pair, some_policy())], some_policy(), test, max_views=2, draws=1)["pairs"]
+        each = novel_classes(adding, [(pair, policy)], policy, test, Walking(2, 1))
+        assert {one.shape for one in each.values()} == {(2, np.isin(labels, pair).sum())}
+        (row,) = novel_metrics(each, [pair], labels)["pairs"]
         assert row["objects"] == np.isin(labels, pair).sum()
         assert row["random"] == row["trained_without"] == row["trained_with"] == [right] * 2
 
@@ -128,28 +139,37 @@ def test_the_risk_that_is_allowed_is_that_of_those_who_stop():
     assert row["excess"] == pytest.approx([0.25 - 0.1 * 0.5] * 2, abs=1e-6)
 
 
-@pytest.mark.parametrize("made_anew", ["networks", "policies"])
+@pytest.mark.parametrize("made_anew", ["networks", "policies", "tables", "version"])
 def test_walks_are_computed_anew_when_what_they_are_of_was(made_anew, tmp_path, monkeypatch):
-    """The data set and the networks, or the view policies; on every kind of candidates."""
+    """The data set and the recogniser, the view policies, or PointNet++; and when they mean something else."""
     config = replace(TINY.learned, max_views=3, draws=1, ablations=("look_ahead",), novel=1)
-    stages, computed, version = Study(None, tmp_path, monkeypatch, config).stages, [], dict[str, int]()
+    stages, computed, made = Study(None, tmp_path, monkeypatch, config).stages, list[str](), dict[str, int]()
 
-    def identity_of(*given: Any) -> str:
-        return f"networks {version.get('networks', 0)}"
+    def walk(*given, **rest):
+        computed.append("lattice")
+        return {"policies": {}}, {}
 
-    monkeypatch.setattr(measuring, "made_by", identity_of)
-    monkeypatch.setattr(measuring, "read_json", lambda path: {"identity": version.get("policies", 0)})
+    def walk_novel(*given, **rest):
+        computed.append("novel")
+        return {name: np.ones((3, 4)) for name in ("random", "trained_with")}
+
+    monkeypatch.setattr(measuring, "made_by", lambda *given: f"networks {made.get('networks', 0)}")
+    monkeypatch.setattr(measuring, "read_json", lambda path: {"identity": made.get("policies", 0)})
     monkeypatch.setattr(measuring, "_decision", lambda stages: {})
-    monkeypatch.setattr(
-        measuring, "study", lambda *given, **rest: computed.append("walks") or ({"policies": {}}, {"a": 1})
-    )
-    monkeypatch.setattr(measuring, "novel_classes", lambda *given: computed.append("novel") or {"gain": {}})
+    monkeypatch.setattr(measuring, "study", walk)
+    monkeypatch.setattr(measuring, "novel_classes", walk_novel)
     counts = []
-    for _ in range(2):
+    for anew in (0, 1):
+        if anew:
+            made[made_anew] = 1
+            monkeypatch.setitem(VERSIONS, "walks", VERSIONS["walks"] + (made_anew == "version"))
+        for split in ("val", "test"):
+            tables = replace(some_tables(), made_by=f"tables {made.get('tables', 0)}")
+            save_view_tables(tmp_path / "tables" / f"{split}.npz", tables)
         for _ in range(2):  # the second time, everything is there
             computed.clear()
             measuring.measure(stages)
-            counts.append(len(computed))
-        version[made_anew] = 1
-    assert counts[0] == counts[2] > 4
-    assert counts[1] == counts[3] == 0
+            counts.append(sorted(computed))
+    every = ["lattice"] * 5 + ["novel"]
+    on_tables = ["lattice"] * 3  # with known and unknown pose, and ablations; others are of other views
+    assert counts == [every, [], on_tables if made_anew == "tables" else every, []]

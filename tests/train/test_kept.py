@@ -10,8 +10,9 @@ import pytest
 from data_pipeline.errors import DataError, Unreadable
 from data_pipeline.files import CHECKS, keep_json, read_json, write_json
 from tests.reference.evaluation import some_statistics, some_tables
+from train.results.identity import made_by
 from train.results.kept import keep_beside, kept_array, kept_json
-from train.results.networks import check_config, made_by
+from train.results.networks import check_config
 
 
 def test_content_is_computed_once_for_each_identity(tmp_path):

@@ -147,13 +147,13 @@ def test_conditions_are_compared_with_what_they_differ_from(monkeypatch, tmp_pat
     monkeypatch.setattr(reality, "objects_to_test", lambda data, up: source())
     monkeypatch.setattr(reality, "meshes_of", lambda entries, most: ([(entry, None) for entry in entries], {}))
     monkeypatch.setattr(reality, "_tables", tables_in_every_condition)
-    rows = check_reality({"one": system()}, "tested", tmp_path, RealityConfig(("roll", "table")))["systems"]["one"]
-    assert {row["policy"] for row in rows} == {"random", "thesis", "best"}
+    rows = check_reality({"one": system()}, "tested", tmp_path, RealityConfig(("roll", "table"))).systems["one"]
+    assert {row.policy for row in rows} == {"random", "thesis", "best"}
     for name, there in (("clean", "clean"), ("roll", "clean"), ("upper", "upper"), ("table", "upper")):
-        for row in (row for row in rows if row["condition"] == name):
-            assert row["accuracy"] == accuracy[name]
-            assert row["loss"] == 1 - accuracy[name]
-            assert row["loss_there"] == accuracy[there] - accuracy[name]
+        for row in (row for row in rows if row.condition == name):
+            assert row.accuracy == accuracy[name]
+            assert row.loss == 1 - accuracy[name]
+            assert row.loss_there == accuracy[there] - accuracy[name]
         above = [row is not None for row in reaching[name]]
         assert len(above) == 3
         assert above == [there == "upper"] * 3
