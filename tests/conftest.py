@@ -54,16 +54,19 @@ REAL = Path(__file__).resolve().parents[2] / "shared"
 LONG = (
     "tests/cli/test_cli.py",
     "tests/eval/test_leaks.py",
+    "tests/eval/test_processes.py",
+    "tests/eval/thesis/test_thesis.py",
     "tests/train/many/test_seeds.py",
     "tests/train/many/test_sweep.py",
-    "tests/eval/thesis/test_thesis.py",
     "tests/train/test_training.py",
-    "tests/mevs_jax/rendering/test_soft.py",
     "tests/train/running/test_scaling.py",
+    "tests/train/choosing/test_recogniser.py",
+    "tests/train/choosing/test_together.py",
+    "tests/mevs_jax/rendering/test_soft.py",
     "tests/train/running/test_processes.py",
+    "tests/eval/learned/test_study.py",
     "tests/eval/walks/test_evaluation.py",
     "tests/eval/test_seeds.py",
-    "tests/eval/test_processes.py",
 )
 """The files that take longest. They begin first, so that no worker is left with one of them at the end."""
 
@@ -154,10 +157,11 @@ def otherwise_tested(tmp_path_factory) -> Path:
 
 
 @pytest.fixture(scope="session")
-def whole(tmp_path_factory) -> Path:
-    """One run of the preset `tiny` by the command line, never interrupted, for reading only."""
+def whole(tmp_path_factory, data) -> Path:
+    """One run of the preset `tiny` by the command line, with `data`, never interrupted, for reading only."""
 
     def make(folder: Path) -> None:
+        shutil.copytree(data, folder / "data")
         command = [sys.executable, "-m", "mevs_jax", "run", "--preset", "tiny", "--out", str(folder)]
         result = subprocess.run(command, capture_output=True, text=True, timeout=900)
         assert result.returncode == 0, result.stderr

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import json
+import shutil
 from dataclasses import asdict, dataclass, field, replace
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
 from typing import Any
 
@@ -61,7 +62,10 @@ def tables_of(seed: int, telling: int) -> ViewTables:
     return ViewTables(tables.names, labels, logits, predicted.astype(np.float32), entropy.astype(np.float32))
 
 
-VALIDATION, TEST = tables_of(0, telling=3), tables_of(1, telling=7)
+TELLING_VALIDATION, TELLING_TEST = 3, 7
+VALIDATION, TEST = tables_of(0, telling=TELLING_VALIDATION), tables_of(1, telling=TELLING_TEST)
+BEST, BEST_ON_TEST = "information_gain", "predicted_entropy"
+"""The policies that see the view that tells the class as their second one: of validation objects and of test objects."""
 BY_VIEW = tables_of(2, telling=5)
 """View tables of the test objects by the classifier that is validated by view."""
 STATISTICS = replace(some_statistics(some_tables()), capture={"resolution": 32, "views": VIEWS})
@@ -109,8 +113,8 @@ def run_with(change: str | None, out: Path) -> Run:
             return {"val": VALIDATION}[split]
         return other_tables(TEST if classifier is trained["classifier"] else BY_VIEW, change)
 
-    def run_grid(key, tables, graph, knowledge, policies, **rest):
-        found = walk_grid_anyhow(key, tables, graph, knowledge, policies, **rest)
+    def run_grid(key, tables, graph, knowledge, policies, second, **rest):
+        found = walk_grid_anyhow(key, tables, graph, knowledge, policies, second, **rest)
         run.knowledge.append(knowledge)
         run.walks.append({one.name: np.asarray(found[one.name].views) for one in policies if one.knows != "truth"})
         return found
@@ -139,8 +143,8 @@ def run_with(change: str | None, out: Path) -> Run:
         patch.setattr(stages, "compare_with_tables", compare_with_tables)
         patch.setattr(stages, "save_system", lambda system, folder: setattr(run, "system", system))
         patch.setattr(study, "ladder", lambda *given: tuple(one for one in ladder(*given) if one.name in WALKED))
-        patch.setattr(study, "run_grid", run_grid)
-        patch.setattr(system, "run_grid", run_grid)
+        patch.setattr(study, "run_grid", partial(run_grid, second={BEST_ON_TEST: TELLING_TEST}))
+        patch.setattr(system, "run_grid", partial(run_grid, second={BEST: TELLING_VALIDATION}))
         patch.setattr(confidence, "_fit", fit_confidences)
         run.metrics = stages.evaluate(SETTINGS, out)
         stages.make_system(SETTINGS, out)
@@ -216,6 +220,16 @@ def test_views_are_chosen_without_the_labels_of_test_objects(runs):
         for run in (one, other)
     ]
     check_fitted(*seen)
+
+
+def test_temperatures_are_fitted_on_walks_of_the_policy_that_uses_them(runs):
+    """Beliefs along well-chosen views are other ones than along random views."""
+    run = runs[None]
+    (walks,) = [walks for walks in run.walks if set(walks) == set(study.CONFIDENCE_OF)]
+    objects = np.arange(OBJECTS)[:, None, None]
+    expected = [VALIDATION.logits[objects, views[0, :, :, 0]] for views in walks.values()]
+    assert len({seed_of(logits) for logits in expected}) == len(study.CONFIDENCE_OF)
+    assert {seed_of(np.asarray(logits)) for logits, _ in run.fitted_on} == set(map(seed_of, expected))
 
 
 def test_walks_on_validation_objects_are_the_same_whatever_networks_say_of_test_objects(runs):
@@ -304,8 +318,8 @@ def best_after_views(after_views: dict[str, list[float]]) -> str:
 def test_the_best_policy_is_not_the_one_that_is_best_on_test_objects(runs):
     assert runs[None].system is not None
     described = runs[None].system.description
-    assert described.best == best_after_views(described.evaluation["validation_after_views"])
-    assert described.best != best_after_views(described.evaluation["after_views"])
+    assert described.best == best_after_views(described.evaluation["validation_after_views"]) == BEST
+    assert best_after_views(described.evaluation["after_views"]) == BEST_ON_TEST
 
 
 def test_no_figure_of_test_objects_decides_what_a_system_uses(monkeypatch):
@@ -349,16 +363,21 @@ def found_by(out: Path) -> tuple[dict[str, Any], dict[str, Any]]:
 
 
 @pytest.mark.slow
-def test_everything_is_the_same_for_other_test_objects(tmp_path, request):
-    """Both systems to the last bit, and the losses of every network, from data sets whose test objects are others."""
+def test_everything_is_the_same_for_other_test_objects(otherwise_tested, tmp_path, request):
+    """Both systems to the last bit, and the losses of their networks, from data sets whose test objects are others.
+
+    What ablations, classes that are left out and further training are fitted on, tests of smaller parts compare.
+    """
+    shutil.copytree(otherwise_tested, tmp_path / "data")
+    less = replace(LEARNED, learned=replace(LEARNED.learned, ablations=(), novel=0, rotation_epochs=0))
     with other_test_objects():
-        for stage in (stages.make_data, stages.train, stages.evaluate, stages.make_system, learn_to_choose):
-            stage(LEARNED, tmp_path)
+        for stage in (stages.train, stages.evaluate, stages.make_system, learn_to_choose):
+            stage(less, tmp_path)
     other = found_by(tmp_path)
     one = found_by(request.getfixturevalue("studied"))  # late, since another worker may be making it
-    trained = {place for place in one[0] if place.endswith("summary.json")}
-    assert {"classifier/summary.json", "entropy/summary.json", "learned/seed_0/recogniser/summary.json"} <= trained
-    assert "learned/seed_0/policies/learned_without_0_without_5/summary.json" in trained
-    check_fitted(one[0], other[0])
+    trained = {place for place in other[0] if place.endswith("summary.json")}
+    assert {"classifier/summary.json", "entropy/summary.json", "learned/seed_1/recogniser/summary.json"} <= trained
+    assert "learned/seed_0/policies/learned_aside_1_of_2/summary.json" in trained
+    check_fitted({place: one[0][place] for place in other[0]}, other[0])
     assert "['learned/system']['after_views']['learned'][0]" in differing(one[1], other[1])
     assert "['system']['single_view']" in differing(one[1], other[1])

@@ -48,8 +48,8 @@ def alone(*arguments: str) -> None:
     assert done.returncode == 0, done.stderr
 
 
-def killed_and_finished(made: Path, *arguments: str) -> str:
-    """What the first of two processes prints, once they were started again after one was killed when `made` was there."""
+def killed_and_finished(made: Path, *arguments: str) -> list[tuple[str, str]]:
+    """What two processes print, once they were started again after one was killed when `made` was there."""
     processes = start(*arguments)
     until = time.monotonic() + 300
     while not made.exists():
@@ -57,13 +57,13 @@ def killed_and_finished(made: Path, *arguments: str) -> str:
         assert processes[1].poll() is None, processes[1].communicate()
         time.sleep(0.02)
     processes[1].send_signal(signal.SIGKILL)
-    processes[0].communicate(timeout=120)
+    processes[0].communicate(timeout=SECONDS_TO_END)
     assert processes[0].returncode in (75, -6)
-    return finished(start(*arguments))[0][0]
+    return finished(start(*arguments))
 
 
 def finished(processes: list[subprocess.Popen]) -> list[tuple[str, str]]:
-    said = [process.communicate(timeout=400) for process in processes]
+    said = [process.communicate(timeout=900) for process in processes]
     assert [process.returncode for process in processes] == [0] * len(processes), said
     return said
 
@@ -76,10 +76,7 @@ def test_two_processes_evaluate_as_one_does(whole, tmp_path):
     for made in ("metrics.json", "metrics.csv"):
         (out / made).unlink()
     shutil.rmtree(out / "tables")
-    evaluate = ("eval", "--out", str(out))
-    killed_and_finished(out / "tables", *evaluate)
-    (out / "metrics.json").unlink()
-    (first, _), (second, told) = finished(start(*evaluate))
+    (first, _), (second, told) = killed_and_finished(out / "tables", "eval", "--out", str(out))
     assert "test objects right" in first
     assert "test objects" not in second  # one speaks for all
     assert "Walking" not in told
@@ -91,11 +88,9 @@ def test_two_processes_evaluate_as_one_does(whole, tmp_path):
 
 
 @pytest.mark.slow
-def test_two_processes_make_the_data_set_that_one_makes(tmp_path):
-    given = ("--preset", "tiny", "--views", "6")
-    alone("data", *given, "--out", str(tmp_path / "one"))
-    one, both = tmp_path / "one" / "data", tmp_path / "both" / "data"
-    said = killed_and_finished(both / "captures", "data", *given, "--out", str(both.parent))
+def test_two_processes_make_the_data_set_that_one_makes(data, tmp_path):
+    one, both = data, tmp_path / "data"
+    (said, _), _ = killed_and_finished(both / "captures", "data", "--preset", "tiny", "--out", str(tmp_path))
     assert "\nData set: " in "\n" + said
     assert files_in(both) == files_in(one)
     for name in files_in(one):
@@ -132,7 +127,7 @@ def test_two_processes_sweep_as_two_devices_do(outs):
     alone_on_two_devices(*command, str(outs[0]))
     task = tasks(TINY, load_statistics(outs[0] / "data"))[1]
     epoch = steps_of_an_epoch(task, load_statistics(outs[0] / "data"))
-    said = killed_and_finished(outs[1] / "sweep" / "entropy" / "latest" / str(epoch), *command, str(outs[1]))
+    (said, _), _ = killed_and_finished(outs[1] / "sweep" / "entropy" / "latest" / str(epoch), *command, str(outs[1]))
     assert "Best of 4" in said
     one, both = (json.loads((out / "sweep" / "entropy" / "members.json").read_text()) for out in outs)
     assert [member["dropped"] for member in both] == [member["dropped"] for member in one]
@@ -145,8 +140,10 @@ def test_two_processes_sweep_as_two_devices_do(outs):
 
 @pytest.mark.slow
 def test_two_processes_study_as_one_does(studied, tmp_path):
-    """Two seeds, from the data set to the exported system."""
+    """Two seeds, from the first recogniser to the exported system."""
     outs = studied, tmp_path
+    for made in ("data", "learned/turned"):
+        shutil.copytree(studied / made, tmp_path / made)
     given = ["--preset", "tiny", "--seeds", "2", "--learned.recogniser.optimiser.learning-rate", "1e-4"]
     given += ["--learned.ablations", "--learned.novel", "0", "--learned.rotation-epochs", "0", "--out", str(tmp_path)]
     less = replace(LEARNED.learned, ablations=(), novel=0, rotation_epochs=0)

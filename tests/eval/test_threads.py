@@ -18,22 +18,24 @@ def test_results_have_the_order_of_the_items(items, monkeypatch):
     """The first is done before any other begins; then three at a time, of which the later ones end first."""
     monkeypatch.setattr(threads, "programs_at_once", lambda: 3)
     done, most, running = [], 0, 0
-    lock = threading.Lock()
+    changed, expected = threading.Condition(), min(3, max(1, len(items) - 1)) * bool(items)
 
     def work(item: int) -> int:
         nonlocal most, running
         assert done or item == items[0]
-        with lock:
+        with changed:
             running += 1
             most = max(most, running)
+            changed.notify_all()
+            assert not done or changed.wait_for(lambda: most >= expected, timeout=60)
         time.sleep(0.02 * item)
-        with lock:
+        with changed:
             running -= 1
         done.append(item)
         return item + 10
 
     assert threads.by_threads(work, items) == [item + 10 for item in items]
-    assert most == min(3, max(1, len(items) - 1)) * bool(items)
+    assert most == expected
 
 
 def plus(one, added, *, times: int):

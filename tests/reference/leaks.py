@@ -7,7 +7,7 @@ whose seed is a hash of all that they are given, so that whatever leaks into the
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from typing import Any, TypeVar
@@ -152,9 +152,13 @@ def without_bootstrap(patch: pytest.MonkeyPatch) -> None:
     patch.setattr(comparison, "_intervals", lambda values: np.repeat(np.mean(values, axis=-1)[..., None], 2, axis=-1))
 
 
-def some_walks(seed: int, objects: int, starts: Sequence[int], views: int, steps: int) -> np.ndarray:
-    """Random walks (objects, starts, steps) from the start views, without repetition."""
+def some_walks(
+    seed: int, objects: int, starts: Sequence[int], views: int, steps: int, second: int | None = None
+) -> np.ndarray:
+    """Random walks (objects, starts, steps) from the start views, without repetition; their second view may be given."""
     scores = np.random.default_rng(seed).random((objects, len(starts), views))
+    if second is not None:
+        scores[..., second] = -0.5
     np.put_along_axis(scores, np.broadcast_to(np.array(starts)[:, None], (objects, len(starts), 1)), -1, axis=-1)
     return scores.argsort(axis=-1)[..., :steps].astype(np.int32)
 
@@ -173,15 +177,26 @@ def _read(tables: ViewTable, distances: jax.Array, views: jax.Array) -> tuple[ja
 
 
 def walk_grid_anyhow(
-    key: jax.Array, tables: ViewTable, graph: ViewGraph, knowledge: Any, policies: Sequence[PolicyRecord], **rest: Any
+    key: jax.Array,
+    tables: ViewTable,
+    graph: ViewGraph,
+    knowledge: Any,
+    policies: Sequence[PolicyRecord],
+    second: Mapping[str, int] | None = None,
+    **rest: Any,
 ) -> dict[str, Results]:
-    """In place of `run_grid`: the results of random walks, which depend on everything but the labels."""
+    """In place of `run_grid`: the results of random walks, which depend on everything but the labels.
+
+    Args:
+        second: the second view of all walks of some policies; what else they see is random, too.
+    """
     objects, backbones, views, _ = tables.logits.shape
     found = {}
     for policy in policies:
         given = _given(tables, policy.knows == "truth"), graph, knowledge, policy.name, sorted(rest.items())
         seed = seed_of((jax.random.key_data(key), given))
-        one = some_walks(seed, objects * backbones, range(views), views, rest["max_views"])
+        planted = (second or {}).get(policy.name)
+        one = some_walks(seed, objects * backbones, range(views), views, rest["max_views"], planted)
         walks = jnp.asarray(one.reshape(backbones, objects, views, -1))
         found[policy.name] = Results(*_read(tables, graph.distances, walks), walks[:, :, :, None])
     return found

@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from data_pipeline.errors import DataError, Unreadable
 from data_pipeline.files import CHECKS, keep_json, read_json, write_json
+from tests.reference.evaluation import some_statistics, some_tables
+from train.results.identity import made_by
 from train.results.kept import keep_beside, kept_array, kept_json
 from train.results.networks import check_config
 
@@ -125,3 +129,21 @@ def test_a_file_that_follows_from_another_is_kept(tmp_path, capsys):
     path.mkdir()
     with pytest.raises(Unreadable, match="it is a folder"):
         keep_beside(path, b"c\n")
+
+
+def test_what_a_result_is_made_of_is_named(tmp_path):
+    """A data set, and how each network was trained and how well; not how long that took."""
+    statistics, folder = some_statistics(some_tables()), tmp_path / "network"
+    summary = {"best_epoch": 2, "best": {"accuracy": 0.5}, "epoch": 3, "best_loss": 1.0, "seconds": 1.0, "steps": 9}
+    keep_json(folder / "config.json", {"task": {"seed": 0}})
+    keep_json(folder / "summary.json", summary | {"start": "random weights"})
+    one = made_by(statistics, folder)
+    assert made_by(replace(statistics, points_mean=99.0), folder) != one
+    assert made_by(statistics) != one
+    for name, changed in (("seconds", 2.0), ("best_epoch", 1), ("best", {"accuracy": 0.6})):
+        keep_json(folder / "summary.json", summary | {"start": "random weights", name: changed})
+        assert (made_by(statistics, folder) == one) == (name == "seconds")
+    keep_json(folder / "summary.json", summary | {"start": "random weights"})
+    assert made_by(statistics, folder) == one
+    keep_json(folder / "config.json", {"task": {"seed": 1}})
+    assert made_by(statistics, folder) != one

@@ -129,6 +129,37 @@ def test_reality_uses_the_policies_that_the_system_names(monkeypatch, tmp_path):
     check_fitted(*asked)
 
 
+def test_conditions_are_compared_with_what_they_differ_from(monkeypatch, tmp_path):
+    """All policies reach the same views; what is seen from above is also compared with perfect images from there."""
+    accuracy = {"clean": 1.0, "roll": 0.75, "upper": 0.5, "table": 0.25}
+    reaching = dict[str, list[Any]]()
+
+    def walks(walker, tables, condition, config):
+        before, found = len(seen.asked), real_walks(walker, tables, condition, config)
+        reaching[condition.name] = [reachable for *_, reachable in seen.asked[before:]]
+        right = np.arange(OBJECTS)[:, None, None] < OBJECTS * accuracy[condition.name]
+        return {part: replace(one, right=np.broadcast_to(right, one.right.shape)) for part, one in found.items()}
+
+    seen, real_walks = Seen("random"), reality._walks
+    seen.watch(monkeypatch)
+    without_bootstrap(monkeypatch)
+    monkeypatch.setattr(reality, "_walks", walks)
+    monkeypatch.setattr(reality, "objects_to_test", lambda data, up: source())
+    monkeypatch.setattr(reality, "meshes_of", lambda entries, most: ([(entry, None) for entry in entries], {}))
+    monkeypatch.setattr(reality, "_tables", tables_in_every_condition)
+    rows = check_reality({"one": system()}, "tested", tmp_path, RealityConfig(("roll", "table"))).systems["one"]
+    assert {row.policy for row in rows} == {"random", "thesis", "best"}
+    for name, there in (("clean", "clean"), ("roll", "clean"), ("upper", "upper"), ("table", "upper")):
+        for row in (row for row in rows if row.condition == name):
+            assert row.accuracy == accuracy[name]
+            assert row.loss == 1 - accuracy[name]
+            assert row.loss_there == accuracy[there] - accuracy[name]
+        above = [row is not None for row in reaching[name]]
+        assert len(above) == 3
+        assert above == [there == "upper"] * 3
+        assert all(row == reaching[name][0] for row in reaching[name])
+
+
 def tables_in_every_condition(systems, conditions, meshes, truth: np.ndarray, folder: Path, seed: int):
     return {name: {one.name: tables_of(truth) for one in conditions} for name in systems}
 

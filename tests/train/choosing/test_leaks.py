@@ -10,12 +10,13 @@ import numpy as np
 import pytest
 
 import eval.learned.stopping as stopping
+import train.choosing.stages as choosing
 from eval.learned.measure import APART
 from eval.learned.stopping import walks_apart
 from eval.learned.walks import OnLattice, Walking, by_network
 from eval.settings import TINY
 from tests.reference.leaks import CHANGES, check_fitted, check_tested
-from tests.reference.made_up_study import STUDIED, Study
+from tests.reference.made_up_study import STUDIED, VIEWS, Study
 from train.choosing.variants import VARIANTS
 
 FUSIONS = {
@@ -76,6 +77,30 @@ def test_the_prior_counts_training_objects(tmp_path, monkeypatch):
     stages = Study(None, tmp_path, monkeypatch, TINY.learned).stages
     stages.statistics = replace(STUDIED, counts=uneven)
     np.testing.assert_allclose(jnp.exp(stages.prior), np.array([1, 2, 5]) / 8, rtol=1e-6)
+
+
+def test_expected_views_are_of_training_objects_without_the_prior(tmp_path, monkeypatch):
+    """A recogniser says the prior, and more of the class of training objects. Validation objects are of one class."""
+    uneven = STUDIED.counts | {"train": {"a": 1, "b": 2, "c": 5}}
+    stages = Study(None, tmp_path, monkeypatch, TINY.learned).stages
+    stages.statistics = replace(STUDIED, counts=uneven)
+    directions, width = np.asarray(STUDIED.viewpoints), 8 * TINY.learned.recogniser.network.width
+
+    def outputs(data, split, task, network, ask=None, chosen=None):
+        labels = np.arange(30) % 3 if split == "train" else np.zeros(30)
+        named = labels.astype(int) if split == "train" else np.arange(30) % 3 // 2  # right in two of three cases
+        said = 3 * np.eye(3)[named][:, None] + np.asarray(stages.prior)
+        seen = [np.broadcast_to(said, (30, VIEWS, 3)), np.broadcast_to(directions, (30, VIEWS, 3))]
+        seen.append(np.broadcast_to(labels[:, None, None], (30, VIEWS, 1)))
+        features = [] if "answers" in getattr(ask, "__qualname__", "") else [np.zeros((30, VIEWS, width))]
+        return np.concatenate([*features, *seen], axis=-1).astype(np.float32)
+
+    monkeypatch.setattr(choosing, "network_outputs", outputs)
+    found = np.asarray(stages.expected_views().at(directions))
+    for label in range(3):
+        own, others = found[label, :, label], np.delete(found[label], label, axis=-1)
+        assert (own > others.max(axis=-1) + 0.5).all()
+        np.testing.assert_allclose(others[:, 0], others[:, 1], atol=1e-3)
 
 
 @pytest.mark.parametrize("change", CHANGES)

