@@ -179,7 +179,7 @@ def test_hostile_pickles_give_one_sentence_in_little_memory(tmp_path, hazard, ma
         (pickle.dumps([["0"]], 2), "list of storages"),
         (pickle.dumps("0", 2), "list of storages"),
         (pickle.dumps([], 2), "lacks the numbers"),
-        (b"", "ends early"),
+        (b"", "exhausted before"),
     ],
 )
 def test_numbers_that_do_not_follow_as_declared_are_refused(tmp_path, follows, message):
