@@ -74,13 +74,14 @@ def test_temperatures_serve_every_class_alike():
 
 @pytest.mark.slow
 def test_oracles_and_thresholds_are_of_their_walks(adding):
-    """Views of even number are right. From these start oracles; and thresholds are those of policies trained apart."""
+    """Views of even number are right, and surer than others. Oracles start there. Thresholds are of policies trained apart."""
     random = np.random.default_rng(1)
     even = np.arange(VIEWS) % 2 == 0
 
     def objects(count: int) -> OnLattice:
         data = features_of(np.arange(count) % CLASSES, np.tile(even, (count, 1)))
-        told = data.logits * random.uniform(0.2, 1.5, (count, VIEWS, 1)).astype(np.float32)
+        strength = np.where(even, 1.0, 0.3)[:, None] * random.uniform(0.8, 1.2, (count, VIEWS, 1))
+        told = data.logits * strength.astype(np.float32)
         return OnLattice(replace(data, features=told, logits=told))
 
     policies = []
