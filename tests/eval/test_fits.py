@@ -74,13 +74,14 @@ def test_temperatures_serve_every_class_alike():
 
 @pytest.mark.slow
 def test_oracles_and_thresholds_are_of_their_walks(adding):
-    """Views of even number are right. From these start oracles; and thresholds are those of policies trained apart."""
+    """Views of even number are right, and surer than others. Oracles start there. Thresholds are of policies trained apart."""
     random = np.random.default_rng(1)
     even = np.arange(VIEWS) % 2 == 0
 
     def objects(count: int) -> OnLattice:
         data = features_of(np.arange(count) % CLASSES, np.tile(even, (count, 1)))
-        told = data.logits * random.uniform(0.2, 1.5, (count, VIEWS, 1)).astype(np.float32)
+        strength = np.where(even, 1.0, 0.3)[:, None] * random.uniform(0.8, 1.2, (count, VIEWS, 1))
+        told = data.logits * strength.astype(np.float32)
         return OnLattice(replace(data, features=told, logits=told))
 
     policies = []
@@ -90,7 +91,7 @@ def test_oracles_and_thresholds_are_of_their_walks(adding):
         policies.append(by_network("learned", "", policy, adding))
     validation, test, thresholds = objects(24), objects(20), []
     for one in policies:
-        found, each = study(adding, policies[:1], validation, test, max_views=3, draws=1, apart=[one] * 2, others=False)
+        found, each = study(adding, policies[:1], (validation, test), Walking(3, 1), apart=[one] * 2, others=False)
         thresholds.append([row["ours"] and row["ours"]["threshold"] for row in found["costs"]["beside_thesis"]])
         for policy in each.values():
             assert policy.right[0].mean() == pytest.approx(0.5)
@@ -139,11 +140,12 @@ def test_the_risk_that_is_allowed_is_that_of_those_who_stop():
     assert row["excess"] == pytest.approx([0.25 - 0.1 * 0.5] * 2, abs=1e-6)
 
 
-@pytest.mark.parametrize("made_anew", ["networks", "policies", "tables", "version"])
-def test_walks_are_computed_anew_when_what_they_are_of_was(made_anew, tmp_path, monkeypatch):
+@pytest.mark.slow
+def test_walks_are_computed_anew_when_what_they_are_of_was(tmp_path, monkeypatch):
     """The data set and the recogniser, the view policies, or PointNet++; and when they mean something else."""
     config = replace(TINY.learned, max_views=3, draws=1, ablations=("look_ahead",), novel=1)
-    stages, computed, made = Study(None, tmp_path, monkeypatch, config).stages, list[str](), dict[str, int]()
+    stages, computed = Study(None, tmp_path, monkeypatch, config).stages, list[str]()
+    made = {"networks": 0, "policies": 0, "tables": 0}
 
     def walk(*given, **rest):
         computed.append("lattice")
@@ -153,23 +155,26 @@ def test_walks_are_computed_anew_when_what_they_are_of_was(made_anew, tmp_path, 
         computed.append("novel")
         return {name: np.ones((3, 4)) for name in ("random", "trained_with")}
 
-    monkeypatch.setattr(measuring, "made_by", lambda *given: f"networks {made.get('networks', 0)}")
-    monkeypatch.setattr(measuring, "read_json", lambda path: {"identity": made.get("policies", 0)})
+    def computed_with() -> list[str]:
+        for split in ("val", "test"):
+            tables = replace(some_tables(), made_by=str(made["tables"]))
+            save_view_tables(tmp_path / "tables" / f"{split}.npz", tables)
+        computed.clear()
+        measuring.measure(stages)
+        return sorted(computed)
+
+    monkeypatch.setattr(measuring, "made_by", lambda *given: str(made["networks"]))
+    monkeypatch.setattr(measuring, "read_json", lambda path: {"identity": made["policies"]})
     monkeypatch.setattr(measuring, "_decision", lambda stages: {})
     monkeypatch.setattr(measuring, "study", walk)
     monkeypatch.setattr(measuring, "novel_classes", walk_novel)
-    counts = []
-    for anew in (0, 1):
-        if anew:
-            made[made_anew] = 1
-            monkeypatch.setitem(VERSIONS, "walks", VERSIONS["walks"] + (made_anew == "version"))
-        for split in ("val", "test"):
-            tables = replace(some_tables(), made_by=f"tables {made.get('tables', 0)}")
-            save_view_tables(tmp_path / "tables" / f"{split}.npz", tables)
-        for _ in range(2):  # the second time, everything is there
-            computed.clear()
-            measuring.measure(stages)
-            counts.append(sorted(computed))
     every = ["lattice"] * 5 + ["novel"]
-    on_tables = ["lattice"] * 3  # with known and unknown pose, and ablations; others are of other views
-    assert counts == [every, [], on_tables if made_anew == "tables" else every, []]
+    assert computed_with() == every
+    assert computed_with() == []  # everything is there
+    for name in made:
+        made[name] += 1
+        # PointNet++ is used with known and unknown pose, and in ablations; others are of other views.
+        assert computed_with() == (["lattice"] * 3 if name == "tables" else every), name
+    monkeypatch.setitem(VERSIONS, "walks", VERSIONS["walks"] + 1)
+    assert computed_with() == every
+    assert computed_with() == []
