@@ -15,7 +15,6 @@ import numpy as np
 from data_pipeline.distributed import agreed, is_first, wait_for_all
 from data_pipeline.errors import Unreadable
 from data_pipeline.files import (
-    as_read,
     check_of,
     check_of_file,
     damage_in,
@@ -26,7 +25,7 @@ from data_pipeline.files import (
     write_bytes,
 )
 from data_pipeline.progress import console
-from train.results.identity import why, why_other
+from train.results.identity import why, why_other, why_other_stamp
 from train.results.records import as_json, from_json
 
 Result = TypeVar("Result")
@@ -152,7 +151,7 @@ def _kept_content(
     path: Path, identity: Any, compute: Callable[[], _Content], read: Callable[[dict[str, Any]], Result]
 ) -> Result:
     """Returns what `read` makes of a JSON file that `compute` gives the content of, with or without arrays beside it."""
-    identity = as_read(identity)
+    identity = as_json(identity)
 
     def load(path: Path) -> Any:
         content = read_json(path)
@@ -171,20 +170,17 @@ def _kept_content(
 
 
 def kept_array(path: Path, made: str, compute: Callable[[], np.ndarray]) -> np.ndarray:
-    """Returns the array of an `.npz` file; computes it first unless the file's `made_by` equals `made`."""
+    """Returns the array of an `.npz` file; computes it first unless the file's stamp (`stamp_of`) is `made`."""
 
     def load(path: Path) -> dict[str, np.ndarray]:
         with np.load(path) as stored:
             return {name: stored[name] for name in ("array", "made_by")}
 
-    def why_stale(stored: dict[str, np.ndarray]) -> str | None:
-        return why_other({"made_by": str(stored["made_by"])}, {"made_by": made})
-
     return kept(
         path,
         load,
         lambda path, content: keep(path, npz_bytes(**content)),
-        why_stale,
+        lambda stored: why_other_stamp(str(stored["made_by"]), made),
         lambda: {"array": compute(), "made_by": np.array(made)},
     )["array"]
 
