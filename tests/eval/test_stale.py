@@ -35,7 +35,8 @@ class Work:
         self.run = Run(out, STATISTICS, *tasks(TINY, STATISTICS))
         for name in ("classifier", "entropy"):
             self.train(name, 0.5)
-        monkeypatch.setattr(of_run, "load_best", lambda *_: None)
+        for network in ("classifier", "predictor"):
+            monkeypatch.setattr(Run, network, lambda *_: None)
         monkeypatch.setattr(of_run, "compute_view_tables", self._compute_tables)
         monkeypatch.setattr(evaluation, "load_ascent_scores", lambda *_: None)
         monkeypatch.setattr(evaluation, "run_study", self._study)
