@@ -285,7 +285,9 @@ def accuracy_table(number: int, views: int, results: ThesisResults) -> ThesisTab
         "Mean of the three backbones, over every start view of every test object; random selection in exact expectation. The "
         "thesis draws a random start view, and its random policy may repeat a view. 'pcd' is PointNet++."
     )
-    return _pairs(number, f"Accuracy of all pipelines, {views} views (%)", results, grids, found.max_views.tolist(), note)
+    return _pairs(
+        number, f"Accuracy of all pipelines, {views} views (%)", results, grids, found.max_views.tolist(), note
+    )
 
 
 def _views_used(results: ThesisResults) -> dict[str, np.ndarray]:

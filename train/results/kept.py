@@ -41,8 +41,8 @@ def keep(path: Path, content: bytes) -> None:
 
 
 def check_kept(path: Path) -> None:
-    """Raises `Unreadable` if a file is not as `keep` wrote it. Files without a check, such as older ones, are accepted."""
-    if (damage := damage_in(path.parent, [path.name])) is not None:
+    """Raises `Unreadable` if a file that is there is not as `keep` wrote it; one without a check, as older ones, is accepted."""
+    if path.exists() and (damage := damage_in(path.parent, [path.name])) is not None:
         raise Unreadable(path, damage.removeprefix(f"{path} ").replace("is not", "it is not", 1))
 
 
@@ -144,13 +144,10 @@ def arrays_beside(path: Path, content: dict[str, Any]) -> dict[str, np.ndarray]:
         return {name: stored[name] for name in stored.files}
 
 
-_Content = tuple[dict[str, Any], dict[str, np.ndarray] | None]
-
-
 def _kept_content(
-    path: Path, identity: Any, compute: Callable[[], _Content], read: Callable[[dict[str, Any]], Result]
+    path: Path, identity: Any, compute: Callable[[], Any], read: Callable[[dict[str, Any]], Result]
 ) -> Result:
-    """Returns what `read` makes of a JSON file that `compute` gives the content of, with or without arrays beside it."""
+    """Returns what `read` makes of a JSON file. `compute` gives its content, and the arrays beside it or None."""
     identity = as_json(identity)
 
     def load(path: Path) -> Any:
@@ -166,7 +163,8 @@ def _kept_content(
             content = content | {_ARRAYS: check_of(written)}
         keep(path, json_of(content | {"identity": identity}))
 
-    return kept(path, load, save, lambda stored: stored[0], compute)[1]
+    found: Any = kept(path, load, save, lambda stored: stored[0], compute)
+    return found[1]
 
 
 def kept_array(path: Path, made: str, compute: Callable[[], np.ndarray]) -> np.ndarray:
