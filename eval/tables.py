@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import flax.nnx as nnx
@@ -48,8 +48,8 @@ class ViewTables:
 
     def of_objects(self, chosen: Int[np.ndarray, " chosen"]) -> ViewTables:
         """Returns the tables of some of the objects."""
-        arrays = (array[chosen] for array in (self.labels, self.logits, self.predicted_entropy, self.entropy))
-        return ViewTables([self.names[at] for at in chosen], *arrays, self.made_by)
+        arrays = {name: getattr(self, name)[chosen] for name in ("labels", "logits", "predicted_entropy", "entropy")}
+        return replace(self, names=[self.names[at] for at in chosen], **arrays)
 
     @property
     def single_view_accuracy(self) -> float:

@@ -145,7 +145,9 @@ def confidence_of(
         on_test = _score(read(testing), jnp.asarray(labels))
         shown = reading in ("sum_of_logits", "temperature")
         readings[reading] = Reading(
-            *(np.asarray(on_test[name]) for name in ("accuracy", "ece", "nll")),
+            accuracy=np.asarray(on_test["accuracy"]),
+            ece=np.asarray(on_test["ece"]),
+            nll=np.asarray(on_test["nll"]),
             validation_ece=np.asarray(on_validation["ece"]),
             temperatures=np.asarray(temperatures[reading]) if reading in temperatures else None,
             reliability=np.asarray(on_test["reliability"]) if shown else None,

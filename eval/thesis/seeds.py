@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import product
 from pathlib import Path
@@ -57,21 +57,21 @@ class Row:
 def over_trainings(results: Sequence[ThesisResults]) -> list[Row]:
     """Returns a row for each main number: its mean over trainings, and intervals over objects and over both."""
 
-    def row(table: str, name: str, by_object: Callable[[ThesisResults], np.ndarray]) -> Row:
-        found = np.array([by_object(one) for one in results])  # (trainings, objects)
+    def row(table: str, name: str, by_object: Sequence[np.ndarray]) -> Row:
+        found = np.array(by_object)  # (trainings, objects)
         both, mean = interval_of_both(found), float(found.mean())
         return Row(table, name, mean, interval_of(found.mean(axis=0)), both, found.mean(axis=1))
 
     rows = []
     for views, frame in product(VIEWS, FRAMES):
         name = f"squared error of the entropies, {views} views, {frame} frame"
-        rows.append(row("4", name, lambda one, v=views, f=frame: one.entropy[v].frames[f].by_object))
+        rows.append(row("4", name, [one.entropy[views].frames[frame].by_object for one in results]))
     for backbone, views in product(BACKBONES, VIEWS):
         name = f"{backbone.title}: accuracy of single views, {views} views"
-        rows.append(row("6", name, lambda one, b=backbone.name, v=views: one.single_views[b][v].by_object))
+        rows.append(row("6", name, [one.single_views[backbone.name][views].by_object for one in results]))
     for (views, table), (gain, title) in product(zip(VIEWS, ("7", "12"), strict=True), _GAINS.items()):
         name = f"{title}, mean of all cells, {views} views"
-        rows.append(row(table, name, lambda one, v=views, g=gain: one.pipeline[v].gain[g].by_object))
+        rows.append(row(table, name, [one.pipeline[views].gain[gain].by_object for one in results]))
     return rows
 
 

@@ -118,8 +118,10 @@ def entropy_table(results: ThesisResults) -> ThesisTable:
     parts = [heading for views in VIEWS for heading in (f"{views} views", "sd", "camera", "mean map", "class map")]
     shares, differences = [], []
     for views, found in results.entropy.items():
-        world, camera = (100 * found.frames[frame].explained_variance for frame in ("world", "camera"))
-        shares.append(f"{views} views: {world:.1f} % in the world frame, {camera:.1f} % in the camera frame")
+        explained = {frame: 100 * of.explained_variance for frame, of in found.frames.items()}
+        shares.append(
+            f"{views} views: {explained['world']:.1f} % in the world frame, {explained['camera']:.1f} % in the camera frame"
+        )
         low, high = found.camera_minus_world.interval
         difference = f"{found.camera_minus_world.mse:+.4f} [{low:+.4f}, {high:+.4f}] for {views} views"
         differences.append(difference.replace("-", "−"))
