@@ -28,8 +28,8 @@ from data_pipeline.dataset.batches import train_batches
 from data_pipeline.dataset.builder import prepare
 from data_pipeline.dataset.statistics import load_statistics
 from data_pipeline.files import write_json
+from eval.runs import tasks
 from eval.settings import SMALL, TINY
-from eval.stages import tasks
 from mevs_jax import fibonacci_sphere
 from mevs_jax.beliefs.fusing import CalibratedFusion
 from mevs_jax.models.set_fusion import SetFusion

@@ -36,7 +36,7 @@ from benchmarks.comparing import (
     torch_peers,
 )
 from benchmarks.reporting import RESULTS, Row, Table, keep, machine_name
-from eval.numbers.timing import time_local_maxima
+from eval.thesis.timing import time_local_maxima
 from mevs_jax import (
     NextView,
     PointNet2,
@@ -217,7 +217,7 @@ def main(guard: bool = False) -> None:
     if guard:
         end_by_guard(rows, PATH)
     decided = DECISIONS.show(decisions(clouds))
-    maxima = {name: 1000 * taken for name, taken in time_local_maxima(40, objects=1000).items()}
+    maxima = {name: 1000 * taken for name, taken in vars(time_local_maxima(40, objects=1000)).items()}
     last = f"Local maxima of a map of 40 views: {maxima['alone']:.0f} µs alone, {maxima['batched']:.2f} µs as one of 1,000."
     print(last)
     parts = (

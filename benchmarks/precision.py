@@ -29,8 +29,8 @@ from benchmarks.reporting import RESULTS, Row, Table, machine_name
 from data_pipeline.dataset.statistics import load_statistics
 from data_pipeline.files import write_text
 from eval.run_file import load_run
+from eval.runs import tasks
 from eval.settings import SMALL
-from eval.stages import tasks
 from eval.tables import objects_of
 from mevs_jax import ViewGraph, bootstrap_interval, maxima_first
 from mevs_jax.models.batch_norm import BatchNorm

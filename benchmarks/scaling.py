@@ -30,8 +30,8 @@ from data_pipeline.dataset.builder import prepare
 from data_pipeline.dataset.statistics import DatasetStatistics, load_statistics
 from data_pipeline.distributed import join_processes
 from data_pipeline.files import write_json
+from eval.runs import tasks
 from eval.settings import SMALL, THESIS
-from eval.stages import tasks
 from train.running.devices import device_mesh, parameter_sharding, place, place_batch
 from train.step import Task, initial_state, train_step_of
 

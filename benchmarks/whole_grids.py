@@ -151,7 +151,7 @@ def main(
         "left_out": left_out,
         "epochs": epochs,
         "seconds": time.perf_counter() - started,
-        "machine": machine(),
+        "machine": vars(machine()),
     }
     write_json(RESULTS / "whole_grids.json", result)
     print(result)

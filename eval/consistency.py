@@ -1,19 +1,52 @@
-"""Comparison of settings with those that a run was made with. Later stages refuse settings that differ."""
+"""Checks of settings: that work can begin with them, and that a run was made with them. Later stages refuse others."""
 
 from __future__ import annotations
 
-from dataclasses import asdict
+import re
+import tempfile
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 from data_pipeline.dataset.config import made_with_other_settings
 from data_pipeline.differences import differences, in_words
 from data_pipeline.errors import DataError
-from data_pipeline.files import as_read
 from eval.run_file import NAME, plain
 from eval.settings import Settings
+from eval.walks.grid import FIRST_MV, GridConfig
 from train.own_code import named
 from train.results.identity import config_of
+from train.results.records import as_json
+
+MOST_SEEDS = 1000
+"""Largest number of seeds of a run."""
+
+
+def check_output(out: Path) -> None:
+    """Raises `DataError` if the directory `out` is not writable, or an address of object storage."""
+    if len(out.parts) > 1 and re.fullmatch(r"[a-z][a-z0-9+.-]+:", out.parts[0]):  # `Path` has made one slash of two
+        raise DataError(
+            f"--out {out.parts[0]}//{'/'.join(out.parts[1:])} is an address, and a run needs a folder whose files can be renamed "
+            f"and locked; mount that storage, and give the folder"
+        )
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+        with tempfile.NamedTemporaryFile(prefix=".probe.", dir=out):
+            pass
+    except OSError as error:
+        raise DataError(f"cannot write to {out} ({error.strerror}); choose another --out") from error
+
+
+def check_evaluation(config: GridConfig) -> None:
+    """Raises `DataError` if the grid has no cells."""
+    if config.max_views < FIRST_MV or config.draws < 1:
+        raise DataError("--evaluation.max-views must be at least 2 and --evaluation.draws at least 1")
+
+
+def check_seeds(settings: Settings) -> None:
+    """Raises `DataError` for an impossible number of seeds."""
+    if not 1 <= settings.seeds <= MOST_SEEDS:
+        raise DataError(f"--seeds {settings.seeds} is not from 1 to {MOST_SEEDS}; choose another")
 
 
 def check_made_with(settings: Settings, out: Path) -> None:
@@ -24,11 +57,7 @@ def check_made_with(settings: Settings, out: Path) -> None:
     Raises:
         DataError: names what differs.
     """
-    found = made_with_other_settings(settings.dataset, out / "data")
-    for name, wanted in (("classifier", _classifier(settings)), ("entropy", _entropy(settings))):
-        if not (out / name / "config.json").exists():
-            continue
-        found |= _differences(config_of(out / name)["task"], wanted, name)
+    found = made_with_other_settings(settings.dataset, out / "data") | _in_networks(plain(settings), out)
     if found:
         given = f"{out / NAME} says" if (out / NAME).exists() else "the options say"
         raise DataError(
@@ -39,50 +68,40 @@ def check_made_with(settings: Settings, out: Path) -> None:
 
 def check_classifier(settings: Settings, out: Path) -> None:
     """Raises `DataError` if the settings of the classifier are not those that the run's was trained with; names what differs."""
-    if not (out / "classifier" / "config.json").exists():
-        return
-    if found := _differences(config_of(out / "classifier")["task"], _classifier(settings), "classifier"):
+    if found := _in_networks(plain(settings), out, ("classifier",)):
         raise DataError(
             f"{out} has a classifier trained with other settings ({in_words(found)}); leave these options out, or choose another "
             f"--out"
         )
 
 
-def check_evaluated_with(settings: Settings, metrics: dict[str, Any], out: Path) -> None:
-    """Raises `DataError` if the metrics were made with other settings of the evaluation; names what differs."""
-    made = metrics.get("identity", {}).get("evaluation", {})
-    if found := differences(made, as_read(asdict(settings.evaluation)), "evaluation", shared=True):
+def check_evaluated_with(config: GridConfig, identity: Mapping[str, Any], out: Path) -> None:
+    """Raises `DataError` if `metrics.json`, with this identity, is of other settings of the evaluation; names what differs."""
+    if found := differences(identity.get("evaluation", {}), as_json(config), "evaluation", shared=True):
         raise DataError(
             f"{out / 'metrics.json'} was made with other settings ({in_words(found)}); make it again with: mevs eval --out {out}"
         )
 
 
-def _classifier(settings: Settings) -> dict[str, Any]:
-    config = settings.classifier
-    wanted = {
-        "images": config.images,
-        "augmentation": asdict(config.augmentation),
-        "optimiser": asdict(config.optimiser),
-        "reality": asdict(config.reality) if config.reality.strength else None,
-    }
-    network = plain(settings)["classifier"]["network"]
-    if config.encoder:
-        module, name = named(config.encoder)
-        network |= {"module": module, "name": name}
-    return as_read(wanted | {"network_config": network})
+def _in_networks(
+    content: dict[str, Any], out: Path, names: tuple[str, ...] = ("classifier", "entropy")
+) -> dict[str, tuple[Any, Any]]:
+    """The differences of the networks that are there from the content of all settings, under the names of the settings."""
+    found: dict[str, tuple[Any, Any]] = {}
+    for name in names:
+        if (out / name / "config.json").exists():
+            found |= _in_network(config_of(out / name)["task"], as_json(content[name]), name)
+    return found
 
 
-def _entropy(settings: Settings) -> dict[str, Any]:
-    config = settings.entropy
-    wanted = {"augmentation": asdict(config.augmentation), "optimiser": asdict(config.optimiser)}
-    return as_read(wanted | {"network_config": asdict(config.network)})
-
-
-def _differences(was: dict[str, Any], wanted: dict[str, Any], place: str) -> dict[str, tuple[Any, Any]]:
-    """The differences of a network's task, under the names of the settings."""
-    before, now = was.get("network_config", {}), wanted["network_config"]
+def _in_network(was: dict[str, Any], wanted: dict[str, Any], name: str) -> dict[str, tuple[Any, Any]]:
+    before, now = was.get("network_config", {}), wanted.pop("network")
+    if encoder := wanted.pop("encoder", ""):
+        now["module"], now["name"] = named(encoder)
     if ("module" in before) != ("module" in now):
         shown = (f"{network['module']}:{network['name']}" if "module" in network else "" for network in (before, now))
-        return {f"{place}.encoder": tuple(shown)}  # type: ignore[dict-item]
-    found = differences({"reality": None} | was, wanted, place, shared=True)
-    return {name.replace(".network_config", ".network"): pair for name, pair in found.items()}
+        return {f"{name}.encoder": tuple(shown)}  # type: ignore[dict-item]
+    if "reality" in wanted and not wanted["reality"]["strength"]:
+        wanted["reality"] = None
+    found = differences({"reality": None} | was, wanted | {"network_config": now}, name, shared=True)
+    return {place.replace(".network_config", ".network"): pair for place, pair in found.items()}

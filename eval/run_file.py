@@ -52,13 +52,13 @@ def load_run(out: Path) -> RunFile | None:
 
 
 def save_run(out: Path, preset: str, settings: Settings, arguments: list[str]) -> None:
-    """Writes `run.json`; a file that holds the same settings already is left as it is."""
-    content, path = as_read(configuration(preset, settings)), out / NAME
+    """Writes `run.json`; a file that holds the same settings, and was written by the same versions, is left as it is."""
+    content, path = as_read(configuration(preset, settings) | {"made_with": _made_with()}), out / NAME
     if settings.classifier.encoder:
         content["encoder"] = _encoder(out, settings.classifier.encoder)
     if path.exists() and {name: value for name, value in read_json(path).items() if name in content} == content:
         return
-    keep_json(path, content | {"arguments": arguments, "made_with": _made_with()})
+    keep_json(path, content | {"arguments": arguments})
 
 
 def configuration(preset: str, settings: Settings) -> dict[str, Any]:

@@ -12,25 +12,25 @@ from pathlib import Path
 from typing import Any
 
 import jax
+import numpy as np
 
 from data_pipeline.dataset.statistics import load_statistics
 from data_pipeline.distributed import is_first, wait_for_all
 from data_pipeline.errors import DataError
-from data_pipeline.progress import console
 from eval import stages
+from eval.evaluation import policies_on
+from eval.numbers.metrics import OverTrainings
 from eval.numbers.policies import EvaluationInputs
 from eval.numbers.trainings import csv_over_trainings, rows_over_trainings, walks_of_all
 from eval.run_file import save_run
 from eval.settings import Settings
+from eval.training import say_trained, trainings
+from eval.walks.own_policies import own_identity
 from train.many.seeds import check_networks, train_seeds
-from train.results.chance import warn_of_chance
-from train.results.identity import made_by
-from train.results.kept import keep_beside, kept_json
+from train.results.identity import identity_of, made_by
+from train.results.kept import keep_beside, kept_record
 from train.running.devices import device_mesh
 from train.weights.starting import StartingWeights
-
-LARGEST = 1000
-"""Largest number of seeds of a run."""
 
 
 def seed_folder(out: Path, number: int) -> Path:
@@ -43,12 +43,6 @@ def seed_settings(settings: Settings, number: int) -> Settings:
     classifier = replace(settings.classifier, optimiser=settings.classifier.optimiser.shifted(number))
     entropy = replace(settings.entropy, optimiser=settings.entropy.optimiser.shifted(number))
     return replace(settings, classifier=classifier, entropy=entropy, seeds=1)
-
-
-def check_seeds(settings: Settings) -> None:
-    """Raises `DataError` for an impossible number of seeds."""
-    if not 1 <= settings.seeds <= LARGEST:
-        raise DataError(f"--seeds {settings.seeds} is not from 1 to {LARGEST}; choose another")
 
 
 def make_folders(settings: Settings, preset: str, out: Path, arguments: Sequence[str]) -> None:
@@ -84,7 +78,7 @@ def train(
     statistics, numbers = load_statistics(out / "data"), range(settings.seeds)
     size, mesh = at_once or settings.seeds, mesh or device_mesh()
     parts = [slice(first, first + size) for first in range(0, settings.seeds, size)]
-    seeds = [stages.trainings(seed_settings(settings, number), statistics, start) for number in numbers]
+    seeds = [trainings(seed_settings(settings, number), statistics, start) for number in numbers]
     networks = []
     for same in zip(*seeds, strict=True):
         name, weights = same[0][1], [weights for _, _, weights in same]
@@ -103,15 +97,10 @@ def train(
                 tasks[part], out / "data", statistics, folders[part], work, weights[part], mesh, option
             )
         for number, summary in enumerate(summaries):
-            best = ", ".join(f"{key} {value:.4f}" for key, value in summary["best"].items())
-            console.print(
-                f"{tasks[number].name}, seed {number}: best epoch {summary['best_epoch']} of {summary['epoch']}, "
-                f"validation {best}"
-            )
-            warn_of_chance(tasks[number], summary, statistics)
+            say_trained(tasks[number], summary, statistics, f", seed {number}")
 
 
-def evaluate(settings: Settings, out: Path) -> dict[str, Any]:
+def evaluate(settings: Settings, out: Path) -> OverTrainings:
     """Evaluates the run of every seed, and all together; returns what `seeds.json` holds."""
     runs = [seed_folder(out, number) for number in range(settings.seeds)]
     if missing := [run for run in runs if not (run / "classifier").is_dir()]:
@@ -121,25 +110,23 @@ def evaluate(settings: Settings, out: Path) -> dict[str, Any]:
     for number, run in enumerate(runs):
         stages.evaluate(seed_settings(settings, number), run)
     statistics = load_statistics(out / "data")
-    own = stages.policies_of(settings, statistics)
-    identity = {
-        "evaluation": vars(settings.evaluation),
-        "made_by": [made_by(statistics, run / "classifier", run / "entropy") for run in runs],
-        "policies": [policy.identity for policy in own],
-    }
+    own = policies_on(settings.policies, statistics)
+    identity = identity_of(
+        "seeds",
+        evaluation=settings.evaluation,
+        made_by=[made_by(statistics, run / "classifier", run / "entropy") for run in runs],
+        policies=[own_identity(policy) for policy in own],
+    )
 
-    def compute() -> dict[str, Any]:
+    def compute() -> OverTrainings:
         inputs = [replace(EvaluationInputs.of_run(run), config=settings.evaluation) for run in runs]
-        rungs, results = walks_of_all(inputs, own)
-        return {
-            "seeds": settings.seeds,
-            "objects": len(inputs[0].tables.names),
-            "single_view": [
-                float((one.tables.logits.argmax(-1) == one.tables.labels[:, None]).mean()) for one in inputs
-            ],
-            "rows": rows_over_trainings(rungs, results),
-        }
+        return OverTrainings(
+            seeds=settings.seeds,
+            objects=len(inputs[0].tables.names),
+            single_view=np.array([one.tables.single_view_accuracy for one in inputs]),
+            rows=rows_over_trainings(*walks_of_all(inputs, own)),
+        )
 
-    found = kept_json(out / "seeds.json", identity, compute)
-    keep_beside(out / "seeds.csv", csv_over_trainings(found["rows"]))
+    found = kept_record(out / "seeds.json", OverTrainings, identity, compute)
+    keep_beside(out / "seeds.csv", csv_over_trainings(found.rows))
     return found

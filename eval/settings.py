@@ -7,9 +7,7 @@ from dataclasses import dataclass, replace
 from data_pipeline.capture.casting import CaptureConfig
 from data_pipeline.dataset.augment import CloudAugmentation, ViewAugmentation
 from data_pipeline.dataset.builder import DataConfig
-from eval.checks.agent import AgentConfig
-from eval.rendering.ascent import AscentConfig
-from eval.rendering.policies import RenderingConfig
+from eval.config import AgentConfig, AscentConfig, RenderingConfig
 from eval.walks.grid import GridConfig
 from eval.walks.live import LiveConfig
 from mevs_jax.models import Abstraction

@@ -14,8 +14,8 @@ from data_pipeline.dataset.config import check_same_data
 from data_pipeline.dataset.statistics import load_statistics
 from data_pipeline.distributed import agreed, is_first
 from data_pipeline.errors import DataError
-from eval import stages
 from eval.report.sweep import write_sweep_report
+from eval.runs import tasks
 from eval.settings import Settings
 from train.choosing.stages import Stages
 from train.many.members import Member, SweepTask
@@ -34,7 +34,7 @@ def train_sweep(settings: Settings, out: Path, mesh: jax.sharding.Mesh | None = 
         study.prepare()
         task, data, statistics = study.task(), study.turned, study.statistics
     else:
-        task = stages.tasks(settings, statistics)[("classifier", "entropy").index(name)]
+        task = tasks(settings, statistics)[("classifier", "entropy").index(name)]
     folder = out / "sweep" / name
     members = sweep(task, data, statistics, folder, settings.sweep, mesh)
     if is_first():

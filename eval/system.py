@@ -14,7 +14,6 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from flax import nnx
 from jaxtyping import Array, Float, Int
 
 from data_pipeline.dataset.inputs import view_camera
@@ -23,7 +22,9 @@ from data_pipeline.errors import DataError
 from data_pipeline.files import as_read, digest_of
 from data_pipeline.progress import console
 from eval.numbers.confidence import logits_along
+from eval.numbers.metrics import Metrics
 from eval.run_file import versions_of
+from eval.runs import Run
 from eval.tables import ViewTables
 from eval.walks.grid import run_grid
 from eval.walks.knowledge import learn
@@ -47,7 +48,8 @@ from mevs_jax.trained import (
     verify,
 )
 from mevs_jax.trained.description import FORM
-from train.tasks.classifier import ClassifierTask, ResNetConfig
+from train.results.identity import stamp_of
+from train.tasks.classifier import ResNetConfig
 from train.tasks.entropy import EntropyTask
 
 _USABLE = tuple(
@@ -106,7 +108,7 @@ def walk_validation(tables: ViewTables, graph: ViewGraph, max_views: int, seed: 
     half = np.argsort(np.random.default_rng(seed).permutation(len(tables.labels))) % 2
     parts: dict[str, list[tuple[np.ndarray, np.ndarray]]] = {name: [] for name in USABLE}
     for held in range(2):
-        walking, other = (_some(tables, np.flatnonzero((half == held) == inside)) for inside in (True, False))
+        walking, other = (tables.of_objects(np.flatnonzero((half == held) == inside)) for inside in (True, False))
         knowledge = learn(other.logits, other.labels)
         one_backbone = walking.stacked()
         found = run_grid(
@@ -127,12 +129,6 @@ def walk_validation(tables: ViewTables, graph: ViewGraph, max_views: int, seed: 
         temperatures[name] = np.asarray(_fit(jnp.asarray(logits), jnp.asarray(labels)))
         after[name] = (np.cumsum(logits, axis=1).argmax(-1) == labels[:, None]).mean(axis=0)
     return OnValidation(temperatures, after)
-
-
-def _some(tables: ViewTables, chosen: np.ndarray) -> ViewTables:
-    names = [tables.names[index] for index in chosen]
-    arrays = (tables.labels, tables.logits, tables.predicted_entropy, tables.entropy)
-    return ViewTables(names, *(array[chosen] for array in arrays))
 
 
 def resnet_shape(config: ResNetConfig, channels: int) -> ResNetShape:
@@ -173,55 +169,38 @@ def data_of(statistics: DatasetStatistics) -> DataDescription:
     return DataDescription(statistics.source, statistics.fingerprint, objects)
 
 
-def figures_of(metrics: dict[str, Any]) -> dict[str, Any]:
-    """Figures of a run's evaluation that a system carries: accuracy by policy and number of views, with intervals."""
-    policies = {name: of for name, of in metrics["policies"].items() if name in USABLE}
+def figures_of(metrics: Metrics) -> dict[str, Any]:
+    """Figures of a run's evaluation that a system carries: accuracy by policy and number of views."""
     return {
-        "objects": metrics["objects"],
-        "single_view": metrics["single_view"]["accuracy"],
-        "after_views": {name: of["after_views"] for name, of in policies.items()},
+        "objects": metrics.objects,
+        "single_view": metrics.single_view.accuracy,
+        "after_views": {name: of.after_views.tolist() for name, of in metrics.policies.items() if name in USABLE},
     }
 
 
-def classifier_system(
-    statistics: DatasetStatistics,
-    classify: ClassifierTask,
-    classifier: nnx.Module,
-    predict: EntropyTask,
-    predictor: nnx.Module,
-    validation: ViewTables,
-    evaluation: dict[str, Any],
-    max_views: int,
-    made_by: str,
-) -> TrainedSystem:
+def system_of_run(run: Run, evaluation: dict[str, Any], max_views: int, made_by: str) -> TrainedSystem:
     """Returns the trained system of a run: classifier, entropy predictor, class × view table.
 
     Args:
-        statistics: of the data set.
-        validation: view tables of the validation objects by these networks.
         evaluation: figures to carry.
         max_views: number of views that temperatures are fitted for.
         made_by: identifies what the system is made from.
     """
-    graph = statistics.graph
-    max_views = min(max_views, statistics.views)
+    statistics, graph, validation = run.statistics, run.statistics.graph, run.tables("val")
     console.print(f"Calibrating {len(USABLE)} policies on {len(validation.labels)} validation objects")
-    walks = walk_validation(validation, graph, max_views)
-    labels, classes = validation.labels, len(statistics.classes)
-    knowledge = learn(validation.logits, labels)
-    single = fit_temperature(
-        jnp.asarray(validation.logits).reshape(-1, classes), jnp.repeat(jnp.asarray(labels), statistics.views)
-    )
-    shape, cloud = pointnet2_shape(predict)
-    assert isinstance(classify.network_config, ResNetConfig)  # of an encoder of the user's no system is made
-    channels = classify.network_config.channels
+    walks = walk_validation(validation, graph, min(max_views, statistics.views))
+    logits, labels = jnp.asarray(validation.logits), jnp.asarray(validation.labels)
+    knowledge = learn(validation.logits, validation.labels)
+    shape, cloud = pointnet2_shape(run.predict)
+    network = run.classify.network_config
+    assert isinstance(network, ResNetConfig)  # of an encoder of the user's no system is made
     description = Description(
         form=FORM,
         kind="classifier",
         classes=tuple(statistics.classes),
         camera=view_camera(statistics.camera),
-        image=ImageInput(classify.images, channels),
-        encoder=resnet_shape(classify.network_config, channels),
+        image=ImageInput(run.classify.images, network.channels),
+        encoder=resnet_shape(network, network.channels),
         best=walks.best,
         best_unposed=_WITHOUT_YAW,
         chosen_by="highest mean accuracy after 2 to 4 views on validation objects",
@@ -234,13 +213,27 @@ def classifier_system(
         | {"validation_after_views": {name: after.tolist() for name, after in walks.after.items()}},
     )
     parts = Parts(
-        encoder=Network.of(classifier),
+        encoder=Network.of(run.classifier()),
         viewpoints=graph.points,
         neighbours=graph.neighbours,
-        single=single,
-        entropy=Network.of(predictor),
+        single=fit_temperature(logits.reshape(-1, logits.shape[-1]), jnp.repeat(labels, statistics.views)),
+        entropy=Network.of(run.predictor()),
         knowledge=Knowledge(knowledge.order, knowledge.expected_logits),
         temperatures={name: jnp.asarray(values) for name, values in walks.temperatures.items()},
         strangeness=fit_strangeness(validation.logits, statistics.views),
     )
     return TrainedSystem(description, parts)
+
+
+def make_run_system(run: Run, metrics: Metrics, max_views: int) -> Path:
+    """Writes the trained system of a run into `system/`, unless it is there already; returns the folder.
+
+    Args:
+        metrics: of the run's evaluation.
+        max_views: number of views that temperatures are fitted for.
+    """
+    folder, figures = run.out / "system", figures_of(metrics)
+    made = stamp_of("system", identity_of(run.made_by(), figures, max_views))
+    if not stored_system(folder, made):
+        save_system(system_of_run(run, figures, max_views, made), folder)
+    return folder

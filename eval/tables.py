@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import flax.nnx as nnx
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Int
 
 from data_pipeline.dataset.builder import open_split
 from data_pipeline.dataset.statistics import DatasetStatistics
@@ -45,12 +46,22 @@ class ViewTables:
         """Whether no number is infinite or NaN."""
         return all(np.isfinite(array).all() for array in (self.logits, self.predicted_entropy, self.entropy))
 
+    def of_objects(self, chosen: Int[np.ndarray, " chosen"]) -> ViewTables:
+        """Returns the tables of some of the objects."""
+        arrays = {name: getattr(self, name)[chosen] for name in ("labels", "logits", "predicted_entropy", "entropy")}
+        return replace(self, names=[self.names[at] for at in chosen], **arrays)
+
+    @property
+    def single_view_accuracy(self) -> float:
+        """Share of the views whose prediction is right."""
+        return float((self.logits.argmax(-1) == self.labels[:, None]).mean())
+
     def stacked(self) -> ViewTable:
         """Returns one `ViewTable` with a leading axis of objects for `vmap`."""
-        logits, predicted_entropy, entropy, labels = map(
+        logits, predicted, entropy, labels = map(
             jnp.asarray, (self.logits, self.predicted_entropy, self.entropy, self.labels)
         )
-        return ViewTable(logits, predicted_entropy, entropy, labels)
+        return ViewTable(logits, predicted, entropy, labels)
 
 
 def objects_of(data: Path, split: str, statistics: DatasetStatistics) -> tuple[list[str], np.ndarray, np.ndarray]:

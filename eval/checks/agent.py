@@ -26,6 +26,7 @@ from data_pipeline.objects.mesh import Mesh
 from data_pipeline.progress import progress_bar
 from eval.checks.camera import Pair, pairs, summary
 from eval.checks.walks import Walker, as_table, beliefs_along, with_interval
+from eval.config import AgentConfig
 from eval.numbers.confidence import stopping as by_risk
 from eval.tables import ViewTables
 from eval.walks.live import Agreement
@@ -35,22 +36,6 @@ from mevs_jax.trained import TrainedSystem
 
 STOPS = (0.9, 0.95, 0.99)
 _CENTER, _RADIUS = np.array([0.4, -0.3, 0.7]), 0.25
-
-
-@dataclass(frozen=True)
-class AgentConfig:
-    """The check of an agent."""
-
-    objects: int = 200
-    """number of test objects that agents walk around"""
-    max_views: int = 8
-    """views of each walk"""
-    shots: int = 20
-    """random cameras around each object, at each distance"""
-    distances: tuple[float, ...] = (1.5, 2.0, 3.0, 4.0, 5.0, 6.0)
-    """of these cameras from the object's centre, in radii"""
-    calls: int = 400
-    """decisions whose time is measured"""
 
 
 @dataclass(frozen=True)

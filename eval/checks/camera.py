@@ -15,7 +15,7 @@ import numpy as np
 
 from data_pipeline.capture.casting import Cast, default_caster
 from data_pipeline.objects.mesh import Mesh
-from eval.numbers import timing
+from eval import machine
 from mevs_jax import CanonicalView, ViewCamera, canonical_view, look_at_origin, pixel_directions
 
 SIZES = ((320, 240), (640, 480), (848, 480), (1280, 720))
@@ -257,4 +257,4 @@ def milliseconds(
             image, shot.K, shot.T_world_camera, center=shot.center, radius=shot.radius, camera=camera, mask=image > 0
         )
 
-    return timing.milliseconds(convert, [depth] * calls)
+    return machine.milliseconds(convert, [depth] * calls)

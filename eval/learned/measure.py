@@ -28,8 +28,7 @@ from eval.learned.poses import UnknownPose, of_any_rotation, of_unknown_yaw
 from eval.learned.stopping import MOVEMENT_COSTS, VIEW_COSTS
 from eval.learned.study import novel_classes, novel_metrics, study
 from eval.learned.walks import OnLattice, Walking, by_network
-from eval.machine import machine
-from eval.numbers.timing import milliseconds
+from eval.machine import machine, milliseconds
 from eval.tables import load_view_tables
 from mevs_jax.models.expected_views import ExpectedViews
 from mevs_jax.models.view_policy import expected_gain

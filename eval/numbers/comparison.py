@@ -5,13 +5,12 @@ The bootstrap resamples objects with the same draws everywhere, so every differe
 
 from __future__ import annotations
 
-from typing import Any
-
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Shaped
 
+from eval.numbers.metrics import Difference, Reach, Summary
 from eval.walks.grid import Results
 from mevs_jax.beliefs.metrics import bootstrap_interval, bootstrap_means
 
@@ -28,9 +27,14 @@ def _intervals(values: jax.Array) -> jax.Array:
     return jax.vmap(lambda cell: bootstrap_interval(key, cell))(flat).reshape(*values.shape[:-1], 2)
 
 
+def interval_of(values: Shaped[np.ndarray, "*cells objects"]) -> Float[np.ndarray, "*cells 2"]:
+    """95 % intervals of means over the objects."""
+    return np.asarray(_intervals(jnp.asarray(values, jnp.float32)), float)
+
+
 def intervals(values: np.ndarray) -> list:
-    """95 % intervals of means over the last axis, the objects; two numbers for a single cell."""
-    return np.asarray(_intervals(jnp.asarray(values, jnp.float32)), float).tolist()
+    """As `interval_of`, in lists."""
+    return interval_of(values).tolist()
 
 
 def interval_of_both(values: Float[np.ndarray, "*cells trainings objects"]) -> Float[np.ndarray, "*cells 2"]:
@@ -73,35 +77,34 @@ def cells(results: Results) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndar
     return tuple(np.moveaxis(np.asarray(array[0]), 0, -1) for array in arrays)  # type: ignore[return-value]
 
 
-def summarise(results: Results, labels: np.ndarray) -> dict[str, Any]:
-    """Metrics of one policy with their intervals, (MV, CT) or by number of views."""
+def summarise(results: Results, labels: np.ndarray) -> Summary:
+    """Metrics of one policy with their intervals."""
     right, used, after, travelled = cells(results)
-    return {
-        "accuracy": right.mean(axis=-1).tolist(),
-        "interval": intervals(right),
-        "class_accuracy": class_mean(right, labels).tolist(),
-        "views_used": used.mean(axis=-1).tolist(),
-        "after_views": after.mean(axis=-1).tolist(),
-        "after_views_interval": intervals(after),
-        "travelled": travelled.mean(axis=-1).tolist(),
-        "area": float(after.mean()),
-        "area_interval": intervals(after.mean(axis=0)),
-    }
+    return Summary(
+        accuracy=right.mean(axis=-1),
+        interval=interval_of(right),
+        class_accuracy=np.asarray(class_mean(right, labels)),
+        views_used=used.mean(axis=-1),
+        after_views=after.mean(axis=-1),
+        after_views_interval=interval_of(after),
+        travelled=travelled.mean(axis=-1),
+        area=float(after.mean()),
+        area_interval=interval_of(after.mean(axis=0)),
+    )
 
 
-def difference(results: Results, base: Results) -> dict[str, Any]:
+def difference(results: Results, base: Results) -> Difference:
     """Differences of one policy from another on the same objects and start views."""
-    (right, used, after, _), (base_right, base_used, base_after, _) = cells(results), cells(base)
-    gain, gain_after, gain_used = right - base_right, after - base_after, used - base_used
-    return {
-        "difference": gain.mean(axis=-1).tolist(),
-        "interval": intervals(gain),
-        "after_views_difference": gain_after.mean(axis=-1).tolist(),
-        "after_views_interval": intervals(gain_after),
-        "views_used_difference": gain_used.mean(axis=-1).tolist(),
-        "area_difference": float(gain_after.mean()),
-        "area_interval": intervals(gain_after.mean(axis=0)),
-    }
+    gain, gain_used, gain_after, _ = (mine - other for mine, other in zip(cells(results), cells(base), strict=True))
+    return Difference(
+        difference=gain.mean(axis=-1),
+        interval=interval_of(gain),
+        after_views_difference=gain_after.mean(axis=-1),
+        after_views_interval=interval_of(gain_after),
+        views_used_difference=gain_used.mean(axis=-1),
+        area_difference=float(gain_after.mean()),
+        area_interval=interval_of(gain_after.mean(axis=0)),
+    )
 
 
 def first_reaching(curve: np.ndarray, target: np.ndarray | np.floating) -> np.ndarray:
@@ -115,8 +118,8 @@ def first_reaching(curve: np.ndarray, target: np.ndarray | np.floating) -> np.nd
     return np.where(reached.any(axis=-1), at + part, np.inf)
 
 
-def views_to_reach(results: dict[str, Results], baseline: str = "random") -> dict[str, Any]:
-    """Number of views that each policy needs for the baseline's accuracy after 3, 5 and 9 views; None if it never reaches it."""
+def views_to_reach(results: dict[str, Results], baseline: str = "random") -> dict[int, Reach]:
+    """Number of views that each policy needs for the baseline's accuracy after 3, 5 and 9 views."""
     curves = {name: cells(result)[2] for name, result in results.items()}
 
     @jax.jit
@@ -125,16 +128,17 @@ def views_to_reach(results: dict[str, Results], baseline: str = "random") -> dic
 
     means = {name: after.mean(axis=-1) for name, after in curves.items()}
     drawn = {name: np.asarray(resampled(jnp.asarray(after))) for name, after in curves.items()}
-    out: dict[str, Any] = {}
-    for views in REFERENCE_VIEWS:
-        if views > len(means[baseline]):
-            continue
-        out[str(views)] = {"accuracy": float(means[baseline][views - 1]), "views": {}, "interval": {}}
+
+    def known(views: np.ndarray | np.floating) -> float | None:
+        return float(views) if np.isfinite(views) else None
+
+    def reach(views: int) -> Reach:
+        exactly, ends = {}, {}
         for name in curves:
-            exactly = first_reaching(means[name], means[baseline][views - 1])
-            ends = np.quantile(
-                first_reaching(drawn[name], drawn[baseline][:, views - 1]), (0.025, 0.975), method="nearest"
-            )
-            out[str(views)]["views"][name] = float(exactly) if np.isfinite(exactly) else None
-            out[str(views)]["interval"][name] = [float(end) if np.isfinite(end) else None for end in ends]
-    return out
+            exactly[name] = known(first_reaching(means[name], means[baseline][views - 1]))
+            resampled_views = first_reaching(drawn[name], drawn[baseline][:, views - 1])
+            low, high = np.quantile(resampled_views, (0.025, 0.975), method="nearest")
+            ends[name] = known(low), known(high)
+        return Reach(float(means[baseline][views - 1]), exactly, ends)
+
+    return {views: reach(views) for views in REFERENCE_VIEWS if views <= len(means[baseline])}

@@ -15,7 +15,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from eval.numbers.comparison import intervals
+from eval.numbers.comparison import interval_of
+from eval.numbers.metrics import Confidence, Reading, Stop
 from mevs_jax.beliefs.calibration import (
     expected_calibration_error,
     fit_exponent,
@@ -24,6 +25,7 @@ from mevs_jax.beliefs.calibration import (
     reliability,
 )
 from mevs_jax.beliefs.fusing import discounted, mean_of_probabilities, running_sum
+from train.results.records import as_json
 
 RISKS = (0.3, 0.2, 0.15, 0.1, 0.05, 0.02)
 READINGS = {
@@ -95,6 +97,11 @@ def stops_at(enough: np.ndarray) -> np.ndarray:
 
 
 def stopping(confidence: np.ndarray, right: np.ndarray, risks: Sequence[float] = RISKS) -> list[dict[str, Any]]:
+    """As `stops_of`, as JSON has it."""
+    return as_json(stops_of(confidence, right, risks))
+
+
+def stops_of(confidence: np.ndarray, right: np.ndarray, risks: Sequence[float] = RISKS) -> tuple[Stop, ...]:
     """Stops at the first step with a risk, 1 − confidence, of at most each of `risks`, or at the end of the walk.
 
     The predictions of the walks that stop early should be wrong at most as often as the risk; `error` is how often they are.
@@ -106,17 +113,17 @@ def stopping(confidence: np.ndarray, right: np.ndarray, risks: Sequence[float] =
         answer = np.take_along_axis(right, at[..., None], axis=-1)[..., 0]
         by_object = np.stack([(stops & ~answer).mean(axis=1), stops.mean(axis=1)])
         rows.append(
-            {
-                "risk": risk,
-                "sure": float(stops.mean()),
-                "error": float(by_object[0].mean() / by_object[1].mean()) if stops.any() else None,
+            Stop(
+                risk=risk,
+                sure=float(stops.mean()),
+                error=float(by_object[0].mean() / by_object[1].mean()) if stops.any() else None,
                 # Share of walks that are confident and wrong, minus the share that the risk allows; above zero it is exceeded.
-                "excess": intervals(by_object[0] - risk * by_object[1]),
-                "accuracy": float(answer.mean()),
-                "views": float((at + 1).mean()),
-            }
+                excess=interval_of(by_object[0] - risk * by_object[1]),
+                accuracy=float(answer.mean()),
+                views=float((at + 1).mean()),
+            )
         )
-    return rows
+    return tuple(rows)
 
 
 def confidence_of(
@@ -126,27 +133,24 @@ def confidence_of(
     views: np.ndarray,
     logits: np.ndarray,
     labels: np.ndarray,
-) -> dict[str, Any]:
+) -> Confidence:
     """All confidence metrics of one policy's walks; views are (objects, starts, steps)."""
     fitting = logits_along(jnp.asarray(validation_views), jnp.asarray(validation_logits))
     testing = logits_along(jnp.asarray(views), jnp.asarray(logits))
     temperatures = _fit(fitting, jnp.asarray(validation_labels))
-    out: dict[str, Any] = {"readings": {}}
+    readings = {}
     for reading in READINGS:
         read = partial(_discounted, temperatures=temperatures[reading]) if reading in temperatures else _mixed
         on_validation = _score(read(fitting), jnp.asarray(validation_labels))
         on_test = _score(read(testing), jnp.asarray(labels))
-        out["readings"][reading] = {
-            "accuracy": np.asarray(on_test["accuracy"]).tolist(),
-            "ece": np.asarray(on_test["ece"]).tolist(),
-            "nll": np.asarray(on_test["nll"]).tolist(),
-            "validation_ece": np.asarray(on_validation["ece"]).tolist(),
-        }
-        if reading in temperatures:
-            out["readings"][reading]["temperatures"] = np.asarray(temperatures[reading]).tolist()
-        if reading in ("sum_of_logits", "temperature"):
-            out["readings"][reading]["reliability"] = np.asarray(on_test["reliability"]).tolist()
-            out["readings"][reading]["stopping"] = stopping(
-                np.asarray(on_test["confidence"]), np.asarray(on_test["right"])
-            )
-    return out
+        shown = reading in ("sum_of_logits", "temperature")
+        readings[reading] = Reading(
+            accuracy=np.asarray(on_test["accuracy"]),
+            ece=np.asarray(on_test["ece"]),
+            nll=np.asarray(on_test["nll"]),
+            validation_ece=np.asarray(on_validation["ece"]),
+            temperatures=np.asarray(temperatures[reading]) if reading in temperatures else None,
+            reliability=np.asarray(on_test["reliability"]) if shown else None,
+            stopping=stops_of(np.asarray(on_test["confidence"]), np.asarray(on_test["right"])) if shown else None,
+        )
+    return Confidence(readings)

@@ -17,8 +17,9 @@ from jaxtyping import Bool, Float, Int
 
 from data_pipeline.dataset.statistics import load_statistics
 from data_pipeline.errors import DataError
-from eval.numbers.comparison import cells, difference, summarise
-from eval.numbers.study import BASELINE, Setting, check_own
+from eval.numbers.comparison import difference, summarise
+from eval.numbers.metrics import Difference, Listed, Metrics, Summary
+from eval.numbers.study import BASELINE, Setting, check_own, listed
 from eval.run_file import load_run
 from eval.tables import ViewTables, load_view_tables
 from eval.walks.grid import FIRST_MV, THRESHOLDS, GridConfig, Results
@@ -26,8 +27,8 @@ from eval.walks.own_policies import checked, own_policy
 from mevs_jax.geometry.viewpoints import ViewGraph
 from mevs_jax.policies.base import Policy
 from mevs_jax.policies.registry import POLICIES, Knows, PolicyRecord, policy_record
-from train.results.identity import made_by, why
-from train.results.records import csv_of as rows_as_csv
+from train.results.identity import made_by, stamp_of, why
+from train.results.records import csv_of, ends
 
 By = Literal["views", "threshold"]
 
@@ -56,7 +57,7 @@ class EvaluationInputs:
             DataError: if the run has no view tables, or they were made with other networks than it has now.
         """
         statistics, kept = load_statistics(run / "data"), load_run(run)
-        made = made_by(statistics, run / "classifier", run / "entropy")
+        made = stamp_of("tables", made_by(statistics, run / "classifier", run / "entropy"))
         found = []
         for split in ("test", "val"):
             path = run / "tables" / f"{split}.npz"
@@ -106,13 +107,11 @@ class PolicyStudy:
 
     def rows(self, by: By = "views") -> list[dict[str, Any]]:
         """Returns the numbers as a list of rows; see `to_frame`."""
-        base = self.results[BASELINE]
-        if by == "threshold":
-            return [row for policy in self.policies for row in _rows_of_grid(policy, self.results[policy.name], base)]
-        names = [{"policy": one.name, "title": one.title, "knows": one.knows} for one in self.policies]
+        base, ladder = self.results[BASELINE], listed(self.policies)
         summaries = {name: summarise(result, self.labels) for name, result in self.results.items()}
-        against = {name: difference(result, base) for name, result in self.results.items() if name != BASELINE}
-        return tidy_rows(names, summaries, against)
+        against = {name: difference(result, base) for name, result in self.results.items()}
+        rows = tidy_rows if by == "views" else _rows_of_grid
+        return rows(ladder, summaries, against)
 
     def to_frame(self, by: By = "views") -> Any:
         """Returns the numbers as a pandas `DataFrame` where pandas is installed, else as a list of dictionaries.
@@ -173,55 +172,55 @@ def _is_baseline(name: str, policy: Policy) -> bool:
 
 
 def tidy_rows(
-    ladder: Sequence[Mapping[str, Any]], policies: Mapping[str, Any], against: Mapping[str, Any]
+    ladder: Sequence[Listed], policies: Mapping[str, Summary], against: Mapping[str, Difference]
 ) -> list[dict[str, Any]]:
-    """Returns a row for each policy and number of views, from entries of `metrics.json`; see `PolicyStudy.to_frame`."""
+    """Returns a row for each policy and number of views; see `PolicyStudy.to_frame`."""
     rows = []
-    for rung in ladder:
-        name = rung["policy"]
-        found, gain = policies[name], against.get(name)
-        for step, accuracy in enumerate(found["after_views"]):
-            low, high = found["after_views_interval"][step]
-            paired = gain["after_views_interval"][step] if gain else (0.0, 0.0)
+    for shown in ladder:
+        found, gain = policies[shown.policy], against.get(shown.policy)
+        for step, accuracy in enumerate(found.after_views):
+            low, high = (0.0, 0.0) if gain is None else gain.after_views_interval[step]
             rows.append(
-                {
-                    "policy": name,
-                    "title": rung["title"].lstrip("— "),
-                    "knows": rung["knows"],
-                    "views": step + 1,
-                    "accuracy": accuracy,
-                    "accuracy_low": low,
-                    "accuracy_high": high,
-                    "difference": gain["after_views_difference"][step] if gain else 0.0,
-                    "low": paired[0],
-                    "high": paired[1],
-                    "travelled": found["travelled"][step],
+                _policy(shown)
+                | {"views": step + 1, "accuracy": float(accuracy)}
+                | ends("accuracy", found.after_views_interval[step])
+                | {
+                    "difference": 0.0 if gain is None else float(gain.after_views_difference[step]),
+                    "low": float(low),
+                    "high": float(high),
+                    "travelled": float(found.travelled[step]),
                 }
             )
     return rows
 
 
-def _rows_of_grid(policy: PolicyRecord, results: Results, base: Results) -> list[dict[str, Any]]:
-    right, used, _, _ = cells(results)
-    gain = difference(results, base)
-    return [
-        {
-            "policy": policy.name,
-            "title": policy.title.lstrip("— "),
-            "knows": policy.knows,
-            "max_views": row + FIRST_MV,
-            "threshold": threshold,
-            "accuracy": float(right[row, column].mean()),
-            "views_used": float(used[row, column].mean()),
-            "difference": gain["difference"][row][column],
-            "low": gain["interval"][row][column][0],
-            "high": gain["interval"][row][column][1],
-        }
-        for row in range(right.shape[0])
-        for column, threshold in enumerate(THRESHOLDS)
-    ]
+def _rows_of_grid(
+    ladder: Sequence[Listed], policies: Mapping[str, Summary], against: Mapping[str, Difference]
+) -> list[dict[str, Any]]:
+    rows = []
+    for shown in ladder:
+        found, gain = policies[shown.policy], against[shown.policy]
+        for (row, column), accuracy in np.ndenumerate(found.accuracy):
+            low, high = gain.interval[row, column]
+            rows.append(
+                _policy(shown)
+                | {
+                    "max_views": row + FIRST_MV,
+                    "threshold": THRESHOLDS[column],
+                    "accuracy": float(accuracy),
+                    "views_used": float(found.views_used[row, column]),
+                    "difference": float(gain.difference[row, column]),
+                    "low": float(low),
+                    "high": float(high),
+                }
+            )
+    return rows
 
 
-def csv_of(metrics: Mapping[str, Any]) -> bytes:
+def _policy(shown: Listed) -> dict[str, str]:
+    return {"policy": shown.policy, "title": shown.plain_title, "knows": shown.knows}
+
+
+def metrics_csv(metrics: Metrics) -> bytes:
     """Returns the content of `metrics.csv`: the rows of `tidy_rows`, of all policies in `metrics.json`."""
-    return rows_as_csv(tidy_rows(metrics["ladder"], metrics["policies"], metrics["against_random"]))
+    return csv_of(tidy_rows(metrics.ladder, metrics.policies, metrics.against_random))

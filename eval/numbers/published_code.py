@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 
-from eval.numbers.comparison import cells, intervals
+from eval.numbers.comparison import cells, interval_of
+from eval.numbers.metrics import CodeGain, Compatibility, ThesisGain
 from eval.walks.grid import Results
 
-THESIS_GAINS = {10: {"table": 7, "mean": 0.0111, "above_zero": 48}, 40: {"table": 12, "mean": 0.0006, "above_zero": 29}}
-"""By number of views: the mean of the thesis's gain over random in its 56 cells, and the number of cells above zero."""
+THESIS_GAINS = {10: ThesisGain(table=7, mean=0.0111, above_zero=48), 40: ThesisGain(12, mean=0.0006, above_zero=29)}
+"""By number of views."""
 
 ROWS = (
     ("text", "the thesis's text", "random", "predicted_entropy", False),
@@ -25,8 +24,8 @@ ROWS = (
 
 def compatibility(
     ours: dict[str, Results], by_view: dict[str, Results] | None, views: int, leak: dict[str, dict[str, float]] | None
-) -> dict[str, Any]:
-    """Gain over random in the thesis's grid for each row of `ROWS`; None where the classifier was not trained.
+) -> Compatibility:
+    """Gain over random in the thesis's grid for each row of `ROWS`.
 
     Args:
         ours: results with the classifier validated by object.
@@ -34,20 +33,20 @@ def compatibility(
         views: number of candidate viewpoints, which decides the table of the thesis.
         leak: accuracy on single views, `validation` and `test`, of both classifiers.
     """
-    rows: dict[str, Any] = {}
+    rows: dict[str, CodeGain] = {}
     for name, title, baseline, policy, needs_by_view in ROWS:
         results = by_view if needs_by_view else ours
         if results is None:
-            rows[name] = {"title": title, "difference": None}
+            rows[name] = CodeGain(title)
             continue
         gain = cells(results[policy])[0] - cells(results[baseline])[0]
-        rows[name] = {
-            "title": title,
-            "difference": gain.mean(axis=-1).tolist(),
-            "interval": intervals(gain),
-            "mean": float(gain.mean()),
-            "mean_interval": intervals(gain.mean(axis=(0, 1))),
-            "above_zero": int((gain.mean(axis=-1) > 0).sum()),
-            "cells": int(np.prod(gain.shape[:2])),
-        }
-    return {"rows": rows, "thesis": THESIS_GAINS.get(views), "single_view_accuracy": leak}
+        rows[name] = CodeGain(
+            title,
+            difference=gain.mean(axis=-1),
+            interval=interval_of(gain),
+            mean=float(gain.mean()),
+            mean_interval=interval_of(gain.mean(axis=(0, 1))),
+            above_zero=int((gain.mean(axis=-1) > 0).sum()),
+            cells=int(np.prod(gain.shape[:2])),
+        )
+    return Compatibility(rows, THESIS_GAINS.get(views), leak)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -12,8 +11,20 @@ import numpy as np
 
 from data_pipeline.dataset.statistics import DatasetStatistics
 from data_pipeline.progress import console
-from eval.numbers.comparison import cells, difference, intervals, summarise, views_to_reach
+from eval.numbers.comparison import cells, difference, interval_of, summarise, views_to_reach
 from eval.numbers.confidence import confidence_of
+from eval.numbers.metrics import (
+    Confidence,
+    EntropyErrors,
+    FixedOrder,
+    Headline,
+    Listed,
+    Metrics,
+    Moved,
+    PolicySummary,
+    Share,
+    SingleViews,
+)
 from eval.numbers.published_code import compatibility
 from eval.tables import ViewTables
 from eval.threads import by_threads
@@ -30,7 +41,7 @@ from mevs_jax.policies.registry import PolicyRecord, policy_record
 HEADLINE_CT, HEADLINE_MV = 0.99, 4
 """The cell of the grid used in the thesis's first test and confusion matrices (§5.3)."""
 BASELINE = "random"
-_SWITCHED = ("random", "random_with_repetition", "predicted_entropy")
+SWITCHED = ("random", "random_with_repetition", "predicted_entropy")
 """Policies that are walked by the classifier validated by view too."""
 CONFIDENCE_OF = ("random", "predicted_entropy", "information_gain")
 """Policies whose confidence is evaluated."""
@@ -39,7 +50,7 @@ MOVEMENT_COSTS = (0.02, 0.05, 0.1, 0.2, 0.5)
 """In units of the policy's score (normalised entropy or nats) per radian of movement."""
 
 
-def single_view(tables: ViewTables, classes: int, reachable: np.ndarray) -> dict[str, Any]:
+def single_view(tables: ViewTables, classes: int, reachable: np.ndarray) -> SingleViews:
     """Accuracy on single views, over all reachable views of all objects; `by_view` is of every view."""
     predictions = tables.logits.argmax(-1)
     of_view = (predictions == tables.labels[:, None]).mean(axis=0)
@@ -50,17 +61,17 @@ def single_view(tables: ViewTables, classes: int, reachable: np.ndarray) -> dict
         jnp.repeat(jnp.asarray(tables.labels), views), jnp.asarray(predictions.reshape(-1)), classes
     )
     every = tables.logits[:, reachable].sum(axis=1).argmax(-1) == tables.labels
-    return {
-        "accuracy": float(accuracy(confusion)),
-        "interval": intervals(right.mean(axis=1)),
-        "class_accuracy": float(class_accuracy(confusion)),
-        "by_view": of_view.tolist(),
-        "all_views": float(every.mean()),
-        "all_views_interval": intervals(every),
-    }
+    return SingleViews(
+        accuracy=float(accuracy(confusion)),
+        interval=interval_of(right.mean(axis=1)),
+        class_accuracy=float(class_accuracy(confusion)),
+        by_view=of_view,
+        all_views=float(every.mean()),
+        all_views_interval=interval_of(every),
+    )
 
 
-def entropy_errors(tables: ViewTables, statistics: DatasetStatistics) -> dict[str, Any]:
+def entropy_errors(tables: ViewTables, statistics: DatasetStatistics) -> EntropyErrors:
     """Squared error of the predicted entropies, and of two predictors that receive no view.
 
     The mean map is the training split's mean entropy of each view; the class-mean map is the mean over the true class. All
@@ -75,20 +86,20 @@ def entropy_errors(tables: ViewTables, statistics: DatasetStatistics) -> dict[st
         for label, name in enumerate(statistics.classes)
     }
     variance = float(tables.entropy.var())
-    return {
-        "pointnet2": float(network.mean()),
-        "pointnet2_interval": intervals(network),
-        "mean_map": float(mean_map.mean()),
-        "mean_map_interval": intervals(mean_map),
-        "class_mean_map": float(class_map.mean()),
-        "class_mean_map_interval": intervals(class_map),
-        "better_than_mean_map": intervals(mean_map - network),
-        "by_class": by_class,
-        "explained_variance": 1 - float(network.mean()) / variance if variance else None,
-    }
+    return EntropyErrors(
+        pointnet2=float(network.mean()),
+        pointnet2_interval=interval_of(network),
+        mean_map=float(mean_map.mean()),
+        mean_map_interval=interval_of(mean_map),
+        class_mean_map=float(class_map.mean()),
+        class_mean_map_interval=interval_of(class_map),
+        better_than_mean_map=interval_of(mean_map - network),
+        by_class=by_class,
+        explained_variance=1 - float(network.mean()) / variance if variance else None,
+    )
 
 
-def best_pair(tables: ViewTables, reachable: np.ndarray) -> dict[str, Any]:
+def best_pair(tables: ViewTables, reachable: np.ndarray) -> Share:
     """Accuracy with the pair of views whose sum of logits gives the true label the highest probability.
 
     It uses the label and may start anywhere, so it is approximately an upper bound for two views.
@@ -101,7 +112,7 @@ def best_pair(tables: ViewTables, reachable: np.ndarray) -> dict[str, Any]:
         return jnp.argmax(pairs.reshape(-1, pairs.shape[-1])[jnp.argmax(probability)]) == label
 
     right = np.asarray(jax.lax.map(lambda item: one(*item), (logits, jnp.asarray(tables.labels))))
-    return {"accuracy": float(right.mean()), "interval": intervals(right)}
+    return Share(float(right.mean()), interval_of(right))
 
 
 def headline_confusion(views: np.ndarray, tables: ViewTables, max_views: int) -> np.ndarray:
@@ -142,10 +153,10 @@ def exactly_random(
     )
 
 
-def accuracy_by_distance(results: Results) -> dict[str, list[float]]:
+def moved(cost: float, results: Results) -> Moved:
     """Mean accuracy and mean distance travelled after each number of views."""
     _, _, after, travelled = cells(results)
-    return {"after_views": after.mean(axis=-1).tolist(), "travelled": travelled.mean(axis=-1).tolist()}
+    return Moved(cost, after.mean(axis=-1), travelled.mean(axis=-1))
 
 
 def reachable_views(viewpoints: np.ndarray, lowest_elevation: float) -> np.ndarray:
@@ -236,10 +247,10 @@ def _confidence(
     validation: ViewTables,
     results: dict[str, Results],
     policies: Sequence[PolicyRecord],
-) -> dict[str, Any]:
+) -> dict[str, Confidence]:
     walks = setting.walk(validation, [policy for policy in policies if policy.name in CONFIDENCE_OF], draws=1)
 
-    def of(name: str) -> dict[str, Any]:
+    def of(name: str) -> Confidence:
         fitted_on, shown = setting.starts_of(walks[name]), setting.starts_of(results[name])
         return confidence_of(fitted_on, validation.logits, validation.labels, shown, tables.logits, tables.labels)
 
@@ -248,31 +259,33 @@ def _confidence(
 
 def _movement(
     setting: Setting, tables: ViewTables, results: dict[str, Results], policies: Sequence[PolicyRecord]
-) -> dict[str, list[dict[str, Any]]]:
-    found = {name: [{"cost": 0.0} | accuracy_by_distance(results[name])] for name in MOVING}
+) -> dict[str, tuple[Moved, ...]]:
+    found = {name: [moved(0.0, results[name])] for name in MOVING}
     moving = [policy for policy in policies if policy.name in MOVING]
     for cost in MOVEMENT_COSTS:
         costly = [replace(policy, score=with_movement(policy.score, jnp.float32(cost))) for policy in moving]
         for name, result in setting.walk(tables, costly).items():
-            found[name].append({"cost": cost} | accuracy_by_distance(result))
-    return found
+            found[name].append(moved(cost, result))
+    return {name: tuple(runs) for name, runs in found.items()}
 
 
 def _policies(
     setting: Setting, tables: ViewTables, shown: dict[str, Results], mv: int, column: int
-) -> dict[str, dict[str, Any]]:
-    def of(result: Results) -> dict[str, Any]:
-        return summarise(result, tables.labels) | {
-            "headline_interval": intervals(cells(result)[0][mv - FIRST_MV, column]),
-            "headline_confusion": headline_confusion(setting.starts_of(result), tables, mv).tolist(),
-        }
+) -> dict[str, PolicySummary]:
+    def of(result: Results) -> PolicySummary:
+        return PolicySummary(
+            **vars(summarise(result, tables.labels)),
+            headline_interval=interval_of(cells(result)[0][mv - FIRST_MV, column]),
+            headline_confusion=headline_confusion(setting.starts_of(result), tables, mv),
+        )
 
     return dict(zip(shown, by_threads(of, list(shown.values())), strict=True))
 
 
-def _entry(policy: PolicyRecord, own: bool) -> dict[str, Any]:
-    source = {"own": dict(policy.code or {})} if own else {}
-    return {"policy": policy.name, "title": policy.title, "knows": policy.knows} | source
+def listed(policies: Sequence[PolicyRecord], own: Sequence[PolicyRecord] = ()) -> tuple[Listed, ...]:
+    """The policies in the order of the tables; those of the user, `own`, with their sources."""
+    sources = {policy.name: dict(policy.code or {}) for policy in own}
+    return tuple(Listed(policy.name, policy.title, policy.knows, sources.get(policy.name)) for policy in policies)
 
 
 def run_study(
@@ -283,7 +296,7 @@ def run_study(
     by_view: ViewTables | None = None,
     leak: dict[str, dict[str, float]] | None = None,
     own: Sequence[PolicyRecord] = (),
-) -> dict[str, Any]:
+) -> Metrics:
     """All metrics of the test split.
 
     Args:
@@ -299,39 +312,43 @@ def run_study(
         DataError: if a further policy cannot be used.
     """
     setting = Setting.of(statistics.graph, validation, config)
-    config, can_reach = setting.config, setting.can_reach
     own = checked(own, setting.graph, len(statistics.classes))
-    policies = ladder(own)
-    console.print(f"Walking {len(tables.labels)} test objects from {can_reach.sum()} views by {len(policies)} policies")
+    policies, reachable = ladder(own), setting.can_reach
+    console.print(f"Walking {len(tables.labels)} test objects from {reachable.sum()} views by {len(policies)} policies")
     results, exact = setting.with_random(tables, (*policies, SCRAMBLED))
     shown = {policy.name: results[policy.name] for policy in policies}
     check_own(own, results, tables, setting)
-    other = None if by_view is None else setting.with_random(by_view, [*map(policy_record, _SWITCHED), SCRAMBLED])[0]
-
-    mv = min(HEADLINE_MV, config.max_views)
-    return {
-        "objects": len(tables.labels),
-        "validation_objects": len(validation.labels),
-        "left_out": statistics.left_out,
-        "views": statistics.views,
-        "starts": int(can_reach.sum()),
-        "reachable": can_reach.tolist(),
-        "random_draws_per_start": config.draws,
-        "random_exact_up_to": exact,
-        "thresholds": list(THRESHOLDS),
-        "max_views": list(range(FIRST_MV, config.max_views + 1)),
-        "headline": {"threshold": HEADLINE_CT, "max_views": mv},
-        "single_view": single_view(tables, len(statistics.classes), can_reach),
-        "entropy": entropy_errors(tables, statistics),
-        "ladder": [_entry(policy, policy in own) for policy in policies],
-        "policies": _policies(setting, tables, shown, mv, THRESHOLDS.index(HEADLINE_CT)),
-        "against_random": {
+    mv = min(HEADLINE_MV, setting.config.max_views)
+    return Metrics(
+        objects=len(tables.labels),
+        validation_objects=len(validation.labels),
+        left_out=statistics.left_out,
+        views=statistics.views,
+        starts=int(reachable.sum()),
+        reachable=reachable,
+        random_draws_per_start=config.draws,
+        random_exact_up_to=exact,
+        thresholds=np.array(THRESHOLDS),
+        max_views=np.arange(FIRST_MV, setting.config.max_views + 1),
+        headline=Headline(HEADLINE_CT, mv),
+        single_view=single_view(tables, len(statistics.classes), reachable),
+        entropy=entropy_errors(tables, statistics),
+        ladder=listed(policies, own),
+        policies=_policies(setting, tables, shown, mv, THRESHOLDS.index(HEADLINE_CT)),
+        against_random={
             name: difference(result, shown[BASELINE]) for name, result in shown.items() if name != BASELINE
         },
-        "fixed_order": {"fitted_by": setting.order_by},
-        "views_to_reach": views_to_reach(shown, BASELINE),
-        "best_pair": best_pair(tables, can_reach),
-        "confidence": _confidence(setting, tables, validation, results, policies),
-        "movement": _movement(setting, tables, results, policies),
-        "compatibility": compatibility(results, other, statistics.views, leak),
-    }
+        fixed_order=FixedOrder(setting.order_by),
+        views_to_reach=views_to_reach(shown, BASELINE),
+        best_pair=best_pair(tables, reachable),
+        confidence=_confidence(setting, tables, validation, results, policies),
+        movement=_movement(setting, tables, results, policies),
+        compatibility=compatibility(results, _switched(setting, by_view), statistics.views, leak),
+    )
+
+
+def _switched(setting: Setting, by_view: ViewTables | None) -> dict[str, Results] | None:
+    """The walks that the published code is compared by, with the classifier validated by view; None without its tables."""
+    if by_view is None:
+        return None
+    return setting.with_random(by_view, [*map(policy_record, SWITCHED), SCRAMBLED])[0]

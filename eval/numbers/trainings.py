@@ -10,7 +10,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from data_pipeline.errors import DataError
-from eval.numbers.comparison import interval_of_both, intervals
+from eval.numbers.comparison import interval_of, interval_of_both
+from eval.numbers.metrics import TrainingsRow
 from eval.numbers.policies import EvaluationInputs
 from eval.numbers.study import BASELINE, Setting, exactly_random
 from eval.walks.grid import Results, run_grid
@@ -64,7 +65,7 @@ def walks_of_all(
     return policies, results
 
 
-def rows_over_trainings(policies: Sequence[PolicyRecord], results: Mapping[str, Results]) -> list[dict[str, Any]]:
+def rows_over_trainings(policies: Sequence[PolicyRecord], results: Mapping[str, Results]) -> tuple[TrainingsRow, ...]:
     """A row for each policy and number of views: accuracy and difference from random, with both kinds of interval."""
     after = {name: np.moveaxis(np.asarray(result.after, float), -1, 0) for name, result in results.items()}
     rows = []
@@ -72,34 +73,34 @@ def rows_over_trainings(policies: Sequence[PolicyRecord], results: Mapping[str, 
         found, gain = after[policy.name], after[policy.name] - after[BASELINE]
         columns = {
             "accuracy": found.mean(axis=(-2, -1)),
-            "over_objects": intervals(found.mean(axis=-2)),
+            "over_objects": interval_of(found.mean(axis=-2)),
             "over_both": interval_of_both(found),
             "difference": gain.mean(axis=(-2, -1)),
-            "difference_over_objects": intervals(gain.mean(axis=-2)),
+            "difference_over_objects": interval_of(gain.mean(axis=-2)),
             "difference_over_both": interval_of_both(gain),
             "each": found.mean(axis=-1),
             "difference_each": gain.mean(axis=-1),
         }
         for step in range(len(found)):
-            numbers = {name: np.asarray(column[step], float).tolist() for name, column in columns.items()}
-            rows.append(
-                {"policy": policy.name, "title": policy.title, "knows": policy.knows, "views": step + 1} | numbers
-            )
-    return rows
+            numbers: dict[str, Any] = {name: column[step] for name, column in columns.items()}
+            numbers |= {name: float(numbers[name]) for name in ("accuracy", "difference")}
+            rows.append(TrainingsRow(policy.name, policy.title, policy.knows, step + 1, **numbers))
+    return tuple(rows)
 
 
-def csv_over_trainings(rows: Sequence[Mapping[str, Any]]) -> bytes:
+def csv_over_trainings(rows: Sequence[TrainingsRow]) -> bytes:
     """The rows as CSV, with a column for each end of an interval and for each training."""
-    return csv_of([_flat(row) for row in rows])
-
-
-def _flat(row: Mapping[str, Any]) -> dict[str, Any]:
-    flat: dict[str, Any] = {}
-    for name, value in row.items():
-        if not isinstance(value, list):
-            flat[name] = value.lstrip("— ") if name == "title" else value
-        elif name.endswith("each"):
-            flat |= numbered(f"{name.removesuffix('each') or 'accuracy_'}training", value)
-        else:
-            flat |= ends(name, value)
-    return flat
+    return csv_of(
+        [
+            {"policy": row.policy, "title": row.title.lstrip("— "), "knows": row.knows, "views": row.views}
+            | {"accuracy": row.accuracy}
+            | ends("over_objects", row.over_objects)
+            | ends("over_both", row.over_both)
+            | {"difference": row.difference}
+            | ends("difference_over_objects", row.difference_over_objects)
+            | ends("difference_over_both", row.difference_over_both)
+            | numbered("accuracy_training", row.each)
+            | numbered("difference_training", row.difference_each)
+            for row in rows
+        ]
+    )

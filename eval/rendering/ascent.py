@@ -10,7 +10,7 @@ import tempfile
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -23,6 +23,7 @@ from data_pipeline.files import write_bytes
 from data_pipeline.objects.mesh import Mesh, ObjectEntry
 from data_pipeline.objects.reconstruction import decimate, require_open3d, voxelise
 from data_pipeline.objects.sources import load_object
+from eval.config import AscentConfig
 from eval.projections import longitude_latitude
 from mevs_jax.geometry.cameras import Camera, cameras_at
 from mevs_jax.geometry.viewpoints import fibonacci_sphere
@@ -96,21 +97,6 @@ METHODS: dict[str, Method] = {
         "depth entropy of the mesh (bits)",
     ),
 }
-
-
-@dataclass(frozen=True)
-class AscentConfig:
-    """Settings of the gradient ascent on one object."""
-
-    object: str | None = None
-    """name of the object in the data set; the first test object if not given"""
-    method: Literal["volume", "mesh"] = "volume"
-    """volume: opacity entropy of a grid of densities (after DiffDVR); mesh: depth entropy of a softly rendered mesh of at most
-    500 faces"""
-    starts: int = 40
-    """number of start views"""
-    resolution: int = 64
-    """pixels along each side of the rendered images"""
 
 
 def ascend_on_sphere(method: Method, thing: Any, starts: int, resolution: int) -> Ascent:

@@ -11,7 +11,6 @@ from __future__ import annotations
 from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -35,31 +34,20 @@ from data_pipeline.objects.reconstruction import (
 from data_pipeline.objects.sources import load_object
 from data_pipeline.processes import shared, usable_cpus
 from data_pipeline.progress import console, progress_bar
+from eval.config import RenderingConfig
 from eval.numbers.comparison import difference, summarise
-from eval.numbers.study import exactly_random, reachable_views
+from eval.numbers.metrics import Ascents
+from eval.numbers.study import exactly_random, listed, reachable_views
 from eval.rendering.ascent import METHODS, ascend_on_sphere, padded_triangles
 from eval.tables import ViewTables, objects_of
 from eval.walks.grid import GridConfig, run_grid
 from eval.walks.ladder import BY_ASCENT, ladder
 from mevs_jax.geometry.cameras import Camera, partial_cloud
 from mevs_jax.rendering import corners_of_cells, distinct_optima
+from train.results.identity import stamp_of
 
 COMPARED = ("random", "farthest", "predicted_entropy", "oracle_entropy")
 """The policies that are evaluated on the same objects for comparison."""
-
-
-@dataclass(frozen=True)
-class RenderingConfig:
-    """Settings of the policies by differentiable rendering."""
-
-    objects: int = 200
-    """number of test objects, spread evenly over the split"""
-    starts: int = 6
-    """number of start views of the gradient ascent"""
-    resolution: int = 32
-    """pixels along each side of the rendered images"""
-    faces: int = 200
-    """largest number of faces of a surface"""
 
 
 @dataclass(frozen=True)
@@ -158,7 +146,7 @@ def scores_of_object(
 def _folder(out: Path, statistics: DatasetStatistics, config: RenderingConfig) -> Path:
     """The folder of the scores of one data set with these settings."""
     made = (str(value) for name, value in asdict(config).items() if name != "objects")
-    name = "_".join((statistics.fingerprint, *made))
+    name = "_".join((stamp_of("rendering", statistics.fingerprint), *made))
     older = out / "climbed" / name  # where version 0.1 stored them
     return older if older.exists() else out / "rendering" / name
 
@@ -240,7 +228,7 @@ def load_ascent_scores(out: Path, statistics: DatasetStatistics, config: Renderi
 
 def ascent_study(
     tables: ViewTables, statistics: DatasetStatistics, climbed: AscentScores, config: GridConfig
-) -> dict[str, Any]:
+) -> Ascents:
     """Metrics of these policies and of some others on the chosen objects, from every start view.
 
     Differences from random selection and from the thesis's predicted entropy are paired by object.
@@ -248,11 +236,7 @@ def ascent_study(
     viewpoints = np.array(statistics.viewpoints)
     can_reach = reachable_views(viewpoints, config.lowest_elevation)
     chosen = climbed.chosen
-    some = replace(
-        tables,
-        names=[tables.names[at] for at in chosen],
-        **{name: getattr(tables, name)[chosen] for name in ("labels", "logits", "predicted_entropy", "entropy")},
-    )
+    some = tables.of_objects(chosen)
     table = some.stacked()
     table = replace(
         table,
@@ -272,15 +256,15 @@ def ascent_study(
         reachable=None if can_reach.all() else jnp.asarray(can_reach),
     )
     found["random"], _ = exactly_random(found["random"], table.logits, table.label, can_reach)
-    return {
-        "objects": len(chosen),
-        "views_without_surface": climbed.without_surface,
-        "views": len(chosen) * tables.entropy.shape[1],
-        "settings": asdict(climbed.config),
-        "ladder": [{"policy": policy.name, "title": policy.title, "knows": policy.knows} for policy in compared],
-        "policies": {name: summarise(result, some.labels) for name, result in found.items()},
-        "against": {
+    return Ascents(
+        objects=len(chosen),
+        views_without_surface=climbed.without_surface,
+        views=len(chosen) * tables.entropy.shape[1],
+        settings=climbed.config,
+        ladder=listed(compared),
+        policies={name: summarise(result, some.labels) for name, result in found.items()},
+        against={
             base: {name: difference(result, found[base]) for name, result in found.items() if name != base}
             for base in ("random", "predicted_entropy")
         },
-    }
+    )

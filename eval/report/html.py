@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from data_pipeline.dataset.statistics import DatasetStatistics
+from eval.numbers.metrics import Metrics, OverTrainings
 from eval.report.svg import inline
 from eval.tables import ViewTables
 from eval.walks.ladder import KNOWS, Knows
@@ -24,6 +25,8 @@ if TYPE_CHECKING:
 
 STYLE = Path(__file__).with_name("page.css").read_text()
 SCRIPT = Path(__file__).with_name("page.js").read_text()
+Interval = Sequence[float] | np.ndarray
+"""The two ends of an interval."""
 MARKS = (
     "<b class='up'>▲ bold</b>: the whole interval is above zero; <b class='down'>▼ bold</b>: the whole interval is below zero; "
     "no mark: it contains zero."
@@ -38,18 +41,16 @@ class ReportInputs:
     """The results of the earlier stages from which the page is written."""
 
     statistics: DatasetStatistics
-    metrics: dict[str, Any]
+    metrics: Metrics
     tables: ViewTables
     data: Path
     histories: dict[str, list[dict[str, float]]]
     summaries: dict[str, dict[str, Any]]
     preset: str
     settings: dict[str, Any]
-    learned: dict[str, Any] | None = None
-    """metrics of `mevs study learned`, if it was run"""
-    learned_section: str = ""
-    """the section that the study writes of these"""
-    seeds: dict[str, Any] | None = None
+    learned: str | None = None
+    """section on `mevs study learned`, if it was run"""
+    seeds: OverTrainings | None = None
     """metrics over several trainings, if there are any"""
     validation: ViewTables | None = None
     """tables of the validation objects, whose statistics policies know; without them, no single walks are shown"""
@@ -204,16 +205,26 @@ def signed(value: float, digits: int = 1) -> str:
     return text[1:] if float(text[1:]) == 0 else text
 
 
-def span(interval: Sequence[float]) -> str:
+def span(interval: Interval) -> str:
     return f"{100 * interval[0]:.1f}–{100 * interval[1]:.1f}"
 
 
-def mark(interval: Sequence[float]) -> str:
+def mark(interval: Interval) -> str:
     """▲ for an interval above zero, ▼ for one below zero, and nothing for one that contains zero."""
     return "▲" if interval[0] > 0 else "▼" if interval[1] < 0 else ""
 
 
-def difference(value: float, interval: Sequence[float], digits: int = 1) -> str:
+def with_interval(cell: str, interval: Interval) -> str:
+    """A cell of a table with a 95 % interval of shares below it, in percent."""
+    return f"{cell}<br><small class='note'>{span(interval)}</small>"
+
+
+def folded(summary: str, content: str) -> str:
+    """HTML that is shown when its summary, in HTML, is clicked."""
+    return f"<details><summary>{summary}</summary>{content}</details>"
+
+
+def difference(value: float, interval: Interval, digits: int = 1) -> str:
     """A difference of shares in percentage points with its interval, marked as `MARKS` explains."""
     low, high = (signed(end, digits) for end in interval)
     text, found = signed(value, digits), mark(interval)

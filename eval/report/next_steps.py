@@ -21,7 +21,7 @@ def next_section(inputs: ReportInputs) -> str:
 def _steps(inputs: ReportInputs) -> list[tuple[str, str]]:
     """Sentences and commands, the most useful first."""
     metrics, steps = inputs.metrics, []
-    chance = Chance.of(metrics["single_view"]["accuracy"], inputs.statistics, ["test"])
+    chance = Chance.of(metrics.single_view.accuracy, inputs.statistics, ["test"])
     if chance.warning("classifier", "test") is not None:
         steps.append(
             (
@@ -53,11 +53,11 @@ def _steps(inputs: ReportInputs) -> list[tuple[str, str]]:
                 f"mevs run --out {RUN} --seeds 3",
             )
         )
-    if any(row["difference"] is None for row in metrics["compatibility"]["rows"].values()):
+    if any(row.difference is None for row in metrics.compatibility.rows.values()):
         steps.append(
             ("Compare with all changes of the thesis's published code:", f"mevs study published-code --out {RUN}")
         )
-    if "climbing" not in metrics:
+    if metrics.ascents is None:
         steps.append(
             ("Compare with the thesis's two methods by differentiable rendering:", f"mevs study rendering --out {RUN}")
         )

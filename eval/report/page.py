@@ -24,6 +24,7 @@ from eval.report.html import (
     ReportInputs,
     data_url,
     document,
+    folded,
     image,
     percent,
     picture,
@@ -63,7 +64,7 @@ def _data_section(inputs: ReportInputs) -> str:
         ["class", "train", "val", "test"], [["<b>all</b>", *totals], *rows], "number of objects in each class"
     )
     if len(rows) > MANY_CLASSES:
-        counts = f"<details><summary>Objects in each of the {len(rows)} classes</summary>{counts}</details>"
+        counts = folded(f"Objects in each of the {len(rows)} classes", counts)
     return (
         f"<h2>Data</h2><p>{html.escape(statistics.source)}: {statistics.views} views of each object ({lattice}), "
         f"{camera.resolution}×{camera.resolution} pixels, {camera.field_of_view:g}° field of view from {camera.distance:g} "
@@ -72,11 +73,7 @@ def _data_section(inputs: ReportInputs) -> str:
         + counts
         + f"<p>{statistics.left_out_count} objects were left out "
         + f"({', '.join(f'{len(names)} of {_SPLITS[split]}' for split, names in statistics.left_out.items())}).</p>"
-        + (
-            f"<details><summary>Objects left out, with reasons</summary><ul>{''.join(left_out)}</ul></details>"
-            if left_out
-            else ""
-        )
+        + (folded("Objects left out, with reasons", f"<ul>{''.join(left_out)}</ul>") if left_out else "")
         + _contact_sheet(inputs)
         + image(
             figures.entropy_histogram(
@@ -110,7 +107,7 @@ def _contact_sheet(inputs: ReportInputs) -> str:
 
 
 def _entropy_section(inputs: ReportInputs) -> str:
-    entropy, statistics, tables = inputs.metrics["entropy"], inputs.statistics, inputs.tables
+    entropy, statistics, tables = inputs.metrics.entropy, inputs.statistics, inputs.tables
     graph = statistics.graph
     errors = np.square(tables.predicted_entropy - tables.entropy[:, None, :]).mean(axis=(1, 2))
     example = int(np.argsort(errors)[len(errors) // 2])
@@ -130,25 +127,25 @@ def _entropy_section(inputs: ReportInputs) -> str:
         for weights, title in ((true, "true"), (predicted, "predicted after view 0"))
         for peaks in (local_maxima(jnp.asarray(weights), graph.neighbours),)
     ]
-    low, high = entropy["better_than_mean_map"]
+    low, high = entropy.better_than_mean_map
     verdict = "is better" if low > 0 else "is not better"
     gain = f"{low:+.4f} to {high:+.4f}".replace("-", "−")
-    explained = f"{100 * (entropy['explained_variance'] or 0):.0f}".replace("-", "−")
-    rows = [[html.escape(name), f"{value:.4f}"] for name, value in entropy["by_class"].items() if value is not None]
+    explained = f"{100 * (entropy.explained_variance or 0):.0f}".replace("-", "−")
+    rows = [[html.escape(name), f"{value:.4f}"] for name, value in entropy.by_class.items() if value is not None]
     return (
         "<h2>Predicting depth entropy</h2><p>A <dfn>partial cloud</dfn> is what one view shows of the surface, as points. "
         "From one partial cloud, the network PointNet++ predicts the normalised entropy of every view with a mean squared "
-        f"error of {entropy['pointnet2']:.4f} ({explained} % of the variance explained). "
+        f"error of {entropy.pointnet2:.4f} ({explained} % of the variance explained). "
         f"It {verdict} than the mean map, which receives no view (difference in error {gain}). The "
         "class-mean map is given the true class.</p>"
         + image(
             figures.entropy_errors(entropy),
             "Test objects, every view as input; 95 % intervals over objects. A shorter bar is better.",
-            f"Bars of the mean squared error: PointNet++ {entropy['pointnet2']:.4f}, mean map {entropy['mean_map']:.4f}, "
-            f"class-mean map {entropy['class_mean_map']:.4f}.",
+            f"Bars of the mean squared error: PointNet++ {entropy.pointnet2:.4f}, mean map {entropy.mean_map:.4f}, "
+            f"class-mean map {entropy.class_mean_map:.4f}.",
         )
         + f'<div class="figures">{"".join(maps)}</div>'
-        + f"<details><summary>Error by class</summary>{table(['class', 'MSE'], rows)}</details>"
+        + folded("Error by class", table(["class", "MSE"], rows))
     )
 
 
@@ -172,13 +169,13 @@ def _training_section(inputs: ReportInputs) -> str:
         ]
         for name, s in inputs.summaries.items()
     ]
-    by_view = inputs.metrics["single_view"]["by_view"]
+    by_view = inputs.metrics.single_view.by_view
     return (
         "<h2>Training</h2>"
         + table(["network", "best epoch", "epochs", "best validation loss", "time"], rows)
         + f'<div class="figures">{"".join(_losses(*named) for named in inputs.histories.items())}</div>'
         + f"<p>Accuracy on single views: {percent(min(by_view))} % at the worst viewpoint, {percent(max(by_view))} % at the "
-        f"best; class accuracy {percent(inputs.metrics['single_view']['class_accuracy'])} %.</p>"
+        f"best; class accuracy {percent(inputs.metrics.single_view.class_accuracy)} %.</p>"
     )
 
 
@@ -202,17 +199,21 @@ def _methods_section(inputs: ReportInputs) -> str:
         "<h2>Methods</h2><p>Splits are by object; nothing was chosen on test objects. Walks start from every reachable view of "
         f"every object. Results of random policies are means over {draws(inputs.metrics)}. "
         f"The policies' knowledge of other objects, and all temperatures, are fitted on "
-        f"{inputs.metrics['validation_objects']} validation objects. Preset "
+        f"{inputs.metrics.validation_objects} validation objects. Preset "
         f"<code>{html.escape(inputs.preset)}</code>, JAX {jax.__version__} on {html.escape(device.device_kind)} "
         f"({html.escape(platform.machine())}, Python {platform.python_version()}).</p>"
-        f"<details><summary>All settings</summary><pre>{settings}</pre></details>"
+        f"{folded('All settings', f'<pre>{settings}</pre>')}"
     )
 
 
 def _chance_notice(inputs: ReportInputs) -> str:
     """A notice if the classifier's accuracy on single views of test objects is not above chance."""
-    chance = Chance.of(inputs.metrics["single_view"]["accuracy"], inputs.statistics, ["test"])
+    chance = Chance.of(inputs.metrics.single_view.accuracy, inputs.statistics, ["test"])
     return warning(chance.warning("classifier", "test"))
+
+
+def _learned_section(inputs: ReportInputs) -> str:
+    return inputs.learned or ""
 
 
 _SECTIONS = (
@@ -222,7 +223,7 @@ _SECTIONS = (
     ladder_section,
     seeds_section,
     ascent_section,
-    lambda inputs: inputs.learned_section,
+    _learned_section,
     movement_section,
     confidence_section,
     grid_section,

@@ -18,7 +18,7 @@ import numpy as np
 from data_pipeline.dataset.builder import open_split
 from eval.report.html import ReportInputs, data_url, percent, picture
 from eval.report.surface import Surface, seen_by, surface_of
-from eval.report.walks import OF_EACH, Walks, walks_of
+from eval.report.walks import OF_EACH, POLICY, Walks, walks_of
 
 VIEWER = Path(__file__).with_name("viewer.js").read_text()
 _BARS = 5
@@ -49,7 +49,14 @@ def scenes_section(inputs: ReportInputs) -> str:
     """The walks around some objects, with a viewer; empty if the tables of the validation objects are not at hand."""
     if inputs.validation is None:
         return ""
-    walks = walks_of(inputs.tables, inputs.validation, inputs.statistics.graph, inputs.metrics)
+    metrics = inputs.metrics
+    walks = walks_of(
+        inputs.tables,
+        inputs.validation,
+        inputs.statistics.graph,
+        metrics.reachable,
+        metrics.confidence[POLICY].temperatures,
+    )
     source, shown, scenes = open_split(inputs.data, "test"), list[str](), list[dict]()
     for index, kind in walks.chosen().items():
         example = source[index]
@@ -58,7 +65,7 @@ def scenes_section(inputs: ReportInputs) -> str:
     data = {
         "classes": inputs.statistics.classes,
         "directions": np.round(inputs.statistics.viewpoints, 4).tolist(),
-        "reachable": inputs.metrics["reachable"],
+        "reachable": metrics.reachable.tolist(),
         "scenes": scenes,
     }
     stored = json.dumps(data, separators=(",", ":"), ensure_ascii=False).replace(

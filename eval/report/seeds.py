@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import html
-from typing import Any
 
-import numpy as np
-
+from eval.numbers.metrics import TrainingsRow
 from eval.report.html import MARKS, ReportInputs, difference, percent, rows_by_knowledge, table
 
 _STEPS = (2, 3, 4, 6, 9)
@@ -17,17 +15,17 @@ def seeds_section(inputs: ReportInputs) -> str:
     found = inputs.seeds
     if found is None:
         return ""
-    by_policy: dict[str, dict[int, dict[str, Any]]] = {}
-    for row in found["rows"]:
-        by_policy.setdefault(row["policy"], {})[row["views"]] = row
+    by_policy: dict[str, dict[int, TrainingsRow]] = {}
+    for row in found.rows:
+        by_policy.setdefault(row.policy, {})[row.views] = row
     steps = [step for step in _STEPS if step in by_policy["random"]]
     rows = []
     for of_policy in by_policy.values():
         first = of_policy[1]
-        rows.append((first["knows"], [html.escape(first["title"]), *(_cell(of_policy[step]) for step in steps)]))
-    single = np.array(found["single_view"])
+        rows.append((first.knows, [html.escape(first.title), *(_cell(of_policy[step]) for step in steps)]))
+    single = found.single_view
     return (
-        f"<h2>Over {found['seeds']} trainings</h2><p>Both networks were trained {found['seeds']} times from other seeds, "
+        f"<h2>Over {found.seeds} trainings</h2><p>Both networks were trained {found.seeds} times from other seeds, "
         "which change initial weights, augmentation and batches. All walk around the same objects. Mean accuracy (%) after the "
         "given number of views. Below it the difference from random in percentage points, with its 95 % interval over objects, "
         "for these trainings alone; and below that with its interval over objects and trainings, a t interval. A policy differs "
@@ -40,9 +38,9 @@ def seeds_section(inputs: ReportInputs) -> str:
     )
 
 
-def _cell(row: dict[str, Any]) -> str:
-    cell = f"<b>{percent(row['accuracy'])}</b>"
-    if row["policy"] == "random":
-        return cell
-    gain = row["difference"]
-    return f"{cell}<br>{difference(gain, row['difference_over_objects'])}<br>{difference(gain, row['difference_over_both'])}"
+def _cell(row: TrainingsRow) -> str:
+    cells = [f"<b>{percent(row.accuracy)}</b>"]
+    if row.policy != "random":
+        ends = row.difference_over_objects, row.difference_over_both
+        cells += [difference(row.difference, interval) for interval in ends]
+    return "<br>".join(cells)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import partial
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -77,23 +76,29 @@ class Walks:
         return chosen
 
 
-def walks_of(tables: ViewTables, validation: ViewTables, graph: ViewGraph, metrics: dict[str, Any]) -> Walks:
+def walks_of(
+    tables: ViewTables,
+    validation: ViewTables,
+    graph: ViewGraph,
+    reachable: Bool[np.ndarray, " views"],
+    temperatures: Float[np.ndarray, " steps"],
+) -> Walks:
     """Walks around every test object as the evaluation does, the first from the first view, the second from the second, ….
 
     Args:
         tables: of the test objects.
         validation: of the validation objects, whose mean logits the policy knows.
         graph: the candidate views.
-        metrics: of the evaluation, with reachable views, the limit on views and the fitted temperatures.
+        reachable: the views that the camera can visit.
+        temperatures: of the sum of logits after each number of views; walks are as long.
     """
-    reachable = np.array(metrics["reachable"])
-    steps = min(metrics["max_views"][-1], int(reachable.sum()))
     allowed = np.flatnonzero(reachable)
+    steps = min(len(temperatures), len(allowed))
     starts = allowed[np.arange(len(tables.labels)) % len(allowed)]
     knowledge = learn(validation.logits, validation.labels)
-    fitted = metrics["confidence"][POLICY]["readings"]["temperature"]["temperatures"][:steps]
+    fitted = jnp.asarray(temperatures[:steps], jnp.float32)
     views, gains, log_probabilities = _walk(
-        tables.stacked(), jnp.asarray(starts), graph, knowledge, jnp.asarray(reachable), jnp.asarray(fitted), steps
+        tables.stacked(), jnp.asarray(starts), graph, knowledge, jnp.asarray(reachable), fitted, steps
     )
     return Walks(np.asarray(views), np.asarray(gains), np.exp(np.asarray(log_probabilities)), np.asarray(tables.labels))
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import jax.numpy as jnp
@@ -18,9 +19,9 @@ from data_pipeline.dataset.inputs import metric_depth
 from data_pipeline.dataset.statistics import DatasetStatistics
 from eval.projections import mercator, mercator_ordinate
 from eval.report import figures
-from eval.thesis.results import LatticeTables
+from eval.thesis.results import LatticeTables, ThesisResults
 from mevs_jax.geometry.viewpoints import ViewGraph, local_maxima
-from train.many.thesis import BACKBONES, FRAMES, Frame, ThesisFolder
+from train.many.thesis import BACKBONES, Frame, ThesisFolder
 
 _MEDIAN = {"color": figures.INK, "linewidth": 2}
 _RING: dict[str, Any] = {"facecolors": "none", "edgecolors": "#dc2626", "linewidths": 1.6}
@@ -32,14 +33,14 @@ class FigureInputs:
 
     Attributes:
         folder: folder of the run.
-        results: content of `thesis.json`.
+        results: all numbers.
         statistics, tables: by number of views; the tables are of the test objects.
         histories: training history of each network, by the name of its folder.
         example: index of the test object that is shown as an example.
     """
 
     folder: ThesisFolder
-    results: dict[str, Any]
+    results: ThesisResults
     statistics: dict[int, DatasetStatistics]
     tables: dict[int, LatticeTables]
     histories: dict[str, list[dict[str, float]]]
@@ -48,20 +49,43 @@ class FigureInputs:
     def graph(self, views: int) -> ViewGraph:
         return self.statistics[views].graph
 
+    @property
+    def entropies(self) -> np.ndarray:
+        """(40,) true entropies of the views of the example."""
+        return self.tables[40].entropy[self.example]
+
+    @property
+    def example_name(self) -> str:
+        return self.tables[40].names[self.example]
+
+
+Drawn = tuple[Figure, str]
+"""A figure, and what it shows in words, for those who do not see it."""
+
 
 @dataclass(frozen=True)
 class ThesisFigure:
-    """A figure of the thesis: its number, the function that draws it, and its caption."""
+    """A figure of the thesis: its number, its caption, and the function that draws it."""
 
-    number: str
-    draw: Callable[[FigureInputs], Figure]
+    number: int
     caption: str
+    draw: Callable[[FigureInputs], Drawn]
+
+
+def extremes(values: Sequence[float] | np.ndarray, names: Sequence[str], form: str = "{:.0f}") -> str:
+    """The lowest and the highest value in words, with their names."""
+    low, high = int(np.argmin(values)), int(np.argmax(values))
+    return f"from {form.format(values[low])} ({names[low]}) to {form.format(values[high])} ({names[high]})"
+
+
+def _entropies(inputs: FigureInputs) -> str:
+    return extremes(inputs.entropies, [f"view {view}" for view in range(len(inputs.entropies))], "{:.2f}")
 
 
 # ------------------------------------------------------------------------------------------------------------- data, 5–9
 
 
-def class_distribution(inputs: FigureInputs) -> Figure:
+def class_distribution(inputs: FigureInputs) -> Drawn:
     statistics = inputs.statistics[40]
     train = [statistics.counts["train"][name] + statistics.counts["val"][name] for name in statistics.classes]
     test = [statistics.counts["test"][name] for name in statistics.classes]
@@ -76,10 +100,13 @@ def class_distribution(inputs: FigureInputs) -> Figure:
     views.spines.right.set_visible(True)
     views.set_ylabel(f"views ({statistics.views} per object)")
     figure.legend(frameon=False, ncols=2, loc="outside upper center")
-    return figure
+    return figure, (
+        f"Bars of {len(train)} classes. Objects to train on: {extremes(train, statistics.classes)}. Test objects: "
+        f"{extremes(test, statistics.classes)}."
+    )
 
 
-def points_per_view(inputs: FigureInputs) -> Figure:
+def points_per_view(inputs: FigureInputs) -> Drawn:
     statistics = inputs.statistics[40]
     boxes = [
         {"label": name, "whislo": low, "q1": first, "med": middle, "q3": third, "whishi": high, "fliers": []}
@@ -94,16 +121,23 @@ def points_per_view(inputs: FigureInputs) -> Figure:
         ylabel="points in a view",
         title=f"mean {statistics.points_mean:,.0f} ± {statistics.points_std:,.0f} of {pixels:,} pixels",
     )
-    return figure
+    medians = extremes([middle for _, _, middle, *_ in statistics.points_by_class], statistics.classes)
+    return figure, (
+        f"Boxes of the points in a view, by class. Medians are {medians}; a dotted line is at the mean, "
+        f"{statistics.points_mean:.0f}."
+    )
 
 
-def entropy_distribution(inputs: FigureInputs) -> Figure:
+def entropy_distribution(inputs: FigureInputs) -> Drawn:
     statistics = inputs.statistics[40]
     figure, train = plt.subplots(figsize=(6.4, 3.2), layout="constrained")
     test = train.twinx()
-    edges = np.linspace(0, 1, 51)
+    edges, said = np.linspace(0, 1, 51), []
     for axis, split, colour in ((train, "train", "#93c5fd"), (test, "test", "#d97706")):
         counts = statistics.entropy_histograms[split]
+        centres, called = (np.arange(len(counts)) + 0.5) / len(counts), "training" if split == "train" else split
+        mean, highest = np.average(centres, weights=np.array(counts, float)), centres[np.argmax(counts)]
+        said.append(f"{called} views, mean {mean:.2f}, highest bin at {highest:.2f}")
         axis.stairs(counts, edges, label=split, color=colour, fill=split == "train", linewidth=1.8)
         axis.set_ylabel(f"{split} views ({'filled' if split == 'train' else 'line'})")
         axis.set_ylim(0, 1.05 * max(counts))
@@ -113,7 +147,7 @@ def entropy_distribution(inputs: FigureInputs) -> Figure:
         title=f"training views: mean {statistics.entropy_mean:.3f}, sd {statistics.entropy_std:.3f} "
         f"(thesis, all views: 0.329, 0.156)",
     )
-    return figure
+    return figure, f"Two histograms of depth entropy on top of each other: {'; '.join(said)}."
 
 
 # ---------------------------------------------------------------------------------------------- lattices and graphs, 6–11
@@ -138,22 +172,24 @@ def _sphere_axes(rows: int, columns: int) -> tuple[Figure, np.ndarray]:
     return figure, axes
 
 
-def lattices(inputs: FigureInputs) -> Figure:
+def lattices(inputs: FigureInputs) -> Drawn:
     figure, axes = _sphere_axes(1, len(inputs.statistics))
     for axis, (views, statistics) in zip(axes[0], inputs.statistics.items(), strict=True):
         points = np.array(statistics.viewpoints)
         _sphere(axis, points)
         axis.scatter(*points.T, c=points[:, 2], cmap="coolwarm", s=26, depthshade=False)
         axis.set_title(f"{views} views")
-    return figure
+    return figure, f"Spheres with {' and '.join(map(str, inputs.statistics))} dots, evenly spread from pole to pole."
 
 
-def view_graphs(inputs: FigureInputs) -> Figure:
+def view_graphs(inputs: FigureInputs) -> Drawn:
     figure, axes = _sphere_axes(len(inputs.statistics), 3)
     dots: Any = None
+    counted = []
     for row, (views, statistics) in zip(axes, inputs.statistics.items(), strict=True):
         points, weights = np.array(statistics.viewpoints), inputs.tables[views].entropy[inputs.example]
         edges = np.argwhere(np.triu(np.asarray(inputs.graph(views).neighbours)))
+        counted.append(f"{len(edges)} edges between {views} views")
         for axis, coloured, connected in zip(row, (True, False, True), (False, True, True), strict=True):
             _sphere(axis, points)
             if connected:
@@ -166,7 +202,10 @@ def view_graphs(inputs: FigureInputs) -> Figure:
             dots = drawn if coloured else dots
             axis.set_title(f"{views} views" + (f", {len(edges)} edges" if connected else ""))
     figure.colorbar(dots, ax=axes, label="normalised depth entropy", shrink=0.6, pad=0.06)
-    return figure
+    return figure, (
+        f"Spheres in two rows, with the viewpoints coloured by entropy, the graph of neighbours, and both: "
+        f"{' and '.join(counted)}."
+    )
 
 
 def _map(axis: Axes, points: np.ndarray, **colour: Any) -> Any:
@@ -192,22 +231,26 @@ def _map_edges(axis: Axes, points: np.ndarray, neighbours: np.ndarray) -> None:
         axis.plot([x[east] - 360, x[west]], [y[east], y[west]], color="#9ca3af", linewidth=0.8, zorder=1, linestyle=":")
 
 
-def mercator_order_and_entropies(inputs: FigureInputs) -> Figure:
-    points, weights = np.array(inputs.statistics[40].viewpoints), inputs.tables[40].entropy[inputs.example]
+def mercator_order_and_entropies(inputs: FigureInputs) -> Drawn:
+    points, weights = np.array(inputs.statistics[40].viewpoints), inputs.entropies
     figure, (order, entropies) = plt.subplots(2, 1, figsize=(6.4, 8), layout="constrained")
     _map(order, points, color="#bfdbfe")
     for number, (x, y) in enumerate(zip(*mercator(points), strict=True)):
         order.annotate(str(number), (x, y), ha="center", va="center", fontsize=8, zorder=4, color="black")
     order.set_title("(a) canonical order")
     dots = _map(entropies, points, c=weights, cmap="viridis", vmin=0, vmax=1)
-    entropies.set_title(f"(b) {inputs.tables[40].names[inputs.example]}")
+    entropies.set_title(f"(b) {inputs.example_name}")
     figure.colorbar(dots, ax=entropies, label="normalised depth entropy")
-    return figure
+    way = "north to south" if points[0, 2] > points[-1, 2] else "south to north"
+    return figure, (
+        f"Two maps of 40 dots. Above, they are numbered in a spiral from {way}. Below, they are coloured by the entropies of "
+        f"{inputs.example_name}, {_entropies(inputs)}."
+    )
 
 
-def graph_with_maxima(inputs: FigureInputs) -> Figure:
+def graph_with_maxima(inputs: FigureInputs) -> Drawn:
     graph = inputs.graph(40)
-    points, weights = np.asarray(graph.points), inputs.tables[40].entropy[inputs.example]
+    points, weights = np.asarray(graph.points), inputs.entropies
     maxima = np.asarray(local_maxima(jnp.asarray(weights), graph.neighbours))
     figure, axes = plt.subplots(2, 1, figsize=(6.4, 8), layout="constrained")
     for axis in axes:
@@ -219,7 +262,10 @@ def graph_with_maxima(inputs: FigureInputs) -> Figure:
     axes[1].scatter(longitude[maxima], height[maxima], s=240, zorder=4, **_RING)
     axes[1].set_title(f"(b) {maxima.sum()} local maxima")
     figure.colorbar(dots, ax=axes[1], label="normalised depth entropy")
-    return figure
+    return figure, (
+        f"Two maps of 40 dots joined by lines to their neighbours. Below, entropies {_entropies(inputs)}, with rings around the "
+        f"local maxima: views {', '.join(map(str, np.flatnonzero(maxima)))}."
+    )
 
 
 _EXAMPLE_NODES = {
@@ -230,7 +276,7 @@ _EXAMPLE_EDGES = ("AB", "AC", "AD", "BC", "BE", "CF", "CG", "DG", "EF", "EH", "E
 """The graph of the thesis's Fig. 21 (positions, weights, edges), from `check_functionality.py` of its published code."""
 
 
-def example_graph(inputs: FigureInputs) -> Figure:
+def example_graph(inputs: FigureInputs) -> Drawn:
     names = list(_EXAMPLE_NODES)
     x, y, weights = np.array(list(_EXAMPLE_NODES.values())).T
     neighbours = np.zeros((len(names), len(names)), bool)
@@ -248,16 +294,17 @@ def example_graph(inputs: FigureInputs) -> Figure:
         axis.annotate(name, place, ha="center", va="center", fontsize=8, fontweight="bold", color="black")
     axis.set_axis_off()
     axis.margins(0.08, 0.2)
-    return figure
+    return figure, "A graph of ten nodes, A to J, with their weights; rings are around the local maxima E, D, C and I."
 
 
-def best_and_worst_depths(inputs: FigureInputs) -> Figure:
-    weights = inputs.tables[40].entropy[inputs.example]
+def best_and_worst_depths(inputs: FigureInputs) -> Drawn:
+    weights = inputs.entropies
     depth = np.asarray(metric_depth(open_split(inputs.folder.data(40), "test")[inputs.example]["depth"]))
     nearest = inputs.statistics[40].camera.distance - 1
     order = np.argsort(weights)
+    highest, lowest = order[::-1][:3], order[:3]
     figure, axes = plt.subplots(2, 3, figsize=(6.6, 4.8), layout="constrained")
-    for row, chosen in zip(axes, (order[::-1][:3], order[:3]), strict=True):
+    for row, chosen in zip(axes, (highest, lowest), strict=True):
         for axis, view in zip(row, chosen, strict=True):
             axis.imshow(
                 np.where(depth[view] > 0, depth[view], np.nan), cmap="viridis_r", vmin=nearest, vmax=nearest + 2
@@ -267,159 +314,177 @@ def best_and_worst_depths(inputs: FigureInputs) -> Figure:
             axis.spines[:].set_visible(False)
     axes[0][0].set_ylabel("highest")
     axes[1][0].set_ylabel("lowest")
-    return figure
+    above, below = (", ".join(map(str, views)) for views in (highest, lowest))
+    return figure, (
+        f"Six depth images of {inputs.example_name}: above, views {above} of highest entropy; below, views {below} of lowest."
+    )
 
 
 # ---------------------------------------------------------------------------------------------------------- losses, 17–19
 
 
-def _losses(axis: Axes, history: list[dict[str, float]], colour: str, label: str, marker: str = "o") -> None:
-    """Training losses by dashed lines, validation losses by solid ones; `marker` differs between networks."""
-    epochs = [entry["epoch"] for entry in history]
-    for key, line, called in (("train/loss", "--", "training"), ("val/loss", "-", "validation")):
-        losses = [entry[key] for entry in history]
-        axis.plot(epochs, losses, marker + line, color=colour, markersize=4, label=f"{label}{called}")
+def _losses(axis: Axes, history: list[dict[str, float]], colour: str, label: str = "", marker: str = "o") -> str:
+    """Training losses by dashed lines, validation losses by solid ones; `marker` differs between networks. In words, too."""
+    lines = (("--", "training"), ("-", "validation"))
+    figures.loss_curves(axis, history, [(marker + line, colour, f"{label}{called}") for line, called in lines])
+    axis.xaxis.set_major_locator(MaxNLocator(integer=True))
+    first, last = history[0], history[-1]
+    return (
+        f"training loss from {first['train/loss']:.4f} to {last['train/loss']:.4f}, validation loss from "
+        f"{first['val/loss']:.4f} to {last['val/loss']:.4f}, in {len(history)} epochs"
+    )
 
 
-def entropy_losses(inputs: FigureInputs) -> Figure:
+def entropy_losses(inputs: FigureInputs) -> Drawn:
     figure, axes = plt.subplots(2, 1, figsize=(4.2, 5.6), layout="constrained")
     styles: dict[Frame, tuple[str, str]] = {"world": ("#2563eb", "o"), "camera": ("#d97706", "s")}
+    said = []
     for axis, views, letter in zip(axes, inputs.statistics, "ab", strict=True):
-        for frame in FRAMES:
-            colour, marker = styles[frame]
-            _losses(axis, inputs.histories[f"entropy_{views}_{frame}"], colour, f"{frame} frame, ", marker)
+        for frame, (colour, marker) in styles.items():
+            history = inputs.histories[f"entropy_{views}_{frame}"]
+            curves = _losses(axis, history, colour, f"{frame} frame, ", marker)
+            said.append(f"{views} views, {frame} frame: {curves}")
         axis.set(xlabel="epoch", ylabel="mean squared error", title=f"({letter}) {views} views")
         figures.logarithmic(axis)
-        axis.xaxis.set_major_locator(MaxNLocator(integer=True))
         axis.legend(frameon=False, fontsize=9)
-    return figure
+    return figure, f"Curves of losses. {'; '.join(said)}."
 
 
-def backbone_losses(indices: Sequence[int]) -> Callable[[FigureInputs], Figure]:
-    def draw(inputs: FigureInputs) -> Figure:
-        figure, axes = plt.subplots(2, 1, figsize=(4.2, 5.6), layout="constrained", sharey=True)
-        for axis, index, letter in zip(axes, indices, "ab", strict=True):
-            backbone = BACKBONES[index]
-            _losses(axis, inputs.histories[backbone.name], "#2563eb", "")
-            axis.set(xlabel="epoch", ylabel="cross entropy", title=f"({letter}) {backbone.title}")
-            axis.xaxis.set_major_locator(MaxNLocator(integer=True))
-            axis.legend(frameon=False, fontsize=9)
-        axes[0].set_ylim(bottom=0)
-        return figure
-
-    return draw
+def backbone_losses(inputs: FigureInputs, indices: Sequence[int]) -> Drawn:
+    figure, axes = plt.subplots(2, 1, figsize=(4.2, 5.6), layout="constrained", sharey=True)
+    said = []
+    for axis, index, letter in zip(axes, indices, "ab", strict=True):
+        backbone = BACKBONES[index]
+        said.append(f"{backbone.title}: {_losses(axis, inputs.histories[backbone.name], '#2563eb')}")
+        axis.set(xlabel="epoch", ylabel="cross entropy", title=f"({letter}) {backbone.title}")
+        axis.legend(frameon=False, fontsize=9)
+    axes[0].set_ylim(bottom=0)
+    return figure, f"Curves of losses. {'; '.join(said)}."
 
 
 # -------------------------------------------------------------------------------------------------- accuracies, 20, 23–25
 
 
-def accuracy_grid(views: int) -> Callable[[FigureInputs], Figure]:
-    def draw(inputs: FigureInputs) -> Figure:
-        found, thresholds = inputs.results["pipeline"][str(views)], inputs.results["thresholds"]
-        random, predicted = (
-            100 * np.mean(found["policies"][name]["accuracy"], axis=0) for name in ("random", "predicted_entropy")
-        )  # (MV, CT)
-        figure, axis = plt.subplots(figsize=(8.6, 4.4), layout="constrained")
-        limits = np.array(found["max_views"])
-        offsets = np.linspace(-0.3, 0.3, len(limits))
-        for row, offset, alpha in zip(range(len(limits)), offsets, np.linspace(0.25, 1, len(limits)), strict=True):
-            x = np.arange(len(thresholds)) + offset
-            for column, at in enumerate(x):
-                before, after = random[row, column], predicted[row, column]
-                colour, line = ("#059669", "-") if after > before else ("#dc2626", ":")
-                axis.plot([at, at], [before, after], line, color=colour, linewidth=1.5)
-            last = row == len(limits) - 1
-            for values, colour, marker, name in (
-                (random, "#6b7280", "o", "random"),
-                (predicted, "#2563eb", "s", "PointNet++"),
-            ):
-                label = name if last else None
-                axis.scatter(x, values[row], s=18, color=colour, marker=marker, alpha=alpha, label=label, zorder=3)
-        axis.set_xticks(range(len(thresholds)), [f"{ct:g}" for ct in thresholds])
-        axis.set(
-            xlabel=f"confidence threshold (for each, left to right: limit of {limits[0]} to {limits[-1]} views)",
-            ylabel="accuracy (%)",
-            title=f"{views} views, mean of the three backbones",
-        )
-        axis.legend(frameon=False, loc="lower right")
-        return figure
-
-    return draw
-
-
-def confusion_matrices(inputs: FigureInputs) -> Figure:
-    policies = inputs.results["pipeline"]["10"]["confusion"]["policies"]
-    titles = {"random": "random", "predicted_entropy": "PointNet++"}
-    return figures.confusions(
-        {title: np.array(policies[name]) for name, title in titles.items()}, inputs.results["classes"]
-    )
-
-
-def confusion_difference(inputs: FigureInputs) -> Figure:
-    policies, classes = inputs.results["pipeline"]["10"]["confusion"]["policies"], inputs.results["classes"]
+def accuracy_grid(inputs: FigureInputs, views: int) -> Drawn:
+    found, thresholds = inputs.results.pipeline[views], inputs.results.thresholds
     random, predicted = (
-        100 * np.array(policies[name]) / np.maximum(np.sum(policies[name], axis=1, keepdims=True), 1e-9)
-        for name in ("random", "predicted_entropy")
+        100 * found.policies[name].accuracy.mean(axis=0) for name in ("random", "predicted_entropy")
+    )  # (MV, CT)
+    figure, axis = plt.subplots(figsize=(8.6, 4.4), layout="constrained")
+    limits = found.max_views
+    offsets, alphas = np.linspace(-0.3, 0.3, len(limits)), np.linspace(0.25, 1, len(limits))
+    for row, (offset, alpha) in enumerate(zip(offsets, alphas, strict=True)):
+        x = np.arange(len(thresholds)) + offset
+        for at, before, after in zip(x, random[row], predicted[row], strict=True):
+            colour, line = ("#059669", "-") if after > before else ("#dc2626", ":")
+            axis.plot([at, at], [before, after], line, color=colour, linewidth=1.5)
+        for values, colour, marker, name in (
+            (random, "#6b7280", "o", "random"),
+            (predicted, "#2563eb", "s", "PointNet++"),
+        ):
+            label = name if row == len(limits) - 1 else None
+            axis.scatter(x, values[row], s=18, color=colour, marker=marker, alpha=alpha, label=label, zorder=3)
+    axis.set_xticks(range(len(thresholds)), [f"{ct:g}" for ct in thresholds])
+    axis.set(
+        xlabel=f"confidence threshold (for each, left to right: limit of {limits[0]} to {limits[-1]} views)",
+        ylabel="accuracy (%)",
+        title=f"{views} views, mean of the three backbones",
     )
+    axis.legend(frameon=False, loc="lower right")
+    return figure, (
+        f"Pairs of dots for each limit on views and each threshold. PointNet++ is above random in "
+        f"{(predicted > random).sum()} of {random.size} cells. Random: {random.min():.1f} to {random.max():.1f} %; "
+        f"PointNet++: {predicted.min():.1f} to {predicted.max():.1f} %."
+    )
+
+
+def _confusions(inputs: FigureInputs) -> dict[str, np.ndarray]:
+    policies = inputs.results.pipeline[10].confusion.policies
+    return {"random": policies["random"], "PointNet++": policies["predicted_entropy"]}
+
+
+def confusion_matrices(inputs: FigureInputs) -> Drawn:
+    classes, said, matrices = inputs.results.classes, [], _confusions(inputs)
+    for name, matrix in matrices.items():
+        share = figures.shares_of(matrix)
+        right, wrong = np.diag(share), share * (1 - np.eye(len(classes)))
+        true, taken = np.unravel_index(wrong.argmax(), wrong.shape)
+        said.append(
+            f"{name}: classes are right in {right.min():.0f} to {right.max():.0f} %, and {wrong.max():.0f} % of "
+            f"{classes[true]} are taken for {classes[taken]}"
+        )
+    return (
+        figures.confusions(matrices, classes),
+        f"Two matrices of true and predicted classes. {'; '.join(said)}.",
+    )
+
+
+def confusion_difference(inputs: FigureInputs) -> Drawn:
+    classes = inputs.results.classes
+    random, predicted = map(figures.shares_of, _confusions(inputs).values())
     gain = predicted - random
+
+    def text_of(row: int, column: int) -> str:
+        value = gain[row, column]
+        return f"{value:+.1f}".replace("-", "−") if abs(value) >= 0.05 else ""
+
     largest = max(1.0, np.abs(gain).max())
     figure, axis = plt.subplots(figsize=(5.4, 4.8), layout="constrained")
-    cells = axis.imshow(gain, cmap="RdBu", vmin=-largest, vmax=largest)
-    for (row, column), value in np.ndenumerate(gain):
-        if abs(value) >= 0.05:
-            colour = figures.ink_on(cells.to_rgba(value))
-            text = f"{value:+.1f}".replace("-", "−")
-            axis.text(column, row, text, ha="center", va="center", fontsize=8, color=colour)
-    axis.set_xticks(range(len(classes)), classes, rotation=60, ha="right")
-    axis.set_yticks(range(len(classes)), classes)
+    names = classes, classes
+    figures.heat_map(axis, gain, text_of, names, rotation=60, cmap="RdBu", vmin=-largest, vmax=largest)
     axis.set(xlabel="predicted", ylabel="true", title="PointNet++ minus random (points)")
-    return figure
+    gains = extremes([round(float(value), 1) + 0.0 for value in np.diag(gain)], classes, "{:+.1f}")
+    return figure, f"A matrix of differences. On its diagonal, gains in points: {gains}."
 
 
 _LINES = "Solid, green lines: PointNet++ is above random; dotted, red lines: below."
 
 FIGURES = (
     ThesisFigure(
-        "5",
-        class_distribution,
-        "Number of objects in each class; validation objects are taken from the training split.",
+        5, "Number of objects in each class; validation objects are taken from the training split.", class_distribution
     ),
-    ThesisFigure("6", lattices, "Fibonacci lattices of 10 and 40 viewpoints; the 10 viewpoints are not among the 40."),
+    ThesisFigure(6, "Fibonacci lattices of 10 and 40 viewpoints; the 10 viewpoints are not among the 40.", lattices),
     ThesisFigure(
-        "7",
-        mercator_order_and_entropies,
+        7,
         "The 40 viewpoints: their order, and the depth entropies of one test object. The Mercator projection, which the thesis "
         "uses, enlarges what is near the poles.",
+        mercator_order_and_entropies,
     ),
-    ThesisFigure("8", points_per_view, "Points per view by class: median, quartiles, 5th and 95th percentiles."),
-    ThesisFigure("9", entropy_distribution, "Depth entropies of all views by split; each split has its own scale."),
+    ThesisFigure(8, "Points per view by class: median, quartiles, 5th and 95th percentiles.", points_per_view),
+    ThesisFigure(9, "Depth entropies of all views by split; each split has its own scale.", entropy_distribution),
     ThesisFigure(
-        "10", view_graphs, "Viewpoints with the entropies of one test object, the view graph (convex hull), and both."
+        10, "Viewpoints with the entropies of one test object, the view graph (convex hull), and both.", view_graphs
     ),
     ThesisFigure(
-        "11",
-        graph_with_maxima,
+        11,
         "The view graph and the local maxima (red rings) of one test object; dotted edges cross ±180° longitude.",
+        graph_with_maxima,
     ),
     ThesisFigure(
-        "17",
-        entropy_losses,
+        17,
         "Losses of PointNet++. Training losses are means over an epoch, with augmentation if it is on.",
+        entropy_losses,
     ),
     ThesisFigure(
-        "18", backbone_losses((0, 1)), "ResNet-18 on images: training on 10 views, and fine-tuning on 40 views."
-    ),
-    ThesisFigure("19", backbone_losses((2, 3)), "ResNet-18 on depth, initialised from images, and ResNet-34 on depth."),
-    ThesisFigure("20", accuracy_grid(10), "Table 10 as a figure. " + _LINES),
-    ThesisFigure("21", example_graph, "The thesis's example graph, with local maxima E, D, C and I."),
-    ThesisFigure(
-        "22", best_and_worst_depths, "Depth images of one test object from the views of highest and lowest entropy."
+        18,
+        "ResNet-18 on images: training on 10 views, and fine-tuning on 40 views.",
+        partial(backbone_losses, indices=(0, 1)),
     ),
     ThesisFigure(
-        "23",
-        confusion_matrices,
+        19,
+        "ResNet-18 on depth, initialised from images, and ResNet-34 on depth.",
+        partial(backbone_losses, indices=(2, 3)),
+    ),
+    ThesisFigure(20, "Table 10 as a figure. " + _LINES, partial(accuracy_grid, views=10)),
+    ThesisFigure(21, "The thesis's example graph, with local maxima E, D, C and I.", example_graph),
+    ThesisFigure(
+        22, "Depth images of one test object from the views of highest and lowest entropy.", best_and_worst_depths
+    ),
+    ThesisFigure(
+        23,
         "Confusion matrices in % of the true class: 10 views, CT 0.99, MV 4, ResNet-18 on images.",
+        confusion_matrices,
     ),
-    ThesisFigure("24", confusion_difference, "Difference between the two confusion matrices of Figure 23."),
-    ThesisFigure("25", accuracy_grid(40), "Table 11 as a figure. " + _LINES),
+    ThesisFigure(24, "Difference between the two confusion matrices of Figure 23.", confusion_difference),
+    ThesisFigure(25, "Table 11 as a figure. " + _LINES, partial(accuracy_grid, views=40)),
 )

@@ -9,7 +9,6 @@ import matplotlib.pyplot as plt
 
 from data_pipeline.files import write_bytes, write_text
 from eval.report.html import commands, document, drawn, embedded, table
-from eval.thesis.alts import ALTS
 from eval.thesis.figures import FIGURES, FigureInputs, ThesisFigure
 from eval.thesis.layout import ThesisTable
 from eval.thesis.tables import all_tables, markdown, shown_cells
@@ -86,12 +85,12 @@ def _mark(gain: str) -> str:
 
 def _save_figure(shown: ThesisFigure, inputs: FigureInputs, folder: Path) -> str:
     """Draws a figure, saves it as PNG and SVG, and returns its HTML."""
-    figure = shown.draw(inputs)
+    figure, alt = shown.draw(inputs)
     files = {kind: drawn(figure, kind) for kind in ("png", "svg")}
     plt.close(figure)
     for kind, content in files.items():
-        write_bytes(folder / f"figure_{int(shown.number):02d}.{kind}", content)
-    return embedded(files["svg"], "svg", shown.caption, f"Figure {shown.number}", ALTS[shown.number](inputs))
+        write_bytes(folder / f"figure_{shown.number:02d}.{kind}", content)
+    return embedded(files["svg"], "svg", shown.caption, f"Figure {shown.number}", alt)
 
 
 def write_thesis_report(inputs: FigureInputs, lead: str, folder: Path, over: ThesisTable | None = None) -> Path:
@@ -120,7 +119,7 @@ def write_thesis_report(inputs: FigureInputs, lead: str, folder: Path, over: The
                 shown = pictures[name]
                 page.append(_save_figure(shown, inputs, folder / "figures"))
                 text.append(
-                    f"![Figure {shown.number}](figures/figure_{int(shown.number):02d}.png)\n\n"
+                    f"![Figure {shown.number}](figures/figure_{shown.number:02d}.png)\n\n"
                     f"**Figure {shown.number}.** {shown.caption}\n"
                 )
     title = "Reproduction of the thesis"

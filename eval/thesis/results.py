@@ -3,17 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
-from typing import Any
+from dataclasses import dataclass
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Float, Int
 
 from data_pipeline.dataset.statistics import DatasetStatistics
-from eval.numbers.comparison import class_mean, intervals
+from eval.numbers.comparison import class_mean, interval_of
 from eval.numbers.study import HEADLINE_CT, HEADLINE_MV, exactly_random, headline_confusion
 from eval.tables import ViewTables
+from eval.thesis.timing import Measured
 from eval.walks.grid import FIRST_MV, THRESHOLDS, GridConfig, Results, run_grid
 from eval.walks.ladder import SCRAMBLED, ladder
 from mevs_jax.geometry.viewpoints import ViewGraph
@@ -51,67 +52,197 @@ class LatticeTables:
         return ViewTables(self.names, self.labels, self.logits[backbone], self.predicted_entropy[frame], self.entropy)
 
 
-# ------------------------------------------------------------------------------------------------------- single networks
+# ---------------------------------------------------------------------------------------------------------------- records
+
+_Pair = Float[np.ndarray, "2"]
+_Grid = Float[np.ndarray, "limits thresholds"]
+_GridIntervals = Float[np.ndarray, "limits thresholds 2"]
+_Objects = Float[np.ndarray, " objects"]
+ByClass = dict[str, tuple[float, float]]
+"""Mean and standard deviation by class, and for all of them."""
 
 
-def single_views(tables: dict[int, LatticeTables]) -> dict[str, dict[str, Any]]:
-    """Accuracy of every backbone on single views of both data sets (Table 6)."""
-    out: dict[str, dict[str, Any]] = {}
-    for backbone in BACKBONES:
-        out[backbone.name] = {}
-        for views, lattice in tables.items():
-            right = (lattice.logits[backbone.name].argmax(-1) == lattice.labels[:, None]).mean(axis=1)
-            out[backbone.name][str(views)] = {
-                "accuracy": float(right.mean()),
-                "interval": intervals(right),
-                "by_object": right.tolist(),
-            }
-    return out
+@dataclass(frozen=True)
+class SingleView:
+    """Accuracy of a backbone on single views."""
+
+    accuracy: float
+    interval: _Pair
+    by_object: _Objects
 
 
-def _by_class(errors: np.ndarray, labels: np.ndarray, classes: Sequence[str]) -> dict[str, list[float]]:
-    """Mean and standard deviation over clouds, from (objects, views)."""
-    rows = {name: errors[labels == label] for label, name in enumerate(classes)} | {"all": errors}
-    return {name: [float(of.mean()), float(of.std())] for name, of in rows.items() if of.size}
+@dataclass(frozen=True)
+class FrameErrors:
+    """Squared error of the entropies that a network predicts from clouds in one frame."""
+
+    mse: float
+    interval: _Pair
+    by_object: _Objects
+    explained_variance: float
+    by_class: ByClass
 
 
-def entropy_learning(lattice: LatticeTables, statistics: DatasetStatistics) -> dict[str, Any]:
-    """Errors of the predicted entropies on test objects by frame and class, and of two predictors that receive no view.
+@dataclass(frozen=True)
+class ErrorDifference:
+    """A difference of squared errors."""
+
+    mse: float
+    interval: _Pair
+
+
+@dataclass(frozen=True)
+class EntropyLearning:
+    """Errors of the predicted entropies on test objects, and of two predictors that receive no view.
 
     `every_side` is the error of the mean prediction over the clouds of all views, approximately the best that clouds allow.
     """
+
+    frames: dict[str, FrameErrors]
+    every_side: ByClass
+    variance: float
+    mean_map: ByClass
+    class_mean_map: ByClass
+    camera_minus_world: ErrorDifference
+
+
+@dataclass(frozen=True)
+class PolicyGrid:
+    """A policy by limit on views and threshold; the interval is of the mean over backbones."""
+
+    accuracy: Float[np.ndarray, "backbones limits thresholds"]
+    interval: _GridIntervals
+    views_used: Float[np.ndarray, "backbones limits thresholds"]
+
+
+@dataclass(frozen=True)
+class Gain:
+    """The difference between two policies, mean over backbones."""
+
+    difference: _Grid
+    interval: _GridIntervals
+    mean: float
+    mean_interval: _Pair
+    by_object: _Objects
+    above_zero: int
+
+
+@dataclass(frozen=True)
+class BestCell:
+    """A cell of the grid."""
+
+    max_views: int
+    threshold: float
+    accuracy: float
+    interval: _Pair
+    class_accuracy: float
+
+
+@dataclass(frozen=True)
+class Confusions:
+    """Confusion matrices by policy in one cell of the grid."""
+
+    max_views: int
+    threshold: float
+    policies: dict[str, Float[np.ndarray, "classes classes"]]
+
+
+@dataclass(frozen=True)
+class Pipeline:
+    """The thesis's multi-view grid on one lattice; `best` is by backbone and by the objects it was chosen on."""
+
+    max_views: Int[np.ndarray, " limits"]
+    policies: dict[str, PolicyGrid]
+    gain: dict[str, Gain]
+    views_used_gain: Gain
+    best: dict[str, dict[str, BestCell]]
+    confusion: Confusions
+
+
+@dataclass(frozen=True)
+class Grids:
+    """What is computed from the outputs of the networks, most of it by number of views."""
+
+    objects: dict[int, int]
+    classes: list[str]
+    thresholds: Float[np.ndarray, " thresholds"]
+    evaluation: GridConfig
+    single_views: dict[str, dict[int, SingleView]]
+    entropy: dict[int, EntropyLearning]
+    pipeline: dict[int, Pipeline]
+
+
+@dataclass(frozen=True)
+class BackboneTraining:
+    """The training of a classifier (Table 5)."""
+
+    train_loss: float
+    val_loss: float
+    epochs: int
+    best_epoch: int
+    start: str
+
+
+@dataclass(frozen=True)
+class ThesisResults(Measured, Grids):
+    """All that `thesis.json` holds but its identity."""
+
+    backbones: dict[str, BackboneTraining]
+    training_seconds: dict[str, float]
+    left_out: dict[int, dict[str, dict[str, str]]]
+
+
+# ------------------------------------------------------------------------------------------------------- single networks
+
+
+def single_view(lattice: LatticeTables, backbone: str) -> SingleView:
+    """Accuracy of a backbone on single views (Table 6)."""
+    right = (lattice.logits[backbone].argmax(-1) == lattice.labels[:, None]).mean(axis=1)
+    return SingleView(float(right.mean()), interval_of(right), right)
+
+
+def _by_class(errors: np.ndarray, labels: np.ndarray, classes: Sequence[str]) -> ByClass:
+    """Mean and standard deviation over clouds, from (objects, views)."""
+    rows = {name: errors[labels == label] for label, name in enumerate(classes)} | {"all": errors}
+    return {name: (float(of.mean()), float(of.std())) for name, of in rows.items() if of.size}
+
+
+def entropy_learning(lattice: LatticeTables, statistics: DatasetStatistics) -> EntropyLearning:
+    """Errors of the predicted entropies on test objects by frame and class, and of predictors that receive no view."""
     true, labels, classes = lattice.entropy, lattice.labels, statistics.classes
-    errors = {frame: np.square(lattice.predicted_entropy[frame] - true[:, None]).mean(axis=-1) for frame in FRAMES}
-    mean_map = np.square(np.array(statistics.mean_map) - true).mean(axis=1, keepdims=True)
-    class_map = np.square(np.array(statistics.class_mean_maps)[labels] - true).mean(axis=1, keepdims=True)
-    every_side = np.square(lattice.predicted_entropy["world"].mean(axis=1) - true).mean(axis=1, keepdims=True)
     variance = float(true.var())
+    errors = {frame: np.square(lattice.predicted_entropy[frame] - true[:, None]).mean(axis=-1) for frame in FRAMES}
     per_object = {frame: of.mean(axis=1) for frame, of in errors.items()}
-    return {
-        "frames": {
-            frame: {
-                "mse": float(of.mean()),
-                "interval": intervals(of),
-                "by_object": of.tolist(),
-                "explained_variance": 1 - float(of.mean()) / variance,
-                "by_class": _by_class(errors[frame], labels, classes),
-            }
-            for frame, of in per_object.items()
-        },
-        "every_side": _by_class(every_side, labels, classes),
-        "variance": variance,
-        "mean_map": _by_class(mean_map, labels, classes),
-        "class_mean_map": _by_class(class_map, labels, classes),
-        "camera_minus_world": {
-            "mse": float((per_object["camera"] - per_object["world"]).mean()),
-            "interval": intervals(per_object["camera"] - per_object["world"]),
-        },
-    }
+    difference = per_object["camera"] - per_object["world"]
+
+    def of_map(predicted: np.ndarray) -> ByClass:
+        return _by_class(np.square(predicted - true).mean(axis=1, keepdims=True), labels, classes)
+
+    def of_frame(frame: Frame) -> FrameErrors:
+        each = per_object[frame]
+        mean, by_class = float(each.mean()), _by_class(errors[frame], labels, classes)
+        return FrameErrors(mean, interval_of(each), each, 1 - mean / variance, by_class)
+
+    return EntropyLearning(
+        frames={frame: of_frame(frame) for frame in FRAMES},
+        every_side=of_map(lattice.predicted_entropy["world"].mean(axis=1)),
+        variance=variance,
+        mean_map=of_map(np.array(statistics.mean_map)),
+        class_mean_map=of_map(np.array(statistics.class_mean_maps)[labels]),
+        camera_minus_world=ErrorDifference(float(difference.mean()), interval_of(difference)),
+    )
 
 
 # ---------------------------------------------------------------------------------------------------------------- walking
 
 
+GAINS = {
+    "text": ("predicted_entropy", "random"),
+    "camera": ("camera_predicted_entropy", "random"),
+    "repetition": ("predicted_entropy", "random_with_repetition"),
+    "published_code": ("camera_scrambled_entropy", "random_with_repetition"),
+    "oracle": ("oracle_entropy", "random"),
+}
+"""Policy and baseline of each gain."""
 POLICIES = ("random", "random_with_repetition", "predicted_entropy", "oracle_entropy")
 """The policies of `ladder` that the thesis evaluates."""
 
@@ -130,52 +261,45 @@ def walk(
     return found
 
 
-def _gain(policy: Results, base: Results, field: str = "right") -> dict[str, Any]:
-    """Difference between two policies, mean over backbones, (MV, CT), with intervals over objects."""
+def _gain(policy: Results, base: Results, field: str = "right") -> Gain:
+    """Difference between two policies, with intervals over objects."""
     each = np.asarray(getattr(policy, field)) - np.asarray(getattr(base, field))
     gain = np.moveaxis(each.mean(axis=0), 0, -1)
-    return {
-        "difference": gain.mean(axis=-1).tolist(),
-        "interval": intervals(gain),
-        "mean": float(gain.mean()),
-        "mean_interval": intervals(gain.mean(axis=(0, 1))),
-        "by_object": gain.mean(axis=(0, 1)).tolist(),
-        "above_zero": int((gain.mean(axis=-1) > 0).sum()),
-    }
+    return Gain(
+        difference=gain.mean(axis=-1),
+        interval=interval_of(gain),
+        mean=float(gain.mean()),
+        mean_interval=interval_of(gain.mean(axis=(0, 1))),
+        by_object=gain.mean(axis=(0, 1)),
+        above_zero=int((gain.mean(axis=-1) > 0).sum()),
+    )
 
 
-def _accuracy(results: Results) -> dict[str, Any]:
+def _grid_of(results: Results) -> PolicyGrid:
     right, used = np.asarray(results.right), np.asarray(results.used)
-    return {
-        "accuracy": right.mean(axis=1).tolist(),  # (backbones, MV, CT)
-        "interval": intervals(np.moveaxis(right.mean(axis=0), 0, -1)),  # of the mean over backbones
-        "views_used": used.mean(axis=1).tolist(),
-    }
+    interval = interval_of(np.moveaxis(right.mean(axis=0), 0, -1))
+    return PolicyGrid(right.mean(axis=1), interval, used.mean(axis=1))
 
 
-def best_cells(test: Results, validation: Results, labels: np.ndarray) -> list[dict[str, Any]]:
+def best_cells(test: Results, validation: Results, labels: np.ndarray) -> list[dict[str, BestCell]]:
     """The best cell of each backbone, chosen on test objects as in the thesis, and chosen on validation objects."""
-    out = []
-    for right, held_out in zip(np.asarray(test.right), np.asarray(validation.right), strict=True):
-        by_cell = np.moveaxis(right, 0, -1)
-        found = {}
-        for chosen_on, scores in (("test", by_cell.mean(axis=-1)), ("validation", held_out.mean(axis=0))):
-            row, column = np.unravel_index(scores.argmax(), scores.shape)
-            cell = by_cell[row, column]
-            found[chosen_on] = {
-                "max_views": int(row) + FIRST_MV,
-                "threshold": THRESHOLDS[column],
-                "accuracy": float(cell.mean()),
-                "interval": intervals(cell),
-                "class_accuracy": float(class_mean(cell, labels)),
-            }
-        out.append(found)
-    return out
+
+    def best(right: np.ndarray, scores: np.ndarray) -> BestCell:
+        row, column = np.unravel_index(scores.argmax(), scores.shape)
+        cell = right[:, row, column]
+        recall = float(class_mean(cell, labels))
+        return BestCell(int(row) + FIRST_MV, THRESHOLDS[column], float(cell.mean()), interval_of(cell), recall)
+
+    pairs = zip(np.asarray(test.right), np.asarray(validation.right), strict=True)
+    return [
+        {"test": best(right, right.mean(axis=0)), "validation": best(right, held_out.mean(axis=0))}
+        for right, held_out in pairs
+    ]
 
 
 def pipeline(
     test: LatticeTables, validation: LatticeTables, statistics: DatasetStatistics, config: GridConfig
-) -> dict[str, Any]:
+) -> Pipeline:
     """The thesis's multi-view grid on one lattice: Tables 7–8 and 10–15, and the confusion matrices of Fig. 23."""
     graph = statistics.graph
     policies = [*(policy for policy in ladder() if policy.name in POLICIES), SCRAMBLED]
@@ -183,49 +307,41 @@ def pipeline(
     camera = walk(test, graph, config, "camera", [policy for policy in policies if policy.knows == "networks"])
     chosen = walk(validation, graph, config, "world", [policy_record("predicted_entropy")])
     max_views = found["random"].after.shape[-1]
-    confusion = {}
-    for name in ("random", "predicted_entropy"):
-        walks = np.asarray(found[name].views)[0, :, :, 0]  # with the backbone of the thesis's first test
-        of = test.of(PIPELINE[0].name, "world")
-        confusion[name] = headline_confusion(walks, of, min(HEADLINE_MV, max_views)).tolist()
-    camera_found = {f"camera_{name}": results for name, results in camera.items()}
-    return {
-        "max_views": list(range(FIRST_MV, max_views + 1)),
-        "policies": {name: _accuracy(results) for name, results in (found | camera_found).items()},
-        "gain": {
-            "text": _gain(found["predicted_entropy"], found["random"]),
-            "camera": _gain(camera["predicted_entropy"], found["random"]),
-            "repetition": _gain(found["predicted_entropy"], found["random_with_repetition"]),
-            "published_code": _gain(camera["scrambled_entropy"], found["random_with_repetition"]),
-            "oracle": _gain(found["oracle_entropy"], found["random"]),
-        },
-        "views_used_gain": _gain(found["predicted_entropy"], found["random"], "used"),
-        "best": {
-            backbone.name: best
-            for backbone, best in zip(
-                PIPELINE, best_cells(found["predicted_entropy"], chosen["predicted_entropy"], test.labels), strict=True
-            )
-        },
-        "confusion": {"max_views": min(HEADLINE_MV, max_views), "threshold": HEADLINE_CT, "policies": confusion},
+    headline_mv = min(HEADLINE_MV, max_views)
+    confusions = {
+        name: headline_confusion(
+            np.asarray(found[name].views)[0, :, :, 0], test.of(PIPELINE[0].name, "world"), headline_mv
+        )
+        for name in ("random", "predicted_entropy")  # with the backbone of the thesis's first test
     }
+    best = best_cells(found["predicted_entropy"], chosen["predicted_entropy"], test.labels)
+    grids = found | {f"camera_{name}": results for name, results in camera.items()}
+    return Pipeline(
+        max_views=np.arange(FIRST_MV, max_views + 1),
+        policies={name: _grid_of(results) for name, results in grids.items()},
+        gain={name: _gain(grids[policy], found[base]) for name, (policy, base) in GAINS.items()},
+        views_used_gain=_gain(found["predicted_entropy"], found["random"], "used"),
+        best={backbone.name: cells for backbone, cells in zip(PIPELINE, best, strict=True)},
+        confusion=Confusions(headline_mv, HEADLINE_CT, confusions),
+    )
 
 
-# ---------------------------------------------------------------------------------------------------------------- machine
-
-
-def all_results(
+def grids_of(
     test: dict[int, LatticeTables],
     validation: dict[int, LatticeTables],
     statistics: dict[int, DatasetStatistics],
     config: GridConfig,
-) -> dict[str, Any]:
-    """All results that are computed from the outputs of the networks, most of them by lattice."""
-    return {
-        "objects": {str(views): len(lattice.labels) for views, lattice in test.items()},
-        "classes": next(iter(statistics.values())).classes,
-        "thresholds": list(THRESHOLDS),
-        "evaluation": asdict(config),
-        "single_views": single_views(test),
-        "entropy": {str(views): entropy_learning(test[views], statistics[views]) for views in test},
-        "pipeline": {str(views): pipeline(test[views], validation[views], statistics[views], config) for views in test},
-    }
+) -> Grids:
+    """All results that are computed from the outputs of the networks."""
+    return Grids(
+        objects={views: len(lattice.labels) for views, lattice in test.items()},
+        classes=next(iter(statistics.values())).classes,
+        thresholds=np.array(THRESHOLDS),
+        evaluation=config,
+        single_views={
+            backbone.name: {views: single_view(lattice, backbone.name) for views, lattice in test.items()}
+            for backbone in BACKBONES
+        },
+        entropy={views: entropy_learning(test[views], statistics[views]) for views in test},
+        pipeline={views: pipeline(test[views], validation[views], statistics[views], config) for views in test},
+    )

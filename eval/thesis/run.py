@@ -6,9 +6,8 @@ The directory holds both data sets (`views10/`, `views40/`), the networks (`back
 
 from __future__ import annotations
 
-from dataclasses import asdict, replace
+from dataclasses import fields, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from flax import nnx
@@ -17,21 +16,30 @@ from data_pipeline.capture.viewpoints import is_file
 from data_pipeline.dataset.builder import open_objects, prepare
 from data_pipeline.dataset.statistics import report_left_out
 from data_pipeline.errors import DataError
-from data_pipeline.files import keep_json, read_json
+from data_pipeline.files import json_of, read_json
 from data_pipeline.objects.reconstruction import why_no_open3d
 from data_pipeline.objects.sources import load_object
 from data_pipeline.progress import console
+from eval.consistency import check_evaluation, check_seeds
 from eval.machine import NO_ACCELERATOR, machine
-from eval.numbers.timing import decision_memory_alone, time_ascent, time_local_maxima, time_predictor
 from eval.rendering.ascent import METHODS
-from eval.seeds import check_seeds
 from eval.settings import Settings
-from eval.stages import check_evaluation
 from eval.tables import objects_of
 from eval.thesis.figures import FigureInputs
 from eval.thesis.page import write_thesis_report
-from eval.thesis.results import LatticeTables, all_results
-from eval.thesis.seeds import csv_of, folders_of, over_trainings, table_of
+from eval.thesis.results import BackboneTraining, LatticeTables, ThesisResults, grids_of
+from eval.thesis.seeds import csv_over_trainings, folders_of, over_trainings, table_of
+from eval.thesis.timing import (
+    AscentTimes,
+    LatticeTimes,
+    Measured,
+    Memory,
+    Timing,
+    decision_memory_alone,
+    time_ascent,
+    time_local_maxima,
+    time_predictor,
+)
 from train.loop import load_best
 from train.many.thesis import (
     BACKBONES,
@@ -48,9 +56,10 @@ from train.many.thesis import (
     train_thesis,
 )
 from train.results.finite import check_results
-from train.results.identity import made_by
-from train.results.kept import keep_beside, kept_array, kept_json
+from train.results.identity import identity_of, made_by, stamp_of
+from train.results.kept import keep_beside, kept_array, kept_record
 from train.results.outputs import network_outputs
+from train.results.records import as_json
 from train.running.log import read_history
 from train.tasks.classifier import ClassifierTask
 from train.tasks.entropy import EntropyTask
@@ -80,7 +89,7 @@ def lattice_tables(
     def outputs(name: str, network: Path, task: ClassifierTask | EntropyTask) -> np.ndarray:
         return kept_array(
             folder.out / "outputs" / f"{name}_on_{views}_{split}.npz",
-            made_by(statistics, network),
+            stamp_of("outputs", made_by(statistics, network)),
             lambda: network_outputs(data, split, task, load_best(task, network)),
         )
 
@@ -99,7 +108,7 @@ def lattice_tables(
 # --------------------------------------------------------------------------------------------------------- time and memory
 
 
-def _memory(settings: Settings, folder: ThesisFolder) -> dict[str, Any]:
+def _memory(settings: Settings, folder: ThesisFolder) -> dict[str, Memory]:
     statistics = {views: folder.statistics(views) for views in VIEWS}
     out = {}
     for backbone in (PIPELINE[1], PIPELINE[2]):
@@ -112,26 +121,26 @@ def _memory(settings: Settings, folder: ThesisFolder) -> dict[str, Any]:
     return out
 
 
-def _timing(settings: Settings, folder: ThesisFolder, tables: dict[int, LatticeTables]) -> dict[str, Any]:
+def _timing(settings: Settings, folder: ThesisFolder, tables: dict[int, LatticeTables]) -> Timing:
     runs = settings.thesis.timing_runs
-    out: dict[str, Any] = {"runs": runs}
-    for views in VIEWS:
-        statistics, data = folder.statistics(views), folder.data(views)
+
+    def of_lattice(views: int) -> LatticeTimes:
+        statistics = folder.statistics(views)
         task = entropy_task("world", settings.entropy, statistics)
         network: nnx.Module = load_best(task, folder.entropy(views, "world"))
-        out[str(views)] = {
-            "by_class": time_predictor(data, task, network, tables[views].labels, statistics.classes, runs),
-            "local_maxima": time_local_maxima(views),
-        }
-    return out
+        labels, classes = tables[views].labels, statistics.classes
+        by_class = time_predictor(folder.data(views), task, network, labels, classes, runs)
+        return LatticeTimes(by_class, time_local_maxima(views))
+
+    return Timing(runs, *map(of_lattice, VIEWS))
 
 
-def _ascents(settings: Settings, tables: LatticeTables, classes: list[str]) -> dict[str, Any]:
-    """Times and memory of the methods by differentiable rendering, or `missing`: why they cannot be measured here."""
+def _ascents(settings: Settings, tables: LatticeTables, classes: list[str]) -> AscentTimes:
+    """Times and memory of the methods by differentiable rendering."""
     thesis = settings.thesis
     runs, starts, resolution = thesis.ascent_runs, thesis.ascent_starts, thesis.ascent_resolution
     if (missing := why_no_open3d()) is not None:
-        return {"runs": runs, "starts": starts, "resolution": resolution, "missing": missing}
+        return AscentTimes(runs, starts, resolution, missing)
     meshes = {}
     entries = {entry.name: entry for entry in open_objects(settings.dataset).entries}
     for label, name in enumerate(classes):
@@ -139,36 +148,31 @@ def _ascents(settings: Settings, tables: LatticeTables, classes: list[str]) -> d
         evenly = np.unique(np.linspace(0, len(members) - 1, min(runs, len(members))).round().astype(int))
         if len(members):
             meshes[name] = [load_object(entries[tables.names[members[at]]]) for at in evenly]
-    methods = {name: time_ascent(method, meshes, starts, resolution) for name, method in METHODS.items()}
-    return {"runs": runs, "starts": starts, "resolution": resolution, **methods}
+    volume, mesh = (time_ascent(METHODS[name], meshes, starts, resolution) for name in ("volume", "mesh"))
+    return AscentTimes(runs, starts, resolution, volume=volume, mesh=mesh)
 
 
-def measure(settings: Settings, folder: ThesisFolder, tables: dict[int, LatticeTables]) -> dict[str, Any]:
+def measure(settings: Settings, folder: ThesisFolder, tables: dict[int, LatticeTables]) -> Measured:
     """Machine, times and memory; measured again only on another machine or with other settings."""
-    ran_on = machine()
-    thesis = settings.thesis
-    counts = thesis.timing_runs, thesis.ascent_runs, thesis.ascent_starts, thesis.ascent_resolution
-    identity = [
-        ran_on,
-        counts,
-        asdict(settings.entropy.network),
-        "ascent",
-        *([] if why_no_open3d() is None else ["no Open3D"]),
-    ]
+    ran_on, thesis = machine(), settings.thesis
+    identity = identity_of(
+        "timing",
+        machine=ran_on,
+        timing_runs=thesis.timing_runs,
+        ascent=[thesis.ascent_runs, thesis.ascent_starts, thesis.ascent_resolution],
+        network=settings.entropy.network,
+        open3d=why_no_open3d() is None,
+    )
 
-    def compute() -> dict[str, Any]:
+    def compute() -> Measured:
         console.print(
-            f"Timing {counts[0]} decisions and {counts[1]} gradient ascents per class, and measuring their memory"
+            f"Timing {thesis.timing_runs} decisions and {thesis.ascent_runs} gradient ascents per class, and measuring their "
+            f"memory"
         )
-        return {
-            "identity": identity,
-            "machine": ran_on,
-            "timing": _timing(settings, folder, tables),
-            "memory": _memory(settings, folder),
-            "ascent": _ascents(settings, tables[40], folder.statistics(40).classes),
-        }
+        ascent = _ascents(settings, tables[40], folder.statistics(40).classes)
+        return Measured(ran_on, _timing(settings, folder, tables), _memory(settings, folder), ascent)
 
-    return kept_json(folder.out / "timing.json", identity, compute)
+    return kept_record(folder.out / "timing.json", Measured, identity, compute)
 
 
 # ------------------------------------------------------------------------------------------------------------- everything
@@ -180,26 +184,21 @@ def _example(tables: LatticeTables, classes: list[str]) -> int:
     return int(np.flatnonzero(tables.labels == label)[0])
 
 
-def _training(folder: ThesisFolder, histories: dict[str, list[dict[str, float]]]) -> dict[str, Any]:
+def _training(
+    folder: ThesisFolder, histories: dict[str, list[dict[str, float]]]
+) -> tuple[dict[str, BackboneTraining], dict[str, float]]:
     """Losses and initial weights of the classifiers (Table 5), and training times of all networks."""
     summaries = {name: read_json(network / "summary.json") for name, network in folder.networks().items()}
-    backbones = {
-        backbone.name: {
-            "train_loss": min(entry["train/loss"] for entry in histories[backbone.name]),
-            "val_loss": summaries[backbone.name]["best_loss"],
-            "epochs": summaries[backbone.name]["epoch"],
-            "best_epoch": summaries[backbone.name]["best_epoch"],
-            "start": summaries[backbone.name]["start"],
-        }
-        for backbone in BACKBONES
-    }
-    return {
-        "backbones": backbones,
-        "training_seconds": {name: summary["seconds"] for name, summary in summaries.items()},
-    }
+    backbones = {}
+    for name in (backbone.name for backbone in BACKBONES):
+        summary, train_loss = summaries[name], min(entry["train/loss"] for entry in histories[name])
+        backbones[name] = BackboneTraining(
+            train_loss, summary["best_loss"], summary["epoch"], summary["best_epoch"], summary["start"]
+        )
+    return backbones, {name: summary["seconds"] for name, summary in summaries.items()}
 
 
-def evaluate_thesis(settings: Settings, folder: ThesisFolder, measured: dict[str, Any] | None = None) -> FigureInputs:
+def evaluate_thesis(settings: Settings, folder: ThesisFolder, measured: Measured | None = None) -> FigureInputs:
     """Returns all numbers, as written to `thesis.json`, and the other inputs of the report.
 
     Args:
@@ -213,19 +212,27 @@ def evaluate_thesis(settings: Settings, folder: ThesisFolder, measured: dict[str
                 f"{network / 'metrics.jsonl'} is lost; delete {network}, and the same command trains it again"
             )
     test = {views: lattice_tables(settings, folder, views, "test") for views in VIEWS}
-    measured = measured or measure(settings, folder, test)
-    made = made_by(statistics[40], *folder.networks().values())
-    identity = [made, asdict(settings.evaluation), measured, "by object"]
+    costs = measured or measure(settings, folder, test)
+    identity = identity_of(
+        "thesis",
+        made_by=[made_by(statistics[views], *folder.networks().values()) for views in VIEWS],
+        evaluation=settings.evaluation,
+        measured=costs,
+    )
 
-    def compute() -> dict[str, Any]:
+    def compute() -> ThesisResults:
         validation = {views: lattice_tables(settings, folder, views, "val", PIPELINE, ("world",)) for views in VIEWS}
         console.print(f"Walking {len(test[40].labels)} test objects with {len(PIPELINE)} classifiers on two lattices")
-        results = all_results(test, validation, statistics, settings.evaluation) | _training(folder, histories)
-        results |= {name: measured[name] for name in ("machine", "timing", "memory", "ascent")}
-        check_results(results, f"the results in {folder.out}")
-        return results | {"identity": identity, "left_out": {str(v): s.left_out for v, s in statistics.items()}}
+        grids = grids_of(test, validation, statistics, settings.evaluation)
+        left_out = {views: of.left_out for views, of in statistics.items()}
+        backbones, seconds = _training(folder, histories)
+        results = ThesisResults(
+            **vars(grids), **vars(costs), backbones=backbones, training_seconds=seconds, left_out=left_out
+        )
+        check_results(as_json(results), f"the results in {folder.out}")
+        return results
 
-    results = kept_json(folder.out / "thesis.json", identity, compute)
+    results = kept_record(folder.out / "thesis.json", ThesisResults, identity, compute)
     return FigureInputs(folder, results, statistics, test, histories, _example(test[40], statistics[40].classes))
 
 
@@ -258,8 +265,8 @@ def reproduce(settings: Settings, preset: str, out: Path, pretrained: tuple[Path
     each = [own.shifted(number) for number in range(settings.seeds)]
     train_thesis(folders, each, first)
     inputs = evaluate_thesis(settings, folder)
-    measured = {name: inputs.results[name] for name in ("machine", "timing", "memory", "ascent")}
     results, table = [inputs.results], None
+    measured = Measured(*(getattr(inputs.results, field.name) for field in fields(Measured)))
     for of_seed, its in zip(folders[1:], each[1:], strict=True):
         own_settings = replace(settings, classifier=its.classifier, entropy=its.entropy, thesis=its.thesis)
         found = evaluate_thesis(own_settings, of_seed, measured)
@@ -267,8 +274,8 @@ def reproduce(settings: Settings, preset: str, out: Path, pretrained: tuple[Path
         write_thesis_report(found, _lead(found, preset), of_seed.out / "report")
     if len(results) > 1:
         rows = over_trainings(results)
-        keep_json(out / "seeds.json", {"seeds": settings.seeds, "rows": rows})
-        keep_beside(out / "seeds.csv", csv_of(rows))
+        keep_beside(out / "seeds.json", json_of({"seeds": settings.seeds, "rows": as_json(rows)}))
+        keep_beside(out / "seeds.csv", csv_over_trainings(rows))
         table = table_of(rows)
     return write_thesis_report(inputs, _lead(inputs, preset), out / "report", table)
 
@@ -276,12 +283,11 @@ def reproduce(settings: Settings, preset: str, out: Path, pretrained: tuple[Path
 def _lead(inputs: FigureInputs, preset: str) -> str:
     """A sentence that describes a run."""
     results, statistics = inputs.results, inputs.statistics[40]
-    ran_on = results["machine"]
-    where = f"{ran_on['cores']} CPU cores" if ran_on["device"] == NO_ACCELERATOR else ran_on["device"]
-    minutes = sum(results["training_seconds"].values()) / 60
-    camera = statistics.camera
+    ran_on, camera = results.machine, statistics.camera
+    where = f"{ran_on.cores} CPU cores" if ran_on.device == NO_ACCELERATOR else ran_on.device
+    minutes = sum(results.training_seconds.values()) / 60
     return (
         f"{statistics.source}, preset {preset}: views of {camera.resolution}×{camera.resolution} pixels, "
-        f"{results['objects']['40']} test objects, {statistics.left_out_count} objects left out, "
+        f"{results.objects[40]} test objects, {statistics.left_out_count} objects left out, "
         f"{minutes:.0f} minutes of training on {where}. Numbers of this run, with those of the thesis in parentheses."
     )

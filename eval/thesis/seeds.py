@@ -3,16 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import product
 from pathlib import Path
-from typing import Any
 
 import numpy as np
+from jaxtyping import Float
 
-from eval.numbers.comparison import interval_of_both, intervals
-from eval.thesis.layout import Row, ThesisTable
+from eval.numbers.comparison import interval_of, interval_of_both
+from eval.thesis.layout import Row as TableRow
+from eval.thesis.layout import ThesisTable
+from eval.thesis.results import ThesisResults
 from train.many.thesis import BACKBONES, FRAMES, VIEWS, ThesisFolder
-from train.results.records import csv_of as rows_as_csv
-from train.results.records import ends, numbered
+from train.results.records import csv_of, ends, numbered
 
 _GAINS = {
     "text": "PointNet++ minus random",
@@ -35,80 +38,75 @@ def folders_of(out: Path, seeds: int) -> list[ThesisFolder]:
     return folders
 
 
-def over_trainings(each: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
-    """Returns a row for each main number: its mean over trainings, and intervals over objects and over both.
+@dataclass(frozen=True)
+class Row:
+    """A number of one of the thesis's tables over several trainings; `each` is by training."""
 
-    Args:
-        each: the results of every training, as in `thesis.json`.
-    """
+    table: str
+    name: str
+    mean: float
+    over_objects: Float[np.ndarray, "2"]
+    over_both: Float[np.ndarray, "2"]
+    each: Float[np.ndarray, " trainings"]
 
-    def row(table: str, name: str, values: Sequence[Sequence[float]]) -> dict[str, Any]:
-        found = np.array(values)  # (trainings, objects)
-        return {
-            "table": table,
-            "name": name,
-            "mean": float(found.mean()),
-            "over_objects": intervals(found.mean(axis=0)),
-            "over_both": interval_of_both(found).tolist(),
-            "each": found.mean(axis=1).tolist(),
-        }
+    @property
+    def is_gain(self) -> bool:
+        return self.table in ("7", "12")
+
+
+def over_trainings(results: Sequence[ThesisResults]) -> list[Row]:
+    """Returns a row for each main number: its mean over trainings, and intervals over objects and over both."""
+
+    def row(table: str, name: str, by_object: Sequence[np.ndarray]) -> Row:
+        found = np.array(by_object)  # (trainings, objects)
+        both, mean = interval_of_both(found), float(found.mean())
+        return Row(table, name, mean, interval_of(found.mean(axis=0)), both, found.mean(axis=1))
 
     rows = []
-    for views in map(str, VIEWS):
-        for frame in FRAMES:
-            errors = [one["entropy"][views]["frames"][frame]["by_object"] for one in each]
-            rows.append(row("4", f"squared error of the entropies, {views} views, {frame} frame", errors))
-    for backbone in BACKBONES:
-        for views in map(str, VIEWS):
-            right = [one["single_views"][backbone.name][views]["by_object"] for one in each]
-            rows.append(row("6", f"{backbone.title}: accuracy of single views, {views} views", right))
-    for views, table in zip(map(str, VIEWS), ("7", "12"), strict=True):
-        for name, title in _GAINS.items():
-            gains = [one["pipeline"][views]["gain"][name]["by_object"] for one in each]
-            rows.append(row(table, f"{title}, mean of all cells, {views} views", gains))
+    for views, frame in product(VIEWS, FRAMES):
+        name = f"squared error of the entropies, {views} views, {frame} frame"
+        rows.append(row("4", name, [one.entropy[views].frames[frame].by_object for one in results]))
+    for backbone, views in product(BACKBONES, VIEWS):
+        name = f"{backbone.title}: accuracy of single views, {views} views"
+        rows.append(row("6", name, [one.single_views[backbone.name][views].by_object for one in results]))
+    for (views, table), (gain, title) in product(zip(VIEWS, ("7", "12"), strict=True), _GAINS.items()):
+        name = f"{title}, mean of all cells, {views} views"
+        rows.append(row(table, name, [one.pipeline[views].gain[gain].by_object for one in results]))
     return rows
 
 
-def csv_of(rows: Sequence[dict[str, Any]]) -> bytes:
+def csv_over_trainings(rows: Sequence[Row]) -> bytes:
     """The rows as CSV, with a column for each end of an interval and for each training."""
-    return rows_as_csv(
+    return csv_of(
         [
-            {name: row[name] for name in ("table", "name", "mean")}
-            | ends("over_objects", row["over_objects"])
-            | ends("over_both", row["over_both"])
-            | numbered("training", row["each"])
+            {"table": row.table, "name": row.name, "mean": row.mean}
+            | ends("over_objects", row.over_objects)
+            | ends("over_both", row.over_both)
+            | numbered("training", row.each)
             for row in rows
         ]
     )
 
 
-def table_of(rows: Sequence[dict[str, Any]]) -> ThesisTable:
+def table_of(rows: Sequence[Row]) -> ThesisTable:
     """The rows as a table of the report."""
-    trainings = len(rows[0]["each"])
 
-    def text(row: dict[str, Any], values: Sequence[float]) -> str:
-        error, signed = row["table"] == "4", "+" if row["table"] in ("7", "12") else ""
-        digits = f"{signed}.5f" if error else f"{signed}.2f"
-        return ", ".join(f"{value * (1 if error else 100):{digits}}" for value in values).replace("-", "−")
+    def shown(row: Row) -> TableRow:
+        error, sign = row.table == "4", "+" if row.is_gain else ""
+
+        def text(*values: float) -> str:
+            form = f"{sign}.5f" if error else f"{sign}.2f"
+            return ", ".join(f"{value * (1 if error else 100):{form}}" for value in values).replace("-", "−")
+
+        cells = text(row.mean), f"[{text(*row.over_objects)}]", f"[{text(*row.over_both)}]", text(*row.each)
+        differs = bool(row.over_both[0] > 0 or row.over_both[1] < 0)
+        return TableRow(f"Table {row.table}. {row.name}", cells, bold=[row.is_gain and differs])
 
     return ThesisTable(
         0,
-        f"Over {trainings} trainings of all networks",
+        f"Over {len(rows[0].each)} trainings of all networks",
         ("mean", "95 %, other objects", "95 %, other objects and trainings", "each training"),
-        [
-            Row(
-                f"Table {row['table']}. {row['name']}",
-                [
-                    text(row, [row["mean"]]),
-                    f"[{text(row, row['over_objects'])}]",
-                    f"[{text(row, row['over_both'])}]",
-                    text(row, row["each"]),
-                ],
-                bold=[row["table"] in ("7", "12") and (row["over_both"][0] > 0 or row["over_both"][1] < 0)]
-                + 3 * [False],
-            )
-            for row in rows
-        ],
+        [shown(row) for row in rows],
         "Accuracies in %, gains in points. The first interval is for these trainings alone. The second adds the variance of the "
         "trainings, and is a t interval. A gain is bold if the second excludes zero. All other tables and figures are of the "
         "first training.",

@@ -2,20 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable
 from itertools import product
-from typing import Any
 
 import numpy as np
 
 from eval.rendering.ascent import FACES
 from eval.thesis.layout import Cell, Row, ThesisTable, thesis_numbers
-from eval.thesis.results import ORACLE_MV
+from eval.thesis.results import ORACLE_MV, ThesisResults
+from eval.thesis.timing import AscentTimes
 from mevs_jax.markdown import markdown_table
-from train.many.thesis import BACKBONES, FRAMES, PIPELINE
+from train.many.thesis import BACKBONES, FRAMES, PIPELINE, VIEWS
 
 
-def _percent(values: Any) -> list[float]:
+def _percent(values: Iterable[float]) -> list[Cell]:
     return [100 * value for value in values]
 
 
@@ -24,49 +24,45 @@ def _points(value: float) -> str:
     return f"{100 * value:+.2f}".replace("-", "−")
 
 
-def _ct(results: dict[str, Any]) -> list[str]:
-    return [f"CT {threshold:g}" for threshold in results["thresholds"]]
+def _with_ends(mean: float, interval: np.ndarray) -> str:
+    """A difference of shares in percentage points with its interval."""
+    low, high = map(_points, interval)
+    return f"{_points(mean)} [{low}, {high}]"
 
 
-def _mean_of_backbones(policy: dict[str, Any], name: str) -> np.ndarray:
-    """Mean over backbones, (MV, CT)."""
-    return np.mean(policy[name], axis=0)
+def _ct(results: ThesisResults) -> list[str]:
+    return [f"CT {threshold:g}" for threshold in results.thresholds]
 
 
 # ------------------------------------------------------------------------------------------------------------- the tables
 
 
-def machine_table(results: dict[str, Any]) -> ThesisTable:
-    ours = results["machine"]
-    memory = f"{ours['memory_gib']:.0f} GiB" if ours["memory_gib"] else None
+def machine_table(results: ThesisResults) -> ThesisTable:
+    ours = results.machine
+    memory = f"{ours.memory_gib:.0f} GiB" if ours.memory_gib else None
     return ThesisTable(
         1,
         "Machine",
         ["value"],
         [
-            Row("Operating system", [ours["operating_system"]], ["Linux Mint 20.3"]),
-            Row("CPU", [f"{ours['cpu']}, {ours['cores']} cores"], ["Intel i7-10875H, 16 threads"]),
-            Row("Device", [ours["device"]], ["NVIDIA GeForce RTX 2060 Max-Q, 6 GB"]),
+            Row("Operating system", [ours.operating_system], ["Linux Mint 20.3"]),
+            Row("CPU", [f"{ours.cpu}, {ours.cores} cores"], ["Intel i7-10875H, 16 threads"]),
+            Row("Device", [ours.device], ["NVIDIA GeForce RTX 2060 Max-Q, 6 GB"]),
             Row("Memory", [memory], ["31,817 MiB"]),
-            Row("Framework", [f"JAX {ours['jax']}"], ["PyTorch 1.7.1, CUDA 11.0"]),
-            Row("Python", [ours["python"]], ["3.7"]),
+            Row("Framework", [f"JAX {ours.jax}"], ["PyTorch 1.7.1, CUDA 11.0"]),
+            Row("Python", [ours.python], ["3.7"]),
         ],
         "The machine of all results below.",
     )
 
 
-def rendering_times(results: dict[str, Any]) -> ThesisTable:
-    thesis, ours = thesis_numbers()["table_2"], results["ascent"]
-    names = [*results["classes"], "all"]
-    seconds = {method: ours[method]["seconds"] for method in ("mesh", "volume") if method in ours}
+def rendering_times(results: ThesisResults) -> ThesisTable:
+    thesis, ours = thesis_numbers()["table_2"], results.ascent
+    methods = [method.seconds for method in (ours.mesh, ours.volume) if method is not None]
     rows = [
-        Row(
-            name,
-            [n for of_method in seconds.values() for n in of_method[name]] or [None] * 4,
-            thesis["rows"].get(name, [None] * 4),
-        )
-        for name in names
-        if not seconds or name in seconds["mesh"]
+        Row(name, [n for seconds in methods for n in seconds[name]] or [None] * 4, thesis["rows"].get(name, [None] * 4))
+        for name in [*results.classes, "all"]
+        if not methods or name in methods[0]
     ]
     return ThesisTable(
         2,
@@ -74,74 +70,67 @@ def rendering_times(results: dict[str, Any]) -> ThesisTable:
         thesis["columns"],
         rows,
         f"Ours: depth entropy of a soft mesh of at most {FACES} faces, and opacity entropy of a 32³ volume, both at "
-        f"{ours['resolution']}×{ours['resolution']} pixels; all {ours['starts']} start views of an object together, "
-        f"{ours['runs']} objects per class, on the machine of Table 1. The thesis: one start view, on its GPU.{_missing(ours)}",
+        f"{ours.resolution}×{ours.resolution} pixels; all {ours.starts} start views of an object together, "
+        f"{ours.runs} objects per class, on the machine of Table 1. The thesis: one start view, on its GPU.{_missing(ours)}",
     )
 
 
-def _missing(ascent: dict[str, Any]) -> str:
-    return f" Not measured: {ascent['missing']}." if "missing" in ascent else ""
+def _missing(ascent: AscentTimes) -> str:
+    return f" Not measured: {ascent.missing}." if ascent.missing else ""
 
 
-def predictor_times(results: dict[str, Any]) -> ThesisTable:
-    thesis, ours = thesis_numbers()["table_3"]["rows"], results["timing"]
-    names = [*results["classes"], "all"]
+def predictor_times(results: ThesisResults) -> ThesisTable:
+    thesis, ours = thesis_numbers()["table_3"]["rows"], results.timing
     rows = [
         Row(
             name,
-            [number for views in ("10", "40") for number in ours[views]["by_class"].get(name, [None, None])],
+            [number for views in VIEWS for number in ours.of(views).by_class.get(name, (None, None))],
             thesis.get(name, [None] * 4),
         )
-        for name in names
+        for name in [*results.classes, "all"]
     ]
+    found = {views: ours.of(views).local_maxima for views in VIEWS}
     maxima = ", ".join(
-        f"{ours[views]['local_maxima']['alone']:.3f} ms alone and {1000 * ours[views]['local_maxima']['batched']:.2f} µs per "
-        f"object in a batch of 1,000 for {views} views"
-        for views in ("10", "40")
+        f"{times.alone:.3f} ms alone and {1000 * times.batched:.2f} µs per object in a batch of 1,000 for {views} views"
+        for views, times in found.items()
     )
     return ThesisTable(
         3,
         "Time of PointNet++ by class (ms)",
         ["10 views, mean", "sd", "40 views, mean", "sd"],
         rows,
-        f"One cloud, {ours['runs']} runs per class with device synchronisation, for the network size of this run on "
+        f"One cloud, {ours.runs} runs per class with device synchronisation, for the network size of this run on "
         f"the machine of Table 1. Local maxima (Appendix A; in the thesis 0.144 and 0.584 ms): {maxima}.",
         digits=3,
     )
 
 
-def entropy_table(results: dict[str, Any]) -> ThesisTable:
-    thesis = thesis_numbers()["table_4"]["rows"]
-    rows = []
-    for name in [*results["classes"], "all"]:
+def entropy_table(results: ThesisResults) -> ThesisTable:
+    thesis, rows = thesis_numbers()["table_4"]["rows"], []
+    for name in [*results.classes, "all"]:
         ours: list[Cell] = []
-        for views in ("10", "40"):
-            found = results["entropy"][views]
-            frames = {frame: found["frames"][frame]["by_class"].get(name, [None, None]) for frame in FRAMES}
-            baselines = [found[predictor].get(name, [None])[0] for predictor in ("mean_map", "class_mean_map")]
-            ours += [*frames["world"], frames["camera"][0], *baselines]
+        for found in results.entropy.values():
+            world, camera = (found.frames[frame].by_class.get(name, (None, None)) for frame in ("world", "camera"))
+            maps = (by_class.get(name, (None,))[0] for by_class in (found.mean_map, found.class_mean_map))
+            ours += [*world, camera[0], *maps]
         theirs = thesis.get(name, [None] * 4)
         rows.append(Row(name, ours, [*theirs[:2], None, None, None, *theirs[2:], None, None, None]))
-    parts = [
-        heading for views in ("10", "40") for heading in (f"{views} views", "sd", "camera", "mean map", "class map")
-    ]
-    shares = "; ".join(
-        f"{views} views: {100 * results['entropy'][views]['frames']['world']['explained_variance']:.1f} % in the world frame, "
-        f"{100 * results['entropy'][views]['frames']['camera']['explained_variance']:.1f} % in the camera frame"
-        for views in ("10", "40")
-    )
-    differences = []
-    for views in ("10", "40"):
-        found = results["entropy"][views]["camera_minus_world"]
-        low, high = found["interval"]
-        differences.append(f"{found['mse']:+.4f} [{low:+.4f}, {high:+.4f}] for {views} views".replace("-", "−"))
+    parts = [heading for views in VIEWS for heading in (f"{views} views", "sd", "camera", "mean map", "class map")]
+    shares, differences = [], []
+    for views, found in results.entropy.items():
+        explained = {frame: 100 * of.explained_variance for frame, of in found.frames.items()}
+        shares.append(
+            f"{views} views: {explained['world']:.1f} % in the world frame, {explained['camera']:.1f} % in the camera frame"
+        )
+        low, high = found.camera_minus_world.interval
+        difference = f"{found.camera_minus_world.mse:+.4f} [{low:+.4f}, {high:+.4f}] for {views} views"
+        differences.append(difference.replace("-", "−"))
     # Classes on which the network is no better than a predictor that receives no view.
     above: dict[str, list[str]] = {frame: [] for frame in FRAMES}
-    for frame, views in product(FRAMES, ("10", "40")):
-        found = results["entropy"][views]
-        for name, (error, _) in found["frames"][frame]["by_class"].items():
-            if error >= min(found["mean_map"][name][0], found["class_mean_map"][name][0]):
-                every_side = f" ({found['every_side'][name][0]:.4f} with the mean prediction over clouds of all views)"
+    for frame, (views, found) in product(FRAMES, results.entropy.items()):
+        for name, (error, _) in found.frames[frame].by_class.items():
+            if error >= min(found.mean_map[name][0], found.class_mean_map[name][0]):
+                every_side = f" ({found.every_side[name][0]:.4f} with the mean prediction over clouds of all views)"
                 above[frame].append(f"{name} with {views} views{every_side if frame == 'world' else ''}")
     return ThesisTable(
         4,
@@ -152,24 +141,18 @@ def entropy_table(results: dict[str, Any]) -> ThesisTable:
         "objects, this run did not. The thesis's clouds do not hold the camera pose. Ours are in the world frame, where each "
         "point has the direction to the camera unless that is switched off; for comparison, also in the camera frame, without "
         "directions. The mean map receives no view; the class map, the mean of a class, is given the true class. Variance "
-        f"explained, {shares}; from the thesis's means and its standard deviation of 0.156: 51 % and 30 %. Error in the "
-        f"camera frame minus the world frame, paired by object: {', '.join(differences)}. Not below both trivial predictors: "
+        f"explained, {'; '.join(shares)}; from the thesis's means and its standard deviation of 0.156: 51 % and 30 %. Error in "
+        f"the camera frame minus the world frame, paired by object: {', '.join(differences)}. Not below both trivial predictors: "
         f"in the world frame {', '.join(above['world']) or 'none'}; in the camera frame {', '.join(above['camera']) or 'none'}.",
         digits=4,
     )
 
 
-def losses_table(results: dict[str, Any]) -> ThesisTable:
+def losses_table(results: ThesisResults) -> ThesisTable:
     thesis = thesis_numbers()["table_5"]["rows"]
-    rows = [
-        Row(
-            b.title,
-            [results["backbones"][b.name]["train_loss"], results["backbones"][b.name]["val_loss"]],
-            thesis[b.title],
-        )
-        for b in BACKBONES
-    ]
-    started = "; ".join(f"{b.title}: {results['backbones'][b.name]['start']}" for b in BACKBONES)
+    trained = [(backbone.title, results.backbones[backbone.name]) for backbone in BACKBONES]
+    rows = [Row(title, [found.train_loss, found.val_loss], thesis[title]) for title, found in trained]
+    started = "; ".join(f"{title}: {found.start}" for title, found in trained)
     return ThesisTable(
         5,
         "Best losses of the classifiers",
@@ -181,12 +164,12 @@ def losses_table(results: dict[str, Any]) -> ThesisTable:
     )
 
 
-def single_view_table(results: dict[str, Any]) -> ThesisTable:
+def single_view_table(results: ThesisResults) -> ThesisTable:
     thesis = thesis_numbers()["table_6"]["rows"]
     rows = []
     for backbone in BACKBONES:
-        found = results["single_views"][backbone.name]
-        rows.append(Row(backbone.title, _percent(found[v]["accuracy"] for v in ("10", "40")), thesis[backbone.title]))
+        ours = _percent(found.accuracy for found in results.single_views[backbone.name].values())
+        rows.append(Row(backbone.title, ours, thesis[backbone.title]))
     return ThesisTable(
         6,
         "Accuracy of the classifiers on single views (%)",
@@ -196,17 +179,17 @@ def single_view_table(results: dict[str, Any]) -> ThesisTable:
     )
 
 
-def gain_table(number: int, views: str, results: dict[str, Any]) -> ThesisTable:
-    thesis, found = thesis_numbers()[f"table_{number}"], results["pipeline"][views]
-    gain = found["gain"]["text"]
+def gain_table(number: int, views: int, results: ThesisResults) -> ThesisTable:
+    thesis, found = thesis_numbers()[f"table_{number}"], results.pipeline[views]
+    gain = found.gain["text"]
     rows = [
         Row(
             f"MV {mv}",
             _percent(values),
             thesis.get(str(mv), ()),
-            [low > 0 or high < 0 for low, high in intervals],
+            [bool(low > 0 or high < 0) for low, high in intervals],
         )
-        for mv, values, intervals in zip(found["max_views"], gain["difference"], gain["interval"], strict=True)
+        for mv, values, intervals in zip(found.max_views, gain.difference, gain.interval, strict=True)
     ]
     switches = {
         "text": "PointNet++ minus random",
@@ -217,9 +200,8 @@ def gain_table(number: int, views: str, results: dict[str, Any]) -> ThesisTable:
     }
     means = []
     for name, title in switches.items():
-        of = found["gain"][name]
-        low, high = map(_points, of["mean_interval"])
-        means.append(f"{title}: {_points(of['mean'])} [{low}, {high}], {of['above_zero']} cells above zero")
+        of = found.gain[name]
+        means.append(f"{title}: {_with_ends(of.mean, of.mean_interval)}, {of.above_zero} cells above zero")
     printed = [value for values in thesis.values() for value in values]
     above = sum(value > 0 for value in printed)
     theirs = f"{_points(sum(printed) / len(printed) / 100)}, {above} of {len(printed)} cells above zero"
@@ -236,18 +218,16 @@ def gain_table(number: int, views: str, results: dict[str, Any]) -> ThesisTable:
     )
 
 
-def best_table(results: dict[str, Any]) -> ThesisTable:
+def best_table(results: ThesisResults) -> ThesisTable:
     thesis, rows = thesis_numbers()["table_8"]["rows"], []
     for backbone in PIPELINE:
-        for views in ("10", "40"):
+        for views, found in results.pipeline.items():
             kind = "images" if backbone.images == "image" else backbone.images
             title = f"ResNet-{backbone.depth} ({kind}) + PointNet++ ({views} views)"
-            found = results["pipeline"][views]["best"][backbone.name]
             ours: list[Cell] = []
             for chosen_on in ("test", "validation"):
-                cell = found[chosen_on]
-                ours += [100 * cell["accuracy"], 100 * cell["class_accuracy"]]
-                ours.append(f"MV {cell['max_views']}, CT {cell['threshold']:g}")
+                cell = found.best[backbone.name][chosen_on]
+                ours += [100 * cell.accuracy, 100 * cell.class_accuracy, f"MV {cell.max_views}, CT {cell.threshold:g}"]
             rows.append(Row(title, ours, [*thesis[title], None, None, None, None]))
     return ThesisTable(
         8,
@@ -259,13 +239,13 @@ def best_table(results: dict[str, Any]) -> ThesisTable:
     )
 
 
-def memory_table(results: dict[str, Any]) -> ThesisTable:
-    thesis, ours = thesis_numbers()["table_9"]["rows"], dict(results["memory"])
-    for name, method in (("Neural Renderer", "mesh"), ("DiffDVR", "volume")):
-        if method in results["ascent"]:
-            ours[name] = results["ascent"][method]["memory"]
+def memory_table(results: ThesisResults) -> ThesisTable:
+    thesis, ours, ascent = thesis_numbers()["table_9"]["rows"], dict(results.memory), results.ascent
+    for name, method in (("Neural Renderer", ascent.mesh), ("DiffDVR", ascent.volume)):
+        if method is not None:
+            ours[name] = method.memory
     rows = [
-        Row(name, [ours[name]["planned"], ours[name]["device_peak"]] if name in ours else [None, None], [*values, None])
+        Row(name, [*vars(ours[name]).values()] if name in ours else [None, None], [*values, None])
         for name, values in thesis.items()
     ]
     return ThesisTable(
@@ -275,7 +255,7 @@ def memory_table(results: dict[str, Any]) -> ThesisTable:
         rows,
         "Weights, inputs and temporaries of one compiled decision, for the network sizes of this run. CPUs report no peak. The "
         "thesis reports PyTorch's peak on a GPU. Neural Renderer and DiffDVR: all start views of Table 2 on one object."
-        f"{_missing(results['ascent'])}",
+        f"{_missing(ascent)}",
         digits=2,
     )
 
@@ -283,52 +263,59 @@ def memory_table(results: dict[str, Any]) -> ThesisTable:
 def _pairs(
     number: int,
     title: str,
-    results: dict[str, Any],
-    grids: dict[str, list[list[float]]],
-    max_views: Sequence[int],
+    results: ThesisResults,
+    grids: dict[str, np.ndarray],
+    max_views: Iterable[int],
     note: str,
 ) -> ThesisTable:
     """A table with alternating rows for random and PointNet++, as in the thesis."""
     thesis, rows = thesis_numbers()[f"table_{number}"], []
     for index, mv in enumerate(max_views):
         for short, grid in grids.items():
-            rows.append(Row(f"MV {mv} ({short})", grid[index], thesis.get(f"{mv} ({short})", ())))
+            rows.append(Row(f"MV {mv} ({short})", grid[index].tolist(), thesis.get(f"{mv} ({short})", ())))
     return ThesisTable(number, title, _ct(results), rows, note)
 
 
-def accuracy_table(number: int, views: str, results: dict[str, Any]) -> ThesisTable:
-    found = results["pipeline"][views]
-    grids = {
-        short: (100 * _mean_of_backbones(found["policies"][name], "accuracy")).tolist()
-        for short, name in (("random", "random"), ("pcd", "predicted_entropy"))
-    }
+_POLICIES = {"random": "random", "pcd": "predicted_entropy"}
+"""Policies by how the thesis's tables call them."""
+
+
+def accuracy_table(number: int, views: int, results: ThesisResults) -> ThesisTable:
+    found = results.pipeline[views]
+    grids = {short: 100 * found.policies[name].accuracy.mean(axis=0) for short, name in _POLICIES.items()}
     note = (
         "Mean of the three backbones, over every start view of every test object; random selection in exact expectation. The "
         "thesis draws a random start view, and its random policy may repeat a view. 'pcd' is PointNet++."
     )
-    return _pairs(number, f"Accuracy of all pipelines, {views} views (%)", results, grids, found["max_views"], note)
+    return _pairs(
+        number, f"Accuracy of all pipelines, {views} views (%)", results, grids, found.max_views.tolist(), note
+    )
 
 
-def _views_used(results: dict[str, Any], policy: str) -> list[list[float]]:
-    """Mean over backbones and both lattices, (MV, CT); the first row is for one view."""
-    lattices = [_mean_of_backbones(found["policies"][policy], "views_used") for found in results["pipeline"].values()]
-    rows = min(map(len, lattices))
-    return [[1.0] * len(results["thresholds"]), *np.mean([lattice[:rows] for lattice in lattices], axis=0).tolist()]
+def _views_used(results: ThesisResults) -> dict[str, np.ndarray]:
+    """Mean over backbones and both lattices, (MV, CT), of random and of PointNet++; the first row is for one view."""
+    used = {}
+    for short, name in _POLICIES.items():
+        lattices = [found.policies[name].views_used.mean(axis=0) for found in results.pipeline.values()]
+        rows = min(map(len, lattices))
+        mean = np.mean([lattice[:rows] for lattice in lattices], axis=0)
+        used[short] = np.concatenate([np.ones((1, mean.shape[1])), mean])
+    return used
 
 
-def views_table(results: dict[str, Any]) -> ThesisTable:
-    grids = {short: _views_used(results, name) for short, name in (("random", "random"), ("pcd", "predicted_entropy"))}
+def views_table(results: ThesisResults) -> ThesisTable:
+    grids = _views_used(results)
     max_views = range(1, len(grids["random"]) + 1)
     note = "Mean of the three backbones and both lattices."
     return _pairs(13, "Number of views used", results, grids, max_views, note)
 
 
-def views_gain_table(results: dict[str, Any]) -> ThesisTable:
+def views_gain_table(results: ThesisResults) -> ThesisTable:
     thesis = thesis_numbers()["table_14"]
-    random, predicted = _views_used(results, "random"), _views_used(results, "predicted_entropy")
+    used = _views_used(results)
     rows = [
-        Row(f"MV {mv}", [b - a for a, b in zip(before, after, strict=True)], thesis.get(str(mv), ()))
-        for mv, (before, after) in enumerate(zip(random, predicted, strict=True), start=1)
+        Row(f"MV {mv}", gains.tolist(), thesis.get(str(mv), ()))
+        for mv, gains in enumerate(used["pcd"] - used["random"], start=1)
     ]
     return ThesisTable(
         14,
@@ -341,27 +328,26 @@ def views_gain_table(results: dict[str, Any]) -> ThesisTable:
     )
 
 
-def oracle_table(results: dict[str, Any]) -> ThesisTable:
-    thesis, found, rows = thesis_numbers()["table_15"], results["pipeline"]["40"], []
-    for backbone, grid in zip(PIPELINE, found["policies"]["oracle_entropy"]["accuracy"], strict=True):
-        for mv, values in zip(found["max_views"], grid, strict=True):
+def oracle_table(results: ThesisResults) -> ThesisTable:
+    thesis, found, rows = thesis_numbers()["table_15"], results.pipeline[40], []
+    for backbone, grid in zip(PIPELINE, found.policies["oracle_entropy"].accuracy, strict=True):
+        for mv, values in zip(found.max_views, grid, strict=True):
             if mv <= ORACLE_MV:
                 title = f"ResNet-{backbone.depth}, {backbone.images}"
                 rows.append(Row(f"MV {mv} ({title})", _percent(values), thesis[f"{mv} ({title})"]))
-    gain = found["gain"]["oracle"]
-    low, high = map(_points, gain["mean_interval"])
+    gain = found.gain["oracle"]
     return ThesisTable(
         15,
         "Accuracy of the oracle, 40 views (%)",
         _ct(results),
         rows,
         "The oracle is given the true entropies of all views. Its gain over random selection is "
-        f"{_points(gain['mean'])} [{low}, {high}] points over all cells up to nine views; in the thesis's own Tables 15 and "
+        f"{_with_ends(gain.mean, gain.mean_interval)} points over all cells up to nine views; in the thesis's own Tables 15 and "
         "11 it is −0.72 points up to five views.",
     )
 
 
-def all_tables(results: dict[str, Any]) -> list[ThesisTable]:
+def all_tables(results: ThesisResults) -> list[ThesisTable]:
     """Tables 1–15, in order."""
     return [
         machine_table(results),
@@ -370,12 +356,12 @@ def all_tables(results: dict[str, Any]) -> list[ThesisTable]:
         entropy_table(results),
         losses_table(results),
         single_view_table(results),
-        gain_table(7, "10", results),
+        gain_table(7, 10, results),
         best_table(results),
         memory_table(results),
-        accuracy_table(10, "10", results),
-        accuracy_table(11, "40", results),
-        gain_table(12, "40", results),
+        accuracy_table(10, 10, results),
+        accuracy_table(11, 40, results),
+        gain_table(12, 40, results),
         views_table(results),
         views_gain_table(results),
         oracle_table(results),

@@ -57,8 +57,8 @@ def _run(name: str, arguments: list[str]) -> None:
         COMMANDS[name].load()(tool_options(name, arguments))
         return
     from data_pipeline.lock import locked
+    from eval.consistency import check_output
     from eval.run_file import configuration
-    from eval.stages import check_output
     from mevs_jax.cli.parsing import parse
 
     call = parse(name, arguments)

@@ -33,14 +33,14 @@ def plan(call: Invocation) -> None:
         import jax
 
         jax.config.update("jax_platforms", "cpu")
-    from eval import stages
+    from eval import training
 
     if call.settings.seeds != 1:
         raise Unusable(
             f"a plan is of one training, and --seeds is {call.settings.seeds}; add --seeds 1 to plan for each"
         )
     layout = layout_of(options)
-    found = stages.plan_training(call.settings, call.out, weights_of(call), layout, options.plan_objects)
+    found = training.plan_training(call.settings, call.out, weights_of(call), layout, options.plan_objects)
     print(json.dumps(found) if options.json else plan_text(found))
 
 

@@ -15,7 +15,9 @@ if TYPE_CHECKING:
 
 def run(call: Invocation) -> None:
     """All stages, one after the other."""
-    from eval import seeds, stages
+    from eval import stages, training
+    from eval.consistency import check_seeds
+    from eval.evaluation import policies_on
     from eval.walks.own_policies import load_policies
     from train.own_code import load_own
 
@@ -23,9 +25,9 @@ def run(call: Invocation) -> None:
     load_policies(call.settings.policies)  # so that an error in a policy is found before anything is computed
     if encoder:
         load_own(encoder, "--encoder")
-    seeds.check_seeds(call.settings)
-    stages.check_batches(call.settings, call.out)
-    stages.policies_of(call.settings, stages.make_data(call.settings, call.out))
+    check_seeds(call.settings)
+    training.check_batches(call.settings, call.out)
+    policies_on(call.settings.policies, training.make_data(call.settings, call.out))
     _train(call, start)
     evaluate(call)
     if not encoder:  # of which no trained system can be made
@@ -43,11 +45,12 @@ def weights_of(call: Invocation) -> StartingWeights | None:
 
 def _train(call: Invocation, start: StartingWeights | None, mesh: Mesh | None = None) -> None:
     """Both networks, from one seed or several."""
-    from eval import seeds, stages
+    from eval import seeds, training
+    from eval.consistency import check_seeds
 
-    seeds.check_seeds(call.settings)
+    check_seeds(call.settings)
     if call.settings.seeds == 1:
-        stages.train(call.settings, call.out, start, mesh)
+        training.train(call.settings, call.out, start, mesh)
         return
     begin = partial(seeds.make_folders, call.settings, call.preset, call.out, call.arguments)
     seeds.train(call.settings, call.out, start, mesh, call.options.seeds_at_once, begin)
@@ -56,11 +59,11 @@ def _train(call: Invocation, start: StartingWeights | None, mesh: Mesh | None = 
 def data(call: Invocation) -> None:
     """The data set."""
     from data_pipeline.errors import DataError
-    from eval import stages
+    from eval.training import make_data
 
     if call.options.beam and call.options.distributed:
         raise DataError("--beam has workers of its own; leave out --distributed")
-    statistics = stages.make_data(call.settings, call.out, call.options.beam)
+    statistics = make_data(call.settings, call.out, call.options.beam)
     counts = ", ".join(f"{sum(of.values())} {split}" for split, of in statistics.counts.items())
     print(f"Data set: {counts} objects of {len(statistics.classes)} classes, {statistics.views} views each")
 
@@ -97,13 +100,10 @@ def evaluate(call: Invocation) -> None:
     from eval import stages
 
     metrics = stages.evaluate(call.settings, call.out)
-    accuracy = metrics["single_view"]["accuracy"]
-    print(f"Single views: {100 * accuracy:.1f} % of {metrics['objects']} test objects right")
-    titles = {rung["policy"]: rung["title"] for rung in metrics["ladder"]}
-    own = [rung["policy"] for rung in metrics["ladder"] if "own" in rung]
+    print(f"Single views: {100 * metrics.single_view.accuracy:.1f} % of {metrics.objects} test objects right")
+    named = ("random", "predicted_entropy", "oracle_entropy", "information_gain", *(own.policy for own in metrics.own))
     after_two = ", ".join(
-        f"{titles[name]} {100 * metrics['policies'][name]['after_views'][1]:.1f} %"
-        for name in ("random", "predicted_entropy", "oracle_entropy", "information_gain", *own)
+        f"{metrics.titles[name]} {100 * metrics.policies[name].after_views[1]:.1f} %" for name in named
     )
     print(f"After two views: {after_two}")
     print(f"Metrics: {call.out / 'metrics.json'}")
@@ -115,11 +115,11 @@ def _print_seeds(call: Invocation) -> None:
     from eval import seeds
 
     found = seeds.evaluate(call.settings, call.out)
-    print(f"Over {found['seeds']} trainings, after two views, less random (95 % for other objects and trainings):")
-    for row in found["rows"]:
-        if row["views"] == 2 and row["policy"] in ("predicted_entropy", "information_gain"):
-            low, high = row["difference_over_both"]
-            print(f"  {row['title']}: {100 * row['difference']:+.1f} points [{100 * low:+.1f}, {100 * high:+.1f}]")
+    print(f"Over {found.seeds} trainings, after two views, less random (95 % for other objects and trainings):")
+    for row in found.rows:
+        if row.views == 2 and row.policy in ("predicted_entropy", "information_gain"):
+            low, high = 100 * row.difference_over_both
+            print(f"  {row.title}: {100 * row.difference:+.1f} points [{low:+.1f}, {high:+.1f}]")
     print(f"Means over trainings: {call.out / 'seeds.csv'}")
 
 

@@ -32,8 +32,8 @@ def rendering(call: Invocation) -> None:
 
 def published_code(call: Invocation) -> None:
     """What the published code does otherwise than the thesis's text."""
-    from eval import stages
+    from eval import training
 
-    stages.train_by_view(call.settings, call.out, weights_of(call))
+    training.train_by_view(call.settings, call.out, weights_of(call))
     evaluate(call)
     report(call)

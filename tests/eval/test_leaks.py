@@ -15,10 +15,14 @@ import numpy as np
 import pytest
 from flax import nnx
 
+import eval.evaluation as evaluation
 import eval.numbers.confidence as confidence
 import eval.numbers.study as study
+import eval.promises as promises
+import eval.runs as of_run
 import eval.stages as stages
 import eval.system as system
+import eval.training as training
 from eval.learned.stage import learn_to_choose
 from eval.numbers.policies import EvaluationInputs, evaluate_policies
 from eval.numbers.study import entropy_errors
@@ -45,6 +49,7 @@ from tests.reference.leaks import (
     without_bootstrap,
 )
 from tests.reference.weights import untrained
+from train.results.records import as_json
 
 SETTINGS = replace(TINY, evaluation=GridConfig(max_views=4, draws=1))
 WALKED = ("random", "random_with_repetition", "predicted_entropy", "remembered_entropy", "fixed_order")
@@ -94,11 +99,11 @@ class Run:
 
 @cache
 def networks() -> dict[str, nnx.Module]:
-    classify, predict = stages.tasks(SETTINGS, STATISTICS)
+    classify, predict = of_run.tasks(SETTINGS, STATISTICS)
     return {
         name: filled(untrained(lambda task=task: task.network(nnx.Rngs(0))), seed)
         for seed, (name, task) in enumerate(
-            {"classifier": classify, stages.BY_VIEW: classify, "entropy": predict}.items()
+            {"classifier": classify, of_run.BY_VIEW: classify, "entropy": predict}.items()
         )
     }
 
@@ -129,24 +134,24 @@ def run_with(change: str | None, out: Path) -> Run:
 
     fitted = confidence._fit
     statistics = other_statistics(STATISTICS) if change else STATISTICS
-    (out / stages.BY_VIEW).mkdir()
-    (out / stages.BY_VIEW / "summary.json").touch()
+    (out / of_run.BY_VIEW).mkdir()
+    (out / of_run.BY_VIEW / "summary.json").touch()
     with pytest.MonkeyPatch.context() as patch:
         without_bootstrap(patch)
-        patch.setattr(stages, "load_statistics", lambda folder: statistics)
-        patch.setattr(stages, "check_made_with", lambda settings, out: None)
-        patch.setattr(stages, "made_by", lambda statistics, *networks: " ".join(folder.name for folder in networks))
-        patch.setattr(stages, "load_ascent_scores", lambda *_: None)
-        patch.setattr(stages, "load_best", lambda task, folder: trained[folder.name])
-        patch.setattr(stages, "summary_of", lambda folder: {"best": {"accuracy": 0.5}})
-        patch.setattr(stages, "compute_view_tables", compute_view_tables)
-        patch.setattr(stages, "compare_with_tables", compare_with_tables)
-        patch.setattr(stages, "save_system", lambda system, folder: setattr(run, "system", system))
+        patch.setattr(of_run, "load_statistics", lambda folder: statistics)
+        patch.setattr(of_run, "check_made_with", lambda settings, out: None)
+        patch.setattr(of_run, "made_by", lambda statistics, *networks: " ".join(folder.name for folder in networks))
+        patch.setattr(evaluation, "load_ascent_scores", lambda *_: None)
+        patch.setattr(of_run, "load_best", lambda task, folder: trained[folder.name])
+        patch.setattr(evaluation, "summary_of", lambda folder: {"best": {"accuracy": 0.5}})
+        patch.setattr(of_run, "compute_view_tables", compute_view_tables)
+        patch.setattr(promises, "compare_with_tables", compare_with_tables)
+        patch.setattr(system, "save_system", lambda system, folder: setattr(run, "system", system))
         patch.setattr(study, "ladder", lambda *given: tuple(one for one in ladder(*given) if one.name in WALKED))
         patch.setattr(study, "run_grid", partial(run_grid, second={BEST_ON_TEST: TELLING_TEST}))
         patch.setattr(system, "run_grid", partial(run_grid, second={BEST: TELLING_VALIDATION}))
         patch.setattr(confidence, "_fit", fit_confidences)
-        run.metrics = stages.evaluate(SETTINGS, out)
+        run.metrics = as_json(stages.evaluate(SETTINGS, out))
         stages.make_system(SETTINGS, out)
         stages.check_live(SETTINGS, out)
     return run
@@ -269,9 +274,9 @@ def test_maps_that_receive_no_view_are_of_training_objects():
     random = np.random.default_rng(5)
     maps = {"mean_map": random.random(VIEWS).tolist(), "class_mean_maps": random.random((CLASSES, VIEWS)).tolist()}
     found = entropy_errors(TEST, replace(STATISTICS, **maps))
-    assert found["mean_map"] == pytest.approx(np.square(maps["mean_map"] - TEST.entropy).mean())
+    assert found.mean_map == pytest.approx(np.square(maps["mean_map"] - TEST.entropy).mean())
     of_classes = np.array(maps["class_mean_maps"])[TEST.labels]
-    assert found["class_mean_map"] == pytest.approx(np.square(of_classes - TEST.entropy).mean())
+    assert found.class_mean_map == pytest.approx(np.square(of_classes - TEST.entropy).mean())
 
 
 # ---------------------------------------------------------------------------------------------------------- the trained system
@@ -324,16 +329,19 @@ def test_the_best_policy_is_not_the_one_that_is_best_on_test_objects(runs):
 
 def test_no_figure_of_test_objects_decides_what_a_system_uses(monkeypatch):
     """Whichever policy wins on test objects, and however far."""
-    classify, predict = stages.tasks(SETTINGS, STATISTICS)
+    classify, predict = of_run.tasks(SETTINGS, STATISTICS)
     trained, made = networks(), []
     monkeypatch.setattr(system, "run_grid", walk_grid_anyhow)
     on_validation = system.walk_validation(VALIDATION, STATISTICS.graph, 4)
     monkeypatch.setattr(system, "walk_validation", lambda *given: on_validation)
+    monkeypatch.setattr(of_run.Run, "tables", lambda *_: VALIDATION)
+    monkeypatch.setattr(of_run.Run, "classifier", lambda _: trained["classifier"])
+    monkeypatch.setattr(of_run.Run, "predictor", lambda _: trained["entropy"])
+    run = of_run.Run(Path("run"), STATISTICS, classify, predict)
     for winner in system.USABLE:
         after = {name: [float(name == winner)] * 4 for name in system.USABLE}
         figures = {"objects": OBJECTS, "single_view": float(winner == "random"), "after_views": after}
-        given = classify, trained["classifier"], predict, trained["entropy"], VALIDATION, figures, 4, ""
-        found = system.classifier_system(STATISTICS, *given)
+        found = system.system_of_run(run, figures, 4, "")
         assert found.description.evaluation["after_views"] == after
         made.append({"description": asdict(replace(found.description, evaluation={})), "parts": found.parts})
     for one in made:
@@ -371,7 +379,7 @@ def test_everything_is_the_same_for_other_test_objects(otherwise_tested, tmp_pat
     shutil.copytree(otherwise_tested, tmp_path / "data")
     less = replace(LEARNED, learned=replace(LEARNED.learned, ablations=(), novel=0, rotation_epochs=0))
     with other_test_objects():
-        for stage in (stages.train, stages.evaluate, stages.make_system, learn_to_choose):
+        for stage in (training.train, stages.evaluate, stages.make_system, learn_to_choose):
             stage(less, tmp_path)
     other = found_by(tmp_path)
     one = found_by(request.getfixturevalue("studied"))  # late, since another worker may be making it

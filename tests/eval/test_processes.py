@@ -21,8 +21,8 @@ from data_pipeline.dataset.statistics import load_statistics
 from data_pipeline.distributed import from_all, own_share
 from data_pipeline.files import files_in
 from data_pipeline.lock import locked
+from eval.runs import tasks
 from eval.settings import TINY
-from eval.stages import tasks
 from mevs_jax import load
 from mevs_jax.cli.parsing import parse
 from tests.reference.leaks import LEARNED

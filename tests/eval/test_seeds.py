@@ -13,15 +13,17 @@ from pathlib import Path
 import pytest
 
 from data_pipeline.errors import DataError
-from eval import seeds, stages
+from eval import consistency, seeds, stages
+from eval.numbers.metrics import OverTrainings
 from eval.run_file import load_run, save_run
 from eval.settings import TINY, Settings
 from train.results.identity import summary_of
+from train.results.records import as_json
 
 SETTINGS = replace(TINY, seeds=2)
 
 
-def run(settings: Settings, out: Path) -> dict:
+def run(settings: Settings, out: Path) -> OverTrainings:
     save_run(out, "tiny", settings, [])
     seeds.train(settings, out, begin=partial(seeds.make_folders, settings, "tiny", out, []))
     return seeds.evaluate(settings, out)
@@ -30,7 +32,7 @@ def run(settings: Settings, out: Path) -> dict:
 def test_an_address_of_object_storage_is_no_folder(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     with pytest.raises(DataError, match="--out gs://bucket/run is an address, and a run needs a folder"):
-        stages.check_output(Path("gs://bucket/run"))
+        consistency.check_output(Path("gs://bucket/run"))
     assert not any(tmp_path.iterdir())
 
 
@@ -49,15 +51,15 @@ def test_the_run_of_a_seed_equals_a_run_from_that_seed_alone(whole, tmp_path):
         assert of_seed["policies"][name]["after_views"] == pytest.approx(policy["after_views"], abs=1e-5), name
     of_second = json.loads((together / "seeds" / "1" / "metrics.json").read_text())
     for number, one in enumerate((metrics, of_second)):
-        for row in found["rows"]:
-            expected = one["policies"][row["policy"]]["after_views"][row["views"] - 1]
-            assert row["each"][number] == pytest.approx(expected, abs=1e-5)
-        assert found["single_view"][number] == pytest.approx(one["single_view"]["accuracy"])
+        for row in found.rows:
+            expected = one["policies"][row.policy]["after_views"][row.views - 1]
+            assert row.each[number] == pytest.approx(expected, abs=1e-5)
+        assert found.single_view[number] == pytest.approx(one["single_view"]["accuracy"])
     best = [summary_of(out / "entropy")["best_loss"] for out in (together, together / "seeds" / "1")]
     assert best[0] != best[1]
     with (together / "seeds.csv").open(newline="") as file:
         rows = list(csv.DictReader(file))
-    assert len(rows) == len(found["rows"])
+    assert len(rows) == len(found.rows)
 
     page = stages.report(SETTINGS, "tiny", together).read_text()
     assert "Over 2 trainings" in page
@@ -66,16 +68,16 @@ def test_the_run_of_a_seed_equals_a_run_from_that_seed_alone(whole, tmp_path):
     page = stages.report(kept.settings, "tiny", together / "seeds" / "1").read_text()
     assert "Over 2 trainings" not in page
     before = {path: path.stat().st_mtime_ns for path in together.rglob("*.json")}
-    assert run(SETTINGS, together) == found  # nothing is done again
+    assert as_json(run(SETTINGS, together)) == as_json(found)  # nothing is done again
     assert {path: path.stat().st_mtime_ns for path in together.rglob("*.json")} == before
     more = run(replace(SETTINGS, seeds=3), together)
-    assert [row["each"][:2] for row in more["rows"]] == [row["each"] for row in found["rows"]]
+    assert [row.each[:2].tolist() for row in more.rows] == [row.each.tolist() for row in found.rows]
 
 
 def test_impossible_numbers_of_seeds_are_refused():
     for count in (0, -1, 10_000):
         with pytest.raises(DataError, match=f"--seeds {count} is not from 1 to 1000"):
-            seeds.check_seeds(replace(TINY, seeds=count))
+            consistency.check_seeds(replace(TINY, seeds=count))
 
 
 def test_processes_of_one_number_try_a_folder_at_once(tmp_path, monkeypatch):
@@ -85,7 +87,7 @@ def test_processes_of_one_number_try_a_folder_at_once(tmp_path, monkeypatch):
     monkeypatch.setattr(os, "getpid", lambda: 1)
     monkeypatch.setattr(os, "open", lambda path, *rest: made.append(path) or real(path, *rest))
     for _ in range(3):
-        stages.check_output(tmp_path)
+        consistency.check_output(tmp_path)
     tried = [path for path in made if ".probe." in str(path)]
     assert len(set(tried)) == len(tried) == 3
     assert not list(tmp_path.iterdir())

@@ -5,7 +5,25 @@ from __future__ import annotations
 import numpy as np
 
 from data_pipeline.dataset.statistics import DatasetStatistics
+from eval.numbers.metrics import (
+    CodeGain,
+    Compatibility,
+    Confidence,
+    Difference,
+    EntropyErrors,
+    FixedOrder,
+    Headline,
+    Listed,
+    Metrics,
+    Moved,
+    PolicySummary,
+    Reach,
+    Reading,
+    Share,
+    SingleViews,
+)
 from eval.tables import ViewTables
+from eval.walks.grid import THRESHOLDS
 from mevs_jax import fibonacci_sphere
 
 VIEWS, CLASSES, OBJECTS = 10, 3, 24
@@ -43,4 +61,38 @@ def some_statistics(tables: ViewTables) -> DatasetStatistics:
         viewpoints=fibonacci_sphere(VIEWS).tolist(),
         capture={},
         source="made up",
+    )
+
+
+def some_metrics() -> Metrics:
+    """Metrics of two policies with walks of three views, all of whose numbers are a half."""
+    grid, steps, pair = np.full((2, 7), 0.5), np.full(3, 0.5), np.full(2, 0.5)
+    grids, pairs = np.full((2, 7, 2), 0.5), np.full((3, 2), 0.5)
+    policy = PolicySummary(
+        grid, grids, grid, grid, steps, pairs, steps, 0.5, pair, pair, np.full((CLASSES, CLASSES), 0.5)
+    )
+    names = ("random", "predicted_entropy")
+    return Metrics(
+        objects=OBJECTS,
+        validation_objects=OBJECTS,
+        left_out={"train": {}, "test": {}},
+        views=VIEWS,
+        starts=VIEWS,
+        reachable=np.ones(VIEWS, bool),
+        random_draws_per_start=1,
+        random_exact_up_to=3,
+        thresholds=np.array(THRESHOLDS),
+        max_views=np.arange(2, 4),
+        headline=Headline(0.99, 3),
+        single_view=SingleViews(0.5, pair, 0.5, np.full(VIEWS, 0.5), 0.5, pair),
+        entropy=EntropyErrors(0.5, pair, 0.5, pair, 0.5, pair, pair, {"a": 0.5, "b": None}, None),
+        ladder=tuple(Listed(name, name, "nothing") for name in names),
+        policies=dict.fromkeys(names, policy),
+        against_random={names[1]: Difference(grid, grids, steps, pairs, grid, 0.5, pair)},
+        fixed_order=FixedOrder("accuracy"),
+        views_to_reach={3: Reach(0.5, dict.fromkeys(names, 2.5), dict.fromkeys(names, (2.0, None)))},
+        best_pair=Share(0.5, pair),
+        confidence={"random": Confidence({"temperature": Reading(steps, steps, steps, steps, steps)})},
+        movement={names[1]: (Moved(0.0, steps, steps),)},
+        compatibility=Compatibility({"text": CodeGain("the text")}, None, None),
     )

@@ -3,17 +3,18 @@
 from __future__ import annotations
 
 import json
-from typing import Any
 
 import numpy as np
 
 from data_pipeline.dataset.statistics import DatasetStatistics
 from data_pipeline.objects.furniture import CLASSES
 from eval.machine import machine
-from eval.thesis.results import LatticeTables, all_results
+from eval.thesis.results import BackboneTraining, LatticeTables, ThesisResults, grids_of
+from eval.thesis.timing import AscentTimes, LatticeTimes, MaximaTimes, Memory, MethodTimes, Timing
 from eval.walks.grid import GridConfig
 from mevs_jax.geometry.viewpoints import fibonacci_sphere
 from train.many.thesis import BACKBONES, VIEWS
+from train.results.records import as_json, from_json
 
 OBJECTS = 10
 
@@ -56,23 +57,19 @@ def made_up_statistics(lattices: dict[int, LatticeTables]) -> dict[int, DatasetS
     }
 
 
-def made_up_results(lattices: dict[int, LatticeTables], statistics: dict[int, DatasetStatistics]) -> dict[str, Any]:
+def made_up_results(lattices: dict[int, LatticeTables], statistics: dict[int, DatasetStatistics]) -> ThesisResults:
     validation = {views: made_up_lattice(views, 100 + views) for views in VIEWS}
-    found = all_results(lattices, validation, statistics, GridConfig(draws=2))
-    losses = {"train_loss": 0.4, "val_loss": 0.5, "epochs": 3, "best_epoch": 2, "start": "random weights"}
-    by_class = {name: [3.0, 0.5] for name in (*CLASSES, "all")}
-    timing = {"by_class": by_class, "local_maxima": {"alone": 0.1, "batched": 0.001}}
-    memory = {"planned": 80.0, "device_peak": None}
-    ascent = {
-        "seconds": {name: [2.0, 0.25] for name in (*CLASSES, "all")},
-        "memory": {"planned": 5.0, "device_peak": None},
-    }
-    found |= {
-        "backbones": {backbone.name: losses for backbone in BACKBONES},
-        "machine": machine(),
-        "timing": {"runs": 50, "10": timing, "40": timing},
-        "memory": {"ResNet-18 + Random view selection": memory},
-        "ascent": {"runs": 3, "starts": 8, "resolution": 64, "mesh": ascent, "volume": ascent},
-        "left_out": {"10": {}, "40": {}},
-    }
-    return json.loads(json.dumps(found))
+    by_class = {name: (3.0, 0.5) for name in (*CLASSES, "all")}
+    times = LatticeTimes(by_class, MaximaTimes(alone=0.1, batched=0.001))
+    method = MethodTimes({name: (2.0, 0.25) for name in (*CLASSES, "all")}, Memory(5.0, None))
+    found = ThesisResults(
+        **vars(grids_of(lattices, validation, statistics, GridConfig(draws=2))),
+        backbones={backbone.name: BackboneTraining(0.4, 0.5, 3, 2, "random weights") for backbone in BACKBONES},
+        machine=machine(),
+        timing=Timing(50, times, times),
+        memory={"ResNet-18 + Random view selection": Memory(80.0, None)},
+        ascent=AscentTimes(3, 8, 64, mesh=method, volume=method),
+        training_seconds={},
+        left_out={10: {}, 40: {}},
+    )
+    return from_json(ThesisResults, json.loads(json.dumps(as_json(found))), "made up")

@@ -12,8 +12,8 @@ import jax.numpy as jnp
 from flax import nnx
 
 from data_pipeline.dataset.statistics import DatasetStatistics
+from eval.runs import tasks
 from eval.settings import TINY
-from eval.stages import tasks
 from mevs_jax.models import PointNet2
 from train.optimiser import OptimiserConfig
 from train.tasks.classifier import ClassifierTask

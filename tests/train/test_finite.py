@@ -14,9 +14,10 @@ from flax import nnx
 from data_pipeline.dataset.statistics import StatisticsCollector, load_statistics
 from data_pipeline.errors import Diverged
 from data_pipeline.progress import console
+from eval.evaluation import check_metrics
 from eval.report.html import warning
+from eval.runs import tasks
 from eval.settings import TINY
-from eval.stages import _check_metrics, tasks
 from eval.tables import ViewTables, compute_view_tables
 from tests.reference.choosing import CLASSES, fusion_of, some_features
 from tests.reference.weights import untrained
@@ -116,9 +117,9 @@ def test_tables_of_numbers_that_are_not_finite_are_not_made(data, monkeypatch, t
     tables = ViewTables(["a"], np.zeros(1), np.full((1, 2, 3), 1e20), np.ones((1, 2, 2)), np.ones((1, 2)))
     assert tables.is_finite
     assert not replace(tables, logits=tables.logits * np.inf).is_finite
-    _check_metrics({"accuracy": 0.5}, tables, tmp_path)
+    check_metrics({"accuracy": 0.5}, tables, tmp_path)
     with pytest.raises(Diverged, match=r"metric a.0 is not finite, .*classifier reach 1e\+20; .* lower --classifier"):
-        _check_metrics({"a": [math.inf]}, tables, tmp_path)
+        check_metrics({"a": [math.inf]}, tables, tmp_path)
 
 
 def test_an_interval_of_a_share():

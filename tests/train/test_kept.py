@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
@@ -10,8 +10,9 @@ import pytest
 from data_pipeline.errors import DataError, Unreadable
 from data_pipeline.files import CHECKS, keep_json, read_json, write_json
 from tests.reference.evaluation import some_statistics, some_tables
-from train.results.identity import made_by
-from train.results.kept import keep_beside, kept_array, kept_json
+from train.results import kept as keeping
+from train.results.identity import VERSIONS, identity_of, made_by, stamp_of
+from train.results.kept import keep_beside, kept_array, kept_json, kept_record, kept_with_arrays
 from train.results.networks import check_config
 
 
@@ -147,3 +148,99 @@ def test_what_a_result_is_made_of_is_named(tmp_path):
     assert made_by(statistics, folder) == one
     keep_json(folder / "config.json", {"task": {"seed": 1}})
     assert made_by(statistics, folder) != one
+
+
+def numbers(scale: float) -> tuple[dict, dict[str, np.ndarray]]:
+    return {"scale": scale}, {"numbers": scale * np.arange(4.0)}
+
+
+def scale_of(path, identity, scale: float) -> float:
+    """The scale of the stored content and arrays, which are one result; computed with `scale` if they are stale."""
+    content, arrays = kept_with_arrays(path, identity, lambda: numbers(scale))
+    np.testing.assert_array_equal(arrays["numbers"], content["scale"] * np.arange(4.0))
+    return content["scale"]
+
+
+def test_arrays_are_one_result_with_the_file_beside_them(tmp_path, capsys):
+    path = tmp_path / "walks.json"
+    assert scale_of(path, 1, 1.0) == scale_of(path, 1, 2.0) == 1.0
+    np.savez(path.with_suffix(".npz"), numbers=3 * np.arange(4.0))  # edited
+    assert scale_of(path, 1, 4.0) == 4.0
+    path.with_suffix(".npz").unlink()
+    assert scale_of(path, 1, 5.0) == 5.0
+    said = " ".join(capsys.readouterr().err.split())
+    assert "walks.npz holds other arrays than those that were stored with it" in said
+    assert "walks.npz, which belongs to it, is missing" in said
+
+
+def test_a_job_that_ends_between_two_files_mixes_no_results(tmp_path, monkeypatch):
+    path = tmp_path / "walks.json"
+    assert scale_of(path, {"reach": 0}, 1.0) == 1.0
+
+    def killed(*_):
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr(keeping, "keep", killed)  # which writes the JSON file, last
+        with pytest.raises(KeyboardInterrupt):
+            scale_of(path, {"reach": 1}, 2.0)
+    assert scale_of(path, {"reach": 0}, 3.0) == 3.0  # the arrays are those of the other reach
+    assert scale_of(path, {"reach": 0}, 4.0) == 3.0
+
+
+def test_arrays_that_were_edited_are_computed_again(tmp_path, capsys):
+    path = tmp_path / "array.npz"
+    kept_array(path, "a", lambda: np.zeros(3))
+    np.savez(path, array=np.ones(3), made_by=np.array("a"))
+    np.testing.assert_array_equal(kept_array(path, "a", lambda: np.full(3, 2.0)), np.full(3, 2.0))
+    assert "it is not as it was written" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("now", "version", "sentence"),
+    [
+        ({"made_by": "other networks"}, 1, "the data or the networks that it was made from are others now"),
+        ({"reach": {"lowest": 20}}, 1, "its settings were others: reach.lowest 0, not 20"),
+        ({}, 2, "it is of version 1 of such results, and this program has version 2"),
+    ],
+)
+@pytest.mark.parametrize("older", [False, True])
+def test_a_stale_result_is_computed_anew_and_says_why(tmp_path, monkeypatch, capsys, now, version, sentence, older):
+    """Also one that was made before there were versions."""
+    path, settings = tmp_path / "found.json", {"made_by": "networks", "reach": {"lowest": 0}}
+    monkeypatch.setitem(VERSIONS, "metrics", 1)
+    identity = identity_of("metrics", **settings)
+    if older:
+        write_json(path, {"value": 1, "identity": settings})
+    assert kept_json(path, identity, lambda: {"value": 1})["value"] == 1
+    assert capsys.readouterr().err == ""
+    monkeypatch.setitem(VERSIONS, "metrics", version)
+    assert kept_json(path, identity_of("metrics", **settings | now), lambda: {"value": 2})["value"] == 2
+    assert f"{path} is computed anew: {sentence}" in " ".join(capsys.readouterr().err.split())
+
+
+def test_arrays_of_another_version_are_computed_anew(tmp_path, monkeypatch, capsys):
+    path = tmp_path / "array.npz"
+    monkeypatch.setitem(VERSIONS, "tables", 1)
+    assert stamp_of("tables", "made") == "made"  # as before there were versions
+    kept_array(path, "made", lambda: np.zeros(1))
+    monkeypatch.setitem(VERSIONS, "tables", 2)
+    assert kept_array(path, stamp_of("tables", "made"), lambda: np.ones(1))[0] == 1
+    assert "it is of version 1 of such results" in " ".join(capsys.readouterr().err.split())
+    assert kept_array(path, stamp_of("tables", "other"), lambda: np.full(1, 2.0))[0] == 2
+    assert "the networks that it was made from are others now" in " ".join(capsys.readouterr().err.split())
+
+
+@dataclass(frozen=True)
+class Value:
+    value: float
+
+
+def test_a_record_is_kept_under_its_identity(tmp_path, capsys):
+    path = tmp_path / "found.json"
+    assert kept_record(path, Value, {"version": 1}, lambda: Value(1.0)) == Value(1.0)
+    assert kept_record(path, Value, {"version": 1}, lambda: Value(2.0)) == Value(1.0)
+    assert read_json(path) == {"value": 1.0, "identity": {"version": 1}}
+    keep_json(path, {"share": 1.0, "identity": {"version": 1}})  # of another form
+    assert kept_record(path, Value, {"version": 1}, lambda: Value(3.0)) == Value(3.0)
+    assert "another form" in " ".join(capsys.readouterr().err.split())

@@ -10,8 +10,8 @@ import pytest
 from flax import nnx
 
 from data_pipeline.dataset.statistics import load_statistics
+from eval.runs import tasks
 from eval.settings import TINY
-from eval.stages import tasks
 from tests.reference.leaks import check_fitted, check_tested
 from tests.reference.quick import QuickClassifierTask, lines
 from train.loop import fit, load_best, steps_of_an_epoch

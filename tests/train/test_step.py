@@ -13,7 +13,7 @@ from flax import nnx
 
 from data_pipeline.dataset.batches import train_batches
 from data_pipeline.dataset.statistics import load_statistics
-from eval.stages import tasks
+from eval.runs import tasks
 from tests.train.running.scaling_worker import SETTINGS
 from train.step import Task, initial_state, train_step_of
 

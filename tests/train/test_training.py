@@ -18,8 +18,8 @@ from flax import nnx
 import train.loop
 from data_pipeline.dataset.statistics import load_statistics
 from data_pipeline.errors import DataError, Diverged
+from eval.runs import tasks
 from eval.settings import TINY
-from eval.stages import tasks
 from tests.reference.quick import lines, quick_tasks
 from train.loop import fit, load_best, steps_of_an_epoch
 from train.optimiser import OptimiserConfig

@@ -10,8 +10,8 @@ import pytest
 
 import train.validation
 from data_pipeline.dataset.statistics import load_statistics
+from eval.runs import tasks
 from eval.settings import TINY
-from eval.stages import tasks
 from tests.reference.quick import quick_tasks
 from train.loop import fit
 from train.tasks.recogniser import RecogniserTask

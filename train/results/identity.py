@@ -15,6 +15,7 @@ from data_pipeline.dataset.statistics import DatasetStatistics
 from data_pipeline.differences import differences, in_words
 from data_pipeline.errors import DataError, Unreadable, reason_of
 from data_pipeline.files import as_read, digest_of, read_json
+from train.results.records import as_json
 
 VERSIONS = {
     "tables": 1,
@@ -22,6 +23,7 @@ VERSIONS = {
     "seeds": 2,
     "system": 2,
     "outputs": 1,
+    "rendering": 1,
     "timing": 1,
     "thesis": 2,
     "features": 1,
@@ -38,9 +40,22 @@ def identity_of(kind: str, **content: Any) -> dict[str, Any]:
 
     Args:
         kind: of result, in `VERSIONS`.
-        content: the settings, and `made_by` for the data and networks that made the inputs.
+        content: the settings, as records or plain values, and `made_by` for the data and networks that made the inputs.
     """
-    return {"version": VERSIONS[kind], **as_read(content)}
+    return {"version": VERSIONS[kind], **as_json(content)}
+
+
+def stamp_of(kind: str, made: str) -> str:
+    """Returns what names the origin of arrays that are kept without JSON: what made them, and the version of their kind."""
+    return made if VERSIONS[kind] == 1 else f"{made}.{VERSIONS[kind]}"
+
+
+def why_other_stamp(was: str, now: str) -> str | None:
+    """Returns why arrays with one stamp are not those of another, in a few words; None if they are the same."""
+    (made_before, _, before), (made_now, _, version) = was.partition("."), now.partition(".")
+    return why_other(
+        {"version": int(before or 1), "made_by": made_before}, {"version": int(version or 1), "made_by": made_now}
+    )
 
 
 def why_other(was: Any, now: Any) -> str | None:
@@ -51,8 +66,11 @@ def why_other(was: Any, now: Any) -> str | None:
             return f"it is of version {was['version']} of such results, and this program has version {now['version']}"
     if was == now:
         return None
+    if not isinstance(was, Mapping):
+        return "it was made by an earlier version of this program"
     found = differences(was, now)
-    if settings := {place: pair for place, pair in found.items() if place.split(".")[0] not in ("made_by", "by_view")}:
+    made_from = ("made_by", "tables_made_by", "by_view")
+    if settings := {place: pair for place, pair in found.items() if place.split(".")[0] not in made_from}:
         return f"its settings were others: {in_words(settings)}" if all(settings) else "its settings were others"
     return "the data or the networks that it was made from are others now"
 

@@ -15,7 +15,6 @@ import numpy as np
 from data_pipeline.distributed import agreed, is_first, wait_for_all
 from data_pipeline.errors import Unreadable
 from data_pipeline.files import (
-    as_read,
     check_of,
     check_of_file,
     damage_in,
@@ -26,7 +25,7 @@ from data_pipeline.files import (
     write_bytes,
 )
 from data_pipeline.progress import console
-from train.results.identity import why, why_other
+from train.results.identity import why, why_other, why_other_stamp
 from train.results.records import as_json, from_json
 
 Result = TypeVar("Result")
@@ -42,8 +41,8 @@ def keep(path: Path, content: bytes) -> None:
 
 
 def check_kept(path: Path) -> None:
-    """Raises `Unreadable` if a file is not as `keep` wrote it. Files without a check, such as older ones, are accepted."""
-    if (damage := damage_in(path.parent, [path.name])) is not None:
+    """Raises `Unreadable` if a file that is there is not as `keep` wrote it; one without a check, as older ones, is accepted."""
+    if path.exists() and (damage := damage_in(path.parent, [path.name])) is not None:
         raise Unreadable(path, damage.removeprefix(f"{path} ").replace("is not", "it is not", 1))
 
 
@@ -145,14 +144,11 @@ def arrays_beside(path: Path, content: dict[str, Any]) -> dict[str, np.ndarray]:
         return {name: stored[name] for name in stored.files}
 
 
-_Content = tuple[dict[str, Any], dict[str, np.ndarray] | None]
-
-
 def _kept_content(
-    path: Path, identity: Any, compute: Callable[[], _Content], read: Callable[[dict[str, Any]], Result]
+    path: Path, identity: Any, compute: Callable[[], Any], read: Callable[[dict[str, Any]], Result]
 ) -> Result:
-    """Returns what `read` makes of a JSON file that `compute` gives the content of, with or without arrays beside it."""
-    identity = as_read(identity)
+    """Returns what `read` makes of a JSON file. `compute` gives its content, and the arrays beside it or None."""
+    identity = as_json(identity)
 
     def load(path: Path) -> Any:
         content = read_json(path)
@@ -167,24 +163,22 @@ def _kept_content(
             content = content | {_ARRAYS: check_of(written)}
         keep(path, json_of(content | {"identity": identity}))
 
-    return kept(path, load, save, lambda stored: stored[0], compute)[1]
+    found: Any = kept(path, load, save, lambda stored: stored[0], compute)
+    return found[1]
 
 
 def kept_array(path: Path, made: str, compute: Callable[[], np.ndarray]) -> np.ndarray:
-    """Returns the array of an `.npz` file; computes it first unless the file's `made_by` equals `made`."""
+    """Returns the array of an `.npz` file; computes it first unless the file's stamp (`stamp_of`) is `made`."""
 
     def load(path: Path) -> dict[str, np.ndarray]:
         with np.load(path) as stored:
             return {name: stored[name] for name in ("array", "made_by")}
 
-    def why_stale(stored: dict[str, np.ndarray]) -> str | None:
-        return why_other({"made_by": str(stored["made_by"])}, {"made_by": made})
-
     return kept(
         path,
         load,
         lambda path, content: keep(path, npz_bytes(**content)),
-        why_stale,
+        lambda stored: why_other_stamp(str(stored["made_by"]), made),
         lambda: {"array": compute(), "made_by": np.array(made)},
     )["array"]
 

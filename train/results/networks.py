@@ -13,9 +13,10 @@ from jax.experimental import multihost_utils
 from data_pipeline.differences import differences, in_words
 from data_pipeline.distributed import agreed, is_first, wait_for_all
 from data_pipeline.errors import DataError, Unreadable
-from data_pipeline.files import as_read, checks_in, keep_json, read_json, was_written
+from data_pipeline.files import checks_in, keep_json, read_json, was_written
 from data_pipeline.progress import console
 from train.results.identity import IN_A_SUMMARY, why, why_other
+from train.results.records import as_json
 from train.running.checkpoints import Checkpoints, damage_of, drop_damaged, has_save
 from train.running.devices import device_mesh, parameter_sharding, place
 
@@ -33,7 +34,7 @@ def trained_once(
         like: a network of the same structure, into which stored weights are loaded; shapes are enough (`nnx.eval_shape`).
         train: returns the network and what `summary.json` holds about it.
     """
-    path, identity = folder / "summary.json", as_read(identity)
+    path, identity = folder / "summary.json", as_json(identity)
     current = is_stored(folder, identity)
     drop_damaged(folder, "so the network is trained again")
     with Checkpoints(folder) as checkpoints:
@@ -64,7 +65,7 @@ def trained_once(
 
 def is_stored(folder: Path, identity: dict[str, Any]) -> bool:
     """Returns whether `trained_once` has stored a network under this identity; the same in all processes."""
-    path, identity = folder / "summary.json", as_read(identity)
+    path, identity = folder / "summary.json", as_json(identity)
     return agreed(_is_stored(path, identity))
 
 

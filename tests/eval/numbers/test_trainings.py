@@ -65,19 +65,19 @@ def test_rows_have_means_both_intervals_and_every_training(found):
     policies, results = found
     rows = rows_over_trainings(policies, results)
     assert len(rows) == len(policies) * 4
-    row = next(row for row in rows if row["policy"] == "information_gain" and row["views"] == 3)
+    row = next(row for row in rows if row.policy == "information_gain" and row.views == 3)
     after, random = (np.asarray(results[name].after)[:, :, 2] for name in ("information_gain", "random"))
-    assert row["accuracy"] == pytest.approx(after.mean())
-    np.testing.assert_allclose(row["each"], after.mean(axis=1))
-    np.testing.assert_allclose(row["difference_each"], (after - random).mean(axis=1), atol=1e-6)
-    np.testing.assert_allclose(row["over_both"], interval_of_both(after))
-    low, high = row["difference_over_objects"]
-    assert low <= row["difference"] <= high
+    assert row.accuracy == pytest.approx(after.mean())
+    np.testing.assert_allclose(row.each, after.mean(axis=1))
+    np.testing.assert_allclose(row.difference_each, (after - random).mean(axis=1), atol=1e-6)
+    np.testing.assert_allclose(row.over_both, interval_of_both(after))
+    low, high = row.difference_over_objects
+    assert low <= row.difference <= high
     read = list(csv.DictReader(io.StringIO(csv_over_trainings(rows).decode())))
     assert len(read) == len(rows)
     same = next(one for one in read if one["policy"] == "information_gain" and one["views"] == "3")
-    assert float(same["difference_over_both_high"]) == row["difference_over_both"][1]
-    assert float(same["accuracy_training_2"]) == row["each"][2]
+    assert float(same["difference_over_both_high"]) == pytest.approx(row.difference_over_both[1], rel=1e-7)
+    assert float(same["accuracy_training_2"]) == pytest.approx(row.each[2], rel=1e-7)
 
 
 def test_trainings_on_other_objects_are_not_averaged(each):

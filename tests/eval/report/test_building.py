@@ -9,6 +9,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 import pytest
 
+from eval.numbers.metrics import Headline
 from eval.projections import equal_area
 from eval.report import figures
 from eval.report.grid import _most_confused
@@ -119,7 +120,7 @@ def test_confusions_of_many_classes_are_a_table():
     classes = [f"class {number}" for number in range(MANY_CLASSES + 1)]
     matrix = 10 * np.eye(len(classes))
     matrix[3, 7], matrix[5, 2] = 30, 10
-    shown = _most_confused("random", matrix, classes, {"threshold": 0.99, "max_views": 4})
+    shown = _most_confused("random", matrix, classes, Headline(0.99, 4))
     cells = re.findall(r'<th scope="row">(.*?)</th><td>(.*?)</td><td>(.*?)</td>', shown)
     assert cells == [("class 3", "class 7", "75.0"), ("class 5", "class 2", "50.0")]
 

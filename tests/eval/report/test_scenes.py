@@ -17,6 +17,7 @@ from eval.numbers.study import Setting
 from eval.report.scenes import _which, nats
 from eval.report.surface import MOST_POINTS, seen_by, surface_of
 from eval.report.walks import OF_EACH, Walks, walks_of
+from eval.tables import ViewTables
 from eval.walks.grid import GridConfig
 from mevs_jax import fibonacci_sphere, look_at_origin
 from mevs_jax.beliefs.entropy import DEPTH_SCALE
@@ -24,11 +25,7 @@ from mevs_jax.policies import policy_record
 from tests.reference.evaluation import CLASSES, OBJECTS, VIEWS, some_statistics, some_tables
 
 STEPS = 4
-METRICS = {
-    "reachable": [True] * VIEWS,
-    "max_views": [2, 3, STEPS],
-    "confidence": {"information_gain": {"readings": {"temperature": {"temperatures": [2.0, 1.5, 1.0, 1.0]}}}},
-}
+TEMPERATURES = np.array([2.0, 1.5, 1.0, 1.0])
 
 
 @pytest.fixture(scope="module")
@@ -36,9 +33,13 @@ def tables():
     return some_tables()
 
 
+def walks_within(tables: ViewTables, reachable: np.ndarray) -> Walks:
+    return walks_of(tables, tables, some_statistics(tables).graph, reachable, TEMPERATURES)
+
+
 @pytest.fixture(scope="module")
 def walks(tables):
-    return walks_of(tables, tables, some_statistics(tables).graph, METRICS)
+    return walks_within(tables, np.ones(VIEWS, bool))
 
 
 def test_walks_are_those_of_the_evaluation(tables, walks):
@@ -57,13 +58,13 @@ def test_the_next_view_has_the_highest_gain_of_those_left(walks):
 
 def test_probabilities_are_calibrated_sums_of_logits(tables, walks):
     logits = tables.logits[np.arange(OBJECTS)[:, None], walks.views].cumsum(axis=1)
-    logits /= np.array([2.0, 1.5, 1.0, 1.0])[:, None]
+    logits /= TEMPERATURES[:, None]
     np.testing.assert_allclose(walks.probabilities, jax.nn.softmax(jnp.asarray(logits)), atol=1e-5)
 
 
 def test_views_out_of_reach_are_not_visited(tables):
-    reachable = [view % 3 != 0 for view in range(VIEWS)]
-    found = walks_of(tables, tables, some_statistics(tables).graph, METRICS | {"reachable": reachable})
+    reachable = np.arange(VIEWS) % 3 != 0
+    found = walks_within(tables, reachable)
     assert set(np.unique(found.views)) <= set(np.flatnonzero(reachable).tolist())
 
 

@@ -12,9 +12,11 @@ import pytest
 
 import eval.thesis.results as thesis_results
 import eval.thesis.run as thesis_run
+from eval.machine import machine
 from eval.settings import TINY
-from eval.thesis.results import LatticeTables, entropy_learning
+from eval.thesis.results import LatticeTables, ThesisResults, entropy_learning
 from eval.thesis.tables import best_table
+from eval.thesis.timing import AscentTimes, LatticeTimes, MaximaTimes, Measured, Timing
 from eval.walks.grid import GridConfig
 from tests.reference.evaluation import CLASSES, OBJECTS, VIEWS, some_statistics, some_tables
 from tests.reference.leaks import (
@@ -34,15 +36,16 @@ from train.tasks.entropy import EntropyTask
 SETTINGS = replace(TINY, evaluation=GridConfig(max_views=5, draws=1))
 STATISTICS = replace(some_statistics(some_tables()), capture={"resolution": 32, "views": VIEWS})
 """Of both lattices, which have as many views here."""
-MEASURED = ("machine", "timing", "memory", "ascent")
+_TIMES = LatticeTimes({}, MaximaTimes(1.0, 1.0))
+MEASURED = Measured(machine(), Timing(1, _TIMES, _TIMES), {}, AscentTimes(1, 2, 8, "not here"))
 
 
 def drawn(*names: Any) -> np.random.Generator:
     return np.random.default_rng(zlib.crc32(" ".join(map(str, names)).encode()))
 
 
-def results_with(change: str | None, out: Path) -> dict[str, Any]:
-    """The content of `thesis.json`, with networks whose outputs are made up."""
+def results_with(change: str | None, out: Path) -> ThesisResults:
+    """The results of the study, with networks whose outputs are made up."""
 
     def labels_of(split: str) -> np.ndarray:
         return drawn(split).integers(0, CLASSES, OBJECTS).astype(np.int32)
@@ -72,22 +75,21 @@ def results_with(change: str | None, out: Path) -> dict[str, Any]:
         patch.setattr(thesis_run, "load_best", lambda task, folder: None)
         patch.setattr(thesis_run, "made_by", lambda statistics, *networks: str(networks))
         patch.setattr(thesis_run, "read_history", lambda folder: [{"epoch": 1}])
-        patch.setattr(thesis_run, "measure", lambda settings, folder, tables: {name: {} for name in MEASURED})
-        patch.setattr(thesis_run, "_training", lambda folder, histories: {})
+        patch.setattr(thesis_run, "measure", lambda settings, folder, tables: MEASURED)
+        patch.setattr(thesis_run, "_training", lambda folder, histories: ({}, {}))
         return thesis_run.evaluate_thesis(SETTINGS, ThesisFolder(out)).results
 
 
 @pytest.fixture(scope="module")
-def results(tmp_path_factory) -> dict[str | None, dict[str, Any]]:
+def results(tmp_path_factory) -> dict[str | None, ThesisResults]:
     return {change: results_with(change, tmp_path_factory.mktemp("thesis")) for change in (None, *CHANGES)}
 
 
-def cells(results: dict[str, Any], chosen_on: str) -> dict[str, Any]:
+def cells(results: ThesisResults, chosen_on: str) -> dict[str, Any]:
     """The cells of Table 8 that were chosen, by lattice and classifier."""
     return {
         f"{views} {backbone.name}": [
-            results["pipeline"][str(views)]["best"][backbone.name][chosen_on][name]
-            for name in ("max_views", "threshold")
+            getattr(results.pipeline[views].best[backbone.name][chosen_on], name) for name in ("max_views", "threshold")
         ]
         for views in LATTICES
         for backbone in PIPELINE
@@ -100,8 +102,7 @@ def test_cells_chosen_on_validation_objects_are_the_same(change, results):
     check_fitted(cells(one, "validation"), cells(other, "validation"))
     # Their accuracies on test objects are others, and so are the cells that are chosen on these, as in the thesis.
     accuracies = [
-        {name: best["validation"]["accuracy"] for name, best in found["pipeline"]["40"]["best"].items()}
-        for found in (one, other)
+        {name: best["validation"].accuracy for name, best in found.pipeline[40].best.items()} for found in (one, other)
     ]
     check_tested(*accuracies)
     assert differing(cells(one, "test"), cells(other, "test"))
@@ -116,7 +117,7 @@ def test_table_8_shows_the_cells_chosen_on_validation_objects(change, results):
     assert shown == [f"MV {max_views}, CT {threshold:g}" for max_views, threshold in expected]
     assert [float(row.ours[3]) for row in table.rows] == pytest.approx(
         [
-            100 * results[change]["pipeline"][str(views)]["best"][backbone.name]["validation"]["accuracy"]
+            100 * results[change].pipeline[views].best[backbone.name]["validation"].accuracy
             for backbone in PIPELINE
             for views in LATTICES
         ]
@@ -134,6 +135,6 @@ def test_maps_that_receive_no_view_are_of_training_objects():
     )
     predicted = {frame: tables.predicted_entropy for frame in FRAMES}
     found = entropy_learning(LatticeTables(tables.names, tables.labels, tables.entropy, {}, predicted), statistics)
-    assert found["mean_map"]["all"][0] == pytest.approx(np.square(statistics.mean_map - tables.entropy).mean())
+    assert found.mean_map["all"][0] == pytest.approx(np.square(statistics.mean_map - tables.entropy).mean())
     of_classes = np.array(statistics.class_mean_maps)[tables.labels]
-    assert found["class_mean_map"]["all"][0] == pytest.approx(np.square(of_classes - tables.entropy).mean())
+    assert found.class_mean_map["all"][0] == pytest.approx(np.square(of_classes - tables.entropy).mean())

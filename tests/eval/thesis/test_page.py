@@ -14,8 +14,8 @@ from tests.reference.browser import WAYS
 @pytest.mark.slow
 def test_the_page_is_sound(inputs, opened, tmp_path, monkeypatch):
     """The captures are those of another figure."""
-    example = next(shown for shown in FIGURES if shown.number == "21")
-    drawn = tuple(replace(shown, draw=example.draw) if shown.number == "22" else shown for shown in FIGURES)
+    example = next(shown for shown in FIGURES if shown.number == 21)
+    drawn = tuple(replace(shown, draw=example.draw) if shown.number == 22 else shown for shown in FIGURES)
     monkeypatch.setattr(thesis_page, "FIGURES", drawn)
     page = thesis_page.write_thesis_report(inputs, "A run that is made up.", tmp_path / "report")
     shown = opened(page, 1200)

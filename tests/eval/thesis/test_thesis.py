@@ -22,14 +22,14 @@ from data_pipeline.dataset.builder import open_split
 from data_pipeline.dataset.statistics import load_statistics
 from data_pipeline.files import write_json
 from data_pipeline.objects.furniture import CLASSES, furniture
-from eval.numbers.timing import decision_memory, milliseconds, time_local_maxima
+from eval.machine import milliseconds
 from eval.settings import PRESETS
-from eval.thesis.alts import ALTS
 from eval.thesis.figures import FIGURES
 from eval.thesis.layout import thesis_numbers
 from eval.thesis.page import CHAPTERS, _table_html
 from eval.thesis.results import LatticeTables, best_cells
 from eval.thesis.tables import all_tables, markdown
+from eval.thesis.timing import decision_memory, time_local_maxima
 from eval.walks.grid import THRESHOLDS, Results
 from mevs_jax.geometry.viewpoints import ViewGraph, fibonacci_sphere
 from tests.reference.made_up_thesis import OBJECTS
@@ -134,55 +134,51 @@ def test_the_best_cell_is_chosen_where_it_says(lattices):
     validation[:, :, 5, 2] = 2.0
     found = best_cells(grid(test), grid(validation), lattices[10].labels)
     for backbone, best in enumerate(found):
-        assert (best["validation"]["max_views"], best["validation"]["threshold"]) == (7, 0.7)
-        assert best["validation"]["accuracy"] == pytest.approx(test[backbone, :, 5, 2].mean())
-        assert best["test"]["accuracy"] == pytest.approx(test[backbone].mean(axis=0).max())
+        assert (best["validation"].max_views, best["validation"].threshold) == (7, 0.7)
+        assert best["validation"].accuracy == pytest.approx(test[backbone, :, 5, 2].mean())
+        assert best["test"].accuracy == pytest.approx(test[backbone].mean(axis=0).max())
 
 
 def test_entropy_errors_are_by_class_and_beside_what_looks_at_nothing(lattices, statistics, results):
-    found = results["entropy"]["40"]
-    world, lattice = found["frames"]["world"], lattices[40]
-    assert world["mse"] == pytest.approx(0.05**2, rel=0.1)
-    assert found["frames"]["camera"]["mse"] == pytest.approx(0.2**2, rel=0.1)
-    assert found["camera_minus_world"]["interval"][0] > 0
-    assert world["explained_variance"] == pytest.approx(1 - world["mse"] / lattice.entropy.var(), rel=1e-5)
+    found = results.entropy[40]
+    world, lattice = found.frames["world"], lattices[40]
+    assert world.mse == pytest.approx(0.05**2, rel=0.1)
+    assert found.frames["camera"].mse == pytest.approx(0.2**2, rel=0.1)
+    assert found.camera_minus_world.interval[0] > 0
+    assert world.explained_variance == pytest.approx(1 - world.mse / lattice.entropy.var(), rel=1e-5)
     sofa = lattice.labels == CLASSES.index("sofa")
     by_hand = np.square(np.array(statistics[40].mean_map) - lattice.entropy[sofa]).mean()
-    assert found["mean_map"]["sofa"][0] == pytest.approx(by_hand, rel=1e-5)
+    assert found.mean_map["sofa"][0] == pytest.approx(by_hand, rel=1e-5)
 
 
-def test_every_figure_but_the_captures_is_drawn(inputs):
+def test_every_figure_but_the_captures_is_drawn_and_told_in_words(inputs):
+    said = {}
     for shown in FIGURES:
-        if shown.number == "22":  # of stored captures; drawn by the whole command below
+        if shown.number == 22:  # of stored captures; drawn by the whole command below
             continue
-        figure = shown.draw(inputs)
+        figure, said[shown.number] = shown.draw(inputs)
         assert isinstance(figure, Figure)
         figure.canvas.draw()
         plt.close(figure)
     wanted = {f"F{n}" for n in (*range(5, 12), *range(17, 26))} | {f"T{n}" for n in range(1, 16)}
     assert {name for _, names in CHAPTERS for name in names} == wanted
     assert {f"F{shown.number}" for shown in FIGURES} == {name for name in wanted if name.startswith("F")}
-
-
-def test_every_figure_is_told_in_words(inputs):
-    said = {shown.number: ALTS[shown.number](inputs) for shown in FIGURES}
-    assert said.keys() == ALTS.keys()
     assert all(text.endswith(".") and len(text) > 50 for text in said.values())
     assert len(set(said.values())) == len(said)
-    accuracies = 100 * np.mean(inputs.results["pipeline"]["10"]["policies"]["random"]["accuracy"], axis=0)
-    assert f"Random: {accuracies.min():.1f} to {accuracies.max():.1f} %" in said["20"]
+    accuracies = 100 * inputs.results.pipeline[10].policies["random"].accuracy.mean(axis=0)
+    assert f"Random: {accuracies.min():.1f} to {accuracies.max():.1f} %" in said[20]
     entropies = inputs.tables[40].entropy[0]
-    assert f"to {entropies.max():.2f} (view {entropies.argmax()})" in said["7"]
-    assert "training loss from 1.0000 to 0.3333" in said["17"]
+    assert f"to {entropies.max():.2f} (view {entropies.argmax()})" in said[7]
+    assert "training loss from 1.0000 to 0.3333" in said[17]
 
 
 def test_gains_are_marked_without_bold_print_or_colour(results):
     """Where the interval excludes zero, and nowhere else."""
     table = next(shown for shown in all_tables(results) if shown.number == 7)
     page = _table_html(table)
-    gain = results["pipeline"]["10"]["gain"]["text"]
-    for mark, ends in (("▲", [low > 0 for row in gain["interval"] for low, _ in row]),
-                       ("▼", [high < 0 for row in gain["interval"] for _, high in row])):  # fmt: skip
+    gain = results.pipeline[10].gain["text"]
+    for mark, ends in (("▲", [low > 0 for row in gain.interval for low, _ in row]),
+                       ("▼", [high < 0 for row in gain.interval for _, high in row])):  # fmt: skip
         assert page.count(f"<b class='up'>{mark} ") == sum(ends)
     for mark, text in re.findall(r"<b class='up'>(.) (.)", page):
         assert (mark, text) in {("▲", "+"), ("▼", "−")}
@@ -219,7 +215,7 @@ def test_times_are_taken_after_warming_up():
     assert (times > 0).all()
     assert len(calls) == 8
     found = time_local_maxima(10, runs=3, objects=50)
-    assert min(found["batched"], found["alone"]) > 0
+    assert min(found.batched, found.alone) > 0
 
 
 def test_memory_grows_with_the_networks(statistics):
@@ -227,8 +223,8 @@ def test_memory_grows_with_the_networks(statistics):
     classify = backbone_task(BACKBONES[2], settings.classifier, settings.thesis, statistics[40])
     predict = entropy_task("world", settings.entropy, statistics[40])
     alone, both = decision_memory(classify, None), decision_memory(classify, predict)
-    assert 0.5 < alone["planned"] < both["planned"]  # 180,000 weights, and more
-    assert alone["device_peak"] is None or alone["device_peak"] > 0
+    assert 0.5 < alone.planned < both.planned  # 180,000 weights, and more
+    assert alone.device_peak is None or alone.device_peak > 0
 
 
 # --------------------------------------------------------------------------------------------------------- the whole command
@@ -290,8 +286,8 @@ def test_the_stages_make_everything_and_go_on(results, tmp_path, monkeypatch, ca
     for module in (thesis_networks, thesis_run):
         monkeypatch.setattr(module, "load_best", lambda task, _: untrained(lambda: task.network(nnx.Rngs(0))))
     monkeypatch.setattr(thesis_run, "network_outputs", outputs)
-    monkeypatch.setattr(thesis_run, "_memory", lambda *_: results["memory"])
-    monkeypatch.setattr(thesis_run, "_ascents", lambda *_: results["ascent"])
+    monkeypatch.setattr(thesis_run, "_memory", lambda *_: results.memory)
+    monkeypatch.setattr(thesis_run, "_ascents", lambda *_: results.ascent)
     shown = []
 
     def write(inputs, lead, folder, over=None):

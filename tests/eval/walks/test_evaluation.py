@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 import subprocess
 import sys
@@ -27,6 +26,7 @@ from mevs_jax import POLICIES, ViewGraph, bootstrap_interval, fibonacci_sphere, 
 from mevs_jax.policies import PolicyRecord, policy_record, with_movement
 from tests.reference import numpy_rules
 from tests.reference.evaluation import CLASSES, OBJECTS, VIEWS, some_statistics, some_tables
+from train.results.records import as_json
 from train.running import over_objects
 
 
@@ -273,13 +273,13 @@ def test_95_percent_intervals_cover_the_truth_95_times_in_100(graph):
 
 def test_single_view_and_entropy_errors(tables, statistics):
     result = single_view(tables, CLASSES, np.ones(tables.logits.shape[1], bool))
-    assert result["accuracy"] == pytest.approx((tables.logits.argmax(-1) == tables.labels[:, None]).mean(), abs=1e-6)
-    assert result["interval"][0] <= result["accuracy"] <= result["interval"][1]
+    assert result.accuracy == pytest.approx((tables.logits.argmax(-1) == tables.labels[:, None]).mean(), abs=1e-6)
+    assert result.interval[0] <= result.accuracy <= result.interval[1]
     errors = entropy_errors(tables, statistics)
-    assert errors["pointnet2"] == pytest.approx(0.0025, rel=0.1)
-    assert errors["mean_map"] == pytest.approx(tables.entropy.var(axis=0).mean(), rel=1e-4)
-    assert errors["class_mean_map"] < errors["mean_map"]
-    assert errors["better_than_mean_map"][0] > 0
+    assert errors.pointnet2 == pytest.approx(0.0025, rel=0.1)
+    assert errors.mean_map == pytest.approx(tables.entropy.var(axis=0).mean(), rel=1e-4)
+    assert errors.class_mean_map < errors.mean_map
+    assert errors.better_than_mean_map[0] > 0
 
 
 def test_first_reaching_interpolates():
@@ -306,35 +306,35 @@ def study(tables, statistics):
 @pytest.mark.slow
 def test_the_study_repeats(study, tables, statistics):
     again = run_study(tables, tables, statistics, GridConfig(draws=2), by_view=tables, leak=None)
-    assert json.dumps(study) == json.dumps(again)
+    assert as_json(study) == as_json(again)
 
 
 def test_the_study_is_complete(study):
-    names = [rung["policy"] for rung in study["ladder"]]
+    names = [listed.policy for listed in study.ladder]
     assert set(names) == set(POLICIES) - {"scrambled_entropy"} - {policy.name for policy in BY_ASCENT}
-    assert set(study["policies"]) == set(names)
-    assert set(study["against_random"]) == set(names) - {"random"}
-    assert study["left_out"] == {"train": {"x": "empty"}, "test": {}}
-    for result in study["policies"].values():
-        assert np.shape(result["accuracy"]) == (8, 7)
-        assert np.shape(result["interval"]) == (8, 7, 2)
-        used = np.array(result["views_used"])
+    assert set(study.policies) == set(names)
+    assert set(study.against_random) == set(names) - {"random"}
+    assert study.left_out == {"train": {"x": "empty"}, "test": {}}
+    for result in study.policies.values():
+        assert np.shape(result.accuracy) == (8, 7)
+        assert np.shape(result.interval) == (8, 7, 2)
+        used = result.views_used
         assert (np.diff(used, axis=0) >= -1e-6).all()  # more views allowed, more used
         assert (np.diff(used, axis=1) >= -1e-6).all()  # a higher threshold, more used
         assert used.min() >= 1
         assert used.max() <= 9 + 1e-5
-        low, high = np.moveaxis(np.array(result["interval"]), -1, 0)
-        assert (low <= np.array(result["accuracy"]) + 1e-6).all()
-        assert (np.array(result["accuracy"]) <= high + 1e-6).all()
+        low, high = np.moveaxis(result.interval, -1, 0)
+        assert (low <= result.accuracy + 1e-6).all()
+        assert (result.accuracy <= high + 1e-6).all()
 
 
 def test_oracles_stand_where_they_must(study):
     """A greedy oracle is best after two views, and a pair searched for is after three."""
-    after = {name: result["after_views"] for name, result in study["policies"].items()}
+    after = {name: result.after_views for name, result in study.policies.items()}
     assert max(after, key=lambda name: after[name][1]) == "label_oracle"
     assert after["pair_oracle"][2] >= after["label_oracle"][2] - 1e-6
     assert len({round(values[0], 6) for values in after.values()}) == 1  # all start from the same views
-    assert study["best_pair"]["accuracy"] >= after["label_oracle"][1] - 1e-6
+    assert study.best_pair.accuracy >= after["label_oracle"][1] - 1e-6
 
 
 def test_class_accuracy_is_the_mean_recall(tables):
@@ -344,24 +344,23 @@ def test_class_accuracy_is_the_mean_recall(tables):
 
 
 def test_the_published_codes_switches_each_change_their_own_side(study):
-    rows = study["compatibility"]["rows"]
-    assert study["compatibility"]["thesis"]["table"] == 7
-    assert rows["validation_by_view"]["difference"] == rows["text"]["difference"]  # here the same tables
+    rows = {name: row.difference for name, row in study.compatibility.rows.items()}
+    assert study.compatibility.thesis.table == 7
+    np.testing.assert_array_equal(rows["validation_by_view"], rows["text"])  # here the same tables
     for name in ("repetition", "sorted_in_place", "all_clouds"):
-        assert rows[name]["difference"] != rows["text"]["difference"]
-    both = np.array(rows["published_code"]["difference"])
-    expected = np.array(rows["repetition"]["difference"]) + rows["sorted_in_place"]["difference"]
-    np.testing.assert_allclose(both, expected - np.array(rows["text"]["difference"]), atol=1e-6)
+        assert (rows[name] != rows["text"]).any()
+    expected = rows["repetition"] + rows["sorted_in_place"] - rows["text"]
+    np.testing.assert_allclose(rows["published_code"], expected, atol=1e-6)
     # The scrambling starts only after a step: two views are still chosen as the text says.
-    np.testing.assert_allclose(rows["sorted_in_place"]["difference"][0], rows["text"]["difference"][0], atol=1e-6)
+    np.testing.assert_allclose(rows["sorted_in_place"][0], rows["text"][0], atol=1e-6)
 
 
 def test_only_a_mixture_may_answer_otherwise(study):
-    for confidence in study["confidence"].values():
-        readings = confidence["readings"]
+    for confidence in study.confidence.values():
+        accuracy = {name: reading.accuracy for name, reading in confidence.readings.items()}
         for name in ("mean_of_log_probabilities", "product_of_experts", "temperature"):
-            assert readings[name]["accuracy"] == readings["sum_of_logits"]["accuracy"]
-        assert readings["mean_of_probabilities"]["accuracy"] != readings["sum_of_logits"]["accuracy"]
+            np.testing.assert_array_equal(accuracy[name], accuracy["sum_of_logits"])
+        assert (accuracy["mean_of_probabilities"] != accuracy["sum_of_logits"]).any()
 
 
 def test_tables_are_saved_whole(tables, tmp_path):

@@ -162,9 +162,8 @@ def test_calibrated_stopping_keeps_promises_that_the_sum_breaks():
     half = slice(0, 600), slice(600, None)
     found = confidence_of(*(part for at in half for part in (views[at], logits[at], labels[at])))
     by_risk = {
-        name: {row["risk"]: row for row in found["readings"][name]["stopping"]}
-        for name in ("sum_of_logits", "temperature")
+        name: {row.risk: row for row in found.readings[name].stopping} for name in ("sum_of_logits", "temperature")
     }
-    assert by_risk["sum_of_logits"][0.05]["excess"][0] > 0
+    assert by_risk["sum_of_logits"][0.05].excess[0] > 0
     for row in by_risk["temperature"].values():
-        assert row["excess"][0] <= 0
+        assert row.excess[0] <= 0

@@ -21,8 +21,8 @@ import train.many.training
 from data_pipeline.dataset.statistics import load_statistics
 from data_pipeline.errors import DataError, Diverged
 from eval.report.sweep import sweep_table
+from eval.runs import tasks
 from eval.settings import TINY
-from eval.stages import tasks
 from eval.sweeping import adopt, train_sweep
 from tests.reference.quick import quick_tasks
 from tests.train.running.scaling_worker import SETTINGS

@@ -12,8 +12,8 @@ from data_pipeline.dataset.batches import train_batches
 from data_pipeline.dataset.statistics import load_statistics
 from data_pipeline.errors import DataError
 from data_pipeline.files import write_json
+from eval.runs import tasks
 from eval.settings import PRESETS, TINY
-from eval.stages import tasks
 from train.loop import check_launch, check_training, identity_of
 from train.optimiser import OptimiserConfig
 from train.planning.costs import bytes_of, flop_of, memory_of, views_like

@@ -16,8 +16,8 @@ from jax.sharding import Mesh
 import train.loop
 from data_pipeline.dataset.batches import train_batches
 from data_pipeline.dataset.statistics import load_statistics
+from eval.runs import tasks
 from eval.settings import TINY
-from eval.stages import tasks
 from tests.reference.quick import quick_tasks
 from train.running.devices import DATA, MODEL, device_mesh, parameter_sharding, place, place_batch
 from train.running.preemption import Preempted

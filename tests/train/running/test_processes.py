@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from data_pipeline.dataset.statistics import load_statistics
-from eval.stages import tasks
+from eval.runs import tasks
 from mevs_jax.cli.parsing import parse
 from tests.reference.processes import start
 from tests.reference.quick import lines

@@ -14,7 +14,7 @@ import pytest
 from flax import nnx
 
 from data_pipeline.dataset.statistics import load_statistics
-from eval.stages import tasks
+from eval.runs import tasks
 from tests.reference.processes import CPU
 from tests.reference.quick import lines, quick_tasks
 from tests.train.running.scaling_worker import SETTINGS

@@ -10,8 +10,8 @@ from __future__ import annotations
 import multiprocessing
 import os
 import time
-from collections.abc import Callable, Sequence
 from concurrent.futures import ProcessPoolExecutor
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -24,30 +24,87 @@ from flax import nnx
 from data_pipeline.dataset.batches import views_of_example
 from data_pipeline.dataset.builder import open_split
 from data_pipeline.objects.mesh import Mesh
+from eval.machine import WARM_UP, Machine, milliseconds, planned_memory
 from eval.rendering.ascent import Method, ascend_on_sphere
 from mevs_jax.geometry.viewpoints import ViewGraph, fibonacci_sphere, local_maxima
 from mevs_jax.policies.base import maxima_first
+from train.results.records import named
 from train.tasks.classifier import ClassifierTask
 from train.tasks.entropy import EntropyTask
 
-_WARM_UP = 3
+Times = dict[str, tuple[float, float]]
+"""Mean and standard deviation by class, and for all of them."""
 
 
-def milliseconds(call: Callable[[Any], Any], inputs: Sequence[Any]) -> np.ndarray:
-    """Time in milliseconds of a call with each of the inputs, until its result is ready, (inputs,)."""
-    for _ in range(_WARM_UP):
-        jax.block_until_ready(call(inputs[0]))
-    times = np.empty(len(inputs))
-    for run, given in enumerate(inputs):
-        started = time.perf_counter()
-        jax.block_until_ready(call(given))
-        times[run] = 1000 * (time.perf_counter() - started)
-    return times
+@dataclass(frozen=True)
+class MaximaTimes:
+    """Milliseconds to find the local maxima of one object's map, alone and per object in a batch."""
+
+    alone: float
+    batched: float
+
+
+@dataclass(frozen=True)
+class LatticeTimes:
+    """Milliseconds of a prediction by class, and of the local maxima."""
+
+    by_class: Times
+    local_maxima: MaximaTimes
+
+
+@dataclass(frozen=True)
+class Timing:
+    """Times of the predictor with each number of views; `runs` are those of each class."""
+
+    runs: int
+    views_10: LatticeTimes = named("10")
+    views_40: LatticeTimes = named("40")
+
+    def of(self, views: int) -> LatticeTimes:
+        return {10: self.views_10, 40: self.views_40}[views]
+
+
+@dataclass(frozen=True)
+class Memory:
+    """Megabytes of one decision: planned by XLA, and the peak of the device; None if unknown."""
+
+    planned: float | None
+    device_peak: float | None
+
+
+@dataclass(frozen=True)
+class MethodTimes:
+    """Seconds of gradient ascent on the objects of each class, and its memory for one object."""
+
+    seconds: Times
+    memory: Memory
+
+
+@dataclass(frozen=True)
+class AscentTimes:
+    """The methods by differentiable rendering, or why they were not measured (`missing`)."""
+
+    runs: int
+    starts: int
+    resolution: int
+    missing: str | None = named(omitted=True)
+    volume: MethodTimes | None = named(omitted=True)
+    mesh: MethodTimes | None = named(omitted=True)
+
+
+@dataclass(frozen=True)
+class Measured:
+    """Machine, times and memory: all that `timing.json` holds but its identity."""
+
+    machine: Machine
+    timing: Timing
+    memory: dict[str, Memory]
+    ascent: AscentTimes
 
 
 def time_predictor(
     data: Path, task: EntropyTask, network: nnx.Module, labels: np.ndarray, classes: list[str], runs: int
-) -> dict[str, list[float]]:
+) -> Times:
     """Mean and standard deviation (ms) of PointNet++ on one cloud, by class, over random views of random test objects."""
     structure, state = nnx.split(network)
     predict = jax.jit(lambda state, cloud: nnx.merge(structure, state)(cloud))
@@ -65,24 +122,24 @@ def time_predictor(
             )
             clouds.append(task.inputs({name: jnp.asarray(array) for name, array in chosen.items()})[0])
         times = milliseconds(partial(predict, state), clouds)
-        out[name] = [float(times.mean()), float(times.std())]
+        out[name] = float(times.mean()), float(times.std())
         every.append(times)
-    return out | {"all": [float(np.mean(every)), float(np.std(every))]}
+    return out | {"all": (float(np.mean(every)), float(np.std(every)))}
 
 
-def time_local_maxima(views: int, runs: int = 200, objects: int = 1000) -> dict[str, float]:
-    """Time in milliseconds to find the local maxima of one object's map, alone and per object in a batch."""
+def time_local_maxima(views: int, runs: int = 200, objects: int = 1000) -> MaximaTimes:
+    """Times to find the local maxima of a map of entropies, each the median of `runs`."""
     graph = ViewGraph.from_points(fibonacci_sphere(views))
     maps = jax.random.uniform(jax.random.key(0), (objects, views))
     alone = jax.jit(lambda entropies: local_maxima(entropies, graph.neighbours))
     batched = jax.jit(jax.vmap(lambda entropies: local_maxima(entropies, graph.neighbours)))
-    return {
-        "alone": float(np.median(milliseconds(alone, [maps[0]] * runs))),
-        "batched": float(np.median(milliseconds(batched, [maps] * runs))) / objects,
-    }
+    return MaximaTimes(
+        alone=float(np.median(milliseconds(alone, [maps[0]] * runs))),
+        batched=float(np.median(milliseconds(batched, [maps] * runs))) / objects,
+    )
 
 
-def time_ascent(method: Method, meshes: dict[str, list[Mesh]], starts: int, resolution: int) -> dict[str, Any]:
+def time_ascent(method: Method, meshes: dict[str, list[Mesh]], starts: int, resolution: int) -> MethodTimes:
     """Mean and standard deviation (seconds) of gradient ascent on the objects of each class, and megabytes for one object."""
     things = {name: [jnp.asarray(method.prepare(mesh)) for mesh in some] for name, some in meshes.items()}
     first = next(iter(things.values()))[0]
@@ -97,27 +154,17 @@ def time_ascent(method: Method, meshes: dict[str, list[Mesh]], starts: int, reso
             times.append(time.perf_counter() - begun)
         seconds[name] = np.array(times)
     seconds["all"] = np.concatenate(list(seconds.values()))
-    return {
-        "seconds": {name: [float(times.mean()), float(times.std())] for name, times in seconds.items()},
-        "memory": {"planned": _planned(compiled), "device_peak": None},
-    }
+    return MethodTimes(
+        {name: (float(times.mean()), float(times.std())) for name, times in seconds.items()},
+        Memory(planned_memory(compiled), None),
+    )
 
 
-def _planned(compiled: Any) -> float | None:
-    """Megabytes that XLA plans for a program: arguments, results and temporaries; None if unknown."""
-    plan = compiled.memory_analysis()
-    parts = ("argument_size_in_bytes", "output_size_in_bytes", "temp_size_in_bytes")
-    return sum(getattr(plan, part) for part in parts) / 1e6 if plan else None
-
-
-def decision_memory(classify: ClassifierTask, predict: EntropyTask | None) -> dict[str, float | None]:
+def decision_memory(classify: ClassifierTask, predict: EntropyTask | None) -> Memory:
     """Memory in megabytes of one decision by networks of these sizes: from the inputs of a view to logits and the next view.
 
     Args:
         predict: None for random selection, which needs only the classifier.
-
-    Returns:
-        `planned` by XLA, and the `device_peak` of this process, None if the device does not report it.
     """
     side, views = classify.camera.resolution, predict.views if predict else 40
     graph = ViewGraph.from_points(fibonacci_sphere(views))
@@ -139,23 +186,20 @@ def decision_memory(classify: ClassifierTask, predict: EntropyTask | None) -> di
         jax.random.key(0),
     )
     compiled = jax.jit(decide).lower(*arguments).compile()
-    for _ in range(_WARM_UP):
+    for _ in range(WARM_UP):
         jax.block_until_ready(compiled(*arguments))
     reported = jax.devices()[0].memory_stats()
-    return {
-        "planned": _planned(compiled),
-        "device_peak": reported["peak_bytes_in_use"] / 1e6 if reported else None,
-    }
+    return Memory(planned_memory(compiled), reported["peak_bytes_in_use"] / 1e6 if reported else None)
 
 
-def decision_memory_alone(classify: ClassifierTask, predict: EntropyTask | None) -> dict[str, float | None]:
+def decision_memory_alone(classify: ClassifierTask, predict: EntropyTask | None) -> Memory:
     """`decision_memory` in a separate process if the device reports peaks, which cover the whole life of a process.
 
     A TPU serves one process, so that its peak cannot be measured.
     """
     device = jax.devices()[0]
     if device.platform == "tpu":
-        return decision_memory(classify, predict) | {"device_peak": None}
+        return replace(decision_memory(classify, predict), device_peak=None)
     if not device.memory_stats():
         return decision_memory(classify, predict)
     before = os.environ.get("XLA_PYTHON_CLIENT_PREALLOCATE")
