@@ -68,9 +68,9 @@ def depths(triangles: jax.Array, poses: jax.Array, side: int) -> jax.Array:
     )
 
 
-def share_equal(ours: jax.Array, theirs: np.ndarray) -> float:
+def share_equal(rendered: jax.Array, theirs: np.ndarray) -> float:
     """The share of pixels in which depth of the array program is that of ray casting, up to rounding."""
-    ours = np.asarray(ours)
+    ours = np.asarray(rendered)
     return float((np.abs(np.where(np.isfinite(ours), ours, 0) * 10_000 - theirs) < 5).mean())
 
 

@@ -115,7 +115,8 @@ class TrainingStep:
         loss_of: Callable[..., jax.Array],
         optimiser: optax.GradientTransformation = optax.adam(1e-5),  # noqa: B008
     ) -> None:
-        structure, parameters, others = nnx.split(network, nnx.Param, ...)
+        split: Any = nnx.split(network, nnx.Param, ...)
+        structure, parameters, others = split
 
         def step(state, *inputs):
             parameters, others, moments = state

@@ -11,7 +11,7 @@ The table is written to `benchmarks/results/precision.md`.
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -103,7 +103,7 @@ def main(run: Annotated[Path, tyro.conf.Positional]) -> None:
     if not (run / "metrics.json").exists():
         sys.exit(f"{run} was not made by `mevs run`")
     statistics, made = load_statistics(run / "data"), load_run(run)
-    both = tasks(SMALL if made is None else made.settings, statistics)
+    both: Sequence[Any] = tasks(SMALL if made is None else made.settings, statistics)
     _, labels, entropy = objects_of(run / "data", "test", statistics)
 
     def calculate(dtype: Literal["float32", "bfloat16"], wrap: Callable[[Any], Any]) -> Outputs:

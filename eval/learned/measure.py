@@ -203,11 +203,11 @@ class _Walks:
         features = self.stages.features(f"{self.views}_{split}", self.data, split)
         if "cloud" in self.variants:
             features = replace(features, clouds=self.stages.clouds(self.data, split))
-        path, entropies = _entropy_tables(self.stages.out, self.data, split), (None, None)
+        path, predicted, true = _entropy_tables(self.stages.out, self.data, split), None, None
         if path is not None:
             tables = load_view_tables(path)
-            entropies = tables.predicted_entropy, tables.entropy
-        return OnLattice(features, *entropies, load_statistics(self.data).neighbours)
+            predicted, true = tables.predicted_entropy, tables.entropy
+        return OnLattice(features, predicted, true, load_statistics(self.data).neighbours)
 
     def _title(self, test: Features) -> str:
         objects, count, _ = test.logits.shape

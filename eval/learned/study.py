@@ -212,7 +212,8 @@ def study(
     validation, test = lattices
     points, labels, method = test.features.directions[0], test.features.labels, learned[0].name
     shared = fusion.posed and bool(jnp.allclose(test.features.directions, points, atol=1e-4))
-    walking, knowledge, order = walking.on(len(points)), known, None
+    walking, order = walking.on(len(points)), None
+    knowledge: Known = known
     if shared and not isinstance(known, UnknownPose):
         knowledge, order = learn(fusion, validation.features, known, walking.max_views)
     found: dict[str, Any] = {

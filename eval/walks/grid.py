@@ -156,14 +156,14 @@ def _results_of(
     policy: Policy,
     graph: ViewGraph,
     knowledge: Knowledge | None,
-    reachable: Bool[AnyArray, " views"] | None,
+    reachable: Bool[Array, " views"] | None,
     *,
     draws: int,
     max_views: int,
 ) -> Results:
     """The results of a policy on one object, whose number and table are given."""
     (number, table), starts = one, len(graph.points)
-    weight = jnp.ones(starts) if reachable is None else reachable.astype(jnp.float32)
+    weight = jnp.ones(starts) if reachable is None else jnp.asarray(reachable, jnp.float32)
     weight = (weight / jnp.sum(weight)).repeat(draws) / draws
 
     def walks(logits: Array, entropies: Array | None, knowledge: Knowledge | None) -> Int[Array, "walks steps"]:

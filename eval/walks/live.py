@@ -161,13 +161,14 @@ def compare_with_tables(
     policies = {policy.name: as_tree(policy.score) for policy in (*map(policy_record, names), *own)}
     views, stacked, key = len(graph.points), tables.stacked(), jax.random.key(0)
     objects = min(config.objects, len(tables.labels))
-    limits = {"at_once": min(config.at_once, objects), "max_views": min(config.max_views, views)}
+    size, max_views = min(config.at_once, objects), min(config.max_views, views)
+    walk = partial(walk_each, key, at_once=size, max_views=max_views)
     walks: dict[str, list[tuple[np.ndarray, np.ndarray]]] = {policy: [] for policy in policies}
     points, images = networks.predict.network_config.points, networks.classify.images
     batches = evaluation_batches(data, split, points=points, images=images, chosen=np.arange(objects))
     with progress_bar("objects") as bar:
         line = bar.add_task("Walking live", total=objects, note="")
-        for first in range(0, objects, size := limits["at_once"]):
+        for first in range(0, objects, size):
             chunk = [_captures(next(batches), networks) for _ in range(min(size, objects - first))]
             # A shorter last chunk is padded, so that nothing is compiled again.
             index = np.resize(np.arange(len(chunk)), size)
@@ -177,8 +178,8 @@ def compare_with_tables(
             starts = (index % views).astype(np.int32)
             scenes = jax.vmap(lambda table: table.scene(graph, knowledge))(part)
             for name, policy in policies.items():
-                live = walk_each(key, (index, captures, scenes, starts), policy, networks, **limits)
-                stored = walk_each(key, (index, part, scenes, starts), policy, **limits)
+                live = walk((index, captures, scenes, starts), policy, networks)
+                stored = walk((index, part, scenes, starts), policy)
                 same = np.all(np.asarray(live.views == stored.views), axis=1)
                 apart = np.abs(np.asarray(live.confidences - stored.confidences)).max(axis=1)
                 walks[name].append((same[: len(chunk)], apart[: len(chunk)]))

@@ -14,7 +14,7 @@ from typing import Any
 import jax
 import numpy as np
 from jax import Array
-from jax.sharding import Mesh, PartitionSpec
+from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
 from data_pipeline.distributed import from_all, own_share
 from data_pipeline.processes import usable_cpus
@@ -48,6 +48,7 @@ def over_objects(
         by_all: whether every process calls this, so that they share the objects; each returns all results.
         static: arguments by name that the program is compiled for; they must be hashable.
     """
+    objects = jax.device_get(objects)  # parts of them may belong on other devices than they are on
     count = len(jax.tree.leaves(objects)[0])
     devices, threads = jax.local_device_count(), programs_at_once()
     workers_of_any = _MOST_AT_ONCE if jax.default_backend() == "cpu" else devices  # chunks are those of one core
@@ -58,12 +59,15 @@ def over_objects(
     firsts = range(0, count, size)
     own = own_share(len(firsts)) if by_all else np.arange(len(firsts))
 
+    if devices > 1:
+        shared = jax.device_put(shared, NamedSharding(_mesh(), PartitionSpec()))
+
     def given(first: int) -> list[Any]:
         index = np.minimum(np.arange(first, first + size), count - 1)  # the last object fills up the last part
         return jax.tree.leaves((jax.tree.map(lambda leaf: leaf[index], objects), shared))
 
     program = function, jax.tree.structure((objects, shared)), tuple(static.items()), at_once
-    run = partial(_run, *program)
+    run: Callable[[list[Any]], Any] = partial(_run, *program)
     parts = [firsts[number] for number in own] or [0]  # a process without a part still needs shapes
     if min(threads, len(parts)) > 1:
         run = _run.lower(*program, given(parts[0])).compile()  # once, not by every thread
@@ -79,6 +83,10 @@ def over_objects(
     return jax.tree.map(joined, *done)
 
 
+def _mesh() -> Mesh:
+    return Mesh(np.array(jax.local_devices()), "objects")
+
+
 @partial(jax.jit, static_argnums=(0, 1, 2, 3))
 def _run(
     function: Callable[..., Any], structure: Any, static: tuple[tuple[str, Any], ...], at_once: int, leaves: list[Array]
@@ -92,7 +100,9 @@ def _run(
     def of_some(objects: Any, shared: tuple[Any, ...]) -> Any:
         return jax.lax.map(lambda one: function(one, *shared, **dict(static)), objects, batch_size=at_once)
 
-    if len(devices := jax.local_devices()) > 1:
-        mesh, over = Mesh(np.array(devices), "objects"), PartitionSpec("objects")
-        of_some = jax.shard_map(of_some, mesh=mesh, in_specs=(over, PartitionSpec()), out_specs=over, check_vma=False)
+    if jax.local_device_count() > 1:
+        over = PartitionSpec("objects")
+        of_some = jax.shard_map(
+            of_some, mesh=_mesh(), in_specs=(over, PartitionSpec()), out_specs=over, check_vma=False
+        )
     return of_some(*structure.unflatten(leaves))
