@@ -100,9 +100,9 @@ def save_view_tables(path: Path, tables: ViewTables) -> None:
     keep(path, npz_bytes(**vars(tables)))
 
 
-def load_view_tables(path: Path) -> ViewTables:
+def load_view_tables(path: str | Path) -> ViewTables:
     """Reads what `save_view_tables` wrote; raises `Unreadable` if the file is not as it was written."""
-    check_kept(path)
+    check_kept(Path(path))
     with np.load(path) as stored:
         predicted = "predicted_entropy" if "predicted_entropy" in stored else "utility"  # its name in version 0.1
         arrays = {name: stored[name] for name in ("labels", "logits", "entropy")} | {
