@@ -124,11 +124,11 @@ def test_views_to_reach_are_of_the_same_objects_as_their_target():
         return Results(after[..., None], after[..., None], after, after, jnp.zeros((1, 12, 1, 1, 9), jnp.int32))
 
     found = views_to_reach({"random": results(0), "same": results(0), "better": results(1)})
-    assert set(found) == {"3", "5", "9"}
+    assert set(found) == {3, 5, 9}
     for views, row in found.items():
-        for name, expected in (("same", int(views)), ("better", int(views) - 1)):
-            assert row["views"][name] == pytest.approx(expected, abs=1e-3)
-            assert row["interval"][name] == pytest.approx([expected] * 2, abs=1e-3)
+        for name, expected in (("same", views), ("better", views - 1)):
+            assert row.views[name] == pytest.approx(expected, abs=1e-3)
+            assert row.interval[name] == pytest.approx([expected] * 2, abs=1e-3)
 
 
 def test_the_risk_that_is_allowed_is_that_of_those_who_stop():

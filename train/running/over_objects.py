@@ -48,8 +48,8 @@ def over_objects(
         by_all: whether every process calls this, so that they share the objects; each returns all results.
         static: arguments by name that the program is compiled for; they must be hashable.
     """
-    objects = jax.device_get(objects)  # parts of them may belong on other devices than they are on
-    count = len(jax.tree.leaves(objects)[0])
+    every = jax.device_get(jax.tree.leaves(objects))  # parts may belong on other devices than those that they are on
+    count = len(every[0])
     devices, threads = jax.local_device_count(), programs_at_once()
     workers_of_any = _MOST_AT_ONCE if jax.default_backend() == "cpu" else devices  # chunks are those of one core
     at_once = max(1, min(at_once, -(-count // workers_of_any)))
@@ -64,7 +64,7 @@ def over_objects(
 
     def given(first: int) -> list[Any]:
         index = np.minimum(np.arange(first, first + size), count - 1)  # the last object fills up the last part
-        return jax.tree.leaves((jax.tree.map(lambda leaf: leaf[index], objects), shared))
+        return [*(leaf[index] for leaf in every), *jax.tree.leaves(shared)]
 
     program = function, jax.tree.structure((objects, shared)), tuple(static.items()), at_once
     run: Callable[[list[Any]], Any] = partial(_run, *program)
@@ -75,10 +75,10 @@ def over_objects(
         done = list(pool.map(lambda first: jax.device_get(run(given(first))), parts))
 
     def joined(*leaves: np.ndarray) -> np.ndarray:
-        every = np.stack(leaves)
+        found = np.stack(leaves)
         if by_all:
-            every = from_all(every[: len(own)], len(firsts))
-        return every.reshape(-1, *every.shape[2:])[:count]
+            found = from_all(found[: len(own)], len(firsts))
+        return found.reshape(-1, *found.shape[2:])[:count]
 
     return jax.tree.map(joined, *done)
 
