@@ -217,7 +217,8 @@ def main(quick: Path | None = None) -> None:
     """
     print(machine_name())
     rows = TABLE.show(measured(QUICK if quick else FULL))
-    keep((quick or RESULTS) / "accelerator.json", {"rows": rows}, "", TABLE.markdown(rows))
+    stored = [row | {"value": None} if np.isnan(row["value"]) else row for row in rows]
+    keep((quick or RESULTS) / "accelerator.json", {"rows": stored}, "", TABLE.markdown(rows))
     sys.exit(any(np.isnan(row["value"]) or "DIFFER" in row["note"] for row in rows))
 
 

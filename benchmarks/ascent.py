@@ -69,7 +69,7 @@ def main(
         objects: how many of its test objects.
     """
     how, path = METHODS[method], RESULTS / f"ascent_{method}.json"
-    source = open_source(data, train_per_class=1, test_per_class=objects // 10)
+    source = open_source(data, train_per_class=1, test_per_class=-(-objects // 10))
     entries = [entry for entry in source.entries if entry.split == "test"]
     dense = np.asarray(trimesh.creation.icosphere(4).vertices)
     run_ascent = jax.jit(lambda thing: ascend_on_sphere(how, thing, STARTS, SIDE))

@@ -10,7 +10,6 @@ The tables are written to `benchmarks/results/canonical.json` and `canonical.md`
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Annotated
@@ -18,7 +17,7 @@ from typing import Annotated
 import numpy as np
 import tyro
 
-from benchmarks.reporting import RESULTS, Row, Table, keep, machine_name
+from benchmarks.reporting import RESULTS, Row, Table, keep, machine_name, refuse
 from data_pipeline.objects.formats import MESH_SUFFIXES
 from data_pipeline.objects.mesh import Mesh, normalise
 from data_pipeline.objects.recipes import MeshFile
@@ -77,7 +76,7 @@ def main(
     """
     meshes = objects(folder, per_class)
     if not meshes:
-        sys.exit(f"no meshes in {folder}; give a folder of mesh files")
+        refuse(f"no meshes in {folder}; give a folder of mesh files")
     name = f"{len(meshes)} objects of {folder.name if folder else 'furniture10'}"
     print(f"Measured on: {machine_name()}. {name}.")
     compared = AGREEMENT.show(compare(meshes, shots, ViewCamera(resolution)))

@@ -20,6 +20,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import trimesh
+import tyro
 
 from benchmarks.comparing import seconds_of
 from benchmarks.reporting import RESULTS, Row, Table, keep, machine_name
@@ -156,4 +157,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    tyro.cli(main)

@@ -17,7 +17,6 @@ from __future__ import annotations
 import io
 import json
 import re
-import sys
 from collections import defaultdict
 from pathlib import Path
 from typing import Annotated, Any
@@ -25,7 +24,7 @@ from typing import Annotated, Any
 import numpy as np
 import tyro
 
-from benchmarks.reporting import RESULTS
+from benchmarks.reporting import RESULTS, refuse
 from data_pipeline.dataset.builder import open_split
 from data_pipeline.files import read_json, write_bytes, write_text
 from eval.learned.comparison import BASELINES, ByObject, seeds_together
@@ -56,6 +55,8 @@ def keep(run: Path, folder: Path) -> None:
         write_bytes(folder / f"{path.parent.name}_novel.json", path.read_bytes())
     names = np.array([one["name"].decode() for one in open_split(run / "data", "test", ("name",))])
     for path in sorted((run / "learned").glob("seed_*/walks_*.npz")):
+        if path.stem == "walks_novel":
+            continue
         found = read_json(path.with_suffix(".json"))
         summary: dict[str, Any] = {key: found[key] for key in _KEPT}
         summary["policies"] = {
@@ -160,7 +161,7 @@ def main(run: Annotated[Path | None, tyro.conf.Positional] = None, to: str = "ch
     for path in sorted(folder.glob("*.npz")):
         parts = re.fullmatch(r"seed_(\d+(?:_rotated)?)_(.*)", path.stem)
         if parts is None:
-            sys.exit(f"the name of {path} has no seed and candidates; rename it like seed_0_lattice_40.npz")
+            refuse(f"the name of {path} has no seed and candidates; rename it like seed_0_lattice_40.npz")
         seed, kind = parts.groups()
         kinds[kind + "_rotated" * seed.endswith("rotated")].append((seed, *kept(path)))
     text = "Written by `benchmarks/choices.py`; accuracy in %, differences in points.\n\n"

@@ -45,7 +45,7 @@ from train.tasks.recogniser import RecogniserTask
 
 SEEDS, OBJECTS, STEPS = 4, 12, 8
 TABLE = Table(
-    "network | separate, s | in turn, s | ratio | at once, s | ratio | step: in turn / at once",
+    "network | separate, s | in turn, s | ratio | at once, s | ratio | step: at once / in turn",
     "{network} | {separate:.1f} | {in turn:.1f} | {faster in turn:.2f} | {at once:.1f} | {faster at once:.2f} | {step:.2f}",
 )
 WAYS: tuple[Way, ...] = ("in turn", "at once")

@@ -10,7 +10,6 @@ The table is written to `benchmarks/results/precision.md`.
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
@@ -25,7 +24,7 @@ import tyro
 from flax import nnx
 from jaxtyping import Float, Int
 
-from benchmarks.reporting import RESULTS, Row, Table, machine_name
+from benchmarks.reporting import RESULTS, Row, Table, machine_name, refuse
 from data_pipeline.dataset.statistics import load_statistics
 from data_pipeline.files import write_text
 from eval.run_file import load_run
@@ -101,7 +100,7 @@ def row_of(name: str, by: Outputs, first: Outputs, variance: float) -> Row:
 
 def main(run: Annotated[Path, tyro.conf.Positional]) -> None:
     if not (run / "metrics.json").exists():
-        sys.exit(f"{run} was not made by `mevs run`")
+        refuse(f"{run} was not made by `mevs run`")
     statistics, made = load_statistics(run / "data"), load_run(run)
     both: Sequence[Any] = tasks(SMALL if made is None else made.settings, statistics)
     _, labels, entropy = objects_of(run / "data", "test", statistics)

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import platform
+import sys
 from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NoReturn
 
 import jax
 
@@ -48,6 +49,12 @@ class Table:
 
 def machine_name() -> str:
     return f"{platform.processor() or platform.machine()}, {jax.devices()[0].device_kind}, JAX {jax.__version__}"
+
+
+def refuse(reason: str) -> NoReturn:
+    """Ends the program as `mevs` does when it was asked for what it cannot do."""
+    print(reason, file=sys.stderr)
+    sys.exit(2)
 
 
 def keep(path: Path, results: dict[str, Any], *parts: str) -> None:

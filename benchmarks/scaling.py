@@ -19,9 +19,11 @@ from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from typing import Annotated
 
 import jax
 import numpy as np
+import tyro
 
 from benchmarks.comparing import seconds_of
 from benchmarks.reporting import machine_name
@@ -136,7 +138,7 @@ def row_of(preset: str, name: str, data: Path) -> dict[str, float]:
     }
 
 
-def main() -> None:
+def main(results: Annotated[Path | None, tyro.conf.Positional] = None) -> None:
     print(f"{os.cpu_count()} cores, {machine_name()}")
     measured = {}
     for preset, settings in PRESETS.items():
@@ -146,9 +148,9 @@ def main() -> None:
             for name in NETWORKS:
                 row = measured[f"{preset} {name}"] = row_of(preset, name, data)
                 print(f"{preset} {name}", {key: round(value, 2) for key, value in row.items()}, flush=True)
-    if len(sys.argv) > 1:
-        write_json(Path(sys.argv[1]), measured)
+    if results is not None:
+        write_json(results, measured)
 
 
 if __name__ == "__main__":
-    work(*sys.argv[2:]) if sys.argv[1:2] == ["--worker"] else main()
+    work(*sys.argv[2:]) if sys.argv[1:2] == ["--worker"] else tyro.cli(main)

@@ -237,6 +237,7 @@ def policy_of(networks: Agent) -> Policy:
 
 def main(config: Config) -> None:
     inputs = EvaluationInputs.of_run(config.run)
+    inputs = replace(inputs, config=replace(inputs.config, max_views=max(2, config.max_views)))
     validation = replace(inputs.validation.stacked(), predicted_entropy=None)
     of_temperatures, of_training, _ = jax.random.split(jax.random.key(config.seed), 3)
     temperatures = jax.jit(fitted_temperatures, static_argnums=2)(of_temperatures, validation, config.max_views)

@@ -196,8 +196,8 @@ def _grids(archive: zipfile.ZipFile, info: zipfile.ZipInfo, count: int) -> list[
             content = file.read(part * size)
             if len(content) < part * size:
                 raise Damage(f"is cut short: {first} of {count} grids are there; download it again")
-            cells = np.frombuffer(content, kind)
-            cells = (cells.reshape(shape, order="F") if fortran else cells).reshape(part, -1)
+            stored = np.frombuffer(content, kind)
+            cells = (stored.reshape(shape, order="F") if fortran else stored).reshape(part, -1)
             if kind.kind == "f" and not np.isfinite(cells).all():
                 raise Damage("has cells that are not finite (NaN or infinite); correct the file")
             found += [VoxelGrid(bits.tobytes(), side) for bits in np.packbits(cells > 0, axis=1)]

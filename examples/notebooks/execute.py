@@ -56,5 +56,8 @@ def execute(name: str) -> None:
 
 
 if __name__ == "__main__":
+    if unknown := [name for name in sys.argv[1:] if name not in NOTEBOOKS]:
+        print(f"no notebook {unknown[0]}; there are {', '.join(NOTEBOOKS)}", file=sys.stderr)
+        sys.exit(2)
     for name in sys.argv[1:] or NOTEBOOKS:
         execute(name)

@@ -38,6 +38,7 @@ def test_what_is_kept_says_what_the_walks_said(tmp_path, monkeypatch, random):
     gain = {"difference": [0.0, 0.015, 0.01], "interval": [[0.0, 0.0], [0.008, 0.022], [-0.001, 0.02]]}
     novel = {"objects": OBJECTS, "pairs": [{}], "gain": {"expected_views_without": gain}}
     (folder / "walks_novel.json").write_text(json.dumps(novel))
+    np.savez(folder / "walks_novel.npz", random=np.ones((4, OBJECTS)))
     choices.main(tmp_path / "run", "others")
 
     assert json.loads((tmp_path / "others" / "seed_0_novel.json").read_text()) == novel

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import ast
 import base64
 import json
 import re
+from importlib import import_module
 from typing import Any
 
 import pytest
@@ -39,6 +41,17 @@ def test_links_of_a_notebook_lead_somewhere(name):
     texts = ("".join(cell["source"]) for cell in stored(name)["cells"] if cell["cell_type"] == "markdown")
     for target in re.findall(r"\]\(([^)\s]+)\)", "\n".join(texts)):
         assert (HERE / target).resolve().exists(), target
+
+
+@pytest.mark.parametrize("name", NOTEBOOKS)
+def test_what_a_notebook_imports_exists(name):
+    """The slow test runs the cells; this one notices a name that is gone."""
+    cells = ("".join(cell["source"]) for cell in stored(name)["cells"] if cell["cell_type"] == "code")
+    imports = [node for cell in cells for node in ast.walk(ast.parse(cell)) if isinstance(node, ast.ImportFrom)]
+    assert imports
+    for node in imports:
+        for alias in node.names:
+            assert hasattr(import_module(str(node.module)), alias.name)
 
 
 @pytest.mark.slow
