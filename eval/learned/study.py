@@ -123,7 +123,8 @@ def order_of_fused(fusion: CalibratedFusion, data: Features, most: int) -> Fixed
     A greedy search chooses the first `most` views. Each later view is the farthest from those before it.
     """
     objects, views, classes = data.logits.shape
-    starts = (np.arange(objects)[:, None] + np.arange(_STARTS_OF_EACH) * views // _STARTS_OF_EACH) % views
+    # Two objects that follow each other, which are of different halves in `fit_order`, have the same start views.
+    starts = (np.arange(objects)[:, None] // 2 + np.arange(_STARTS_OF_EACH) * views // _STARTS_OF_EACH) % views
 
     def worth(before: frozenset[int]) -> np.ndarray:
         given = np.array(sorted(before), int)
@@ -214,7 +215,7 @@ def study(
     shared = fusion.posed and bool(jnp.allclose(test.features.directions, points, atol=1e-4))
     walking, order = walking.on(len(points)), None
     knowledge: Known = known
-    if shared and not isinstance(known, UnknownPose):
+    if shared and others and not isinstance(known, UnknownPose):
         knowledge, order = learn(fusion, validation.features, known, walking.max_views)
     found: dict[str, Any] = {
         "objects": len(labels),

@@ -20,7 +20,7 @@ from mevs_jax.trained.description import FORM
 from mevs_jax.trained.system import EXPECTED_VIEWS, UNPOSED
 from train.choosing.expected import FITTED_AS
 from train.choosing.stages import Stages, lattice_data
-from train.results.identity import made_by
+from train.results.identity import made_by, stamp_of
 
 POLICIES = {"learned": True, "learned_unposed": False}
 """The view policies of a system, and whether they know the object's pose."""
@@ -55,11 +55,9 @@ def make_learned_system(stages: Stages, found: dict[str, Any]) -> Path:
     views, folder = stages.dataset.capture.views, stages.out / "learned" / "system"
     figures = figures_of(found, views)
     networks = [stages.policy_folder(name) for name in POLICIES]
-    made = identity_of(
-        made_by(stages.statistics, stages.recogniser_folder()),
-        [FITTED_AS, *((network / "summary.json").read_text() for network in networks)],
-        figures,
-    )
+    made_from = made_by(stages.statistics, stages.recogniser_folder())
+    summaries = [(network / "summary.json").read_text() for network in networks]
+    made = stamp_of("system", identity_of(made_from, [FITTED_AS, *summaries], figures))
     if not agreed(stored_system(folder, made)):
         system = learned_system(stages, found, figures, made)
         if is_first():

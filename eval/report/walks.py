@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from eval.tables import ViewTables
-from eval.walks.knowledge import learn
+from eval.walks.knowledge import class_view_table
 from mevs_jax.beliefs.fusing import discounted
 from mevs_jax.geometry.viewpoints import ViewGraph
 from mevs_jax.policies.base import Knowledge
@@ -95,7 +95,7 @@ def walks_of(
     allowed = np.flatnonzero(reachable)
     steps = min(len(temperatures), len(allowed))
     starts = allowed[np.arange(len(tables.labels)) % len(allowed)]
-    knowledge = learn(validation.logits, validation.labels)
+    knowledge = Knowledge(None, class_view_table(jnp.asarray(validation.logits), jnp.asarray(validation.labels)))
     fitted = jnp.asarray(temperatures[:steps], jnp.float32)
     views, gains, log_probabilities = _walk(
         tables.stacked(), jnp.asarray(starts), graph, knowledge, jnp.asarray(reachable), fitted, steps

@@ -1,7 +1,7 @@
 """One function of one object, applied to many objects: shared by processes, devices and cores, in chunks of bounded memory.
 
-Every chunk is computed as one core alone would compute it. So the results do not depend on how many processes, devices and cores
-share them.
+On CPUs every chunk is computed as one core alone would compute it. So the results do not depend on how many processes, devices
+and cores share them.
 """
 
 from __future__ import annotations
