@@ -37,7 +37,8 @@ def live_agreement(run: Run, config: LiveConfig, references: tuple[str, ...]) ->
             raise DataError(
                 f"{policy} needs the tables of mevs study rendering, which live walks do not have; leave it out"
             )
-    graph, validation = run.statistics.graph, run.tables("val")
+    graph = run.statistics.graph
+    own, validation = checked(load_policies(references), graph, len(run.statistics.classes)), run.tables("val")
     found = compare_with_tables(
         run.data,
         "test",
@@ -46,7 +47,7 @@ def live_agreement(run: Run, config: LiveConfig, references: tuple[str, ...]) ->
         learn(validation.logits, validation.labels),
         graph,
         config=config,
-        own=checked(load_policies(references), graph, len(run.statistics.classes)),
+        own=own,
     )
     write_json(run.out / "live.json", as_json(found))
     return found

@@ -103,7 +103,7 @@ def fit(
         begin()
     drop_damaged(folder)
     training = _Training(task, data, statistics, folder, start, mesh, rate_option)
-    _train(training, begin)
+    _train(training, begin if changed else None)
     if changed:
         begin()
     if training.epoch and training.progress["best_loss"] is None:  # only in a folder of a version before 0.2
@@ -114,11 +114,11 @@ def fit(
     return summary
 
 
-def _train(training: _Training, begin: Callable[[], None]) -> None:
+def _train(training: _Training, begin: Callable[[], None] | None) -> None:
     """Trains until an epoch is the last one; saves and logs after each epoch.
 
     Args:
-        begin: called after each epoch's last step, before its results are stored.
+        begin: called once, after the first epoch's last step, before its results are stored.
     """
     task, config, epoch_steps = training.task, training.task.optimiser, training.epoch_steps
     with Checkpoints(training.folder) as checkpoints, progress_bar("views") as bar, Preemption() as preemption:
@@ -135,7 +135,9 @@ def _train(training: _Training, begin: Callable[[], None]) -> None:
                     training.save_within_epoch(checkpoints, started)
                     raise Preempted(f"{task.name} was asked to end after step {training.step}")
             bar.advance(line, lead.end() * views)
-            begin()
+            if begin is not None:
+                begin()
+                begin = None
             means, checked = training.finish_epoch(checkpoints, log, started)
             note = ", ".join(f"{name} {value:.4f}" for name, value in checked.items())
             bar.update(line, note=f"val {note}")

@@ -106,7 +106,7 @@ class StrangerRow:
 
 @dataclass(frozen=True)
 class Strangers:
-    """Number of objects of unknown classes, and how well they are told from the others."""
+    """Number of objects of unknown classes, and how well they are distinguished from the others."""
 
     objects: int
     after: list[StrangerRow]

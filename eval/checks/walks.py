@@ -152,9 +152,7 @@ class Walker:
             number, table = one
             fuse, run = system.fuse(parts, posed), system.policy(policy, parts, posed)
             scene = table.scene(graph, parts.knowledge if posed else parts.knowledge_by_pose(graph.points), can_reach)
-            views = walks_around(
-                jax.random.fold_in(key, number), table.observe, scene, run, walks, max_views=steps, fuse=fuse
-            ).views
+            views = walks_around(key, table.observe, scene, run, (number, *walks), max_views=steps, fuse=fuse).views
             beliefs = jax.vmap(partial(beliefs_along, parts, table, posed=posed))(views)
             calibrated = jax.vmap(jax.vmap(log_probabilities), (0, None))(beliefs, jnp.arange(1, steps + 1))
             right = jnp.argmax(calibrated, axis=-1) == table.label

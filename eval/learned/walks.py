@@ -162,9 +162,7 @@ def _walks_of(
     if isinstance(knowledge, UnknownPose) and table.features is not None:
         table = replace(table, pose_evidence=knowledge.evidence(table.features, directions))
     scene = table.scene(replace(graph, points=directions), _at(knowledge, directions))
-    return walks_around(
-        jax.random.fold_in(key, number), table.observe, scene, policy, walks, max_views=max_views, fuse=fuse
-    ).views
+    return walks_around(key, table.observe, scene, policy, (number, *walks), max_views=max_views, fuse=fuse).views
 
 
 def _most_at_once(policy: PolicyRecord, knowledge: Known, views: int) -> int:

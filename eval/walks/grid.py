@@ -169,9 +169,7 @@ def _results_of(
     def walks(logits: Array, entropies: Array | None, knowledge: Knowledge | None) -> Int[Array, "walks steps"]:
         own = replace(table, logits=logits, predicted_entropy=entropies)
         scene, every = own.scene(graph, knowledge, reachable), every_walk(jnp.arange(starts), draws)
-        return walks_around(
-            jax.random.fold_in(key, number), own.observe, scene, policy, every, max_views=max_views
-        ).views
+        return walks_around(key, own.observe, scene, policy, (number, *every), max_views=max_views).views
 
     entropies = table.predicted_entropy
     each = 0 if entropies is not None and entropies.ndim == 3 else None

@@ -113,8 +113,7 @@ def _walk(
         return Observation(classifier(classify.inputs(image))[0], predictor(predict.inputs(cloud))[0])
 
     observe = shown.observe if isinstance(shown, ViewTable) else look
-    own, walks = jax.random.fold_in(key, number), every_walk(start[None], 1)
-    found = walks_around(own, observe, scene, policy, walks, **limits)
+    found = walks_around(key, observe, scene, policy, (number, *every_walk(start[None], 1)), **limits)
     return found.views[0], found.predictions[0], found.confidences[0], found.count[0]
 
 

@@ -37,7 +37,7 @@ def walks_around(
     observe: Callable[[Int[Array, ""]], Observation],
     scene: Scene,
     policy: Policy,
-    walks: tuple[Int[Array, " walks"], Int[Array, " walks"]],
+    walks: tuple[Int[Array, ""], Int[Array, " walks"], Int[Array, " walks"]],
     *,
     max_views: int,
     threshold: float | Float[Array, ""] | None = None,
@@ -46,16 +46,17 @@ def walks_around(
     """Returns the walks around one object, with a leading axis of walks.
 
     Args:
-        key: of the object: `jax.random.fold_in` of the evaluation's key and the number of the object.
+        key: of the evaluation.
         observe, scene, policy, max_views, threshold, fuse: as for `select_views`.
-        walks: start view and number of the draw of each walk; see `every_walk`.
+        walks: number of the object; start view and number of the draw of each walk, see `every_walk`.
     """
+    number, starts, draws = walks
 
     def walk(start: Array, draw: Array) -> Episode:
-        own = jax.random.fold_in(jax.random.fold_in(key, start), draw)
+        own = walk_key(key, number, start, draw)
         return select_views(own, observe, scene, policy, start, threshold=threshold, max_views=max_views, fuse=fuse)
 
-    return jax.vmap(walk)(*walks)
+    return jax.vmap(walk)(starts, draws)
 
 
 def every_walk(starts: Int[Array, " starts"], draws: int) -> tuple[Int[Array, " walks"], Int[Array, " walks"]]:

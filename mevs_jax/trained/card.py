@@ -50,7 +50,7 @@ from the object's centre, z up in the image.
 def model_card(description: Description, size: int) -> str:
     """Returns the card as Markdown, for weights of `size` bytes."""
     of, sizes = description, description.size
-    told = "* Size: the object's radius, where it is told, from {0.smallest:g} to {0.largest:g} m.\n"
+    told = "* Size: the object's radius, where it is given, from {0.smallest:g} to {0.largest:g} m.\n"
     return _CARD.format(
         of=of,
         data=of.data,

@@ -118,11 +118,8 @@ def _walks_of(
     number, data = one
     table = ViewTable(data.logits, None, None, data.labels, features=data.features, clouds=data.clouds)
     starts = jax.random.randint(jax.random.fold_in(drawn, number), (walks,), 0, len(data.directions))
-    scene, pairs = table.scene(graph_of(data.directions)), (starts, jnp.arange(walks))
-    fuse = by_attention(fusion)
-    return walks_around(
-        jax.random.fold_in(key, number), table.observe, scene, policy, pairs, max_views=most, fuse=fuse
-    ).views
+    scene, each = table.scene(graph_of(data.directions)), (number, starts, jnp.arange(walks))
+    return walks_around(key, table.observe, scene, policy, each, max_views=most, fuse=by_attention(fusion)).views
 
 
 def walk(

@@ -66,6 +66,7 @@ def kept(
     result is computed anew.
 
     Args:
+        load: reads the file; raises if it is not as it was written.
         why_stale: returns why a result is not current, in a few words; None if it is.
 
     Raises:
@@ -75,7 +76,6 @@ def kept(
     stored = None
     if path.exists():
         try:
-            check_kept(path)
             stored = load(path)
             if (reason := why_stale(stored)) is not None:
                 stored = None
@@ -171,6 +171,7 @@ def kept_array(path: Path, made: str, compute: Callable[[], np.ndarray]) -> np.n
     """Returns the array of an `.npz` file; computes it first unless the file's stamp (`stamp_of`) is `made`."""
 
     def load(path: Path) -> dict[str, np.ndarray]:
+        check_kept(path)
         with np.load(path) as stored:
             return {name: stored[name] for name in ("array", "made_by")}
 

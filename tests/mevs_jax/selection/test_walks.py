@@ -28,9 +28,8 @@ def graph() -> ViewGraph:
 
 def around(tables, graph, number, starts, draws, policy="random", **rest):
     table = jax.tree.map(lambda leaf: leaf[number], tables)
-    own = jax.random.fold_in(KEY, number)
-    walks = every_walk(jnp.asarray(starts), draws)
-    return walks_around(own, table.observe, table.scene(graph), POLICIES[policy], walks, max_views=5, **rest)
+    walks = (jnp.int32(number), *every_walk(jnp.asarray(starts), draws))
+    return walks_around(KEY, table.observe, table.scene(graph), POLICIES[policy], walks, max_views=5, **rest)
 
 
 def test_walks_are_those_of_the_loop_with_their_own_keys(tables, graph):

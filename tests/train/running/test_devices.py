@@ -1,4 +1,4 @@
-"""Devices share batches and weights equally, or it is told what cannot be shared."""
+"""Devices share batches and weights equally, or a message says what cannot be shared."""
 
 from __future__ import annotations
 
