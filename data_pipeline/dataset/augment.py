@@ -146,11 +146,11 @@ def object_turns(key: Array, objects: int) -> Float[Array, "objects 3 3"]:
 
 def views_after(
     change: Float[Array, "3 3"],
-    images: Float[Array, "views height width 4"],
+    images: Float[Array, "views height width channels"],
     poses: Float[Array, "views 4 4"],
     camera: CaptureConfig,
     shifts: Int[Array, "views 2"] | None = None,
-) -> tuple[Float[Array, "views height width 4"], Float[Array, "views 3"]]:
+) -> tuple[Float[Array, "views height width channels"], Float[Array, "views 3"]]:
     """Returns views of an object whose points are multiplied by a matrix A, and the directions of the new cameras.
 
     A linear map preserves lines and the order of points on them. The view of the object from c is therefore, up to a
@@ -182,14 +182,15 @@ def views_after(
         row, column = (jnp.floor(part / z * pinhole.focal_length + side / 2).astype(jnp.int32) for part in (y, x))
         inside = (row >= 0) & (row < side) & (column >= 0) & (column < side) & kept[0][:, None] & kept[1]
         pixel = jnp.clip(row, 0, side - 1) * side + jnp.clip(column, 0, side - 1)
-        sampled = image.reshape(-1, 4).at[pixel].get(mode="promise_in_bounds")
+        sampled = image.reshape(-1, image.shape[-1]).at[pixel].get(mode="promise_in_bounds")
         near, *normal = (jnp.where(inside, part, 0.0) for part in jnp.moveaxis(sampled, -1, 0))
+        normal, unknown = normal[:3], normal[3:]
         depth = scale * (distance + 1 - 2 * near) / z
         nearness = jnp.where(near > 0, (distance + 1 - depth) / 2, 0.0)
         # Normals transform by the inverse transpose.
         normal = [sum(factor * part for factor, part in zip(column, normal, strict=True)) for column in back.T]
         length = jnp.maximum(jnp.sqrt(sum(jnp.square(part) for part in normal)), 1e-12)
-        seen = jnp.stack([nearness, *(part / length for part in normal)], axis=-1)
+        seen = jnp.stack([nearness, *(part / length for part in normal), *unknown], axis=-1)
         return seen, position / jnp.linalg.norm(position)
 
     return jax.vmap(of_view)(images, poses, shifts)

@@ -39,9 +39,11 @@ def image_input(
     return jnp.repeat((view.astype(jnp.float32) / 255)[..., None], channels, axis=-1)
 
 
-def depth_and_normals(view: Integer[Array, "height width"], camera: CaptureConfig) -> Float[Array, "height width 4"]:
+def depth_and_normals(
+    view: Integer[Array, "height width"], camera: CaptureConfig, channels: int = 4
+) -> Float[Array, "height width {channels}"]:
     """Returns depth and normals of one stored view, as `mevs_jax.geometry.inputs.depth_and_normals`."""
-    return inputs.depth_and_normals(metric_depth(view), view_camera(camera))
+    return inputs.depth_and_normals(metric_depth(view), view_camera(camera), channels)
 
 
 def cloud_input(

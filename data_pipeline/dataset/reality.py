@@ -1,7 +1,7 @@
 """Augmentation of training views by what real images have: errors of the sensor, a wrong sphere, a table, something in front.
 
 Functions take one depth image of the data set's camera, in radii, 0 where nothing is hit, and return what would reach the
-networks in its place. They work on the device, one image at a time: `jax.vmap` them over views.
+networks in its place, NaN where nothing is known. They work on the device, one image at a time: `jax.vmap` them over views.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from typing import Literal
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from data_pipeline.capture.sensor import Kind, SensorConfig, sense
 from data_pipeline.dataset.inputs import metric_depth
@@ -21,6 +21,9 @@ from data_pipeline.errors import DataError
 from mevs_jax.arrays import AnyArray
 from mevs_jax.geometry.cameras import ViewCamera, look_at_origin, partial_cloud, pixel_directions
 from mevs_jax.geometry.source_view import MARGIN
+
+_WAVES = 6
+"""Plane waves of the random field that says where an image has patches without depth."""
 
 
 @dataclass(frozen=True)
@@ -39,10 +42,13 @@ class RealityAugmentation:
     """largest height that is cut off with the table on which the object stands, in radii"""
     hidden: float = 0.3
     """largest share of the object's width that something else hides"""
+    unseen: float = 0.0
+    """largest share of the object's sphere that an image does not show, in half of the images, at any strength: it is outside
+    of the image, behind something else, or has no measured depth"""
 
 
 def used_reality(config: RealityAugmentation, option: str) -> RealityAugmentation | None:
-    """Returns the configuration, or None if its strength is 0.
+    """Returns the configuration, or None if it changes nothing.
 
     Args:
         option: the group of options that it was given by, for messages.
@@ -50,7 +56,14 @@ def used_reality(config: RealityAugmentation, option: str) -> RealityAugmentatio
     Raises:
         DataError: for numbers out of their range.
     """
-    limits = {"strength": (0, 4), "sphere": (0, 0.5), "floor": (0, 1), "hidden": (0, 0.9), "distance": (0.1, 10)}
+    limits = {
+        "strength": (0, 4),
+        "sphere": (0, 0.5),
+        "floor": (0, 1),
+        "hidden": (0, 0.9),
+        "distance": (0.1, 10),
+        "unseen": (0, 0.99),
+    }
     for name, (least, most) in limits.items():
         if not least <= getattr(config, name) <= most:
             given = f"{option}.{name} {getattr(config, name):g}"
@@ -60,7 +73,7 @@ def used_reality(config: RealityAugmentation, option: str) -> RealityAugmentatio
             f"{option}.strength {config.strength:g} times .sphere {config.sphere:g} is above 0.5, or times .floor "
             f"{config.floor:g} above 1, so that nothing of some objects would be left; lower one of them"
         )
-    return config if config.strength else None
+    return config if config.strength or config.unseen else None
 
 
 def realistic_views(
@@ -76,7 +89,8 @@ def realistic_views(
         views: number of views of each object in the batch.
 
     Returns:
-        Depth in radii, 0 where nothing is measured; and the poses that the robot believes in, around the believed centre.
+        Depth in radii, 0 where nothing is hit and NaN where it is unknown what is there; and the poses that the robot believes
+        in, around the believed centre.
     """
     depth, poses = metric_depth(batch["depth"]), batch["pose"]
     either, of_objects, of_views = jax.random.split(key, 3)
@@ -114,30 +128,77 @@ def as_in_reality(
     depth, pose = jnp.asarray(depth, jnp.float32), jnp.asarray(pose, jnp.float32)
     strength = config.strength * jax.random.uniform(amount)
     depth = hidden(hide, depth, jnp.minimum(strength * config.hidden, 0.9))
-    depth = without_floor(cut, depth, pose, camera, strength * config.floor)
+    unknown = jnp.isnan(depth)
+    depth = without_floor(cut, jnp.where(unknown, 0.0, depth), pose, camera, strength * config.floor)
     # Without the barriers XLA computes each stage again for every pixel that the next one reads.
     depth = jax.lax.optimization_barrier(depth)
-    depth = sense(noise, depth, pose, camera, SensorConfig(kind, 1.0, config.distance), strength, surface)
-    depth = jnp.asarray(jax.lax.optimization_barrier(depth))
+    sensed = sense(noise, depth, pose, camera, SensorConfig(kind, 1.0, config.distance), strength, surface)
+    unknown |= (depth > 0) & (sensed == 0)
+    if config.unseen:
+        unknown |= unseen_part(jax.random.fold_in(noise, 1), len(depth), config.unseen)
+    depth = jnp.asarray(jax.lax.optimization_barrier(jnp.where(unknown, jnp.nan, sensed)))
     offset = jax.random.ball(where, 3) * strength * config.sphere
     factor = 1 + strength * config.sphere * jax.random.uniform(size, minval=-1.0)
     believed = pose[:3, 3] - offset
     believed = look_at_origin(camera.distance * believed / jnp.linalg.norm(believed))
-    return around_another_sphere(depth, pose, camera, offset, factor), believed
+    depth = around_another_sphere(depth, pose, camera, offset, factor)
+    return jnp.where(jnp.isnan(depth) & ~in_sphere(camera, len(depth)), 0.0, depth), believed
 
 
 def hidden(key: Array, depth: Float[Array, "side side"], most: float | Array) -> Float[Array, "side side"]:
-    """Removes one side of the object in the image, as something in front of it does.
+    """Returns the image without one side of it, which something in front of the object hides.
+
+    This side is NaN. In half of the images it is 0, as a mask of the object alone has it.
 
     Args:
         key: of the direction, and of the share of the object's width that is removed, between 0 and `most`.
     """
     turn, share = jax.random.split(key)
+    width = jax.random.uniform(share, maxval=most)
     side, angle = len(depth), jax.random.uniform(turn, maxval=2 * jnp.pi)
     at = jnp.arange(side) - (side - 1) / 2
     across = jnp.cos(angle) * at[:, None] + jnp.sin(angle) * at
     first, last = jnp.min(across, where=depth > 0, initial=side), jnp.max(across, where=depth > 0, initial=-side)
-    return jnp.where(across < first + jax.random.uniform(share, maxval=most) * (last - first), 0.0, depth)
+    value = jnp.where(jax.random.bernoulli(jax.random.fold_in(key, 0)), jnp.nan, 0.0)
+    return jnp.where((across < first + width * (last - first)) & (width > 0), value, depth)
+
+
+def in_sphere(camera: ViewCamera, side: int) -> Bool[Array, "{side} {side}"]:
+    """Returns which pixels look at the object's sphere."""
+    square = jnp.sum(jnp.square(pixel_directions(camera.at(jnp.eye(4), side))), axis=-1)
+    return square * (camera.distance**2 - 1) <= camera.distance**2
+
+
+def unseen_part(key: Array, side: int, most: float) -> Bool[Array, "{side} {side}"]:
+    """Returns the pixels that an image does not show; none in half of the images.
+
+    They are one side of the image, all outside of a window, a blob, or patches without measured depth. Their share is that of a
+    disc as large as the object's sphere in the image.
+
+    Args:
+        key: of the image.
+        side: pixels along each side.
+        most: largest share.
+    """
+    some, amount, sort, angle, middle, stretch, wave = jax.random.split(key, 7)
+    share = jax.random.bernoulli(some) * jax.random.uniform(amount, maxval=most)
+    at = (jnp.arange(side) + 0.5) * 2 / side - 1
+    x, y = jnp.meshgrid(at, at)
+    turn = jax.random.uniform(angle, maxval=2 * jnp.pi)
+    along, across = jnp.cos(turn) * x + jnp.sin(turn) * y, jnp.cos(turn) * y - jnp.sin(turn) * x
+    (a, b), factor = jax.random.uniform(middle, (2,), minval=-0.7, maxval=0.7), jnp.exp(jax.random.normal(stretch) / 2)
+    waves = 4.0 * jax.random.normal(wave, (3, _WAVES, 1, 1))
+    patches = jnp.sum(jnp.sin(waves[0] * x + waves[1] * y + 10 * waves[2]), axis=0)
+    window, blob = jnp.maximum(jnp.abs(x - a), factor * jnp.abs(y - b)), -jnp.hypot(along - a, factor * (across - b))
+    field = jnp.stack([along, window, blob, patches])[jax.random.randint(sort, (), 0, 4)]
+    disc = x**2 + y**2 < 1
+
+    def halve(_: Array, ends: tuple[Array, Array]) -> tuple[Array, Array]:
+        half = (ends[0] + ends[1]) / 2
+        above = jnp.mean(field > half, where=disc) > share
+        return jnp.where(above, half, ends[0]), jnp.where(above, ends[1], half)
+
+    return (field > jax.lax.fori_loop(0, 10, halve, (jnp.min(field), jnp.max(field)))[1]) & (share > 0)
 
 
 def without_floor(
@@ -165,7 +226,7 @@ def around_another_sphere(
     """Returns the image that follows from a wrong centre and radius of the object.
 
     The camera stays where it is, so that the view from the wrong centre's side is the same image, turned and scaled; points
-    outside of the wrong sphere are lost. Pixels are sampled from the nearest old pixel.
+    outside of the wrong sphere are lost. Pixels are sampled from the nearest old pixel; NaN stays NaN.
 
     Args:
         offset: of the believed centre from the true one, in true radii.
@@ -185,4 +246,4 @@ def around_another_sphere(
     along = sampled / old[..., 2] / factor  # new depth, from where the camera is
     point = rays * along[..., None] + turned.T @ towards  # from the believed centre, in the new camera's axes
     kept = (sampled > 0) & (jnp.linalg.norm(point, axis=-1) < 1 + MARGIN)  # as in `mevs_jax.canonical_view`
-    return jnp.where(kept, along + distance - away, 0.0)
+    return jnp.where(jnp.isnan(sampled), jnp.nan, jnp.where(kept, along + distance - away, 0.0))

@@ -280,6 +280,7 @@ def _decision_times(stages: Stages, calls: int = 200) -> dict[str, Any]:
     camera, most, recogniser = stages.dataset.capture, stages.config.max_views, stages.recogniser()
     structure, weights = nnx.split((recogniser, stages.policy()))
     fusion, classes = stages.fusion(), len(stages.statistics.classes)
+    channels = stages.config.recogniser.network.channels
     candidates = jnp.asarray(stages.statistics.viewpoints, jnp.float32)
     seen, present = candidates[:most], jnp.arange(most) < most - 1
 
@@ -294,7 +295,7 @@ def _decision_times(stages: Stages, calls: int = 200) -> dict[str, Any]:
     @jax.jit
     def from_image(weights: nnx.State, given: tuple[Array, Array, Array]) -> Array:
         image, features, logits = given
-        newest = nnx.merge(structure, weights)[0].see(depth_and_normals(image, camera))
+        newest = nnx.merge(structure, weights)[0].see(depth_and_normals(image, camera, channels))
         features, logits = features.at[most - 2].set(newest[:-classes]), logits.at[most - 2].set(newest[-classes:])
         return from_features(weights, (features, logits))
 

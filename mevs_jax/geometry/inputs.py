@@ -1,7 +1,7 @@
 """Conversion of metric depth, as the data set's camera takes it, into network inputs: images, normals, clouds.
 
-Depth is in radii of the object, along the optical axis, and 0 where nothing is hit. `mevs_jax.canonical_view` makes such an image
-from that of any depth camera.
+Depth is in radii of the object, along the optical axis. It is 0 where nothing is hit, and NaN where it is not known what is
+there. `mevs_jax.canonical_view` makes such an image from that of any depth camera.
 """
 
 from __future__ import annotations
@@ -53,15 +53,18 @@ def depth_image(
     return jnp.repeat(pixels[..., None], channels, axis=-1)
 
 
-def depth_and_normals(depth: Float[AnyArray, "height width"], camera: ViewCamera) -> Float[Array, "height width 4"]:
+def depth_and_normals(
+    depth: Float[AnyArray, "height width"], camera: ViewCamera, channels: int = 4
+) -> Float[Array, "height width {channels}"]:
     """Returns depth (as `depth_image`) and the unit surface normal of each pixel in the camera's frame, 0 for background.
 
     A normal is that of the plane through the point of a pixel and one neighbour along each image axis, the one closer in
     depth, so that depth discontinuities are avoided. It is 0 unless the pixel has a neighbour on the object along both axes.
 
     Args:
-        depth: metric depth, 0 where nothing is hit.
+        depth: metric depth, 0 where nothing is hit, NaN where unknown.
         camera: the camera; its resolution is not used, since that of `depth` is known.
+        channels: 4, in which unknown pixels are background; or 5, of which the last is 1 at unknown pixels and else 0.
     """
     metric = jnp.asarray(depth)
     side, hit = len(metric), metric > 0
@@ -81,7 +84,8 @@ def depth_and_normals(depth: Float[AnyArray, "height width"], camera: ViewCamera
     normals = jnp.cross(down, right)
     length = jnp.linalg.norm(normals, axis=-1, keepdims=True)
     normals = jnp.where((has_down & has_right)[..., None], normals / jnp.maximum(length, 1e-12), 0.0)
-    return jnp.concatenate([depth_image(metric, camera), normals], axis=-1)
+    unknown = jnp.isnan(metric)[..., None].astype(normals.dtype)
+    return jnp.concatenate([depth_image(metric, camera), normals, unknown][: channels - 2], axis=-1)
 
 
 def view_cloud(

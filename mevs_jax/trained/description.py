@@ -21,7 +21,8 @@ class ImageInput:
         content: `depth`: (far − depth) / (far − near), where near and far bound the object's sphere, and 0 for background;
             `depth_and_normals`: this and the unit normal in the camera's frame; `image`: grey levels, which a depth camera
             does not give.
-        channels: of the image; depth is repeated in all channels, except for `depth_and_normals`, which has 4.
+        channels: of the image; depth is repeated in all channels, except for `depth_and_normals`, which has 4, or 5 of which
+            the last is 1 where it is unknown what is there.
     """
 
     content: Literal["depth", "depth_and_normals", "image"]

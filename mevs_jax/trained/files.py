@@ -188,7 +188,8 @@ def check(description: Description) -> None:
         and 0 < camera.field_of_view < 180
         and 1 < camera.distance < 1e3,
         "there are fewer than two classes, or two of one name": 2 <= len(set(classes)) == len(classes),
-        "depth and normals have 4 channels": of.image.content != "depth_and_normals" or of.image.channels == 4,
+        "depth and normals have 4 or 5 channels": of.image.content != "depth_and_normals"
+        or of.image.channels in (4, 5),
         "encoder and image differ in their channels": of.encoder.channels == of.image.channels,
         "the size is impossible, or used by another kind than a recogniser": size is None
         or (of.fusion is not None and 0 < size.smallest < size.largest < 1e9 and 2 <= size.steps <= 1000),

@@ -96,9 +96,9 @@ def sample_pixels(depth: Float[Array, "side side"], points: int) -> Int[Array, "
 
 
 def image_of(depth: Float[Array, "side side"], of: Description) -> Float[Array, "side side channels"]:
-    """The input of the encoder for a depth image in radii, 0 where nothing is hit."""
+    """The input of the encoder for a depth image in radii, 0 where nothing is hit and NaN where unknown."""
     if of.image.content == "depth_and_normals":
-        return depth_and_normals(depth, of.camera)
+        return depth_and_normals(depth, of.camera, of.image.channels)
     return depth_image(depth, of.camera, of.image.channels)
 
 

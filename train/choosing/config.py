@@ -55,10 +55,11 @@ def check_learned(config: LearnedConfig, views: int) -> None:
     if config.changed < 0:
         raise DataError(f"--learned.changed must be at least 0, got {config.changed}")
     network, optimiser = config.recogniser.network, config.recogniser.optimiser
-    if (network.channels, network.standardise) != (4, False) or optimiser.validation_by != "object":
+    if network.channels not in (4, 5) or network.standardise or optimiser.validation_by != "object":
         raise DataError(
-            "the recogniser sees depth and normals, four channels that are not standardised, and is validated by object; leave "
-            "out --learned.recogniser.network.channels, .standardise and --learned.recogniser.optimiser.validation-by"
+            "the recogniser sees depth and normals, four channels that are not standardised, or five with what is unknown, and "
+            "is validated by object; leave out --learned.recogniser.network.channels, .standardise and "
+            "--learned.recogniser.optimiser.validation-by"
         )
     if config.recogniser.augmentation.turn:
         raise DataError(

@@ -27,12 +27,12 @@ def see(network: Recogniser, task: Task, batch: Batch) -> jax.Array:
     return _see_images(network, task, task.inputs(batch), task.directions(batch), batch)
 
 
-def quarter_turns(images: Float[Array, "*batch side side 4"]) -> list[Float[Array, "*batch side side 4"]]:
+def quarter_turns(images: Float[Array, "*batch side side channels"]) -> list[Float[Array, "*batch side side channels"]]:
     """Returns images of depth and normals turned about the optical axis by 0, 90, 180 and 270 degrees."""
     found = [images]
     for _ in range(3):
-        near, right, down, away = jnp.moveaxis(jnp.rot90(found[-1], 1, (-3, -2)), -1, 0)
-        found.append(jnp.stack([near, down, -right, away], axis=-1))
+        near, right, down, *others = jnp.moveaxis(jnp.rot90(found[-1], 1, (-3, -2)), -1, 0)
+        found.append(jnp.stack([near, down, -right, *others], axis=-1))
     return found
 
 

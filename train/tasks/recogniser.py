@@ -36,7 +36,7 @@ class RecogniserConfig:
     """Settings of the recogniser and its training."""
 
     network: ResNetConfig = ResNetConfig(channels=4, standardise=False)
-    """the encoder; its input is depth and normals in four channels"""
+    """the encoder; its input is depth and normals in four channels, and a fifth one where it is told what is unknown"""
     fusion: SetFusionConfig = SetFusionConfig()
     """the set fusion"""
     augmentation: ViewAugmentation = ViewAugmentation()
@@ -123,7 +123,7 @@ class RecogniserTask:
         encoder = ResNet(
             depth=shape.depth,
             classes=self.classes,
-            channels=4,
+            channels=shape.channels,
             width=shape.width,
             stem=shape.stem,
             dtype=jnp.dtype(self.optimiser.compute),
@@ -137,15 +137,17 @@ class RecogniserTask:
         return Recogniser(encoder, fusion, SizeInput() if self.size else None, pose)
 
     def inputs(self, batch: Batch) -> jax.Array:
-        """Returns the images of a batch, (views, height, width, 4)."""
-        return jax.vmap(partial(depth_and_normals, camera=self.camera))(batch["depth"])
+        """Returns the images of a batch, (views, height, width, channels)."""
+        of_view = partial(depth_and_normals, camera=self.camera, channels=self.network_config.channels)
+        return jax.vmap(of_view)(batch["depth"])
 
     def realistic(self, key: jax.Array, batch: Batch) -> tuple[jax.Array, jax.Array]:
-        """Returns the images of a batch with the errors of `reality`, (views, height, width, 4), and their poses."""
+        """Returns the images of a batch with the errors of `reality`, as `inputs` does, and their poses."""
         assert self.reality is not None
         camera = view_camera(self.camera)
         depth, poses = realistic_views(key, batch, camera, self.reality, self.optimiser.views_per_object)
-        return jax.vmap(partial(inputs_of.depth_and_normals, camera=camera))(depth), poses
+        of_view = partial(inputs_of.depth_and_normals, camera=camera, channels=self.network_config.channels)
+        return jax.vmap(of_view)(depth), poses
 
     def directions(self, batch: Batch) -> jax.Array:
         """Returns the unit vectors from the object to the cameras, (views, 3)."""
