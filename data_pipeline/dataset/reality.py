@@ -19,7 +19,7 @@ from data_pipeline.capture.sensor import Kind, SensorConfig, sense
 from data_pipeline.dataset.inputs import metric_depth
 from data_pipeline.errors import DataError
 from mevs_jax.arrays import AnyArray
-from mevs_jax.geometry.cameras import ViewCamera, look_at_origin, partial_cloud, pixel_directions
+from mevs_jax.geometry.cameras import ViewCamera, in_sphere, look_at_origin, partial_cloud, pixel_directions
 from mevs_jax.geometry.source_view import MARGIN
 
 _WAVES = 6
@@ -161,12 +161,6 @@ def hidden(key: Array, depth: Float[Array, "side side"], most: float | Array) ->
     first, last = jnp.min(across, where=depth > 0, initial=side), jnp.max(across, where=depth > 0, initial=-side)
     value = jnp.where(jax.random.bernoulli(jax.random.fold_in(key, 0)), jnp.nan, 0.0)
     return jnp.where((across < first + width * (last - first)) & (width > 0), value, depth)
-
-
-def in_sphere(camera: ViewCamera, side: int) -> Bool[Array, "{side} {side}"]:
-    """Returns which pixels look at the object's sphere."""
-    square = jnp.sum(jnp.square(pixel_directions(camera.at(jnp.eye(4), side))), axis=-1)
-    return square * (camera.distance**2 - 1) <= camera.distance**2
 
 
 def unseen_part(key: Array, side: int, most: float) -> Bool[Array, "{side} {side}"]:

@@ -124,6 +124,12 @@ def pixel_directions(camera: Camera) -> Float[Array, "resolution resolution 3"]:
     return jnp.stack([x, y, jnp.ones_like(x)], axis=-1) @ camera.pose[:3, :3].T
 
 
+def in_sphere(camera: ViewCamera, side: int) -> Bool[Array, "{side} {side}"]:
+    """Which pixels of an image with `side` pixels along each side look at the object's sphere."""
+    square = jnp.sum(jnp.square(pixel_directions(camera.at(jnp.eye(4), side))), axis=-1)
+    return square * (camera.distance**2 - 1) <= camera.distance**2
+
+
 def unproject(
     pixels: Int[AnyArray, " points"], depth: Float[AnyArray, " points"], camera: Camera, *, frame: str = "world"
 ) -> Float[Array, "points 3"]:

@@ -15,7 +15,8 @@ slightly different surfaces: what the source did not see remains empty and is no
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from functools import partial
 
 import jax
@@ -25,7 +26,7 @@ from jaxtyping import Array, Bool, Float
 
 from mevs_jax.arrays import AnyArray, AnyVector
 from mevs_jax.beliefs.entropy import DEPTH_SCALE, DEPTH_STEP
-from mevs_jax.geometry.cameras import ViewCamera, look_at_origin, pixel_directions
+from mevs_jax.geometry.cameras import ViewCamera, in_sphere, look_at_origin, pixel_directions
 from mevs_jax.geometry.source_view import MARGIN, DepthImage, Window, why_empty, window_of
 from mevs_jax.geometry.sphere import Sphere
 
@@ -38,6 +39,9 @@ _STRIDE = 1.0
 
 _MOST_STEPS = 16
 """Largest number of steps between such points. With 40 the masks were not better by more than 0.001."""
+
+_STEPS_ASIDE = 64
+"""The same where the data set's camera is not in the direction of the source, so that segments in the image are long."""
 
 _REACH = 1.0
 """How far the plane of a sample is continued along a ray, in steps; half a step would leave gaps between planes."""
@@ -75,6 +79,11 @@ class CanonicalView:
     in_image: float
     unknown: float
 
+    @property
+    def image(self) -> Float[np.ndarray, "resolution resolution"]:
+        """Depth with NaN where it is not `known` what is there, as networks that are told so are given it."""
+        return np.where(self.known, self.depth, np.float32(np.nan))
+
 
 def canonical_view(
     depth: AnyArray,
@@ -111,30 +120,59 @@ def canonical_view(
     return convert(DepthImage(depth, K, T_world_camera, mask, floor), sphere, camera)
 
 
-def convert(image: DepthImage, sphere: Sphere, camera: ViewCamera) -> CanonicalView:
-    """`canonical_view` of an image with its camera, around an object at a place, whose yaw is not used."""
+def convert(
+    image: DepthImage, sphere: Sphere, camera: ViewCamera, towards: Float[np.ndarray, " 3"] | None = None
+) -> CanonicalView:
+    """`canonical_view` of an image with its camera, around an object at a place, whose yaw is not used.
+
+    Args:
+        image, sphere, camera: as of `canonical_view`.
+        towards: unit vector from the object to the data set's camera, in the object's frame; by default that of the image.
+            What the image does not show from there is not `known`.
+    """
     window = window_of(image, sphere, max(_LEAST_SAMPLES, 2 * camera.resolution))
+    own = np.asarray(window.eye / np.linalg.norm(window.eye), np.float32)
+    direction, steps = (own, _MOST_STEPS) if towards is None else (np.asarray(towards, np.float32), _STEPS_ASIDE)
     with jax.default_matmul_precision("highest"):  # accelerators round more, by pixels
         inverse = _without_small_holes(*_inverse_depth(window), window.rays)
-        depth, known, pose, in_image, unknown = jax.device_get(_render(window, inverse, camera))
+        depth, known, pose, in_image, unknown = jax.device_get(_render(window, inverse, direction, camera, steps))
     if not depth.any():
         raise ValueError(why_empty(window))
     depth = np.round(depth * DEPTH_SCALE) * DEPTH_STEP  # to the bit as the data set's views are read
-    direction = np.asarray(window.eye / np.linalg.norm(window.eye), np.float32)
     return CanonicalView(depth, known, pose, direction, float(in_image), float(unknown))
 
 
-@partial(jax.jit, static_argnames="camera")
-def _render(window: Window, inverse: Float[Array, "grid grid"], camera: ViewCamera) -> tuple[Array, ...]:
+def combined(views: Sequence[CanonicalView], camera: ViewCamera) -> CanonicalView:
+    """One view from images that were converted towards the same direction: what any of them shows, where several do the nearest.
+
+    Its `in_image` is that of the image that shows most, so at most the true share.
+    """
+    depths = np.stack([np.where(view.depth > 0, view.depth, np.inf) for view in views]).min(axis=0)
+    known = np.any([view.known for view in views], axis=0)
+    unknown = np.mean(~known, where=np.asarray(in_sphere(camera, camera.resolution)))
+    depth = np.where(np.isfinite(depths), depths, np.float32(0)).astype(np.float32)
+    return replace(
+        views[0], depth=depth, known=known, unknown=float(unknown), in_image=max(view.in_image for view in views)
+    )
+
+
+@partial(jax.jit, static_argnames=("camera", "most_steps"))
+def _render(
+    window: Window,
+    inverse: Float[Array, "grid grid"],
+    direction: Float[Array, " 3"],
+    camera: ViewCamera,
+    most_steps: int,
+) -> tuple[Array, ...]:
     """Returns depth, known, pose, in_image and unknown of a `CanonicalView`."""
     surface = _surface(inverse, window.rays)
-    pose = look_at_origin(camera.distance * window.eye / jnp.linalg.norm(window.eye))
+    pose = look_at_origin(camera.distance * direction)
     directions = pixel_directions(camera.at(pose)).reshape(-1, 3)
     square, along = jnp.sum(directions**2, axis=-1), directions @ pose[:3, 3]
     inside = along**2 - square * (camera.distance**2 - (1 + MARGIN) ** 2)  # below 0 for rays that miss the sphere
     half = jnp.sqrt(jnp.maximum(inside, 0.0)) / square
     near, far = -along / square - half, -along / square + half
-    depth, certain = _meet(surface, window, pose[:3, 3], directions, near, far)
+    depth, certain = _meet(surface, window, pose[:3, 3], directions, (near, far), most_steps)
     disc = along**2 >= square * (camera.distance**2 - 1)
     depth = jnp.where(inside > 0, depth, 0.0)
     known = certain & (inside > 0)
@@ -231,16 +269,16 @@ def _meet(
     window: Window,
     origin: Float[Array, " 3"],
     directions: Float[Array, "rays 3"],
-    near: Float[Array, " rays"],
-    far: Float[Array, " rays"],
+    between: tuple[Float[Array, " rays"], Float[Array, " rays"]],
+    most_steps: int,
 ) -> tuple[Float[Array, " rays"], Bool[Array, " rays"]]:
-    """Where rays first meet the measured surface, between `near` and `far`.
+    """Where rays first meet the measured surface, between two distances.
 
     Returns:
         The distance along each ray in units of its direction, 0 where it meets nothing; and whether this is certain: until it
         meets something, it is in front of all that was measured.
     """
-    grid = window.depth.shape[0]
+    grid, (near, far) = window.depth.shape[0], between
     start, stop = (_seen(window, origin + directions * t[:, None]) for t in (near, far))
     change, shape = stop - start, near.shape
 
@@ -258,7 +296,7 @@ def _meet(
         return found, gap, share - gap / jnp.where(jnp.abs(rate) > 1e-9, rate, -1e-9)
 
     longest = jnp.max(jnp.where(far > near, jnp.hypot(change[0], change[1]), 0.0))
-    steps = jnp.clip(jnp.ceil(longest / _STRIDE), 1, _MOST_STEPS)
+    steps = jnp.clip(jnp.ceil(longest / _STRIDE), 1, most_steps)
 
     def visit(number: Array, state: Array) -> Array:
         """The state of a ray: 1 + the share at which it meets the surface, 3 before that; negative if something may hide this.

@@ -31,6 +31,10 @@ class Features:
         """Returns those of the chosen objects."""
         return jax.tree.map(lambda leaf: leaf[chosen], self)
 
+    def and_of(self, others: Features) -> Features:
+        """Returns these and those of further objects, or of the same objects in other images."""
+        return jax.tree.map(lambda *leaves: jnp.concatenate(leaves), self, others)
+
     def without(self, classes: tuple[int, ...]) -> Features:
         """Returns those of objects that belong to none of `classes`."""
         return self.some(np.flatnonzero(~np.isin(self.labels, classes))) if classes else self

@@ -18,7 +18,7 @@ from mevs_jax.models import PointNet2, Recogniser
 from train.results.outputs import Ask
 from train.step import Batch, Task
 from train.tasks.entropy import EntropyTask
-from train.tasks.recogniser import RecogniserTask, views_by_object
+from train.tasks.recogniser import RecogniserTask, directions_of, views_by_object
 
 
 def see(network: Recogniser, task: Task, batch: Batch) -> jax.Array:
@@ -122,6 +122,20 @@ def see_changed(number: int) -> Ask:
         return _see_changed_by(changes(positions), network, task, batch)
 
     return see
+
+
+def see_in_reality(network: Recogniser, task: Task, batch: Batch) -> jax.Array:
+    """Returns `see` of images with the errors of `task.reality`; each object has its own draw."""
+    assert isinstance(task, RecogniserTask)
+
+    def of_object(position: Array, depth: Array, pose: Array) -> tuple[Array, Array]:
+        key = jax.random.fold_in(jax.random.key(2), position[0])
+        return task.realistic(key, {"depth": depth, "pose": pose}, task.camera.views)
+
+    each = (views_by_object(batch[name], task.camera.views) for name in ("position", "depth", "pose"))
+    images, poses = jax.vmap(of_object)(*each)
+    directions = directions_of(poses.reshape(-1, 4, 4))
+    return _see_images(network, task, images.reshape(-1, *images.shape[2:]), directions, batch)
 
 
 def embed(network: PointNet2, task: Task, batch: Batch) -> jax.Array:

@@ -35,7 +35,7 @@ from train.choosing.calibrated import calibrated
 from train.choosing.config import LearnedConfig
 from train.choosing.expected import FITTED_AS, fit_expected_views
 from train.choosing.features import Features
-from train.choosing.looks import answers, embed, see, see_changed, see_rotated
+from train.choosing.looks import answers, embed, see, see_changed, see_in_reality, see_rotated
 from train.choosing.policy import Lesson, PolicyConfig, Seen, Trained, new_policy, train_policies
 from train.choosing.q_learning import QLearningConfig, train_all_by_q_learning
 from train.choosing.variants import VARIANTS
@@ -241,11 +241,18 @@ class Stages:
         return self.recogniser().pose
 
     def fusion(self, fold: int | None = None, posed: bool = True, summed: bool = False) -> CalibratedFusion:
-        """Returns the recogniser's fusion, or the sum of its logits, with temperatures, for objects of known or unknown pose."""
+        """Returns the recogniser's fusion, or the sum of its logits, with temperatures, for objects of known or unknown pose.
+
+        Temperatures are fitted on perfect images of validation objects; if the recogniser was trained with the errors of real
+        images, on as many such images too.
+        """
         wanted = fold, posed, summed
         if wanted not in self._fusions:
-            validation = self.features("turned_val" if fold is None else f"fold_{fold}_val", self.turned, "val", fold)
-            recogniser = self.recogniser(fold)
+            name = "turned_val" if fold is None else f"fold_{fold}_val"
+            validation, recogniser = self.features(name, self.turned, "val", fold), self.recogniser(fold)
+            if self.task(fold).reality and self.upright is None:  # half perfect images, half such as it will meet
+                real = self.features(f"{name}_in_reality", self.turned, "val", fold, ask=see_in_reality)
+                validation = validation.and_of(real)
             network: SetFusion | OfFirstFeatures | SumFusion = recogniser.fusion
             if summed:
                 network = SumFusion(recogniser.encoder.head, self.prior)

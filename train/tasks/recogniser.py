@@ -141,18 +141,21 @@ class RecogniserTask:
         of_view = partial(depth_and_normals, camera=self.camera, channels=self.network_config.channels)
         return jax.vmap(of_view)(batch["depth"])
 
-    def realistic(self, key: jax.Array, batch: Batch) -> tuple[jax.Array, jax.Array]:
-        """Returns the images of a batch with the errors of `reality`, as `inputs` does, and their poses."""
+    def realistic(self, key: jax.Array, batch: Batch, views: int) -> tuple[jax.Array, jax.Array]:
+        """Returns the images of a batch with the errors of `reality`, as `inputs` does, and their poses.
+
+        Args:
+            views: number of views of each object, which are one after another.
+        """
         assert self.reality is not None
         camera = view_camera(self.camera)
-        depth, poses = realistic_views(key, batch, camera, self.reality, self.optimiser.views_per_object)
+        depth, poses = realistic_views(key, batch, camera, self.reality, views)
         of_view = partial(inputs_of.depth_and_normals, camera=camera, channels=self.network_config.channels)
         return jax.vmap(of_view)(depth), poses
 
     def directions(self, batch: Batch) -> jax.Array:
         """Returns the unit vectors from the object to the cameras, (views, 3)."""
-        position = batch["pose"][:, :3, 3]
-        return position / jnp.linalg.norm(position, axis=-1, keepdims=True)
+        return directions_of(batch["pose"])
 
     def radii(self, batch: Batch) -> jax.Array | None:
         """Returns the radius of the object of every view in metres, (views,); None if sizes are not used."""
@@ -166,7 +169,7 @@ class RecogniserTask:
         by_object = partial(views_by_object, views=self.optimiser.views_per_object)
         inputs, poses = self.inputs(batch), batch["pose"]
         if self.reality:
-            inputs, poses = self.realistic(jax.random.fold_in(key, 4), batch)
+            inputs, poses = self.realistic(jax.random.fold_in(key, 4), batch, self.optimiser.views_per_object)
         images, poses = by_object(inputs), by_object(poses)
         labels = batch["label"].reshape(images.shape[:2])[:, 0]
         changes = object_changes(change, len(images), self.augmentation)
@@ -200,6 +203,11 @@ class RecogniserTask:
         outputs = network(images, directions, jnp.ones(images.shape[:2], bool), radii)
         found = _metrics_of(outputs, labels, directions, turns)
         return {name: values.reshape(-1) for name, values in found.items()}
+
+
+def directions_of(poses: jax.Array) -> jax.Array:
+    """Returns the unit vectors from the object to cameras, (views, 3), from their poses (views, 4, 4)."""
+    return poses[:, :3, 3] / jnp.linalg.norm(poses[:, :3, 3], axis=-1, keepdims=True)
 
 
 def _metrics_of(outputs: Outputs, labels: jax.Array, directions: jax.Array, turns: jax.Array | None) -> Metrics:

@@ -16,7 +16,6 @@ from data_pipeline.dataset.reality import (
     around_another_sphere,
     as_in_reality,
     hidden,
-    in_sphere,
     realistic_views,
     unseen_part,
     used_reality,
@@ -28,7 +27,7 @@ from data_pipeline.objects.recipes import FurniturePiece
 from eval.checks.camera import cast_canonical
 from eval.settings import TINY
 from mevs_jax import canonical_view
-from mevs_jax.geometry.cameras import ViewCamera, cameras_at, partial_cloud, pixel_directions
+from mevs_jax.geometry.cameras import ViewCamera, cameras_at, in_sphere, partial_cloud, pixel_directions
 from mevs_jax.geometry.inputs import depth_and_normals
 from train.results.identity import content_of
 from train.tasks.classifier import ClassifierTask

@@ -15,8 +15,9 @@ from data_pipeline.dataset.inputs import metric_depth
 from data_pipeline.objects.furniture import furniture
 from data_pipeline.objects.mesh import Mesh, normalise
 from eval.checks.camera import SIZES, Shot, agreement, agreements, cast_canonical, cast_shot, random_shot, summary
-from mevs_jax import CanonicalView, ViewCamera, canonical_view, look_at_origin
+from mevs_jax import CanonicalView, DepthImage, Sphere, ViewCamera, canonical_view, look_at_origin
 from mevs_jax.geometry import canonical as canonical_module
+from mevs_jax.geometry.canonical import combined
 
 CAMERA = ViewCamera(resolution=64)
 DIRECTION = np.array([0.5, -0.75, 0.43], np.float32) / np.float32(np.linalg.norm([0.5, -0.75, 0.43]))
@@ -283,3 +284,32 @@ def test_wrong_arguments_are_refused_with_a_sentence(change, message):
 def test_a_data_set_s_camera_is_outside_the_sphere_and_has_pixels(numbers):
     with pytest.raises(ValueError, match="got ViewCamera"):
         ViewCamera(**numbers)
+
+
+def test_images_that_show_a_part_each_are_combined_into_one_view():
+    caster, views = default_caster()(chair()), []
+    for number, (row, column) in enumerate([(0, 0), (0, 64), (64, 0), (64, 64), (32, 32)]):
+        aside = DIRECTION + 0.15 * np.array([np.cos(number), np.sin(number), 0], np.float32)
+        shot = data_set_shot(replace(CAMERA, resolution=128), aside / np.linalg.norm(aside))
+        K = shot.K - np.array([[0, 0, column], [0, 0, row], [0, 0, 0]])
+        part = replace(shot, width=64, height=64, K=K)
+        depth = cast_shot(caster, part)
+        image = DepthImage(np.where(depth > 0, depth, np.inf), K, part.T_world_camera)
+        views.append(canonical_module.convert(image, Sphere((0, 0, 0), 1.0), CAMERA, DIRECTION))
+        assert views[-1].unknown > 0.5
+    whole = combined(views, CAMERA)
+    truth = cast_canonical(default_caster()(chair()), DIRECTION, CAMERA)
+    assert whole.unknown < 0.15
+    assert overlap(whole.depth, truth) > 0.85
+    both = (whole.depth > 0) & (truth > 0)
+    assert np.median(np.abs(whole.depth - truth)[both]) < 0.01
+    np.testing.assert_array_equal(whole.pose, views[0].pose)
+    np.testing.assert_array_equal(np.isnan(whole.image), ~whole.known)
+
+
+def test_towards_its_own_direction_an_image_is_what_it_is_without():
+    shot = data_set_shot(replace(CAMERA, resolution=96))
+    image = DepthImage(cast_shot(default_caster()(chair()), shot), shot.K, shot.T_world_camera)
+    plain, towards = (canonical_module.convert(image, Sphere((0, 0, 0), 1.0), CAMERA, way) for way in (None, DIRECTION))
+    np.testing.assert_allclose(plain.depth, towards.depth, atol=1e-4)
+    np.testing.assert_array_equal(plain.known, towards.known)
