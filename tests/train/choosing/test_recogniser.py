@@ -20,6 +20,7 @@ from scipy.spatial.transform import Rotation
 
 from data_pipeline.dataset.augment import views_after
 from data_pipeline.dataset.batches import evaluation_batches
+from data_pipeline.dataset.reality import RealityAugmentation
 from data_pipeline.dataset.statistics import load_statistics
 from data_pipeline.errors import DataError
 from eval.settings import TINY
@@ -27,7 +28,7 @@ from mevs_jax.geometry.viewpoints import viewpoint_lattice
 from mevs_jax.models import Recogniser
 from mevs_jax.models.rotation import ROTATIONS
 from train.choosing.config import check_learned
-from train.choosing.looks import quarter_turns, see, see_changed, see_rotated
+from train.choosing.looks import quarter_turns, see, see_changed, see_in_reality, see_rotated
 from train.choosing.stages import Stages
 from train.loop import fit, load_best, steps_of_an_epoch
 from train.results.identity import summary_of
@@ -116,6 +117,25 @@ def test_changed_objects_are_each_changed_in_a_way_of_their_own_and_the_same_eve
 
 
 @pytest.mark.slow
+def test_images_with_errors_are_drawn_by_object_and_seen_with_what_is_unknown(turned):
+    config = TINY.learned.recogniser
+    config = replace(
+        config, network=replace(config.network, channels=5), reality=RealityAugmentation(strength=1.0, unseen=0.9)
+    )
+    task = RecogniserTask.of(config, 10, load_statistics(turned).camera)
+    network = nnx.jit(lambda: task.network(nnx.Rngs(0)))()
+    batches = on_device(islice(evaluation_batches(turned, "train", images="depth"), 2))
+    together = {name: np.concatenate([batch[name] for batch in batches]) for name in batches[0]}
+    look = nnx.jit(partial(see_in_reality, task=task))
+    alone, both = [look(network, batch=batch) for batch in batches], look(network, batch=together)
+    np.testing.assert_allclose(np.concatenate(alone), both, atol=1e-4)
+    assert np.abs(alone[0] - nnx.jit(partial(see, task=task))(network, batch=batches[0])).max() > 0.01
+    images, _ = task.realistic(jax.random.key(0), batches[0], task.camera.views)
+    assert images.shape[-1] == 5
+    assert 0.02 < float(images[..., 4].mean()) < 0.9
+    assert not bool(jnp.any(task.inputs(batches[0])[..., 4]))
+
+
 def test_recognisers_of_objects_turned_anyhow_go_on_from_the_others(turned, tmp_path):
     config = replace(TINY.learned, rotation_epochs=1)
     stages = Stages(config, TINY.dataset, tmp_path)
