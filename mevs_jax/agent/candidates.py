@@ -11,7 +11,7 @@ from jaxtyping import Bool, Float
 from mevs_jax.arrays import AnyArray
 from mevs_jax.geometry.source_view import checked_pose
 from mevs_jax.geometry.viewpoints import great_circle_distances, hull_edges
-from mevs_jax.trained.situation import SAME, Candidates
+from mevs_jax.trained.situation import REPEATED, SAME, Candidates
 from mevs_jax.trained.system import TrainedSystem
 
 _NEAREST = 3
@@ -114,7 +114,7 @@ def candidates_of(system: TrainedSystem, directions: Float[np.ndarray, "candidat
         jnp.asarray(padded(distances.astype(np.float32), 2, np.pi)),
         jnp.arange(size) < number,
         jnp.asarray(padded(_weights(points, system.viewpoints), 1)),
-        jnp.float32(max(min(spacing / 2, 0.2), SAME)),
+        jnp.float32(max(min(spacing / 2, 0.2), REPEATED)),
     )
 
 

@@ -16,11 +16,8 @@ from mevs_jax.policies.informed import information_gain
 from mevs_jax.policies.registry import POLICIES
 from mevs_jax.selection.loop import Fuse, best_view
 from mevs_jax.trained.parts import Parts, observe
-from mevs_jax.trained.situation import Candidates, Memory, angles, situation
+from mevs_jax.trained.situation import REPEATED, Candidates, Memory, angles, situation
 from mevs_jax.trained.system import TrainedSystem
-
-REPEATED = 0.02
-"""Views whose directions differ by less, in radians, are one view taken again."""
 
 
 class Programs:
@@ -130,6 +127,7 @@ def remember(memory: Memory, observation: Observation, direction: Float[Array, 3
     slot = jnp.where(again, jnp.argmin(apart), memory.count)
     memory = Memory(
         count=memory.count + ~again,
+        latest=slot.astype(jnp.int32),
         directions=memory.directions.at[slot].set(direction),
         seen=jax.tree.map(lambda history, now: history.at[slot].set(now), memory.seen, observation),
         belief=memory.belief - jnp.where(again, memory.seen.logits[slot], 0.0),  # of a fusion that adds logits
