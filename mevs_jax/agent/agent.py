@@ -37,7 +37,8 @@ class Agent:
 
     Args:
         system: from `mevs_jax.load`.
-        policy: `best`, a name of `system.policies`, or a function `(key, state, scene) -> scores` as in `mevs_jax.POLICIES`.
+        policy: `best`, a name of `system.policies`, or a function `(key, state, scene) -> scores` as in `mevs_jax.POLICIES`. A
+            function is compiled once for all agents, so what it refers to must not change.
         stop: calibrated probability of the most likely class from which on the agent is sure, in (0, 1]; above 1 it never is.
         max_views: the budget: largest number of images of an object, views that are taken again included.
         unknown: an object that is stranger than this share of the known objects is an `unknown object`, in (0, 1]; None: never.
@@ -357,7 +358,7 @@ class Agent:
         sphere, camera = self._current.sphere, self.system.description.camera
         distance = camera.distance * sphere.radius if self.distance is None else self.distance
         directions = self.system.viewpoints.astype(float) @ sphere.rotation.T
-        return np.stack([pose_towards(one, sphere.position, distance, sphere.axis) for one in directions])
+        return pose_towards(directions, sphere.position, distance, sphere.axis)
 
     def _given(self, poses: np.ndarray) -> tuple[Candidates, Bool[np.ndarray, " candidates"]]:
         """Candidates of a caller, and which of them `observe` could use."""
