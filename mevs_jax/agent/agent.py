@@ -37,9 +37,10 @@ class Agent:
 
     Args:
         system: from `mevs_jax.load`.
-        policy: `best`, a name of `system.policies`, or a function `(key, state, scene) -> scores` as in `mevs_jax.POLICIES`.
+        policy: `best`, a name of `system.policies`, or a function `(key, state, scene) -> scores` as in `mevs_jax.POLICIES`. A
+            function is compiled once for all agents, so what it refers to must not change.
         stop: calibrated probability of the most likely class from which on the agent is sure, in (0, 1]; above 1 it never is.
-        max_views: the budget: largest number of views of an object.
+        max_views: the budget: largest number of images of an object, views that are taken again included.
         unknown: an object that is stranger than this share of the known objects is an `unknown object`, in (0, 1]; None: never.
         gain_per_cost: expected gain that one unit of a candidate's cost is worth, in units of the policy's scores (nats for
             `information_gain` and learned policies).
@@ -245,7 +246,7 @@ class Agent:
 
     def _check_budget(self) -> None:
         _check(
-            self._current.belief is None or self._current.belief.views < self.max_views,
+            self._current.belief is None or self._current.belief.images < self.max_views,
             f"the budget of {self.max_views} views is spent; call reset, or make the agent with max_views above it",
         )
 
@@ -260,6 +261,7 @@ class Agent:
             name=self.system.classes[label],
             confidence=float(probabilities[label]),
             views=int(count),
+            images=self.history.views + 1,
             strangeness=float(strangeness),
             known=self.unknown is None or not strangeness > self.unknown,
             unseen=float(unseen),
@@ -345,7 +347,7 @@ class Agent:
         if belief is None:
             return ""
         sure = belief.confidence >= self.stop
-        spent = belief.views >= self.max_views
+        spent = belief.images >= self.max_views
         if not belief.known and (sure or spent):
             return "unknown object"
         return "sure" if sure else "budget" if spent else ""
@@ -356,7 +358,7 @@ class Agent:
         sphere, camera = self._current.sphere, self.system.description.camera
         distance = camera.distance * sphere.radius if self.distance is None else self.distance
         directions = self.system.viewpoints.astype(float) @ sphere.rotation.T
-        return np.stack([pose_towards(one, sphere.position, distance, sphere.axis) for one in directions])
+        return pose_towards(directions, sphere.position, distance, sphere.axis)
 
     def _given(self, poses: np.ndarray) -> tuple[Candidates, Bool[np.ndarray, " candidates"]]:
         """Candidates of a caller, and which of them `observe` could use."""

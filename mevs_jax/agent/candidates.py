@@ -9,9 +9,9 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from mevs_jax.arrays import AnyArray
-from mevs_jax.geometry.source_view import checked_pose
+from mevs_jax.geometry.source_view import first_wrong_pose
 from mevs_jax.geometry.viewpoints import great_circle_distances, hull_edges
-from mevs_jax.trained.situation import SAME, Candidates
+from mevs_jax.trained.situation import REPEATED, SAME, Candidates
 from mevs_jax.trained.system import TrainedSystem
 
 _NEAREST = 3
@@ -19,20 +19,24 @@ _NEAREST = 3
 
 
 def pose_towards(
-    direction: Float[np.ndarray, " 3"], center: Float[np.ndarray, " 3"], distance: float, up: Float[np.ndarray, " 3"]
-) -> Float[np.ndarray, "4 4"]:
+    direction: Float[np.ndarray, "*cameras 3"],
+    center: Float[np.ndarray, " 3"],
+    distance: float,
+    up: Float[np.ndarray, " 3"],
+) -> Float[np.ndarray, "*cameras 4 4"]:
     """Pose of a camera at a distance from `center`, in a direction from there, that looks at it with `up` upwards in its image.
 
-    Where it looks along `up`, any direction across it is upwards.
+    Where it looks along `up`, any direction across it is upwards. Many directions give as many poses.
     """
     forward = -direction
     right = np.cross(forward, up)
-    if np.linalg.norm(right) < 1e-6:
-        right = np.cross(forward, np.eye(3)[np.argmin(np.abs(forward))])
-    right /= np.linalg.norm(right)
-    pose = np.eye(4)
-    pose[:3, :3] = np.stack([right, np.cross(forward, right), forward], axis=1)
-    pose[:3, 3] = center + distance * direction
+    along = np.linalg.norm(right, axis=-1, keepdims=True) < 1e-6
+    right = np.where(along, np.cross(forward, np.eye(3)[np.argmin(np.abs(forward), axis=-1)]), right)
+    right /= np.linalg.norm(right, axis=-1, keepdims=True)
+    pose = np.zeros((*direction.shape[:-1], 4, 4))
+    pose[..., :3, :3] = np.stack([right, np.cross(forward, right), forward], axis=-1)
+    pose[..., :3, 3] = center + distance * direction
+    pose[..., 3, 3] = 1
     return pose
 
 
@@ -46,11 +50,8 @@ def aimed(
     """
     if poses.ndim != 3 or poses.shape[1:] != (4, 4):
         raise ValueError(f"candidates must be poses (candidates, 4, 4), got shape {poses.shape}")
-    for number, pose in enumerate(poses):
-        try:
-            checked_pose(pose)
-        except ValueError as error:
-            raise ValueError(f"candidate {number}: {error}") from error
+    if (wrong := first_wrong_pose(poses)) is not None:
+        raise ValueError(f"candidate {wrong[0]}: {wrong[1]}")
     away = poses[:, :3, 3] - center
     lengths = np.linalg.norm(away, axis=1)
     if (lengths < 1e-9).any():
@@ -114,7 +115,7 @@ def candidates_of(system: TrainedSystem, directions: Float[np.ndarray, "candidat
         jnp.asarray(padded(distances.astype(np.float32), 2, np.pi)),
         jnp.arange(size) < number,
         jnp.asarray(padded(_weights(points, system.viewpoints), 1)),
-        jnp.float32(max(min(spacing / 2, 0.2), SAME)),
+        jnp.float32(max(min(spacing / 2, 0.2), REPEATED)),
     )
 
 

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from functools import lru_cache
 from typing import Any
 
 import jax
@@ -15,46 +16,32 @@ from mevs_jax.policies.base import Observation, Policy, Scene, SelectionState
 from mevs_jax.policies.informed import information_gain
 from mevs_jax.policies.registry import POLICIES
 from mevs_jax.selection.loop import Fuse, best_view
+from mevs_jax.trained.description import Description
 from mevs_jax.trained.parts import Parts, observe
-from mevs_jax.trained.situation import Candidates, Memory, angles, situation
+from mevs_jax.trained.situation import REPEATED, Candidates, Memory, angles, situation
 from mevs_jax.trained.system import TrainedSystem
-
-REPEATED = 0.02
-"""Views whose directions differ by less, in radians, are one view taken again."""
+from mevs_jax.trained.usable import fusion_of, policy_of, resolved, shared
 
 
-class Programs:
-    """The compiled steps for one policy, and a known or unknown yaw."""
+@dataclass(frozen=True)
+class Steps:
+    """The steps for one policy, and a known or unknown yaw. Equal ones are compiled once, for all systems and agents.
 
-    def __init__(self, system: TrainedSystem, policy: str | Policy, posed: bool, most: int):
-        entropy = system.parts.entropy is not None and posed
-        if entropy and system.why_not(policy, posed, False) is None:
-            entropy = False  # the policy does not use predicted entropies
-        if (reason := system.why_not(policy, posed, entropy)) is not None:
-            name = policy if isinstance(policy, str) else getattr(policy, "__name__", "given")
-            without = "" if posed else " for an object of unknown yaw"
-            raise ValueError(f"the policy {name} cannot be used here{without}: {reason}")
-        self._system, self._policy, self._posed = system, policy, posed
-        self._entropy, self._most = entropy, most
-        self._temperatures_of = system.calibrated_as(policy if isinstance(policy, str) else "random", posed)
-        # Compiled once for all agents of a system that need the same.
-        self._see = system.compiled.setdefault(("see", entropy, posed, most), jax.jit(self.see_view))
-        self.choose = jax.jit(self.choose_next)
-        if isinstance(policy, str):
-            key = "choose", policy, POLICIES.get(policy), posed, most
-            self.choose = system.compiled.setdefault(key, self.choose)
+    Attributes:
+        description: of the system.
+        policy: its name, or the function.
+        registered: the function that is registered under this name, if it is a name.
+        posed: whether the yaw is known.
+        entropy: whether entropies are predicted.
+        most: largest number of views.
+    """
 
-    def see(self, parts: Parts, memory: Memory, depth: np.ndarray, pose: np.ndarray, radius: float) -> Any:
-        """`see_view`, compiled, with the temperatures of the policy."""
-        return self._see(parts, memory, depth, pose, np.float32(radius), self.temperatures(parts))
-
-    def temperatures(self, parts: Parts) -> Float[Array, " counts"]:
-        """The temperatures of the policy's walks; those of random ones for a policy without its own."""
-        return parts.temperatures.get(self._temperatures_of, parts.temperatures["random"])
-
-    def blank(self) -> Memory:
-        """The memory before the first view."""
-        return Memory.blank(self._system.example(self._entropy), self._most)
+    description: Description
+    policy: str | Policy
+    registered: Policy | None
+    posed: bool
+    entropy: bool
+    most: int
 
     def see_view(
         self,
@@ -69,9 +56,9 @@ class Programs:
 
         The radius is in metres, NaN if the size is unknown. The last of the temperatures holds for more views.
         """
-        seen = observe(parts, depth, pose, radius, self._system.description, self._entropy)
+        seen = observe(parts, depth, pose, radius, self.description, self.entropy)
         direction = pose[:3, 3] / jnp.linalg.norm(pose[:3, 3])
-        memory = remember(memory, seen, direction, self._system.fuse(parts, self._posed))
+        memory = remember(memory, seen, direction, fusion_of(parts, self.posed))
         at = jnp.clip(memory.count, 1, len(temperatures)) - 1
         probabilities = jax.nn.softmax(memory.belief / temperatures[at])
         strangeness = jnp.float32(jnp.nan)
@@ -97,9 +84,9 @@ class Programs:
             cost: subtracted from the scores.
             key: of random policies.
         """
-        state, scene = situation(parts, memory, candidates, failed, allowed, self._posed)
-        policy, number, slots = self._policy, len(candidates.directions), jnp.zeros(self._most)
-        run = self._system.policy(policy, parts, self._posed) if isinstance(policy, str) else policy
+        state, scene = situation(parts, memory, candidates, failed, allowed, self.posed)
+        policy, number, slots = self.policy, len(candidates.directions), jnp.zeros(self.most)
+        run = policy_of(self.description, parts, policy, self.posed) if isinstance(policy, str) else policy
         assert scene.reachable is not None
         left, costs = scene.reachable & ~state.attempted, jnp.concatenate([cost, slots])
         scores = run(jax.random.fold_in(key, state.count), state, scene) - costs
@@ -114,9 +101,55 @@ class Programs:
 
     def _first(self, parts: Parts, candidates: Candidates) -> Float[Array, " candidates"]:
         """Scores of the first view, from 0 to 1: the best fixed order of views where there is one, else views from above."""
-        if self._posed and parts.knowledge is not None and parts.knowledge.order is not None:
-            return candidates.weights @ parts.knowledge.order / jnp.max(parts.knowledge.order)
+        if self.posed and parts.knowledge is not None and (order := parts.knowledge.order) is not None:
+            lowest, highest = jnp.min(order), jnp.max(order)
+            return candidates.weights @ ((order - lowest) / jnp.maximum(highest - lowest, jnp.finfo(order.dtype).tiny))
         return 1 - jnp.abs(candidates.directions[:, 2] - 0.5)
+
+
+@lru_cache(maxsize=128)
+def _see(steps: Steps) -> Any:
+    return jax.jit(steps.see_view)
+
+
+@lru_cache(maxsize=128)
+def _choose(steps: Steps) -> Any:
+    return jax.jit(steps.choose_next)
+
+
+class Programs:
+    """The compiled steps for one policy, and a known or unknown yaw."""
+
+    def __init__(self, system: TrainedSystem, policy: str | Policy, posed: bool, most: int):
+        entropy = system.parts.entropy is not None and posed
+        if entropy and system.why_not(policy, posed, False) is None:
+            entropy = False  # the policy does not use predicted entropies
+        if (reason := system.why_not(policy, posed, entropy)) is not None:
+            name = policy if isinstance(policy, str) else getattr(policy, "__name__", "given")
+            without = "" if posed else " for an object of unknown yaw"
+            raise ValueError(f"the policy {name} cannot be used here{without}: {reason}")
+        self._system, registered = system, None
+        self._temperatures_of = system.calibrated_as(policy if isinstance(policy, str) else "random", posed)
+        if isinstance(policy, str):
+            policy = resolved(system.description, policy, posed)
+            registered = POLICIES.get(policy)
+        else:
+            policy = shared(policy)
+        self.steps = Steps(system.description, policy, registered, posed, entropy, most)
+        self._see = _see(replace(self.steps, policy="", registered=None))  # the same for all policies
+        self.choose = _choose(self.steps)
+
+    def see(self, parts: Parts, memory: Memory, depth: np.ndarray, pose: np.ndarray, radius: float) -> Any:
+        """`Steps.see_view`, compiled, with the temperatures of the policy."""
+        return self._see(parts, memory, depth, pose, np.float32(radius), self.temperatures(parts))
+
+    def temperatures(self, parts: Parts) -> Float[Array, " counts"]:
+        """The temperatures of the policy's walks; those of random ones for a policy without its own."""
+        return parts.temperatures.get(self._temperatures_of, parts.temperatures["random"])
+
+    def blank(self) -> Memory:
+        """The memory before the first view."""
+        return Memory.blank(self._system.example(self.steps.entropy), self.steps.most)
 
 
 def remember(memory: Memory, observation: Observation, direction: Float[Array, 3], fuse: Fuse) -> Memory:
@@ -130,6 +163,7 @@ def remember(memory: Memory, observation: Observation, direction: Float[Array, 3
     slot = jnp.where(again, jnp.argmin(apart), memory.count)
     memory = Memory(
         count=memory.count + ~again,
+        latest=slot.astype(jnp.int32),
         directions=memory.directions.at[slot].set(direction),
         seen=jax.tree.map(lambda history, now: history.at[slot].set(now), memory.seen, observation),
         belief=memory.belief - jnp.where(again, memory.seen.logits[slot], 0.0),  # of a fusion that adds logits

@@ -25,7 +25,8 @@ class Belief:
         label: index of the most likely class.
         name: its name.
         confidence: its probability.
-        views: number of views seen.
+        views: number of views seen; one that was taken again counts once.
+        images: number of images seen, which the budget counts.
         strangeness: share of the known objects that look less strange after as many views, in [0, 1]; NaN if it is not measured.
         known: False if the object is stranger than the agent's limit `unknown`.
         unseen: share of the object's sphere that the latest image does not show, in [0, 1].
@@ -37,6 +38,7 @@ class Belief:
     name: str
     confidence: float
     views: int
+    images: int
     strangeness: float
     known: bool
     unseen: float
@@ -87,7 +89,7 @@ class History:
 
     @property
     def views(self) -> int:
-        """Number of views seen."""
+        """Number of images seen, views that were taken again included."""
         return len(self.depths)
 
     @property

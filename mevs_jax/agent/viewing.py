@@ -12,6 +12,7 @@ from jaxtyping import Float
 
 from mevs_jax.agent.records import History
 from mevs_jax.geometry.cameras import partial_cloud
+from mevs_jax.trained.situation import REPEATED
 from mevs_jax.trained.system import TrainedSystem
 
 if TYPE_CHECKING:
@@ -136,7 +137,7 @@ def _show_candidates(server: viser.ViserServer, system: TrainedSystem, history: 
     directions = np.asarray(decision.get("directions", system.viewpoints))
     gains = np.array([np.nan if gain is None else gain for gain in decision.get("gains", [None] * len(directions))])
     seen = np.stack([pose[:3, 3] / np.linalg.norm(pose[:3, 3]) for pose in history.poses[:step]])
-    left = (directions @ seen.T).max(axis=1) < 1 - 1e-5
+    left = (directions @ seen.T).max(axis=1) < np.cos(REPEATED)
     known = left & np.isfinite(gains)
     low, high = (gains[known].min(), gains[known].max()) if known.any() else (0.0, 0.0)
     server.scene.remove_by_name("/candidates")

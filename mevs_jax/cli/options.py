@@ -176,7 +176,7 @@ class LookOptions:
     """Options of `mevs look`."""
 
     system: System = "furniture10"
-    """the trained system: a folder, a run, a name that comes with the package, or owner/name on the Hugging Face hub"""
+    """the trained system: a folder, a run, a name that comes with the package, or hf://owner/name on the Hugging Face hub"""
     mesh: Annotated[Path | None, _arg("FILE")] = None
     """a mesh to recognise: .off, .obj, .stl, .ply, .glb, .gltf, .dae or .3mf; it is rendered from the views that are chosen"""
     depth: Annotated[Path | None, _arg("FILE")] = None

@@ -176,10 +176,10 @@ def _decide(system: TrainedSystem, policy: str, max_views: int) -> _Program:
         memory: Any, depth: Array, pose: Array, reachable: Array, cost: Array, seed: Array, radius: Any = jnp.nan
     ) -> dict[str, Any]:
         before = jax.tree.unflatten(structure, [memory[name] for name in names])
-        after, (probabilities, strangeness) = programs.see_view(
+        after, (probabilities, strangeness) = programs.steps.see_view(
             parts, before, depth, pose, jnp.asarray(radius, jnp.float32), programs.temperatures(parts)
         )
-        following, gains = programs.choose_next(
+        following, gains = programs.steps.choose_next(
             parts, after, lattice, jnp.zeros(views, bool), reachable, cost, jax.random.key(seed)
         )
         return {

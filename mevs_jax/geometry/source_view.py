@@ -176,21 +176,38 @@ def _check_intrinsics(K: np.ndarray) -> None:
 def checked_pose(T_world_camera: AnyArray) -> np.ndarray:
     """The pose in float64; raises `ValueError` unless it is a rotation and a translation, with the last row (0, 0, 0, 1)."""
     pose = _finite(T_world_camera, "T_world_camera", (4, 4))
-    if not np.allclose(pose[3], (0, 0, 0, 1), atol=1e-6):
-        raise ValueError(
-            f"the last row of T_world_camera is {pose[3].tolist()}, not (0, 0, 0, 1); check that the matrix is not transposed"
-        )
-    rotation = pose[:3, :3]
-    if not np.allclose(rotation.T @ rotation, np.eye(3), atol=1e-3):
-        raise ValueError(
-            "the upper left 3×3 block of T_world_camera is not a rotation: its columns are not orthogonal unit vectors; "
-            "take scale and shear out of the pose"
-        )
-    if np.linalg.det(rotation) < 0:
-        raise ValueError(
-            "the rotation of T_world_camera has determinant −1, so it mirrors; use right-handed axes (x right, y down, z forward)"
-        )
+    if (wrong := first_wrong_pose(pose[None])) is not None:
+        raise ValueError(wrong[1])
     return pose
+
+
+def first_wrong_pose(poses: Float[np.ndarray, "poses 4 4"]) -> tuple[int, str] | None:
+    """The number of the first matrix that is no pose, and why; None if all are poses."""
+    finite = np.isfinite(poses).all(axis=(1, 2))
+    rotations = np.where(finite[:, None, None], poses[:, :3, :3], np.eye(3))
+    products = np.swapaxes(rotations, 1, 2) @ rotations
+    checks = (
+        (finite, "T_world_camera has numbers that are not finite"),
+        (
+            np.isclose(poses[:, 3], (0, 0, 0, 1), atol=1e-6).all(axis=1),
+            "the last row of T_world_camera is {}, not (0, 0, 0, 1); check that the matrix is not transposed",
+        ),
+        (
+            np.isclose(products, np.eye(3), atol=1e-3).all(axis=(1, 2)),
+            "the upper left 3×3 block of T_world_camera is not a rotation: its columns are not orthogonal unit vectors; "
+            "take scale and shear out of the pose",
+        ),
+        (
+            np.linalg.det(rotations) > 0,
+            "the rotation of T_world_camera has determinant −1, so it mirrors; use right-handed axes "
+            "(x right, y down, z forward)",
+        ),
+    )
+    number = int(np.argmin(np.all([right for right, _ in checks], axis=0)))
+    for right, why in checks:
+        if not right[number]:
+            return number, why.format(poses[number, 3].tolist())
+    return None
 
 
 def _sphere_in_image(center: np.ndarray, K: np.ndarray, size: tuple[int, int]) -> list[tuple[int, int]]:

@@ -136,7 +136,8 @@ class SetFusion(nnx.Module):
             posed: whether directions are in the object's own frame; if not, in one rotated about the vertical axis by an unknown
                 angle.
         """
-        features, directions, present = jnp.asarray(features), jnp.asarray(directions), jnp.asarray(present)
+        features, present = jnp.asarray(features), jnp.asarray(present)
+        directions = jnp.where(present[..., None], jnp.asarray(directions), 0.0)
         if not posed:
             directions = relative_to_first(directions, present)[0]
         keys = [None] * (len(self.blocks) + 1) if key is None else list(jax.random.split(key, len(self.blocks) + 1))

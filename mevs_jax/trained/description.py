@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+import json
+from dataclasses import asdict, dataclass, field
 from typing import Any, Literal
 
 from mevs_jax.geometry.cameras import ViewCamera
@@ -109,3 +110,6 @@ class Description:
     cloud: CloudInput | None = None
     view_policies: dict[str, ViewPolicyShape] = field(default_factory=dict)
     evaluation: dict[str, Any] = field(default_factory=dict)
+
+    def __hash__(self) -> int:
+        return hash(json.dumps(asdict(self), sort_keys=True, default=str))

@@ -29,6 +29,8 @@ LARGEST = 2**31
 LARGEST_DESCRIPTION = 2**24
 LARGEST_SIZE, MOST_LAYERS = 2**16, 64
 """Largest number in the shape of a network, and of its layers."""
+HUB = "hf://"
+"""Begins the name of a model on the Hugging Face hub."""
 _HUB_ID = re.compile(r"[A-Za-z0-9][\w.-]{0,95}/[A-Za-z0-9][\w.-]{0,95}")
 
 
@@ -44,8 +46,9 @@ def load(path: str | Path) -> TrainedSystem:
     """Returns a trained system.
 
     Args:
-        path: a folder that `mevs run`, `mevs study learned` or `mevs export` wrote; a run's folder; the name of a system that
-            comes with the package, as `furniture10`; or `owner/name` of a model on the Hugging Face hub.
+        path: the name of a system that comes with the package, as `furniture10`, also if there is a folder of this name (which
+            is `./furniture10`); a folder that `mevs run`, `mevs study learned` or `mevs export` wrote; a run's folder; or
+            `hf://owner/name`, a model on the Hugging Face hub, which is asked for nothing else.
 
     Raises:
         FileNotFoundError: if there is no such folder or name.
@@ -63,6 +66,11 @@ def load(path: str | Path) -> TrainedSystem:
 
 
 def _folder_of(path: str | Path) -> Path:
+    shipped = sorted(place.parent.name for place in SHIPPED.glob(f"*/{DESCRIPTION}"))
+    if isinstance(path, str) and path in shipped:
+        return SHIPPED / path
+    if isinstance(path, str) and path.startswith(HUB):
+        return _from_hub(path.removeprefix(HUB))
     folder = Path(path)
     for place in (folder, folder / "system", folder / "learned" / "system"):
         if (place / DESCRIPTION).exists():
@@ -73,13 +81,12 @@ def _folder_of(path: str | Path) -> Path:
         )
     if folder.exists():
         raise FileNotFoundError(f"{folder} has no {DESCRIPTION}: it is no trained system; write one with mevs export")
-    if (SHIPPED / str(path) / DESCRIPTION).exists() and "/" not in str(path):
-        return SHIPPED / str(path)
-    if isinstance(path, str) and _HUB_ID.fullmatch(path) and not folder.parent.exists():
-        return _from_hub(path)
-    shipped = ", ".join(sorted(found.name for found in SHIPPED.glob("*/"))) if SHIPPED.is_dir() else "none"
+    if str(path) in shipped:
+        return SHIPPED / path
+    hub = f"; a model on the Hugging Face hub is {HUB}{path}" if _HUB_ID.fullmatch(str(path)) else ""
     raise FileNotFoundError(
-        f"there is no folder {path}, and no system of this name; those that come with the package: {shipped}"
+        f"there is no folder {path}, and no system of this name; those that come with the package: "
+        f"{', '.join(shipped) or 'none'}{hub}"
     )
 
 
@@ -87,7 +94,7 @@ def from_pretrained(name: str, revision: str | None = None) -> TrainedSystem:
     """Returns a trained system from the Hugging Face hub, downloaded once into its cache.
 
     Args:
-        name: `owner/name`.
+        name: `owner/name`, with or without `hf://`.
         revision: branch, tag or commit.
 
     Raises:
@@ -95,23 +102,23 @@ def from_pretrained(name: str, revision: str | None = None) -> TrainedSystem:
         FileNotFoundError: if it cannot be downloaded.
         UnreadableSystem: as of `load`.
     """
-    return _read(_from_hub(name, revision), name)
+    return _read(_from_hub(name.removeprefix(HUB), revision), name)
 
 
 def _from_hub(name: str, revision: str | None = None) -> Path:
+    if not _HUB_ID.fullmatch(name):
+        raise FileNotFoundError(f"a model on the Hugging Face hub is owner/name, got {name!r:.80}")
     try:
         from huggingface_hub import snapshot_download
     except ImportError as error:
         raise ImportError(
-            f"there is no folder {name}; to get it from the Hugging Face hub, install huggingface_hub: pip install mevs-jax[hub]"
+            f"to get {name} from the Hugging Face hub, install huggingface_hub: pip install mevs-jax[hub]"
         ) from error
     try:
         return Path(snapshot_download(name, revision=revision, allow_patterns=[DESCRIPTION, WEIGHTS, CARD]))
     except Exception as error:  # of the hub, of its client and of the network: many kinds, one meaning
         reason = (str(error).strip() or type(error).__name__).splitlines()[0][:200]
-        raise FileNotFoundError(
-            f"there is no folder {name}, and the Hugging Face hub did not give a model of this name ({reason})"
-        ) from error
+        raise FileNotFoundError(f"the Hugging Face hub did not give a model of the name {name} ({reason})") from error
 
 
 def verify(folder: str | Path) -> Description:

@@ -19,7 +19,9 @@ from mevs_jax.policies.base import Knowledge, Observation, Scene, SelectionState
 from mevs_jax.trained.parts import Parts
 
 SAME = 1e-3
-"""Directions closer than this, in radians, are the same view."""
+"""A view in a direction closer than this to a candidate's, in radians, has the candidate's index and values."""
+REPEATED = 0.02
+"""Views in directions closer than this, in radians, are one view taken again. No candidate is chosen within it of a view seen."""
 
 
 @flax.struct.dataclass
@@ -27,13 +29,15 @@ class Memory:
     """The views of one object so far.
 
     Attributes:
-        count: number of views seen.
+        count: number of views seen; one that was taken again counts once.
+        latest: slot of the view that was looked at last.
         directions: (most, 3) unit vectors from the object to the cameras; zeros beyond `count`.
         seen: (most, …) observations; zeros beyond `count`.
         belief: (classes,) of the fusion.
     """
 
     count: Int[Array, ""]
+    latest: Int[Array, ""]
     directions: Float[Array, "most 3"]
     seen: Observation
     belief: Float[Array, " classes"]
@@ -42,7 +46,7 @@ class Memory:
     def blank(cls, like: Observation, most: int) -> Memory:
         """The memory before the first view, for at most `most` views with the shapes of an observation."""
         seen = jax.tree.map(lambda leaf: jnp.zeros((most, *leaf.shape), leaf.dtype), like)
-        return cls(jnp.int32(0), jnp.zeros((most, 3)), seen, jnp.zeros(like.logits.shape[-1]))
+        return cls(jnp.int32(0), jnp.int32(0), jnp.zeros((most, 3)), seen, jnp.zeros(like.logits.shape[-1]))
 
     @property
     def present(self) -> Bool[Array, " most"]:
@@ -61,7 +65,7 @@ class Candidates:
         exists: False for padding.
         weights: (candidates, views) of the system's viewpoints, which the values of a candidate are interpolated from; rows have
             the sum 1, and a candidate in the direction of a viewpoint has only this one.
-        same: angle in radians within which a view counts as having been taken from a candidate.
+        same: angle in radians within which a view counts as having been taken from a candidate, at least `REPEATED`.
     """
 
     directions: Float[Array, "candidates 3"]
@@ -107,7 +111,7 @@ def situation(
             return observation
         return replace(observation, predicted_entropy=_along(candidates, observation.predicted_entropy, most))
 
-    latest = jnp.maximum(memory.count - 1, 0)
+    latest = memory.latest
     state = SelectionState(
         count=memory.count,
         view=views[latest],

@@ -17,24 +17,29 @@ from mevs_jax.geometry.cameras import cameras_at
 from mevs_jax.geometry.inputs import check_depth
 from mevs_jax.geometry.viewpoints import ViewGraph, great_circle_distances
 from mevs_jax.policies.base import Observation, Policy
-from mevs_jax.policies.informed import expected_views
-from mevs_jax.policies.learned import learned
-from mevs_jax.policies.registry import POLICIES, policy_named
-from mevs_jax.selection.loop import Fuse, by_attention, sum_of_logits
+from mevs_jax.policies.registry import POLICIES
+from mevs_jax.selection.loop import Fuse
 from mevs_jax.trained.description import Description
 from mevs_jax.trained.parts import Parts, observe
-from mevs_jax.trained.situation import SAME, Candidates, Memory, situation
+from mevs_jax.trained.usable import (
+    AND_TABLE,
+    EXPECTED_VIEWS,
+    Structure,
+    example_of,
+    fusion_of,
+    policy_of,
+    resolved,
+    why_not,
+)
 from mevs_jax.trained.writing import Programs, write
 
 if TYPE_CHECKING:
     from mevs_jax import Agent
 
-_AND_TABLE = "learned_and_table"
-"""The policy that averages the gains by the network `learned` and by what views are expected to show."""
-EXPECTED_VIEWS = "expected_views"
-"""The policy by what a recogniser is expected to say (`mevs_jax.policies.informed.expected_views`)."""
 UNPOSED = "_unposed"
 """Ends the name of a policy among the temperatures, for its walks around objects of unknown yaw."""
+_observe = jax.jit(observe, static_argnames="of")
+"""Systems with equal descriptions share its programs."""
 
 
 @dataclass(frozen=True)
@@ -50,8 +55,6 @@ class TrainedSystem:
     description: Description
     parts: Parts = field(repr=False)
     name: str = ""
-    compiled: dict[Any, Any] = field(default_factory=dict, init=False, repr=False, compare=False)
-    """What was compiled for it, by those who use it."""
 
     @property
     def classes(self) -> tuple[str, ...]:
@@ -84,7 +87,7 @@ class TrainedSystem:
     @property
     def policies(self) -> tuple[str, ...]:
         """Names of the policies that can be used with this system, for objects of known yaw."""
-        own = [*self.parts.view_policies, *[_AND_TABLE] * ("learned" in self.parts.view_policies), EXPECTED_VIEWS]
+        own = [*self.parts.view_policies, *[AND_TABLE] * ("learned" in self.parts.view_policies), EXPECTED_VIEWS]
         own = [name for name in own if name not in (shapes := self.description.view_policies) or shapes[name].posed]
         return tuple(name for name in (*POLICIES, *own) if self.can_run(name, posed=True))
 
@@ -94,39 +97,15 @@ class TrainedSystem:
 
     def why_not(self, policy: str | Policy, posed: bool, with_entropy: bool) -> str | None:
         """Why a policy cannot be used, with or without predicted entropies; None if it can."""
-        if not isinstance(policy, str):
-            return self._try(policy, posed, with_entropy)
-        key = "why_not", policy, POLICIES.get(policy), posed, with_entropy  # one of this name may be registered later
-        if key not in self.compiled:
-            self.compiled[key] = self._try(policy, posed, with_entropy)
-        return self.compiled[key]
+        return why_not(self._structure, policy, posed, with_entropy)
 
-    def _try(self, policy: str | Policy, posed: bool, with_entropy: bool) -> str | None:
-        views, most = len(self.parts.viewpoints), 2
-
-        def trial(parts: Parts) -> Any:
-            memory = Memory.blank(self.example(with_entropy), most)
-            all_views, apart = jnp.ones(views, bool), jnp.zeros((views, views))
-            graph = parts.viewpoints, parts.neighbours, apart
-            candidates = Candidates(*graph, all_views, jnp.eye(views), jnp.float32(SAME))
-            state, scene = situation(parts, memory, candidates, ~all_views, all_views, posed)
-            run = self.policy(policy, parts, posed) if isinstance(policy, str) else policy
-            return run(jax.random.key(0), state, scene)
-
-        try:
-            scores = jax.eval_shape(trial, self.parts)
-        except (ValueError, TypeError, KeyError, AttributeError, NotImplementedError) as error:
-            return (str(error).strip() or type(error).__name__).splitlines()[0]
-        if scores.shape != (views + most,):
-            return f"it returns scores of shape {scores.shape}, not one for each of {views + most} views"
-        return None
+    @cached_property
+    def _structure(self) -> Structure:
+        return Structure.of(self.description, self.parts)
 
     def example(self, with_entropy: bool) -> Observation:
         """An observation of zeros, for its shapes."""
-        classes, features = len(self.classes), 8 * self.description.encoder.width
-        entropies = jnp.zeros(len(self.parts.viewpoints)) if with_entropy else None
-        evidence = None if self.parts.pose is None else jnp.zeros(self.parts.pose.module.shape)
-        return Observation(jnp.zeros(classes), entropies, jnp.zeros(features), pose_evidence=evidence)
+        return example_of(self.description, self.parts, with_entropy)
 
     @property
     def temperatures(self) -> dict[str, np.ndarray]:
@@ -140,9 +119,7 @@ class TrainedSystem:
             parts: those of this system, as they are within a compiled function.
             posed: whether the object's yaw is known.
         """
-        if not parts.fusion:
-            return sum_of_logits
-        return by_attention(parts.fusion["posed" if posed else "unposed"])
+        return fusion_of(parts, posed)
 
     def policy(self, name: str, parts: Parts | None = None, posed: bool = True) -> Policy:
         """Returns a policy by its name: one of this system's networks, or a registered policy.
@@ -155,26 +132,7 @@ class TrainedSystem:
         Raises:
             ValueError: for an unknown name, or a network that needs the object's yaw where it is unknown.
         """
-        parts = self.parts if parts is None else parts
-        if name == "best":
-            name = self.description.best if posed else self.description.best_unposed
-        network = "learned" if name == _AND_TABLE else name
-        if network in parts.view_policies:
-            if not posed and self.description.view_policies[network].posed:
-                raise ValueError("its network needs the object's yaw")
-            by = "table" if name == _AND_TABLE else "belief"
-            return learned(parts.view_policies[network].module, parts.single, by=by)  # type: ignore[arg-type]
-        if name == EXPECTED_VIEWS and parts.expected is not None:
-            return expected_views
-        if name not in POLICIES:
-            own = (*parts.view_policies, *[EXPECTED_VIEWS] * (parts.expected is not None))
-            known = ", ".join(("best", *own, *POLICIES))
-            raise ValueError(f"unknown policy {name!r}; it is one of {known}")
-        return policy_named(name)
-
-    @cached_property
-    def _observe(self) -> Any:
-        return jax.jit(partial(observe, of=self.description))
+        return policy_of(self.description, self.parts if parts is None else parts, name, posed)
 
     def observe(
         self,
@@ -202,7 +160,7 @@ class TrainedSystem:
                 f"from any camera's image with mevs_jax.canonical_view"
             )
         given = (jnp.asarray(array, jnp.float32) for array in (depth, pose, radius))
-        return self._observe(self.parts, *given)
+        return _observe(self.parts, *given, self.description)
 
     def calibrated_as(self, policy: str, posed: bool = True) -> str:
         """The policy whose temperatures are those of a policy's walks.
@@ -210,8 +168,7 @@ class TrainedSystem:
         That is the policy itself. For an unknown yaw, where the fusion is another one, it is the policy's name with `_unposed`,
         or the best policy for an unknown yaw if there are no temperatures of that name.
         """
-        if policy == "best":
-            policy = self.description.best if posed else self.description.best_unposed
+        policy = resolved(self.description, policy, posed)
         if posed or not self.parts.fusion:
             return policy
         names = (policy, self.description.best_unposed)

@@ -39,6 +39,7 @@ def write(
     content = json.loads(json.dumps(asdict(description)))
     content["weights"] = {"sha256": hashlib.sha256(weights).hexdigest(), "bytes": len(weights)}
     content["sha256"] = hash_of(content)
+    folder = folder.resolve()  # what a link points to is replaced, not the link
     folder.parent.mkdir(parents=True, exist_ok=True)
     made = Path(tempfile.mkdtemp(prefix=f".{folder.name}.", dir=folder.parent))
     try:
@@ -48,11 +49,25 @@ def write(
             programs(made / PROGRAMS)
         _write(made / CARD, model_card(description, len(weights)).encode())
         _write(made / DESCRIPTION, json.dumps(content, indent=1, ensure_ascii=False).encode())
-        if folder.is_dir():
-            shutil.rmtree(folder)
-        made.rename(folder)
+        _put_in_place(made, folder)
     finally:
         shutil.rmtree(made, ignore_errors=True)
+
+
+def _put_in_place(made: Path, folder: Path) -> None:
+    """Renames a folder to another name. A folder of this name is removed once the new one stands, and stays if it cannot."""
+    before = None
+    if folder.is_dir():
+        before = made.with_name(f"{made.name}.before")
+        folder.rename(before)
+    try:
+        made.rename(folder)
+    except BaseException:
+        if before is not None:
+            before.rename(folder)
+        raise
+    if before is not None:
+        shutil.rmtree(before, ignore_errors=True)
 
 
 def _write(path: Path, content: bytes) -> None:

@@ -164,6 +164,15 @@ def test_the_first_view_is_that_of_the_fixed_order(classifier):
     assert agent.decide(cost=np.where(np.arange(making.VIEWS) == step.index, 9.0, 0.0)).index != step.index
 
 
+def test_the_first_view_is_the_best_of_a_fixed_order_of_negative_scores(classifier):
+    """A log-likelihood, for example."""
+    knowledge = classifier.parts.knowledge
+    for order in (knowledge.order - 100.0, jnp.full(making.VIEWS, -1.0)):
+        changed = replace(classifier.parts, knowledge=replace(knowledge, order=order))
+        agent = begun(mevs_jax.TrainedSystem(classifier.description, changed))
+        assert agent.decide().index == int(np.argmax(order))
+
+
 def test_without_a_fixed_order_the_first_view_is_from_thirty_degrees_above(classifier):
     """Above the object, which may lie: heights are along its own upward direction."""
     agent = begun(classifier, sphere=mevs_jax.Sphere(CENTER, RADIUS, UP))

@@ -32,7 +32,9 @@ def shot(system, view: int, aim=(0.0, 0.0, 0.0)) -> tuple[np.ndarray, np.ndarray
     )
 
 
-def test_a_view_taken_again_is_no_new_evidence(system, agent):
+def test_a_view_taken_again_is_no_new_evidence(system):
+    agent = Agent(system, stop=2, max_views=7)
+    agent.reset(center=CENTER, radius=RADIUS, yaw=0.0)
     first = agent.observe(*_camera(shot(system, 2)))
     for _ in range(4):
         again = agent.observe(*_camera(shot(system, 2)))
@@ -40,12 +42,13 @@ def test_a_view_taken_again_is_no_new_evidence(system, agent):
     np.testing.assert_allclose(again.probabilities, first.probabilities, atol=1e-5)
     third, fourth = (agent.observe(*_camera(shot(system, view))) for view in (5, 7))
     assert (third.views, fourth.views) == (2, 3)
-    other = Agent(system, stop=2, max_views=3)
+    assert (again.images, fourth.images) == (5, 7)
+    other = Agent(system, stop=2, max_views=7)
     other.reset(center=CENTER, radius=RADIUS, yaw=0.0)
     for view in (2, 5, 7):
         once = other.observe(*_camera(shot(system, view)))
     np.testing.assert_allclose(fourth.probabilities, once.probabilities, atol=1e-5)
-    with pytest.raises(ValueError, match="the budget of 3 views is spent"):
+    with pytest.raises(ValueError, match="the budget of 7 views is spent"):
         agent.observe(*_camera(shot(system, 9)))
 
 

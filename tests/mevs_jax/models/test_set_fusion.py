@@ -88,7 +88,8 @@ def test_order_and_padding_do_not_matter_and_no_view_is_a_belief_too(network, se
     order = np.array([3, 1, 4, 0, 2])
     np.testing.assert_allclose(fused(network, features[order], directions[order], present[order]), belief, atol=1e-5)
     junk = np.where(present[:, None], features, np.nan).astype(np.float32)
-    np.testing.assert_allclose(fused(network, junk, directions, present), belief, atol=1e-6)
+    nowhere = np.where(present[:, None], directions, np.nan).astype(np.float32)
+    np.testing.assert_allclose(fused(network, junk, nowhere, present), belief, atol=1e-6)
     some = np.flatnonzero(present)
     alone = fused(network, features[some], directions[some], present[some])
     np.testing.assert_allclose(alone, belief, atol=1e-5)
@@ -114,6 +115,8 @@ def test_without_a_pose_objects_may_face_any_way(network, seen):
     features, directions, present = seen
     blind = nnx.jit(partial(SetFusion.__call__, posed=False))
     belief = blind(network, features, directions, present)
+    nowhere = np.where(present[:, None], directions, np.nan).astype(np.float32)
+    np.testing.assert_allclose(blind(network, features, nowhere, present), belief, atol=1e-6)
     angle = 2.1
     turn = np.array([[np.cos(angle), -np.sin(angle), 0], [np.sin(angle), np.cos(angle), 0], [0, 0, 1]], np.float32)
     np.testing.assert_allclose(blind(network, features, directions @ turn.T, present), belief, atol=1e-5)

@@ -6,6 +6,7 @@ import hashlib
 import json
 import shutil
 from dataclasses import replace
+from pathlib import Path
 
 import jax
 import jax.numpy as jnp
@@ -77,6 +78,44 @@ def test_writing_replaces_a_system_and_nothing_else(written, tmp_path):
     with pytest.raises(FileExistsError, match="is a file"):
         save(made, folder / "notes.txt")
     assert sorted(path.name for path in tmp_path.iterdir()) == ["there"]
+
+
+@pytest.mark.parametrize("linked", [False, True])
+def test_a_system_is_not_lost_where_the_new_one_cannot_stand(written, tmp_path, monkeypatch, linked):
+    made, _ = written
+    folder = tmp_path / "there"
+    if linked:
+        (tmp_path / "target").mkdir()
+        folder.symlink_to(tmp_path / "target")
+    save(made, folder)
+    before, rename = sorted(tmp_path.iterdir()), Path.rename
+
+    def failing(path, target):
+        if (path / WEIGHTS).exists() and Path(target) == folder.resolve() and not str(path).endswith("before"):
+            raise OSError("the disk is away")
+        return rename(path, target)
+
+    again = replace(made, description=replace(made.description, chosen_by="again"))
+    monkeypatch.setattr(Path, "rename", failing)
+    with pytest.raises(OSError, match="the disk is away"):
+        save(again, folder)
+    assert load(folder).description == made.description
+    assert sorted(tmp_path.iterdir()) == before
+    monkeypatch.undo()
+    save(again, folder)
+    assert load(folder).description.chosen_by == "again"
+    assert sorted(tmp_path.iterdir()) == before
+
+
+def test_names_of_the_package_win_over_folders(written, tmp_path, monkeypatch):
+    made, folder = written
+    shutil.copytree(folder, tmp_path / "furniture10")
+    monkeypatch.chdir(tmp_path)
+    assert "desk" in load("furniture10").classes
+    for path in ("./furniture10", Path("furniture10")):
+        assert load(path).description == made.description
+    shutil.rmtree("furniture10")
+    assert "desk" in load(Path("furniture10")).classes
 
 
 def test_what_is_not_there_is_said(tmp_path):

@@ -26,7 +26,19 @@ def has_hub():
 @pytest.mark.skipif(has_hub(), reason="huggingface_hub is installed")
 def test_without_the_package_one_sentence_says_what_to_install():
     with pytest.raises(ImportError, match=r"install huggingface_hub: pip install mevs-jax\[hub\]"):
+        mevs_jax.load(f"hf://{NAME}")
+
+
+def test_a_missing_path_never_asks_the_hub(monkeypatch):
+    def ask(*_):
+        raise AssertionError("the hub was asked")
+
+    monkeypatch.setattr("mevs_jax.trained.files._from_hub", ask)
+    with pytest.raises(FileNotFoundError, match=rf"no folder {NAME}, and no system .* hub is hf://{NAME}$"):
         mevs_jax.load(NAME)
+    monkeypatch.undo()
+    with pytest.raises(FileNotFoundError, match="is owner/name, got"):
+        mevs_jax.load("hf://../../etc")
 
 
 @pytest.fixture
@@ -103,10 +115,11 @@ def hub(tmp_path, monkeypatch):
 
 def test_a_system_is_loaded_from_the_hub(hub):
     made, asked = hub
-    read = mevs_jax.load(NAME)
+    read = mevs_jax.load(f"hf://{NAME}")
     assert read.description == made.description
-    assert read.name == NAME
+    assert read.name == f"hf://{NAME}"
     assert not any("pickle.bin" in path and "resolve" in path for path in asked)
     assert mevs_jax.from_pretrained(NAME, revision="main").classes == made.classes
-    with pytest.raises(FileNotFoundError, match="the Hugging Face hub did not give a model of this name"):
-        mevs_jax.load("somebody/else")
+    assert mevs_jax.from_pretrained(f"hf://{NAME}").classes == made.classes
+    with pytest.raises(FileNotFoundError, match="the Hugging Face hub did not give a model of the name somebody/else"):
+        mevs_jax.load("hf://somebody/else")
