@@ -20,6 +20,7 @@ from mevs_jax.agent.present import Present, sphere_of
 from mevs_jax.agent.programs import Programs
 from mevs_jax.agent.records import Belief, History, Reason, Step, plain
 from mevs_jax.arrays import AnyArray, AnyVector
+from mevs_jax.geometry.cameras import in_sphere
 from mevs_jax.geometry.inputs import check_depth
 from mevs_jax.geometry.source_view import DepthImage
 from mevs_jax.geometry.sphere import Sphere
@@ -27,6 +28,12 @@ from mevs_jax.policies.base import Policy
 from mevs_jax.trained.situation import Candidates
 from mevs_jax.trained.system import TrainedSystem
 
+_UNKNOWN = 0.95
+"""By default, an object that is stranger than this share of the known ones is unknown."""
+_ENOUGH = 0.25
+"""How much of the object must have been seen before the agent is sure, in views that show all of its sphere."""
+_ENOUGH_EACH = 0.5
+"""The same for each view, where networks are not told what is unknown."""
 Reachable = AnyArray | Sequence[int] | Callable[[np.ndarray], bool] | None
 """Which candidates can be reached: a mask, indices, a function of the camera's pose (4, 4), or None for all."""
 
@@ -42,6 +49,7 @@ class Agent:
         stop: calibrated probability of the most likely class from which on the agent is sure, in (0, 1]; above 1 it never is.
         max_views: the budget: largest number of images of an object, views that are taken again included.
         unknown: an object that is stranger than this share of the known objects is an `unknown object`, in (0, 1]; None: never.
+            By default 0.95, or None for a system that has a class of unknown objects, or that cannot tell them.
         gain_per_cost: expected gain that one unit of a candidate's cost is worth, in units of the policy's scores (nats for
             `information_gain` and learned policies).
         distance: of the next cameras from the object's centre, in metres; by default that of the training views in radii.
@@ -61,19 +69,22 @@ class Agent:
     _: KW_ONLY
     stop: float = 0.95
     max_views: int = 8
-    unknown: float | None = None
+    unknown: Any = "default"
     gain_per_cost: float = 0.0
     distance: float | None = None
     max_candidates: int | None = None
     seed: int = 0
 
     def __post_init__(self) -> None:
+        can_tell = self.system.parts.strangeness is not None
+        if self.unknown == "default":
+            has_class = self.system.description.unknown_class is not None
+            self.unknown = _UNKNOWN if can_tell and not has_class else None
         most, unknown, gain, distance = self.max_views, self.unknown, self.gain_per_cost, self.distance
         _check(self.stop > 0, f"stop must be a probability above 0, got {self.stop}")
         _check(int(most) == most and 1 <= most <= 512, f"max_views must be from 1 to 512, got {most}")
         _check(unknown is None or 0 < unknown <= 1, f"unknown must be in (0, 1] or None, got {unknown}")
-        tells = unknown is None or self.system.parts.strangeness is not None
-        _check(tells, "this system cannot tell unknown objects: leave out unknown")
+        _check(unknown is None or can_tell, "this system cannot tell unknown objects: leave out unknown")
         _check(np.isfinite(gain) and gain >= 0, f"gain_per_cost must be at least 0, got {gain}")
         _check(distance is None or 0 < distance < np.inf, f"distance must be positive, in metres, got {distance}")
         shaded = self.system.description.image.content == "image"
@@ -205,7 +216,9 @@ class Agent:
                 )
             of, view = of.refined(self.system, image.copy(), self.history)
             self._object = of
-        return self._add(view.depth, of.placed(self.system, view), view.unknown, begun)
+            return self._add(view.image, of.placed(self.system, view), view.unknown, begun)
+        view = of.with_parts(self.system, image, view)
+        return self._add(view.image, of.placed(self.system, view), view.unknown, begun)
 
     @property
     def sphere(self) -> Sphere:
@@ -226,7 +239,7 @@ class Agent:
         """Adds a view that the system's own camera has taken, as it is in the data set.
 
         Args:
-            depth: in radii of the object along the optical axis, 0 where nothing is hit.
+            depth: in radii of the object along the optical axis, 0 where nothing is hit, NaN where it is unknown what is there.
             pose: from the camera to the object's frame, whose unit is the radius.
         """
         begun, of, side = time.perf_counter(), self._current, self.system.description.camera.resolution
@@ -242,7 +255,8 @@ class Agent:
             bool(np.isfinite(placed).all()) and bool(placed[:3, 3].any()),
             "pose is not finite, or at the object's centre",
         )
-        return self._add(image, placed, 0.0, begun)
+        unknown = np.mean(np.isnan(image), where=np.asarray(in_sphere(self.system.description.camera, side)))
+        return self._add(image, placed, float(unknown), begun)
 
     def _check_budget(self) -> None:
         _check(
@@ -253,8 +267,9 @@ class Agent:
     def _add(self, depth: np.ndarray, pose: np.ndarray, unseen: float, begun: float) -> Belief:
         of = self._current
         of.memory, said = of.programs.see(self.system.parts, of.memory, depth, pose, of.known_radius)
-        (probabilities, strangeness), count = jax.device_get((said, of.memory.count))
+        (probabilities, strangeness), count, slot = jax.device_get((said, of.memory.count, of.memory.latest))
         label = int(probabilities.argmax())
+        of.shown[int(slot)] = 1 - unseen
         belief = Belief(
             probabilities=probabilities,
             label=label,
@@ -263,7 +278,8 @@ class Agent:
             views=int(count),
             images=self.history.views + 1,
             strangeness=float(strangeness),
-            known=self.unknown is None or not strangeness > self.unknown,
+            known=label != self.system.description.unknown_class and not (self.unknown and strangeness > self.unknown),
+            evidence=sum(of.shown.values()),
             unseen=float(unseen),
             latency_ms=1e3 * (time.perf_counter() - begun),
         )
@@ -346,7 +362,8 @@ class Agent:
         belief = self._current.belief
         if belief is None:
             return ""
-        sure = belief.confidence >= self.stop
+        enough = _ENOUGH if self.system.description.told_unknown else _ENOUGH_EACH * belief.views
+        sure = belief.confidence >= self.stop and belief.evidence >= enough
         spent = belief.images >= self.max_views
         if not belief.known and (sure or spent):
             return "unknown object"

@@ -9,7 +9,8 @@ from jaxtyping import Bool, Float
 
 from mevs_jax.agent.programs import Programs
 from mevs_jax.agent.records import Belief, History
-from mevs_jax.geometry.canonical import CanonicalView, convert
+from mevs_jax.geometry.cameras import in_sphere
+from mevs_jax.geometry.canonical import CanonicalView, combined, convert
 from mevs_jax.geometry.source_view import DepthImage
 from mevs_jax.geometry.sphere import Sphere, estimate_sphere, upright
 from mevs_jax.trained.situation import Candidates, Memory
@@ -19,7 +20,14 @@ _REACH = 1.3
 """Points up to this many radii from the estimated centre belong to the object, since an estimate from one side is too small."""
 
 _LEAST = 0.5
-"""Share of an object's sphere that an image must show, and of a mask's pixels that must have a depth."""
+"""Share of an object's sphere that an image must show, and of a mask's pixels that must have a depth, for networks that are not
+told what is unknown."""
+_LEAST_PIXELS = 0.005
+"""Share of the sphere's pixels that must show the object, for networks that are told what is unknown."""
+_PART = 0.25
+"""An image that does not show more than this share of the sphere shows a part, which is seen together with other parts."""
+_ASIDE = 0.5
+"""Largest angle in radians between directions of images that are seen together."""
 _AT_VIEWPOINT = 1e-5
 """Poses that differ by less, in radii, are the same to rounding. Sampling of a cloud has ties, which rounding would decide."""
 
@@ -37,6 +45,8 @@ class Present:
         failed: directions (3,), in its frame, from which no view could be taken.
         points: (points, 3) of its surface in the world, if its sphere is estimated from them; None if it is known.
         images: from which they are.
+        parts: images that show a part, by direction: each as seen from the direction of the first.
+        shown: share of the sphere that is known in each view, by its slot in the memory.
     """
 
     sphere: Sphere
@@ -47,6 +57,8 @@ class Present:
     failed: list[np.ndarray] = field(default_factory=list)
     points: np.ndarray | None = None
     images: list[DepthImage] = field(default_factory=list)
+    parts: list[list[CanonicalView]] = field(default_factory=list)
+    shown: dict[int, float] = field(default_factory=dict)
 
     @property
     def known_radius(self) -> float:
@@ -66,6 +78,14 @@ class Present:
     def seen(self, system: TrainedSystem, image: DepthImage) -> CanonicalView:
         """A new image as the data set's camera would have taken it; raises `ValueError` if it shows too little of the object."""
         view = convert(image, self.sphere, system.description.camera)
+        if system.description.told_unknown:
+            pixels = np.asarray(in_sphere(system.description.camera, len(view.depth))).sum()
+            if (shown := (view.depth > 0).sum()) < _LEAST_PIXELS * pixels:
+                raise ValueError(
+                    f"only {shown} of the {pixels} pixels of the object's sphere show the object; aim the camera at its center, "
+                    "move closer, or check the mask"
+                )
+            return view
         if view.in_image < _LEAST:
             raise ValueError(
                 f"only {view.in_image:.0%} of the object's sphere is in the image, and half of it is needed; aim the camera at "
@@ -78,6 +98,20 @@ class Present:
                     f"only {share:.0%} of the mask's pixels have a measured depth, and half of them are needed; move the camera, "
                     "or take another image"
                 )
+        return view
+
+    def with_parts(self, system: TrainedSystem, image: DepthImage, view: CanonicalView) -> CanonicalView:
+        """A new view; if it shows a part of the object, together with the parts that were seen from about its direction."""
+        if not system.description.told_unknown or view.unknown <= _PART:
+            return view
+        for seen in self.parts:
+            if seen[0].direction @ view.direction > np.cos(_ASIDE):
+                try:
+                    seen.append(convert(image, self.sphere, system.description.camera, seen[0].direction))
+                except ValueError:  # nothing of it can be seen from there
+                    continue
+                return combined(seen, system.description.camera)
+        self.parts.append([view])
         return view
 
     def placed(self, system: TrainedSystem, view: CanonicalView) -> Float[np.ndarray, "4 4"]:
@@ -105,11 +139,13 @@ class Present:
         if np.linalg.norm(center - sphere.position) + abs(radius - sphere.radius) < 0.01 * sphere.radius:
             return again, self.seen(system, image)
         again.sphere, again.memory = replace(sphere, center=center, radius=radius), self.programs.blank()
+        again.shown = {}
         views = [convert(one, again.sphere, system.description.camera) for one in self.images]
         view, poses = again.seen(system, image), [again.placed(system, one) for one in views]
         for one, pose in zip(views, poses, strict=True):
-            again.memory, _ = self.programs.see(system.parts, again.memory, one.depth, pose, again.known_radius)
-        history.depths[:], history.poses[:] = [one.depth for one in views], poses
+            again.memory, _ = self.programs.see(system.parts, again.memory, one.image, pose, again.known_radius)
+            again.shown[int(again.memory.latest)] = 1 - one.unknown
+        history.depths[:], history.poses[:] = [one.image for one in views], poses
         history.options["reset"] |= {"center": center.tolist(), "radius": float(radius)}
         return again, view
 

@@ -28,7 +28,8 @@ class Belief:
         views: number of views seen; one that was taken again counts once.
         images: number of images seen, which the budget counts.
         strangeness: share of the known objects that look less strange after as many views, in [0, 1]; NaN if it is not measured.
-        known: False if the object is stranger than the agent's limit `unknown`.
+        known: False if the object is stranger than the agent's limit `unknown`, or most likely of the class of unknown objects.
+        evidence: how much of the object was seen, in views that show all of its sphere.
         unseen: share of the object's sphere that the latest image does not show, in [0, 1].
         latency_ms: time that the call took.
     """
@@ -41,6 +42,7 @@ class Belief:
     images: int
     strangeness: float
     known: bool
+    evidence: float
     unseen: float
     latency_ms: float
 

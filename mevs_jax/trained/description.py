@@ -12,6 +12,8 @@ from mevs_jax.models.shapes import PointNet2Shape, PoseShape, ResNetShape, SetFu
 
 FORM = 1
 """Version of the folder's form; a program reads this version alone."""
+UNKNOWN_OBJECT = "unknown object"
+"""Name of the class of all objects that belong to no other class, in a data set that has such objects."""
 
 
 @dataclass(frozen=True)
@@ -110,6 +112,16 @@ class Description:
     cloud: CloudInput | None = None
     view_policies: dict[str, ViewPolicyShape] = field(default_factory=dict)
     evaluation: dict[str, Any] = field(default_factory=dict)
+
+    @property
+    def told_unknown(self) -> bool:
+        """Whether its networks are told what an image does not show, so that images may show a part of the object."""
+        return self.image.channels == 5
+
+    @property
+    def unknown_class(self) -> int | None:
+        """Label of the class of objects that belong to no other class; None if there is no such class."""
+        return self.classes.index(UNKNOWN_OBJECT) if UNKNOWN_OBJECT in self.classes else None
 
     def __hash__(self) -> int:
         return hash(json.dumps(asdict(self), sort_keys=True, default=str))

@@ -67,7 +67,7 @@ def in_metres(depth, pose, sphere=LYING):
 
 def begun(system, policy="best", sphere=LYING, **options) -> Agent:
     """An agent that is never sure, with an object."""
-    agent = Agent(system, policy, **{"stop": 2} | options)
+    agent = Agent(system, policy, **{"stop": 2, "unknown": None} | options)
     agent.begin(sphere)
     return agent
 
@@ -118,7 +118,7 @@ def test_walks_are_those_of_the_selection_loop_on_tables(request, kind, policy):
     def by_table(key, first):
         return select_from_table(key, table, scene, run, first, max_views=6, fuse=fuse)
 
-    agent = Agent(system, policy, stop=2, max_views=6)
+    agent = Agent(system, policy, stop=2, max_views=6, unknown=None)
     for first, up, yaw in ((0, (0, 0, 1), 0.0), (7, UP, YAW)):
         sphere = mevs_jax.Sphere(CENTER, RADIUS, up, yaw if posed else None)
         seen, probabilities, reason = walk(agent, views, first, sphere)
@@ -144,12 +144,12 @@ def test_random_views_differ_between_objects_and_repeat_with_the_seed(classifier
 
 def test_it_stops_when_it_is_sure_or_has_spent_its_budget(classifier):
     views = views_of(classifier)
-    _, probabilities, reason = walk(Agent(classifier, "farthest", stop=0.3, max_views=6), views, 0)
+    _, probabilities, reason = walk(Agent(classifier, "farthest", stop=0.3, max_views=6, unknown=None), views, 0)
     assert reason == "sure"
     assert (probabilities[:-1].max(axis=1) < 0.3).all()
     assert probabilities[-1].max() >= 0.3
     for most in (1, 3):
-        seen, _, reason = walk(Agent(classifier, "farthest", stop=2, max_views=most), views, 0)
+        seen, _, reason = walk(Agent(classifier, "farthest", stop=2, max_views=most, unknown=None), views, 0)
         assert (len(seen), reason) == (most, "budget")
 
 
@@ -416,7 +416,7 @@ def test_strange_objects_are_unknown_when_the_agent_would_stop(classifier):
     agent.stop = 1e-9  # sure of every view
     agent.observe_view(*views[0])
     assert agent.decide().reason == "unknown object"
-    assert Agent(classifier, stop=2, max_views=2).unknown is None
+    assert Agent(classifier, stop=2, max_views=2).unknown == 0.95
 
 
 def test_nothing_is_compiled_after_the_warm_up(recogniser):

@@ -65,7 +65,7 @@ def test_the_last_view_is_the_one_that_was_looked_at_last(classifier):
 
 def test_the_budget_of_refined_spheres_counts_images_too(classifier):
     depth, K, pose = in_metres(*views_of(classifier)[3])
-    agent = Agent(classifier, stop=2, max_views=2)
+    agent = Agent(classifier, stop=2, max_views=2, unknown=None)
     image = depth, K, pose
     points = CENTER + RADIUS * np.random.default_rng(0).uniform(-0.5, 0.5, (200, 3))
     agent.reset_from_points(points)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import jax.numpy as jnp
 import numpy as np
 from flax import nnx
@@ -24,7 +26,7 @@ from mevs_jax.trained import (
     TrainedSystem,
     fit_strangeness,
 )
-from mevs_jax.trained.description import FORM
+from mevs_jax.trained.description import FORM, UNKNOWN_OBJECT
 
 CLASSES = ("bed", "chair", "sofa", "table")
 VIEWS = 12
@@ -63,11 +65,17 @@ def system(kind: str = "classifier", seed: int = 0) -> TrainedSystem:
     """A small system; its networks are random, and sure of what they see.
 
     Args:
-        kind: `classifier`, `recogniser`, or `sized`, a recogniser that uses the size of objects.
+        kind: `classifier`, `recogniser`, `sized`, a recogniser that uses the size of objects, or `parts`, one that is told what
+            is unknown and has a class of unknown objects in place of tables.
         seed: of its weights.
     """
     rngs, random = nnx.Rngs(seed), np.random.default_rng(seed)
-    of = description("recogniser", size=SizeInput()) if kind == "sized" else description(kind)
+    of = description(kind if kind == "classifier" else "recogniser")
+    if kind == "sized":
+        of = replace(of, size=SizeInput())
+    if kind == "parts":
+        image, encoder = ImageInput("depth_and_normals", 5), replace(of.encoder, channels=5)
+        of = replace(of, image=image, encoder=encoder, classes=(*CLASSES[:-1], UNKNOWN_OBJECT))
     classes, graph = len(CLASSES), ViewGraph.from_points(fibonacci_sphere(VIEWS))
     encoder = of.encoder.network(classes, rngs)
     encoder.head.kernel.set_value(8 * encoder.head.kernel[...])

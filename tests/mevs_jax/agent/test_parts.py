@@ -1,0 +1,99 @@
+"""Images that show a part of the object, for a system that is told what is unknown."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from mevs_jax.agent import Agent
+from mevs_jax.trained import TrainedSystem
+from tests.mevs_jax.agent.test_agent import K, begun, in_metres, pose_at, views_of
+from tests.mevs_jax.trained import making
+
+
+@pytest.fixture(scope="module")
+def parts() -> TrainedSystem:
+    return making.system("parts")
+
+
+def half(image: np.ndarray, number: int) -> np.ndarray:
+    """The left, right, upper or lower half of an image; the rest was not measured."""
+    turned = np.rot90(image, number)
+    shown = np.where(np.arange(len(image)) < len(image) // 2, turned, np.nan)
+    return np.rot90(shown, -number)
+
+
+def test_parts_from_about_one_direction_are_one_view(parts):
+    direction = np.array([0.6, -0.48, 0.64])
+    whole, agent = begun(parts, max_views=5), begun(parts, max_views=5)
+    expected = whole.observe(*in_metres(making.depth_of_ball(direction), pose_at(*direction)))
+    for number in range(4):
+        aside = direction + 0.05 * np.array([np.cos(number), np.sin(number), 0]) * (number > 0)
+        aside /= np.linalg.norm(aside)
+        depth, K, pose = in_metres(making.depth_of_ball(aside), pose_at(*aside))
+        belief = agent.observe(half(depth, number), K, pose)
+        assert (belief.views, belief.images) == (1, number + 1)
+        shown = (0.5, 0.75, 1.0, 1.0)[number]
+        assert belief.evidence == pytest.approx(shown, abs=0.1)
+        assert belief.unseen == pytest.approx(1 - shown, abs=0.1)
+    np.testing.assert_allclose(belief.probabilities, expected.probabilities, atol=0.15)
+    other = agent.observe(*in_metres(*views_of(parts)[0]))
+    assert other.views == 2
+    assert other.evidence > 1.8
+
+
+def test_confidence_without_evidence_is_not_sure(parts, recogniser):
+    depth, K, pose = in_metres(*views_of(parts)[3])
+    small = np.full_like(depth, np.nan)
+    at = np.argwhere(np.isfinite(depth))
+    small[tuple(at[::8].T)] = depth[tuple(at[::8].T)]
+    for system, image in (
+        (parts, small),
+        (recogniser, np.where(np.random.default_rng(0).random(depth.shape) < 0.4, depth, np.nan)),
+    ):
+        agent = begun(system, stop=1e-9, max_views=3)
+        belief = agent.observe(image, K, pose)
+        assert belief.evidence < 0.5
+        assert agent.decide().reason == ""
+        agent.observe(depth, K, pose)
+        assert agent.decide().reason in ("sure", "unknown object")
+
+
+def test_an_image_that_shows_next_to_nothing_is_refused(parts):
+    depth, _, pose = in_metres(*views_of(parts)[3])
+    one = np.full_like(depth, np.nan)
+    middle = len(one) // 2
+    one[middle, middle] = depth[middle, middle]
+    agent = begun(parts)
+    with pytest.raises(ValueError, match="pixels of the object's sphere show the object; aim the camera"):
+        agent.observe(one, K, pose)
+    assert agent.history.views == 0
+
+
+def test_the_class_of_unknown_objects_is_an_answer_of_its_own(parts):
+    label = parts.description.unknown_class
+    assert parts.classes[label] == "unknown object"
+    assert Agent(parts).unknown is None
+    fusion = {
+        name: replace(fusion, prior=fusion.prior.at[label].set(-30.0)) for name, fusion in parts.parts.fusion.items()
+    }
+    stranger = replace(parts, parts=replace(parts.parts, fusion=fusion))  # all is unknown to it
+    for stop, reasons in ((0.9, ["unknown object"]), (2.0, ["", "unknown object"])):
+        agent = begun(stranger, stop=stop, max_views=2)
+        for index, reason in enumerate(reasons):
+            belief = agent.observe_view(*views_of(parts)[index])
+            assert (belief.name, belief.known) == ("unknown object", False)
+            assert agent.decide().reason == reason
+
+
+def test_what_an_image_does_not_show_matters(parts, recogniser):
+    """A system that is not told takes it for background."""
+    depth, pose = views_of(parts)[2]
+    unknown = np.where(np.arange(len(depth)) < len(depth) // 2, np.nan, depth).astype(np.float32)
+    for system, equal in ((parts, False), (recogniser, True)):
+        given, taken = (
+            begun(system).observe_view(image, pose).probabilities for image in (unknown, np.nan_to_num(unknown))
+        )
+        assert np.allclose(given, taken, atol=1e-6) == equal
