@@ -190,8 +190,8 @@ class LookOptions:
     """calibrated probability of the class at which to stop; above 1 never"""
     max_views: Annotated[int, _arg("N", "8")] = 8
     """largest number of views"""
-    unknown: Annotated[float | None, _arg("Q", "no such answer")] = None
-    """answer "unknown object" for an object that is stranger than this share of the known ones, as 0.99"""
+    unknown: Annotated[float | None, _arg("Q", "0.95, unless the system has a class of unknown objects")] = None
+    """answer "unknown object" for an object that is stranger than this share of the known ones; 1: never"""
     up: Up = "auto"
     """the upward axis of the mesh"""
     metres: Annotated[float, _arg("M", "0, its size is unknown")] = 0.0

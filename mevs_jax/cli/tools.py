@@ -38,7 +38,8 @@ def look(options: LookOptions) -> None:
     system = load_system(options.system)
     if options.metres and system.description.size is None:
         raise Unusable(f"{options.system} does not use sizes; leave out --metres")
-    given = {name: getattr(options, name) for name in ("policy", "stop", "max_views", "unknown")}
+    given = {name: getattr(options, name) for name in ("policy", "stop", "max_views")}
+    given |= {} if options.unknown is None else {"unknown": options.unknown}
     try:
         if mesh is not None:
             from mevs_jax.agent import look as look_at_mesh

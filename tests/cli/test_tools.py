@@ -63,7 +63,22 @@ def frames(tmp_path_factory):
 
 def test_a_mesh_is_looked_at(system, chair, at_once, tmp_path):
     picture, kept = tmp_path / "walk.png", tmp_path / "walk.npz"
-    options = ["--system", system, "--mesh", chair, "--up", "y", "--max-views", 3, "--stop", 2, "--first", 4]
+    options = [
+        "--system",
+        system,
+        "--mesh",
+        chair,
+        "--up",
+        "y",
+        "--max-views",
+        3,
+        "--stop",
+        2,
+        "--first",
+        4,
+        "--unknown",
+        1,
+    ]
     walk = json.loads(ended(at_once("look", *options, "--json", "--draw", picture, "--save", kept)))
     assert walk["object"] == "chair.obj"
     assert walk["views"][0] == 4
@@ -74,13 +89,15 @@ def test_a_mesh_is_looked_at(system, chair, at_once, tmp_path):
     assert picture.read_bytes().startswith(b"\x89PNG")
     assert load_history(kept).views == 3
     piece = furniture("chair", 3)
-    again = mevs_jax.look(load(system), piece.vertices, piece.faces, first=4, max_views=3, stop=2)
+    again = mevs_jax.look(load(system), piece.vertices, piece.faces, first=4, max_views=3, stop=2, unknown=None)
     assert list(again.views) == walk["views"]
     assert str(again).splitlines()[-1].endswith("after 3 views (budget)")
 
 
 def test_recorded_images_are_looked_at(system, frames, at_once):
-    said = at_once("look", "--system", system, "--depth", frames[0], "--stop", 2, "--policy", "farthest")
+    said = at_once(
+        "look", "--system", system, "--depth", frames[0], "--stop", 2, "--unknown", 1, "--policy", "farthest"
+    )
     lines = ended(said).splitlines()
     assert lines[0] == "frames.npz"
     assert lines[-1].endswith("after 6 views (budget)")
