@@ -22,6 +22,8 @@ from mevs_jax.arrays import AnyArray
 from mevs_jax.geometry.cameras import ViewCamera, in_sphere, look_at_origin, partial_cloud, pixel_directions
 from mevs_jax.geometry.source_view import MARGIN
 
+_BARE = 0.15
+"""Share of the images in which nothing but the object has a measured depth."""
 _WAVES = 6
 """Plane waves of the random field that says where an image has patches without depth."""
 
@@ -44,7 +46,7 @@ class RealityAugmentation:
     """largest share of the object's width that something else hides"""
     unseen: float = 0.0
     """largest share of the object's sphere that an image does not show, in half of the images, at any strength: it is outside
-    of the image, behind something else, or has no measured depth"""
+    of the image, behind something else, or has no measured depth; in some images, all of the background has none"""
 
 
 def used_reality(config: RealityAugmentation, option: str) -> RealityAugmentation | None:
@@ -136,6 +138,7 @@ def as_in_reality(
     unknown |= (depth > 0) & (sensed == 0)
     if config.unseen:
         unknown |= unseen_part(jax.random.fold_in(noise, 1), len(depth), config.unseen)
+        unknown |= (sensed == 0) & jax.random.bernoulli(jax.random.fold_in(noise, 2), _BARE)
     depth = jnp.asarray(jax.lax.optimization_barrier(jnp.where(unknown, jnp.nan, sensed)))
     offset = jax.random.ball(where, 3) * strength * config.sphere
     factor = 1 + strength * config.sphere * jax.random.uniform(size, minval=-1.0)

@@ -30,10 +30,8 @@ from mevs_jax.trained.system import TrainedSystem
 
 _UNKNOWN = 0.95
 """By default, an object that is stranger than this share of the known ones is unknown."""
-_ENOUGH = 0.25
+_ENOUGH = 0.15
 """How much of the object must have been seen before the agent is sure, in views that show all of its sphere."""
-_ENOUGH_EACH = 0.5
-"""The same for each view, where networks are not told what is unknown."""
 Reachable = AnyArray | Sequence[int] | Callable[[np.ndarray], bool] | None
 """Which candidates can be reached: a mask, indices, a function of the camera's pose (4, 4), or None for all."""
 
@@ -362,8 +360,8 @@ class Agent:
         belief = self._current.belief
         if belief is None:
             return ""
-        enough = _ENOUGH if self.system.description.told_unknown else _ENOUGH_EACH * belief.views
-        sure = belief.confidence >= self.stop and belief.evidence >= enough
+        enough = belief.evidence >= _ENOUGH or not self.system.description.told_unknown
+        sure = belief.confidence >= self.stop and enough
         spent = belief.images >= self.max_views
         if not belief.known and (sure or spent):
             return "unknown object"
