@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -20,18 +21,21 @@ from data_pipeline.objects.names import plain_class
 from data_pipeline.objects.sources import load_object, objects_to_test
 from data_pipeline.progress import progress_bar
 from eval.checks.agent import STOPS
+from eval.checks.promise import PromiseRow, Strangers, promises, strangers
 from eval.checks.walks import BASELINE, AccuracyRow, Observer, Walker, Walks, rows_of, with_interval
 from eval.numbers.confidence import stopping
 from eval.system import USABLE
 from mevs_jax.geometry.cameras import pixel_directions
 from mevs_jax.selection.loop import ViewTable
 from mevs_jax.trained import TrainedSystem
+from mevs_jax.trained.description import UNKNOWN_OBJECT
 from train.results.records import named
 
 VIEWS = (1, 2, 3, 4, 8)
 """Numbers of views after which accuracy is reported."""
 STRANGER = -1
 """Label of an object whose class the system does not know."""
+_NONE_KNOWN = "the system knows none of these classes; if one only has another name, say so: --names FOLDER=CLASS"
 
 
 @dataclass(frozen=True)
@@ -89,30 +93,6 @@ class StoppingRow:
 
 
 @dataclass(frozen=True)
-class StrangerRow:
-    """How well strangeness tells objects of unknown classes from the others after some random views.
-
-    Attributes:
-        auroc: area under the ROC curve (½ is chance, 1 perfect) of one walk of each object, averaged over draws.
-        unknown_found, known_refused: shares of unknown and of known objects that are stranger than 95 % of the validation
-            objects.
-    """
-
-    views: int
-    auroc: float
-    unknown_found: float
-    known_refused: float
-
-
-@dataclass(frozen=True)
-class Strangers:
-    """Number of objects of unknown classes, and how well they are distinguished from the others."""
-
-    objects: int
-    after: list[StrangerRow]
-
-
-@dataclass(frozen=True)
 class Answer:
     """How often one known object was right after one random view, and at the end of the best policy's walks."""
 
@@ -140,7 +120,9 @@ class Transfer:
         objects, known, strangers: number of all objects, of those of known and of unknown classes.
         classes, known_as: number of objects, and the system's class, by class of the data.
         left_out: reasons by name.
-        unknown_objects: None where there are none, or the system cannot tell them; all that follows on walks is of known ones.
+        single_view: of known objects, as all figures of walks but `promises` and `unknown_objects`; None without any.
+        promises: what agents would say, of known and of unknown objects.
+        unknown_objects: None where there are none, or no known ones, or the system cannot tell them.
     """
 
     system: str
@@ -155,11 +137,12 @@ class Transfer:
     known_as: dict[str, str]
     left_out: dict[str, str]
     notes: list[str]
-    single_view: SingleView
+    single_view: SingleView | None
     policies: list[AccuracyRow]
     by_class: list[ClassRow]
     calibration: list[CalibrationRow]
     stopping: list[StoppingRow]
+    promises: list[PromiseRow]
     unknown_objects: Strangers | None
     answers: list[Answer]
 
@@ -174,22 +157,18 @@ def matched(classes: Sequence[str], known: Sequence[str], renamed: Mapping[str, 
         known: names of the system's classes, by label.
         renamed: the system's class for classes that are called otherwise.
 
+    A class of unknown objects, of the source or of the system, is none that is known.
+
     Raises:
-        DataError: if no class is known, or `renamed` names a class that is not there.
+        DataError: if `renamed` names a class that is not there.
     """
-    labels = {plain_class(name): label for label, name in enumerate(known)}
+    labels = {plain_class(name): label for label, name in enumerate(known) if name != UNKNOWN_OBJECT}
     for folder, name in renamed.items():
         if folder not in classes:
             raise DataError(f"--names {folder}={name}: the objects have no class {folder}, but {', '.join(classes)}")
         if plain_class(name) not in labels:
             raise DataError(f"--names {folder}={name}: the system knows no class {name}, but {', '.join(known)}")
-    found = {folder: labels.get(plain_class(renamed.get(folder, folder)), STRANGER) for folder in classes}
-    if all(label == STRANGER for label in found.values()):
-        raise DataError(
-            f"none of the classes {', '.join(classes)} is one that the system knows ({', '.join(known)}); if one only has "
-            f"another name, say so: --names FOLDER=CLASS"
-        )
-    return found
+    return {folder: labels.get(plain_class(renamed.get(folder, folder)), STRANGER) for folder in classes}
 
 
 def see_objects(system: TrainedSystem, source: ObjectSource, labels: Mapping[str, int], metres: float) -> Objects:
@@ -267,14 +246,13 @@ def check_transfer(
     labels = matched(source.classes, system.classes, renamed or {})
     objects = see_objects(system, source, labels, metres)
     known = objects.labels != STRANGER
-    if not known.any():
-        raise DataError(f"{data} has no object left of a class that the system knows; {len(objects.left_out)} left out")
-    of_known = jax.tree.map(lambda leaf: leaf[known], objects.tables)
     best = system.description.best if posed else system.description.best_unposed
     walker = Walker(system)
     policies = [name for name in dict.fromkeys((BASELINE, *USABLE, best)) if system.can_run(name, posed)]
     times = {name: draws if name == BASELINE else 1 for name in policies}
-    walks = {name: walker.walk(of_known, name, max_views, posed=posed, draws=times[name]) for name in policies}
+    walked = policies if known.any() else list(dict.fromkeys((BASELINE, best)))
+    every = {name: walker.walk(objects.tables, name, max_views, posed=posed, draws=times[name]) for name in walked}
+    budgets = [count for count in VIEWS if count <= every[best].right.shape[-1]]
     return Transfer(
         system=system.name,
         data=data,
@@ -287,15 +265,29 @@ def check_transfer(
         classes=dict(Counter(objects.folders)),
         known_as={folder: system.classes[label] for folder, label in labels.items() if label != STRANGER},
         left_out=objects.left_out,
-        notes=[*source.notes, *source.said],
-        single_view=SingleView(*with_interval(walks[BASELINE].accuracy[:, 0])),
-        policies=rows_of(walks, VIEWS),
-        by_class=_by_class(objects.labels[known], system.classes, walks[BASELINE].accuracy, walks[best].accuracy),
-        calibration=[row for name in dict.fromkeys((BASELINE, best)) for row in _calibration(name, walks[name])],
-        stopping=_stops(walks[best]),
-        unknown_objects=strangers(system, objects.tables, known),
-        answers=_answers(objects, known, walks[best]),
+        notes=[*source.notes, *source.said, *[_NONE_KNOWN] * (not known.any())],
+        **_of_known(system, objects, {name: walks.some(known) for name, walks in every.items()}, best),
+        promises=promises(every[best], known, STOPS, budgets),
+        unknown_objects=strangers(every[BASELINE], known),
     )
+
+
+def _of_known(system: TrainedSystem, objects: Objects, walks: dict[str, Walks], best: str) -> dict[str, Any]:
+    """The figures of a `Transfer` that known objects alone have, from their walks."""
+    labels, names = (np.asarray(values)[objects.labels != STRANGER] for values in (objects.labels, objects.names))
+    if not len(labels):
+        return {"single_view": None, "policies": [], "by_class": [], "calibration": [], "stopping": [], "answers": []}
+    accuracy = walks[best].accuracy
+    return {
+        "single_view": SingleView(*with_interval(walks[BASELINE].accuracy[:, 0])),
+        "policies": rows_of(walks, VIEWS),
+        "by_class": _by_class(labels, system.classes, walks[BASELINE].accuracy, accuracy),
+        "calibration": [row for name in dict.fromkeys((BASELINE, best)) for row in _calibration(name, walks[name])],
+        "stopping": _stops(walks[best]),
+        "answers": [
+            Answer(str(name), float(row[0]), float(row[-1])) for name, row in zip(names, accuracy, strict=True)
+        ],
+    }
 
 
 def _stops(walks: Walks) -> list[StoppingRow]:
@@ -322,37 +314,3 @@ def _calibration(policy: str, walks: Walks) -> list[CalibrationRow]:
         means = float(confidence.mean()), float(accuracy.mean())
         rows.append(CalibrationRow(policy, count, *means, *with_interval(confidence - accuracy)))
     return rows
-
-
-def _answers(objects: Objects, known: np.ndarray, walks: Walks) -> list[Answer]:
-    names = [name for name, is_known in zip(objects.names, known, strict=True) if is_known]
-    return [Answer(name, float(row[0]), float(row[-1])) for name, row in zip(names, walks.accuracy, strict=True)]
-
-
-def strangers(
-    system: TrainedSystem, tables: ViewTable, known: np.ndarray, draws: int = 32, seed: int = 0
-) -> Strangers | None:
-    """How well strangeness tells objects of unknown classes from the others, on random walks; None if one kind is missing."""
-    if system.parts.strangeness is None or known.all() or not known.any():
-        return None
-    views, measure, rows = tables.logits.shape[1], jax.jit(jax.vmap(system.parts.strangeness.of)), []
-    random, all_logits = np.random.default_rng(seed), np.asarray(tables.logits)
-    energy = -np.asarray(jax.nn.logsumexp(tables.logits, axis=-1))
-    for count in (count for count in (1, 2, 4) if count <= views):
-        areas, beyond = [], np.zeros(len(known))
-        for _ in range(draws):
-            chosen = np.argsort(random.random((len(known), views)), axis=1)[:, :count]
-            areas.append(auroc(np.take_along_axis(energy, chosen, axis=1).mean(axis=1), ~known))
-            logits = jnp.asarray(np.take_along_axis(all_logits, chosen[..., None], axis=1))
-            beyond += (np.asarray(measure(logits, jnp.ones((len(known), count), bool))) > 0.95) / draws
-        refused = float(beyond[~known].mean()), float(beyond[known].mean())
-        rows.append(StrangerRow(count, float(np.mean(areas)), *refused))
-    return Strangers(int((~known).sum()), rows)
-
-
-def auroc(scores: np.ndarray, positive: np.ndarray) -> float:
-    """Probability that a positive has a higher score than a negative; equal scores count half."""
-    from scipy.stats import rankdata  # late, since it takes a quarter of a second
-
-    ranks, count = rankdata(scores), int(positive.sum())
-    return float((ranks[positive].sum() - count * (count + 1) / 2) / (count * (len(scores) - count)))

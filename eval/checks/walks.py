@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from functools import cache, partial
 from typing import Any
 
@@ -14,6 +14,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from eval.numbers.comparison import intervals
 from mevs_jax.beliefs.fusing import running_sum
+from mevs_jax.beliefs.strangeness import STRANGE
 from mevs_jax.policies.base import Observation
 from mevs_jax.selection.loop import ViewTable
 from mevs_jax.selection.walks import every_walk, walks_around
@@ -34,11 +35,20 @@ class Walks:
         right: after each number of views, whether the most likely class is the true one; False for an object of no known class.
         confidence: calibrated probability of the most likely class.
         views: the views of every walk, in order.
+        strange: how likely the object belongs to no known class: the probability of the class of unknown objects, or else the
+            share of known objects that are less strange; NaN where neither is known.
+        unknown: whether an agent would say that the object is unknown, if it stopped.
     """
 
     right: Bool[np.ndarray, "objects walks steps"]
     confidence: Float[np.ndarray, "objects walks steps"]
     views: Int[np.ndarray, "objects walks steps"]
+    strange: Float[np.ndarray, "objects walks steps"]
+    unknown: Bool[np.ndarray, "objects walks steps"]
+
+    def some(self, objects: Bool[np.ndarray, " objects"]) -> Walks:
+        """Those around some of the objects."""
+        return Walks(*(getattr(self, one.name)[objects] for one in fields(self)))
 
     @property
     def accuracy(self) -> Float[np.ndarray, "objects steps"]:
@@ -135,7 +145,7 @@ class Walker:
         shared = self.system.parts, every_walk(firsts, draws), jnp.asarray(can_reach), jax.random.key(seed)
         return Walks(*over_objects(self._around(policy, posed), objects, *shared, at_once=_AT_ONCE, steps=steps))
 
-    def _around_by(self, policy: str, posed: bool) -> Callable[..., tuple[Array, Array, Array]]:
+    def _around_by(self, policy: str, posed: bool) -> Callable[..., tuple[Array, ...]]:
         system, graph = self.system, self.system.graph
         log_probabilities = partial(system.log_probabilities, policy=system.calibrated_as(policy, posed))
 
@@ -147,18 +157,36 @@ class Walker:
             key: Array,
             *,
             steps: int,
-        ) -> tuple[Array, Array, Array]:
-            """Whether predictions are right, confidences and views of the walks around one object."""
+        ) -> tuple[Array, ...]:
+            """The `Walks` around one object."""
             number, table = one
             fuse, run = system.fuse(parts, posed), system.policy(policy, parts, posed)
             scene = table.scene(graph, parts.knowledge if posed else parts.knowledge_by_pose(graph.points), can_reach)
             views = walks_around(key, table.observe, scene, run, (number, *walks), max_views=steps, fuse=fuse).views
             beliefs = jax.vmap(partial(beliefs_along, parts, table, posed=posed))(views)
             calibrated = jax.vmap(jax.vmap(log_probabilities), (0, None))(beliefs, jnp.arange(1, steps + 1))
-            right = jnp.argmax(calibrated, axis=-1) == table.label
-            return right, jnp.exp(jnp.max(calibrated, axis=-1)), views
+            answer, strange = jnp.argmax(calibrated, axis=-1), _strange(system, parts, table, views, calibrated)
+            label = system.description.unknown_class
+            unknown = strange > STRANGE if label is None else answer == label
+            return answer == table.label, jnp.exp(jnp.max(calibrated, axis=-1)), views, strange, unknown
 
         return around
+
+
+def _strange(
+    system: TrainedSystem,
+    parts: Parts,
+    table: ViewTable,
+    views: Int[Array, "walks steps"],
+    calibrated: Float[Array, "walks steps classes"],
+) -> Float[Array, "walks steps"]:
+    """`Walks.strange` of the walks around one object."""
+    if (label := system.description.unknown_class) is not None:
+        return jnp.exp(calibrated[..., label])
+    if parts.strangeness is None:
+        return jnp.full(views.shape, jnp.nan)
+    present = jnp.tril(jnp.ones((views.shape[1],) * 2, bool))
+    return jax.vmap(jax.vmap(parts.strangeness.of, (None, 0)), (0, None))(table.logits[views], present)
 
 
 @dataclass(frozen=True)

@@ -20,6 +20,7 @@ from mevs_jax.agent.present import Present, sphere_of
 from mevs_jax.agent.programs import Programs
 from mevs_jax.agent.records import Belief, History, Reason, Step, plain
 from mevs_jax.arrays import AnyArray, AnyVector
+from mevs_jax.beliefs.strangeness import STRANGE
 from mevs_jax.geometry.cameras import in_sphere
 from mevs_jax.geometry.inputs import check_depth
 from mevs_jax.geometry.source_view import DepthImage
@@ -28,8 +29,6 @@ from mevs_jax.policies.base import Policy
 from mevs_jax.trained.situation import Candidates
 from mevs_jax.trained.system import TrainedSystem
 
-_UNKNOWN = 0.95
-"""By default, an object that is stranger than this share of the known ones is unknown."""
 _ENOUGH = 0.15
 """How much of the object must have been seen before the agent is sure, in views that show all of its sphere."""
 Reachable = AnyArray | Sequence[int] | Callable[[np.ndarray], bool] | None
@@ -77,7 +76,7 @@ class Agent:
         can_tell = self.system.parts.strangeness is not None
         if self.unknown == "default":
             has_class = self.system.description.unknown_class is not None
-            self.unknown = _UNKNOWN if can_tell and not has_class else None
+            self.unknown = STRANGE if can_tell and not has_class else None
         most, unknown, gain, distance = self.max_views, self.unknown, self.gain_per_cost, self.distance
         _check(self.stop > 0, f"stop must be a probability above 0, got {self.stop}")
         _check(int(most) == most and 1 <= most <= 512, f"max_views must be from 1 to 512, got {most}")

@@ -15,6 +15,8 @@ from jaxtyping import Array, Bool, Float
 
 from mevs_jax.arrays import AnyArray
 
+STRANGE = 0.95
+"""An object that is stranger than this share of the known objects is unknown, unless another share is asked for."""
 LEVELS = 201
 """Number of quantiles of the energies of known objects that are kept for each number of views."""
 

@@ -120,7 +120,39 @@ def transfer_text(found: Transfer) -> str:
     if found.strangers:
         lines.append(f"{found.strangers} objects of unknown classes: {', '.join(named[False])}")
     lines += [f"left out: {name}: {reason}" for name, reason in found.left_out.items()]
-    lines += [*found.notes, "", *_policy_lines(found)]
+    lines += [*found.notes, *_known_lines(found), *_promise_lines(found)]
+    for seen in found.unknown_objects.after if found.unknown_objects else []:
+        lines.append(
+            f"unknown objects, {seen.views} random views seen: AUROC {seen.auroc:.3f}; said to be unknown: "
+            f"{100 * seen.unknown_found:.0f} % of the unknown, {100 * seen.known_refused:.0f} % of the known"
+        )
+    return "\n".join(lines)
+
+
+def _promise_lines(found: Transfer) -> list[str]:
+    """What agents would say, at each probability and number of views."""
+
+    def shown(share: float | None) -> str:
+        return f"{'–' if share is None else f'{100 * share:.1f} %':>11}"
+
+    titles = "wrong", "sure", "unknown", "sure", "unknown"
+    lines = [
+        "",
+        "Answers of agents by the best policy: wrong among the sure ones of known objects; known objects that end sure,",
+    ]
+    lines += ["or as unknown objects; objects of unknown classes that end sure, or as unknown objects:"]
+    lines.append(f"  {'stop':>5}{'views':>6}" + "".join(f"{title:>11}" for title in titles))
+    for row in found.promises:
+        shares = row.wrong, row.sure, row.refused, row.strangers_sure, row.strangers_refused
+        lines.append(f"  {row.stop:>5g}{row.views:>6}" + "".join(map(shown, shares)))
+    return lines
+
+
+def _known_lines(found: Transfer) -> list[str]:
+    """Accuracy and calibration of known objects."""
+    if found.single_view is None:
+        return []
+    lines = ["", *_policy_lines(found)]
     lines += ["", "By class: accuracy of single views, and after 2 and 4 views by the best policy:"]
     for row in found.by_class:
         shares = [row.single, *(row.chosen[count - 1] for count in (2, 4) if count <= len(row.chosen))]
@@ -134,12 +166,7 @@ def transfer_text(found: Transfer) -> str:
             f"  stops at {stop.stop:g}: {error} (promised {100 * stop.risk:g} %), "
             f"{100 * stop.sure:.0f} % of walks stop, {stop.views:.1f} views"
         )
-    for seen in found.unknown_objects.after if found.unknown_objects else []:
-        lines.append(
-            f"unknown objects, {seen.views} seen: AUROC {seen.auroc:.3f}; stranger than 95 % of validation objects: "
-            f"{100 * seen.unknown_found:.0f} % of the unknown, {100 * seen.known_refused:.0f} % of the known"
-        )
-    return "\n".join(lines)
+    return lines
 
 
 def reality(options: RealityOptions) -> None:

@@ -15,8 +15,9 @@ import eval.checks.reality as reality
 import eval.checks.transfer as transfer
 from data_pipeline.objects.mesh import ObjectEntry, ObjectSource
 from data_pipeline.objects.recipes import FurniturePiece
+from eval.checks.promise import strangers
 from eval.checks.reality import RealityConfig, check_reality
-from eval.checks.transfer import STRANGER, Objects, Transfer, check_transfer, strangers
+from eval.checks.transfer import STRANGER, Objects, Transfer, check_transfer
 from eval.checks.walks import BASELINE, Walker, Walks
 from mevs_jax.selection.loop import ViewTable
 from mevs_jax.trained import TrainedSystem
@@ -67,7 +68,8 @@ class Seen:
         found = some_walks(len(policy), objects, starts, views, min(steps, views))
         right = np.zeros(found.shape, bool)
         right[..., 1:] = policy == self.winner
-        return Walks(right, np.random.default_rng(len(policy)).random(found.shape).astype(np.float32), found)
+        confidence = np.random.default_rng(len(policy)).random(found.shape).astype(np.float32)
+        return Walks(right, confidence, found, np.full(found.shape, np.nan), np.zeros(found.shape, bool))
 
 
 def transfer_with(patch: pytest.MonkeyPatch, seen: Seen, labels: np.ndarray, **options: Any) -> Transfer:
@@ -77,7 +79,6 @@ def transfer_with(patch: pytest.MonkeyPatch, seen: Seen, labels: np.ndarray, **o
     names = [f"o{number}" for number in range(OBJECTS)]
     without_bootstrap(patch)
     seen.watch(patch)
-    patch.setattr(transfer, "strangers", lambda *given: None)  # tested below
     patch.setattr(transfer, "objects_to_test", lambda data, up: source())
     patch.setattr(transfer, "see_objects", lambda *given: Objects(names, folders, labels, tables_of(labels), {}))
     return check_transfer(system(), "tested", max_views=4, draws=2, **options)
@@ -181,7 +182,8 @@ def test_strangeness_is_compared_with_the_objects_that_the_system_was_fitted_on(
     moved = replace(
         of.parts, strangeness=replace(of.parts.strangeness, quantiles=of.parts.strangeness.quantiles + shift)
     )
-    found = strangers(replace(of, parts=moved), tables_of(LABELS), np.arange(OBJECTS) < 10, draws=1)
+    walks = Walker(replace(of, parts=moved)).walk(tables_of(LABELS), BASELINE, 4)
+    found = strangers(walks, np.arange(OBJECTS) < 10)
     assert found is not None
     for row in found.after:
         assert row.unknown_found == row.known_refused == (shift < 0)

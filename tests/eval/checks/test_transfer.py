@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 
 import jax.numpy as jnp
 import numpy as np
@@ -10,9 +11,13 @@ import pytest
 
 import mevs_jax
 from data_pipeline.errors import DataError
-from data_pipeline.objects.recipes import FurniturePiece
+from data_pipeline.objects.recipes import FurniturePiece, read_mesh
 from data_pipeline.objects.sources import objects_to_test
-from eval.checks.transfer import STRANGER, Transfer, auroc, check_transfer, matched, strangers
+from eval.checks.promise import auroc, promises, strangers
+from eval.checks.transfer import STRANGER, Transfer, check_transfer, matched
+from eval.checks.walks import Walker, Walks
+from mevs_jax.beliefs.strangeness import Strangeness
+from mevs_jax.cli.checks import transfer_text
 from mevs_jax.selection.loop import ViewTable
 from tests.mevs_jax.trained import making
 from train.results.records import as_json, from_json
@@ -72,7 +77,7 @@ def test_other_furniture_of_known_kinds_is_recognised(found):
         assert row.gain == pytest.approx(row.accuracy - rows["random", views].accuracy)
         if views == 1:  # the same first views
             assert row.accuracy == rows["random", 1].accuracy, policy
-    assert [row.views for row in found.unknown_objects.after] == [1, 2, 4]
+    assert [row.views for row in found.unknown_objects.after] == [1, 2]
     assert found.unknown_objects.objects == 1
     single = np.mean([answer.single for answer in found.answers])
     assert single == pytest.approx(found.single_view.accuracy)
@@ -93,8 +98,10 @@ def test_names_of_classes(tmp_path):
         "Glass": 2,
         "lamp": STRANGER,
     }
-    with pytest.raises(DataError, match="none of the classes lamp is one that the system knows"):
-        matched(["lamp"], known, {})
+    assert matched(["unknown object", "lamp"], (*known, "unknown object"), {}) == {
+        "unknown object": STRANGER,
+        "lamp": STRANGER,
+    }
     with pytest.raises(DataError, match="the objects have no class couch, but lamp"):
         matched(["lamp"], known, {"couch": "chair"})
     with pytest.raises(DataError, match="the system knows no class sofa, but chair"):
@@ -115,12 +122,52 @@ def test_strangers_are_told_apart_by_as_many_views_as_the_row_says(random):
     views = len(system.viewpoints)
     known = np.arange(40) < 25
     logits = random.normal(0, 3, (40, views, len(system.classes))) + 2.0 * known[:, None, None]
-    table = ViewTable(jnp.asarray(logits, jnp.float32), None, None, jnp.zeros(40, jnp.int32))
-    found = strangers(system, table, known).after
     energy = -np.log(np.exp(logits).sum(axis=-1))
+    quantiles = np.quantile(energy[known], np.linspace(0, 1, 2001))
+    strangeness = Strangeness(jnp.asarray(np.tile(quantiles, (views, 1)), jnp.float32))
+    system = replace(system, parts=replace(system.parts, strangeness=strangeness))
+    table = ViewTable(jnp.asarray(logits, jnp.float32), None, None, jnp.zeros(40, jnp.int32))
+    found = strangers(Walker(system).walk(table, "random", 4, draws=2), known).after
     pairs = np.mean(energy[~known].reshape(-1, 1) > energy[known].reshape(1, -1))
     assert found[0].auroc == pytest.approx(pairs, abs=0.03)
     assert found[0].auroc + 0.03 < found[1].auroc < found[2].auroc
+    assert found[0].known_refused == pytest.approx(0.05, abs=0.02)
+
+
+def test_what_walks_end_with_is_counted_as_an_agent_would_say_it():
+    """Two known objects and two strangers, of two walks of three views each."""
+    confidence = np.array(
+        [
+            [[0.5, 0.96, 0.99], [0.5, 0.6, 0.7]],  # right and sure at the second view; never sure
+            [[0.97, 0.97, 0.97], [0.5, 0.5, 0.96]],  # wrong and sure at once; an unknown object at the third
+            [[0.6, 0.7, 0.96], [0.5, 0.5, 0.5]],  # sure at the third; never
+            [[0.99, 0.2, 0.2], [0.5, 0.96, 0.2]],  # unknown at once; sure at the second
+        ]
+    )
+    unknown = np.zeros(confidence.shape, bool)
+    unknown[1, 1] = unknown[2, 1, 2] = unknown[3, 0] = True
+    right = np.zeros(confidence.shape, bool)
+    right[0] = True
+    walks = Walks(right, confidence, np.zeros(confidence.shape, int), np.full(confidence.shape, 0.5), unknown)
+    known = np.array([True, True, False, False])
+    two, three = promises(walks, known, [0.95], [2, 3])
+    assert (two.stop, two.views, three.views) == (0.95, 2, 3)
+    assert (two.sure, two.wrong, two.refused) == (0.5, 0.5, 0.25)
+    assert (three.sure, three.wrong, three.refused) == (0.5, 0.5, 0.25)
+    assert (two.strangers_sure, two.strangers_refused) == (0.25, 0.25)
+    assert (three.strangers_sure, three.strangers_refused) == (0.5, 0.5)
+    (alone,) = promises(walks.some(~known), known[2:], [0.95], [3])
+    assert (alone.wrong, alone.excess, alone.sure, alone.refused) == (None, None, None, None)
+    assert alone.strangers_sure == 0.5
+
+
+def test_strangers_alone_are_checked(others, tmp_path):
+    write_off(tmp_path / "lamp" / "a.off", *read_mesh(others / "spikes" / "one.off"))
+    found = check_transfer(mevs_jax.load("furniture10"), str(tmp_path), max_views=2, draws=1)
+    assert (found.known, found.strangers, found.single_view) == (0, 1, None)
+    assert any("the system knows none of these classes" in note for note in found.notes)
+    assert {row.views for row in found.promises} == {1, 2}
+    assert "of unknown classes that end sure" in transfer_text(found)
 
 
 def test_area_under_the_curve(random):
