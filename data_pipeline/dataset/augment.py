@@ -6,7 +6,6 @@ angle is off, since the targets are in the object's own order of views and do no
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 
 import jax
@@ -166,7 +165,7 @@ def views_after(
         shifts: numbers of rows and columns by which each image is moved afterwards, up and to the left; none by default.
     """
     side, distance = images.shape[1], camera.distance
-    pinhole = Camera(jnp.eye(4), math.radians(camera.field_of_view), side)
+    pinhole = Camera(jnp.eye(4), camera.radians, side)
     rays = jnp.moveaxis(pixel_directions(pinhole), -1, 0)
     undo = jnp.linalg.inv(change)
     shifts = jnp.zeros((len(images), 2), jnp.int32) if shifts is None else shifts

@@ -23,6 +23,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
+from mevs_jax.arguments import numbers
 from mevs_jax.arrays import AnyArray, AnyVector
 from mevs_jax.beliefs.entropy import DEPTH_SCALE, DEPTH_STEP
 from mevs_jax.geometry.cameras import ViewCamera, look_at_origin, pixel_directions
@@ -107,7 +108,7 @@ def canonical_view(
     """
     sphere = Sphere(center, radius, up)
     if floor is not None:
-        floor = float(floor + sphere.position @ sphere.axis)
+        floor = numbers(floor) + float(sphere.position @ sphere.axis)  # checked with the image
     return convert(DepthImage(depth, K, T_world_camera, mask, floor), sphere, camera)
 
 
