@@ -187,7 +187,7 @@ def see_objects(system: TrainedSystem, source: ObjectSource, labels: Mapping[str
     """
     camera, poses = system.description.camera, jnp.asarray(system.poses)
     directions = jax.vmap(lambda pose: pixel_directions(camera.at(pose)))(poses)
-    rig = Rig(np.asarray(poses, np.float32), np.asarray(directions, np.float32), np.deg2rad(camera.field_of_view))
+    rig = Rig(np.asarray(poses, np.float32), np.asarray(directions, np.float32), camera.radians)
     left_out = {name: reason for by_name in source.left_out.values() for name, reason in by_name.items()}
     names, folders, observer = [], [], Observer(system)
     with progress_bar("objects") as bar:

@@ -9,6 +9,8 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import KW_ONLY, dataclass
+from functools import wraps
+from threading import RLock
 from typing import Any
 
 import jax
@@ -19,6 +21,7 @@ from mevs_jax.agent.candidates import aimed, candidates_of, mask_of, pose_toward
 from mevs_jax.agent.present import Present, sphere_of
 from mevs_jax.agent.programs import Programs
 from mevs_jax.agent.records import Belief, History, Reason, Step, plain
+from mevs_jax.arguments import number, numbers, whole
 from mevs_jax.arrays import AnyArray, AnyVector
 from mevs_jax.beliefs.strangeness import STRANGE
 from mevs_jax.geometry.cameras import in_sphere
@@ -31,13 +34,29 @@ from mevs_jax.trained.system import TrainedSystem
 
 _ENOUGH = 0.15
 """How much of the object must have been seen before the agent is sure, in views that show all of its sphere."""
+MOST_VIEWS, MOST_CANDIDATES = 512, 4096
+"""Largest numbers of views and of candidates of an agent."""
 Reachable = AnyArray | Sequence[int] | Callable[[np.ndarray], bool] | None
 """Which candidates can be reached: a mask, indices, a function of the camera's pose (4, 4), or None for all."""
+
+
+def _one_at_a_time(call: Any) -> Any:
+    """A method that waits until no other thread is in one of its agent."""
+
+    @wraps(call)
+    def waiting(self: Agent, *given: Any, **named: Any) -> Any:
+        with self._turn:
+            return call(self, *given, **named)
+
+    return waiting
 
 
 @dataclass(eq=False, repr=False)
 class Agent:
     """Recognises one object after another: `reset`, then `observe` and `decide` in turn until `Step.done`.
+
+    Calls from several threads wait for each other, so two cameras may show it the same object. For two objects at once, make two
+    agents, which share their programs.
 
     Args:
         system: from `mevs_jax.load`.
@@ -50,8 +69,9 @@ class Agent:
         gain_per_cost: expected gain that one unit of a candidate's cost is worth, in units of the policy's scores (nats for
             `information_gain` and learned policies).
         distance: of the next cameras from the object's centre, in metres; by default that of the training views in radii.
-        max_candidates: largest number of candidates of `decide`. For an unknown yaw, a decision of a recogniser holds what it
-            expects of each: about 300 bytes × candidates × the square of the number of classes.
+        max_candidates: largest number of candidates of `decide`, at most 4096; 128 by default. A decision takes about 30 bytes ×
+            its square (0.5 GB for 4096). For an unknown yaw, a decision of a recogniser holds what it expects of each: about 300
+            bytes × candidates × the square of the number of classes.
         seed: of random policies.
 
     Attributes:
@@ -73,21 +93,28 @@ class Agent:
     seed: int = 0
 
     def __post_init__(self) -> None:
+        _check(isinstance(self.system, TrainedSystem), f"system must be from mevs_jax.load, got {self.system!r:.80}")
+        self.stop = number(self.stop, "stop must be a probability above 0", lambda stop: stop > 0)
+        self.max_views = whole(self.max_views, f"max_views must be from 1 to {MOST_VIEWS}", 1, MOST_VIEWS)
         can_tell = self.system.parts.strangeness is not None
         if self.unknown == "default":
-            has_class = self.system.description.unknown_class is not None
-            self.unknown = STRANGE if can_tell and not has_class else None
-        most, unknown, gain, distance = self.max_views, self.unknown, self.gain_per_cost, self.distance
-        _check(self.stop > 0, f"stop must be a probability above 0, got {self.stop}")
-        _check(int(most) == most and 1 <= most <= 512, f"max_views must be from 1 to 512, got {most}")
-        _check(unknown is None or 0 < unknown <= 1, f"unknown must be in (0, 1] or None, got {unknown}")
-        _check(unknown is None or can_tell, "this system cannot tell unknown objects: leave out unknown")
-        _check(np.isfinite(gain) and gain >= 0, f"gain_per_cost must be at least 0, got {gain}")
-        _check(distance is None or 0 < distance < np.inf, f"distance must be positive, in metres, got {distance}")
+            self.unknown = STRANGE if can_tell and self.system.description.unknown_class is None else None
+        if self.unknown is not None:
+            self.unknown = number(self.unknown, "unknown must be in (0, 1] or None", lambda share: 0 < share <= 1)
+            _check(can_tell, "this system cannot tell unknown objects: leave out unknown")
+        at_least = "gain_per_cost must be at least 0"
+        self.gain_per_cost = number(self.gain_per_cost, at_least, lambda gain: 0 <= gain < np.inf)
+        if self.distance is not None:
+            self.distance = number(self.distance, "distance must be positive, in metres", lambda far: 0 < far < np.inf)
+        self.seed = whole(self.seed, "seed must be a whole number of 32 bits", -(2**31), 2**32 - 1)
+        size = 128
+        if self.max_candidates is not None:
+            rule = f"max_candidates must be from 1 to {MOST_CANDIDATES}"
+            size = self.max_candidates = whole(self.max_candidates, rule, 1, MOST_CANDIDATES)
         shaded = self.system.description.image.content == "image"
         _check(not shaded, "this system reads shaded images, which a depth camera does not give; train one on depth")
-        self.max_views = int(most)
-        self.size = max(len(self.system.viewpoints), 128 if self.max_candidates is None else int(self.max_candidates))
+        self._turn = RLock()
+        self.size = max(len(self.system.viewpoints), size)
         self._resets, self.key = 0, jax.random.key(self.seed)
         self._programs: dict[bool, Programs] = {}
         self._lattice = candidates_of(self.system, None, self.size)
@@ -100,6 +127,7 @@ class Agent:
             self._programs[posed] = Programs(self.system, self.policy, posed, self.max_views)
         return self._programs[posed]
 
+    @_one_at_a_time
     def warm_up(self) -> None:
         """Compiles everything that the agent computes, so that no later call waits for the compiler.
 
@@ -142,8 +170,9 @@ class Agent:
         Raises:
             ValueError: for an argument out of its range, or a policy that cannot be used without the yaw.
         """
-        self.begin(Sphere(center, float(radius), up, yaw), true_size=true_size)
+        self.begin(Sphere(center, radius, up, yaw), true_size=true_size)
 
+    @_one_at_a_time
     def begin(self, sphere: Sphere, *, true_size: bool = True) -> None:
         """`reset`, for an object whose place is one record."""
         _check(
@@ -161,6 +190,7 @@ class Agent:
         mine = {"policy": policy} | {name: getattr(self, name) for name in named}
         self.history = History(self.system.name, {"agent": mine, "reset": options | {"yaw": sphere.yaw}})
 
+    @_one_at_a_time
     def reset_from_points(self, points: AnyArray, **options: Any) -> None:
         """Begins with a new object whose centre and radius are estimated from points on its surface, and from all views to come.
 
@@ -171,7 +201,7 @@ class Agent:
             points: (points, 3) in the world, in metres, of the object alone.
             options: `up`, `yaw` and `true_size` as of `reset`.
         """
-        cloud = np.array(points, float)
+        cloud = numbers(points).copy()
         turned = Sphere((0.0, 0.0, 0.0), 1.0, options.get("up", (0.0, 0.0, 1.0)), options.get("yaw"))
         center, radius = sphere_of(cloud, turned.rotation)
         self.reset(center=center, radius=radius, **options)
@@ -198,8 +228,9 @@ class Agent:
         Raises:
             ValueError: for an input that cannot be used, or beyond `max_views`.
         """
-        return self.see(DepthImage(depth, K, T_world_camera, mask, None if floor is None else float(floor)))
+        return self.see(DepthImage(depth, K, T_world_camera, mask, floor))
 
+    @_one_at_a_time
     def see(self, image: DepthImage) -> Belief:
         """`observe`, for an image that is one record with its camera."""
         begun, of = time.perf_counter(), self._current
@@ -232,6 +263,7 @@ class Agent:
         """Radius of `sphere`."""
         return self.sphere.radius
 
+    @_one_at_a_time
     def observe_view(self, depth: Float[np.ndarray, "side side"], pose: Float[np.ndarray, "4 4"]) -> Belief:
         """Adds a view that the system's own camera has taken, as it is in the data set.
 
@@ -243,15 +275,17 @@ class Agent:
         self._check_budget()
         _check(of.points is None, "an object of unknown size is seen by observe alone, in metres")
         check_depth(depth, self.system.description.camera)
-        image, placed = np.array(depth, np.float32), np.array(pose, np.float32)
+        image, placed = np.array(depth, np.float32), numbers(pose).astype(np.float32)
         _check(
             image.shape == (side, side) and placed.shape == (4, 4),
-            f"this system's camera takes images ({side}, {side}) at poses (4, 4), got {image.shape} and {placed.shape}",
+            f"depth or pose has another shape: this system's camera takes images ({side}, {side}) at poses (4, 4), "
+            f"got {image.shape} and {placed.shape}",
         )
         _check(
             bool(np.isfinite(placed).all()) and bool(placed[:3, 3].any()),
             "pose is not finite, or at the object's centre",
         )
+        _check(bool((image > 0).any()), "depth shows nothing of the object: no pixel is above 0")
         unknown = np.mean(np.isnan(image), where=np.asarray(in_sphere(self.system.description.camera, side)))
         return self._add(image, placed, float(unknown), begun)
 
@@ -286,6 +320,7 @@ class Agent:
         of.belief = belief
         return belief
 
+    @_one_at_a_time
     def decide(
         self,
         reachable: Reachable = None,
@@ -308,7 +343,9 @@ class Agent:
             ValueError: for a mask or costs of another length, poses that are no poses, or if no candidate looks at the object.
         """
         begun, of = time.perf_counter(), self._current
-        poses = self.poses if candidates is None else np.asarray(candidates, float)
+        poses = self.poses if candidates is None else numbers(candidates)
+        shaped = poses.ndim > 0 and (poses.ndim == 3 or not poses.size)
+        _check(shaped, f"candidates must be poses (candidates, 4, 4), got {candidates!r:.80}")
         number = len(poses)
         where, useful = (self._lattice, np.ones(number, bool)) if candidates is None else self._given(poses)
         allowed = (
@@ -334,9 +371,9 @@ class Agent:
 
     def _costs(self, cost: AnyVector | None, number: int) -> Float[np.ndarray, " candidates"]:
         """Costs of candidates as they are given, infinite where they cannot be reached."""
-        costs = np.zeros(number) if cost is None else np.asarray(cost, float).reshape(-1)
+        costs = np.zeros(number) if cost is None else numbers(cost).reshape(-1)
         _check(costs.shape == (number,), f"cost has {costs.size} values; there are {number} candidates")
-        _check(not np.isnan(costs).any(), "cost has values that are NaN")
+        _check(not np.isnan(costs).any(), "cost has values that are NaN, or no numbers")
         finite = costs[np.isfinite(costs)]
         worth = self.gain_per_cost > 0 or not len(finite) or bool(np.ptp(finite) == 0)
         _check(
@@ -382,6 +419,7 @@ class Agent:
         directions, useful = aimed(poses, sphere.position, sphere.radius)
         return candidates_of(self.system, directions @ sphere.rotation, self.size), useful
 
+    @_one_at_a_time
     def mark_failed(self, step: Step | AnyArray) -> None:
         """Says that a view could not be taken, so that it is not chosen again.
 
@@ -389,7 +427,7 @@ class Agent:
             step: that `decide` returned, or a pose `T_world_camera`.
         """
         of = self._current
-        pose = step.T_world_camera if isinstance(step, Step) else np.asarray(step, float)
+        pose = step.T_world_camera if isinstance(step, Step) else numbers(step)
         if pose is None or np.shape(pose) != (4, 4):
             raise ValueError("mark_failed needs a step that has a pose, or a pose (4, 4)")
         away = pose[:3, 3] - of.sphere.position

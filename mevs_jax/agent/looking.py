@@ -14,6 +14,7 @@ from jaxtyping import Array, Float, Int, Shaped
 
 from mevs_jax.agent.agent import Agent
 from mevs_jax.agent.records import Belief, History, Reason, Step
+from mevs_jax.arguments import number, numbers, whole
 from mevs_jax.geometry.cameras import ViewCamera, look_at_origin
 from mevs_jax.geometry.source_view import DepthImage
 from mevs_jax.geometry.sphere import Sphere, estimate_sphere
@@ -85,13 +86,15 @@ def look(
         ValueError: for a mesh without faces or with coordinates that are not finite, or an option out of its range.
     """
     agent = system.agent(**options)
-    views = len(system.viewpoints)
-    if first is not None and not 0 <= first < views:
-        raise ValueError(f"first must be a view from 0 to {views - 1}, got {first}")
+    if first is not None:
+        views = len(system.viewpoints)
+        first = whole(first, f"first must be a view from 0 to {views - 1}", 0, views - 1)
     triangles, radius = _centred(vertices, faces)
     padded = jnp.asarray(pad_triangles(triangles))
     camera = system.description.camera
-    known = 1.0 if metres is None else radius * metres
+    known = 1.0
+    if metres is not None:
+        known = radius * number(metres, "metres must be positive, or None", lambda one: 0 < one < np.inf)
     agent.reset(center=(0.0, 0.0, 0.0), radius=known, yaw=0.0, true_size=metres is not None)
 
     def take(index: int) -> Belief:
@@ -137,7 +140,7 @@ def _centred(
     vertices: Float[np.ndarray, "vertices 3"], faces: Int[np.ndarray, "faces 3"]
 ) -> tuple[Float[np.ndarray, "faces 3 3"], float]:
     """`unit_triangles`, and the distance of the furthest corner from the centre."""
-    vertices, faces = np.asarray(vertices, np.float64), np.asarray(faces)
+    vertices, faces = numbers(vertices), np.asarray(faces)
     if vertices.ndim != 2 or vertices.shape[1] != 3 or faces.ndim != 2 or faces.shape[1] != 3 or not len(faces):
         raise ValueError(
             f"a mesh needs vertices (n, 3) and triangles (m, 3), at least one, got shapes {vertices.shape} and {faces.shape}"
@@ -187,7 +190,7 @@ class Frames:
         for name in ("depth", "K", "T_world_camera"):
             if name not in stored:
                 raise ValueError(f"there is no array {name!r}; it holds {', '.join(stored) or 'nothing'}")
-        depth, poses, K = stored["depth"], *(np.asarray(stored[name], float) for name in ("T_world_camera", "K"))
+        depth, poses, K = np.asarray(stored["depth"]), *(numbers(stored[name]) for name in ("T_world_camera", "K"))
         number = len(depth) if depth.ndim == 3 else 0
         if not 1 <= number <= MOST_FRAMES:
             raise ValueError(
@@ -198,7 +201,7 @@ class Frames:
         if K.shape not in ((3, 3), (number, 3, 3)):
             raise ValueError(f"K must be (3, 3) or ({number}, 3, 3), got shape {K.shape}")
         K = np.broadcast_to(K, (number, 3, 3))
-        mask = np.asarray(stored["mask"], bool) if "mask" in stored else None
+        mask = np.asarray(stored["mask"]) if "mask" in stored else None
         if mask is not None and mask.shape != depth.shape:
             raise ValueError(f"mask must have the shape of depth, {depth.shape}, got {mask.shape}")
         up, yaw = stored.get("up", np.array((0.0, 0.0, 1.0))), _number(stored, "yaw")
@@ -227,7 +230,7 @@ def _number(stored: dict[str, np.ndarray], name: str) -> Any:
         return None
     if np.size(stored[name]) != 1:
         raise ValueError(f"{name} must be one number, got shape {np.shape(stored[name])}")
-    return float(np.reshape(stored[name], ()))
+    return number(stored[name], f"{name} must be a finite number")
 
 
 def look_at_frames(agent: Agent, frames: Frames, *, first: int = 0) -> Walk:
@@ -238,11 +241,10 @@ def look_at_frames(agent: Agent, frames: Frames, *, first: int = 0) -> Walk:
         frames: the recorded images.
         first: the first frame.
     """
-    number = len(frames.depth)
-    if not 0 <= first < number:
-        raise ValueError(f"first must be a frame from 0 to {number - 1}, got {first}")
+    count = len(frames.depth)
+    first = whole(first, f"first must be a frame from 0 to {count - 1}", 0, count - 1)
     agent.begin(frames.sphere)
-    left, left_out = np.ones(number, bool), dict[int, str]()
+    left, left_out = np.ones(count, bool), dict[int, str]()
 
     def take(index: int) -> Belief | None:
         left[index] = False
@@ -266,9 +268,13 @@ def replay(history: History, agent: Agent) -> list[Belief]:
         agent: which is reset first, as it was for the history.
 
     Raises:
-        ValueError: for a history without an object, or images of another size than the agent's.
+        ValueError: for a history without an object, with options that `reset` does not have, or images of another size than the
+            agent's.
     """
     if "reset" not in history.options:
         raise ValueError("the history has no object: its agent was not reset")
-    agent.reset(**history.options["reset"])
+    options, required = history.options["reset"], {"center", "radius"}
+    if not isinstance(options, dict) or not required <= set(options) <= {*required, "up", "yaw", "true_size"}:
+        raise ValueError(f"the history has other options of its object than Agent.reset: {options!r:.80}")
+    agent.reset(**options)
     return [agent.observe_view(depth, pose) for depth, pose in zip(history.depths, history.poses, strict=True)]

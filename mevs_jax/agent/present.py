@@ -152,5 +152,6 @@ class Present:
 
 def sphere_of(points: np.ndarray, rotation: np.ndarray) -> tuple[np.ndarray, float]:
     """Centre and radius of an object by points on it, with its bounding box along the axes of its own frame."""
-    center, radius = estimate_sphere(points @ rotation)
+    cloud = points @ rotation if points.ndim == 2 and points.shape[1] == 3 else points  # the latter is refused
+    center, radius = estimate_sphere(cloud)
     return rotation @ center, radius

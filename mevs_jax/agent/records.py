@@ -8,12 +8,15 @@ import os
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any, Literal
+from zipfile import ZipFile
 
 import numpy as np
 from jaxtyping import Float
 
 Reason = Literal["", "sure", "budget", "nothing reachable", "unknown object"]
 """Why an agent is done; empty while it is not."""
+LARGEST_HISTORY = 2**28
+"""Largest size of a history in memory, in bytes: 512 images of 362×362 pixels."""
 
 
 @dataclass(frozen=True)
@@ -125,6 +128,11 @@ def load_history(path: str | Path) -> History:
         ValueError: for any other file.
     """
     try:
+        with ZipFile(path) as packed:
+            if (size := sum(member.file_size for member in packed.infolist())) > LARGEST_HISTORY:
+                raise ValueError(
+                    f"it would take {size >> 20} MB of memory, and at most {LARGEST_HISTORY >> 20} are read"
+                )
         with np.load(path, allow_pickle=False) as stored:
             if int(stored["form"]) != 1:
                 raise ValueError("it is of another version")

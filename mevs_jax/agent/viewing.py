@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import html
-import math
 from typing import TYPE_CHECKING, Any
 
 import jax.numpy as jnp
@@ -98,7 +97,7 @@ def clouds_of(history: History, system: TrainedSystem) -> list[Float[np.ndarray,
 def _add_views(server: viser.ViserServer, history: History, system: TrainedSystem) -> None:
     """Adds the points and the camera of every view, and the ways between the cameras."""
     camera, size = system.description.camera, 1.2 / max(1, len(history.depths[0]))
-    angle = math.radians(camera.field_of_view)
+    angle = camera.radians
     for number, (points, pose) in enumerate(zip(clouds_of(history, system), history.poses, strict=True), 1):
         for name, colour, larger in (("new", _NEW, 2.4), ("seen", _SEEN, 1.2)):
             server.scene.add_point_cloud(

@@ -9,17 +9,42 @@ from __future__ import annotations
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
+from mevs_jax.arguments import check, check_indices, known, whole
 from mevs_jax.arrays import AnyArray
 
 BINS = 15
 """Number of bins of the expected calibration error (Guo et al. 2017)."""
+_IMPOSSIBLE = -1e9
+"""Log-probability in place of −inf, relative to that of another class: its product with the probability 0 is 0."""
 
 
 def _bin_of(confidences: Array, bins: int) -> Int[Array, "..."]:
     """Index of the bin, of (0, 1/bins], (1/bins, 2/bins], …, that each confidence is in."""
     return jnp.clip(jnp.ceil(confidences * bins).astype(jnp.int32) - 1, 0, bins - 1)
+
+
+def _check_confidences(confidences: AnyArray, bins: int) -> None:
+    whole(bins, "bins must be at least 1", 1, 2**20)
+    rule = "confidences must be probabilities, above 0 and at most 1"
+    check(confidences, rule, lambda share: (share >= 0) & (share <= 1 + 1e-5))
+
+
+def _check_beliefs(beliefs: AnyArray, labels: AnyArray) -> None:
+    """Raises `ValueError` for what has no likelihood: no numbers, no such class, or a true class of no probability."""
+    check_indices(labels, "labels", beliefs.shape[-1])
+    check(beliefs, "beliefs must be log-probabilities, no NaN and no infinity", lambda belief: belief < np.inf)
+    if (known_beliefs := known(beliefs)) is not None and (known_labels := known(labels)) is not None:
+        own = np.take_along_axis(known_beliefs, _as_steps(known_labels, known_beliefs), axis=-1)
+        check(own, "beliefs must be finite for the true classes", np.isfinite)
+
+
+def _as_steps(labels: np.ndarray, beliefs: np.ndarray) -> np.ndarray:
+    """The labels as indices along the last axis of beliefs, which may have an axis of steps that the labels lack."""
+    labels = labels.astype(int)
+    return np.broadcast_to(labels.reshape(*labels.shape, *[1] * (beliefs.ndim - labels.ndim)), (*beliefs.shape[:-1], 1))
 
 
 def reliability(
@@ -32,6 +57,7 @@ def reliability(
         right: whether each answer is correct.
         bins: number of bins of equal width, (0, 1/bins], ….
     """
+    _check_confidences(confidences, bins)
     confidences, right = jnp.asarray(confidences), jnp.asarray(right)
     member = _bin_of(confidences, bins) == jnp.arange(bins)[:, None]
     count = jnp.sum(member, axis=1)
@@ -69,6 +95,8 @@ def calibration_error_by_chance(
     Returns:
         The mean, and the 95 % quantile.
     """
+    _check_confidences(confidences, bins)
+    whole(draws, "draws must be at least 1", 1, 2**31 - 1)
     confidences, right = jnp.asarray(confidences), jnp.asarray(right)
     objects, walks = confidences.shape
     member = jax.nn.one_hot(_bin_of(confidences, bins), bins)
@@ -85,7 +113,12 @@ def log_likelihood(beliefs: Float[AnyArray, "*n classes"], labels: Int[AnyArray,
 
 
 def negative_log_likelihood(beliefs: Float[AnyArray, "n classes"], labels: Int[AnyArray, " n"]) -> Float[Array, ""]:
-    """Mean of −log softmax(belief)[label], in nats."""
+    """Mean of −log softmax(belief)[label], in nats.
+
+    Raises:
+        ValueError: for a label that is known and outside the classes.
+    """
+    check_indices(labels, "labels", beliefs.shape[-1])
     return -jnp.mean(log_likelihood(beliefs, labels))
 
 
@@ -106,9 +139,16 @@ def fit_temperature(
         beliefs: unnormalised log-probabilities.
         labels: the true classes.
         weights: weight of each example.
+
+    Raises:
+        ValueError: for beliefs or labels that are known and have no likelihood: NaN or infinity (−inf may be that of a class
+            which is never the true one), or a label outside the classes.
     """
+    _check_beliefs(beliefs, labels)
+    check(weights, "weights must be at least 0", lambda weight: (weight >= 0) & (weight < np.inf))
     beliefs, labels = jnp.asarray(beliefs), jnp.asarray(labels)
     centred = beliefs - jnp.take_along_axis(beliefs, labels[:, None], axis=-1)
+    centred = jnp.maximum(centred, _IMPOSSIBLE)
 
     def slope(log_inverse: Array) -> Array:
         return jnp.mean(weights * jnp.sum(jax.nn.softmax(jnp.exp(log_inverse) * centred, axis=-1) * centred, axis=-1))
@@ -135,7 +175,9 @@ def fit_exponent(
         beliefs: sums of logits after each step of a walk.
         labels: the true classes.
     """
+    _check_beliefs(beliefs, labels)
     beliefs, labels = jnp.asarray(beliefs), jnp.asarray(labels)
+    beliefs = jnp.maximum(beliefs, jnp.max(beliefs, axis=-1, keepdims=True) + _IMPOSSIBLE)
     steps = jnp.arange(1, beliefs.shape[1] + 1, dtype=jnp.float32)
 
     def cost(parameters: Array) -> Array:

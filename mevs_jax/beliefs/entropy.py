@@ -13,6 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
+from mevs_jax.arguments import check
 from mevs_jax.arrays import AnyArray
 
 DEPTH_SCALE = 10_000
@@ -43,9 +44,14 @@ def depth_levels(depth: Float[AnyArray, "*shape"]) -> Int[Array, "*shape"]:
 
 
 def shannon_entropy(counts: Float[AnyArray, " levels"] | Int[AnyArray, " levels"]) -> Float[Array, ""]:
-    """Entropy of a histogram in bits; 0 for an empty histogram."""
+    """Entropy of a histogram in bits, whatever its sum; 0 for an empty histogram.
+
+    Raises:
+        ValueError: for a count that is known and negative or not finite.
+    """
+    check(counts, "counts must be at least 0", lambda count: (count >= 0) & (count < np.inf))
     total = jnp.sum(counts)
-    p = counts / jnp.maximum(total, 1)
+    p = counts / jnp.where(total > 0, total, 1)
     return -jnp.sum(jnp.where(p > 0, p * jnp.log2(jnp.where(p > 0, p, 1.0)), 0.0))
 
 

@@ -15,9 +15,11 @@ from __future__ import annotations
 import flax.struct
 import jax
 import jax.numpy as jnp
+import numpy as np
 from flax import nnx
 from jaxtyping import Array, Bool, Float
 
+from mevs_jax.arguments import check
 from mevs_jax.arrays import AnyArray
 
 
@@ -45,7 +47,11 @@ def discounted(
     Args:
         beliefs: sums of the logits after each step of a walk.
         temperatures: T(n); T = 1 is the thesis's sum of logits, T = n the mean of logits.
+
+    Raises:
+        ValueError: for a temperature that is known and not positive.
     """
+    check(temperatures, "temperatures must be positive", lambda T: (T > 0) & (np.inf > T))
     return jax.nn.log_softmax(beliefs / temperatures[:, None], axis=-1)
 
 

@@ -10,6 +10,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
+from mevs_jax.arguments import check, whole
 from mevs_jax.arrays import AnyArray
 
 
@@ -23,6 +24,7 @@ def confusion_matrix(
 
     Labels and predictions outside 0..classes−1, such as the −1 of an `Episode` beyond its end, are not counted.
     """
+    classes = whole(classes, "classes must be at least 1", 1, 2**20)
     weights = jnp.ones(labels.shape) if weights is None else weights
     # Of JAX's indices, negative ones count from the end; those that are too large are dropped.
     labels, predictions = (jnp.where(jnp.asarray(i) < 0, classes, i) for i in (labels, predictions))
@@ -59,6 +61,8 @@ def bootstrap_means(
     one matrix product.
     """
     count = values.shape[0]
+    whole(count, "a bootstrap needs at least 1 value", 1, 2**31 - 1)
+    whole(resamples, "resamples must be at least 1", 1, 2**31 - 1)
 
     def times_drawn(key: Array) -> Array:
         return jnp.zeros(count).at[jax.random.randint(key, (count,), 0, count)].add(1.0)
@@ -78,6 +82,10 @@ def bootstrap_interval(
             views, draws) first, since only objects are independent.
         level: probability that the interval covers, in (0, 1).
         resamples: number of bootstrap samples.
+
+    Raises:
+        ValueError: for a level or a number out of its range, or no values.
     """
+    check(level, "level must be a probability between 0 and 1", lambda share: (share > 0) & (share < 1))
     means = bootstrap_means(key, values, resamples=resamples)
     return jnp.quantile(means, jnp.array([(1 - level) / 2, (1 + level) / 2]))

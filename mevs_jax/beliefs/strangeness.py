@@ -13,6 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
+from mevs_jax.arguments import whole
 from mevs_jax.arrays import AnyArray
 
 STRANGE = 0.95
@@ -55,6 +56,8 @@ def fit_strangeness(
         draws: random walks of each object.
         seed: of the walks.
     """
+    most = whole(most, f"most must be from 1 to {logits.shape[1]} views", 1, logits.shape[1])
+    draws = whole(draws, "draws must be at least 1", 1, 2**20)
     energy = np.asarray(-jax.nn.logsumexp(jnp.asarray(logits), axis=-1))
     views = np.broadcast_to(np.arange(energy.shape[1]), (draws, *energy.shape))
     walks = np.random.default_rng(seed).permuted(views, axis=-1)[..., :most]

@@ -123,7 +123,7 @@ def read_arrays(path: Path) -> dict[str, np.ndarray]:
         raise Unusable(f"{path} is no .npz of arrays that can be read ({reason})") from error
 
 
-def load_system(name: str) -> TrainedSystem:
+def load_system(name: str | Path) -> TrainedSystem:
     """A trained system by its path or name."""
     import mevs_jax
 
@@ -166,4 +166,4 @@ def _system_of_run(out: Path) -> TrainedSystem:
         assert run is not None
         with locked(out, "mevs export"):
             stages.make_system(run.settings, out)
-    return load_system(str(out))
+    return load_system(out)

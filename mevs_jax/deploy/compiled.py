@@ -7,6 +7,7 @@ from contextlib import suppress
 from pathlib import Path
 
 import jax
+from jax.experimental.compilation_cache import compilation_cache
 
 LARGEST = 512 * 2**20
 """Size in bytes above which the oldest programs in the folder are removed."""
@@ -34,6 +35,7 @@ def keep_compiled(folder: str | Path | None = None) -> Path:
     folder.mkdir(parents=True, exist_ok=True)
     _prune(folder)
     jax.config.update("jax_compilation_cache_dir", str(folder))
+    compilation_cache.reset_cache()  # JAX keeps the folder that it has begun to use
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
     jax.config.update("jax_persistent_cache_min_entry_size_bytes", -1)
     return folder

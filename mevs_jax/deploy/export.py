@@ -20,8 +20,10 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
+from mevs_jax.agent.agent import MOST_VIEWS
 from mevs_jax.agent.candidates import candidates_of
 from mevs_jax.agent.programs import Programs
+from mevs_jax.arguments import whole
 from mevs_jax.deploy import exported as loader
 from mevs_jax.points.ops import portable
 from mevs_jax.trained.parts import features_of, logits_of
@@ -55,8 +57,11 @@ def export(
 
     Raises:
         ImportError: without the package flatbuffers.
-        ValueError: for a policy that cannot be used.
+        ValueError: for a policy that cannot be used, or a number of views or a platform that cannot be.
     """
+    max_views = whole(max_views, f"max_views must be from 1 to {MOST_VIEWS}", 1, MOST_VIEWS)
+    if not platforms or not set(platforms) <= set(PLATFORMS):
+        raise ValueError(f"platforms must be one or more of {', '.join(PLATFORMS)}, got {platforms!r:.80}")
     try:
         import flatbuffers  # noqa: F401
     except ImportError as error:

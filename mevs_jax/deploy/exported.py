@@ -80,6 +80,8 @@ def load(folder: str | Path) -> dict[str, Program]:
         raise ValueError(f"{path} is of form {form!r}, this loader reads {FORM}; export the programs again")
     found = {}
     for name, about in programs:
+        if not name.isidentifier():
+            raise ValueError(f"{path} names a program {name!r:.40}, which is no name; export the programs again")
         file = path.parent / f"{name}.stablehlo"
         try:
             content = file.read_bytes()

@@ -17,7 +17,8 @@ from typing import Any
 import jax
 import numpy as np
 
-from mevs_jax.environment.pure import ActiveRecognition, EnvironmentObservation, EnvironmentState
+from mevs_jax.arguments import check, whole
+from mevs_jax.environment.pure import ActiveRecognition, EnvironmentObservation, EnvironmentState, check_action
 
 try:
     import ap_gym
@@ -29,6 +30,7 @@ except ImportError as error:
 
 NAME = "mevs_jax/ActiveRecognition-v0"
 """The name that both environments are registered under."""
+_NOT_DRAWN = "this environment draws nothing; mevs_jax.agent.viewing.view shows the walk of an agent"
 
 
 class ActiveRecognitionEnv(ap_gym.ActiveClassificationEnv):
@@ -45,6 +47,7 @@ class ActiveRecognitionEnv(ap_gym.ActiveClassificationEnv):
     metadata: dict[str, Any] = {"render_modes": []}  # noqa: RUF012  # as Gymnasium declares it
 
     def __init__(self, environment: ActiveRecognition):
+        _check_rules(environment)
         super().__init__(environment.classes, gymnasium.spaces.Discrete(environment.views))
         self.environment = environment
         self.observation_space = _observation_space(environment)
@@ -68,7 +71,6 @@ class ActiveRecognitionEnv(ap_gym.ActiveClassificationEnv):
         return _in_numpy(observation), {"index": int(index)}
 
     def _step(self, action: Any, prediction: Any) -> tuple[dict, float, bool, bool, dict[str, Any], np.int64]:
-        _check(action, prediction, self.environment, ())
         self._state, observation, done, info, target = _move(self.environment, self._state, np.int32(action))
         base_reward = float(info.pop("base_reward"))
         self._info = {name: np.asarray(value).item() for name, value in info.items()}
@@ -78,11 +80,18 @@ class ActiveRecognitionEnv(ap_gym.ActiveClassificationEnv):
         """Scores the prediction, moves the camera and returns (observation, reward, terminated, truncated, info).
 
         Raises:
-            ValueError: for an action outside its range, or a prediction with NaN or another shape than (classes,).
+            ValueError: for an action without a view or prediction, a view outside its range, or a prediction that is not
+                finite or of another shape than (classes,).
+            gymnasium.error.ResetNeeded: before the first `reset`.
         """
+        _check(self, action, ())
         observation, reward, terminated, truncated, info = super().step(action)
         # The method above returns `info` without what `_step` put into it.
         return observation, float(reward), terminated, truncated, self._info | info
+
+    def render(self) -> None:
+        """Raises `NotImplementedError`, as there is nothing to see."""
+        raise NotImplementedError(_NOT_DRAWN)
 
 
 class ActiveRecognitionVectorEnv(ap_gym.ActiveClassificationVectorEnv):
@@ -103,6 +112,8 @@ class ActiveRecognitionVectorEnv(ap_gym.ActiveClassificationVectorEnv):
     }
 
     def __init__(self, environment: ActiveRecognition, num_envs: int):
+        _check_rules(environment)
+        num_envs = whole(num_envs, "num_envs must be at least 1", 1, 2**31 - 1)
         super().__init__(num_envs, environment.classes, gymnasium.spaces.Discrete(environment.views))
         self.environment = environment
         self.single_observation_space = _observation_space(environment)
@@ -120,7 +131,6 @@ class ActiveRecognitionVectorEnv(ap_gym.ActiveClassificationVectorEnv):
 
     def _step(self, action: Any, prediction: Any) -> tuple[dict, np.ndarray, np.ndarray, np.ndarray, dict, np.ndarray]:
         count = self.num_envs
-        _check(action, prediction, self.environment, (count,))
         begin = np.zeros(count, np.int64), np.zeros(count, np.int64)
         if self._ended.any():
             begin = _drawn(self.environment, self.np_random, (count,), None)
@@ -132,6 +142,15 @@ class ActiveRecognitionVectorEnv(ap_gym.ActiveClassificationVectorEnv):
         base_reward = info.pop("base_reward")
         target = np.asarray(target, np.int64)
         return _in_numpy(observation), base_reward, self._ended.copy(), np.zeros(count, bool), info, target
+
+    def step(self, action: Mapping[str, Any]) -> tuple[dict, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
+        """`ActiveRecognitionEnv.step` for all episodes."""
+        _check(self, action, (self.num_envs,))
+        return super().step(action)
+
+    def render(self) -> None:
+        """Raises `NotImplementedError`, as there is nothing to see."""
+        raise NotImplementedError(_NOT_DRAWN)
 
 
 def _observation_space(environment: ActiveRecognition) -> gymnasium.spaces.Dict:
@@ -174,24 +193,36 @@ def _drawn(
     found = []
     for name, size in (("object_index", environment.objects), ("start", environment.views)):
         value = np.asarray(random.integers(size, size=shape))
-        if options and options.get(name) is not None:
-            value = np.broadcast_to(np.asarray(options[name], np.int64), shape).copy()
-        if not ((value >= 0) & (value < size)).all():
-            raise ValueError(f"the option {name!r} must be between 0 and {size - 1}, got {options[name]}")  # type: ignore[index]
+        if options and (given := options.get(name)) is not None:
+            check(
+                given,
+                f"the option {name!r} must be between 0 and {size - 1}",
+                lambda one, size=size: (one >= 0) & (one < size) & (one == np.floor(one)),
+            )
+            if np.shape(given) not in ((), shape):
+                raise ValueError(
+                    f"the option {name!r} must be one index or of shape {shape}, got shape {np.shape(given)}"
+                )
+            value = np.broadcast_to(np.asarray(given, np.int64), shape).copy()
         found.append(value)
     return found[0], found[1]
 
 
-def _check(action: Any, prediction: Any, environment: ActiveRecognition, shape: tuple[int, ...]) -> None:
-    action, prediction = np.asarray(action), np.asarray(prediction)
-    whole = action.shape == shape and np.issubdtype(action.dtype, np.integer)
-    if not whole or not ((action >= 0) & (action < environment.views)).all():
-        raise ValueError(f"an action is an index from 0 to {environment.views - 1}, of shape {shape}, got {action}")
-    if prediction.shape != (*shape, environment.classes) or np.isnan(prediction).any():
-        raise ValueError(
-            f"a prediction is logits of shape {(*shape, environment.classes)} without NaN, got shape {prediction.shape} with "
-            f"{np.isnan(prediction).sum()} NaN"
-        )
+def _check(env: Any, action: Any, shape: tuple[int, ...]) -> None:
+    """Raises the errors of `ActiveRecognitionEnv.step`."""
+    environment: ActiveRecognition = env.environment
+    if not hasattr(env, "_state"):
+        raise gymnasium.error.ResetNeeded("step was called before reset: begin the first episode with reset")
+    check_action(action, shape, environment.classes)
+    view = np.asarray(action["action"])
+    integers = view.shape == shape and np.issubdtype(view.dtype, np.integer)
+    if not integers or not ((view >= 0) & (view < environment.views)).all():
+        raise ValueError(f"an action is an index from 0 to {environment.views - 1}, of shape {shape}, got {view}")
+
+
+def _check_rules(environment: Any) -> None:
+    if not isinstance(environment, ActiveRecognition):
+        raise ValueError(f"environment must be a mevs_jax.ActiveRecognition, got {environment!r:.80}")
 
 
 _Moved = tuple[EnvironmentState, EnvironmentObservation, jax.Array, dict[str, jax.Array], jax.Array]

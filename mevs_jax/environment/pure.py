@@ -21,8 +21,10 @@ from typing import Any
 import flax.struct
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
+from mevs_jax.arguments import check, check_indices, whole
 from mevs_jax.geometry.viewpoints import ViewGraph
 from mevs_jax.policies.base import Knowledge, Observation, Scene, SelectionState
 from mevs_jax.selection.loop import Fuse, ViewTable, sum_of_logits
@@ -80,6 +82,18 @@ class EnvironmentObservation:
     cloud: Float[Array, "*batch embedding"] | None = None
 
 
+def check_action(action: Any, episodes: tuple[int, ...], classes: int) -> None:
+    """Raises `ValueError` unless an action has a view and a prediction of finite logits for each of some episodes."""
+    if not isinstance(action, Mapping) or not {"action", "prediction"} <= set(action):
+        got = sorted(action) if isinstance(action, Mapping) else action
+        raise ValueError(
+            f'an action is {{"action": index of the next view, "prediction": logits of {classes} classes}}, got {got!r:.80}'
+        )
+    if (shape := np.shape(action["prediction"])) != (*episodes, classes):
+        raise ValueError(f"a prediction is finite logits of shape {(*episodes, classes)}, got shape {shape}")
+    check(action["prediction"], f"a prediction is finite logits of shape {shape}", np.isfinite)
+
+
 @jax.tree_util.register_pytree_node_class
 class ActiveRecognition:
     """Active recognition of one object per episode; `jax.vmap` over keys and states runs many episodes at once.
@@ -111,7 +125,7 @@ class ActiveRecognition:
 
     Raises:
         ValueError: for tables without axis of objects or with several classifiers, for fewer than two classes, for a graph or a
-            mask with another number of views, or `max_views` outside its range.
+            mask with another number of views, or `max_views` or `movement_cost` outside their ranges.
     """
 
     def __init__(
@@ -139,8 +153,8 @@ class ActiveRecognition:
             raise ValueError(f"the tables have {views} views, the graph has {graph.points.shape[0]}")
         if reachable is not None and reachable.shape != (views,):
             raise ValueError(f"`reachable` must have shape ({views},), got {reachable.shape}")
-        if not 1 <= max_views <= views:
-            raise ValueError(f"max_views must be between 1 and the {views} candidate views, got {max_views}")
+        max_views = whole(max_views, f"max_views must be between 1 and the {views} candidate views", 1, views)
+        check(movement_cost, "movement_cost must be at least 0", lambda cost: (cost >= 0) & (cost < np.inf))
         self.tables, self.graph, self.reachable, self.movement_cost = tables, graph, reachable, movement_cost
         self.max_views, self.normalised, self.fuse = max_views, normalised, fuse
 
@@ -184,7 +198,13 @@ class ActiveRecognition:
             key: PRNG key, for what is drawn.
             object_index: index of the object; drawn uniformly if None.
             start: index of the start view; drawn uniformly if None.
+
+        Raises:
+            ValueError: for an index that is known and outside its range.
         """
+        for name, given, size in (("object_index", object_index, self.objects), ("start", start, self.views)):
+            if given is not None:
+                check_indices(given, name, size)
         # Both indices from one call, because `step_autoreset` draws for every episode in every step, and `randint` is slower.
         sizes = jnp.array([self.objects, self.views])
         drawn = jnp.minimum((jax.random.uniform(key, (2,)) * sizes).astype(jnp.int32), sizes - 1)
@@ -214,6 +234,9 @@ class ActiveRecognition:
             state: of the episode.
             action: `{"action": index of the next view, "prediction": (classes,) logits}`.
 
+        Raises:
+            ValueError: for an action of another form, or a prediction that is known and not finite.
+
         Returns:
             The new state, the observation, the reward, whether the episode has ended, and
             `{"base_reward", "prediction": {"target", "loss", "metrics"}, "distance", "new_view"}`: the true class and the loss
@@ -221,6 +244,8 @@ class ActiveRecognition:
             seen for the first time.
         """
         del key
+        check_action(action, (), self.classes)
+        check(action["action"], "an action is the index of a view", lambda view: view == np.floor(view))
         done = state.steps >= self.max_views
         target = jnp.clip(jnp.asarray(action["action"], jnp.int32), 0, self.views - 1)
         if self.reachable is not None:

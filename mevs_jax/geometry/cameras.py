@@ -19,6 +19,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
+from mevs_jax.arguments import check, check_directions, number, whole
 from mevs_jax.arrays import AnyArray
 
 
@@ -28,13 +29,21 @@ class Camera:
 
     Attributes:
         pose: (4, 4) matrix from camera to world.
-        field_of_view: horizontal and vertical, in radians.
+        field_of_view: horizontal and vertical, in radians (that of a `ViewCamera` is in degrees, and `ViewCamera.radians`).
         resolution: pixels per side of the image.
+
+    Raises:
+        ValueError: for a field of view or a resolution out of its range.
     """
 
     pose: Float[Array, "*batch 4 4"]
     field_of_view: float = flax.struct.field(pytree_node=False, default=math.pi / 3)
     resolution: int = flax.struct.field(pytree_node=False, default=224)
+
+    def __post_init__(self) -> None:
+        rule = "field_of_view of a Camera is in radians, between 0 and π"
+        check(self.field_of_view, rule, lambda angle: (angle > 0) & (angle < math.pi))
+        whole(self.resolution, "resolution must be at least 1 pixel", 1, 2**20)
 
     @property
     def focal_length(self) -> float:
@@ -48,7 +57,7 @@ class ViewCamera:
 
     Attributes:
         resolution: pixels per side of the image.
-        field_of_view: horizontal and vertical, in degrees.
+        field_of_view: horizontal and vertical, in degrees, as settings and stored systems have it. Computations use `radians`.
         distance: from the object's centre, in radii of the object.
 
     Raises:
@@ -60,22 +69,28 @@ class ViewCamera:
     distance: float = 2.0
 
     def __post_init__(self) -> None:
-        if self.resolution < 1 or not 0 < self.field_of_view < 180 or not self.distance > 1:
-            raise ValueError(
-                "a camera has at least 1 pixel, a field of view between 0 and 180 degrees and a distance above 1 radius, "
-                f"got {self}"
-            )
+        rule = (
+            "a camera has at least 1 pixel, a field of view between 0 and 180 degrees and a distance above 1 radius; "
+        )
+        whole(self.resolution, f"{rule}resolution", 1, 2**20)
+        number(self.field_of_view, f"{rule}field_of_view", lambda angle: 0 < angle < 180)
+        number(self.distance, f"{rule}distance", lambda far: 1 < far < math.inf)
+
+    @property
+    def radians(self) -> float:
+        """`field_of_view` in radians, as that of a `Camera`."""
+        return math.radians(self.field_of_view)
 
     @property
     def intrinsics(self) -> Float[np.ndarray, "3 3"]:
         """Intrinsics in OpenCV's convention: in pixels, whose centres are at whole numbers."""
-        focal = self.resolution / 2 / np.tan(np.radians(self.field_of_view) / 2)
+        focal = self.resolution / 2 / np.tan(self.radians / 2)
         middle = (self.resolution - 1) / 2
         return np.array([[focal, 0, middle], [0, focal, middle], [0, 0, 1]])
 
     def at(self, pose: Float[AnyArray, "*batch 4 4"], resolution: int | None = None) -> Camera:
         """Returns the pinhole camera at `pose`, with another resolution where one is given."""
-        return Camera(jnp.asarray(pose), math.radians(self.field_of_view), resolution or self.resolution)
+        return Camera(jnp.asarray(pose), self.radians, resolution or self.resolution)
 
 
 def look_at_origin(position: Float[AnyArray, 3]) -> Float[Array, "4 4"]:
@@ -83,6 +98,7 @@ def look_at_origin(position: Float[AnyArray, 3]) -> Float[Array, "4 4"]:
 
     Straight above or below the origin, where world z is no upward direction, world y is used instead.
     """
+    check_directions(position, "position")
     position = jnp.asarray(position)
     forward = -position / jnp.linalg.norm(position)
     polar = jnp.abs(forward[2]) > 1 - 1e-6
@@ -105,6 +121,7 @@ def orbit(pose: Float[AnyArray, "4 4"], step: Float[AnyArray, 2]) -> Float[Array
         step: tangent vector on the unit sphere, (to the camera's right, downwards). A step of length s moves the camera by an
             angle of arctan(s).
     """
+    check(step, "step must be finite", np.isfinite)
     pose, step = jnp.asarray(pose), jnp.asarray(step)
     right, down, forward = pose[:3, 0], pose[:3, 1], pose[:3, 2]
     distance = jnp.linalg.norm(pose[:3, 3])
@@ -179,4 +196,6 @@ def cameras_at(
         resolution: pixels per side of the image.
         field_of_view: in radians.
     """
-    return Camera(jax.vmap(look_at_origin)(jnp.asarray(points) * distance), float(field_of_view), resolution)
+    check_directions(points, "points")
+    check(distance, "distance must be positive", lambda far: (far > 0) & (far < np.inf))
+    return Camera(jax.vmap(look_at_origin)(jnp.asarray(points) * distance), field_of_view, resolution)

@@ -18,12 +18,14 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
+from mevs_jax.arguments import numbers
 from mevs_jax.arrays import AnyArray, AnyVector
 from mevs_jax.beliefs.entropy import DEPTH_SCALE, DEPTH_STEP
 from mevs_jax.geometry.cameras import ViewCamera, in_sphere, look_at_origin, pixel_directions
@@ -115,9 +117,10 @@ def canonical_view(
             the sphere.
     """
     sphere = Sphere(center, radius, up)
+    height: Any = floor
     if floor is not None:
-        floor = float(floor + sphere.position @ sphere.axis)
-    return convert(DepthImage(depth, K, T_world_camera, mask, floor), sphere, camera)
+        height = numbers(floor) + float(sphere.position @ sphere.axis)  # checked with the image
+    return convert(DepthImage(depth, K, T_world_camera, mask, height), sphere, camera)
 
 
 def convert(

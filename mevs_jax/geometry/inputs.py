@@ -13,6 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
+from mevs_jax.arguments import known
 from mevs_jax.arrays import AnyArray
 from mevs_jax.geometry.cameras import ViewCamera, pixel_directions, unproject
 
@@ -24,11 +25,18 @@ def check_depth(depth: AnyArray, camera: ViewCamera) -> None:
     """Refuses what cannot be depth in radii of an object, as this camera sees it.
 
     Raises:
-        ValueError: for whole numbers; and, where numbers are known, for depth outside the object's sphere.
+        ValueError: for whole numbers; and, where numbers are known, for negative numbers and depth outside the object's sphere.
     """
-    if not jnp.issubdtype(depth.dtype, jnp.floating):
-        raise ValueError(f"depth must be in radii of the object, of a floating type, got {depth.dtype}")
-    if isinstance(depth, np.ndarray) and (hit := depth[depth > 0]).size:
+    kind = getattr(depth, "dtype", None) or np.asarray(depth).dtype
+    if not jnp.issubdtype(kind, jnp.floating):
+        raise ValueError(f"depth must be in radii of the object, of a floating type, got {kind}")
+    if (array := known(depth)) is None:
+        return
+    if (array < 0).any():
+        raise ValueError(
+            "depth has negative numbers; give 0 where nothing is hit, and NaN where it is not known what is there"
+        )
+    if (hit := array[array > 0]).size:
         near, far = camera.distance - 1 - _BEYOND, camera.distance + 1 + _BEYOND
         if not (near <= hit.min() and hit.max() <= far):
             raise ValueError(

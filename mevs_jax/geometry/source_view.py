@@ -12,6 +12,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float
 
+from mevs_jax.arguments import numbers
 from mevs_jax.arrays import AnyArray, AnyVector
 from mevs_jax.geometry.sphere import Sphere, upright
 
@@ -43,6 +44,8 @@ class DepthImage:
     floor: float | None = None
 
     def __post_init__(self) -> None:
+        if np.ma.isMaskedArray(self.depth):
+            raise ValueError("depth is a masked array, whose mask would be lost; give depth.filled(numpy.nan)")
         _check_images(np.asarray(self.depth), None if self.mask is None else np.asarray(self.mask))
         _check_intrinsics(_finite(self.K, "K", (3, 3)))
         checked_pose(self.pose)
@@ -143,11 +146,11 @@ def why_empty(window: Window) -> str:
 
 def _finite(value: AnyVector | float, name: str, shape: tuple[int, ...]) -> np.ndarray:
     """The value as a float64 array of a shape."""
-    array = np.asarray(value, np.float64)
+    array = numbers(value)
     if array.shape != shape:
-        raise ValueError(f"{name} has shape {array.shape}, not {shape}")
+        raise ValueError(f"{name} has shape {np.shape(value)}, not {shape}")
     if not np.isfinite(array).all():
-        raise ValueError(f"{name} has numbers that are not finite")
+        raise ValueError(f"{name} has numbers that are not finite, or no numbers")
     return array
 
 
@@ -159,10 +162,13 @@ def _check_images(image: np.ndarray, mask: np.ndarray | None) -> None:
         )
     if image.ndim != 2 or 0 in image.shape:
         raise ValueError(f"depth has shape {image.shape}, not (height, width)")
-    if mask is not None and mask.dtype.kind == "f" and np.isnan(mask).any():
-        raise ValueError("mask has NaN; give True for the pixels of the object and False for the others")
-    if mask is not None and mask.shape != image.shape:
+    if mask is None:
+        return
+    if mask.shape != image.shape:
         raise ValueError(f"mask has shape {mask.shape}, depth {image.shape}; they must be equal")
+    if mask.dtype != bool and not (mask.dtype.kind in "iuf" and np.isin(mask, (0, 1, 255)).all()):
+        what = "NaN" if mask.dtype.kind == "f" and np.isnan(mask).any() else "other values than 0 and 1 (or 255)"
+        raise ValueError(f"mask has {what}; give True for the pixels of the object and False for the others")
 
 
 def _check_intrinsics(K: np.ndarray) -> None:

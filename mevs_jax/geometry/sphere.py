@@ -8,6 +8,7 @@ from functools import cached_property
 import numpy as np
 from jaxtyping import Float
 
+from mevs_jax.arguments import number, numbers
 from mevs_jax.arrays import AnyArray, AnyVector
 
 _NEIGHBOURS = 8
@@ -41,14 +42,14 @@ class Sphere:
     yaw: float | None = None
 
     def __post_init__(self) -> None:
-        center = np.asarray(self.center, float)
+        center = numbers(self.center)
         if center.size != 3 or not np.isfinite(center).all():
-            raise ValueError(f"center must be three finite numbers, got {center.tolist()}")
-        if not 0 < float(self.radius) < np.inf:
-            raise ValueError(f"radius must be positive, in metres, got {self.radius}")
+            raise ValueError(f"center must be three finite numbers, got {self.center!r:.80}")
+        radius = number(self.radius, "radius must be positive, in metres", lambda radius: 0 < radius < np.inf)
+        object.__setattr__(self, "radius", radius)
         upright(self.up)
-        if self.yaw is not None and not np.isfinite(self.yaw):
-            raise ValueError(f"yaw must be a finite angle in radians, or None, got {self.yaw}")
+        if self.yaw is not None:
+            object.__setattr__(self, "yaw", number(self.yaw, "yaw must be a finite angle in radians, or None"))
 
     @cached_property
     def position(self) -> Float[np.ndarray, " 3"]:
@@ -69,16 +70,17 @@ class Sphere:
 
 def upright(up: AnyVector) -> Float[np.ndarray, "3 3"]:
     """The smallest rotation that takes `up` to z."""
-    vector = np.asarray(up, float).reshape(-1)
+    vector = numbers(up).reshape(-1)
     if vector.shape != (3,) or not np.isfinite(vector).all() or np.linalg.norm(vector) < 1e-9:
         raise ValueError(
-            f"up must be a direction of three finite numbers, the object's upward one in the world, got {np.asarray(up).tolist()}"
+            f"up must be a direction of three finite numbers, the object's upward one in the world, got {up!r:.80}"
         )
     x, y, z = vector / np.linalg.norm(vector)
-    if z < -1 + 1e-12:
+    level = x**2 + y**2
+    if z < 0 and level < 1e-24:
         return np.diag([1.0, -1.0, -1.0])
     axis = np.array([[0, 0, -x], [0, 0, -y], [x, y, 0]])
-    return np.eye(3) + axis + axis @ axis / (1 + z)
+    return np.eye(3) + axis + axis @ axis / (1 + z if z > 0 else level / (1 - z))  # 1 + z, without what rounding loses
 
 
 def estimate_sphere(points: AnyArray, *, up: AnyVector = (0.0, 0.0, 1.0)) -> tuple[Float[np.ndarray, " 3"], float]:
@@ -102,7 +104,7 @@ def estimate_sphere(points: AnyArray, *, up: AnyVector = (0.0, 0.0, 1.0)) -> tup
     Raises:
         ValueError: for less than four points, points that are not finite, or points that are all equal.
     """
-    cloud = np.asarray(points, np.float64)
+    cloud = numbers(points)
     if cloud.ndim != 2 or cloud.shape[1] != 3 or len(cloud) < 4:
         raise ValueError(f"points have shape {cloud.shape}, not (points, 3) with at least 4 points")
     if not np.isfinite(cloud).all():
@@ -123,6 +125,9 @@ def _without_outliers(cloud: np.ndarray) -> np.ndarray:
 
     if len(cloud) > _MOST_POINTS:
         cloud = np.random.default_rng(0).permutation(cloud)[:_MOST_POINTS]
+    cloud = np.unique(cloud, axis=0)  # copies would be neighbours at a distance of 0
+    if len(cloud) < 2:
+        return cloud
     nearest = min(_NEIGHBOURS, len(cloud) - 1)
     distance = cKDTree(cloud).query(cloud, k=[nearest + 1])[0][:, 0]
     return cloud[distance <= _SPARSE * max(np.median(distance), np.finfo(float).tiny)]

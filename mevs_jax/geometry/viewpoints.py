@@ -16,6 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
+from mevs_jax.arguments import numbers, whole
 from mevs_jax.arrays import AnyArray
 
 Lattice = Literal[
@@ -25,6 +26,10 @@ SOLIDS = {"tetrahedron": 4, "octahedron": 6, "cube": 8, "icosahedron": 12, "dode
 """The number of corners of each Platonic solid."""
 RINGS = 5
 """Number of rings of the lattice `rings`, as in MORE (Parisotto, Mukhopadhyay and Kasaei, 2021), which has 12 views per ring."""
+
+
+def _count(n: int) -> int:
+    return whole(n, "a view lattice needs at least 2 viewpoints", 2, 2**20)
 
 
 def fibonacci_sphere(n: int, variant: str = "golden_angle") -> Float[np.ndarray, "{n} 3"]:
@@ -38,8 +43,7 @@ def fibonacci_sphere(n: int, variant: str = "golden_angle") -> Float[np.ndarray,
     Raises:
         ValueError: for fewer than 2 points or an unknown variant.
     """
-    if n < 2:
-        raise ValueError(f"a view lattice needs at least 2 viewpoints, got {n}")
+    n = _count(n)
     i, published = np.arange(n), variant == "golden_angle"
     if not published and variant != "equation8":
         raise ValueError(f"unknown lattice {variant!r}: it is 'golden_angle' or 'equation8'")
@@ -85,6 +89,7 @@ def ring_lattice(n: int) -> Float[np.ndarray, "{n} 3"]:
     Raises:
         ValueError: if `n` is not a multiple of five, or there are fewer than two views per ring.
     """
+    n = _count(n)
     if n % RINGS or n < 2 * RINGS:
         raise ValueError(f"rings need a multiple of {RINGS} viewpoints, at least {2 * RINGS}, got {n}")
     elevation = np.pi / 2 - np.pi * np.arange(1, RINGS + 1) / (RINGS + 1)
@@ -104,8 +109,8 @@ def nested_lattice(n: int) -> Float[np.ndarray, "{n} 3"]:
         ValueError: for fewer than 2 points, or too many for the dense sphere.
     """
     dense = fibonacci_sphere(2000, "equation8")
-    if not 2 <= n <= len(dense) // 4:
-        raise ValueError(f"a nested lattice needs between 2 and {len(dense) // 4} viewpoints, got {n}")
+    most = len(dense) // 4
+    n = whole(n, f"a nested lattice needs between 2 and {most} viewpoints", 2, most)
     chosen, nearest = [0], np.full(len(dense), np.inf)
     while len(chosen) < n:
         nearest = np.minimum(nearest, np.linalg.norm(dense - dense[chosen[-1]], axis=1))
@@ -183,10 +188,10 @@ class ViewGraph:
             ValueError: for fewer than 2 points, points off the unit sphere, duplicates, pairs of views that do not exist or of a
                 view and itself, or, without `neighbours`, four or more points in one plane.
         """
-        array = np.asarray(points, float)
+        array = numbers(points)
         if array.ndim != 2 or array.shape[1] != 3 or len(array) < 2:
             raise ValueError(f"a view graph needs at least 2 points of 3 coordinates, got shape {array.shape}")
-        if np.abs(np.linalg.norm(array, axis=1) - 1).max() > 1e-4:
+        if not np.abs(np.linalg.norm(array, axis=1) - 1).max() <= 1e-4:
             raise ValueError("viewpoints must be unit vectors: divide each by its length")
         distances, count = great_circle_distances(array), len(array)
         if np.min(distances + 10 * np.eye(count)) < 1e-4:
@@ -194,8 +199,9 @@ class ViewGraph:
         near = np.zeros((count, count), bool)
         if neighbours is not None:
             for a, b in neighbours:
-                if a == b or not (0 <= a < count and 0 <= b < count):
-                    raise ValueError(f"views {a} and {b} cannot be neighbours: the {count} views are 0 to {count - 1}")
+                rule = f"views {a} and {b} cannot be neighbours: the {count} views are 0 to {count - 1}"
+                if whole(a, rule, 0, count - 1) == whole(b, rule, 0, count - 1):
+                    raise ValueError(rule)
                 near[[a, b], [b, a]] = True
         elif count <= 3:
             near[:] = ~np.eye(count, dtype=bool)

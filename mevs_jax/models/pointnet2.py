@@ -19,6 +19,7 @@ import jax.numpy as jnp
 from flax import nnx
 from jaxtyping import Array, Float, Int
 
+from mevs_jax.arguments import check, whole
 from mevs_jax.arrays import AnyArray
 from mevs_jax.models.batch_norm import BatchNorm
 from mevs_jax.models.calling import TrainedByCall
@@ -174,10 +175,10 @@ def _abstract(
 
 
 def _pieces(level: Abstraction) -> int:
-    """Number of pieces that a level's centres are processed in; on CPU, equal pieces of at most 4,096 neighbours."""
+    """Number of equal pieces that a level's centres are processed in; on CPU, of at most 4,096 neighbours, or of one centre."""
     if jax.default_backend() != "cpu":
         return 1
-    fewest = -(-level.centres * level.samples // 4096)
+    fewest = min(-(-level.centres * level.samples // 4096), level.centres)
     return next(count for count in range(fewest, level.centres + 1) if level.centres % count == 0)
 
 
@@ -195,7 +196,7 @@ class PointNet2(TrainedByCall):
             statistics and the last layer keep their own types.
 
     Raises:
-        ValueError: for fewer than 2 views.
+        ValueError: for fewer than 2 views, a dropout outside its range, or abstractions of impossible sizes.
     """
 
     def __init__(
@@ -209,10 +210,13 @@ class PointNet2(TrainedByCall):
         rngs: nnx.Rngs,
         dtype: jnp.dtype | None = None,
     ):
-        if views < 2:
-            raise ValueError(f"PointNet2 needs at least 2 candidate views, got {views}")
-        self.views = views
+        self.views = whole(views, "PointNet2 needs at least 2 candidate views", 2, 2**20)
         self.levels = tuple(abstractions)
+        for level in self.levels:
+            whole(level.centres, "an abstraction needs at least 1 centre", 1, 2**31 - 1)
+            whole(level.samples, "an abstraction needs at least 1 sample", 1, 2**31 - 1)
+            check(level.radius, "radius of an abstraction must be above 0", lambda far: (far > 0) & (far < jnp.inf))
+        check(dropout, "dropout must be a probability below 1", lambda rate: (rate >= 0) & (rate < 1))
         channels = 3  # in place of normals
         perceptrons = []
         for level in self.levels:

@@ -13,6 +13,7 @@ import numpy as np
 from flax import nnx
 from jaxtyping import Array, Bool, Float
 
+from mevs_jax.arguments import check
 from mevs_jax.arrays import AnyArray
 from mevs_jax.models.set_fusion import dropped
 
@@ -39,6 +40,7 @@ class PoseHead(nnx.Module):
         dropout: float = 0.2,
         rngs: nnx.Rngs,
     ):
+        check(dropout, "dropout must be a probability below 1", lambda rate: (rate >= 0) & (rate < 1))
         self.shape, self.dropout, self.width = (classes, poses), dropout, width
         self.norm = nnx.LayerNorm(features, rngs=rngs)
         self.layer1 = nnx.Linear(features + 1, width, rngs=rngs)

@@ -7,6 +7,7 @@ import jax.numpy as jnp
 from flax import nnx
 from jaxtyping import Array, Bool, Float
 
+from mevs_jax.arguments import check
 from mevs_jax.arrays import AnyArray
 
 
@@ -108,6 +109,7 @@ class SetFusion(nnx.Module):
         dropout: float = 0.1,
         rngs: nnx.Rngs,
     ):
+        check(dropout, "dropout must be a probability below 1", lambda rate: (rate >= 0) & (rate < 1))
         self.norm = nnx.LayerNorm(features, rngs=rngs)
         self.dropout = dropout
         self.view = nnx.Linear(features, width, rngs=rngs)

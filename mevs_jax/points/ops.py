@@ -22,6 +22,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int, UInt32
 
+from mevs_jax.arguments import check, whole
 from mevs_jax.arrays import AnyArray
 from mevs_jax.points import farthest
 from mevs_jax.points import kernels as point_kernels
@@ -64,8 +65,7 @@ def farthest_point_sample(points: Float[AnyArray, "points 3"], k: int) -> Int[Ar
     Raises:
         ValueError: for `k` below 1, a cloud without points, or an array of other than one cloud.
     """
-    if k < 1:
-        raise ValueError(f"farthest_point_sample needs k >= 1, got {k}")
+    k = whole(k, "farthest_point_sample needs k >= 1", 1, 2**31 - 1)
     _check_cloud("farthest_point_sample", points)
     if isinstance(points, jax.core.Tracer) or jax.default_backend() != "cpu":
         return _farthest(points, k)
@@ -127,8 +127,8 @@ def ball_query(
     Raises:
         ValueError: for `k` below 1, a cloud without points, or arrays of other than one cloud.
     """
-    if k < 1:
-        raise ValueError(f"ball_query needs k >= 1, got {k}")
+    k = whole(k, "ball_query needs k >= 1", 1, 2**31 - 1)
+    check(radius, "radius must be at least 0", lambda far: far >= 0)
     _check_cloud("ball_query", points)
     _check_cloud("ball_query", centres)
     points, centres = (jax.lax.stop_gradient(jnp.asarray(array)) for array in (points, centres))

@@ -10,6 +10,7 @@ import jax.numpy as jnp
 from jax.tree_util import Partial
 from jaxtyping import Array, Bool, Float, Int
 
+from mevs_jax.arguments import check
 from mevs_jax.geometry.viewpoints import ViewGraph, local_maxima
 
 
@@ -165,7 +166,11 @@ def with_movement(policy: Policy, cost: float | Float[Array, ""]) -> Policy:
     Args:
         policy: the policy without movement cost.
         cost: per radian of great-circle distance from the latest view.
+
+    Raises:
+        ValueError: for a cost that is known and negative or not finite.
     """
+    check(cost, "cost must be at least 0", lambda one: (one >= 0) & (one < jnp.inf))
     return Partial(_with_movement, as_tree(policy), cost)
 
 

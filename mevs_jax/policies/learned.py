@@ -12,6 +12,7 @@ from flax import nnx
 from jax.tree_util import Partial
 from jaxtyping import Array, Float
 
+from mevs_jax.arguments import check, whole
 from mevs_jax.models.view_policy import ViewPolicy, expected_gain, utility_of
 from mevs_jax.policies.base import Policy, Scene, SelectionState, candidates, known
 
@@ -43,6 +44,10 @@ def _scores_by(structure: nnx.GraphDef, by: By) -> Callable[..., Float[Array, " 
     return scores
 
 
+def _check_temperature(temperature: float | Float[Array, ""]) -> None:
+    check(temperature, "temperature must be positive", lambda T: (T > 0) & (jnp.inf > T))
+
+
 def learned(
     network: ViewPolicy, temperature: float | Float[Array, ""], *, by: Literal["belief", "state", "table"] = "belief"
 ) -> Policy:
@@ -56,7 +61,11 @@ def learned(
         by: `belief` uses the network's gain for each class, weighted by the belief; `state` uses its gain for the state as a
             whole; `table` averages the gain for each class with the gain computed from the views of other objects
             (`Knowledge.expected_logits`, log-probabilities of single views), weighted by the belief.
+
+    Raises:
+        ValueError: for a temperature that is known and not positive.
     """
+    _check_temperature(temperature)
 
     def scores(key: Array, state: SelectionState, scene: Scene) -> Float[Array, " views"]:
         del key
@@ -103,7 +112,13 @@ def looking_ahead(
         network, temperature: as for `learned`.
         shortlist: number of views to evaluate, those with the highest gain of one view; no other view is chosen.
         classes: number of classes to consider, the most likely ones.
+
+    Raises:
+        ValueError: for a temperature or a number out of its range.
     """
+    _check_temperature(temperature)
+    shortlist = whole(shortlist, "shortlist must be at least 1", 1, 2**20)
+    classes = whole(classes, "classes must be at least 1", 1, 2**20)
 
     def scores(key: Array, state: SelectionState, scene: Scene) -> Float[Array, " views"]:
         del key

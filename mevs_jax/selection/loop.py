@@ -17,6 +17,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
+from mevs_jax.arguments import check, check_indices, whole
 from mevs_jax.arrays import first_true
 from mevs_jax.beliefs.fusing import CalibratedFusion, confidence
 from mevs_jax.geometry.viewpoints import ViewGraph
@@ -150,11 +151,13 @@ def select_views(
         fuse: computes the belief after each observation.
 
     Raises:
-        ValueError: for `max_views` outside its range, or a scene without a field that the policy needs.
+        ValueError: for `start`, `threshold` or `max_views` outside their ranges, a scene without a field that the policy needs,
+            or a policy that returns other than a score for each view.
     """
     views = scene.graph.points.shape[0]
-    if not 1 <= max_views <= views:
-        raise ValueError(f"max_views must be between 1 and the {views} candidate views, got {max_views}")
+    max_views = whole(max_views, f"max_views must be between 1 and the {views} candidate views", 1, views)
+    check_indices(start, "start", views)
+    check(threshold if threshold is not None else 1.0, "threshold must be a probability", lambda share: share >= 0)
     start = jnp.asarray(start, jnp.int32)
     limit: int | Array = max_views
     if scene.reachable is not None:
@@ -175,6 +178,8 @@ def select_views(
 
         def next_view() -> Int[Array, ""]:
             scores = policy(jax.random.fold_in(key, state.count), state, scene)
+            if scores.shape != (views,):
+                raise ValueError(f"a policy must return a score for each of {views} views, got shape {scores.shape}")
             return best_view(scores, candidates(state, scene), scene.reachable)
 
         # After the last view nothing is chosen.

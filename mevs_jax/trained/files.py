@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import os
 import re
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -55,6 +56,8 @@ def load(path: str | Path) -> TrainedSystem:
         UnreadableSystem: for a folder that is damaged or was written by another version.
         ImportError: for a name on the hub, without the package huggingface_hub.
     """
+    if not isinstance(path, str | os.PathLike):
+        raise ValueError(f"path must be a name or a folder, got {path!r:.80}")
     folder = _folder_of(path)
     try:
         return _read(folder, str(path))

@@ -12,6 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from mevs_jax.arguments import check, known
 from mevs_jax.arrays import AnyArray
 from mevs_jax.geometry.cameras import cameras_at
 from mevs_jax.geometry.inputs import check_depth
@@ -150,8 +151,15 @@ class TrainedSystem:
             radius: of the object in metres, for a system that uses it (`description.size`); NaN if it is unknown.
 
         Raises:
-            ValueError: for a depth image of another size, of whole numbers, or not in radii.
+            ValueError: for a depth image of another size, of whole numbers, or not in radii; for no pose, or a radius that is not
+                positive.
         """
+        is_number = isinstance(radius, float | int | np.number | AnyArray)
+        rule = "radius must be positive, in metres, or NaN"
+        check(radius, rule, lambda far: ~(far <= 0) & ~np.isinf(far) & is_number)
+        placed = known(pose)
+        if np.shape(pose) != (4, 4) or (placed is not None and not (np.isfinite(placed).all() and placed[:3, 3].any())):
+            raise ValueError("pose must be a finite matrix (4, 4), away from the object's centre")
         side = self.description.camera.resolution
         check_depth(depth, self.description.camera)
         if np.shape(depth) != (side, side):
@@ -178,7 +186,8 @@ class TrainedSystem:
     def log_probabilities(
         self, belief: Float[Array, "*batch classes"], count: int | Array, policy: str = "random"
     ) -> Float[Array, "*batch classes"]:
-        """Calibrated log-probabilities of the classes, from the belief after `count` views of a policy's walk."""
+        """Calibrated log-probabilities of the classes, from the belief after `count` views of a policy's walk, at least 1."""
+        check(count, "count must be at least 1", lambda views: views >= 1)
         temperatures = self.parts.temperatures.get(policy, self.parts.temperatures["random"])
         at = jnp.clip(jnp.asarray(count), 1, len(temperatures)) - 1
         return jax.nn.log_softmax(belief / temperatures[at], axis=-1)

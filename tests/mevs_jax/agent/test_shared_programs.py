@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
+from threading import Barrier
 
 import jax
 import numpy as np
@@ -75,3 +77,24 @@ def test_poses_of_many_directions_are_those_of_each():
         assert pose[2, 1] <= 1e-12  # up is upwards in the image, whose y axis points down
         np.testing.assert_array_equal(pose, pose_towards(direction, center, 0.7, up))
         np.testing.assert_array_equal(pose[3], (0, 0, 0, 1))
+
+
+def test_calls_from_several_threads_wait_for_each_other(classifier):
+    """None of their images is lost, and none is seen half."""
+    agent, views = Agent(classifier, "random", stop=2, max_views=12), views_of(classifier)
+    for trial in range(3):
+        agent.begin(LYING)
+        start = Barrier(4)
+
+        def show(first: int, start: Barrier = start) -> None:
+            start.wait()
+            for index in range(first, 12, 4):
+                agent.observe_view(*views[index])
+                agent.decide()
+
+        with ThreadPoolExecutor(4) as threads:
+            list(threads.map(show, range(4)))
+        counts = [(belief["views"], belief["images"]) for belief in agent.history.beliefs]
+        assert counts == [(count, count) for count in range(1, 13)], trial
+        for depth, pose in zip(agent.history.depths, agent.history.poses, strict=True):
+            assert any(np.array_equal(depth, image) and np.array_equal(pose, where) for image, where in views)

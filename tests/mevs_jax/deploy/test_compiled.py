@@ -29,6 +29,23 @@ def test_programs_are_kept_in_the_users_cache(tmp_path):
     assert ended.stdout.strip() == str(tmp_path / "own")
 
 
+SECOND = """
+import sys, jax, jax.numpy as jnp
+from mevs_jax import keep_compiled
+for size, folder in enumerate(sys.argv[1:], 5):
+    print(keep_compiled(folder))
+    jax.jit(lambda x: jnp.sin(x) @ x)(jnp.ones((size, size))).block_until_ready()
+"""
+
+
+def test_a_second_folder_is_used_from_then_on(tmp_path):
+    folders = [str(tmp_path / name) for name in ("one", "two")]
+    ended = subprocess.run([sys.executable, "-c", SECOND, *folders], capture_output=True, text=True, timeout=300)
+    assert ended.stdout.split() == folders, ended.stderr
+    for folder in folders:
+        assert any(path.name.endswith("-cache") for path in os.scandir(folder))
+
+
 def test_the_oldest_programs_go_first(tmp_path):
     for age, name in enumerate(("a-cache", "b-cache", "c-cache", "d-cache", "notes.txt")):
         (tmp_path / name).write_bytes(bytes(100))

@@ -292,6 +292,8 @@ def test_an_environment_is_an_argument_of_a_compiled_program():
     [
         ({"max_views": 0}, "max_views must be between 1 and the 12"),
         ({"max_views": 13}, "max_views must be between 1 and the 12"),
+        ({"movement_cost": float("nan")}, "movement_cost must be at least 0, got nan"),
+        ({"movement_cost": -1.0}, "movement_cost must be at least 0, got -1"),
         ({"reachable": jnp.ones(5, bool)}, "`reachable` must have shape"),
         ({"graph": ViewGraph.from_points(fibonacci_sphere(10))}, "the tables have 12 views, the graph has 10"),
         ({"tables": tables_of(1)}, "needs an object and two classes"),
@@ -306,3 +308,25 @@ def test_what_does_not_fit_together_is_refused(change, message):
     arguments = {"tables": tables_of(), "graph": GRAPH, "max_views": MAX_VIEWS} | change
     with pytest.raises(ValueError, match=message):
         ActiveRecognition(arguments.pop("tables"), arguments.pop("graph"), **arguments)
+
+
+def test_what_an_episode_cannot_begin_or_go_on_with_is_refused():
+    environment, key = ActiveRecognition(tables_of(), GRAPH, max_views=MAX_VIEWS), jax.random.key(0)
+    for given, message in (
+        ({"start": -1}, f"start must be from 0 to {VIEWS - 1}, got -1"),
+        ({"start": VIEWS}, f"start must be from 0 to {VIEWS - 1}, got {VIEWS}"),
+        ({"object_index": OBJECTS}, f"object_index must be from 0 to {OBJECTS - 1}, got {OBJECTS}"),
+        ({"object_index": jnp.int32(-1)}, "object_index must be from 0"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            environment.reset(key, **given)
+    state, observation = environment.reset(key, start=0)
+    logits = observation.belief
+    for action, message in (
+        ({"action": 1}, r'an action is \{"action": index of the next view, "prediction": logits'),
+        ({"action": 1, "prediction": logits[:-1]}, "a prediction is finite logits of shape"),
+        ({"action": 1, "prediction": logits.at[0].set(jnp.inf)}, "finite logits of shape .* got inf"),
+        ({"action": 1.5, "prediction": logits}, "an action is the index of a view, got 1.5"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            environment.step(key, state, action)

@@ -223,7 +223,9 @@ def test_wrappers_of_ap_gym_log_the_accuracy(gym, ap_gym):
         (12, np.zeros(CLASSES), "an action is an index from 0 to 11"),
         (-1, np.zeros(CLASSES), "an action is an index from 0 to 11"),
         (1.5, np.zeros(CLASSES), "an action is an index from 0 to 11"),
-        (0, np.full(CLASSES, np.nan), "with 4 NaN"),
+        (0, np.full(CLASSES, np.nan), r"finite logits of shape \(4,\), got nan"),
+        (0, np.array([0, 0, np.inf, 0]), r"finite logits of shape \(4,\), got inf"),
+        (0, np.array([0, 0, -np.inf, 0]), r"finite logits of shape \(4,\), got -inf"),
         (0, np.zeros(3), r"logits of shape \(4,\)"),
     ],
 )
@@ -232,3 +234,35 @@ def test_an_action_outside_its_space_is_refused(action, prediction, message, gym
     env.reset(seed=0)
     with pytest.raises(ValueError, match=message):
         env.step({"action": action, "prediction": prediction})
+
+
+def test_misuse_is_one_sentence(gym):
+    import gymnasium
+
+    environment = environment_of()
+    for env, shape in (
+        (gym.ActiveRecognitionEnv(environment), ()),
+        (gym.ActiveRecognitionVectorEnv(environment, 2), (2,)),
+    ):
+        whole = {"action": np.zeros(shape, int), "prediction": np.zeros((*shape, CLASSES))}
+        with pytest.raises(gymnasium.error.ResetNeeded, match="begin the first episode with reset"):
+            env.step(whole)
+        for options, message in (
+            ({"start": "a"}, "'start' must be between 0 and 11, got 'a'"),
+            ({"start": 2.5}, "'start' must be between 0 and 11, got 2.5"),
+            ({"object_index": -1}, "'object_index' must be between 0 and 6, got -1"),
+            ({"start": [1, 2, 3]}, r"'start' must be one index or of shape"),
+        ):
+            with pytest.raises(ValueError, match=message):
+                env.reset(options=options)
+        env.reset(seed=0)
+        for action in ({}, {"action": whole["action"]}, {"prediction": whole["prediction"]}):
+            with pytest.raises(
+                ValueError, match=r'an action is \{"action": index of the next view, "prediction": logits'
+            ):
+                env.step(action)
+        with pytest.raises(NotImplementedError, match="this environment draws nothing"):
+            env.render()
+        assert np.isfinite(env.step(whole)[1]).all()
+    with pytest.raises(ValueError, match="num_envs must be at least 1, got 0"):
+        gym.ActiveRecognitionVectorEnv(environment, 0)

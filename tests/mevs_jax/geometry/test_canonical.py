@@ -262,7 +262,7 @@ MIRROR, SCALED, TRANSPOSED = np.diag([1.0, 1, -1, 1]), np.diag([2.0, 2, 2, 1]), 
         ({"T_world_camera": data_set_shot().T_world_camera @ MIRROR}, "determinant −1"),
         ({"center": 5 * DIRECTION.astype(float)}, "not in the image.*not its inverse"),  # behind the camera
         ({"center": (9.0, 9.0, 0.0)}, "not in the image"),
-        ({"center": (0.0, 0.0)}, r"center must be three finite numbers, got \[0.0, 0.0\]"),
+        ({"center": (0.0, 0.0)}, r"center must be three finite numbers, got \(0.0, 0.0\)"),
         ({"radius": 0.0}, "radius must be positive, in metres, got 0.0"),
         ({"radius": -1.0}, "radius must be positive, in metres, got -1.0"),
         ({"radius": 2.5}, "inside its sphere"),
@@ -282,7 +282,8 @@ def test_wrong_arguments_are_refused_with_a_sentence(change, message):
 
 @pytest.mark.parametrize("numbers", [{"resolution": 0}, {"field_of_view": 180.0}, {"distance": 1.0}])
 def test_a_data_set_s_camera_is_outside_the_sphere_and_has_pixels(numbers):
-    with pytest.raises(ValueError, match="got ViewCamera"):
+    ((name, value),) = numbers.items()
+    with pytest.raises(ValueError, match=f"above 1 radius; {name}, got {value}"):
         ViewCamera(**numbers)
 
 
