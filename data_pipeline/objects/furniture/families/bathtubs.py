@@ -7,6 +7,7 @@ import numpy as np
 from data_pipeline.objects.furniture.families.parts import (
     CORNER,
     Outline,
+    draws,
     loft,
     moved,
     prism,
@@ -101,7 +102,7 @@ def tub_freestanding(random: Random) -> Parts:
 def tub_alcove(random: Random) -> Parts:
     """A built-in tub: a deck wider than the basin, a panel in front, tiles or a ledge at a side."""
     width, depth, height = _tub_size(random)
-    power, ledge = random.uniform(3, 30), random.uniform(0.05, 0.16)
+    power, ledge = draws(random, (3, 30), (0.05, 0.16))
     parts: Parts = [_vessel(random, superellipse(power), width, depth, height, random.uniform(0.85, 0.95), ledge)]
     parts += [
         box(width, 0.02, height, 0, -depth / 2 + 0.01),
@@ -119,7 +120,7 @@ def tub_alcove(random: Random) -> Parts:
 
 def tub_corner(random: Random) -> Parts:
     """A tub for a corner of the room, with a seat, jets or a step."""
-    side, height = random.uniform(1.2, 1.6), random.uniform(0.48, 0.62)
+    side, height = draws(random, (1.2, 1.6), (0.48, 0.62))
     wall, rim = random.uniform(0.05, 0.16), np.repeat(CORNER, 2, axis=0)
     rim[1::2] = (CORNER + np.roll(CORNER, -1, axis=0)) / 2
     if random.random() < 0.5:  # a round front
@@ -133,7 +134,7 @@ def tub_corner(random: Random) -> Parts:
 
 def tub_round(random: Random) -> Parts:
     """A round or nearly square tub, with or without a ring of panels and a step."""
-    width, height = random.uniform(1.2, 1.7), random.uniform(0.5, 0.75)
+    width, height = draws(random, (1.2, 1.7), (0.5, 0.75))
     outline = superellipse(random.choice([2.0, 2.0, 5.0]))
     parts: Parts = [
         _vessel(
@@ -153,7 +154,7 @@ def tub_round(random: Random) -> Parts:
 
 def tub_soaking(random: Random) -> Parts:
     """A short deep tub with straight walls, of wood with hoops or of stone, with a bench."""
-    width, depth, height = random.uniform(0.9, 1.25), random.uniform(0.7, 0.95), random.uniform(0.62, 0.85)
+    width, depth, height = draws(random, (0.9, 1.25), (0.7, 0.95), (0.62, 0.85))
     outline = superellipse(random.choice([2.0, 4.0, 40.0]))
     parts: Parts = [_vessel(random, outline, width, depth, height, random.uniform(0.85, 1), random.uniform(0.03, 0.06))]
     for z in (0.25, 0.75) if random.random() < 0.5 else ():

@@ -10,6 +10,7 @@ from data_pipeline.objects.furniture.families.parts import (
     bent,
     crested,
     cushion,
+    draws,
     moved,
     rounded,
     sheet,
@@ -147,7 +148,7 @@ def bed_sleigh(random: Random) -> Parts:
 def bed_canopy(random: Random) -> Parts:
     """Posts with a roof, flat or curved, or half a roof on the side of the head."""
     width, length, base, thick = bed_size(random)
-    height, r = random.uniform(1.8, 2.2), random.uniform(0.02, 0.04)
+    height, r = draws(random, (1.8, 2.2), (0.02, 0.04))
     parts = [
         *_frame(width, length, base),
         *_made(random, width, length, base, thick),
@@ -155,11 +156,7 @@ def bed_canopy(random: Random) -> Parts:
     ]
     share = float(random.choice([1.0, random.uniform(0.35, 0.6)]))
     y = np.linspace(0.5 - share, 0.5, 7) * length
-    roof = bent(
-        [(v, height + 0.15 * (share == 1) * np.sin(np.pi * (v / length + 0.5))) for v in y],
-        width + 0.1,
-        0.03,
-    )
+    roof = bent([(v, height + 0.15 * (share == 1) * np.sin(np.pi * (v / length + 0.5))) for v in y], width + 0.1, 0.03)
     parts += [roof, *[rod((s * width / 2, length / 2, 0), (s * width / 2, length / 2, height), r) for s in (-1, 1)]]
     foot = height if share == 1 else base + thick + 0.2
     return parts + [rod((s * width / 2, -length / 2, 0), (s * width / 2, -length / 2, foot), r) for s in (-1, 1)]
@@ -167,7 +164,7 @@ def bed_canopy(random: Random) -> Parts:
 
 def bed_crib(random: Random) -> Parts:
     """A cot with bars on all sides, on legs, castors or rockers, with or without closed ends."""
-    width, length, rise = random.uniform(0.55, 0.75), random.uniform(0.85, 1.4), random.uniform(0.45, 0.6)
+    width, length, rise = draws(random, (0.55, 0.75), (0.85, 1.4), (0.45, 0.6))
     base, ends_closed = random.uniform(0.25, 0.45), random.random() < 0.5
     top, count, rocking = base + rise, int(random.integers(7, 15)), random.random() < 0.4
     parts = [
@@ -192,7 +189,7 @@ def bed_crib(random: Random) -> Parts:
 
 def bed_futon(random: Random) -> Parts:
     """A thick mat on the floor or on slats, with or without a low backrest at the head."""
-    width, length = random.uniform(0.9, 1.8), random.uniform(1.85, 2.1)
+    width, length = draws(random, (0.9, 1.8), (1.85, 2.1))
     base = float(random.choice([0.02, random.uniform(0.08, 0.2)]))
     parts = (
         [box(width * 1.05, 0.07, 0.03, 0, y, base - 0.02) for y in np.linspace(-0.46, 0.46, 9) * length]
@@ -239,8 +236,8 @@ def bed_drawers(random: Random) -> Parts:
 
 def bed_hospital(random: Random) -> Parts:
     """A mattress in three parts, the head raised, on a lifting frame with castors and side rails."""
-    width, base = random.uniform(0.85, 1.0), random.uniform(0.45, 0.65)
-    lift, knee = random.uniform(0, 0.9), random.uniform(0, 0.35)
+    width, base = draws(random, (0.85, 1.0), (0.45, 0.65))
+    lift, knee = draws(random, (0, 0.9), (0, 0.35))
     lengths, line = (0.75, 0.5, 0.75), [(-1.0, base)]
     for length, angle in zip(lengths, (-knee * 0.6, knee, lift), strict=True):
         y, z = line[-1]
@@ -267,7 +264,7 @@ def bed_hospital(random: Random) -> Parts:
 
 def bed_loft(random: Random) -> Parts:
     """A bed on high legs with rails, a ladder, and sometimes a desk below."""
-    width, length, base = random.uniform(0.85, 1.1), random.uniform(1.9, 2.05), random.uniform(1.2, 1.6)
+    width, length, base = draws(random, (0.85, 1.1), (1.9, 2.05), (1.2, 1.6))
     parts = [
         *_frame(width, length, base),
         *_made(random, width, length, base, 0.14),
@@ -290,7 +287,7 @@ def bed_loft(random: Random) -> Parts:
 
 def bed_round(random: Random) -> Parts:
     """A round or oval bed, with a curved head board."""
-    width, base, thick = random.uniform(1.7, 2.2), random.uniform(0.2, 0.32), random.uniform(0.18, 0.26)
+    width, base, thick = draws(random, (1.7, 2.2), (0.2, 0.32), (0.18, 0.26))
     parts = [
         turned([(width * 0.45, 0), (width * 0.5, base)]),
         turned([(width * 0.48, base), (width * 0.49, base + thick * 0.8), (width * 0.45, base + thick)]),

@@ -12,6 +12,7 @@ from data_pipeline.objects.furniture.families.parts import (
     Outline,
     crested,
     cushion,
+    draws,
     loft,
     moved,
     pedestal,
@@ -44,12 +45,7 @@ def _feet(random: Random, high: float = 0.2) -> float:
 
 def dresser_lowboy(random: Random) -> Parts:
     """A low sideboard on high legs, with drawers, doors and an open compartment."""
-    width, depth, height, feet = (
-        random.uniform(1.2, 1.9),
-        random.uniform(0.4, 0.5),
-        random.uniform(0.6, 0.8),
-        random.uniform(0.14, 0.3),
-    )
+    width, depth, height, feet = draws(random, (1.2, 1.9), (0.4, 0.5), (0.6, 0.8), (0.14, 0.3))
     parts = [
         box(width, depth, height - feet, 0, 0, feet),
         *four_legs(width * 0.9, depth * 0.9, feet, 0.045, splay=random.uniform(0, 0.07)),
@@ -66,12 +62,7 @@ def dresser_lowboy(random: Random) -> Parts:
 
 def dresser_bombe(random: Random) -> Parts:
     """Its front bows outwards, its sides may bulge; on short legs."""
-    width, depth, height, feet = (
-        random.uniform(0.8, 1.4),
-        random.uniform(0.4, 0.5),
-        random.uniform(0.78, 0.95),
-        random.uniform(0.08, 0.22),
-    )
+    width, depth, height, feet = draws(random, (0.8, 1.4), (0.4, 0.5), (0.78, 0.95), (0.08, 0.22))
     bow = random.uniform(0.3, 0.8)
     front = np.stack([x := np.linspace(1, -1, 11), np.full(11, 0.0)], axis=1)
     outline = np.concatenate([[[1.0, 1.0]], [[-1.0, 1.0]], np.c_[-x, -1 + bow * (x**2)]])
@@ -97,7 +88,7 @@ def dresser_bombe(random: Random) -> Parts:
 
 def dresser_stepped(random: Random) -> Parts:
     """A lower part that is deeper than the upper one, both with drawers or doors."""
-    width, depth, height = random.uniform(0.8, 1.3), random.uniform(0.42, 0.55), random.uniform(0.6, 0.85)
+    width, depth, height = draws(random, (0.8, 1.3), (0.42, 0.55), (0.6, 0.85))
     feet, rise = _feet(random), random.uniform(0.4, 1.0)
     upper, narrow = depth * random.uniform(0.55, 0.9), width * random.uniform(0.85, 1)
     y = (depth - upper) / 2
@@ -132,7 +123,7 @@ def dresser_stepped(random: Random) -> Parts:
 
 def dresser_vanity(random: Random) -> Parts:
     """Drawers at both sides of a lower middle, with an oval, arched or three-part mirror."""
-    width, depth, height = random.uniform(1.0, 1.5), random.uniform(0.4, 0.5), random.uniform(0.72, 0.82)
+    width, depth, height = draws(random, (1.0, 1.5), (0.4, 0.5), (0.72, 0.82))
     body, feet, rise = random.uniform(0.3, 0.42), _feet(random, 0.14), random.uniform(0.55, 0.9)
     parts = [
         tabletop(width, depth, height, 0.03),
@@ -172,12 +163,8 @@ def dresser_vanity(random: Random) -> Parts:
 
 def dresser_changing(random: Random) -> Parts:
     """A chest with a rail around its top and a pad on it; drawers, or open shelves below."""
-    width, depth, height, feet = (
-        random.uniform(0.75, 1.1),
-        random.uniform(0.48, 0.6),
-        random.uniform(0.8, 0.95),
-        _feet(random),
-    )
+    width, depth, height = draws(random, (0.75, 1.1), (0.48, 0.6), (0.8, 0.95))
+    feet = _feet(random)
     parts = [*_body(random, width, depth, height, feet), cushion(width * 0.9, depth * 0.85, 0.07, 0, 0, height)]
     parts += [box(0.02, depth, 0.12, s * width / 2, 0, height) for s in (-1, 1)] + [
         box(width, 0.02, 0.14, 0, depth / 2, height)
@@ -191,12 +178,8 @@ def dresser_changing(random: Random) -> Parts:
 
 def dresser_armoire(random: Random) -> Parts:
     """High doors above one or two rows of drawers, with a cornice or a crest."""
-    width, depth, height, feet = (
-        random.uniform(0.8, 1.3),
-        random.uniform(0.48, 0.6),
-        random.uniform(1.3, 1.9),
-        _feet(random),
-    )
+    width, depth, height = draws(random, (0.8, 1.3), (0.48, 0.6), (1.3, 1.9))
+    feet = _feet(random)
     low = feet + random.uniform(0.25, 0.6)
     parts = [
         *_body(random, width, depth, height, feet),
@@ -219,12 +202,8 @@ def dresser_armoire(random: Random) -> Parts:
 
 def dresser_open(random: Random) -> Parts:
     """A frame of posts around drawers that stand apart or hang like baskets."""
-    width, depth, height, rows = (
-        random.uniform(0.5, 1.1),
-        random.uniform(0.4, 0.5),
-        random.uniform(0.75, 1.2),
-        int(random.integers(3, 6)),
-    )
+    width, depth, height = draws(random, (0.5, 1.1), (0.4, 0.5), (0.75, 1.2))
+    rows = int(random.integers(3, 6))
     parts = [tabletop(width, depth, height, 0.03), *four_legs(width, depth, height, 0.035)]
     each = (height - 0.1) / rows
     for row in range(rows):
@@ -238,7 +217,7 @@ def dresser_open(random: Random) -> Parts:
 
 def dresser_tall_plinth(random: Random) -> Parts:
     """A plain tall chest or filing cabinet on a recessed plinth, grips instead of handles."""
-    width, depth, height = random.uniform(0.4, 0.75), random.uniform(0.42, 0.62), random.uniform(0.8, 1.4)
+    width, depth, height = draws(random, (0.4, 0.75), (0.42, 0.62), (0.8, 1.4))
     plinth, rows = random.uniform(0.05, 0.12), int(random.integers(3, 7))
     parts = [box(width * 0.95, depth * 0.85, plinth, 0, 0.03), box(width, depth, height - plinth, 0, 0, plinth)]
     each = (height - plinth) / rows
@@ -258,12 +237,8 @@ def dresser_tall_plinth(random: Random) -> Parts:
 
 def stand_cube(random: Random) -> Parts:
     """A cube on a plinth or on thin legs, drawers with grips or none."""
-    width, depth, height, feet = (
-        random.uniform(0.4, 0.55),
-        random.uniform(0.38, 0.5),
-        random.uniform(0.38, 0.55),
-        _feet(random),
-    )
+    width, depth, height = draws(random, (0.4, 0.55), (0.38, 0.5), (0.38, 0.55))
+    feet = _feet(random)
     parts, rows = _body(random, width, depth, height, feet), int(random.integers(1, 3))
     return parts + drawers(random, width * 0.97, height - feet - 0.04, rows, 1, 0, -depth / 2, feet + 0.01)
 
@@ -286,7 +261,7 @@ def stand_round(random: Random) -> Parts:
 
 def stand_pedestal(random: Random) -> Parts:
     """A box with a drawer, or a round top, on one column."""
-    width, height, drop = random.uniform(0.38, 0.5), random.uniform(0.52, 0.68), random.uniform(0.12, 0.2)
+    width, height, drop = draws(random, (0.38, 0.5), (0.52, 0.68), (0.12, 0.2))
     outline = (SQUARE, CIRCLE, superellipse(5))[random.integers(3)]
     parts = [prism(outline, width, width, drop, 0, 0, height - drop), *pedestal(random, width * 0.42, height - drop)]
     y = -width / 2
@@ -299,7 +274,7 @@ def stand_pedestal(random: Random) -> Parts:
 
 def stand_tiers(random: Random) -> Parts:
     """Open shelves between posts or between panels, sometimes with a drawer below the top."""
-    width, depth, height = random.uniform(0.36, 0.52), random.uniform(0.32, 0.45), random.uniform(0.5, 0.68)
+    width, depth, height = draws(random, (0.36, 0.52), (0.32, 0.45), (0.5, 0.68))
     levels = np.linspace(random.uniform(0.06, 0.15), height, int(random.integers(2, 5)))
     parts = [box(width, depth, 0.025, 0, 0, z - 0.025) for z in levels]
     if random.random() < 0.6:
@@ -316,12 +291,7 @@ def stand_tiers(random: Random) -> Parts:
 
 def stand_c_shape(random: Random) -> Parts:
     """A top and a foot on one side wall, like a C or a Z."""
-    width, depth, height, thick = (
-        random.uniform(0.38, 0.52),
-        random.uniform(0.32, 0.45),
-        random.uniform(0.48, 0.65),
-        random.uniform(0.025, 0.06),
-    )
+    width, depth, height, thick = draws(random, (0.38, 0.52), (0.32, 0.45), (0.48, 0.65), (0.025, 0.06))
     parts = [box(width, depth, thick), tabletop(width, depth, height, thick), box(thick, depth, height, -width / 2)]
     if random.random() < 0.6:
         z = height * random.uniform(0.35, 0.6)
@@ -331,12 +301,7 @@ def stand_c_shape(random: Random) -> Parts:
 
 def stand_rail(random: Random) -> Parts:
     """A drawer on legs, with a rail or a crest around back and sides of the top."""
-    width, depth, height, drop = (
-        random.uniform(0.4, 0.55),
-        random.uniform(0.34, 0.45),
-        random.uniform(0.55, 0.7),
-        random.uniform(0.14, 0.3),
-    )
+    width, depth, height, drop = draws(random, (0.4, 0.55), (0.34, 0.45), (0.55, 0.7), (0.14, 0.3))
     parts = [
         tabletop(width, depth, height, 0.02),
         box(width * 0.94, depth * 0.92, drop, 0, 0, height - drop),
@@ -350,12 +315,7 @@ def stand_rail(random: Random) -> Parts:
 
 def stand_hanging(random: Random) -> Parts:
     """A flat box with a drawer or an open niche on hairpin legs or a frame of tube."""
-    width, depth, height, drop = (
-        random.uniform(0.42, 0.58),
-        random.uniform(0.34, 0.45),
-        random.uniform(0.45, 0.62),
-        random.uniform(0.14, 0.28),
-    )
+    width, depth, height, drop = draws(random, (0.42, 0.58), (0.34, 0.45), (0.45, 0.62), (0.14, 0.28))
     low, r = height - drop, random.uniform(0.006, 0.011)
     if random.random() < 0.5:
         parts = [box(width, depth, drop, 0, 0, low), *drawers(random, width * 0.96, drop, 1, 1, 0, -depth / 2, low)]
@@ -379,12 +339,8 @@ def stand_hanging(random: Random) -> Parts:
 
 def stand_cabinet(random: Random) -> Parts:
     """Doors below a drawer or an open niche, with a framed plinth and a moulded top."""
-    width, depth, height, feet = (
-        random.uniform(0.42, 0.6),
-        random.uniform(0.36, 0.48),
-        random.uniform(0.58, 0.78),
-        _feet(random, 0.14),
-    )
+    width, depth, height = draws(random, (0.42, 0.6), (0.36, 0.48), (0.58, 0.78))
+    feet = _feet(random, 0.14)
     inside, split = height - feet, random.uniform(0.25, 0.4)
     parts = [
         *_body(random, width, depth, height, feet),
@@ -406,7 +362,7 @@ def stand_cabinet(random: Random) -> Parts:
 
 def stand_bedside(random: Random) -> Parts:
     """Sides that stand on the floor and rise above or reach past drawers that lie between them."""
-    width, depth, height = random.uniform(0.38, 0.55), random.uniform(0.36, 0.5), random.uniform(0.42, 0.65)
+    width, depth, height = draws(random, (0.38, 0.55), (0.36, 0.5), (0.42, 0.65))
     low, rows, t = random.uniform(0.03, 0.2), int(random.integers(1, 4)), random.uniform(0.018, 0.04)
     parts = [box(t, depth, height + random.choice([0, 0.06]), s * (width + t) / 2) for s in (-1, 1)]
     parts += [box(width, depth * 0.96, height - low, 0, 0.01, low)]

@@ -20,6 +20,7 @@ from data_pipeline.objects.furniture.families.parts import (
     bent,
     crested,
     cushion,
+    draws,
     loft,
     moved,
     pedestal,
@@ -98,12 +99,7 @@ def chair_shell(random: Random) -> Parts:
 
 def chair_bucket(random: Random) -> Parts:
     """A bucket whose rim rises from the front to the back, on legs, a trumpet or a star."""
-    width, depth, seat, rise = (
-        random.uniform(0.55, 0.78),
-        random.uniform(0.5, 0.65),
-        random.uniform(0.38, 0.46),
-        random.uniform(0.32, 0.5),
-    )
+    width, depth, seat, rise = draws(random, (0.55, 0.78), (0.5, 0.65), (0.38, 0.46), (0.32, 0.5))
     wall = around(
         width, depth, rise * random.uniform(0.15, 0.6), rise, random.uniform(0.015, 0.06), random.uniform(0.5, 1.0)
     )
@@ -127,8 +123,8 @@ def chair_bucket(random: Random) -> Parts:
 
 def chair_club(random: Random) -> Parts:
     """A fat upholstered armchair: arms as rolls, cushions or boxes."""
-    width, depth, seat = random.uniform(0.5, 0.65), random.uniform(0.75, 0.92), random.uniform(0.38, 0.46)
-    rise, arm, feet = random.uniform(0.35, 0.5), random.uniform(0.13, 0.22), random.uniform(0.03, 0.14)
+    width, depth, seat = draws(random, (0.5, 0.65), (0.75, 0.92), (0.38, 0.46))
+    rise, arm, feet = draws(random, (0.35, 0.5), (0.13, 0.22), (0.03, 0.14))
     parts = [
         box(width, depth * 0.95, seat - 0.12 - feet, 0, 0, feet),
         *four_legs(width + 2 * arm, depth, feet, 0.05, 0.03),
@@ -160,12 +156,7 @@ def chair_club(random: Random) -> Parts:
 
 def chair_wing(random: Random) -> Parts:
     """A high back with wings, upholstered arms and short legs."""
-    width, depth, seat, rise = (
-        random.uniform(0.52, 0.64),
-        random.uniform(0.6, 0.78),
-        random.uniform(0.4, 0.46),
-        random.uniform(0.6, 0.78),
-    )
+    width, depth, seat, rise = draws(random, (0.52, 0.64), (0.6, 0.78), (0.4, 0.46), (0.6, 0.78))
     feet = random.uniform(0.1, 0.2)
     parts = [box(width, depth, seat - 0.1 - feet, 0, 0, feet), *four_legs(width + 0.1, depth, feet, 0.045, 0.02)]
     parts.append(cushion(width, depth * 0.9, 0.15, 0, -0.05, seat - 0.1))
@@ -200,7 +191,7 @@ def chair_folding(random: Random) -> Parts:
 
 def chair_director(random: Random) -> Parts:
     """Crossed legs across the front, a sling seat and a sling back, flat arms."""
-    width, depth, seat = random.uniform(0.5, 0.6), random.uniform(0.38, 0.46), random.uniform(0.42, 0.6)
+    width, depth, seat = draws(random, (0.5, 0.6), (0.38, 0.46), (0.42, 0.6))
     rise, r = random.uniform(0.35, 0.45), 0.016
     x, y = width / 2, depth / 2
     parts: Parts = [bent([(-y, seat), (y, seat)], width, 0.012, 0)]
@@ -213,8 +204,8 @@ def chair_director(random: Random) -> Parts:
 
 def chair_deck(random: Random) -> Parts:
     """A sling between two frames that lean against each other."""
-    width, length, height = random.uniform(0.52, 0.66), random.uniform(0.9, 1.15), random.uniform(0.75, 0.95)
-    r, sag = random.uniform(0.013, 0.02), random.uniform(0.06, 0.16)
+    width, length, height = draws(random, (0.52, 0.66), (0.9, 1.15), (0.75, 0.95))
+    r, sag = draws(random, (0.013, 0.02), (0.06, 0.16))
     low, high = (-length / 2, 0.28), (length / 2, height)
     parts: Parts = []
     for s in (-1, 1):
@@ -239,7 +230,7 @@ def chair_deck(random: Random) -> Parts:
 
 def chair_lounger(random: Random) -> Parts:
     """A reclining seat with a leg rest in one curve, on a frame or a sled."""
-    width, length = random.uniform(0.52, 0.7), random.uniform(1.45, 1.9)
+    width, length = draws(random, (0.52, 0.7), (1.45, 1.9))
     line = [(-0.5, 0.36), (-0.3, 0.4), (-0.12, 0.46), (0.02, 0.36), (0.12, 0.34), (0.3, 0.5), (0.5, 0.8)]
     profile = [(y * length, z * random.uniform(0.9, 1.05)) for y, z in line]
     parts: Parts = [bent(profile, width, random.uniform(0.03, 0.1))]
@@ -260,12 +251,7 @@ def chair_lounger(random: Random) -> Parts:
 
 def chair_easy(random: Random) -> Parts:
     """A low seat and back of slats or sling, in a frame of bent wood or tube whose sides are the arms."""
-    width, depth, seat, rise = (
-        random.uniform(0.55, 0.68),
-        random.uniform(0.65, 0.8),
-        random.uniform(0.34, 0.4),
-        random.uniform(0.45, 0.6),
-    )
+    width, depth, seat, rise = draws(random, (0.55, 0.68), (0.65, 0.8), (0.34, 0.4), (0.45, 0.6))
     r, y = random.uniform(0.014, 0.026), depth / 2
     parts: Parts = []
     for s in (-1, 1):
@@ -311,7 +297,7 @@ def chair_stool(random: Random) -> Parts:
 
 def chair_bar(random: Random) -> Parts:
     """A bar stool on a column with a foot rest, with or without a low back."""
-    width, seat = random.uniform(0.33, 0.44), random.uniform(0.6, 0.8)
+    width, seat = draws(random, (0.33, 0.44), (0.6, 0.8))
     parts = [*_stool_top(random, width, seat), *pedestal(random, random.uniform(0.19, 0.25), seat - 0.03)]
     ring = np.c_[CIRCLE * random.uniform(0.12, 0.18), np.full(28, seat * random.uniform(0.3, 0.45))]
     parts += [tube(ring, 0.011), rod((-0.13, 0, ring[0, 2]), (0.13, 0, ring[0, 2]), 0.01)]
@@ -342,12 +328,7 @@ def chair_rocking(random: Random) -> Parts:
 
 def chair_high(random: Random) -> Parts:
     """A child's high chair with a tray and a foot rest."""
-    width, depth, seat, rise = (
-        random.uniform(0.33, 0.4),
-        random.uniform(0.3, 0.38),
-        random.uniform(0.52, 0.62),
-        random.uniform(0.3, 0.42),
-    )
+    width, depth, seat, rise = draws(random, (0.33, 0.4), (0.3, 0.38), (0.52, 0.62), (0.3, 0.42))
     parts = [*seat_of(random, width, depth, seat), *_placed_back(random, width, depth, seat, rise)]
     parts += four_legs(width, depth, seat, 0.035, splay=random.uniform(0.05, 0.11)) + stretchers(
         width * 1.1, depth * 1.1, seat * 0.35
@@ -365,12 +346,7 @@ def chair_high(random: Random) -> Parts:
 
 def chair_executive(random: Random) -> Parts:
     """A swivel chair with a thick high back, a head rest and padded arms on a star with castors."""
-    width, depth, seat, rise = (
-        random.uniform(0.48, 0.56),
-        random.uniform(0.46, 0.54),
-        random.uniform(0.42, 0.52),
-        random.uniform(0.6, 0.8),
-    )
+    width, depth, seat, rise = draws(random, (0.48, 0.56), (0.46, 0.54), (0.42, 0.52), (0.6, 0.8))
     upper = [
         cushion(width, 0.13, rise * 0.55, 0, 0, 0.06),
         cushion(width * random.uniform(0.6, 1), 0.12, rise * 0.42, 0, 0, rise * 0.58),

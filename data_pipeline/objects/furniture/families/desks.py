@@ -9,6 +9,7 @@ from data_pipeline.objects.furniture.families.parts import (
     HALF_ROUND,
     SQUARE,
     bent,
+    draws,
     ends,
     loft,
     moved,
@@ -58,7 +59,7 @@ def desk_standing(random: Random) -> Parts:
 
 def desk_computer(random: Random) -> Parts:
     """Panels, a tray for the keyboard, a raised shelf for the screen, and a tower with shelves or drawers at a side."""
-    width, depth, height = random.uniform(0.9, 1.4), random.uniform(0.5, 0.65), random.uniform(0.7, 0.78)
+    width, depth, height = draws(random, (0.9, 1.4), (0.5, 0.65), (0.7, 0.78))
     t, s, tower = 0.025, random.choice([-1, 1]), random.uniform(0.25, 0.4)
     tall = height + float(random.choice([0.0, random.uniform(0.2, 0.6)]))
     x = s * (width - tower) / 2
@@ -84,12 +85,7 @@ def desk_computer(random: Random) -> Parts:
 
 def desk_secretary(random: Random) -> Parts:
     """A chest with drawers, a sloping or open writing flap, and small compartments above it."""
-    width, depth, height, rise = (
-        random.uniform(0.75, 1.0),
-        random.uniform(0.4, 0.5),
-        random.uniform(0.7, 0.78),
-        random.uniform(0.25, 0.9),
-    )
+    width, depth, height, rise = draws(random, (0.75, 1.0), (0.4, 0.5), (0.7, 0.78), (0.25, 0.9))
     feet = float(random.choice([0.0, 0.12]))
     parts = [
         box(width, depth, height - feet, 0, 0, feet),
@@ -120,8 +116,8 @@ def _pigeonholes(width: float, depth: float, rise: float, y: float, z: float) ->
 
 def desk_roll_top(random: Random) -> Parts:
     """Two pedestals below a curved shutter, closed or half open."""
-    width, depth, height = random.uniform(1.1, 1.5), random.uniform(0.65, 0.8), random.uniform(0.72, 0.78)
-    rise, body = random.uniform(0.3, 0.5), random.uniform(0.3, 0.4)
+    width, depth, height = draws(random, (1.1, 1.5), (0.65, 0.8), (0.72, 0.78))
+    rise, body = draws(random, (0.3, 0.5), (0.3, 0.4))
     parts = [tabletop(width, depth, height, 0.03)]
     for s in (-1, 1):
         parts += drawer_pedestal(random, body, depth * 0.95, height - 0.03, s * (width - body) / 2)
@@ -143,12 +139,7 @@ def desk_roll_top(random: Random) -> Parts:
 
 def desk_executive(random: Random) -> Parts:
     """A heavy top on two pedestals with a closed panel that is seen by visitors; straight or bowed."""
-    width, depth, height, thick = (
-        random.uniform(1.5, 2.0),
-        random.uniform(0.75, 1.0),
-        random.uniform(0.72, 0.78),
-        random.uniform(0.04, 0.07),
-    )
+    width, depth, height, thick = draws(random, (1.5, 2.0), (0.75, 1.0), (0.72, 0.78), (0.04, 0.07))
     body, state = random.uniform(0.38, 0.5), int(random.integers(2**31))
     parts = [tabletop(width, depth, height, thick), box(width * 0.95, 0.04, height - thick, 0, depth * 0.42)]
     if random.random() < 0.4:
@@ -199,12 +190,7 @@ def desk_l_return(random: Random) -> Parts:
 
 def desk_school(random: Random) -> Parts:
     """A small desk with an open box below its top, on legs of tube, or with a sloping top."""
-    width, depth, height, drop = (
-        random.uniform(0.6, 1.1),
-        random.uniform(0.45, 0.6),
-        random.uniform(0.62, 0.78),
-        random.uniform(0.1, 0.16),
-    )
+    width, depth, height, drop = draws(random, (0.6, 1.1), (0.45, 0.6), (0.62, 0.78), (0.1, 0.16))
     parts: Parts = [
         box(width * 0.95, depth * 0.9, 0.015, 0, 0, height - drop),
         box(width * 0.95, 0.015, drop, 0, depth * 0.44, height - drop),

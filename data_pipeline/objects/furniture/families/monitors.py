@@ -177,11 +177,9 @@ def monitor_console(random: Random) -> Parts:
 def monitor_tube_swivel(random: Random) -> Parts:
     """A computer's tube monitor: rounded front, a stepped or tapering back, on a swivel foot."""
     width = random.uniform(0.35, 0.48)
-    height, depth, lift = (
-        width * random.uniform(0.78, 0.92),
-        width * random.uniform(0.8, 1.05),
-        random.uniform(0.03, 0.07),
-    )
+    height = width * random.uniform(0.78, 0.92)
+    depth = width * random.uniform(0.8, 1.05)
+    lift = random.uniform(0.03, 0.07)
     front = random.uniform(0.1, 0.2)
     parts = [
         rounded(box(width, front, height, 0, front / 2, lift), 0.02),

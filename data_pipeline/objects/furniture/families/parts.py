@@ -20,6 +20,11 @@ Level = tuple[float, float, float, float, float]
 """A cross-section of a loft: factors of its outline along x and y, and where its centre is (x, y, z)."""
 
 
+def draws(random: Random, *ranges: tuple[float, float]) -> tuple[float, ...]:
+    """One number from each range."""
+    return tuple(random.uniform(low, high) for low, high in ranges)
+
+
 def superellipse(power: float, points: int = 28) -> Outline:
     """The curve |x|^power + |y|^power = 1, counter-clockwise: 2 is a circle, 4 a rounded square, 1 a rhombus."""
     angles = np.linspace(0, 2 * np.pi, points, endpoint=False) + np.pi / points

@@ -9,6 +9,7 @@ from data_pipeline.objects.furniture.families.parts import (
     bent,
     crested,
     cushion,
+    draws,
     moved,
     prism,
     superellipse,
@@ -72,7 +73,7 @@ def _feet(random: Random, width: float, depth: float, height: float) -> Parts:
 def sofa_cushioned(random: Random) -> Parts:
     """Soft arms, soft seats and soft backs."""
     width, depth, seat, rise, seats = _size(random)
-    feet, arm = random.uniform(0.02, 0.14), random.uniform(0.14, 0.28)
+    feet, arm = draws(random, (0.02, 0.14), (0.14, 0.28))
     whole = width + 2 * arm
     parts = [box(whole - 0.02, depth * 0.96, seat - 0.14 - feet, 0, 0, feet), *_feet(random, whole, depth, feet)]
     parts += _cushions(random, width, depth, seat, rise, seats)
@@ -125,8 +126,8 @@ def sofa_framed(random: Random) -> Parts:
 
 def sofa_curved(random: Random) -> Parts:
     """Seat and back follow an arc around the front."""
-    radius, half = random.uniform(0.95, 1.6), random.uniform(0.55, 1.0)
-    depth, seat, rise = random.uniform(0.7, 0.85), random.uniform(0.38, 0.45), random.uniform(0.35, 0.48)
+    radius, half = draws(random, (0.95, 1.6), (0.55, 1.0))
+    depth, seat, rise = draws(random, (0.7, 0.85), (0.38, 0.45), (0.35, 0.48))
     count = int(random.integers(3, 6))
     parts: Parts = []
     for t in (np.arange(count) - (count - 1) / 2) * 2 * half / count:
@@ -148,8 +149,8 @@ def sofa_curved(random: Random) -> Parts:
 
 def sofa_chaise(random: Random) -> Parts:
     """A long seat with one high end, and a low back along a part of it."""
-    length, depth, seat = random.uniform(1.45, 1.9), random.uniform(0.62, 0.8), random.uniform(0.36, 0.44)
-    feet, rise = random.uniform(0.08, 0.2), random.uniform(0.3, 0.5)
+    length, depth, seat = draws(random, (1.45, 1.9), (0.62, 0.8), (0.36, 0.44))
+    feet, rise = draws(random, (0.08, 0.2), (0.3, 0.5))
     parts = [
         box(length, depth, seat - feet - 0.1, 0, 0, feet),
         *_feet(random, length, depth, feet),
@@ -189,7 +190,7 @@ def sofa_camelback(random: Random) -> Parts:
 def sofa_sectional(random: Random) -> Parts:
     """Soft modules in a row with a turned one at one or both ends, as an L or a U."""
     side, count = random.uniform(0.75, 0.95), int(random.integers(2, 4))
-    seat, rise, feet = random.uniform(0.36, 0.44), random.uniform(0.3, 0.46), random.uniform(0.02, 0.1)
+    seat, rise, feet = draws(random, (0.36, 0.44), (0.3, 0.46), (0.02, 0.1))
 
     def module(corner: bool, open_end: bool = False) -> Parts:
         parts = [
@@ -219,8 +220,8 @@ def sofa_sectional(random: Random) -> Parts:
 
 def sofa_bed(random: Random) -> Parts:
     """A sleeper: thick folded seat, flat back that folds down, thin arms or none."""
-    width, depth = random.uniform(1.5, 2.1), random.uniform(0.8, 1.05)
-    seat, rise = random.uniform(0.36, 0.44), random.uniform(0.4, 0.55)
+    width, depth = draws(random, (1.5, 2.1), (0.8, 1.05))
+    seat, rise = draws(random, (0.36, 0.44), (0.4, 0.55))
     low = random.uniform(0.06, 0.2)
     parts = [box(width, depth * 0.9, seat - low - 0.2, 0, 0, low), *four_legs(width, depth * 0.9, low, 0.04, 0.1)]
     halves = int(random.integers(1, 3))
@@ -239,12 +240,7 @@ def sofa_bed(random: Random) -> Parts:
 
 def sofa_settee(random: Random) -> Parts:
     """A bench of wood with a back of slats or spindles, thin arms, with or without a cushion."""
-    width, depth, seat, rise = (
-        random.uniform(1.05, 1.6),
-        random.uniform(0.5, 0.62),
-        random.uniform(0.4, 0.46),
-        random.uniform(0.4, 0.55),
-    )
+    width, depth, seat, rise = draws(random, (1.05, 1.6), (0.5, 0.62), (0.4, 0.46), (0.4, 0.55))
     parts = [
         box(width, depth, 0.05, 0, 0, seat - 0.05),
         *four_legs(width, depth, seat, 0.055),
@@ -268,13 +264,8 @@ def sofa_settee(random: Random) -> Parts:
 
 def sofa_tub(random: Random) -> Parts:
     """A loveseat inside of one wall around back and sides."""
-    width, depth, seat, rise = (
-        random.uniform(1.15, 1.7),
-        random.uniform(0.75, 0.95),
-        random.uniform(0.38, 0.44),
-        random.uniform(0.3, 0.45),
-    )
-    feet, thick = random.uniform(0.06, 0.15), random.uniform(0.08, 0.16)
+    width, depth, seat, rise = draws(random, (1.15, 1.7), (0.75, 0.95), (0.38, 0.44), (0.3, 0.45))
+    feet, thick = draws(random, (0.06, 0.15), (0.08, 0.16))
     wall = around(
         width, depth, (seat + rise * random.uniform(0.4, 1)) - feet, seat + rise - feet, thick, random.uniform(0.5, 0.9)
     )

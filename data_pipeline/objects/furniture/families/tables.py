@@ -7,6 +7,7 @@ from data_pipeline.objects.furniture.families.parts import (
     HALF_ROUND,
     SQUARE,
     crossed,
+    draws,
     ends,
     loft,
     moved,
@@ -22,7 +23,7 @@ from data_pipeline.objects.furniture.tables import board
 
 def table_pedestal(random: Random) -> Parts:
     """A round, oval or square top on one support."""
-    radius, height, thick = random.uniform(0.35, 0.75), random.uniform(0.55, 0.78), random.uniform(0.02, 0.05)
+    radius, height, thick = draws(random, (0.35, 0.75), (0.55, 0.78), (0.02, 0.05))
     top = prism(
         superellipse(random.choice([2.0, 2.0, 4.0, 30.0])),
         2 * radius,
@@ -147,7 +148,7 @@ def table_picnic(random: Random) -> Parts:
 
 def table_console(random: Random) -> Parts:
     """A narrow half-moon or rectangle against a wall, with or without a shelf."""
-    width, depth, height = random.uniform(0.8, 1.4), random.uniform(0.3, 0.45), random.uniform(0.72, 0.86)
+    width, depth, height = draws(random, (0.8, 1.4), (0.3, 0.45), (0.72, 0.86))
     outline = HALF_ROUND if random.random() < 0.6 else superellipse(40)
     parts = [
         prism(outline, width, depth, 0.03, 0, 0, height - 0.03),
@@ -179,7 +180,7 @@ def table_drum(random: Random) -> Parts:
 
 def table_side(random: Random) -> Parts:
     """A small high table on three or four slender legs, with a shelf, a rim or a drawer."""
-    width, height = random.uniform(0.35, 0.55), random.uniform(0.48, 0.68)
+    width, height = draws(random, (0.35, 0.55), (0.48, 0.68))
     outline = superellipse(random.choice([2.0, 6.0, 40.0]))
     parts = [prism(outline, width, width, 0.025, 0, 0, height - 0.025)]
     parts += four_legs(
@@ -192,7 +193,7 @@ def table_side(random: Random) -> Parts:
 
 def table_nest(random: Random) -> Parts:
     """Two or three tables that stand partly below each other."""
-    width, depth, height = random.uniform(0.5, 0.65), random.uniform(0.36, 0.45), random.uniform(0.45, 0.55)
+    width, depth, height = draws(random, (0.5, 0.65), (0.36, 0.45), (0.45, 0.55))
     parts: Parts = []
     for step in range(int(random.integers(2, 4))):
         share = 1 - 0.16 * step
@@ -206,12 +207,7 @@ def table_nest(random: Random) -> Parts:
 
 def table_conference(random: Random) -> Parts:
     """A long top, boat-shaped, oval or rectangular, on panels or drums."""
-    width, depth, height, thick = (
-        random.uniform(1.8, 2.6),
-        random.uniform(0.9, 1.25),
-        random.uniform(0.7, 0.77),
-        random.uniform(0.03, 0.07),
-    )
+    width, depth, height, thick = draws(random, (1.8, 2.6), (0.9, 1.25), (0.7, 0.77), (0.03, 0.07))
     outline = superellipse(random.choice([2.0, 3.0, 5.0, 40.0]))
     parts, under = [prism(outline, width, depth, thick, 0, 0, height - thick)], height - thick
     foot = CIRCLE if random.random() < 0.4 else SQUARE

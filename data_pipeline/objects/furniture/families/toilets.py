@@ -6,6 +6,7 @@ import numpy as np
 
 from data_pipeline.objects.furniture.families.parts import (
     CORNER,
+    draws,
     loft,
     moved,
     prism,
@@ -77,7 +78,7 @@ def _seat(random: Random, width: float, front: float, rear: float, height: float
 
 def _cistern(random: Random, width: float, base: float, y: float) -> Parts:
     """A tank with its back at `y`: rounded, tapering, or oval, with a lid, and a lever or a button."""
-    depth, height = random.uniform(0.15, 0.21), random.uniform(0.3, 0.42)
+    depth, height = draws(random, (0.15, 0.21), (0.3, 0.42))
     wide, power, taper = width * random.uniform(0.95, 1.35), random.choice([3.0, 6.0, 40.0]), random.uniform(0.8, 1)
     outline, middle = superellipse(power), y - depth / 2
     parts = [
@@ -118,7 +119,7 @@ def toilet_skirted(random: Random) -> Parts:
     """A body with closed straight sides, and a tank that grows out of it."""
     height, width = _height(random)
     bowl, front, rear = _pan(random, height, random.uniform(0.8, 0.95), width, lean=0.02)
-    depth, rise = random.uniform(0.18, 0.26), random.uniform(0.22, 0.42)
+    depth, rise = draws(random, (0.18, 0.26), (0.22, 0.42))
     levels = [
         (width * 0.42, depth * 0.7, 0, rear, 0.0),
         (width * 0.46, depth * 0.7, 0, rear, height),
@@ -170,7 +171,7 @@ def toilet_corner_tank(random: Random) -> Parts:
     """A bowl with a triangular tank for a corner of the room."""
     height, width = _height(random)
     bowl, front, rear = _pan(random, height, random.uniform(0.55, 0.8), width)
-    side, rise = random.uniform(0.32, 0.42), random.uniform(0.28, 0.38)
+    side, rise = draws(random, (0.32, 0.42), (0.28, 0.38))
     tank = [
         prism(CORNER, side, side, rise, 0, 0, height),
         prism(CORNER, side * 1.06, side * 1.06, 0.03, 0, 0, height + rise),
@@ -183,7 +184,7 @@ def toilet_boxed(random: Random) -> Parts:
     """A bowl in front of a wide box that hides the tank, half high or as a bench."""
     height, width = _height(random)
     bowl, front, rear = _pan(random, height, random.uniform(0.6, 0.9), width)
-    wide, high, depth = random.uniform(0.5, 0.9), random.uniform(0.75, 1.0), random.uniform(0.14, 0.22)
+    wide, high, depth = draws(random, (0.5, 0.9), (0.75, 1.0), (0.14, 0.22))
     parts = [bowl, *_seat(random, width, front, rear, height), box(width * 0.7, 0.15, height, 0, rear - 0.02)]
     return [
         *parts,
@@ -212,7 +213,7 @@ def toilet_commode(random: Random) -> Parts:
     """A bowl with armrests or a raised rail around it, for people who need support."""
     parts = toilet_close_coupled(random)
     low, high = joined(parts).bounds
-    rise, x = random.uniform(0.62, 0.72), random.uniform(0.27, 0.32)
+    rise, x = draws(random, (0.62, 0.72), (0.27, 0.32))
     for s in (-1, 1):
         line = [
             (s * x, high[1], 0),
