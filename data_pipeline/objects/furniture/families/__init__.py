@@ -143,12 +143,12 @@ def _finished(random: Random, parts: Parts, soft: bool) -> Solid:
     if random.random() < 0.6:
         limit = random.uniform(0.02, 0.09) if soft else random.uniform(0.004, 0.03)
         boxes = [part for part in parts if len(part.vertices) == 8 and np.ptp(part.vertices, axis=0).min() > 0.018]
-        steps, faces = (2 if soft and len(boxes) < 12 else 1), sum(len(part.faces) for part in parts)
-        chosen = {id(part) for part in boxes[: max(0, 5800 - faces) // (288 if steps == 2 else 96)]}
+        steps, count = (2 if soft and len(boxes) < 12 else 1), sum(len(part.faces) for part in parts)
+        chosen = {id(part) for part in boxes[: max(0, 5800 - count) // (288 if steps == 2 else 96)]}
         parts = [rounded(part, limit, steps) if id(part) in chosen else part for part in parts]
     whole = joined(parts)
     vertices = whole.vertices * np.exp(random.uniform(-np.log(1.2), np.log(1.2), 3))
-    faces = whole.faces
+    faces = np.asarray(whole.faces)
     if random.random() < 0.5:
         vertices, faces = vertices * (-1, 1, 1), faces[:, ::-1]
     return Solid(vertices - (0, 0, vertices[:, 2].min()), faces, process=False)

@@ -39,9 +39,10 @@ def _made(random: Random, width: float, length: float, base: float, thick: float
     elif style == 1:
         parts.append(cushion(width, length * 0.25, 0.14, 0, -length * 0.3, top - 0.02))
     elif style == 2:
-        y, x = np.meshgrid(np.linspace(-0.5, 0.28, 9) * length, np.linspace(-0.5, 0.5, 9) * width * 1.03, indexing="ij")
-        folds = random.uniform(0.0, 0.025) * np.sin(x * random.uniform(3, 9) + y * random.uniform(3, 9))
-        parts.append(sheet(np.stack([x, y, top + 0.03 + folds], axis=-1), 0.03))
+        along, across = np.linspace(-0.5, 0.28, 9) * length, np.linspace(-0.5, 0.5, 9) * width * 1.03
+        v, u = np.meshgrid(along, across, indexing="ij")
+        folds = random.uniform(0.0, 0.025) * np.sin(u * random.uniform(3, 9) + v * random.uniform(3, 9))
+        parts.append(sheet(np.stack([u, v, top + 0.03 + folds], axis=-1), 0.03))
     return parts
 
 

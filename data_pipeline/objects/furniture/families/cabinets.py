@@ -149,7 +149,7 @@ def dresser_vanity(random: Random) -> Parts:
     y, kind = depth / 2 - 0.06, random.integers(3)
     if kind == 0:
         mirror = loft(CIRCLE, [(width * 0.28, rise / 2, 0, 0, -0.015), (width * 0.28, rise / 2, 0, 0, 0.015)])
-        mirror.apply_transform([[1, 0, 0, 0], [0, 0, -1, y], [0, 1, 0, height + rise / 2], [0, 0, 0, 1]])
+        mirror.apply_transform(np.array([[1, 0, 0, 0], [0, 0, -1, y], [0, 1, 0, height + rise / 2], [0, 0, 0, 1]]))
         return [*parts, mirror, box(width * 0.3, 0.06, 0.08, 0, y, height)]
     if kind == 1:
         return parts + moved([crested(width * random.uniform(0.5, 0.95), rise, 0.03)], 0, y, height)

@@ -16,6 +16,7 @@ from data_pipeline.objects.furniture.families.parts import (
     superellipse,
     tube,
     turned,
+    upturned,
 )
 from data_pipeline.objects.furniture.monitors import screen
 from data_pipeline.objects.furniture.solids import Parts, Random, box, four_legs, rod, tilt
@@ -49,9 +50,7 @@ def _panel(random: Random, width: float, height: float, z: float, thick: float) 
     low, share = random.uniform(0, 0.2) * height, random.uniform(0.4, 0.9)
     deep, h = random.uniform(0.02, 0.07), height * random.uniform(0.4, 0.8)
     levels = [(width * share / 2, h / 2, 0, 0, 0), (width * share * (0.5 if kind == 1 else 0.35), h * 0.42, 0, 0, deep)]
-    bulge = loft(superellipse(8), levels)
-    bulge.apply_transform([[1, 0, 0, 0], [0, 0, 1, thick], [0, -1, 0, z + low + h / 2], [0, 0, 0, 1]])
-    return [*parts, bulge]
+    return [*parts, upturned(loft(superellipse(8), levels), thick, z + low + h / 2)]
 
 
 def monitor_desktop(random: Random) -> Parts:
@@ -191,8 +190,7 @@ def monitor_tube_swivel(random: Random) -> Parts:
         (width * 0.46, height * 0.45, 0, 0, front + depth * 0.3),
         (width * share / 2, height * share / 2, 0, -height * 0.03, depth),
     ]
-    back = loft(superellipse(7), levels)
-    back.apply_transform([[1, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, lift + height / 2], [0, 0, 0, 1]])
+    back = upturned(loft(superellipse(7), levels), 0, lift + height / 2)
     return [
         *parts,
         back,

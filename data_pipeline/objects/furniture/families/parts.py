@@ -78,7 +78,9 @@ def turned(profile: Sequence[tuple[float, float]], x: float = 0, y: float = 0, s
 
 
 def tube(
-    points: Float[ndarray, "n 3"] | Sequence[Sequence[float]], radius: float | Sequence[float], sections: int = 7
+    points: Float[ndarray, "n 3"] | Sequence[Sequence[float]],
+    radius: float | Sequence[float] | Float[ndarray, " n"],
+    sections: int = 7,
 ) -> Solid:
     """A tube along a curve in about one plane, of one radius or one a point."""
     line = np.array(points, float)
@@ -167,7 +169,8 @@ def _cube(steps: int) -> tuple[Float[ndarray, "n 3"], Float[ndarray, "n 3"], Int
     offsets = np.concatenate([-quarter[::-1], quarter])
     size = len(offsets)
     side = np.repeat([-1.0, 1.0], steps + 1)
-    signs, directions, faces = [], [], []
+    signs: list[np.ndarray] = []
+    directions, faces = [], []
     u, v = (part.ravel() for part in np.meshgrid(np.arange(size), np.arange(size), indexing="ij"))
     index = np.arange(size * size).reshape(size, size)
     a, b, c, d = (part.ravel() for part in (index[:-1, :-1], index[1:, :-1], index[1:, 1:], index[:-1, 1:]))
@@ -208,6 +211,11 @@ def moved(parts: Parts, x: float = 0, y: float = 0, z: float = 0, turn: float = 
     for part in parts:
         part.vertices = part.vertices @ np.array([[c, s, 0], [-s, c, 0], [0, 0, 1]]) + (x, y, z)
     return parts
+
+
+def upturned(solid: Solid, y: float, z: float) -> Solid:
+    """Turns a part about the x axis, in place, so that its upper side becomes its back; its origin goes to (0, y, z)."""
+    return solid.apply_transform(np.array([[1, 0, 0, 0], [0, 0, 1, y], [0, -1, 0, z], [0, 0, 0, 1]]))
 
 
 def star(reach: float, height: float, arms: int = 5, castors: bool = True) -> Parts:
