@@ -181,17 +181,28 @@ def _other_legs(random: Random, parts: Parts) -> Parts:
     if style > 8 and top < 0.25:
         size = (high - low) * random.uniform(0.9, 1, 3)
         return others if style == 9 else [*others, box(size[0], size[1], top, middle[0], middle[1])]
-    made = [new for leg in legs for new in _leg(leg, style, middle)]
+    made = [new for leg in legs for new in _other_leg(leg, style, middle)]
     if style == 8 and top < 0.9:
         for side in (low[0], high[0]):
             made.append(box(0.04, high[1] - low[1], 0.03, side + 0.02 * np.sign(middle[0] - side), middle[1]))
     return others + made
 
 
-def _leg(leg: Solid, style: int, middle: np.ndarray) -> Parts:
-    """Another leg in the place of one; `middle` is that of all legs of the piece."""
-    (x, y, _), height = leg.bounds.mean(axis=0), float(np.ptp(leg.bounds[:, 2]))
-    r, (sx, sy) = float(np.sqrt(abs(leg.volume) / height / np.pi)), np.sign(np.array([x, y]) - middle[:2])
+def _other_leg(leg: Solid, style: int, middle: np.ndarray) -> Parts:
+    """A leg of this style in the place of one, leaning as it does; `middle` is that of all legs of the piece."""
+    height = float(np.ptp(leg.bounds[:, 2]))
+    upper = leg.vertices[:, 2] > height / 2
+    top, foot = (leg.vertices[half, :2].mean(axis=0) for half in (upper, ~upper))
+    radius = float(np.sqrt(abs(leg.volume) / height / np.pi))
+    parts = _leg(style, top, np.sign(top - middle[:2]), radius, height)
+    for part in parts:
+        part.vertices[:, :2] += (foot - top) * (1 - part.vertices[:, 2:] / height)
+    return parts or [leg]
+
+
+def _leg(style: int, at: np.ndarray, outwards: np.ndarray, r: float, height: float) -> Parts:
+    """An upright leg of this style; none if it is left as it is."""
+    (x, y), (sx, sy) = at, outwards
     reach = min(0.08, 0.15 * height)
     if style == 2:
         return [cylinder(r, height, x, y, sections=10)]
@@ -216,4 +227,4 @@ def _leg(leg: Solid, style: int, middle: np.ndarray) -> Parts:
             rod((x - 0.015, y, lift / 2), (x + 0.015, y, lift / 2), lift / 2),
             cylinder(r * 0.7, height - lift * 0.9, x, y, lift * 0.9, 10),
         ]
-    return [leg]
+    return []

@@ -72,7 +72,7 @@ def _end(random: Random, width: float, height: float) -> Parts:
         columns, rows = int(random.integers(2, 6)), int(random.integers(1, 4))
         w, h = width / columns, height * 0.6 / rows
         pads = [
-            cushion(w, 0.1, h, (c - (columns - 1) / 2) * w, -0.04, height * 0.4 + row * h)
+            rounded(box(w, 0.1, h, (c - (columns - 1) / 2) * w, -0.04, height * 0.4 + row * h), 0.045)
             for c in range(columns)
             for row in range(rows)
         ]

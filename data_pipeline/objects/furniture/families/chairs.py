@@ -59,7 +59,7 @@ def chair_bentwood(random: Random) -> Parts:
     width, _, seat, rise = chair_size(random)
     r = random.uniform(0.011, 0.016)
     parts = [prism(CIRCLE, width, width, 0.035, 0, 0, seat - 0.035)]
-    parts += four_legs(width * 0.8, width * 0.8, seat, r * 2.2, splay=random.uniform(0.02, 0.07))
+    parts += four_legs(width * 0.66, width * 0.66, seat, r * 2.2, splay=random.uniform(0.02, 0.07))
     parts.append(tube(np.c_[CIRCLE * width * 0.36, np.full(28, seat * 0.4)], r * 0.7))
     if random.random() < 0.5:  # a hoop around back and sides
         t = np.linspace(-0.5, np.pi + 0.5, 17)
@@ -117,7 +117,7 @@ def chair_bucket(random: Random) -> Parts:
     if random.random() < 0.5:
         return parts + pedestal(random, random.uniform(0.22, 0.32), seat - 0.1)
     return parts + four_legs(
-        width * 0.7, depth * 0.7, seat - 0.08, random.uniform(0.025, 0.04), splay=random.uniform(0, 0.08)
+        width * 0.56, depth * 0.56, seat - 0.08, random.uniform(0.025, 0.04), splay=random.uniform(0, 0.08)
     )
 
 
@@ -284,7 +284,7 @@ def _stool_top(random: Random, width: float, seat: float) -> Parts:
 def chair_stool(random: Random) -> Parts:
     """A stool without back, low or high, on three or four legs with rings of stretchers."""
     width, seat = random.uniform(0.3, 0.42), float(random.choice([random.uniform(0.42, 0.5), random.uniform(0.6, 0.8)]))
-    side, splay = width * 0.75, random.uniform(0, 0.09)
+    side, splay = width * 0.66, random.uniform(0, 0.09)
     parts = [
         *_stool_top(random, width, seat),
         *four_legs(side, side, seat - 0.02, random.uniform(0.025, 0.045), splay=splay),

@@ -8,6 +8,7 @@ from data_pipeline.objects.furniture.families.parts import (
     CIRCLE,
     bent,
     cushion,
+    draws,
     loft,
     moved,
     prism,
@@ -57,13 +58,14 @@ def monitor_desktop(random: Random) -> Parts:
     """A screen on a neck and any foot."""
     width = random.uniform(0.38, 0.72)
     height, lift, thick = width * random.uniform(0.54, 0.8), random.uniform(0.05, 0.2), random.uniform(0.015, 0.05)
-    parts = tilt(_panel(random, width, height, lift, thick), random.uniform(-0.05, 0.25), (0, 0, lift))
-    neck = random.uniform(0.02, 0.06)
-    top = lift + height * random.uniform(0.25, 0.5)
+    lean, neck = draws(random, (-0.05, 0.25), (0.02, 0.06))
+    parts = tilt(_panel(random, width, height, lift, thick), lean, (0, 0, lift))
+    rise = height * random.uniform(0.25, 0.5)
+    y, top = thick + 0.02 + rise * lean, lift + rise
     if random.random() < 0.5:
-        parts.append(tube([(0, 0.03, 0.01), (0, thick + 0.06, top * 0.4), (0, thick + 0.03, top)], neck))
+        parts.append(tube([(0, 0.03, 0.01), (0, y + neck + 0.02, top * 0.4), (0, y + neck, top)], neck))
     else:
-        parts.append(box(neck * 3, 0.025, top, 0, thick + 0.03))
+        parts += [box(neck * 3, 0.025, top, 0, y + 0.02), box(neck * 2, 0.03, 0.06, 0, y, top - 0.06)]
     return parts + _foot(random, width * random.uniform(0.22, 0.34))
 
 

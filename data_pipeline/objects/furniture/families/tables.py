@@ -184,7 +184,7 @@ def table_side(random: Random) -> Parts:
     outline = superellipse(random.choice([2.0, 6.0, 40.0]))
     parts = [prism(outline, width, width, 0.025, 0, 0, height - 0.025)]
     parts += four_legs(
-        width * 0.75, width * 0.75, height - 0.02, random.uniform(0.02, 0.035), splay=float(random.choice([0.0, 0.05]))
+        width * 0.68, width * 0.68, height - 0.02, random.uniform(0.02, 0.035), splay=float(random.choice([0.0, 0.05]))
     )
     if random.random() < 0.5:
         parts.append(prism(outline, width * 0.75, width * 0.75, 0.02, 0, 0, height * 0.3))
