@@ -1,9 +1,9 @@
 """Sources of objects.
 
 A *source* lists objects. Each is an `ObjectEntry` whose `recipe` is small, picklable, and makes the mesh in the process that
-needs it. There are four kinds: procedural ones (`MADE`), a folder of class folders, a zip archive of the same layout such as
-ModelNet's, and an archive of voxel grids. Capture workers import this module, so it must not import JAX, which would slow their
-start.
+needs it. There are four kinds: procedural ones (`PROCEDURAL`), a folder of class folders, a zip archive of the same layout, such
+as ModelNet's, and an archive of voxel grids. Capture workers import this module, so it must not import JAX, which would slow
+their start.
 """
 
 from __future__ import annotations
@@ -127,7 +127,7 @@ def furniture_families(name: str, train_per_class: int, test_per_class: int) -> 
     return ObjectSource(name, MODELNET10_CLASSES, tuple(entries))
 
 
-MADE: dict[str, Callable[[int, int], ObjectSource]] = {
+PROCEDURAL: dict[str, Callable[[int, int], ObjectSource]] = {
     "furniture10": furniture10,
     **{name: partial(furniture_families, name) for name in _FAMILIES_OF},
 }
@@ -245,7 +245,7 @@ def mesh_zip(archive: Path, reading: Reading = Reading()) -> ObjectSource:
 def _of_meshes(data: str, reading: Reading, known: str) -> ObjectSource | None:
     """Returns the objects of a folder or zip of meshes; None for anything else that exists."""
     path = Path(os.path.expanduser(data))
-    if data not in MADE and not os.path.exists(path):
+    if data not in PROCEDURAL and not os.path.exists(path):
         raise DataError(f"no such file or folder: {data}; --data takes {known}")
     if path.is_dir():
         return mesh_folder(path.resolve(), reading)
@@ -253,7 +253,7 @@ def _of_meshes(data: str, reading: Reading, known: str) -> ObjectSource | None:
 
 
 def _is_made_or_voxels(data: str) -> bool:
-    return data in MADE or data.lower().endswith(".npz")
+    return data in PROCEDURAL or data.lower().endswith(".npz")
 
 
 def objects_to_test(data: str, up: Up = "auto") -> ObjectSource:
@@ -262,7 +262,7 @@ def objects_to_test(data: str, up: Up = "auto") -> ObjectSource:
     Raises:
         DataError: as `open_source`, but one class is enough, and none needs objects for training.
     """
-    known = f"a folder or zip of meshes in class folders, an .npz of voxel grids, or {', '.join(MADE)}"
+    known = f"a folder or zip of meshes in class folders, an .npz of voxel grids, or {', '.join(PROCEDURAL)}"
     if (meshes := _of_meshes(data, Reading(up, all_tested=True), known)) is not None:
         return meshes
     if up != "auto" and _is_made_or_voxels(data):
@@ -281,15 +281,15 @@ def open_source(
     seed: int = 0,
     keep_splits: bool = False,
 ) -> ObjectSource:
-    """Returns the source for `data`: a name of `MADE`, or the path of a folder, a .zip or an .npz.
+    """Returns the source for `data`: a name of `PROCEDURAL`, or the path of a folder, a .zip or an .npz.
 
     Raises:
         DataError: if the file does not exist or is not usable as a data set.
     """
     if (split or up != "auto") and _is_made_or_voxels(data):
         raise DataError(f"--dataset.split and --dataset.up go with a folder or zip of meshes, not with {data}")
-    if data in MADE:
-        return MADE[data](train_per_class, test_per_class)
+    if data in PROCEDURAL:
+        return PROCEDURAL[data](train_per_class, test_per_class)
     known = "furniture10, furniture10-families, modelnet10, modelnet40, a folder of class folders, a .zip or a .npz"
     if (meshes := _of_meshes(data, Reading(up, split, seed, keep_splits), known)) is not None:
         return meshes

@@ -33,8 +33,6 @@ def superellipse(power: float, points: int = 28) -> Outline:
 
 
 CIRCLE, SQUARE = superellipse(2), np.array([[1.0, 1.0], [-1.0, 1.0], [-1.0, -1.0], [1.0, -1.0]])
-EGG = CIRCLE * np.where(CIRCLE[:, 1:] < 0, (1, 1.35), (1, 0.65))
-"""Longer towards the front."""
 HALF_ROUND = np.concatenate(
     [[[1.0, 1.0]], [[-1.0, 1.0]], np.c_[-np.cos(t := np.linspace(0, np.pi, 15)), 1 - 2 * np.sin(t)]]
 )
@@ -72,9 +70,9 @@ def prism(
     return loft(outline, [(width / 2, depth / 2, x, y, z), (width / 2, depth / 2, x, y, z + height)])
 
 
-def turned(profile: Sequence[tuple[float, float]], x: float = 0, y: float = 0, stretch: float = 1) -> Solid:
+def turned(profile: Sequence[tuple[float, float]], x: float = 0, y: float = 0) -> Solid:
     """A body of revolution of (radius, height) pairs from the lowest to the highest, around the upright axis at (x, y)."""
-    return loft(superellipse(2, 14), [(r, r * stretch, x, y, z) for r, z in profile])
+    return loft(superellipse(2, 14), [(r, r, x, y, z) for r, z in profile])
 
 
 def tube(
