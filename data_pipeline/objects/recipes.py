@@ -32,6 +32,22 @@ class FurniturePiece:
 
 
 @dataclass(frozen=True)
+class FamilyPiece:
+    """A piece of furniture10-families: of a family, which belongs to a class and a split."""
+
+    class_name: str
+    split: str
+    family: str
+    seed: int
+
+    def load(self) -> tuple[np.ndarray, np.ndarray]:
+        from data_pipeline.objects.furniture.families import family_piece  # imported late: it needs trimesh
+
+        piece = family_piece(self.class_name, self.split, self.family, self.seed)
+        return piece.vertices, piece.faces
+
+
+@dataclass(frozen=True)
 class MeshFile:
     """A mesh file on disk, its state when it was found (`stamp_of`), and which of its axes is up."""
 

@@ -1,9 +1,9 @@
 """Sources of objects.
 
 A *source* lists objects. Each is an `ObjectEntry` whose `recipe` is small, picklable, and makes the mesh in the process that
-needs it. There are four sources: `furniture10` (procedural), a folder of class folders, a zip archive of the same layout such as
-ModelNet's, and an archive of voxel grids. Capture workers import this module, so it must not import JAX, which would slow their
-start.
+needs it. There are four kinds: procedural ones (`PROCEDURAL`), a folder of class folders, a zip archive of the same layout, such
+as ModelNet's, and an archive of voxel grids. Capture workers import this module, so it must not import JAX, which would slow
+their start.
 """
 
 from __future__ import annotations
@@ -11,8 +11,9 @@ from __future__ import annotations
 import itertools
 import os
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path, PurePosixPath
 
 from data_pipeline.errors import DataError, EmptyMesh
@@ -31,7 +32,7 @@ from data_pipeline.objects.layout import (
 )
 from data_pipeline.objects.mesh import MODELNET10_CLASSES, SOURCE_SPLITS, Mesh, ObjectEntry, ObjectSource, normalise
 from data_pipeline.objects.names import kind_of_ignored, plain_class, say_ignored, shown
-from data_pipeline.objects.recipes import FurniturePiece, MeshFile
+from data_pipeline.objects.recipes import FamilyPiece, FurniturePiece, MeshFile
 from data_pipeline.objects.splits import divide
 from data_pipeline.objects.voxels import voxel_archive
 
@@ -74,9 +75,7 @@ def furniture10(train_per_class: int, test_per_class: int) -> ObjectSource:
     Raises:
         DataError: if there are fewer than 2 training pieces or no test pieces per class.
     """
-    if train_per_class < 2 or test_per_class < 1:
-        needed = "at least 2 training pieces and 1 test piece per class"
-        raise DataError(f"furniture10 needs {needed}, got {train_per_class} and {test_per_class}")
+    _check_numbers("furniture10", train_per_class, test_per_class)
     entries = (
         ObjectEntry(f"{name}_{split}_{index:04d}", label, split, FurniturePiece(name, first + index))
         for label, name in enumerate(MODELNET10_CLASSES)
@@ -84,6 +83,55 @@ def furniture10(train_per_class: int, test_per_class: int) -> ObjectSource:
         for index in range(count)
     )
     return ObjectSource("furniture10", MODELNET10_CLASSES, tuple(entries))
+
+
+def _check_numbers(name: str, train_per_class: int, test_per_class: int) -> None:
+    if train_per_class < 2 or test_per_class < 1:
+        needed = "at least 2 training pieces and 1 test piece per class"
+        raise DataError(f"{name} needs {needed}, got {train_per_class} and {test_per_class}")
+
+
+_FAMILIES_OF: dict[str, dict[str, tuple[str, ...]]] = {
+    "furniture10-families": {"train": ("train",), "val": ("val",), "test": ("test",)},
+    "furniture10-families-seen": {"train": ("train",), "test": ("train",)},
+    "furniture10-families-all": {"train": ("train", "val", "test"), "test": ("train", "val", "test")},
+}
+"""For each source of families and each of its splits: the splits of the families whose pieces it has."""
+
+
+def furniture_families(name: str, train_per_class: int, test_per_class: int) -> ObjectSource:
+    """Returns procedural furniture of many families, by turns. Pieces of different splits are made from different seeds.
+
+    Args:
+        name: `furniture10-families`, whose training, validation and test pieces are of different families;
+            `furniture10-families-seen`, whose test pieces are of the families for training; or `furniture10-families-all`, all of
+            whose pieces are of all families.
+        train_per_class: pieces for training.
+        test_per_class: pieces for testing, and as many for validation where families are for that.
+
+    Raises:
+        DataError: if there are fewer than 2 training pieces or no test pieces per class.
+    """
+    from data_pipeline.objects.furniture.families import FAMILIES  # imported late: it needs trimesh
+
+    _check_numbers(name, train_per_class, test_per_class)
+    counts = {"train": (train_per_class, 0), "val": (test_per_class, 2_000_000), "test": (test_per_class, 1_000_000)}
+    entries: list[ObjectEntry] = []
+    for label, of_class in enumerate(MODELNET10_CLASSES):
+        for split, kinds in _FAMILIES_OF[name].items():
+            families = [(kind, family) for kind in kinds for family in FAMILIES[of_class][kind]]
+            count, first = counts[split]
+            for index, (kind, family) in zip(range(count), itertools.cycle(families), strict=False):
+                recipe = FamilyPiece(of_class, kind, family, first + index)
+                entries.append(ObjectEntry(f"{of_class}_{family}_{split}_{index:04d}", label, split, recipe))
+    return ObjectSource(name, MODELNET10_CLASSES, tuple(entries))
+
+
+PROCEDURAL: dict[str, Callable[[int, int], ObjectSource]] = {
+    "furniture10": furniture10,
+    **{name: partial(furniture_families, name) for name in _FAMILIES_OF},
+}
+"""The sources that are made and not read, by name, as functions of the numbers of pieces per class for training and testing."""
 
 
 def _arranged(listing: Listing, name: str, where: str, reading: Reading) -> ObjectSource:
@@ -197,7 +245,7 @@ def mesh_zip(archive: Path, reading: Reading = Reading()) -> ObjectSource:
 def _of_meshes(data: str, reading: Reading, known: str) -> ObjectSource | None:
     """Returns the objects of a folder or zip of meshes; None for anything else that exists."""
     path = Path(os.path.expanduser(data))
-    if data != "furniture10" and not os.path.exists(path):
+    if data not in PROCEDURAL and not os.path.exists(path):
         raise DataError(f"no such file or folder: {data}; --data takes {known}")
     if path.is_dir():
         return mesh_folder(path.resolve(), reading)
@@ -205,7 +253,7 @@ def _of_meshes(data: str, reading: Reading, known: str) -> ObjectSource | None:
 
 
 def _is_made_or_voxels(data: str) -> bool:
-    return data == "furniture10" or data.lower().endswith(".npz")
+    return data in PROCEDURAL or data.lower().endswith(".npz")
 
 
 def objects_to_test(data: str, up: Up = "auto") -> ObjectSource:
@@ -214,7 +262,7 @@ def objects_to_test(data: str, up: Up = "auto") -> ObjectSource:
     Raises:
         DataError: as `open_source`, but one class is enough, and none needs objects for training.
     """
-    known = "a folder or zip of meshes in class folders, an .npz of voxel grids, or furniture10"
+    known = f"a folder or zip of meshes in class folders, an .npz of voxel grids, or {', '.join(PROCEDURAL)}"
     if (meshes := _of_meshes(data, Reading(up, all_tested=True), known)) is not None:
         return meshes
     if up != "auto" and _is_made_or_voxels(data):
@@ -233,16 +281,16 @@ def open_source(
     seed: int = 0,
     keep_splits: bool = False,
 ) -> ObjectSource:
-    """Returns the source for `data`: `furniture10`, or the path of a folder, a .zip or an .npz.
+    """Returns the source for `data`: a name of `PROCEDURAL`, or the path of a folder, a .zip or an .npz.
 
     Raises:
         DataError: if the file does not exist or is not usable as a data set.
     """
     if (split or up != "auto") and _is_made_or_voxels(data):
         raise DataError(f"--dataset.split and --dataset.up go with a folder or zip of meshes, not with {data}")
-    if data == "furniture10":
-        return furniture10(train_per_class, test_per_class)
-    known = "furniture10, modelnet10, modelnet40, a folder of class folders, a .zip or a .npz"
+    if data in PROCEDURAL:
+        return PROCEDURAL[data](train_per_class, test_per_class)
+    known = "furniture10, furniture10-families, modelnet10, modelnet40, a folder of class folders, a .zip or a .npz"
     if (meshes := _of_meshes(data, Reading(up, split, seed, keep_splits), known)) is not None:
         return meshes
     path = Path(os.path.expanduser(data))

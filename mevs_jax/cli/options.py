@@ -106,7 +106,8 @@ class WithData(Options):
     """Commands that make a data set."""
 
     data: Annotated[str | None, _arg("SOURCE", "furniture10, built in")] = None
-    """modelnet10 or modelnet40 (downloaded), a folder or zip of meshes (CLASS/train/, CLASS/test/), or an .npz of voxels"""
+    """furniture10-families, modelnet10 or modelnet40 (downloaded), a folder or zip of meshes (CLASS/train/, CLASS/test/), or an
+    .npz of voxels"""
     archive: Annotated[str | None, _arg("FILE")] = None
     """ModelNet10.zip or ModelNet40.zip, where it has been downloaded already"""
 

@@ -19,7 +19,7 @@ def _mattress(random: Random, width: float, length: float, base: float, thicknes
     return parts
 
 
-def _bed_size(random: Random) -> tuple[float, float, float, float]:
+def bed_size(random: Random) -> tuple[float, float, float, float]:
     """Draws the width (single or double), the length, the height of the mattress's lower side, and its thickness."""
     width = float(random.choice([random.uniform(0.85, 1.1), random.uniform(1.35, 1.9)]))
     return width, random.uniform(1.9, 2.15), random.uniform(0.2, 0.4), random.uniform(0.15, 0.28)
@@ -27,7 +27,7 @@ def _bed_size(random: Random) -> tuple[float, float, float, float]:
 
 def bed_platform(random: Random) -> Parts:
     """A platform on short legs, with or without a headboard."""
-    width, length, base, thickness = _bed_size(random)
+    width, length, base, thickness = bed_size(random)
     head = random.uniform(0.0, 0.6)
     parts = [
         box(width + 0.1, length + 0.1, base * 0.6, 0, 0, base * 0.4),
@@ -41,7 +41,7 @@ def bed_platform(random: Random) -> Parts:
 
 def bed_boards(random: Random) -> Parts:
     """A bed with a head and a foot board, each a panel or a rail with spindles."""
-    width, length, base, thickness = _bed_size(random)
+    width, length, base, thickness = bed_size(random)
     head, foot = random.uniform(0.3, 0.8), random.uniform(0.05, 0.35)
     parts = [box(width, length, 0.12, 0, 0, base - 0.12), *_mattress(random, width, length, base, thickness)]
     for y, rise in ((length / 2 + 0.03, head), (-length / 2 - 0.03, foot)):
@@ -57,7 +57,7 @@ def bed_boards(random: Random) -> Parts:
 
 def bed_four_poster(random: Random) -> Parts:
     """Four high posts, usually with rails between their tops."""
-    width, length, base, thickness = _bed_size(random)
+    width, length, base, thickness = bed_size(random)
     height = random.uniform(1.6, 2.1)
     parts = [box(width, length, 0.14, 0, 0, base - 0.14), *_mattress(random, width, length, base, thickness)]
     parts += four_legs(width + 0.1, length + 0.1, height, random.uniform(0.06, 0.1))

@@ -72,7 +72,7 @@ def stand_drawers(random: Random) -> Parts:
     return parts + drawers(random, width * 0.95, height - feet - 0.05, rows, 1, 0, -depth / 2, feet + 0.01)
 
 
-def _open_shelf(width: float, depth: float, bottom: float, top: float) -> Parts:
+def open_shelf(width: float, depth: float, bottom: float, top: float) -> Parts:
     """Two sides, a back and a floor."""
     rise = top - bottom
     parts = [box(0.025, depth, rise, side * (width / 2 - 0.0125), 0, bottom) for side in (-1, 1)]
@@ -83,7 +83,7 @@ def stand_shelf(random: Random) -> Parts:
     """A drawer above an open compartment."""
     width, depth, height, feet = _stand_size(random)
     split = feet + (height - feet) * random.uniform(0.45, 0.65)
-    parts = [*_open_shelf(width, depth, feet, split), box(width, depth, height - split, 0, 0, split)]
+    parts = [*open_shelf(width, depth, feet, split), box(width, depth, height - split, 0, 0, split)]
     if feet > 0.02:
         parts += four_legs(width, depth, feet, 0.045)
     return parts + drawers(random, width * 0.94, height - split - 0.03, 1, 1, 0, -depth / 2, split + 0.01)

@@ -17,7 +17,7 @@ from data_pipeline.objects.furniture.solids import (
 )
 
 
-def _board(random: Random) -> tuple[float, float, float, float]:
+def board(random: Random) -> tuple[float, float, float, float]:
     """Draws the width, depth, height and thickness of a top.
 
     Tables and desks share this distribution, so that the top alone does not tell them apart.
@@ -27,7 +27,7 @@ def _board(random: Random) -> tuple[float, float, float, float]:
 
 def table_four_legs(random: Random) -> Parts:
     """Four legs, usually with an apron below the top."""
-    width, depth, height, thick = _board(random)
+    width, depth, height, thick = board(random)
     leg, inset = random.uniform(0.04, 0.09), random.uniform(0, 0.08)
     parts = [
         tabletop(width, depth, height, thick),
@@ -47,7 +47,7 @@ def table_four_legs(random: Random) -> Parts:
 
 def table_panel_ends(random: Random) -> Parts:
     """Two upright panels as legs, usually with a beam between them."""
-    width, depth, height, thick = _board(random)
+    width, depth, height, thick = board(random)
     inset = random.uniform(0, 0.2)
     parts = [tabletop(width, depth, height, thick)]
     parts += [box(thick, depth * 0.95, height - thick, side * (width / 2 - thick / 2 - inset)) for side in (-1, 1)]
@@ -69,7 +69,7 @@ def table_round(random: Random) -> Parts:
 
 def table_trestle(random: Random) -> Parts:
     """Two pairs of crossed legs."""
-    width, depth, height, thick = _board(random)
+    width, depth, height, thick = board(random)
     parts = [tabletop(width, depth, height, thick), box(width * 0.7, 0.04, 0.1, 0, 0, height * 0.3)]
     for side in (-1, 1):
         x = side * width * 0.36
@@ -94,7 +94,7 @@ def _modesty(random: Random, width: float, depth: float, height: float, thick: f
     return [box(width - 2 * inset, 0.02, drop, 0, depth / 2 - inset, height - thick - drop)]
 
 
-def _pedestal(random: Random, width: float, depth: float, height: float, x: float) -> Parts:
+def drawer_pedestal(random: Random, width: float, depth: float, height: float, x: float) -> Parts:
     """A column of two to four drawers that stands on the floor, centred at `x`."""
     rows = int(random.integers(2, 5))
     front = -depth / 2 + 0.03
@@ -103,10 +103,10 @@ def _pedestal(random: Random, width: float, depth: float, height: float, x: floa
 
 def desk_one_pedestal(random: Random) -> Parts:
     """Drawers on one side, a panel or two legs on the other."""
-    width, depth, height, thick = _board(random)
+    width, depth, height, thick = board(random)
     body, side = random.uniform(0.32, 0.45), random.choice([-1, 1])
     parts = [tabletop(width, depth, height, thick)]
-    parts += _pedestal(random, body, depth * 0.95, height - thick, side * (width - body) / 2)
+    parts += drawer_pedestal(random, body, depth * 0.95, height - thick, side * (width - body) / 2)
     if random.random() < 0.5:
         parts.append(box(0.04, depth * 0.95, height - thick, -side * (width / 2 - 0.02)))
     else:
@@ -118,19 +118,21 @@ def desk_one_pedestal(random: Random) -> Parts:
 
 def desk_two_pedestals(random: Random) -> Parts:
     """Equal drawers on both sides."""
-    width, depth, height, thick = _board(random)
+    width, depth, height, thick = board(random)
     width = max(width, 1.25)
     body = random.uniform(0.3, 0.42)
     state = int(random.integers(2**31))
     parts = [tabletop(width, depth, height, thick)]
     for side in (-1, 1):  # one random state for both, so that they are equal
-        parts += _pedestal(np.random.default_rng(state), body, depth * 0.95, height - thick, side * (width - body) / 2)
+        parts += drawer_pedestal(
+            np.random.default_rng(state), body, depth * 0.95, height - thick, side * (width - body) / 2
+        )
     return parts + (_modesty(random, width, depth, height, thick) if random.random() < 0.6 else [])
 
 
 def desk_corner(random: Random) -> Parts:
     """An L-shaped desk with panels."""
-    width, depth, height, thick = _board(random)
+    width, depth, height, thick = board(random)
     side, reach, wing = random.choice([-1, 1]), random.uniform(0.5, 0.9), random.uniform(0.45, 0.6)
     x, y = side * (width - wing) / 2, -depth / 2 - reach / 2
     parts = [tabletop(width, depth, height, thick), box(wing, reach, thick, x, y, height - thick)]
@@ -138,7 +140,7 @@ def desk_corner(random: Random) -> Parts:
     parts += [box(wing * 0.95, 0.04, height - thick, x, -depth / 2 - reach + 0.03)]
     parts += [box(width, 0.02, (height - thick) * random.uniform(0.3, 0.8), 0, depth / 2 - 0.02, height * 0.2)]
     if random.random() < 0.6:
-        parts += _pedestal(random, 0.38, depth * 0.9, height - thick, -side * (width / 2 - 0.24))
+        parts += drawer_pedestal(random, 0.38, depth * 0.9, height - thick, -side * (width / 2 - 0.24))
     else:
         parts += [box(0.05, 0.05, height - thick, side * (width / 2 - 0.04), depth / 2 - 0.05)]
     return parts
@@ -146,7 +148,7 @@ def desk_corner(random: Random) -> Parts:
 
 def desk_writing(random: Random) -> Parts:
     """Looks like a table except for the drawers under its top, which are visible only from the front."""
-    width, depth, height, thick = _board(random)
+    width, depth, height, thick = board(random)
     drop, leg = random.uniform(0.1, 0.16), random.uniform(0.04, 0.07)
     parts = [
         tabletop(width, depth, height, thick),
