@@ -15,7 +15,7 @@ from data_pipeline.objects.downloads import ARCHIVES, download, download_folder,
 from data_pipeline.objects.folders import list_folder
 from data_pipeline.objects.mesh import SOURCE_SPLITS, ObjectSource
 from data_pipeline.objects.names import shown
-from data_pipeline.objects.sources import Reading, mesh_zip, open_source, together
+from data_pipeline.objects.sources import PROCEDURAL, Reading, mesh_zip, open_source, together
 from data_pipeline.progress import console
 
 
@@ -38,7 +38,7 @@ def _check_apart(every: Sequence[str]) -> None:
     """
     if {"modelnet10", "modelnet40"} <= set(every):
         raise DataError("modelnet40 holds the objects of modelnet10; leave one of them out")
-    named = {"furniture10", *ARCHIVES}
+    named = {*PROCEDURAL, *ARCHIVES}
     paths = [Path(data).expanduser().resolve() if data not in named else Path(data) for data in every]
     for index, path in enumerate(paths):
         for number, other in enumerate(paths):
@@ -50,7 +50,7 @@ def _check_apart(every: Sequence[str]) -> None:
 def _alone(config: DataConfig, data: str) -> DataConfig:
     """Returns the settings of one of several sources. Options for files of meshes are for those alone, lists and archives for
     `--data`."""
-    of_meshes = data not in ARCHIVES and data != "furniture10" and not data.lower().endswith(".npz")
+    of_meshes = data not in ARCHIVES and data not in PROCEDURAL and not data.lower().endswith(".npz")
     listed = config.split.lower().endswith((".json", ".csv"))
     first = data == config.source
     return replace(

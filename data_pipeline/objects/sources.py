@@ -1,7 +1,7 @@
 """Sources of objects.
 
 A *source* lists objects. Each is an `ObjectEntry` whose `recipe` is small, picklable, and makes the mesh in the process that
-needs it. There are four sources: `furniture10` (procedural), a folder of class folders, a zip archive of the same layout such as
+needs it. There are four kinds: procedural ones (`PROCEDURAL`), a folder of class folders, a zip archive of the same layout such as
 ModelNet's, and an archive of voxel grids. Capture workers import this module, so it must not import JAX, which would slow their
 start.
 """
@@ -11,7 +11,7 @@ from __future__ import annotations
 import itertools
 import os
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path, PurePosixPath
 
@@ -29,9 +29,17 @@ from data_pipeline.objects.layout import (
     names_of,
     without_copies,
 )
-from data_pipeline.objects.mesh import MODELNET10_CLASSES, SOURCE_SPLITS, Mesh, ObjectEntry, ObjectSource, normalise
+from data_pipeline.objects.mesh import (
+    MODELNET10_CLASSES,
+    SOURCE_SPLITS,
+    Mesh,
+    ObjectEntry,
+    ObjectSource,
+    Recipe,
+    normalise,
+)
 from data_pipeline.objects.names import kind_of_ignored, plain_class, say_ignored, shown
-from data_pipeline.objects.recipes import FurniturePiece, MeshFile
+from data_pipeline.objects.recipes import FurniturePiece, MeshFile, Stranger
 from data_pipeline.objects.splits import divide
 from data_pipeline.objects.voxels import voxel_archive
 
@@ -68,22 +76,48 @@ def load_object(entry: ObjectEntry) -> Mesh:
     return normalise(vertices, faces, entry.name)
 
 
-def furniture10(train_per_class: int, test_per_class: int) -> ObjectSource:
-    """Returns procedural furniture. Training and test pieces are made from different seeds.
+def _classes_of(data: str) -> tuple[str, ...]:
+    """Returns the classes of a procedural source."""
+    if data == "furniture10":
+        return MODELNET10_CLASSES
+    from data_pipeline.objects.strangers import KINDS  # imported late: it needs trimesh
+
+    split = data.removeprefix("strangers").removeprefix("-")
+    return tuple(name for name, kind in KINDS.items() if split in ("", kind.split))
+
+
+PROCEDURAL: dict[str, Callable[[str, int], Recipe]] = {
+    "furniture10": FurniturePiece,
+    "strangers": Stranger,
+    "strangers-train": Stranger,
+    "strangers-val": Stranger,
+    "strangers-test": Stranger,
+}
+"""What makes one object of a class and a seed, by the name of the source."""
+
+
+def procedural(data: str, train_per_class: int, test_per_class: int) -> ObjectSource:
+    """Returns the objects of a source in `PROCEDURAL`. Those for training and for testing are made from different seeds.
 
     Raises:
         DataError: if there are fewer than 2 training pieces or no test pieces per class.
     """
     if train_per_class < 2 or test_per_class < 1:
         needed = "at least 2 training pieces and 1 test piece per class"
-        raise DataError(f"furniture10 needs {needed}, got {train_per_class} and {test_per_class}")
+        raise DataError(f"{data} needs {needed}, got {train_per_class} and {test_per_class}")
+    classes = _classes_of(data)
     entries = (
-        ObjectEntry(f"{name}_{split}_{index:04d}", label, split, FurniturePiece(name, first + index))
-        for label, name in enumerate(MODELNET10_CLASSES)
+        ObjectEntry(f"{name}_{split}_{index:04d}", label, split, PROCEDURAL[data](name, first + index))
+        for label, name in enumerate(classes)
         for split, count, first in (("train", train_per_class, 0), ("test", test_per_class, 1_000_000))
         for index in range(count)
     )
-    return ObjectSource("furniture10", MODELNET10_CLASSES, tuple(entries))
+    return ObjectSource(data, classes, tuple(entries))
+
+
+def furniture10(train_per_class: int, test_per_class: int) -> ObjectSource:
+    """Returns procedural furniture, as `procedural` does."""
+    return procedural("furniture10", train_per_class, test_per_class)
 
 
 def _arranged(listing: Listing, name: str, where: str, reading: Reading) -> ObjectSource:
@@ -197,7 +231,7 @@ def mesh_zip(archive: Path, reading: Reading = Reading()) -> ObjectSource:
 def _of_meshes(data: str, reading: Reading, known: str) -> ObjectSource | None:
     """Returns the objects of a folder or zip of meshes; None for anything else that exists."""
     path = Path(os.path.expanduser(data))
-    if data != "furniture10" and not os.path.exists(path):
+    if data not in PROCEDURAL and not os.path.exists(path):
         raise DataError(f"no such file or folder: {data}; --data takes {known}")
     if path.is_dir():
         return mesh_folder(path.resolve(), reading)
@@ -205,7 +239,7 @@ def _of_meshes(data: str, reading: Reading, known: str) -> ObjectSource | None:
 
 
 def _is_made_or_voxels(data: str) -> bool:
-    return data == "furniture10" or data.lower().endswith(".npz")
+    return data in PROCEDURAL or data.lower().endswith(".npz")
 
 
 def objects_to_test(data: str, up: Up = "auto") -> ObjectSource:
@@ -214,7 +248,7 @@ def objects_to_test(data: str, up: Up = "auto") -> ObjectSource:
     Raises:
         DataError: as `open_source`, but one class is enough, and none needs objects for training.
     """
-    known = "a folder or zip of meshes in class folders, an .npz of voxel grids, or furniture10"
+    known = "a folder or zip of meshes in class folders, an .npz of voxel grids, furniture10, or strangers"
     if (meshes := _of_meshes(data, Reading(up, all_tested=True), known)) is not None:
         return meshes
     if up != "auto" and _is_made_or_voxels(data):
@@ -233,16 +267,16 @@ def open_source(
     seed: int = 0,
     keep_splits: bool = False,
 ) -> ObjectSource:
-    """Returns the source for `data`: `furniture10`, or the path of a folder, a .zip or an .npz.
+    """Returns the source for `data`: a name in `PROCEDURAL`, or the path of a folder, a .zip or an .npz.
 
     Raises:
         DataError: if the file does not exist or is not usable as a data set.
     """
     if (split or up != "auto") and _is_made_or_voxels(data):
         raise DataError(f"--dataset.split and --dataset.up go with a folder or zip of meshes, not with {data}")
-    if data == "furniture10":
-        return furniture10(train_per_class, test_per_class)
-    known = "furniture10, modelnet10, modelnet40, a folder of class folders, a .zip or a .npz"
+    if data in PROCEDURAL:
+        return procedural(data, train_per_class, test_per_class)
+    known = "furniture10, strangers, modelnet10, modelnet40, a folder of class folders, a .zip or a .npz"
     if (meshes := _of_meshes(data, Reading(up, split, seed, keep_splits), known)) is not None:
         return meshes
     path = Path(os.path.expanduser(data))
