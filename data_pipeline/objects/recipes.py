@@ -1,4 +1,4 @@
-"""Recipes of meshes: procedural furniture and strangers, a file, a file that cannot be read. Members of archives are in `archives`."""
+"""Recipes of meshes: procedural shapes, a file, a file that cannot be read. Members of archives are in `archives`."""
 
 from __future__ import annotations
 

@@ -1,9 +1,9 @@
 """Sources of objects.
 
 A *source* lists objects. Each is an `ObjectEntry` whose `recipe` is small, picklable, and makes the mesh in the process that
-needs it. There are four kinds: procedural ones (`PROCEDURAL`), a folder of class folders, a zip archive of the same layout such as
-ModelNet's, and an archive of voxel grids. Capture workers import this module, so it must not import JAX, which would slow their
-start.
+needs it. There are four kinds: procedural ones (`PROCEDURAL`), a folder of class folders, a zip archive of the same layout, such
+as ModelNet's, and an archive of voxel grids. Capture workers import this module, so it must not import JAX, which would slow
+their start.
 """
 
 from __future__ import annotations

@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
+
 import numpy as np
 
 from data_pipeline.objects.furniture import solids
 from data_pipeline.objects.furniture.solids import Parts, Random
 from data_pipeline.objects.strangers.shapes import (
     Groups,
+    bend,
     blob,
-    capsule as rounded,
+    capsule,
     circle,
     disc,
     either,
@@ -18,6 +21,7 @@ from data_pipeline.objects.strangers.shapes import (
     loft,
     placed,
     slab,
+    smooth,
     sweep,
     tossed,
     upright,
@@ -109,10 +113,10 @@ def wedge(random: Random) -> Parts:
     return placed([slab(outline, depth)], turn=(0, 0, random.uniform(0, 2 * np.pi)))
 
 
-def capsule(random: Random) -> Parts:
+def pill(random: Random) -> Parts:
     radius = random.uniform(0.06, 0.2)
-    pill = rounded((0, 0, 0), (0, 0, random.uniform(0.15, 0.7)), radius, random.uniform(0.6, 1))
-    return tossed(random, [pill], 0.5)
+    solid = capsule((0, 0, 0), (0, 0, random.uniform(0.15, 0.7)), radius, random.uniform(0.6, 1))
+    return tossed(random, [solid], 0.5)
 
 
 def hemisphere(random: Random) -> Parts:
@@ -160,9 +164,12 @@ def vase(random: Random) -> Parts:
     """A belly with a neck, a tulip, or an urn with handles."""
     belly = [(0.07, 0), (0.14, 0.1), (0.16, 0.2), (0.1, 0.33), (0.06, 0.4), (0.09, 0.47)]
     tulip = [(0.08, 0), (0.06, 0.06), (0.08, 0.2), (0.11, 0.33), (0.15, 0.42)]
-    parts = [hollow(_turned(random, belly if either(random, 0.6) else tulip, 0.25), 0.01)]
+    parts = [hollow(smooth(_turned(random, belly if either(random, 0.6) else tulip, 0.25)), 0.01)]
     if either(random, 0.3):
-        parts += [sweep([(s * 0.12, 0, 0.25), (s * 0.2, 0, 0.33), (s * 0.07, 0, 0.42)], 0.012) for s in (-1, 1)]
+        parts += [
+            sweep(bend([(s * 0.1, 0, 0.15), (s * 0.28, 0, 0.2), (s * 0.25, 0, 0.4), (s * 0.04, 0, 0.35)]), 0.012)
+            for s in (-1, 1)
+        ]
     return parts
 
 
@@ -198,7 +205,7 @@ def goblet(random: Random) -> Parts:
 
 def bell(random: Random) -> Parts:
     profile = [(0.2, 0), (0.17, 0.05), (0.13, 0.14), (0.12, 0.22), (0.08, 0.27), (0.0, 0.28)]
-    shape = _turned(random, profile, 0.1)
+    shape = smooth(_turned(random, profile, 0.1))
     top = shape[-1][1]
     parts = [solids.lathe([*shape, *[(r * 0.9, z * 0.92) for r, z in shape[::-1]]], 1), blob((0.03, 0.03, 0.03))]
     if either(random):
@@ -208,7 +215,7 @@ def bell(random: Random) -> Parts:
 
 def spinning_top(random: Random) -> Parts:
     profile = [(0, 0), (0.01, 0.02), (0.06, 0.06), (0.1, 0.1), (0.09, 0.12), (0.02, 0.14), (0.012, 0.2), (0, 0.2)]
-    return placed([solids.lathe(_turned(random, profile, 0.35), 1)], turn=(random.uniform(0, 0.6), 0, 0))
+    return placed([solids.lathe(smooth(_turned(random, profile, 0.35)), 1)], turn=(random.uniform(0, 0.6), 0, 0))
 
 
 def wheel(random: Random) -> Parts:
@@ -240,7 +247,7 @@ def pan(random: Random) -> Parts:
     radius, wall = random.uniform(0.1, 0.16), random.uniform(0.03, 0.06)
     if either(random):
         tip = (radius + random.uniform(0.12, 0.2), 0, wall + random.uniform(0, 0.05))
-        return [hollow([(radius * 0.85, 0), (radius, wall)], 0.004), rounded((radius, 0, wall * 0.8), tip, 0.012)]
+        return [hollow([(radius * 0.85, 0), (radius, wall)], 0.004), capsule((radius, 0, wall * 0.8), tip, 0.012)]
     wall *= random.uniform(2, 3.5)
     parts = [hollow([(radius, 0), (radius, wall)], 0.005)]
     parts += [solids.box(0.05, 0.08, 0.012, s * (radius + 0.02), 0, wall * 0.8) for s in (-1, 1)]
@@ -332,7 +339,7 @@ def arch(random: Random) -> Parts:
 
 def _piece(random: Random, size: float) -> Parts:
     """A primitive of about `size` in any pose."""
-    make = (cube, sphere, cylinder, cone, capsule, torus, prism, tall_box)[random.integers(8)]
+    make = (cube, sphere, cylinder, cone, pill, torus, prism, tall_box)[random.integers(8)]
     parts = make(random)
     scale = size / solids.joined(parts).extents.max()
     for part in parts:
@@ -353,7 +360,7 @@ def mixed_cluster(random: Random) -> Parts:
     """Three to twelve primitives that overlap."""
     parts: Parts = []
     for _ in range(random.integers(3, 11)):
-        parts += placed(_piece(random, random.uniform(0.2, 0.6)), random.uniform(-0.25, 0.25, 3))
+        parts += placed(_piece(random, random.uniform(0.25, 0.6)), random.uniform(-0.2, 0.2, 3))
     return parts
 
 
@@ -385,8 +392,9 @@ def tube_walk(random: Random) -> Parts:
     count, radius = int(random.integers(5, 14)), random.uniform(0.02, 0.06)
     if either(random):
         points = np.cumsum(np.eye(3)[random.integers(3, size=count)] * random.uniform(-0.4, 0.4, (count, 1)), axis=0)
-        return [rounded(a, b, radius) for a, b in zip(points[:-1], points[1:], strict=True)]
-    return [sweep(np.cumsum(np.cumsum(random.normal(0, 0.02, (count * 3, 3)), axis=0) + 1e-3, axis=0), radius)]
+        return [capsule(a, b, radius) for a, b in pairwise(points)]
+    steps = np.cumsum(random.normal(0, 0.4, (count * 3, 3)), axis=0)
+    return [sweep(np.cumsum(steps / np.linalg.norm(steps, axis=1, keepdims=True) * 0.08, axis=0), radius * 0.6)]
 
 
 def voxel_blob(random: Random) -> Parts:
@@ -401,7 +409,7 @@ def voxel_blob(random: Random) -> Parts:
 
 GROUPS: Groups = {
     "primitives": {
-        "train": (sphere, cylinder, cube, flat_plate, tall_box, prism, capsule, hemisphere),
+        "train": (sphere, cylinder, cube, flat_plate, tall_box, prism, pill, hemisphere),
         "val": (cone, upright_plate, pyramid),
         "test": (ellipsoid, torus, bar, wedge),
     },

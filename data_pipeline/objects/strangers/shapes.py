@@ -42,7 +42,7 @@ def circle(n: int, turn: float = 0) -> np.ndarray:
 
 def level(outline: np.ndarray, z: float, x: float = 0, y: float = 0) -> np.ndarray:
     """Returns an outline (n, 2) as a section (n, 3) at height `z`, moved by `x` and `y`."""
-    return np.column_stack([outline + (x, y), np.full(len(outline), z)])
+    return np.column_stack([np.add(outline, (x, y)), np.full(len(outline), z)])
 
 
 def upright(outline: np.ndarray, y: float) -> np.ndarray:
@@ -110,6 +110,15 @@ def hollow(profile: Sequence[tuple[float, float]], wall: float, stretch: float =
     inside = [(max(r - wall, 0.001), z) for r, z in profile[::-1] if z > profile[0][1] + wall]
     bottom = profile[0][1] + wall
     return lathe([(0, profile[0][1]), *profile, *inside, (inside[-1][0], bottom), (0, bottom)], stretch)
+
+
+def smooth(profile: Sequence[tuple[float, float]]) -> list[tuple[float, float]]:
+    """Returns a profile whose corners were cut twice; its ends stay."""
+    points = np.asarray(profile, float)
+    for _ in range(2):
+        cut = np.stack([points[:-1] * 0.75 + points[1:] * 0.25, points[:-1] * 0.25 + points[1:] * 0.75], axis=1)
+        points = np.concatenate([points[:1], cut.reshape(-1, 2), points[-1:]])
+    return [(float(r), float(z)) for r, z in points]
 
 
 def disc(radius: float, thickness: float, centre: Point, axis: Point = (1, 0, 0), sections: int = 18) -> Solid:

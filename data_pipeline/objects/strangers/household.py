@@ -1,0 +1,543 @@
+"""Things of a house: appliances, open shelves and racks, plants, vessels, packages, electronics."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from data_pipeline.objects.furniture.solids import Parts, Random, box, cylinder, four_legs, lathe, rod
+from data_pipeline.objects.strangers.shapes import (
+    Groups,
+    bend,
+    blob,
+    capsule,
+    circle,
+    disc,
+    either,
+    hollow,
+    level,
+    loft,
+    placed,
+    slab,
+    smooth,
+    sweep,
+    tossed,
+)
+
+FRONT = (0, 1, 0)
+"""The axis of a disc that lies in a front."""
+
+
+def _knobs(count: int, radius: float, width: float, y: float, z: float) -> Parts:
+    """Round knobs side by side on a front at `y`."""
+    return [disc(radius, 0.03, (x, y, z), FRONT, 12) for x in np.linspace(-width / 2, width / 2, count)]
+
+
+def washing_machine(random: Random) -> Parts:
+    """A porthole in the front, or a lid on top."""
+    width, depth, height = *random.uniform(0.5, 0.65, 2), random.uniform(0.75, 0.95)
+    front, parts = -depth / 2, [box(width, depth, height)]
+    parts += [box(width * 0.3, 0.02, 0.08, -width * 0.3, front, height * 0.88)]
+    parts += _knobs(2, 0.03, 0.1, front, height * 0.92)
+    if either(random, 0.75):
+        hole, z = random.uniform(0.14, 0.2), height * random.uniform(0.42, 0.55)
+        parts += placed([slab(circle(26) * hole * 1.2, 0.06, circle(26) * hole)], (0, front, z))
+        return [*parts, *placed([blob((hole, 0.05, hole))], (0, front, z))]
+    return [
+        *parts,
+        box(width * 0.85, depth * 0.6, 0.04, 0, front * 0.3, height),
+        box(width, 0.1, 0.15, 0, -front - 0.05, height),
+    ]
+
+
+def refrigerator(random: Random) -> Parts:
+    """One door, two above each other, or two beside each other, with long handles."""
+    width, depth, height = random.uniform(0.55, 0.75), random.uniform(0.55, 0.7), random.uniform(1.3, 2.0)
+    front, kind = -depth / 2, int(random.integers(3))
+    parts = [box(width, depth, height, 0, 0, 0.03), *four_legs(width, depth, 0.03, 0.05)]
+    cut = random.choice([random.uniform(0.28, 0.4), random.uniform(0.6, 0.72)]) * height
+    if kind == 2:
+        width, leaves = width * 1.4, [(-1, 0.03, height), (1, 0.03, height)]
+        parts[0] = box(width, depth, height, 0, 0, 0.03)
+    else:
+        leaves = [(0, 0.03, height)] if kind == 0 else [(0, 0.03, cut), (0, cut + 0.03, height - cut)]
+    for side, z, tall in leaves:
+        door = width / 2 if side else width
+        parts.append(box(door - 0.01, 0.06, tall - 0.015, side * width / 4, front - 0.03, z))
+        x = -side * 0.04 if side else -width * 0.42
+        parts.append(box(0.025, 0.05, min(tall * 0.6, 0.6), side * 0.06 if side else x, front - 0.08, z + tall * 0.2))
+    return parts
+
+
+def microwave(random: Random) -> Parts:
+    width, depth, height = random.uniform(0.42, 0.6), random.uniform(0.3, 0.42), random.uniform(0.24, 0.34)
+    front, panel = -depth / 2, width * random.uniform(0.2, 0.3)
+    parts = [box(width, depth, height, 0, 0, 0.01), box(width - panel, 0.025, height * 0.94, -panel / 2, front, 0.02)]
+    parts.append(box(0.02, 0.04, height * 0.7, (width / 2 - panel) * 0.92, front - 0.03, height * 0.16))
+    if either(random):
+        return parts + placed(
+            _knobs(2, 0.025, 0, front, 0), (width / 2 - panel / 2, 0, height * random.uniform(0.2, 0.4))
+        )
+    keys = [(column, row) for column in (-1, 0, 1) for row in range(4)]
+    return parts + [box(0.02, 0.015, 0.015, width / 2 - panel / 2 + c * 0.03, front, 0.05 + r * 0.035) for c, r in keys]
+
+
+def cooker(random: Random) -> Parts:
+    """An oven with a window and a bar, knobs above it, and rings on top."""
+    width, depth, height = random.uniform(0.5, 0.8), random.uniform(0.5, 0.62), random.uniform(0.8, 0.92)
+    front = -depth / 2
+    parts = [box(width, depth, height), box(width * 0.96, 0.03, height * 0.6, 0, front - 0.01, height * 0.2)]
+    parts += [rod((-width * 0.4, front - 0.06, height * 0.75), (width * 0.4, front - 0.06, height * 0.75), 0.012)]
+    parts += _knobs(int(random.integers(4, 7)), 0.022, width * 0.75, front - 0.015, height * 0.9)
+    rings = [(sx, sy) for sx in (-1, 1) for sy in (-1, 1)]
+    parts += [cylinder(random.uniform(0.06, 0.1), 0.02, sx * width / 4, sy * depth / 4, height) for sx, sy in rings]
+    return [*parts, box(width, 0.03, random.uniform(0.05, 0.3), 0, depth / 2, height)] if either(random) else parts
+
+
+def radiator(random: Random) -> Parts:
+    """Columns beside each other, or a ladder of tubes for towels."""
+    count, high = int(random.integers(6, 16)), random.uniform(0.4, 0.9)
+    if either(random, 0.6):
+        deep, step = random.uniform(0.06, 0.16), random.uniform(0.05, 0.09)
+        parts = [loft([level(circle(10) * (step * 0.42, deep), z) for z in (0.08, high)]) for _ in range(count)]
+        for index, part in enumerate(parts):
+            placed([part], ((index - (count - 1) / 2) * step, 0, 0))
+        ends = [(-count / 2 * step, z) for z in (0.12, high - 0.05)]
+        return parts + [rod((x, 0, z), (-x, 0, z), 0.025) for x, z in ends]
+    wide = random.uniform(0.4, 0.6)
+    parts = [capsule((s * wide / 2, 0, 0), (s * wide / 2, 0, high * 1.6), 0.022) for s in (-1, 1)]
+    return parts + [rod((-wide / 2, 0, z), (wide / 2, 0, z), 0.014) for z in np.linspace(0.1, high * 1.55, count)]
+
+
+def fan(random: Random) -> Parts:
+    """Blades in a ring on a stand, on a low foot, or under a ceiling."""
+    radius, blades = random.uniform(0.15, 0.3), int(random.integers(3, 6))
+    blade = [blob((radius * 0.42, 0.008, radius * 0.2), (radius * 0.55, 0, 0), sections=10) for _ in range(blades)]
+    for index, part in enumerate(blade):
+        placed(placed([part], turn=(0.4, 0, 0)), turn=(0, index * 2 * np.pi / blades, 0))
+    head = [*blade, disc(radius * 0.2, 0.12, (0, 0.03, 0), FRONT)]
+    if either(random, 0.3):
+        return [*placed(head, turn=(np.pi / 2, 0, 0)), cylinder(0.015, random.uniform(0.2, 0.5))]
+    for y in (-0.06, 0.06):
+        head += placed([slab(circle(24) * radius * 1.05, 0.012, circle(24) * radius)], (0, y, 0))
+        head += [rod((0, y * 1.3, 0), (x * radius, y, z * radius), 0.003) for x, z in circle(10)]
+    stem = random.choice([random.uniform(0.05, 0.2), random.uniform(0.7, 1.0)])
+    return [*placed(head, (0, -0.06, stem + radius)), cylinder(0.018, stem + radius), cylinder(radius * 0.8, 0.03)]
+
+
+# ------------------------------------------------------------------------------------------------------ shelves and racks
+
+
+def bookcase(random: Random) -> Parts:
+    """Boards between sides, with or without a back, books, and a middle wall; no fronts."""
+    width, depth, height = random.uniform(0.5, 1.2), random.uniform(0.22, 0.35), random.uniform(0.8, 2.0)
+    rows, books = int(random.integers(3, 7)), either(random)
+    parts = [box(0.025, depth, height, s * width / 2) for s in (-1, 1)]
+    parts += [box(width, depth, 0.025, 0, 0, z) for z in np.linspace(0.05, height - 0.025, rows)]
+    parts += [box(width, 0.01, height, 0, depth / 2)] * either(random, 0.6)
+    parts += [box(0.025, depth, height)] * either(random, 0.3)
+    for z in np.linspace(0.05, height - 0.025, rows)[:-1] if books else ():
+        x = -width / 2 + 0.03
+        for _ in range(random.integers(1, 8)):
+            thick, tall = random.uniform(0.02, 0.06), random.uniform(0.5, 0.85) * height / rows
+            parts.append(box(thick, depth * 0.7, tall, x + thick / 2, 0, z))
+            x += thick + 0.004
+    return parts
+
+
+def ladder_shelf(random: Random) -> Parts:
+    """Boards between leaning rails, which become less deep upwards."""
+    width, height, deep = random.uniform(0.5, 0.8), random.uniform(1.2, 1.9), random.uniform(0.35, 0.5)
+    back = deep if either(random) else 0.05
+    parts = [rod((s * width / 2, -deep, 0), (s * width / 2, 0, height), 0.018) for s in (-1, 1)]
+    parts += [rod((s * width / 2, back - 0.05, 0), (s * width / 2, 0, height), 0.018) for s in (-1, 1)]
+    for t in np.linspace(0.12, 0.85, int(random.integers(3, 6))):
+        low, high = -deep * (1 - t), (back - 0.05) * (1 - t)
+        parts.append(box(width, high - low + 0.05, 0.02, 0, (low + high) / 2, t * height))
+    return parts
+
+
+def coat_rack(random: Random) -> Parts:
+    """A post with arms on a foot or three legs, or a rail between two posts."""
+    height, arms = random.uniform(1.4, 1.9), int(random.integers(4, 9))
+    if either(random, 0.35):
+        wide = random.uniform(0.6, 1.2)
+        parts = [rod((s * wide / 2, 0, 0), (s * wide / 2, 0, height), 0.015) for s in (-1, 1)]
+        parts += [rod((s * wide / 2, -0.22, 0.02), (s * wide / 2, 0.22, 0.02), 0.015) for s in (-1, 1)]
+        return [*parts, *[rod((-wide / 2, 0, z), (wide / 2, 0, z), 0.015) for z in (0.2, height)]]
+    parts = [cylinder(0.025, height)]
+    for index, (x, y) in enumerate(circle(arms)):
+        z = height * (0.95 if index % 2 else 0.85)
+        parts.append(
+            sweep(bend([(0, 0, z - 0.1), (x * 0.12, y * 0.12, z - 0.1), (x * 0.2, y * 0.2, z + 0.05)], 6), 0.012, 6)
+        )
+    if either(random):
+        return [*parts, cylinder(random.uniform(0.15, 0.22), 0.03)]
+    return parts + [rod((0, 0, 0.25), (x * 0.28, y * 0.28, 0.01), 0.018) for x, y in circle(3 + either(random))]
+
+
+def step_ladder(random: Random) -> Parts:
+    """Two rails with rungs that lean alone, or stand against a second pair."""
+    height, wide, steps = random.uniform(0.8, 2.2), random.uniform(0.35, 0.5), int(random.integers(3, 8))
+    reach = height * random.uniform(0.25, 0.4)
+    parts = [rod((s * wide / 2, -reach, 0), (s * wide / 2.6, 0, height), 0.022) for s in (-1, 1)]
+    for t in np.linspace(0.12, 0.9, steps):
+        parts.append(box(wide * (1 - 0.2 * t), 0.08, 0.025, 0, -reach * (1 - t), t * height))
+    if either(random, 0.65):
+        parts += [rod((s * wide / 2, reach, 0), (s * wide / 2.6, 0, height), 0.018) for s in (-1, 1)]
+        parts += [
+            box(wide * 0.85, 0.2, 0.03, 0, 0, height),
+            rod((-wide / 2, reach * 0.8, height * 0.2), (wide / 2, reach * 0.8, height * 0.2), 0.012),
+        ]
+    return parts
+
+
+def crate(random: Random) -> Parts:
+    """An open box of slats with gaps between them."""
+    width, depth, height = random.uniform(0.35, 0.6), random.uniform(0.25, 0.4), random.uniform(0.15, 0.35)
+    rows, slat = int(random.integers(2, 5)), random.uniform(0.6, 0.85) * height
+    parts = [box(0.03, 0.03, height, x * width / 2, y * depth / 2) for x in (-1, 1) for y in (-1, 1)]
+    for z in np.linspace(0, height - slat / rows, rows):
+        parts += [box(width, 0.012, slat / rows, 0, s * depth / 2, z) for s in (-1, 1)]
+        parts += [box(0.012, depth, slat / rows, s * width / 2, 0, z) for s in (-1, 1)]
+    return parts + [box(width, depth / 6, 0.012, 0, y) for y in np.linspace(-0.42, 0.42, 5) * depth]
+
+
+def basket(random: Random) -> Parts:
+    """Bars around a floor, wider above, with or without a handle over it."""
+    radius, height, flare = random.uniform(0.12, 0.2), random.uniform(0.12, 0.3), random.uniform(1.05, 1.5)
+    stretch, bars = random.uniform(0.6, 1), int(random.integers(12, 22))
+    ring = np.column_stack([circle(28), np.zeros(28)])[[*range(28), 0]] * (radius, radius * stretch, 1)
+    parts = [
+        sweep(ring * (1 + (flare - 1) * t, 1 + (flare - 1) * t, 1) + (0, 0, t * height), 0.007, 6) for t in (0, 0.5, 1)
+    ]
+    low = ring[np.linspace(0, 27, bars).astype(int)]
+    parts += [sweep([p, p * (flare, flare, 1) + (0, 0, height)], 0.006, 5) for p in low]
+    parts.append(loft([level(circle(28) * (radius, radius * stretch), z) for z in (-0.005, 0.005)]))
+    top = radius * flare
+    handle = bend([(-top, 0, height), (-top, 0, height * 2.4), (top, 0, height * 2.4), (top, 0, height)])
+    return [*parts, sweep(handle, 0.01, 8)] if either(random, 0.6) else parts
+
+
+# ----------------------------------------------------------------------------------------------------------------- plants
+
+
+def _pot(random: Random, radius: float) -> Parts:
+    height = radius * random.uniform(1.2, 2)
+    parts = [hollow([(radius * random.uniform(0.65, 0.95), 0), (radius, height)], radius * 0.1)]
+    return [*parts, cylinder(radius * 0.85, height * 0.85)]
+
+
+def potted_plant(random: Random) -> Parts:
+    """A pot with long blades, leaves on stalks, or a bush."""
+    parts, kind = _pot(random, 0.1), int(random.integers(3))
+    for _ in range(random.integers(7, 18)):
+        turn, tall, wide = random.uniform(0, 2 * np.pi), random.uniform(0.2, 0.5), random.uniform(0.06, 0.3)
+        tip, along = (
+            np.array([np.cos(turn) * wide, np.sin(turn) * wide, 0.15 + tall]),
+            (0, random.uniform(-0.9, 0.3), turn),
+        )
+        if kind == 0:
+            curve = bend([(0, 0, 0.12), (tip[0] * 0.3, tip[1] * 0.3, 0.3 + tall), tip * (1.3, 1.3, 0.85)], 8)
+            parts.append(sweep(curve, 0.022 * np.sin(np.linspace(0.6, 3.1, 8)), 5))
+        elif kind == 1:
+            parts.append(rod((0, 0, 0.1), tip, 0.004))
+            parts += placed([blob((random.uniform(0.06, 0.12), 0.05, 0.006), (0.05, 0, 0), sections=10)], tip, along)
+        else:
+            parts.append(blob(random.uniform(0.05, 0.12, 3), tip * (0.5, 0.5, 0.8), sections=10))
+    return parts
+
+
+def tree(random: Random) -> Parts:
+    """With a round crown, as a fir, or bare with branches."""
+    kind, trunk = int(random.integers(3)), random.uniform(0.5, 1.2)
+    parts = [sweep([(0, 0, 0), (0, 0, trunk * 1.3)], [0.09, 0.06])]
+    if kind == 0:
+        size = random.uniform(0.15, 0.45, (int(random.integers(1, 8)), 3)) + 0.1
+        return parts + [
+            blob(s, (*random.uniform(-0.3, 0.3, 2), trunk + 0.4 + random.uniform(-0.2, 0.4)), sections=14) for s in size
+        ]
+    if kind == 1:
+        for t in np.linspace(0, 1, int(random.integers(1, 6))):
+            wide = random.uniform(0.4, 0.55) * (1 - 0.6 * t)
+            rings = [level(circle(18) * wide, 0), level(circle(18) * 0.01, 0.9)]
+            parts += placed([loft(rings)], (0, 0, trunk * 0.4 + t * random.uniform(0.8, 1.2)))
+        return parts
+    tips = [(np.array([0, 0, trunk]), np.array([0, 0, 0.4]), 0.055)]
+    for _ in range(3):
+        grown = []
+        for start, way, radius in tips:
+            for _ in range(random.integers(2, 4)):
+                step = way * 0.85 + random.normal(0, 0.18, 3)
+                parts.append(sweep([start, start + step], [radius, radius * 0.6], 6))
+                grown.append((start + step, step, radius * 0.6))
+        tips = grown
+    return parts
+
+
+def cactus(random: Random) -> Parts:
+    """A column with arms, a ball with ribs, or ears upon ears; often in a pot."""
+    kind, tall = int(random.integers(3)), random.uniform(0.25, 0.5)
+    if kind == 0:
+        parts = [capsule((0, 0, 0.1), (0, 0, tall + 0.2), 0.055)]
+        for turn in random.uniform(0, 2 * np.pi, random.integers(1, 4)):
+            x, y, z = np.cos(turn) * 0.16, np.sin(turn) * 0.16, random.uniform(0.15, tall)
+            arm = [(0, 0, z), (x, y, z), (x, y, z + random.uniform(0.08, 0.2))]
+            parts += [capsule(arm[0], arm[1], 0.035), capsule(arm[1], arm[2], 0.035)]
+    elif kind == 1:
+        ribs = circle(48) * (1 + 0.12 * np.cos(np.arange(48) * 2 * np.pi / 48 * 12))[:, None]
+        wave = [(np.sin(t), -np.cos(t)) for t in np.linspace(0.1, 3.1, 12)]
+        parts = placed([loft([level(ribs * 0.13 * r, z * tall * 0.5) for r, z in wave])], (0, 0, 0.12 + tall * 0.5))
+    else:
+        parts, ears = [], [(np.array([0, 0, 0.1]), 0.0)]
+        for _ in range(3):
+            for base, lean in ears:
+                parts += placed([blob((0.07, 0.02, 0.11), (0, 0, 0.1), sections=14)], base, (0, lean, 0))
+            ears = [
+                (b + 0.19 * np.array([np.sin(a), 0, np.cos(a)]), a + random.uniform(-0.8, 0.8)) for b, a in ears * 2
+            ][:4]
+    return [*parts, *_pot(random, 0.1)] if either(random, 0.75) else parts
+
+
+# ---------------------------------------------------------------------------------------------------------------- vessels
+
+
+def _ear(x: float, low: float, high: float, reach: float, radius: float) -> Parts:
+    """A handle on the right side of a vessel."""
+    curve = bend([(x, 0, low), (x + reach * 1.4, 0, low), (x + reach * 1.4, 0, high), (x, 0, high)], 10)
+    return [sweep(curve, radius, 8)]
+
+
+def mug(random: Random) -> Parts:
+    """Straight, round or conical."""
+    radius, height = random.uniform(0.035, 0.05), random.uniform(0.07, 0.13)
+    belly = radius * random.choice([1.0, 1.0, 1.25])
+    profile = smooth([(radius * random.uniform(0.75, 1), 0), (belly, height * 0.4), (radius, height)])
+    return [
+        hollow(profile, 0.004),
+        *_ear(radius * 0.95, height * 0.2, height * 0.82, random.uniform(0.02, 0.035), 0.005),
+    ]
+
+
+def teapot(random: Random) -> Parts:
+    """A belly with a spout, a lid, and a handle behind or above."""
+    r, tall = random.uniform(0.07, 0.1), random.uniform(0.7, 1.5)
+    body = smooth(
+        [
+            (0, 0),
+            (r * 0.6, 0),
+            (r, r * 0.7 * tall),
+            (r * 0.75, r * 1.3 * tall),
+            (r * 0.3, r * 1.5 * tall),
+            (0, r * 1.5 * tall),
+        ]
+    )
+    top = r * 1.5 * tall
+    spout = bend(
+        [(-r * 0.7, 0, top * 0.25), (-r * 1.5, 0, top * 0.3), (-r * 1.4, 0, top * 0.8), (-r * 1.9, 0, top * 0.95)], 9
+    )
+    parts = [
+        lathe(body, 1),
+        sweep(spout, np.linspace(r * 0.25, r * 0.1, 9)),
+        blob((r * 0.15,) * 3, (0, 0, top + r * 0.08), sections=10),
+    ]
+    if either(random, 0.65):
+        return parts + _ear(r * 0.8, top * 0.25, top * 0.8, r * 0.6, r * 0.1)
+    hoop = bend([(-r * 0.8, 0, top * 0.8), (-r, 0, top + r * 1.6), (r, 0, top + r * 1.6), (r * 0.8, 0, top * 0.8)])
+    return [*parts, sweep(hoop, r * 0.06, 8)]
+
+
+def jug(random: Random) -> Parts:
+    """A pitcher with a lip and a handle."""
+    r, height = random.uniform(0.05, 0.08), random.uniform(0.16, 0.28)
+    neck = random.uniform(0.55, 0.95)
+    profile = smooth([(r * 0.7, 0), (r, height * 0.3), (r * neck, height * 0.75), (r * neck * 1.15, height)])
+    body = hollow(profile, 0.005)
+    lip = np.clip(body.vertices[:, 2] / height - 0.8, 0, 1) * 5 * np.clip(-body.vertices[:, 0] / r - 0.4, 0, 1)
+    body.vertices = body.vertices - np.outer(lip, (0.06, 0, -0.02))
+    return [body, *_ear(r * 0.85, height * 0.25, height * 0.85, r * 0.8, 0.008)]
+
+
+def bucket(random: Random) -> Parts:
+    """With a hoop that stands or hangs."""
+    r, height = random.uniform(0.1, 0.16), random.uniform(0.2, 0.32)
+    top = r * random.uniform(1.1, 1.4)
+    lean = random.uniform(-1.9, 1.9)
+    hoop = bend([(-top, 0, 0), (-top * 0.9, 0, top * 1.4), (top * 0.9, 0, top * 1.4), (top, 0, 0)])
+    parts = placed([sweep(hoop, 0.006, 6)], (0, 0, height * 0.95), (lean, 0, 0))
+    return [hollow([(r, 0), (top, height), (top * 1.05, height)], 0.006), *parts]
+
+
+def can(random: Random) -> Parts:
+    """Of food or drink, with rims; or a watering can."""
+    r, height = random.uniform(0.03, 0.06), random.uniform(0.07, 0.17)
+    if either(random, 0.65):
+        inner = [(r * 0.94, height), (r * 0.94, height - 0.005), (0, height - 0.005)]
+        profile = [
+            (0, 0.003),
+            (r * 0.9, 0),
+            (r, 0.008),
+            (r, height - 0.01),
+            (r * random.uniform(0.8, 1), height),
+            *inner,
+        ]
+        return tossed(random, [lathe(profile, 1)], 0.25)
+    r, height = r * 2.5, height * 1.6
+    parts = [hollow([(r, 0), (r * 0.95, height)], 0.004), *_ear(r * 0.9, height * 0.2, height * 0.9, r * 0.7, 0.008)]
+    nose = (-r * random.uniform(2, 3), 0, height * random.uniform(0.9, 1.3))
+    return [
+        *parts,
+        sweep([(-r * 0.9, 0, height * 0.2), nose], [0.018, 0.01]),
+        blob((0.02, 0.03, 0.03), nose, sections=10),
+    ]
+
+
+def lidded_box(random: Random) -> Parts:
+    """A chest or a carton whose lid is closed, lies across, or stands open."""
+    width, depth, height = random.uniform(0.2, 0.6), random.uniform(0.15, 0.4), random.uniform(0.1, 0.35)
+    wall, kind = 0.012, int(random.integers(3))
+    parts = [box(width, depth, wall)]
+    parts += [box(wall, depth, height, s * width / 2) for s in (-1, 1)] + [
+        box(width, wall, height, 0, s * depth / 2) for s in (-1, 1)
+    ]
+    lid = [box(width + 0.03, depth + 0.03, random.uniform(0.02, 0.08))]
+    if either(random, 0.4):
+        curve = np.stack([np.cos(t := np.linspace(0, np.pi, 12)) * depth / 2, np.sin(t) * depth * 0.3], axis=1)
+        lid = placed([slab(curve, width)], turn=(0, 0, np.pi / 2))
+    if kind == 0:
+        return [*parts, *placed(lid, (0, 0, height))]
+    if kind == 1:
+        return [
+            *parts,
+            *placed(lid, (random.uniform(-0.1, 0.1), depth * 0.2, height), (0, 0, random.uniform(-0.6, 0.6))),
+        ]
+    return [*parts, *placed(placed(lid, (0, -depth / 2, 0)), (0, depth / 2, height), (-random.uniform(1.2, 2), 0, 0))]
+
+
+# --------------------------------------------------------------------------------------------------------------- packages
+
+
+def parcel(random: Random) -> Parts:
+    """A box with a strap or a bow around it."""
+    width, depth, height = random.uniform(0.2, 0.5, 3) * (1, 0.8, 0.7)
+    parts = [box(width, depth, height, 0, 0, 0.004), box(0.03, depth + 0.01, height + 0.008)]
+    parts += [box(width + 0.01, 0.03, height + 0.008)] * either(random, 0.7)
+    if either(random):
+        for s in (-1, 1):
+            loop = bend([(0, 0, height), (s * 0.16, 0, height), (s * 0.12, 0, height + 0.16), (0, 0, height)], 12)
+            parts.append(sweep(loop, 0.01, 6))
+    return parts
+
+
+def open_carton(random: Random) -> Parts:
+    """A carton with four flaps."""
+    width, depth, height = random.uniform(0.25, 0.5), random.uniform(0.2, 0.4), random.uniform(0.15, 0.4)
+    parts = [box(width, depth, 0.006)]
+    for turn, across, out in [(i * np.pi / 2, *((width, depth), (depth, width))[i % 2]) for i in range(4)]:
+        flap = placed(
+            [box(across, 0.005, min(width, depth) / 2)], (0, out / 2, height), (-random.uniform(-0.4, 2.4), 0, 0)
+        )
+        parts += placed([box(across, 0.005, height, 0, out / 2), *flap], turn=(0, 0, turn))
+    return parts
+
+
+def sack(random: Random) -> Parts:
+    """A bag tied at its neck, or a pillow of sand."""
+    r, height = random.uniform(0.15, 0.3), random.uniform(0.3, 0.6)
+    if either(random, 0.4):
+        return [blob((r * 1.5, r, r * 0.5), (0, 0, 0), flat=0.7, square=0.4)]
+    profile = smooth(
+        [(0, 0), (r * 0.8, 0), (r, height * 0.3), (r * 0.8, height * 0.7), (r * 0.15, height * 0.85), (r * 0.5, height)]
+    )
+    folds = 1 + 0.05 * np.cos(circle(28)[:, :1] * 7 + random.uniform(0, 6))
+    return [loft([level(circle(28) * folds * (a, a * 0.8), z) for a, z in profile])]
+
+
+def bottle_crate(random: Random) -> Parts:
+    """Rows of bottles in a low box."""
+    columns, rows, step = int(random.integers(2, 6)), int(random.integers(2, 4)), 0.08
+    width, depth, high = columns * step, rows * step, random.uniform(0.1, 0.26)
+    parts = [box(width, depth, 0.01)]
+    parts += [box(0.01, depth, high, s * width / 2) for s in (-1, 1)] + [
+        box(width, 0.01, high, 0, s * depth / 2) for s in (-1, 1)
+    ]
+    profile = [(0, 0.01), (0.033, 0.01), (0.033, 0.17), (0.013, 0.22), (0.013, 0.27), (0, 0.27)]
+    cells = [((c + 0.5) * step - width / 2, (r + 0.5) * step - depth / 2) for c in range(columns) for r in range(rows)]
+    return parts + [loft([level(circle(10) * a, z, x, y) for a, z in profile[1:-1]]) for x, y in cells]
+
+
+# ------------------------------------------------------------------------------------------------------------ electronics
+
+
+def camera(random: Random) -> Parts:
+    """A body with a lens, a bump and a button, with or without a tripod."""
+    width, height, deep, lens = (
+        0.14,
+        random.uniform(0.07, 0.1),
+        random.uniform(0.03, 0.06),
+        random.uniform(0.025, 0.035),
+    )
+    parts = [
+        box(width, deep, height),
+        box(width * 0.35, deep, 0.025, 0, 0, height),
+        cylinder(0.008, 0.012, 0.045, 0, height),
+    ]
+    parts.append(disc(lens, long := random.uniform(0.03, 0.14), (0, -deep / 2 - long / 2, height * 0.48), FRONT))
+    if either(random, 0.35):
+        return [*parts, *[rod((0, 0, 0), (x * 0.2, y * 0.2, -0.5), 0.01) for x, y in circle(3)]]
+    return parts
+
+
+def speaker(random: Random) -> Parts:
+    """A box with round membranes, or a cylinder."""
+    width, depth, height = random.uniform(0.15, 0.35), random.uniform(0.15, 0.35), random.uniform(0.25, 1.0)
+    if either(random, 0.25):
+        return [
+            cylinder(width / 2, height),
+            lathe([(0, height), (width * 0.4, height), (width * 0.35, height + 0.02), (0, height + 0.005)], 1),
+        ]
+    parts, z = [box(width, depth, height)], height * 0.1
+    for r in width * np.sort(random.uniform(0.15, 0.42, random.integers(1, 4)))[::-1]:
+        if z + 2 * r > height:
+            break
+        parts += placed(
+            [slab(circle(22) * r, 0.03, circle(22) * r * 0.8), blob((r * 0.35, 0.025, r * 0.35))],
+            (0, -depth / 2, z + r),
+        )
+        z += 2.15 * r
+    return parts
+
+
+def computer_keyboard(random: Random) -> Parts:
+    columns, rows, key = int(random.integers(8, 16)), int(random.integers(4, 7)), 0.019
+    size, wedge = key * random.uniform(0.75, 0.9), random.uniform(0, 0.15)
+    parts = [box(columns * key + 0.02, rows * key + 0.02, 0.015)]
+    cells = [(c - (columns - 1) / 2, r - (rows - 1) / 2) for c in range(columns) for r in range(1, rows)]
+    parts += [box(size, size, 0.008, c * key, r * key, 0.015) for c, r in cells]
+    parts.append(box(key * columns * 0.45, size, 0.008, 0, -(rows - 1) / 2 * key, 0.015))
+    return placed(parts, turn=(wedge, 0, 0))
+
+
+def telephone(random: Random) -> Parts:
+    """A slab with a camera and keys, or a base with a receiver."""
+    if either(random):
+        width, height = random.uniform(0.06, 0.08), random.uniform(0.12, 0.17)
+        parts = [blob((width / 2, height / 2, 0.006), (0, 0, 0.006), flat=0.2, square=0.15, sections=28)]
+        if either(random):
+            parts += [
+                box(width * 0.2, 0.01, 0.004, x, y, 0.011) for x in (-0.02, 0, 0.02) for y in np.linspace(-0.05, 0, 4)
+            ]
+        return tossed(random, [*parts, box(0.025, 0.025, 0.004, -width * 0.2, height * 0.33, 0.01)])
+    base = slab(np.array([(-0.1, 0), (0.1, 0), (0.1, 0.03), (0, 0.08), (-0.1, 0.09)]), random.uniform(0.14, 0.2))
+    parts = [*placed([base], turn=(0, 0, np.pi / 2)), blob((0.1, 0.025, 0.018), (0, 0.06, 0.11), flat=0.6)]
+    parts += [blob((0.03, 0.03, 0.025), (s * 0.085, 0.06, 0.1), sections=12) for s in (-1, 1)]
+    return [*parts, *placed([cylinder(0.05, 0.012)], (0, -0.03, 0.06), (0.4, 0, 0))]
+
+
+GROUPS: Groups = {
+    "appliances": {"train": (washing_machine, microwave, radiator, fan), "val": (cooker,), "test": (refrigerator,)},
+    "shelves": {"train": (ladder_shelf, step_ladder, crate), "val": (coat_rack,), "test": (bookcase, basket)},
+    "plants": {"train": (potted_plant, tree), "test": (cactus,)},
+    "vessels": {"train": (mug, bucket, can, lidded_box), "val": (jug,), "test": (teapot,)},
+    "packages": {"train": (parcel, sack, bottle_crate), "test": (open_carton,)},
+    "electronics": {"val": (camera, speaker, computer_keyboard, telephone)},
+}
