@@ -21,14 +21,14 @@ class DataConfig:
     """Which objects the data set contains, and how they are captured."""
 
     source: str = "furniture10"
-    """furniture10, modelnet10 or modelnet40 (downloaded), a folder of <class>/{train,test}/ meshes, a zip of the same
-    layout, or an .npz of voxel grids"""
+    """furniture10 or strangers (procedural), modelnet10 or modelnet40 (downloaded), a folder of <class>/{train,test}/ meshes,
+    a zip of the same layout, or an .npz of voxel grids"""
     archive: str = ""
     """local ModelNet10.zip or ModelNet40.zip to use instead of the download"""
     train_per_class: int = 60
-    """training objects per class, for furniture10 (including those for validation)"""
+    """training objects per class, for furniture10 and strangers (including those for validation)"""
     test_per_class: int = 20
-    """test objects per class, for furniture10"""
+    """test objects per class, for furniture10 and strangers"""
     validation_share: float = 0.2
     """share of the training objects of each class that is used for validation"""
     seed: int = 0

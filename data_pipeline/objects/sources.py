@@ -76,8 +76,8 @@ def load_object(entry: ObjectEntry) -> Mesh:
     return normalise(vertices, faces, entry.name)
 
 
-def _classes_of(data: str) -> tuple[str, ...]:
-    """Returns the classes of a procedural source."""
+def classes_of(data: str) -> tuple[str, ...]:
+    """Returns the classes of a source in `PROCEDURAL`."""
     if data == "furniture10":
         return MODELNET10_CLASSES
     from data_pipeline.objects.strangers import KINDS  # imported late: it needs trimesh
@@ -105,7 +105,7 @@ def procedural(data: str, train_per_class: int, test_per_class: int) -> ObjectSo
     if train_per_class < 2 or test_per_class < 1:
         needed = "at least 2 training pieces and 1 test piece per class"
         raise DataError(f"{data} needs {needed}, got {train_per_class} and {test_per_class}")
-    classes = _classes_of(data)
+    classes = classes_of(data)
     entries = (
         ObjectEntry(f"{name}_{split}_{index:04d}", label, split, PROCEDURAL[data](name, first + index))
         for label, name in enumerate(classes)

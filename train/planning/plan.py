@@ -24,13 +24,14 @@ from data_pipeline.dataset.config import DataConfig
 from data_pipeline.dataset.proof import folder_of_shards
 from data_pipeline.dataset.statistics import SPLITS, DatasetStatistics
 from data_pipeline.errors import DataError
+from data_pipeline.objects.sources import PROCEDURAL, classes_of
 from train.loop import check_training, steps_of_an_epoch
 from train.planning.costs import bytes_of, flop_of, memory_of, views_like
 from train.running.devices import Layout
 from train.step import Task
 
 _CLASSES = {"modelnet40": 40}
-"""Numbers of classes of sources that have not been read; all others are taken to have ten."""
+"""Numbers of classes of sources of files that have not been read; all others are taken to have ten."""
 
 _VIEW_BYTES, _GROWTH = 2233, 1.63
 """Bytes that a view of 64×64 pixels takes in a record, and the power of the side with which they grow: within 2 % of the records
@@ -135,7 +136,8 @@ def planned_statistics(config: DataConfig, objects: int) -> DatasetStatistics:
         raise DataError(f"--plan-objects must be at least 1, and is {objects}")
     share = config.validation_share
     aside = round(objects * share / (1 - share)) if 0 <= share < 1 else 0
-    names = [f"class {label}" for label in range(_CLASSES.get(config.source, 10))]
+    classes = len(classes_of(config.source)) if config.source in PROCEDURAL else _CLASSES.get(config.source, 10)
+    names = [f"class {label}" for label in range(classes)]
     counts = {split: dict.fromkeys(names, 0) for split in SPLITS}
     counts["train"][names[0]], counts["val"][names[0]] = objects, aside
     points = viewpoints_of(config.capture).points

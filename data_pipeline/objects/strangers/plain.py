@@ -20,6 +20,7 @@ from data_pipeline.objects.strangers.shapes import (
     level,
     loft,
     placed,
+    rod,
     slab,
     smooth,
     sweep,
@@ -227,7 +228,7 @@ def wheel(random: Random) -> Parts:
         parts.append(disc(rim, width * 0.3, (0, 0, 0), (0, 1, 0)))
     else:
         ends = circle(spokes, 0.3) * rim
-        parts += [solids.rod((0, 0, 0), (x, 0, z), radius * random.uniform(0.04, 0.07)) for x, z in ends]
+        parts += [rod((0, 0, 0), (x, 0, z), radius * random.uniform(0.04, 0.07)) for x, z in ends]
     return tossed(random, parts)
 
 
@@ -303,12 +304,14 @@ _STROKES = {
 
 def letter(random: Random) -> Parts:
     """A capital that stands or lies, thin or as deep as a beam."""
-    strokes = _STROKES[str(random.choice(list(_STROKES)))]
-    wide, tall, deep = random.uniform(0.06, 0.14), random.uniform(0.06, 0.14), random.uniform(0.05, 0.8)
-    return tossed(
-        random,
-        [solids.box((c - a) * wide, deep, (d - b) * tall, (a + c) / 2 * wide, 0, b * tall) for a, b, c, d in strokes],
-    )
+    name = str(random.choice(list(_STROKES)))
+    wide, tall = random.uniform(0.06, 0.14, 2)
+    deep = random.uniform(0.05, 0.15 if name == "T" else 0.8)  # a deep T would be a table
+    bars = [
+        solids.box((c - a) * wide, deep, (d - b) * tall, (a + c) / 2 * wide, 0, b * tall)
+        for a, b, c, d in _STROKES[name]
+    ]
+    return tossed(random, bars)
 
 
 def bracket(random: Random) -> Parts:
@@ -320,7 +323,7 @@ def bracket(random: Random) -> Parts:
             rib = slab(np.array([(0, 0), (reach * 0.8, 0), (0, rise * 0.8)]), 0.01)
             parts += placed([rib], (x, 0, 0), (0, 0, -np.pi / 2))
     elif either(random):
-        parts.append(solids.rod((0, -reach * 0.85, thick), (0, 0, rise * 0.85), thick * 0.5))
+        parts.append(rod((0, -reach * 0.85, thick), (0, 0, rise * 0.85), thick * 0.5))
     return parts
 
 

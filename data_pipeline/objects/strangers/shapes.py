@@ -17,8 +17,11 @@ Builder = Callable[[Random], Parts]
 Groups = dict[str, dict[str, tuple[Builder, ...]]]
 """Builders, whose names are kinds, by group and split."""
 
+FRONT = (0, 1, 0)
+"""The axis of a disc that lies in a front."""
 
-def loft(sections: np.ndarray | Sequence[np.ndarray], caps: bool = True) -> Solid:
+
+def loft(sections: np.ndarray | Sequence[np.ndarray | Sequence[Point]], caps: bool = True) -> Solid:
     """The skin over sections (m, n, 3), each a closed loop of n points; `caps` closes both ends by fans from their centres."""
     rows = np.asarray(sections, float)
     if caps:
@@ -75,7 +78,12 @@ def sweep(path: np.ndarray | Sequence[Point], radii: float | Sequence[float] | n
     return loft(rows)
 
 
-def bend(points: Sequence[Point], count: int = 14) -> np.ndarray:
+def rod(start: Point, end: Point, radius: float) -> Solid:
+    """A cylinder whose axis runs from `start` to `end`."""
+    return sweep([start, end], radius)
+
+
+def bend(points: np.ndarray | Sequence[Point], count: int = 14) -> np.ndarray:
     """Returns `count` points (count, 3) on the Bézier curve of three or four points."""
     t, curve = np.linspace(0, 1, count)[:, None, None], np.asarray(points, float)[None].repeat(count, axis=0)
     while curve.shape[1] > 1:
