@@ -15,7 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from data_pipeline.objects.furniture.solids import Solid, joined
-from data_pipeline.objects.strangers import household, outdoors, plain, small, tools
+from data_pipeline.objects.strangers import household, living, outdoors, plain, small, tools
 from data_pipeline.objects.strangers.shapes import Builder
 
 __all__ = ["KINDS", "SPLITS", "Kind", "stranger"]
@@ -34,7 +34,7 @@ class Kind:
 
 KINDS: dict[str, Kind] = {
     build.__name__: Kind(build, group, split)
-    for module in (plain, household, small, tools, outdoors)
+    for module in (plain, household, small, tools, outdoors, living)
     for group, splits in module.GROUPS.items()
     for split, builders in splits.items()
     for build in builders

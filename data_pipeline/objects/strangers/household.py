@@ -1,4 +1,4 @@
-"""Things of a house: appliances, open shelves and racks, plants."""
+"""Things of a house: appliances, open shelves and racks."""
 
 from __future__ import annotations
 
@@ -14,7 +14,6 @@ from data_pipeline.objects.strangers.shapes import (
     circle,
     disc,
     either,
-    hollow,
     level,
     loft,
     placed,
@@ -215,88 +214,7 @@ def basket(random: Random) -> Parts:
     return [*parts, sweep(handle, 0.01, 8)] if either(random, 0.6) else parts
 
 
-# ----------------------------------------------------------------------------------------------------------------- plants
-
-
-def _pot(random: Random, radius: float) -> Parts:
-    height = radius * random.uniform(1.2, 2)
-    parts = [hollow([(radius * random.uniform(0.65, 0.95), 0), (radius, height)], radius * 0.1)]
-    return [*parts, cylinder(radius * 0.85, height * 0.85)]
-
-
-def potted_plant(random: Random) -> Parts:
-    """A pot with long blades, leaves on stalks, or a bush."""
-    parts, kind = _pot(random, 0.1), int(random.integers(3))
-    for _ in range(random.integers(7, 18)):
-        turn, tall, wide = random.uniform(0, 2 * np.pi), random.uniform(0.2, 0.5), random.uniform(0.06, 0.3)
-        tip, along = (
-            np.array([np.cos(turn) * wide, np.sin(turn) * wide, 0.15 + tall]),
-            (0, random.uniform(-0.9, 0.3), turn),
-        )
-        if kind == 0:
-            curve = bend([(0, 0, 0.12), (tip[0] * 0.3, tip[1] * 0.3, 0.3 + tall), tip * (1.3, 1.3, 0.85)], 8)
-            parts.append(sweep(curve, 0.022 * np.sin(np.linspace(0.6, 3.1, 8)), 5))
-        elif kind == 1:
-            parts.append(rod((0, 0, 0.1), tip, 0.004))
-            parts += placed([blob((random.uniform(0.06, 0.12), 0.05, 0.006), (0.05, 0, 0), sections=10)], tip, along)
-        else:
-            parts.append(blob(random.uniform(0.05, 0.12, 3), tip * (0.5, 0.5, 0.8), sections=10))
-    return parts
-
-
-def tree(random: Random) -> Parts:
-    """With a round crown, as a fir, or bare with branches."""
-    kind, trunk = int(random.integers(3)), random.uniform(0.5, 1.2)
-    parts = [sweep([(0, 0, 0), (0, 0, trunk * 1.3)], [0.09, 0.06])]
-    if kind == 0:
-        size = random.uniform(0.15, 0.45, (int(random.integers(1, 8)), 3)) + 0.1
-        return parts + [
-            blob(s, (*random.uniform(-0.3, 0.3, 2), trunk + 0.4 + random.uniform(-0.2, 0.4)), sections=14) for s in size
-        ]
-    if kind == 1:
-        for t in np.linspace(0, 1, int(random.integers(1, 6))):
-            wide = random.uniform(0.4, 0.55) * (1 - 0.6 * t)
-            rings = [level(circle(18) * wide, 0), level(circle(18) * 0.01, 0.9)]
-            parts += placed([loft(rings)], (0, 0, trunk * 0.4 + t * random.uniform(0.8, 1.2)))
-        return parts
-    tips = [(np.array([0, 0, trunk]), np.array([0, 0, 0.4]), 0.055)]
-    for _ in range(3):
-        grown = []
-        for start, way, radius in tips:
-            for _ in range(random.integers(2, 4)):
-                step = way * 0.85 + random.normal(0, 0.18, 3)
-                parts.append(sweep([start, start + step], [radius, radius * 0.6], 6))
-                grown.append((start + step, step, radius * 0.6))
-        tips = grown
-    return parts
-
-
-def cactus(random: Random) -> Parts:
-    """A column with arms, a ball with ribs, or ears upon ears; often in a pot."""
-    kind, tall = int(random.integers(3)), random.uniform(0.25, 0.5)
-    if kind == 0:
-        parts = [capsule((0, 0, 0.1), (0, 0, tall + 0.2), 0.055)]
-        for turn in random.uniform(0, 2 * np.pi, random.integers(1, 4)):
-            x, y, z = np.cos(turn) * 0.16, np.sin(turn) * 0.16, random.uniform(0.15, tall)
-            arm = [(0, 0, z), (x, y, z), (x, y, z + random.uniform(0.08, 0.2))]
-            parts += [capsule(arm[0], arm[1], 0.035), capsule(arm[1], arm[2], 0.035)]
-    elif kind == 1:
-        ribs = circle(48) * (1 + 0.12 * np.cos(np.arange(48) * 2 * np.pi / 48 * 12))[:, None]
-        wave = [(np.sin(t), -np.cos(t)) for t in np.linspace(0.1, 3.1, 12)]
-        parts = placed([loft([level(ribs * 0.13 * r, z * tall * 0.5) for r, z in wave])], (0, 0, 0.12 + tall * 0.5))
-    else:
-        parts, ears = [], [(np.array([0, 0, 0.1]), 0.0)]
-        for _ in range(3):
-            for base, lean in ears:
-                parts += placed([blob((0.07, 0.02, 0.11), (0, 0, 0.1), sections=14)], base, (0, lean, 0))
-            ears = [
-                (b + 0.19 * np.array([np.sin(a), 0, np.cos(a)]), a + random.uniform(-0.8, 0.8)) for b, a in ears * 2
-            ][:4]
-    return [*parts, *_pot(random, 0.1)] if either(random, 0.75) else parts
-
-
 GROUPS: Groups = {
     "appliances": {"train": (washing_machine, microwave, radiator, fan), "val": (cooker,), "test": (refrigerator,)},
     "shelves": {"train": (ladder_shelf, step_ladder, crate), "val": (coat_rack,), "test": (bookcase, basket)},
-    "plants": {"train": (potted_plant, tree), "test": (cactus,)},
 }

@@ -351,7 +351,7 @@ def _piece(random: Random, size: float) -> Parts:
 
 
 def box_cluster(random: Random) -> Parts:
-    """Three to twelve boxes that overlap, upright or in any pose."""
+    """Three to twelve boxes close together, upright or in any pose."""
     loose, parts = either(random), []
     for _ in range(random.integers(3, 13)):
         turn = random.uniform(0, 2 * np.pi, 3) if loose else (0, 0, 0)
@@ -360,7 +360,7 @@ def box_cluster(random: Random) -> Parts:
 
 
 def mixed_cluster(random: Random) -> Parts:
-    """Three to twelve primitives that overlap."""
+    """Three to twelve primitives close together."""
     parts: Parts = []
     for _ in range(random.integers(3, 11)):
         parts += placed(_piece(random, random.uniform(0.25, 0.6)), random.uniform(-0.2, 0.2, 3))
@@ -376,7 +376,7 @@ def box_tree(random: Random) -> Parts:
         step[axis] = random.choice([-1, 1]) * (sizes[on][axis] + size[axis]) / 2
         sizes.append(size)
         centres.append(centres[on] + step)
-    return [solids.box(*size, c[0], c[1], c[2] - size[2] / 2) for size, c in zip(sizes, centres, strict=True)]
+    return [solids.box(w, d, h, x, y, z - h / 2) for (w, d, h), (x, y, z) in zip(sizes, centres, strict=True)]
 
 
 def stack(random: Random) -> Parts:
@@ -384,7 +384,7 @@ def stack(random: Random) -> Parts:
     boxes, z, parts = either(random), 0.0, []
     for _ in range(random.integers(3, 8)):
         size, high = random.uniform(0.15, 0.5, 2), random.uniform(0.05, 0.25)
-        piece = solids.box(*size, high) if boxes else solids.cylinder(size[0] / 2, high)
+        piece = solids.box(size[0], size[1], high) if boxes else solids.cylinder(size[0] / 2, high)
         parts += placed([piece], (*random.uniform(-0.04, 0.04, 2), z), (0, 0, random.uniform(-0.5, 0.5)))
         z += high
     return parts
@@ -402,7 +402,7 @@ def tube_walk(random: Random) -> Parts:
 
 def voxel_blob(random: Random) -> Parts:
     """Unit cubes grown face to face."""
-    cells = {(0, 0, 0)}
+    cells: set[tuple[int, ...]] = {(0, 0, 0)}
     for _ in range(random.integers(8, 40)):
         cell = np.array(sorted(cells)[random.integers(len(cells))])
         cell[random.integers(3)] += random.choice([-1, 1])

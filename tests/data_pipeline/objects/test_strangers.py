@@ -13,7 +13,7 @@ from data_pipeline.errors import DataError
 from data_pipeline.objects.mesh import MODELNET10_CLASSES, normalise
 from data_pipeline.objects.names import plain_class
 from data_pipeline.objects.sources import load_object, objects_to_test, open_source
-from data_pipeline.objects.strangers import KINDS, SPLITS, household, outdoors, plain, small, stranger, tools
+from data_pipeline.objects.strangers import KINDS, SPLITS, household, living, outdoors, plain, small, stranger, tools
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -40,7 +40,7 @@ def test_no_kind_is_a_class_and_each_has_one_split():
     assert not {plain_class(kind) for kind in KINDS} & {plain_class(name) for name in MODELNET10_CLASSES}
     listed = [
         build
-        for module in (plain, household, small, tools, outdoors)
+        for module in (plain, household, small, tools, outdoors, living)
         for splits in module.GROUPS.values()
         for builders in splits.values()
         for build in builders
