@@ -33,18 +33,20 @@ def potted_plant(random: Random) -> Parts:
     parts, kind = _pot(random, 0.1), int(random.integers(3))
     for _ in range(random.integers(7, 18)):
         turn, tall, wide = random.uniform(0, 2 * np.pi), random.uniform(0.2, 0.5), random.uniform(0.06, 0.3)
-        tip, along = (
-            np.array([np.cos(turn) * wide, np.sin(turn) * wide, 0.15 + tall]),
-            (0, random.uniform(-0.9, 0.3), turn),
-        )
+        tip = np.array([np.cos(turn) * wide, np.sin(turn) * wide, 0.15 + tall])
         if kind == 0:
             curve = bend([(0, 0, 0.12), (tip[0] * 0.3, tip[1] * 0.3, 0.3 + tall), tip * (1.3, 1.3, 0.85)], 8)
             parts.append(sweep(curve, 0.022 * np.sin(np.linspace(0.6, 3.1, 8)), 5))
         elif kind == 1:
             parts.append(rod((0, 0, 0.1), tip, 0.004))
-            parts += placed([blob((random.uniform(0.06, 0.12), 0.05, 0.006), (0.05, 0, 0), sections=10)], tip, along)
+            parts += placed(
+                [blob((random.uniform(0.06, 0.12), 0.05, 0.006), (0.05, 0, 0), sections=10)],
+                tip,
+                (0, random.uniform(-0.9, 0.3), turn),
+            )
         else:
-            parts.append(blob(random.uniform(0.05, 0.12, 3), tip * (0.5, 0.5, 0.8), sections=10))
+            middle = tip * (0.5, 0.5, 0.8)
+            parts += [rod((0, 0, 0.1), middle, 0.006), blob(random.uniform(0.05, 0.12, 3), middle, sections=10)]
     return parts
 
 
