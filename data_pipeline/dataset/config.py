@@ -41,7 +41,8 @@ class DataConfig:
     """for a folder or zip without train and test folders: the share of training objects of each class, such as 0.8, or a .json
     or .csv list of splits"""
     more: tuple[str, ...] = ()
-    """further sources of any of these kinds, whose objects are added: classes of one name are one class"""
+    """further sources of any of these kinds, whose objects are added: classes of one name are one class; or strangers: shapes
+    that belong to no class, as many as of ten classes"""
     capture: CaptureConfig = CaptureConfig()
 
 

@@ -26,6 +26,10 @@ def open_objects(config: DataConfig) -> ObjectSource:
         DataError: if a source is not usable or given twice, or `config.archive` is set for another kind of source.
     """
     if not config.more:
+        if config.source == "strangers":
+            raise DataError(
+                "strangers are one class, of unknown objects; give --data others and add --dataset.more strangers"
+            )
         return _open_first(config)
     _check_apart((config.source, *config.more))
     return together([_open_first(_alone(config, data), keep_splits=True) for data in (config.source, *config.more)])

@@ -12,6 +12,8 @@ from data_pipeline.objects.formats.polygons import check_indices
 
 MODELNET10_CLASSES = ("bathtub", "bed", "chair", "desk", "dresser", "monitor", "night_stand", "sofa", "table", "toilet")
 """The classes of ModelNet10 and of furniture10, in alphabetical order, which is the order of labels."""
+UNKNOWN_OBJECT = "unknown object"
+"""The class of objects that belong to no other class. Equal to that of `mevs_jax.trained.description`, which imports JAX."""
 SOURCE_SPLITS = ("train", "test")
 
 LARGEST_COORDINATE = 1e30

@@ -1,4 +1,4 @@
-"""Recipes of meshes: procedural furniture, a file, a file that cannot be read. Members of archives are in `archives`."""
+"""Recipes of meshes: procedural shapes, a file, a file that cannot be read. Members of archives are in `archives`."""
 
 from __future__ import annotations
 
@@ -45,6 +45,20 @@ class FamilyPiece:
 
         piece = family_piece(self.class_name, self.split, self.family, self.seed)
         return piece.vertices, piece.faces
+
+
+@dataclass(frozen=True)
+class Stranger:
+    """A shape of a kind that is none of the ten classes of furniture."""
+
+    kind: str
+    seed: int
+
+    def load(self) -> tuple[np.ndarray, np.ndarray]:
+        from data_pipeline.objects.strangers import stranger  # imported late: it needs trimesh
+
+        shape = stranger(self.kind, self.seed)
+        return shape.vertices, shape.faces
 
 
 @dataclass(frozen=True)

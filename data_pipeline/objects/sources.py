@@ -30,9 +30,17 @@ from data_pipeline.objects.layout import (
     names_of,
     without_copies,
 )
-from data_pipeline.objects.mesh import MODELNET10_CLASSES, SOURCE_SPLITS, Mesh, ObjectEntry, ObjectSource, normalise
+from data_pipeline.objects.mesh import (
+    MODELNET10_CLASSES,
+    SOURCE_SPLITS,
+    UNKNOWN_OBJECT,
+    Mesh,
+    ObjectEntry,
+    ObjectSource,
+    normalise,
+)
 from data_pipeline.objects.names import kind_of_ignored, plain_class, say_ignored, shown
-from data_pipeline.objects.recipes import FamilyPiece, FurniturePiece, MeshFile
+from data_pipeline.objects.recipes import FamilyPiece, FurniturePiece, MeshFile, Stranger
 from data_pipeline.objects.splits import divide
 from data_pipeline.objects.voxels import voxel_archive
 
@@ -127,9 +135,30 @@ def furniture_families(name: str, train_per_class: int, test_per_class: int) -> 
     return ObjectSource(name, MODELNET10_CLASSES, tuple(entries))
 
 
+def strangers(train_per_class: int, test_per_class: int) -> ObjectSource:
+    """Returns procedural shapes that are no furniture, as one class: for training, validation and testing of other kinds.
+
+    They are as many as pieces of all ten classes of furniture, of each kind in turn.
+
+    Raises:
+        DataError: if there are fewer than 2 training pieces or no test pieces per class.
+    """
+    from data_pipeline.objects.strangers import KINDS  # imported late: it needs trimesh
+
+    _check_numbers("strangers", train_per_class, test_per_class)
+    counts = {"train": (train_per_class, 0), "val": (test_per_class, 2_000_000), "test": (test_per_class, 1_000_000)}
+    entries: list[ObjectEntry] = []
+    for split, (count, first) in counts.items():
+        kinds = itertools.cycle([name for name, kind in KINDS.items() if kind.split == split])
+        for index, kind in zip(range(len(MODELNET10_CLASSES) * count), kinds, strict=False):
+            entries.append(ObjectEntry(f"{kind}_{split}_{index:04d}", 0, split, Stranger(kind, first + index)))
+    return ObjectSource("strangers", (UNKNOWN_OBJECT,), tuple(entries))
+
+
 PROCEDURAL: dict[str, Callable[[int, int], ObjectSource]] = {
     "furniture10": furniture10,
     **{name: partial(furniture_families, name) for name in _FAMILIES_OF},
+    "strangers": strangers,
 }
 """The sources that are made and not read, by name, as functions of the numbers of pieces per class for training and testing."""
 
@@ -290,7 +319,7 @@ def open_source(
         raise DataError(f"--dataset.split and --dataset.up go with a folder or zip of meshes, not with {data}")
     if data in PROCEDURAL:
         return PROCEDURAL[data](train_per_class, test_per_class)
-    known = "furniture10, furniture10-families, modelnet10, modelnet40, a folder of class folders, a .zip or a .npz"
+    known = "furniture10, furniture10-families, strangers, modelnet10, modelnet40, a folder of class folders, a .zip or a .npz"
     if (meshes := _of_meshes(data, Reading(up, split, seed, keep_splits), known)) is not None:
         return meshes
     path = Path(os.path.expanduser(data))

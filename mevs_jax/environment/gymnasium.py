@@ -12,6 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import fields
+from functools import partial
 from typing import Any
 
 import jax
@@ -186,6 +187,10 @@ def _in_numpy(observation: EnvironmentObservation) -> dict[str, Any]:
     return found
 
 
+def _are_indices(size: int, values: np.ndarray) -> np.ndarray:
+    return (values >= 0) & (values < size) & (values == np.floor(values))
+
+
 def _drawn(
     environment: ActiveRecognition, random: np.random.Generator, shape: tuple[int, ...], options: dict[str, Any] | None
 ) -> tuple[np.ndarray, np.ndarray]:
@@ -197,7 +202,7 @@ def _drawn(
             check(
                 given,
                 f"the option {name!r} must be between 0 and {size - 1}",
-                lambda one, size=size: (one >= 0) & (one < size) & (one == np.floor(one)),
+                partial(_are_indices, size),
             )
             if np.shape(given) not in ((), shape):
                 raise ValueError(

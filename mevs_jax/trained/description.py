@@ -121,7 +121,8 @@ class Description:
     @property
     def unknown_class(self) -> int | None:
         """Label of the class of objects that belong to no other class; None if there is no such class."""
-        return self.classes.index(UNKNOWN_OBJECT) if UNKNOWN_OBJECT in self.classes else None
+        plain = [name.replace("_", " ").lower() for name in self.classes]
+        return plain.index(UNKNOWN_OBJECT) if UNKNOWN_OBJECT in plain else None
 
     def __hash__(self) -> int:
         return hash(json.dumps(asdict(self), sort_keys=True, default=str))
