@@ -28,7 +28,9 @@ from train.results.records import named
 VIEWS = (1, 2, 4)
 """Numbers of views after which accuracy is reported."""
 THESIS = "predicted_entropy"
-_VERSION = 2
+_UNKNOWN = 65535
+"""Stored where it is unknown what is there."""
+_VERSION = 3
 """Raised when the same numbers make other images."""
 STOP = 0.95
 """Calibrated probability at which walks stop, to see whether those who are sure are right."""
@@ -249,10 +251,10 @@ def images_of(
             placed = placed or Placed(mesh, other)
             drawn = int(digest_of([entry.name, seed, one.name]), 16)
             depth = views_in(one, placed, viewpoints, camera, (drawn,))
-            stored = np.round(depth * DEPTH_SCALE).astype(np.uint16)
+            stored = np.where(np.isnan(depth), _UNKNOWN, np.round(depth * DEPTH_SCALE)).astype(np.uint16)
             path.parent.mkdir(parents=True, exist_ok=True)
             write_npz(path, depth=stored)
-        images[one.name] = np.asarray(metric_depth(stored))
+        images[one.name] = np.where(stored == _UNKNOWN, np.float32(np.nan), np.asarray(metric_depth(stored)))
     return images
 
 

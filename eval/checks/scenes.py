@@ -7,13 +7,14 @@ here is used in training, where errors are added to the data set's own images (`
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 from functools import partial
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from data_pipeline.capture.casting import default_caster
 from data_pipeline.capture.sensor import Kind, SensorConfig, sense
@@ -52,6 +53,7 @@ class Condition:
         sphere: largest error of the centre (uniform in a ball) and of the radius, as a share of the radius.
         turned: whether the object faces anywhere, and the system is not told where.
         roll: whether the camera is rolled by any angle.
+        unseen: share of the object's sphere that no image shows, on one side of a line or along a bar across it.
     """
 
     name: str
@@ -64,6 +66,7 @@ class Condition:
     sphere: float = 0.0
     turned: bool = False
     roll: bool = False
+    unseen: float = 0.0
 
 
 UPPER = Condition("upper", "perfect images, from above only", upper=True)
@@ -78,6 +81,7 @@ CONDITIONS = (
     Condition("sphere_10", "centre and radius off by up to 10 %", sphere=0.1),
     Condition("beside", "another object beside it", beside=True),
     Condition("turned", "unknown yaw", turned=True),
+    *(Condition(f"part_{share}", f"{share} % of the sphere not seen", unseen=share / 100) for share in (30, 50, 70)),
     UPPER,
     Condition("table", "on a table, from above only", table=True, upper=True),
     Condition("together", "stereo at 1 m, 10 % off, on a table", "stereo", table=True, upper=True, sphere=0.1),
@@ -133,7 +137,8 @@ def views_in(
     camera: ViewCamera,
     seed: tuple[int, ...],
 ) -> Float[np.ndarray, "views side side"]:
-    """Returns the networks' images of an object in a scene, from every viewpoint; all 0 where nothing is seen.
+    """Returns the networks' images of an object in a scene, from every viewpoint, with NaN where it is unknown what is there; all
+    0 where nothing is seen.
 
     Args:
         condition: what the scene and the camera are like.
@@ -171,9 +176,12 @@ def views_in(
     for view, pose in enumerate(poses):
         world = pose.copy()
         world[:3, 3] *= RADIUS
+        shown = np.where(depth[view] > 0, measured[view] * RADIUS, np.inf).astype(np.float32)
+        if condition.unseen:
+            shown[_lost(condition.unseen, local, pose[:3, :3].T @ (offset - pose[:3, 3]), factor, random)] = np.nan
         try:
             found[view] = canonical_view(
-                np.where(depth[view] > 0, measured[view] * RADIUS, np.inf).astype(np.float32),
+                shown,
                 source.intrinsics,
                 world,
                 center=offset * RADIUS,
@@ -181,7 +189,7 @@ def views_in(
                 camera=camera,
                 mask=_wider(object_is_nearest[view], int(wider[view])) if condition.beside else None,
                 floor=(placed.lowest - offset[2] + margins[view]) * RADIUS if condition.table else None,
-            ).depth
+            ).image
         except ValueError as error:
             if "pixel" not in str(error):  # not that the image shows nothing of the object
                 raise
@@ -202,6 +210,26 @@ def _seen(
         other = np.minimum(other, np.where((down > 0) & on, down, np.inf))
     nearest = np.minimum(depth, other)
     return np.where(np.isfinite(nearest), np.where(other < depth, -nearest, nearest), 0.0)
+
+
+def _lost(
+    share: float, local: np.ndarray, center: np.ndarray, radius: float, random: np.random.Generator
+) -> Bool[np.ndarray, "side side"]:
+    """The pixels of a source image that are lost: a share of those that look at a sphere, and others in line with them.
+
+    Args:
+        local: (pixels, 3) rays in the camera's frame.
+        center: of the sphere in the camera's frame.
+        radius: of the sphere.
+        random: of the line, and of whether one side of it is lost or a bar along it.
+    """
+    disc = (local @ center) ** 2 >= np.sum(local**2, axis=1) * (center @ center - radius**2)
+    angle = random.uniform(0, 2 * np.pi)
+    across = local[:, :2] @ np.array([np.cos(angle), np.sin(angle)])
+    if random.random() < 0.5:
+        across = -np.abs(across - random.choice(across[disc]))
+    side = math.isqrt(len(local))
+    return (across > np.quantile(across[disc], 1 - share)).reshape(side, side)
 
 
 def _wider(mask: np.ndarray, pixels: int) -> np.ndarray:

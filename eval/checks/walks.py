@@ -69,12 +69,12 @@ class Observer:
         self._of_object: Any = like._of_object if like else jax.jit(jax.vmap(system.observe, in_axes=(0, 0, None)))
 
     def add(self, depth: Float[np.ndarray, "views side side"], radius: float = np.nan) -> None:
-        """Adds the views of an object, in radii, 0 where nothing is hit; `radius` is in metres, NaN if it is unknown.
+        """Adds the views of an object, in radii, 0 where nothing is hit, NaN where unknown; `radius` is in metres or NaN.
 
         A view that shows nothing, which an agent would refuse, is no evidence: its logits are 0.
         """
         seen = self._of_object(jnp.asarray(depth, jnp.float32), self._poses, jnp.float32(radius))
-        shows = jnp.asarray(depth.any(axis=(1, 2)))
+        shows = jnp.asarray((depth > 0).any(axis=(1, 2)))
         self._seen.append(replace(seen, logits=jnp.where(shows[:, None], seen.logits, 0.0)))
 
     def tables(self, labels: Int[np.ndarray, " objects"]) -> ViewTable:

@@ -16,7 +16,7 @@ from eval.checks import reality
 from eval.checks.camera import cast_canonical
 from eval.checks.reality import RealityConfig, check_reality, conditions_of
 from eval.checks.scenes import CONDITIONS, Condition, Placed, reachable_in, views_in
-from mevs_jax.geometry.cameras import ViewCamera, cameras_at, partial_cloud
+from mevs_jax.geometry.cameras import ViewCamera, cameras_at, in_sphere, partial_cloud
 from tests.eval.checks.test_transfer import write_off
 from tests.mevs_jax.trained import making
 
@@ -133,6 +133,19 @@ def test_sensors_add_errors_of_the_size_of_their_strength(placed, clean, name):
         both = (image > 0) & (other > 0)
         worse = (more > 0) & (other > 0)
         assert np.median(np.abs(image - other)[both]) < np.median(np.abs(more - other)[worse])
+
+
+@pytest.mark.parametrize("share", [30, 50, 70])
+def test_a_share_of_the_sphere_is_not_seen_and_the_rest_as_it_is(share, placed, clean):
+    disc, shares = np.asarray(in_sphere(CAMERA, CAMERA.resolution)), []
+    for seed in range(4):
+        for image, other in zip(seen(BY_NAME[f"part_{share}"], placed, seed), clean, strict=True):
+            unknown = np.isnan(image)
+            shares.append(unknown[disc].mean())
+            both = (image > 0) & (other > 0)
+            np.testing.assert_allclose(image[both], other[both], atol=0.02)
+            assert overlap(np.where(unknown, 0, image), np.where(unknown, 0, other)) > 0.9 or not both.any()
+    np.testing.assert_allclose(shares, share / 100, atol=0.06)
 
 
 def test_views_from_below_cannot_be_reached_where_there_is_a_table():
