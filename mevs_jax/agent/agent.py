@@ -25,6 +25,7 @@ from mevs_jax.arguments import number, numbers, whole
 from mevs_jax.arrays import AnyArray, AnyVector
 from mevs_jax.beliefs.strangeness import STRANGE
 from mevs_jax.geometry.cameras import in_sphere
+from mevs_jax.geometry.canonical import convert
 from mevs_jax.geometry.inputs import check_depth
 from mevs_jax.geometry.source_view import DepthImage
 from mevs_jax.geometry.sphere import Sphere
@@ -147,6 +148,8 @@ class Agent:
                     continue
                 self.decide(reachable=[0])  # before the first view, since afterwards it may be sure
                 self.observe(depth, camera.intrinsics, pose)
+            if self.system.description.told_unknown:  # parts are seen from another direction than their own
+                convert(DepthImage(depth, camera.intrinsics, pose), Sphere((0, 0, 0), radius), camera, np.eye(3)[0])
         finally:
             self._object, self.history, self._resets, self.key = kept
 

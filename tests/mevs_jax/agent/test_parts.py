@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import jax
 import numpy as np
 import pytest
 
 from mevs_jax.agent import Agent
 from mevs_jax.trained import TrainedSystem
-from tests.mevs_jax.agent.test_agent import K, begun, in_metres, pose_at, views_of
+from tests.mevs_jax.agent.test_agent import LYING, K, begun, in_metres, pose_at, views_of
 from tests.mevs_jax.trained import making
 
 
@@ -91,3 +92,23 @@ def test_what_an_image_does_not_show_matters(parts, recogniser):
             begun(system).observe_view(image, pose).probabilities for image in (unknown, np.nan_to_num(unknown))
         )
         assert np.allclose(given, taken, atol=1e-6) == equal
+
+
+def test_parts_need_no_compilation_after_the_warm_up(parts):
+    agent, events = Agent(parts, stop=2, max_views=4), []
+    agent.warm_up()
+
+    def listen(event, *_, **__):
+        if "compile" in event:
+            events.append(event)
+
+    jax.monitoring.register_event_duration_secs_listener(listen)
+    try:
+        agent.begin(LYING)
+        depth, K, pose = in_metres(*views_of(parts)[3])
+        for number in range(3):
+            belief = agent.observe(half(depth, number), K, pose)
+        assert (belief.views, belief.images) == (1, 3)
+        assert events == []
+    finally:
+        jax.monitoring.unregister_event_duration_listener(listen)
