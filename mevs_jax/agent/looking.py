@@ -15,6 +15,7 @@ from jaxtyping import Array, Float, Int, Shaped
 from mevs_jax.agent.agent import Agent
 from mevs_jax.agent.records import Belief, History, Reason, Step
 from mevs_jax.arguments import number, numbers, whole
+from mevs_jax.arrays import ByContent
 from mevs_jax.geometry.cameras import ViewCamera, look_at_origin
 from mevs_jax.geometry.source_view import DepthImage
 from mevs_jax.geometry.sphere import Sphere, estimate_sphere
@@ -24,8 +25,8 @@ from mevs_jax.trained.system import TrainedSystem
 MOST_FRAMES = 512
 
 
-@dataclass(frozen=True)
-class Walk:
+@dataclass(frozen=True, eq=False)
+class Walk(ByContent):
     """How an object was recognised.
 
     Attributes:
@@ -158,8 +159,8 @@ def _centred(
     return (corners / radius).astype(np.float32), float(radius)
 
 
-@dataclass(frozen=True)
-class Frames:
+@dataclass(frozen=True, eq=False)
+class Frames(ByContent):
     """Recorded depth images of one object that stands still.
 
     Attributes:

@@ -13,14 +13,16 @@ from zipfile import ZipFile
 import numpy as np
 from jaxtyping import Float
 
+from mevs_jax.arrays import ByContent
+
 Reason = Literal["", "sure", "budget", "nothing reachable", "unknown object"]
 """Why an agent is done; empty while it is not."""
 LARGEST_HISTORY = 2**28
 """Largest size of a history in memory, in bytes: 512 images of 362×362 pixels."""
 
 
-@dataclass(frozen=True)
-class Belief:
+@dataclass(frozen=True, eq=False)
+class Belief(ByContent):
     """What an agent knows after a view.
 
     Attributes:
@@ -34,7 +36,7 @@ class Belief:
         known: False if the object is stranger than the agent's limit `unknown`, or most likely of the class of unknown objects.
         evidence: how much of the object was seen, in views that show all of its sphere.
         unseen: share of the object's sphere that the latest image does not show, in [0, 1].
-        latency_ms: time that the call took.
+        latency_ms: time that the call took, which is not compared.
     """
 
     probabilities: Float[np.ndarray, " classes"]
@@ -47,11 +49,11 @@ class Belief:
     known: bool
     evidence: float
     unseen: float
-    latency_ms: float
+    latency_ms: float = field(compare=False)
 
 
-@dataclass(frozen=True)
-class Step:
+@dataclass(frozen=True, eq=False)
+class Step(ByContent):
     """The next view, or the end.
 
     Attributes:
@@ -61,7 +63,7 @@ class Step:
         expected_gain: expected decrease of the belief's entropy in nats, by views of other objects; NaN where none are known.
         done: whether no further view is needed, or none is possible.
         reason: why it is done.
-        latency_ms: time that the call took.
+        latency_ms: time that the call took, which is not compared.
     """
 
     T_world_camera: Float[np.ndarray, "4 4"] | None
@@ -70,11 +72,11 @@ class Step:
     expected_gain: float
     done: bool
     reason: Reason
-    latency_ms: float
+    latency_ms: float = field(compare=False)
 
 
-@dataclass
-class History:
+@dataclass(eq=False)
+class History(ByContent):
     """The images that an agent received for one object, and all that it answered, so that its beliefs can be computed again.
 
     Attributes:
@@ -91,6 +93,8 @@ class History:
     events: list[dict[str, Any]] = field(default_factory=list)
     depths: list[np.ndarray] = field(default_factory=list)
     poses: list[np.ndarray] = field(default_factory=list)
+
+    __hash__ = None  # type: ignore[assignment]  # it changes
 
     @property
     def views(self) -> int:

@@ -26,7 +26,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from mevs_jax.arguments import numbers
-from mevs_jax.arrays import AnyArray, AnyVector
+from mevs_jax.arrays import AnyArray, AnyVector, ByContent
 from mevs_jax.beliefs.entropy import DEPTH_SCALE, DEPTH_STEP
 from mevs_jax.geometry.cameras import ViewCamera, in_sphere, look_at_origin, pixel_directions
 from mevs_jax.geometry.source_view import MARGIN, DepthImage, Window, why_empty, window_of
@@ -58,8 +58,8 @@ _STEEPEST = 10.0
 """Tangent of the largest angle between a surface and the image plane: neighbouring pixels further apart are not one surface."""
 
 
-@dataclass(frozen=True)
-class CanonicalView:
+@dataclass(frozen=True, eq=False)
+class CanonicalView(ByContent):
     """A view as the data set's camera would have taken it.
 
     The frame of the object has its origin at the object's centre, z up, and the object's radius as its unit.

@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from mevs_jax.arguments import numbers
-from mevs_jax.arrays import AnyArray, AnyVector
+from mevs_jax.arrays import AnyArray, AnyVector, ByContent
 from mevs_jax.geometry.sphere import Sphere, upright
 
 MARGIN = 0.02
@@ -21,7 +21,7 @@ MARGIN = 0.02
 
 
 @dataclass(frozen=True, eq=False)
-class DepthImage:
+class DepthImage(ByContent):
     """The image of a depth camera, and where the camera was.
 
     Attributes:

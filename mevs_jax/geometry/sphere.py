@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float
 
 from mevs_jax.arguments import number, numbers
-from mevs_jax.arrays import AnyArray, AnyVector
+from mevs_jax.arrays import AnyArray, AnyVector, ByContent
 
 _NEIGHBOURS = 8
 """A point is an outlier if its distance to this many neighbours is unusual."""
@@ -22,7 +22,7 @@ _MOST_POINTS = 20_000
 
 
 @dataclass(frozen=True, eq=False)
-class Sphere:
+class Sphere(ByContent):
     """Where an object is.
 
     Attributes:

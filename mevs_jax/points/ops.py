@@ -72,7 +72,9 @@ def farthest_point_sample(points: Float[AnyArray, "points 3"], k: int) -> Int[Ar
     try:
         with jax.ensure_compile_time_eval():
             return _farthest_on_cpu(points, k)
-    except (ValueError, RuntimeError):
+    except (ValueError, RuntimeError) as error:
+        if "RESOURCE_EXHAUSTED" in str(error):  # out of memory
+            raise
         # XLA does not know the option, or JAX refuses options here, as in a shard_map that is not compiled.
         return _farthest(points, k)
 

@@ -89,7 +89,7 @@ def register_policy(
             for the views seen; `others`: statistics of other objects; `learned`: a trained policy network; `rendering`:
             renderings of a reconstruction; `truth`: the object itself.
 
-    A function that is defined again, as when a cell of a notebook is run twice, replaces itself.
+    A function that is registered or defined again, as when a cell of a notebook is run twice, replaces itself.
 
     Raises:
         ValueError: if the name is taken by another policy, or `knows` is none of these.
@@ -106,9 +106,11 @@ def register_policy(
 
 
 def _is_defined_again(policy: Policy, before: Policy) -> bool:
-    """Whether two functions are the same lines of a file or a notebook, run twice."""
+    """Whether two functions are one, or the same lines of a file or a notebook, run twice."""
+    if policy is before:
+        return True
     new, old = (getattr(function, "__code__", None) for function in (policy, before))
-    if new is None or old is None or policy is before or policy.__qualname__ != before.__qualname__:
+    if new is None or old is None or policy.__qualname__ != before.__qualname__:
         return False
     if "<locals>" in policy.__qualname__:
         return False

@@ -17,6 +17,7 @@ import numpy as np
 from flax import nnx
 from jaxtyping import Array, Bool, Float
 
+from mevs_jax.arrays import ByContent
 from mevs_jax.geometry.viewpoints import ViewGraph
 from mevs_jax.models import PointNet2
 from mevs_jax.policies.base import maxima_first
@@ -25,8 +26,8 @@ _FARTHEST = 1.1
 """Largest distance of a point from the object's centre, in radii; above 1 since depth is measured with errors."""
 
 
-@dataclass(frozen=True)
-class Decision:
+@dataclass(frozen=True, eq=False)
+class Decision(ByContent):
     """The next view, and the predictions it was chosen by.
 
     Attributes:

@@ -30,6 +30,10 @@ LARGEST = 2**31
 LARGEST_DESCRIPTION = 2**24
 LARGEST_SIZE, MOST_LAYERS = 2**16, 64
 """Largest number in the shape of a network, and of its layers."""
+MOST_PIXELS, MOST_POINTS, MOST_CLASSES = 1024, 2**16, 2048
+"""Largest resolution of the camera, number of points of a cloud, and of classes; weights do not bound them."""
+MOST_NUMBERS = 2**27
+"""Largest number of outputs of a layer for one view (0.5 GB)."""
 HUB = "hf://"
 """Begins the name of a model on the Hugging Face hub."""
 _HUB_ID = re.compile(r"[A-Za-z0-9][\w.-]{0,95}/[A-Za-z0-9][\w.-]{0,95}")
@@ -194,10 +198,11 @@ def check(description: Description) -> None:
     own = {*of.view_policies, *[EXPECTED_VIEWS] * (of.fusion is not None)}
     unknown = [name for name in (of.best, of.best_unposed) if name not in POLICIES and name not in own]
     sound = {
-        "the camera is impossible": 1 <= camera.resolution <= 4096
+        "the camera is impossible": 1 <= camera.resolution <= MOST_PIXELS
         and 0 < camera.field_of_view < 180
         and 1 < camera.distance < 1e3,
         "there are fewer than two classes, or two of one name": 2 <= len(set(classes)) == len(classes),
+        f"there are more than {MOST_CLASSES} classes": len(classes) <= MOST_CLASSES,
         "depth and normals have 4 or 5 channels": of.image.content != "depth_and_normals"
         or of.image.channels in (4, 5),
         "encoder and image differ in their channels": of.encoder.channels == of.image.channels,
@@ -205,7 +210,7 @@ def check(description: Description) -> None:
         or (of.fusion is not None and 0 < size.smallest < size.largest < 1e9 and 2 <= size.steps <= 1000),
         "nothing but a recogniser finds poses": of.pose is None or of.fusion is not None,
         "an entropy predictor and its cloud belong together": (of.entropy is None) == (of.cloud is None),
-        "the number of points of a cloud is impossible": of.cloud is None or 1 <= of.cloud.points <= 2**20,
+        "the number of points of a cloud is impossible": of.cloud is None or 1 <= of.cloud.points <= MOST_POINTS,
         "a recogniser, and nothing else, has a fusion": (of.kind == "recogniser") == (of.fusion is not None),
         f"it has no policy {next(iter(unknown), '')!r:.40}": not unknown,
     }
@@ -215,6 +220,13 @@ def check(description: Description) -> None:
     for shape in (of.encoder, of.fusion, of.pose, of.entropy, *of.view_policies.values()):
         if shape is not None:
             _check_sizes(asdict(shape))
+    largest = [camera.resolution**2 * max(of.encoder.width, of.image.channels)]
+    if of.entropy is not None:
+        largest += [level.centres * level.samples * max(level.layers, default=1) for level in of.entropy.abstractions]
+    if of.pose is not None:
+        largest.append(of.pose.poses * len(classes) ** 2)
+    if max(largest) > MOST_NUMBERS:
+        raise ValueError(f"a network has {max(largest):,} outputs of one layer, and at most {MOST_NUMBERS:,} are read")
 
 
 def _check_sizes(shape: Any, least: int = 1) -> None:

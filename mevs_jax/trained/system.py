@@ -43,9 +43,11 @@ _observe = jax.jit(observe, static_argnames="of")
 """Systems with equal descriptions share its programs."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class TrainedSystem:
     """Networks that recognise objects and choose views, as `mevs_jax.load` returns them.
+
+    Two systems are equal if all but their names is.
 
     Attributes:
         description: all that is not an array; the content of `trained.json`.
@@ -56,6 +58,17 @@ class TrainedSystem:
     description: Description
     parts: Parts = field(repr=False)
     name: str = ""
+
+    def __eq__(self, other: object) -> bool:
+        if not isinstance(other, TrainedSystem):
+            return NotImplemented
+        return self is other or (
+            self._structure == other._structure
+            and all(map(np.array_equal, *(jax.tree.leaves(system.parts) for system in (self, other))))
+        )
+
+    def __hash__(self) -> int:
+        return hash(self.description)
 
     @property
     def classes(self) -> tuple[str, ...]:

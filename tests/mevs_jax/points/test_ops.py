@@ -230,3 +230,12 @@ def test_what_is_no_cloud_is_described(points, said):
     for call in (lambda: choose(points, 2), lambda: neighbours(points, points, 0.1, 2)):
         with pytest.raises(ValueError, match=said):
             call()
+
+
+def test_no_memory_is_said(monkeypatch, random):
+    def full(*_):
+        raise RuntimeError("RESOURCE_EXHAUSTED: out of memory")
+
+    monkeypatch.setattr("mevs_jax.points.ops._farthest_on_cpu", full)
+    with pytest.raises(RuntimeError, match="out of memory"):
+        farthest_point_sample(random.normal(size=(9, 3)), 2)

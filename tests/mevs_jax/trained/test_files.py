@@ -162,6 +162,9 @@ CHANGES = {
     "an unknown setting": lambda c: c.update(colour="red"),
     "a camera within the object": lambda c: c["camera"].update(distance=0.5),
     "an infinite camera": lambda c: c["camera"].update(distance=float("inf")),
+    "pixels without bound": lambda c: c["camera"].update(resolution=4096),
+    "pixels and width without bound": lambda c: (c["camera"].update(resolution=1024), c["encoder"].update(width=256)),
+    "classes without bound": lambda c: c.update(classes=[str(number) for number in range(2049)]),
     "a million pixels": lambda c: c["camera"].update(resolution=10**6),
     "an unknown policy": lambda c: c.update(best="luck"),
     "another kind": lambda c: c.update(kind="oracle"),
@@ -276,6 +279,7 @@ def test_expected_views_that_cannot_be_used_are_refused(tmp_path):
         lambda level, entropy: level.update(centres=-1),
         lambda level, entropy: level.update(samples=0),
         lambda level, entropy: level.update(radius=float("nan")),
+        lambda level, entropy: level.update(centres=65_536, samples=65_536),
         lambda level, entropy: entropy.update(head_layers=[8] * 200_000),
         lambda level, entropy: entropy.update(abstractions=[level] * 100),
     ],
@@ -287,7 +291,7 @@ def test_networks_of_impossible_sizes_are_not_made(change, tmp_path):
         change(content["entropy"]["abstractions"][0], content["entropy"])
 
     with pytest.raises(
-        UnreadableSystem, match=r"a network has (the size|\d+ layers)|radius is nan, not a finite number"
+        UnreadableSystem, match=r"a network has (the size|\d+ layers|[\d,]+ outputs)|radius is nan, not a finite number"
     ):
         load(damaged(tmp_path / "system", tmp_path, changed))
 
