@@ -61,6 +61,10 @@ REACHED = """
 import mevs_jax
 for name in ["rendering", "agent", "export", "exported", "inputs", "Walk", *mevs_jax.__all__]:
     assert getattr(mevs_jax, name) is not None
+import jax, sys
+cloud = jax.ShapeDtypeStruct((64, 3), "float32")
+jax.eval_shape(lambda points: mevs_jax.farthest_point_sample(points, 8), cloud)
+assert jax.default_backend() != "cpu" or "jax.experimental.pallas" not in sys.modules  # which takes half a second
 assert None not in (mevs_jax.agent.load_history, mevs_jax.export.export, mevs_jax.exported.load, mevs_jax.trained.save)
 """
 

@@ -17,6 +17,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
 from functools import partial
+from types import ModuleType
 
 import jax
 import jax.numpy as jnp
@@ -25,7 +26,6 @@ from jaxtyping import Array, Float, Int, UInt32
 from mevs_jax.arguments import check, whole
 from mevs_jax.arrays import AnyArray
 from mevs_jax.points import farthest
-from mevs_jax.points import kernels as point_kernels
 from mevs_jax.points.bits import WORD, bits_until, set_bits
 from mevs_jax.points.distances import square, squared_distance
 
@@ -47,6 +47,12 @@ def _on_one_gpu(points: Array) -> bool:
     if _PORTABLE.get():
         return False
     return jax.default_backend() == "gpu" and jax.device_count() == 1 and points.dtype == jnp.float32
+
+
+def _kernels() -> ModuleType:
+    from mevs_jax.points import kernels  # late: Pallas takes half a second to import, which a CPU does not need
+
+    return kernels
 
 
 def farthest_point_sample(points: Float[AnyArray, "points 3"], k: int) -> Int[Array, " {k}"]:
@@ -82,7 +88,7 @@ def farthest_point_sample(points: Float[AnyArray, "points 3"], k: int) -> Int[Ar
 def _farthest(points: Float[AnyArray, "points 3"], k: int) -> Int[Array, " {k}"]:
     count = points.shape[0]
     points = jax.lax.stop_gradient(jnp.asarray(points))
-    if _on_one_gpu(points) and count <= point_kernels.LARGEST_CLOUD:
+    if _on_one_gpu(points) and count <= (point_kernels := _kernels()).LARGEST_CLOUD:
         return jax.lax.platform_dependent(
             points,
             cuda=partial(point_kernels.farthest_point_sample, k=k),
@@ -141,7 +147,7 @@ def ball_query(
     arguments = (points, centres, squared_radius)
     if _on_one_gpu(points):
         return jax.lax.platform_dependent(
-            *arguments, cuda=partial(point_kernels.ball_query, k=k), default=partial(_query_of_array, k=k)
+            *arguments, cuda=partial(_kernels().ball_query, k=k), default=partial(_query_of_array, k=k)
         )
     return _query_of_array(*arguments, k)
 
