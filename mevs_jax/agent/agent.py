@@ -239,16 +239,14 @@ class Agent:
         begun, of = time.perf_counter(), self._current
         self._check_budget()
         if of.points is None:
-            view = of.seen(self.system, image)
+            view = of.with_parts(self.system, image, of.seen(self.system, image))
         else:
-            if image.mask is None and image.floor is None:
-                raise ValueError(
-                    "an object of unknown size needs a mask of its pixels or a floor, to be told from the rest"
-                )
+            has_edge = image.mask is not None or image.floor is not None
+            _check(
+                has_edge, "an object of unknown size needs a mask of its pixels or a floor, to be told from the rest"
+            )
             of, view = of.refined(self.system, image.copy(), self.history)
             self._object = of
-            return self._add(view.image, of.placed(self.system, view), view.unknown, begun)
-        view = of.with_parts(self.system, image, view)
         return self._add(view.image, of.placed(self.system, view), view.unknown, begun)
 
     @property
