@@ -48,7 +48,7 @@ from mevs_jax.trained import (
     verify,
 )
 from mevs_jax.trained.description import FORM
-from train.results.identity import stamp_of
+from train.results.identity import stamp_of, why_other_stamp
 from train.tasks.classifier import ResNetConfig
 from train.tasks.entropy import EntropyTask
 
@@ -70,14 +70,17 @@ _WITHOUT_YAW = "farthest"
 
 
 def stored_system(folder: Path, made_by: str) -> bool:
-    """Whether a folder holds the sound trained system that `made_by` identifies; says so if it holds a damaged one."""
+    """Whether a folder holds the sound trained system that `made_by` identifies; says why not if it holds another one."""
     try:
-        return verify(folder).made_by == made_by
+        reason = why_other_stamp(verify(folder).made_by, made_by)
     except FileNotFoundError:
         return False
     except UnreadableSystem as error:
         console.print(f"{str(error).split(';')[0]}, so it is made again", markup=False)
         return False
+    if reason is not None:
+        console.print(f"{folder} is made anew: {reason}", markup=False)
+    return reason is None
 
 
 @dataclass(frozen=True)
@@ -225,14 +228,9 @@ def system_of_run(run: Run, evaluation: dict[str, Any], max_views: int, made_by:
     return TrainedSystem(description, parts)
 
 
-def make_run_system(run: Run, metrics: Metrics, max_views: int) -> Path:
-    """Writes the trained system of a run into `system/`, unless it is there already; returns the folder.
-
-    Args:
-        metrics: of the run's evaluation.
-        max_views: number of views that temperatures are fitted for.
-    """
-    folder, figures = run.out / "system", figures_of(metrics)
+def make_run_system(run: Run, metrics: Metrics) -> Path:
+    """Writes the trained system of a run, with these metrics, into `system/`, unless it is there; returns the folder."""
+    folder, figures, max_views = run.out / "system", figures_of(metrics), run.settings.evaluation.max_views
     made = stamp_of("system", identity_of(run.made_by(), figures, max_views))
     if not stored_system(folder, made):
         save_system(system_of_run(run, figures, max_views, made), folder)

@@ -9,7 +9,7 @@ from data_pipeline.dataset.config import check_same_data
 from data_pipeline.dataset.statistics import load_statistics
 from data_pipeline.distributed import is_first
 from data_pipeline.files import keep_json
-from eval.learned.measure import APART, check_parts, measure, novel_together, together
+from eval.learned.measure import APART, SPLITS, check_parts, entropy_tables, measure, novel_together, together
 from eval.learned.system import make_learned_system
 from eval.settings import Settings
 from train.choosing.config import check_learned
@@ -17,15 +17,21 @@ from train.choosing.stages import Stages, train_recognisers, trained_policies
 from train.results.finite import check_results
 
 
+def seeds_of(settings: Settings, out: Path) -> list[Stages]:
+    """The stages of every seed of the study."""
+    config = settings.learned
+    numbers = range(config.seed, config.seed + config.seeds)
+    return [Stages(config, settings.dataset, out, number, settings.entropy) for number in numbers]
+
+
 def learn_to_choose(settings: Settings, out: Path) -> Path:
     """Trains and evaluates learned fusion and learned view selection; returns the path of the page."""
     config = settings.learned
     check_learned(config, settings.dataset.capture.views)
     check_same_data(settings.dataset, out / "data")
-    seeds = [
-        Stages(config, settings.dataset, out, seed, settings.entropy)
-        for seed in range(config.seed, config.seed + config.seeds)
-    ]
+    for split in SPLITS:
+        entropy_tables(out, split)  # so that stale ones are refused before anything is trained
+    seeds = seeds_of(settings, out)
     seeds[0].prepare()
     check_parts(seeds[0].statistics)
     train_recognisers(seeds)

@@ -55,7 +55,7 @@ def make_learned_system(stages: Stages, found: dict[str, Any]) -> Path:
     views, folder = stages.dataset.capture.views, stages.out / "learned" / "system"
     figures = figures_of(found, views)
     networks = [stages.policy_folder(name) for name in POLICIES]
-    made_from = made_by(stages.statistics, stages.recogniser_folder())
+    made_from = stamp_of("features", made_by(stages.statistics, stages.recogniser_folder()))
     summaries = [(network / "summary.json").read_text() for network in networks]
     made = stamp_of("system", identity_of(made_from, [FITTED_AS, *summaries], figures))
     if not agreed(stored_system(folder, made)):

@@ -329,7 +329,6 @@ def test_the_best_policy_is_not_the_one_that_is_best_on_test_objects(runs):
 
 def test_no_figure_of_test_objects_decides_what_a_system_uses(monkeypatch):
     """Whichever policy wins on test objects, and however far."""
-    classify, predict = of_run.tasks(SETTINGS, STATISTICS)
     trained, made = networks(), []
     monkeypatch.setattr(system, "run_grid", walk_grid_anyhow)
     on_validation = system.walk_validation(VALIDATION, STATISTICS.graph, 4)
@@ -337,7 +336,7 @@ def test_no_figure_of_test_objects_decides_what_a_system_uses(monkeypatch):
     monkeypatch.setattr(of_run.Run, "tables", lambda *_: VALIDATION)
     monkeypatch.setattr(of_run.Run, "classifier", lambda _: trained["classifier"])
     monkeypatch.setattr(of_run.Run, "predictor", lambda _: trained["entropy"])
-    run = of_run.Run(Path("run"), STATISTICS, classify, predict)
+    run = of_run.Run(Path("run"), STATISTICS, SETTINGS)
     for winner in system.USABLE:
         after = {name: [float(name == winner)] * 4 for name in system.USABLE}
         figures = {"objects": OBJECTS, "single_view": float(winner == "random"), "after_views": after}

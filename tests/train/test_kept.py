@@ -199,7 +199,7 @@ def test_arrays_that_were_edited_are_computed_again(tmp_path, capsys):
 @pytest.mark.parametrize(
     ("now", "version", "sentence"),
     [
-        ({"made_by": "other networks"}, 1, "the data or the networks that it was made from are others now"),
+        ({"made_by": "other networks"}, 1, "the data, networks or results that it was made from are others now"),
         ({"reach": {"lowest": 20}}, 1, "its settings were others: reach.lowest 0, not 20"),
         ({}, 2, "it is of version 1 of such results, and this program has version 2"),
     ],
@@ -228,7 +228,7 @@ def test_arrays_of_another_version_are_computed_anew(tmp_path, monkeypatch, caps
     assert kept_array(path, stamp_of("tables", "made"), lambda: np.ones(1))[0] == 1
     assert "it is of version 1 of such results" in " ".join(capsys.readouterr().err.split())
     assert kept_array(path, stamp_of("tables", "other"), lambda: np.full(1, 2.0))[0] == 2
-    assert "the networks that it was made from are others now" in " ".join(capsys.readouterr().err.split())
+    assert "networks or results that it was made from are others now" in " ".join(capsys.readouterr().err.split())
 
 
 @dataclass(frozen=True)

@@ -126,7 +126,11 @@ def kept_with_arrays(
     The JSON file holds the check of the arrays and is written last. Arrays of another result are therefore never taken for those
     of this one, wherever a job ends.
     """
-    return _kept_content(path, identity, compute, lambda content: (content, arrays_beside(path, content)))
+
+    def read(content: dict[str, Any]) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
+        return {name: value for name, value in content.items() if name != _ARRAYS}, arrays_beside(path, content)
+
+    return _kept_content(path, identity, compute, read)
 
 
 def arrays_beside(path: Path, content: dict[str, Any]) -> dict[str, np.ndarray]:
