@@ -7,7 +7,7 @@ each half of them walks with the knowledge of the other half.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -113,15 +113,7 @@ def walk_validation(tables: ViewTables, graph: ViewGraph, max_views: int, seed: 
     for held in range(2):
         walking, other = (tables.of_objects(np.flatnonzero((half == held) == inside)) for inside in (True, False))
         knowledge = learn(other.logits, other.labels)
-        one_backbone = walking.stacked()
-        found = run_grid(
-            jax.random.key(seed),
-            replace(one_backbone, logits=one_backbone.logits[:, None]),
-            graph,
-            jax.tree.map(lambda leaf: leaf[None], knowledge),
-            _USABLE,
-            max_views=max_views,
-        )
+        found = run_grid(jax.random.key(seed), walking.stacked(), graph, knowledge, _USABLE, max_views=max_views)
         for name in USABLE:
             views = jnp.asarray(found[name].views)[0, :, :, 0].astype(jnp.int32)
             along = np.asarray(logits_along(views, jnp.asarray(walking.logits)))

@@ -147,7 +147,7 @@ def evaluate_policies(
     setting = Setting.of(inputs.graph, inputs.validation, inputs.config)
     further = checked(own, setting.graph, tables.logits.shape[-1])
     compared = (policy_record(BASELINE), *further)
-    results, _ = setting.with_random(tables, compared)
+    results, _ = setting.with_random(tables.stacked(), compared)
     check_own(further, results, tables, setting)
     return PolicyStudy(tables.names, tables.labels, compared, results, setting.can_reach)
 

@@ -5,17 +5,16 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, Int
 
 from data_pipeline.dataset.statistics import DatasetStatistics
 from eval.numbers.comparison import class_mean, interval_of
-from eval.numbers.study import HEADLINE_CT, HEADLINE_MV, exactly_random, headline_confusion
+from eval.numbers.study import HEADLINE_CT, HEADLINE_MV, Setting, headline_confusion
 from eval.tables import ViewTables
 from eval.thesis.timing import Measured
-from eval.walks.grid import FIRST_MV, THRESHOLDS, GridConfig, Results, run_grid
+from eval.walks.grid import FIRST_MV, THRESHOLDS, GridConfig, Results
 from eval.walks.ladder import SCRAMBLED, ladder
 from mevs_jax.geometry.viewpoints import ViewGraph
 from mevs_jax.policies.registry import PolicyRecord, policy_record
@@ -251,14 +250,7 @@ def walk(
     lattice: LatticeTables, graph: ViewGraph, config: GridConfig, frame: Frame, policies: Sequence[PolicyRecord]
 ) -> dict[str, Results]:
     """The grid (backbones, objects, MV, CT) of every policy; random selection in exact expectation where possible."""
-    table = lattice.stacked(frame)
-    max_views = min(config.max_views, lattice.entropy.shape[1])
-    key = jax.random.key(config.seed)
-    found = run_grid(key, table, graph, None, policies, max_views=max_views, draws=config.draws)
-    if "random" in found:
-        everywhere = np.ones(lattice.entropy.shape[1], bool)
-        found["random"], _ = exactly_random(found["random"], table.logits, table.label, everywhere)
-    return found
+    return Setting.of(graph, None, config).with_random(lattice.stacked(frame), policies)[0]
 
 
 def _gain(policy: Results, base: Results, field: str = "right") -> Gain:
