@@ -226,7 +226,7 @@ class _Walks:
             others=not self.ablations,
             known=_known(stages, self.posed, lattices[1].features.directions[0]),
         )
-        check_results(found, f"walks by the recogniser in {stages.recogniser_folder()}")
+        found = check_results(as_json(found), f"walks by the recogniser in {stages.recogniser_folder()}")
         return found, {f"{name} {key}": value for name, one in each.items() for key, value in vars(one).items()}
 
     def _objects(self, split: str) -> OnLattice:

@@ -22,7 +22,7 @@ from data_pipeline.errors import DataError
 from eval.learned.study import novel_classes, novel_metrics, order_of_fused, study, walk_metrics
 from eval.learned.walks import OnLattice, Walking, by_network
 from eval.numbers.comparison import views_to_reach
-from eval.numbers.confidence import stopping
+from eval.numbers.confidence import stops_of
 from eval.settings import TINY
 from eval.tables import save_view_tables
 from eval.walks.grid import Results
@@ -116,7 +116,7 @@ def test_policies_without_classes_are_tested_on_objects_of_these(adding):
     for pair, right in (((0, 2), 1.0), ((1, 3), 0.0)):
         each = novel_classes(adding, [(pair, policy)], policy, test, Walking(2, 1))
         assert {one.shape for one in each.values()} == {(2, np.isin(labels, pair).sum())}
-        (row,) = novel_metrics(each, [pair], labels)["pairs"]
+        (row,) = as_json(novel_metrics(each, [pair], labels))["pairs"]
         assert row["objects"] == np.isin(labels, pair).sum()
         assert row["random"] == row["trained_without"] == row["trained_with"] == [right] * 2
 
@@ -141,9 +141,9 @@ def test_the_risk_that_is_allowed_is_that_of_those_who_stop():
     """Of every object half of the walks stop, and of these one in two is wrong."""
     confidence = np.tile([[0.95], [0.95], [0.1], [0.1]], (6, 1, 1))
     right = np.tile([[True], [False], [True], [False]], (6, 1, 1))
-    (row,) = stopping(confidence, right, [0.1])
-    assert (row["sure"], row["error"]) == (0.5, 0.5)
-    assert row["excess"] == pytest.approx([0.25 - 0.1 * 0.5] * 2, abs=1e-6)
+    (row,) = stops_of(confidence, right, [0.1])
+    assert (row.sure, row.error) == (0.5, 0.5)
+    assert row.excess == pytest.approx([0.25 - 0.1 * 0.5] * 2, abs=1e-6)
 
 
 @pytest.mark.slow

@@ -96,7 +96,7 @@ class Study:
                 "warn_of_chance": lambda *given: None,
                 "network_outputs": self._outputs,
                 "train_policies": self._trained,
-                "train_all_by_q_learning": self._trained,
+                "train_by_q_learning": self._trained,
                 "is_stored": lambda folder, identity: False,
                 "trained_once": self._trained_once,
             }.items():

@@ -37,7 +37,7 @@ from train.choosing.expected import FITTED_AS, fit_expected_views
 from train.choosing.features import Features
 from train.choosing.looks import answers, embed, see, see_changed, see_in_reality, see_rotated
 from train.choosing.policy import Lesson, PolicyConfig, Seen, Trained, new_policy, train_policies
-from train.choosing.q_learning import QLearningConfig, train_all_by_q_learning
+from train.choosing.q_learning import QLearningConfig, train_by_q_learning
 from train.choosing.variants import VARIANTS
 from train.loop import fit, load_best
 from train.many.seeds import train_seeds
@@ -379,7 +379,7 @@ def trained_policies(jobs: Sequence[PolicyJob]) -> list[ViewPolicy]:
     def train(some: Sequence[PolicyJob]) -> list[Trained]:
         config, lessons = some[0].config, [job.lesson() for job in some]
         if isinstance(config, QLearningConfig):
-            return train_all_by_q_learning(config, lessons)
+            return train_by_q_learning(config, lessons)
         return train_policies(config, lessons)
 
     together = cache(lambda: train(waiting))
