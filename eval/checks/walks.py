@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from eval.numbers.comparison import interval_of
+from eval.numbers.comparison import intervals
 from mevs_jax.beliefs.fusing import running_sum
 from mevs_jax.beliefs.strangeness import STRANGE
 from mevs_jax.policies.base import Observation
@@ -214,7 +214,7 @@ def rows_of(walks: dict[str, Walks], views: Sequence[int]) -> list[AccuracyRow]:
 
 def with_interval(values: Float[np.ndarray, " objects"]) -> tuple[float, list[float]]:
     """The mean over objects, and its 95 % interval."""
-    return float(values.mean()), interval_of(values).tolist()
+    return float(values.mean()), intervals(values)
 
 
 def _within(walks: Walks, views: Sequence[int]) -> list[int]:

@@ -32,6 +32,11 @@ def interval_of(values: Shaped[np.ndarray, "*cells objects"]) -> Float[np.ndarra
     return np.asarray(_intervals(jnp.asarray(values, jnp.float32)), float)
 
 
+def intervals(values: np.ndarray) -> list:
+    """As `interval_of`, in lists."""
+    return interval_of(values).tolist()
+
+
 def interval_of_both(values: Float[np.ndarray, "*cells trainings objects"]) -> Float[np.ndarray, "*cells 2"]:
     """95 % intervals of means for other objects *and* other trainings, of values of the same objects in every training.
 
