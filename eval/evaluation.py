@@ -89,10 +89,7 @@ def identity_of_seeds(run: Run, own: Sequence[PolicyRecord]) -> dict[str, Any]:
 def _leak(out: Path, tables: dict[str, ViewTables]) -> dict[str, dict[str, float]]:
     """Accuracy on single views of validation and test objects, by classifier."""
     return {
-        name: {
-            "validation": float(summary_of(out / name)["best"]["accuracy"]),
-            "test": made.single_view_accuracy,
-        }
+        name: {"validation": float(summary_of(out / name)["best"]["accuracy"]), "test": made.single_view_accuracy}
         for name, made in tables.items()
     }
 

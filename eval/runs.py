@@ -51,8 +51,8 @@ def stored_tables(statistics: DatasetStatistics, out: Path, split: str) -> ViewT
     try:
         tables = load_view_tables(path)
     except Exception as error:  # the content of a damaged file decides which
-        reason = "it is missing" if isinstance(error, FileNotFoundError) else why(error)
-        raise DataError(f"{path} cannot be read ({reason}); make it with: mevs eval --out {out}") from error
+        problem = "it is missing" if isinstance(error, FileNotFoundError) else why(error)
+        raise DataError(f"{path} cannot be read ({problem}); make it with: mevs eval --out {out}") from error
     if (reason := why_other_stamp(tables.made_by, tables_made_by(statistics, out))) is not None:
         raise DataError(f"{path} is stale ({reason}); make it again with: mevs eval --out {out}")
     return tables

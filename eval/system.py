@@ -141,11 +141,6 @@ def pointnet2_shape(task: EntropyTask) -> tuple[PointNet2Shape, CloudInput]:
     )
 
 
-def identity_of(*content: Any) -> str:
-    """Returns a hash of what a system is made from."""
-    return digest_of(as_read(content))
-
-
 def save_system(system: TrainedSystem, folder: Path) -> None:
     """Writes a system.
 
@@ -223,7 +218,7 @@ def system_of_run(run: Run, evaluation: dict[str, Any], max_views: int, made_by:
 def make_run_system(run: Run, metrics: Metrics) -> Path:
     """Writes the trained system of a run, with these metrics, into `system/`, unless it is there; returns the folder."""
     folder, figures, max_views = run.out / "system", figures_of(metrics), run.settings.evaluation.max_views
-    made = stamp_of("system", identity_of(run.made_by(), figures, max_views))
+    made = stamp_of("system", digest_of(as_read([run.made_by(), figures, max_views])))
     if not stored_system(folder, made):
         save_system(system_of_run(run, figures, max_views, made), folder)
     return folder

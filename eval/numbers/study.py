@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import jax
 import jax.numpy as jnp
@@ -208,10 +209,9 @@ class Setting:
 
     def walk(self, table: ViewTable, policies: Sequence[PolicyRecord], draws: int | None = None) -> dict[str, Results]:
         """As `run_grid`, with the settings of the evaluation; `draws` other than theirs if given."""
-        config, given = self.config, (table, self.graph, self.knowledge, policies)
-        draws = config.draws if draws is None else draws
-        shared = {"max_views": config.max_views, "draws": draws, "reachable": self.reachable}
-        return run_grid(jax.random.key(config.seed), *given, **shared)
+        config, draws = self.config, self.config.draws if draws is None else draws
+        walk = partial(run_grid, max_views=config.max_views, draws=draws, reachable=self.reachable)
+        return walk(jax.random.key(config.seed), table, self.graph, self.knowledge, policies)
 
     def with_random(self, table: ViewTable, policies: Sequence[PolicyRecord]) -> tuple[dict[str, Results], int]:
         """Walks of policies; those of random selection, if it is among them, are exact up to the number of views returned."""
@@ -311,7 +311,9 @@ def run_study(
     results, exact = setting.with_random(tables.stacked(), (*policies, SCRAMBLED))
     shown = {policy.name: results[policy.name] for policy in policies}
     check_own(own, results, tables, setting)
-    mv = min(HEADLINE_MV, setting.config.max_views)
+    switched, mv = None, min(HEADLINE_MV, setting.config.max_views)
+    if by_view is not None:
+        switched, _ = setting.with_random(by_view.stacked(), [*map(policy_record, SWITCHED), SCRAMBLED])
     return Metrics(
         objects=len(tables.labels),
         validation_objects=len(validation.labels),
@@ -331,17 +333,10 @@ def run_study(
         against_random={
             name: difference(result, shown[BASELINE]) for name, result in shown.items() if name != BASELINE
         },
-        fixed_order=FixedOrder(setting.order_by),
+        fixed_order=FixedOrder(str(setting.order_by)),
         views_to_reach=views_to_reach(shown, BASELINE),
         best_pair=best_pair(tables, reachable),
         confidence=_confidence(setting, tables, validation, results, policies),
         movement=_movement(setting, tables, results, policies),
-        compatibility=compatibility(results, _switched(setting, by_view), statistics.views, leak),
+        compatibility=compatibility(results, switched, statistics.views, leak),
     )
-
-
-def _switched(setting: Setting, by_view: ViewTables | None) -> dict[str, Results] | None:
-    """The walks that the published code is compared by, with the classifier validated by view; None without its tables."""
-    if by_view is None:
-        return None
-    return setting.with_random(by_view.stacked(), [*map(policy_record, SWITCHED), SCRAMBLED])[0]
