@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict
 from pathlib import Path
 
 from data_pipeline.dataset.config import check_same_data
@@ -15,6 +14,7 @@ from eval.settings import Settings
 from train.choosing.config import check_learned
 from train.choosing.stages import Stages, train_recognisers, trained_policies
 from train.results.finite import check_results
+from train.results.records import as_json
 
 
 def seeds_of(settings: Settings, out: Path) -> list[Stages]:
@@ -39,10 +39,10 @@ def learn_to_choose(settings: Settings, out: Path) -> Path:
     for part in range(APART):
         trained_policies([stages.policy_job(aside=(part, APART)) for stages in seeds])
     found = [measure(stages) for stages in seeds]
-    metrics = {"seeds": found, "together": together(seeds, found), "settings": asdict(config)}
+    metrics = {"seeds": found, "together": together(seeds, found), "settings": config}
     if (novel := novel_together(seeds)) is not None:
         metrics["novel"] = novel
-    check_results(metrics, "the metrics of the learned study")
+    metrics = check_results(as_json(metrics), "the metrics of the learned study")
     page = out / "learned" / "index.html"
     if is_first():
         from eval.learned.page import write_learned_page  # imported late: it needs plots

@@ -16,6 +16,7 @@ import pytest
 from flax import nnx
 
 import eval.learned.measure as measuring
+import eval.learned.study as studying
 import eval.runs as of_run
 import train.choosing.stages as choosing
 from data_pipeline.errors import DataError
@@ -63,6 +64,16 @@ def test_a_fixed_order_serves_every_class_alike(adding):
     within = order_of_sums(told, labels, reachable)
     assert within.views[0] == common
     assert sorted(within.views) == np.flatnonzero(reachable).tolist()
+
+
+def test_an_order_of_any_length_is_fitted_by_one_program(adding, monkeypatch):
+    shapes, real = set(), studying.over_objects
+    monkeypatch.setattr(
+        studying, "over_objects", lambda *given, **how: shapes.add(given[3].shape) or real(*given, **how)
+    )
+    data = features_of(np.arange(8) % CLASSES, np.tile(np.arange(VIEWS) % 3 > 0, (8, 1)))
+    assert sorted(order_of_fused(adding, data, 3).views) == list(range(VIEWS))
+    assert shapes == {(3,)}
 
 
 def test_temperatures_serve_every_class_alike():
