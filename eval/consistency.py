@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import re
 import tempfile
-from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -72,14 +71,6 @@ def check_classifier(settings: Settings, out: Path) -> None:
         raise DataError(
             f"{out} has a classifier trained with other settings ({in_words(found)}); leave these options out, or choose another "
             f"--out"
-        )
-
-
-def check_evaluated_with(config: GridConfig, identity: Mapping[str, Any], out: Path) -> None:
-    """Raises `DataError` if `metrics.json`, with this identity, is of other settings of the evaluation; names what differs."""
-    if found := differences(identity.get("evaluation", {}), as_json(config), "evaluation", shared=True):
-        raise DataError(
-            f"{out / 'metrics.json'} was made with other settings ({in_words(found)}); make it again with: mevs eval --out {out}"
         )
 
 

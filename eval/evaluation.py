@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -11,18 +12,16 @@ import numpy as np
 from data_pipeline.dataset.statistics import DatasetStatistics
 from data_pipeline.errors import DataError, Diverged, Unreadable
 from data_pipeline.files import read_json
-from eval.config import RenderingConfig
 from eval.numbers.metrics import Metrics
 from eval.numbers.policies import metrics_csv
 from eval.numbers.study import reachable_views, run_study
-from eval.rendering.policies import ascent_study, load_ascent_scores
-from eval.runs import BY_VIEW, Run
+from eval.rendering.policies import AscentScores, ascent_study, load_ascent_scores
+from eval.runs import BY_VIEW, Run, seed_folder, tables_made_by
 from eval.tables import ViewTables
-from eval.walks.grid import GridConfig
 from eval.walks.own_policies import checked, load_policies, own_identity
 from mevs_jax.policies.registry import PolicyRecord
 from train.results.finite import place_not_finite
-from train.results.identity import identity_of, summary_of
+from train.results.identity import identity_of, summary_of, why_other
 from train.results.kept import keep_beside, kept_record, record_in
 from train.results.records import as_json
 
@@ -38,60 +37,59 @@ def policies_on(references: tuple[str, ...], statistics: DatasetStatistics) -> t
     return own
 
 
-@dataclass(frozen=True)
-class Evaluation:
-    """What is evaluated, and how.
+def evaluate_run(run: Run) -> Metrics:
+    """Returns the metrics of the test split; computes and stores them first if they are missing or stale.
 
-    Attributes:
-        run: whose networks.
-        config: of the grid.
-        own: policies of the user.
-        rendering: settings of the policies by differentiable rendering, which are compared if their scores are there.
+    Policies by differentiable rendering are compared if their scores are there.
     """
+    statistics, config = run.statistics, run.settings.evaluation
+    own = policies_on(run.settings.policies, statistics)
+    climbed = load_ascent_scores(run.out, statistics, run.settings.rendering)
 
-    run: Run
-    config: GridConfig
-    own: tuple[PolicyRecord, ...]
-    rendering: RenderingConfig
+    def compute() -> Metrics:
+        try:
+            reachable_views(np.array(statistics.viewpoints), config.lowest_elevation)
+        except ValueError as error:
+            raise DataError(str(error)) from error
+        tables, validation = run.tables("test"), run.tables("val")
+        other = run.tables("test", BY_VIEW) if run.has_by_view else None
+        leak = None if other is None else _leak(run.out, {"classifier": tables, BY_VIEW: other})
+        ascents = None if climbed is None else ascent_study(tables, statistics, climbed, config)
+        metrics = run_study(tables, validation, statistics, config, other, leak, own)
+        return check_metrics(replace(metrics, ascents=ascents), tables, run.out)
 
-    def metrics(self) -> Metrics:
-        """Returns the metrics of the test split; computes and stores them first if they are missing or stale."""
-        run, statistics = self.run, self.run.statistics
-        climbed = load_ascent_scores(run.out, statistics, self.rendering)
-        by_view = run.made_by(BY_VIEW) if (run.out / BY_VIEW / "summary.json").exists() else None
-        identity = identity_of(
-            "metrics",
-            evaluation=self.config,
-            made_by=run.made_by(),
-            by_view=by_view,
-            climbed=None if climbed is None else self.rendering,
-            **({"policies": [own_identity(policy) for policy in self.own]} if self.own else {}),
-        )
+    metrics = kept_record(run.out / "metrics.json", Metrics, _identity(run, climbed, own), compute)
+    keep_beside(run.out / "metrics.csv", metrics_csv(metrics))
+    return metrics
 
-        def compute() -> Metrics:
-            try:
-                reachable_views(np.array(statistics.viewpoints), self.config.lowest_elevation)
-            except ValueError as error:
-                raise DataError(str(error)) from error
-            tables, validation = run.tables("test"), run.tables("val")
-            other = None if by_view is None else run.tables("test", BY_VIEW)
-            leak = None if other is None else _leak(run.out, {"classifier": tables, BY_VIEW: other})
-            ascents = None if climbed is None else ascent_study(tables, statistics, climbed, self.config)
-            metrics = run_study(tables, validation, statistics, self.config, other, leak, self.own)
-            return check_metrics(replace(metrics, ascents=ascents), tables, run.out)
 
-        metrics = kept_record(run.out / "metrics.json", Metrics, identity, compute)
-        keep_beside(run.out / "metrics.csv", metrics_csv(metrics))
-        return metrics
+def _identity(run: Run, climbed: AscentScores | None, own: Sequence[PolicyRecord]) -> dict[str, Any]:
+    """What the metrics of a run depend on."""
+    return identity_of(
+        "metrics",
+        evaluation=run.settings.evaluation,
+        made_by=run.made_by(),
+        by_view=run.made_by(BY_VIEW) if run.has_by_view else None,
+        climbed=None if climbed is None else run.settings.rendering,
+        **({"policies": [own_identity(policy) for policy in own]} if own else {}),
+    )
+
+
+def identity_of_seeds(run: Run, own: Sequence[PolicyRecord]) -> dict[str, Any]:
+    """What the numbers over several trainings of a run depend on."""
+    runs = [seed_folder(run.out, number) for number in range(run.settings.seeds)]
+    return identity_of(
+        "seeds",
+        evaluation=run.settings.evaluation,
+        made_by=[tables_made_by(run.statistics, of_seed) for of_seed in runs],
+        policies=[own_identity(policy) for policy in own],
+    )
 
 
 def _leak(out: Path, tables: dict[str, ViewTables]) -> dict[str, dict[str, float]]:
     """Accuracy on single views of validation and test objects, by classifier."""
     return {
-        name: {
-            "validation": float(summary_of(out / name)["best"]["accuracy"]),
-            "test": made.single_view_accuracy,
-        }
+        name: {"validation": float(summary_of(out / name)["best"]["accuracy"]), "test": made.single_view_accuracy}
         for name, made in tables.items()
     }
 
@@ -111,18 +109,26 @@ def check_metrics(metrics: Any, tables: ViewTables, out: Path) -> Any:
     )
 
 
-def load_metrics(out: Path) -> tuple[Metrics, dict[str, Any]]:
-    """Returns the metrics of a run and their identity.
+def load_metrics(run: Run, own: Sequence[PolicyRecord] | None) -> Metrics:
+    """Returns the metrics of a run, which are those that `evaluate_run` would return.
+
+    Args:
+        own: policies of the user that are to be among them; None if it does not matter which are.
 
     Raises:
-        DataError: if they are missing or damaged; it names the command that makes them.
+        DataError: if they are missing, damaged or stale; it names the command that makes them.
     """
-    path, command = out / "metrics.json", f"mevs eval --out {out}"
+    path, command = run.out / "metrics.json", f"mevs eval --out {run.out}"
     if not path.exists():
-        raise DataError(f"no metrics in {out}; make them with: {command}")
-    content = read_results(path, command)
+        raise DataError(f"no metrics in {run.out}; make them with: {command}")
+    content, climbed = read_results(path, command), load_ascent_scores(run.out, run.statistics, run.settings.rendering)
+    was, now = content.get("identity", {}), _identity(run, climbed, own or ())
+    if own is None:
+        now |= {name: value for name, value in was.items() if name == "policies"}
+    if (reason := why_other(was, now)) is not None:
+        raise DataError(f"{path} is stale ({reason}); make it again with: {command}")
     try:
-        return record_in(Metrics, content, path), content.get("identity", {})
+        return record_in(Metrics, content, path)
     except DataError as error:
         raise Unreadable(path, "it is of another version", f"make it again with: {command}") from error
 

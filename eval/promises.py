@@ -6,28 +6,24 @@ from pathlib import Path
 
 import numpy as np
 
-from data_pipeline.dataset.builder import DataConfig, open_objects
+from data_pipeline.dataset.builder import open_objects
 from data_pipeline.errors import DataError
 from data_pipeline.files import write_json
 from data_pipeline.objects.sources import load_object
 from eval.checks.agent import AgentPromises, compare_walks, latency, recognised, stopping
-from eval.config import AgentConfig
 from eval.runs import Run
 from eval.system import USABLE
 from eval.walks.knowledge import learn
-from eval.walks.live import GIVEN, Agreement, LiveConfig, Networks, compare_with_tables
+from eval.walks.live import GIVEN, Agreement, Networks, compare_with_tables
 from eval.walks.own_policies import checked, load_policies
 from mevs_jax.policies.registry import policy_record
 from mevs_jax.trained import load as load_system
 from train.results.records import as_json
 
 
-def live_agreement(run: Run, config: LiveConfig, references: tuple[str, ...]) -> dict[str, Agreement]:
-    """Compares walks with the networks in the loop with walks on view tables; writes `live.json`.
-
-    Args:
-        references: to policies of the user (`--policy`).
-    """
+def live_agreement(run: Run) -> dict[str, Agreement]:
+    """Compares walks with the networks in the loop with walks on view tables; writes `live.json`."""
+    config = run.settings.live
     for policy in config.policies:
         try:
             record = policy_record(policy)
@@ -38,7 +34,8 @@ def live_agreement(run: Run, config: LiveConfig, references: tuple[str, ...]) ->
                 f"{policy} needs the tables of mevs study rendering, which live walks do not have; leave it out"
             )
     graph = run.statistics.graph
-    own, validation = checked(load_policies(references), graph, len(run.statistics.classes)), run.tables("val")
+    own = checked(load_policies(run.settings.policies), graph, len(run.statistics.classes))
+    validation = run.tables("val")
     found = compare_with_tables(
         run.data,
         "test",
@@ -53,8 +50,9 @@ def live_agreement(run: Run, config: LiveConfig, references: tuple[str, ...]) ->
     return found
 
 
-def agent_promises(run: Run, system_folder: Path, dataset: DataConfig, config: AgentConfig) -> AgentPromises:
+def agent_promises(run: Run, system_folder: Path) -> AgentPromises:
     """Measures what an agent with the run's system promises, on test objects; writes `agent.json`."""
+    dataset, config = run.settings.dataset, run.settings.agent
     if min(config.objects, config.shots, config.calls, config.max_views) < 1:
         raise DataError("--agent.objects, --agent.max-views, --agent.shots and --agent.calls must be at least 1")
     system, tables = load_system(system_folder), run.tables("test")

@@ -18,24 +18,18 @@ from data_pipeline.dataset.statistics import load_statistics
 from data_pipeline.distributed import is_first, wait_for_all
 from data_pipeline.errors import DataError
 from eval import stages
-from eval.evaluation import policies_on
+from eval.evaluation import identity_of_seeds, policies_on
 from eval.numbers.metrics import OverTrainings
 from eval.numbers.policies import EvaluationInputs
 from eval.numbers.trainings import csv_over_trainings, rows_over_trainings, walks_of_all
 from eval.run_file import save_run
+from eval.runs import Run, seed_folder
 from eval.settings import Settings
 from eval.training import say_trained, trainings
-from eval.walks.own_policies import own_identity
 from train.many.seeds import check_networks, train_seeds
-from train.results.identity import identity_of, made_by
 from train.results.kept import keep_beside, kept_record
 from train.running.devices import device_mesh
 from train.weights.starting import StartingWeights
-
-
-def seed_folder(out: Path, number: int) -> Path:
-    """The run of a seed; the first is the run itself."""
-    return out if number == 0 else out / "seeds" / str(number)
 
 
 def seed_settings(settings: Settings, number: int) -> Settings:
@@ -111,12 +105,6 @@ def evaluate(settings: Settings, out: Path) -> OverTrainings:
         stages.evaluate(seed_settings(settings, number), run)
     statistics = load_statistics(out / "data")
     own = policies_on(settings.policies, statistics)
-    identity = identity_of(
-        "seeds",
-        evaluation=settings.evaluation,
-        made_by=[made_by(statistics, run / "classifier", run / "entropy") for run in runs],
-        policies=[own_identity(policy) for policy in own],
-    )
 
     def compute() -> OverTrainings:
         inputs = [replace(EvaluationInputs.of_run(run), config=settings.evaluation) for run in runs]
@@ -127,6 +115,7 @@ def evaluate(settings: Settings, out: Path) -> OverTrainings:
             rows=rows_over_trainings(*walks_of_all(inputs, own)),
         )
 
+    identity = identity_of_seeds(Run(out, statistics, settings), own)
     found = kept_record(out / "seeds.json", OverTrainings, identity, compute)
     keep_beside(out / "seeds.csv", csv_over_trainings(found.rows))
     return found

@@ -13,37 +13,35 @@ from data_pipeline.dataset.config import check_same_data
 from data_pipeline.dataset.statistics import load_statistics
 from data_pipeline.errors import DataError
 from eval.checks.agent import AgentPromises
-from eval.consistency import check_evaluated_with, check_evaluation
-from eval.evaluation import Evaluation, load_metrics, policies_on
+from eval.consistency import check_evaluation
+from eval.evaluation import evaluate_run, load_metrics
 from eval.numbers.metrics import Metrics
 from eval.promises import agent_promises, live_agreement
 from eval.rendering.policies import ascend_objects
 from eval.reporting import write_run_report
-from eval.run_file import plain
 from eval.runs import Run
 from eval.settings import Settings
 from eval.system import make_run_system
 from eval.walks.live import Agreement
+from eval.walks.own_policies import load_policies
 
 
 def evaluate(settings: Settings, out: Path) -> Metrics:
     """Returns the metrics of the test split, as written to `metrics.json`; `metrics.csv` has those by number of views."""
     check_evaluation(settings.evaluation)
-    run = Run.of(settings, out)
-    own = policies_on(settings.policies, run.statistics)
-    return Evaluation(run, settings.evaluation, own, settings.rendering).metrics()
+    return evaluate_run(Run.of(settings, out))
 
 
 def make_system(settings: Settings, out: Path) -> Path:
     """Writes the trained system of the run into `system/`, unless it is there already; returns the folder.
 
     Raises:
-        DataError: if the run is not finished, or its classifier is an encoder of the user's own.
+        DataError: if the run is not finished, its metrics are stale, or its classifier is an encoder of the user's own.
     """
     if encoder := settings.classifier.encoder:
         raise DataError(f"a trained system holds networks of this project, and the classifier of {out} is {encoder}")
-    metrics, _ = load_metrics(out)
-    return make_run_system(Run.of(settings, out), metrics, settings.evaluation.max_views)
+    run = Run.of(settings, out)
+    return make_run_system(run, load_metrics(run, None))
 
 
 def ascend_on_objects(settings: Settings, out: Path) -> None:
@@ -55,18 +53,20 @@ def ascend_on_objects(settings: Settings, out: Path) -> None:
 
 def check_live(settings: Settings, out: Path) -> dict[str, Agreement]:
     """Compares walks with the networks in the loop with walks on view tables; writes `live.json`."""
-    return live_agreement(Run.of(settings, out), settings.live, settings.policies)
+    return live_agreement(Run.of(settings, out))
 
 
 def check_agent(settings: Settings, out: Path) -> AgentPromises:
     """Measures what an agent with the run's system promises, on test objects; writes `agent.json`."""
     folder = make_system(settings, out)
-    return agent_promises(Run.of(settings, out), folder, settings.dataset, settings.agent)
+    return agent_promises(Run.of(settings, out), folder)
 
 
 def report(settings: Settings, preset: str, out: Path) -> Path:
-    """Writes the report and returns its path; a page that is as it was written, from the same content, is kept."""
-    metrics, identity = load_metrics(out)
-    run = Run.of(settings, out)
-    check_evaluated_with(settings.evaluation, identity, out)
-    return write_run_report(run, metrics, preset, plain(settings))
+    """Writes the report and returns its path; a page that is as it was written, from the same content, is kept.
+
+    Raises:
+        DataError: if the run is not finished, or its metrics are stale.
+    """
+    run, own = Run.of(settings, out), load_policies(settings.policies)
+    return write_run_report(run, load_metrics(run, own), own, preset)

@@ -7,7 +7,7 @@ each half of them walks with the knowledge of the other half.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -48,7 +48,7 @@ from mevs_jax.trained import (
     verify,
 )
 from mevs_jax.trained.description import FORM
-from train.results.identity import stamp_of
+from train.results.identity import stamp_of, why_other_stamp
 from train.tasks.classifier import ResNetConfig
 from train.tasks.entropy import EntropyTask
 
@@ -70,14 +70,17 @@ _WITHOUT_YAW = "farthest"
 
 
 def stored_system(folder: Path, made_by: str) -> bool:
-    """Whether a folder holds the sound trained system that `made_by` identifies; says so if it holds a damaged one."""
+    """Whether a folder holds the sound trained system that `made_by` identifies; says why not if it holds another one."""
     try:
-        return verify(folder).made_by == made_by
+        reason = why_other_stamp(verify(folder).made_by, made_by)
     except FileNotFoundError:
         return False
     except UnreadableSystem as error:
         console.print(f"{str(error).split(';')[0]}, so it is made again", markup=False)
         return False
+    if reason is not None:
+        console.print(f"{folder} is made anew: {reason}", markup=False)
+    return reason is None
 
 
 @dataclass(frozen=True)
@@ -110,15 +113,7 @@ def walk_validation(tables: ViewTables, graph: ViewGraph, max_views: int, seed: 
     for held in range(2):
         walking, other = (tables.of_objects(np.flatnonzero((half == held) == inside)) for inside in (True, False))
         knowledge = learn(other.logits, other.labels)
-        one_backbone = walking.stacked()
-        found = run_grid(
-            jax.random.key(seed),
-            replace(one_backbone, logits=one_backbone.logits[:, None]),
-            graph,
-            jax.tree.map(lambda leaf: leaf[None], knowledge),
-            _USABLE,
-            max_views=max_views,
-        )
+        found = run_grid(jax.random.key(seed), walking.stacked(), graph, knowledge, _USABLE, max_views=max_views)
         for name in USABLE:
             views = jnp.asarray(found[name].views)[0, :, :, 0].astype(jnp.int32)
             along = np.asarray(logits_along(views, jnp.asarray(walking.logits)))
@@ -144,11 +139,6 @@ def pointnet2_shape(task: EntropyTask) -> tuple[PointNet2Shape, CloudInput]:
         PointNet2Shape(shape.abstractions, shape.global_layers, shape.head_layers),
         CloudInput(shape.points, shape.frame, directions),
     )
-
-
-def identity_of(*content: Any) -> str:
-    """Returns a hash of what a system is made from."""
-    return digest_of(as_read(content))
 
 
 def save_system(system: TrainedSystem, folder: Path) -> None:
@@ -225,15 +215,10 @@ def system_of_run(run: Run, evaluation: dict[str, Any], max_views: int, made_by:
     return TrainedSystem(description, parts)
 
 
-def make_run_system(run: Run, metrics: Metrics, max_views: int) -> Path:
-    """Writes the trained system of a run into `system/`, unless it is there already; returns the folder.
-
-    Args:
-        metrics: of the run's evaluation.
-        max_views: number of views that temperatures are fitted for.
-    """
-    folder, figures = run.out / "system", figures_of(metrics)
-    made = stamp_of("system", identity_of(run.made_by(), figures, max_views))
+def make_run_system(run: Run, metrics: Metrics) -> Path:
+    """Writes the trained system of a run, with these metrics, into `system/`, unless it is there; returns the folder."""
+    folder, figures, max_views = run.out / "system", figures_of(metrics), run.settings.evaluation.max_views
+    made = stamp_of("system", digest_of(as_read([run.made_by(), figures, max_views])))
     if not stored_system(folder, made):
         save_system(system_of_run(run, figures, max_views, made), folder)
     return folder

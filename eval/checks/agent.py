@@ -27,7 +27,7 @@ from data_pipeline.progress import progress_bar
 from eval.checks.camera import Pair, pairs, summary
 from eval.checks.walks import Walker, as_table, beliefs_along, with_interval
 from eval.config import AgentConfig
-from eval.numbers.confidence import stopping as by_risk
+from eval.numbers.confidence import stops_of
 from eval.tables import ViewTables
 from eval.walks.live import Agreement
 from mevs_jax.agent import Agent
@@ -197,9 +197,9 @@ def stopping(
     Only for systems that add logits, whose beliefs follow from view tables.
     """
     walks = Walker(system).walk(tables.stacked(), policy, max_views)
-    rows = by_risk(walks.confidence, walks.right, [1 - stop for stop in stops])
+    rows = stops_of(walks.confidence, walks.right, [1 - stop for stop in stops])
     return [
-        StoppingRow(stop, row["risk"], row["error"] or 0.0, row["excess"], row["sure"], row["views"], row["accuracy"])
+        StoppingRow(stop, row.risk, row.error or 0.0, row.excess.tolist(), row.sure, row.views, row.accuracy)
         for stop, row in zip(stops, rows, strict=True)
     ]
 

@@ -20,7 +20,7 @@ from data_pipeline.progress import console, progress_bar
 from eval.checks.scenes import CONDITIONS, UPPER, Condition, Placed, reachable_in, version, views_in
 from eval.checks.transfer import STRANGER, matched
 from eval.checks.walks import BASELINE, AccuracyRow, Observer, Walker, Walks, with_interval
-from eval.numbers.confidence import stopping
+from eval.numbers.confidence import stops_of
 from mevs_jax.selection.loop import ViewTable
 from mevs_jax.trained import TrainedSystem
 from train.results.records import named
@@ -296,8 +296,8 @@ def _rows(system: TrainedSystem, walks: dict[str, dict[str, Walks]], conditions:
     for one in conditions:
         for part, found in walks[one.name].items():
             perfect, there = walks["clean"].get(part), walks["upper" if one.upper else "clean"].get(part)
-            (stops,) = stopping(found.confidence, found.right, [1 - STOP])
-            stop = Stop(STOP, stops["error"], stops["sure"], stops["views"])
+            (stops,) = stops_of(found.confidence, found.right, [1 - STOP])
+            stop = Stop(STOP, stops.error, stops.sure, stops.views)
             for views in _numbers(found):
                 right = found.accuracy[:, views - 1]
                 gain = right - walks[one.name][BASELINE].accuracy[:, views - 1]

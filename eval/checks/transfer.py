@@ -23,7 +23,8 @@ from data_pipeline.progress import progress_bar
 from eval.checks.agent import STOPS
 from eval.checks.promise import PromiseRow, Strangers, promises, strangers
 from eval.checks.walks import BASELINE, AccuracyRow, Observer, Walker, Walks, rows_of, with_interval
-from eval.numbers.confidence import stopping
+from eval.numbers.confidence import stops_of
+from eval.numbers.metrics import Stop
 from eval.system import USABLE
 from mevs_jax.geometry.cameras import pixel_directions
 from mevs_jax.selection.loop import ViewTable
@@ -80,15 +81,9 @@ class CalibrationRow:
 
 
 @dataclass(frozen=True)
-class StoppingRow:
-    """Walks that stop at the probability `stop`, 1 − risk; as `eval.numbers.confidence.stopping` has it."""
+class StoppingRow(Stop):
+    """Walks that stop at the probability `stop`, 1 − risk."""
 
-    risk: float
-    sure: float
-    error: float | None
-    excess: list[float]
-    accuracy: float
-    views: float
     stop: float
 
 
@@ -291,8 +286,8 @@ def _of_known(system: TrainedSystem, objects: Objects, walks: dict[str, Walks], 
 
 
 def _stops(walks: Walks) -> list[StoppingRow]:
-    rows = stopping(walks.confidence, walks.right, [1 - stop for stop in STOPS])
-    return [StoppingRow(**row, stop=1 - row["risk"]) for row in rows]
+    rows = stops_of(walks.confidence, walks.right, [1 - stop for stop in STOPS])
+    return [StoppingRow(**vars(row), stop=1 - row.risk) for row in rows]
 
 
 def _by_class(

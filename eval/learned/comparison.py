@@ -10,7 +10,7 @@ import jax
 import numpy as np
 from jaxtyping import Array, Float
 
-from eval.numbers.comparison import interval_of_both, intervals
+from eval.numbers.comparison import interval_of, interval_of_both
 from mevs_jax.beliefs.metrics import bootstrap_means
 
 BASELINES = ("random", "farthest", "fixed_order")
@@ -82,19 +82,19 @@ def seeds_together(
         each[name] = ByObject(**{key: np.mean([value[key] for value in values], axis=0) for key in values[0]})
         errors = [one["policies"][name]["calibration_error"] for one in found]
         policies[name] = {key: policy[key] for key in ("title", "knows")} | {
-            "after_views": each[name].right.mean(axis=1).tolist(),
-            "interval": intervals(each[name].right),
-            "calibration_error": np.mean(errors, axis=0).tolist(),
+            "after_views": each[name].right.mean(axis=1),
+            "interval": interval_of(each[name].right),
+            "calibration_error": np.mean(errors, axis=0),
         }
     same = {key: first[key] for key in ("views", "trying_starts")} | {"policies": policies} | compared(each, method)
     if len(seeds) < 2:  # one training says nothing of others
         return same
     every = {name: np.stack([seed[name].right for seed in seeds], axis=1) for name in policies}
     for name, policy in policies.items():
-        policy["over_both"] = interval_of_both(every[name]).tolist()
+        policy["over_both"] = interval_of_both(every[name])
     same["against_over_both"] = {
         base: {
-            name: interval_of_both(right - every[base]).tolist()
+            name: interval_of_both(right - every[base])
             for name, right in every.items()
             if name != base and right.shape == every[base].shape
         }
@@ -111,9 +111,9 @@ def gains_of_seeds(seeds: Sequence[Mapping[str, Float[np.ndarray, "steps objects
     }
     return {
         name: {
-            "difference": gain.mean(axis=(1, 2)).tolist(),
-            "interval": intervals(gain.mean(axis=1)),
-            **({"over_both": interval_of_both(gain).tolist()} if len(seeds) > 1 else {}),
+            "difference": gain.mean(axis=(1, 2)),
+            "interval": interval_of(gain.mean(axis=1)),
+            **({"over_both": interval_of_both(gain)} if len(seeds) > 1 else {}),
         }
         for name, gain in gains.items()
     }
@@ -127,7 +127,7 @@ def difference(mine: np.ndarray, base: np.ndarray) -> dict[str, Any]:
 
 def gain_of(gain: Float[np.ndarray, "*steps objects"]) -> dict[str, Any]:
     """Mean of differences by object, with intervals."""
-    return {"difference": gain.mean(axis=-1).tolist(), "interval": intervals(gain)}
+    return {"difference": gain.mean(axis=-1), "interval": interval_of(gain)}
 
 
 def _share(

@@ -29,7 +29,8 @@ from eval.learned.stopping import MOVEMENT_COSTS, VIEW_COSTS
 from eval.learned.study import novel_classes, novel_metrics, study
 from eval.learned.walks import OnLattice, Walking, by_network
 from eval.machine import machine, milliseconds
-from eval.tables import load_view_tables
+from eval.runs import stored_tables
+from eval.tables import ViewTables
 from mevs_jax.models.expected_views import ExpectedViews
 from mevs_jax.models.view_policy import expected_gain
 from mevs_jax.policies.registry import PolicyRecord
@@ -38,11 +39,34 @@ from train.choosing.features import Features
 from train.choosing.stages import Aside, Stages, lattice_data
 from train.choosing.variants import VARIANTS
 from train.results.finite import check_results
-from train.results.identity import identity_of, made_by
+from train.results.identity import VERSIONS, identity_of, made_by, stamp_of, why_other
 from train.results.kept import arrays_beside, kept_json, kept_with_arrays
+from train.results.records import as_json
 
+SPLITS = "val", "test"
+"""Whose objects are walked around."""
 APART = 2
 """Parts of the validation objects; stopping rules are fitted on walks of policies that were trained without their objects."""
+
+
+def why_stale(metrics: dict[str, Any], seeds: Sequence[Stages]) -> str | None:
+    """Why metrics of the study are not of these settings and of the networks that are there, in a few words; None if they are.
+
+    Compared are the walks of every seed on the run's own lattice, which the run's report shows.
+    """
+    views = seeds[0].dataset.capture.views
+    pairs = [({"settings": metrics["settings"]}, {"settings": as_json(seeds[0].config)})]
+    for stages, found in zip(seeds, metrics["seeds"], strict=False):
+        walks = _Walks(stages, f"lattice_{views}", stages.out / "data")
+        pairs += [(policy, policy | {"version": VERSIONS["network"]}) for policy in walks.policies]
+        pairs.append((found["lattices"][str(views)]["identity"], as_json(walks.identity())))
+    return next(filter(None, map(why_other, *zip(*pairs, strict=True))), None)
+
+
+def entropy_tables(out: Path, split: str) -> ViewTables | None:
+    """The view tables of `mevs run`, None without them; raises `DataError` if they are of other networks than the run has now."""
+    exists = (out / "tables" / f"{split}.npz").exists()
+    return stored_tables(load_statistics(out / "data"), out, split) if exists else None
 
 
 def check_parts(statistics: DatasetStatistics) -> None:
@@ -66,7 +90,7 @@ def measure(stages: Stages) -> dict[str, Any]:
         return _Walks(stages, f"lattice_{views}", lattice_data(stages.dataset, stages.out, views), **given).metrics()
 
     found = {"lattices": {str(views): on_lattice(views) for views in (own, *config.lattices)}}
-    if config.novel:
+    if _pairs(stages):
         found["novel"] = _novel(stages)
     if stages.seed != config.seed:
         return found
@@ -99,7 +123,7 @@ def together(seeds: Sequence[Stages], found: Sequence[dict[str, Any]]) -> dict[s
 
 def novel_together(seeds: Sequence[Stages]) -> dict[str, Any] | None:
     """Gains over random selection on classes that policies were trained without, over all seeds; None if not measured."""
-    if not seeds[0].config.novel:
+    if not _pairs(seeds[0]):
         return None
     return gains_of_seeds([_by_object(stages, "walks_novel") for stages in seeds])
 
@@ -151,7 +175,7 @@ class _Walks:
             )
         kind = ("" if self.posed else "_unposed") + ("_ablations" if self.ablations else "")
         path = self.stages.folder / f"walks_{self.views}{kind}.json"
-        return kept_with_arrays(path, self._identity(), self._walk)[0]
+        return kept_with_arrays(path, self.identity(), self._walk)[0]
 
     def _policy(self, name: str, aside: Aside | None = None) -> PolicyRecord:
         """A variant of the view policy, trained first if it is not yet; `aside` is as for `Stages.policy`."""
@@ -160,15 +184,21 @@ class _Walks:
         fusion = self.stages.fusion(posed=self.posed, summed=variant.summed)
         return by_network(called, variant.title, network, fusion, variant.by)
 
-    def _identity(self) -> dict[str, Any]:
+    @property
+    def policies(self) -> list[dict[str, Any]]:
+        """The identities of the view policies, which have to be trained."""
+        return [_identity_of_policy(self.stages, VARIANTS[name].network or name) for name in self.variants]
+
+    def identity(self) -> dict[str, Any]:
+        """What the walks depend on."""
         stages, config = self.stages, self.stages.config
-        networks = [stages.policy_folder(VARIANTS[name].network or name) for name in self.variants]
         clouds = [stages.out / "entropy"] if "cloud" in self.variants else []
+        networks = made_by(load_statistics(self.data), stages.recogniser_folder(), *clouds)
         return identity_of(
             "walks",
-            made_by=made_by(load_statistics(self.data), stages.recogniser_folder(), *clouds),
-            policies=[read_json(folder / "summary.json")["identity"] for folder in networks],
-            tables_made_by=_tables_made_by(stages.out, self.data),
+            made_by=stamp_of("features", networks),
+            policies=self.policies,
+            tables_made_by=[tables.made_by for split in SPLITS if (tables := self._tables(split)) is not None],
             walks=[
                 self.variants,
                 config.max_views,
@@ -196,18 +226,21 @@ class _Walks:
             others=not self.ablations,
             known=_known(stages, self.posed, lattices[1].features.directions[0]),
         )
-        check_results(found, f"walks by the recogniser in {stages.recogniser_folder()}")
+        found = check_results(as_json(found), f"walks by the recogniser in {stages.recogniser_folder()}")
         return found, {f"{name} {key}": value for name, one in each.items() for key, value in vars(one).items()}
 
     def _objects(self, split: str) -> OnLattice:
         features = self.stages.features(f"{self.views}_{split}", self.data, split)
         if "cloud" in self.variants:
             features = replace(features, clouds=self.stages.clouds(self.data, split))
-        path, predicted, true = _entropy_tables(self.stages.out, self.data, split), None, None
-        if path is not None:
-            tables = load_view_tables(path)
-            predicted, true = tables.predicted_entropy, tables.entropy
-        return OnLattice(features, predicted, true, load_statistics(self.data).neighbours)
+        neighbours, tables = load_statistics(self.data).neighbours, self._tables(split)
+        if tables is None:
+            return OnLattice(features, neighbours=neighbours)
+        return OnLattice(features, tables.predicted_entropy, tables.entropy, neighbours)
+
+    def _tables(self, split: str) -> ViewTables | None:
+        """The view tables of `mevs run`; None for another data set, or where there are none."""
+        return entropy_tables(self.stages.out, split) if self.data == self.stages.out / "data" else None
 
     def _title(self, test: Features) -> str:
         objects, count, _ = test.logits.shape
@@ -216,6 +249,11 @@ class _Walks:
         pose = "" if self.posed else ", unknown yaw"
         ablations = ", ablations" * bool(self.ablations)
         return f"Walking {objects} test objects, {count} candidate views{around}{pose}{ablations}"
+
+
+def _identity_of_policy(stages: Stages, name: str) -> dict[str, Any]:
+    """What a trained view policy was stored under."""
+    return read_json(stages.policy_folder(name) / "summary.json")["identity"]
 
 
 def _known(stages: Stages, posed: bool, directions: Float[Array, "views 3"]) -> ExpectedViews | UnknownPose | None:
@@ -236,9 +274,11 @@ def _rotated(stages: Stages) -> dict[str, Any]:
 
 
 def _pairs(stages: Stages) -> list[tuple[int, int]]:
-    """The pairs of classes that policies are trained without."""
-    half = len(stages.statistics.classes) // 2
-    return [(first, first + half) for first in range(min(stages.config.novel, half))]
+    """The pairs of classes that policies are trained without; of each there are test objects."""
+    classes, counts = stages.statistics.classes, stages.statistics.counts["test"]
+    half = len(classes) // 2
+    pairs = [(first, first + half) for first in range(min(stages.config.novel, half))]
+    return [pair for pair in pairs if any(counts[classes[label]] for label in pair)]
 
 
 def _novel(stages: Stages) -> dict[str, Any]:
@@ -248,8 +288,8 @@ def _novel(stages: Stages) -> dict[str, Any]:
     policies = [by_network("trained_without", "", stages.policy(without=pair), fusion) for pair in pairs]
     identity = identity_of(
         "walks",
-        made_by=made_by(load_statistics(data), stages.recogniser_folder()),
-        policy=read_json(stages.policy_folder() / "summary.json")["identity"],
+        made_by=stamp_of("features", made_by(load_statistics(data), stages.recogniser_folder())),
+        policy=_identity_of_policy(stages, "learned"),
         walks=[pairs, config.max_views, config.draws, FITTED_AS],
     )
 
@@ -270,7 +310,7 @@ def _novel(stages: Stages) -> dict[str, Any]:
 
 
 def _decision(stages: Stages) -> dict[str, Any]:
-    policy = read_json(stages.policy_folder() / "summary.json")["identity"]
+    policy = _identity_of_policy(stages, "learned")
     identity = identity_of("decision", policy=policy, machine=machine(), candidates=stages.dataset.capture.views)
     return kept_json(stages.folder / "decision.json", identity, partial(_decision_times, stages))
 
@@ -313,15 +353,3 @@ def _decision_times(stages: Stages, calls: int = 200) -> dict[str, Any]:
     return {
         name: {f"p{share}": float(np.percentile(taken, share)) for share in (50, 99)} for name, taken in times.items()
     }
-
-
-def _entropy_tables(out: Path, data: Path, split: str) -> Path | None:
-    """Path of the view tables of `mevs run` for this data set, or None."""
-    path = out / "tables" / f"{split}.npz"
-    return path if data == out / "data" and path.exists() else None
-
-
-def _tables_made_by(out: Path, data: Path) -> list[str]:
-    """What made the view tables of `mevs run` for this data set; empty without them."""
-    paths = [_entropy_tables(out, data, split) for split in ("val", "test")]
-    return [load_view_tables(path).made_by for path in paths if path is not None]

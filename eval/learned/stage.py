@@ -2,19 +2,26 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict
 from pathlib import Path
 
 from data_pipeline.dataset.config import check_same_data
 from data_pipeline.dataset.statistics import load_statistics
 from data_pipeline.distributed import is_first
 from data_pipeline.files import keep_json
-from eval.learned.measure import APART, check_parts, measure, novel_together, together
+from eval.learned.measure import APART, SPLITS, check_parts, entropy_tables, measure, novel_together, together
 from eval.learned.system import make_learned_system
 from eval.settings import Settings
 from train.choosing.config import check_learned
 from train.choosing.stages import Stages, train_recognisers, trained_policies
 from train.results.finite import check_results
+from train.results.records import as_json
+
+
+def seeds_of(settings: Settings, out: Path) -> list[Stages]:
+    """The stages of every seed of the study."""
+    config = settings.learned
+    numbers = range(config.seed, config.seed + config.seeds)
+    return [Stages(config, settings.dataset, out, number, settings.entropy) for number in numbers]
 
 
 def learn_to_choose(settings: Settings, out: Path) -> Path:
@@ -22,10 +29,9 @@ def learn_to_choose(settings: Settings, out: Path) -> Path:
     config = settings.learned
     check_learned(config, settings.dataset.capture.views)
     check_same_data(settings.dataset, out / "data")
-    seeds = [
-        Stages(config, settings.dataset, out, seed, settings.entropy)
-        for seed in range(config.seed, config.seed + config.seeds)
-    ]
+    for split in SPLITS:
+        entropy_tables(out, split)  # so that stale ones are refused before anything is trained
+    seeds = seeds_of(settings, out)
     seeds[0].prepare()
     check_parts(seeds[0].statistics)
     train_recognisers(seeds)
@@ -33,10 +39,10 @@ def learn_to_choose(settings: Settings, out: Path) -> Path:
     for part in range(APART):
         trained_policies([stages.policy_job(aside=(part, APART)) for stages in seeds])
     found = [measure(stages) for stages in seeds]
-    metrics = {"seeds": found, "together": together(seeds, found), "settings": asdict(config)}
+    metrics = {"seeds": found, "together": together(seeds, found), "settings": config}
     if (novel := novel_together(seeds)) is not None:
         metrics["novel"] = novel
-    check_results(metrics, "the metrics of the learned study")
+    metrics = check_results(as_json(metrics), "the metrics of the learned study")
     page = out / "learned" / "index.html"
     if is_first():
         from eval.learned.page import write_learned_page  # imported late: it needs plots

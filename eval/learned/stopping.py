@@ -19,7 +19,7 @@ from jaxtyping import Array, Bool, Float, Int
 from data_pipeline.dataset.batches import fold_of
 from eval.learned.comparison import gain_of
 from eval.learned.walks import Known, OnLattice, Walking, beliefs_of, right_along, walk_all
-from eval.numbers.comparison import intervals
+from eval.numbers.comparison import interval_of
 from eval.numbers.confidence import logits_along, stops_at
 from eval.walks.grid import THRESHOLDS
 from mevs_jax.arrays import AnyArray
@@ -181,9 +181,9 @@ def moving(
         rows.append(
             {
                 "cost": cost,
-                "after_views": after.mean(axis=1).tolist(),
-                "interval": intervals(after),
-                "way": travelled.mean(axis=(0, 1)).tolist(),
+                "after_views": after.mean(axis=1),
+                "interval": interval_of(after),
+                "way": travelled.mean(axis=(0, 1)),
             }
         )
     return rows

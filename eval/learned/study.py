@@ -31,8 +31,8 @@ from eval.learned.walks import (
     right_along,
     walk_all,
 )
-from eval.numbers.comparison import intervals
-from eval.numbers.confidence import stopping
+from eval.numbers.comparison import interval_of
+from eval.numbers.confidence import stops_of
 from eval.walks.knowledge import FixedOrder, fit_order, worth_of
 from mevs_jax.arrays import AnyArray
 from mevs_jax.beliefs.calibration import (
@@ -86,18 +86,18 @@ def walk_metrics(
     likelihood = np.asarray(log_likelihood(beliefs[1] / temperatures[:, None], truth).mean(axis=1).T)
     steps = range(right.shape[2])
     found = {
-        "after_views": after.mean(axis=1).tolist(),
-        "interval": intervals(after),
-        "temperatures": np.asarray(temperatures).tolist(),
+        "after_views": after.mean(axis=1),
+        "interval": interval_of(after),
+        "temperatures": np.asarray(temperatures),
         "calibration_error": [
             float(expected_calibration_error(confidence[:, :, step].reshape(-1), right[:, :, step].reshape(-1)))
             for step in steps
         ],
         "calibration_error_by_chance": [
-            calibration_error_by_chance(confidence[:, :, step], right[:, :, step]).tolist() for step in steps
+            calibration_error_by_chance(confidence[:, :, step], right[:, :, step]) for step in steps
         ],
-        "negative_log_likelihood": (-likelihood.mean(axis=1)).tolist(),
-        "stopping": stopping(confidence, right),
+        "negative_log_likelihood": -likelihood.mean(axis=1),
+        "stopping": stops_of(confidence, right),
     }
     return found, signals, likelihood
 
@@ -105,11 +105,11 @@ def walk_metrics(
 def _worth_of_one(
     one: tuple[Features, Int[Array, " starts"]], fusion: CalibratedFusion, before: Int[Array, " before"]
 ) -> Float[Array, "views criteria"]:
-    """What each view is worth for an object; a view seen before adds nothing."""
+    """What each view is worth for an object; a view seen before adds nothing. `before` ends with −1, which stands for no view."""
     data, starts = one
 
     def after(start: Array, view: Array) -> Array:
-        members = jnp.concatenate([before, start[None], view[None]])
+        members = jnp.concatenate([jnp.where(before < 0, start, before), start[None], view[None]])
         first = jnp.argmax(members[:, None] == members, axis=1) == jnp.arange(len(members))
         return worth_of(fusion(data.features[members], data.directions[members], first), data.labels)
 
@@ -127,7 +127,7 @@ def order_of_fused(fusion: CalibratedFusion, data: Features, most: int) -> Fixed
     starts = (np.arange(objects)[:, None] // 2 + np.arange(_STARTS_OF_EACH) * views // _STARTS_OF_EACH) % views
 
     def worth(before: frozenset[int]) -> np.ndarray:
-        given = np.array(sorted(before), int)
+        given = np.array([*sorted(before), *[-1] * (most - len(before))], int)  # one program for all lengths
         return over_objects(_worth_of_one, (data, starts), fusion, given, at_once=1, by_all=True)
 
     found = fit_order(worth, class_weights(data.labels, classes), np.ones(views, bool), most)
@@ -175,13 +175,13 @@ def random_sets_study(
             right[name] = correct.mean(axis=0)
             row[name] = {
                 "accuracy": float(correct.mean()),
-                "interval": intervals(right[name]),
+                "interval": interval_of(right[name]),
                 "calibration_error": float(
                     expected_calibration_error(probability.max(-1).reshape(-1), correct.reshape(-1))
                 ),
             }
         gain = right["learned"] - right["sum"]
-        row |= {"difference": float(gain.mean()), "difference_interval": intervals(gain)}
+        row |= {"difference": float(gain.mean()), "difference_interval": interval_of(gain)}
         rows.append(row)
     return rows
 
@@ -329,7 +329,7 @@ def novel_metrics(
     rows, first = [], 0
     for classes in pairs:
         own = slice(first, first := first + int(np.isin(labels, classes).sum()))
-        means = {name: right[:, own].mean(axis=1).tolist() for name, right in each.items()}
+        means = {name: right[:, own].mean(axis=1) for name, right in each.items()}
         rows.append({"classes": list(classes), "objects": own.stop - own.start} | means)
     gains = {name: difference(mine, each["random"]) for name, mine in each.items() if name != "random"}
     return {"objects": first, "pairs": rows, "gain": gains}

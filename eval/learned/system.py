@@ -10,9 +10,10 @@ import jax.numpy as jnp
 from data_pipeline.dataset.inputs import view_camera
 from data_pipeline.dataset.statistics import load_statistics
 from data_pipeline.distributed import agreed, is_first, wait_for_all
+from data_pipeline.files import as_read, digest_of
 from eval.learned.study import learn
 from eval.run_file import versions_of
-from eval.system import MADE_WITH, data_of, identity_of, resnet_shape, save_system, stored_system
+from eval.system import MADE_WITH, data_of, resnet_shape, save_system, stored_system
 from mevs_jax.models import ViewPolicy
 from mevs_jax.models.shapes import PoseShape, SetFusionShape, ViewPolicyShape
 from mevs_jax.trained import Description, ImageInput, Network, Parts, TrainedSystem, fit_strangeness
@@ -55,9 +56,9 @@ def make_learned_system(stages: Stages, found: dict[str, Any]) -> Path:
     views, folder = stages.dataset.capture.views, stages.out / "learned" / "system"
     figures = figures_of(found, views)
     networks = [stages.policy_folder(name) for name in POLICIES]
-    made_from = made_by(stages.statistics, stages.recogniser_folder())
+    made_from = stamp_of("features", made_by(stages.statistics, stages.recogniser_folder()))
     summaries = [(network / "summary.json").read_text() for network in networks]
-    made = stamp_of("system", identity_of(made_from, [FITTED_AS, *summaries], figures))
+    made = stamp_of("system", digest_of(as_read([made_from, [FITTED_AS, *summaries], figures])))
     if not agreed(stored_system(folder, made)):
         system = learned_system(stages, found, figures, made)
         if is_first():

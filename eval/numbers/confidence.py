@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from functools import partial
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -25,7 +24,6 @@ from mevs_jax.beliefs.calibration import (
     reliability,
 )
 from mevs_jax.beliefs.fusing import discounted, mean_of_probabilities, running_sum
-from train.results.records import as_json
 
 RISKS = (0.3, 0.2, 0.15, 0.1, 0.05, 0.02)
 READINGS = {
@@ -94,11 +92,6 @@ def _score(log_probabilities: Array, labels: Array) -> dict[str, Array]:
 def stops_at(enough: np.ndarray) -> np.ndarray:
     """The first step (…) of walks (…, steps) at which `enough` is true, or the last step."""
     return np.where(enough.any(axis=-1), enough.argmax(axis=-1), enough.shape[-1] - 1)
-
-
-def stopping(confidence: np.ndarray, right: np.ndarray, risks: Sequence[float] = RISKS) -> list[dict[str, Any]]:
-    """As `stops_of`, as JSON has it."""
-    return as_json(stops_of(confidence, right, risks))
 
 
 def stops_of(confidence: np.ndarray, right: np.ndarray, risks: Sequence[float] = RISKS) -> tuple[Stop, ...]:

@@ -21,13 +21,13 @@ from eval.numbers.comparison import difference, summarise
 from eval.numbers.metrics import Difference, Listed, Metrics, Summary
 from eval.numbers.study import BASELINE, Setting, check_own, listed
 from eval.run_file import load_run
-from eval.tables import ViewTables, load_view_tables
+from eval.runs import stored_tables
+from eval.tables import ViewTables
 from eval.walks.grid import FIRST_MV, THRESHOLDS, GridConfig, Results
 from eval.walks.own_policies import checked, own_policy
 from mevs_jax.geometry.viewpoints import ViewGraph
 from mevs_jax.policies.base import Policy
 from mevs_jax.policies.registry import POLICIES, Knows, PolicyRecord, policy_record
-from train.results.identity import made_by, stamp_of, why
 from train.results.records import csv_of, ends
 
 By = Literal["views", "threshold"]
@@ -57,22 +57,9 @@ class EvaluationInputs:
             DataError: if the run has no view tables, or they were made with other networks than it has now.
         """
         statistics, kept = load_statistics(run / "data"), load_run(run)
-        made = stamp_of("tables", made_by(statistics, run / "classifier", run / "entropy"))
-        found = []
-        for split in ("test", "val"):
-            path = run / "tables" / f"{split}.npz"
-            try:
-                tables = load_view_tables(path)
-            except Exception as error:  # the content of a damaged file decides which
-                reason = "it is missing" if isinstance(error, FileNotFoundError) else why(error)
-                raise DataError(f"{path} cannot be read ({reason}); make it with: mevs eval --out {run}") from error
-            if tables.made_by != made:
-                raise DataError(
-                    f"{path} was made with other networks than {run} has; make it again: mevs eval --out {run}"
-                )
-            found.append(tables)
-        graph = statistics.graph
-        return cls(found[0], found[1], graph, GridConfig() if kept is None else kept.settings.evaluation)
+        tables, validation = (stored_tables(statistics, run, split) for split in ("test", "val"))
+        config = GridConfig() if kept is None else kept.settings.evaluation
+        return cls(tables, validation, statistics.graph, config)
 
 
 @dataclass(frozen=True)
@@ -160,7 +147,7 @@ def evaluate_policies(
     setting = Setting.of(inputs.graph, inputs.validation, inputs.config)
     further = checked(own, setting.graph, tables.logits.shape[-1])
     compared = (policy_record(BASELINE), *further)
-    results, _ = setting.with_random(tables, compared)
+    results, _ = setting.with_random(tables.stacked(), compared)
     check_own(further, results, tables, setting)
     return PolicyStudy(tables.names, tables.labels, compared, results, setting.can_reach)
 

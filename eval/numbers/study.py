@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import jax
 import jax.numpy as jnp
@@ -29,7 +30,7 @@ from eval.numbers.published_code import compatibility
 from eval.tables import ViewTables
 from eval.threads import by_threads
 from eval.walks.exact import expected_random
-from eval.walks.grid import FIRST_MV, THRESHOLDS, GridConfig, Results, run_grid
+from eval.walks.grid import FIRST_MV, THRESHOLDS, GridConfig, Results, of_backbones, run_grid
 from eval.walks.knowledge import Criterion, learn, order_of_sums
 from eval.walks.ladder import SCRAMBLED, ladder
 from eval.walks.own_policies import check_scores, checked
@@ -37,6 +38,7 @@ from mevs_jax.beliefs.metrics import accuracy, class_accuracy, confusion_matrix
 from mevs_jax.geometry.viewpoints import ViewGraph
 from mevs_jax.policies.base import Knowledge, with_movement
 from mevs_jax.policies.registry import PolicyRecord, policy_record
+from mevs_jax.selection.loop import ViewTable
 
 HEADLINE_CT, HEADLINE_MV = 0.99, 4
 """The cell of the grid used in the thesis's first test and confusion matrices (§5.3)."""
@@ -130,16 +132,14 @@ def headline_confusion(views: np.ndarray, tables: ViewTables, max_views: int) ->
     return np.asarray(confusion_matrix(labels, prediction.reshape(-1), tables.logits.shape[-1], weights))
 
 
-def exactly_random(
-    results: Results, logits: jax.Array, labels: jax.Array, reachable: np.ndarray
-) -> tuple[Results, int]:
+def exactly_random(results: Results, table: ViewTable, reachable: np.ndarray) -> tuple[Results, int]:
     """Replaces `results` of random selection by exact expectations where there are few enough subsets of views.
 
     Returns:
         The results, and the number of views up to which they are exact.
     """
     max_views = results.after.shape[-1]
-    right, used, after = expected_random(logits, labels, reachable, THRESHOLDS, max_views)
+    right, used, after = expected_random(of_backbones(table).logits, table.label, reachable, THRESHOLDS, max_views)
     exact = after.shape[-1]
     skip = FIRST_MV - 1
     return (
@@ -181,23 +181,25 @@ class Setting:
 
     Attributes:
         graph: the candidate views.
-        knowledge: statistics over validation objects.
+        knowledge: statistics over validation objects; None if no policy needs them.
         order_by: what the best fixed order was fitted by.
         config: settings of the evaluation; `max_views` at most the number of views that can be reached.
         can_reach: (views,) bool.
     """
 
     graph: ViewGraph
-    knowledge: Knowledge
-    order_by: Criterion
+    knowledge: Knowledge | None
+    order_by: Criterion | None
     config: GridConfig
     can_reach: np.ndarray
 
     @staticmethod
-    def of(graph: ViewGraph, validation: ViewTables, config: GridConfig) -> Setting:
-        """What follows from the settings of an evaluation, with the knowledge learned from validation objects."""
+    def of(graph: ViewGraph, validation: ViewTables | None, config: GridConfig) -> Setting:
+        """What follows from the settings of an evaluation, with knowledge of validation objects if there are any."""
         can_reach = reachable_views(np.asarray(graph.points), config.lowest_elevation)
         config = replace(config, max_views=min(config.max_views, int(can_reach.sum())))
+        if validation is None:
+            return Setting(graph, None, None, config, can_reach)
         order = order_of_sums(validation.logits, validation.labels, can_reach)
         return Setting(graph, learn(validation.logits, validation.labels, order), order.fitted_by, config, can_reach)
 
@@ -205,27 +207,17 @@ class Setting:
     def reachable(self) -> jax.Array | None:
         return None if self.can_reach.all() else jnp.asarray(self.can_reach)
 
-    def walk(
-        self, tables: ViewTables, policies: Sequence[PolicyRecord], draws: int | None = None
-    ) -> dict[str, Results]:
-        """Results of some policies on all objects of a split, by name; `draws` other than those of the settings if given."""
-        one_backbone, config = tables.stacked(), self.config
-        return run_grid(
-            jax.random.key(config.seed),
-            replace(one_backbone, logits=one_backbone.logits[:, None]),
-            self.graph,
-            jax.tree.map(lambda leaf: leaf[None], self.knowledge),
-            policies,
-            max_views=config.max_views,
-            draws=config.draws if draws is None else draws,
-            reachable=self.reachable,
-        )
+    def walk(self, table: ViewTable, policies: Sequence[PolicyRecord], draws: int | None = None) -> dict[str, Results]:
+        """As `run_grid`, with the settings of the evaluation; `draws` other than theirs if given."""
+        config, draws = self.config, self.config.draws if draws is None else draws
+        walk = partial(run_grid, max_views=config.max_views, draws=draws, reachable=self.reachable)
+        return walk(jax.random.key(config.seed), table, self.graph, self.knowledge, policies)
 
-    def with_random(self, tables: ViewTables, policies: Sequence[PolicyRecord]) -> tuple[dict[str, Results], int]:
-        """Walks of policies, among them random selection, whose results are exact up to the number of views returned."""
-        results = self.walk(tables, policies)
-        logits, labels = jnp.asarray(tables.logits)[:, None], jnp.asarray(tables.labels)
-        results[BASELINE], exact = exactly_random(results[BASELINE], logits, labels, self.can_reach)
+    def with_random(self, table: ViewTable, policies: Sequence[PolicyRecord]) -> tuple[dict[str, Results], int]:
+        """Walks of policies; those of random selection, if it is among them, are exact up to the number of views returned."""
+        results, exact = self.walk(table, policies), 0
+        if BASELINE in results:
+            results[BASELINE], exact = exactly_random(results[BASELINE], table, self.can_reach)
         return results, exact
 
     def starts_of(self, result: Results) -> np.ndarray:
@@ -248,7 +240,8 @@ def _confidence(
     results: dict[str, Results],
     policies: Sequence[PolicyRecord],
 ) -> dict[str, Confidence]:
-    walks = setting.walk(validation, [policy for policy in policies if policy.name in CONFIDENCE_OF], draws=1)
+    read = [policy for policy in policies if policy.name in CONFIDENCE_OF]
+    walks = setting.walk(validation.stacked(), read, draws=1)
 
     def of(name: str) -> Confidence:
         fitted_on, shown = setting.starts_of(walks[name]), setting.starts_of(results[name])
@@ -264,7 +257,7 @@ def _movement(
     moving = [policy for policy in policies if policy.name in MOVING]
     for cost in MOVEMENT_COSTS:
         costly = [replace(policy, score=with_movement(policy.score, jnp.float32(cost))) for policy in moving]
-        for name, result in setting.walk(tables, costly).items():
+        for name, result in setting.walk(tables.stacked(), costly).items():
             found[name].append(moved(cost, result))
     return {name: tuple(runs) for name, runs in found.items()}
 
@@ -315,10 +308,12 @@ def run_study(
     own = checked(own, setting.graph, len(statistics.classes))
     policies, reachable = ladder(own), setting.can_reach
     console.print(f"Walking {len(tables.labels)} test objects from {reachable.sum()} views by {len(policies)} policies")
-    results, exact = setting.with_random(tables, (*policies, SCRAMBLED))
+    results, exact = setting.with_random(tables.stacked(), (*policies, SCRAMBLED))
     shown = {policy.name: results[policy.name] for policy in policies}
     check_own(own, results, tables, setting)
-    mv = min(HEADLINE_MV, setting.config.max_views)
+    switched, mv = None, min(HEADLINE_MV, setting.config.max_views)
+    if by_view is not None:
+        switched, _ = setting.with_random(by_view.stacked(), [*map(policy_record, SWITCHED), SCRAMBLED])
     return Metrics(
         objects=len(tables.labels),
         validation_objects=len(validation.labels),
@@ -338,17 +333,10 @@ def run_study(
         against_random={
             name: difference(result, shown[BASELINE]) for name, result in shown.items() if name != BASELINE
         },
-        fixed_order=FixedOrder(setting.order_by),
+        fixed_order=FixedOrder(str(setting.order_by)),
         views_to_reach=views_to_reach(shown, BASELINE),
         best_pair=best_pair(tables, reachable),
         confidence=_confidence(setting, tables, validation, results, policies),
         movement=_movement(setting, tables, results, policies),
-        compatibility=compatibility(results, _switched(setting, by_view), statistics.views, leak),
+        compatibility=compatibility(results, switched, statistics.views, leak),
     )
-
-
-def _switched(setting: Setting, by_view: ViewTables | None) -> dict[str, Results] | None:
-    """The walks that the published code is compared by, with the classifier validated by view; None without its tables."""
-    if by_view is None:
-        return None
-    return setting.with_random(by_view, [*map(policy_record, SWITCHED), SCRAMBLED])[0]

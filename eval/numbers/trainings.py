@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 import jax
@@ -13,12 +14,11 @@ from data_pipeline.errors import DataError
 from eval.numbers.comparison import interval_of, interval_of_both
 from eval.numbers.metrics import TrainingsRow
 from eval.numbers.policies import EvaluationInputs
-from eval.numbers.study import BASELINE, Setting, exactly_random
-from eval.walks.grid import Results, run_grid
+from eval.numbers.study import BASELINE, Setting
+from eval.walks.grid import Results
 from eval.walks.ladder import ladder
 from eval.walks.own_policies import checked
 from mevs_jax.policies.registry import PolicyRecord
-from mevs_jax.selection.loop import ViewTable
 from train.results.records import csv_of, ends, numbered
 
 
@@ -42,27 +42,14 @@ def walks_of_all(
         if other.tables.names != first.tables.names:
             raise DataError("the trainings were evaluated on different objects; evaluate them again: mevs eval")
     settings = [Setting.of(one.graph, one.validation, one.config) for one in inputs]
-    config, can_reach = settings[0].config, settings[0].can_reach
     knowledge = jax.tree.map(lambda *leaves: jnp.stack(leaves), *(setting.knowledge for setting in settings))
     logits, entropies = (
         jnp.stack([jnp.asarray(getattr(one.tables, name)) for one in inputs], axis=1)
         for name in ("logits", "predicted_entropy")
     )
-    labels = jnp.asarray(first.tables.labels)
-    table = ViewTable(logits, entropies, jnp.asarray(first.tables.entropy), labels)
+    table = replace(first.tables.stacked(), logits=logits, predicted_entropy=entropies)
     policies = ladder(checked(own, first.graph, logits.shape[-1]))
-    results = run_grid(
-        jax.random.key(config.seed),
-        table,
-        first.graph,
-        knowledge,
-        policies,
-        max_views=config.max_views,
-        draws=config.draws,
-        reachable=settings[0].reachable,
-    )
-    results[BASELINE], _ = exactly_random(results[BASELINE], logits, labels, can_reach)
-    return policies, results
+    return policies, replace(settings[0], knowledge=knowledge).with_random(table, policies)[0]
 
 
 def rows_over_trainings(policies: Sequence[PolicyRecord], results: Mapping[str, Results]) -> tuple[TrainingsRow, ...]:

@@ -37,10 +37,10 @@ from data_pipeline.progress import console, progress_bar
 from eval.config import RenderingConfig
 from eval.numbers.comparison import difference, summarise
 from eval.numbers.metrics import Ascents
-from eval.numbers.study import exactly_random, listed, reachable_views
+from eval.numbers.study import Setting, listed
 from eval.rendering.ascent import METHODS, ascend_on_sphere, padded_triangles
 from eval.tables import ViewTables, objects_of
-from eval.walks.grid import GridConfig, run_grid
+from eval.walks.grid import GridConfig
 from eval.walks.ladder import BY_ASCENT, ladder
 from mevs_jax.geometry.cameras import Camera, partial_cloud
 from mevs_jax.rendering import corners_of_cells, distinct_optima
@@ -233,29 +233,12 @@ def ascent_study(
 
     Differences from random selection and from the thesis's predicted entropy are paired by object.
     """
-    viewpoints = np.array(statistics.viewpoints)
-    can_reach = reachable_views(viewpoints, config.lowest_elevation)
-    chosen = climbed.chosen
-    some = tables.of_objects(chosen)
-    table = some.stacked()
-    table = replace(
-        table,
-        logits=table.logits[:, None],
-        ascent_scores={name: jnp.asarray(scores, jnp.float32) for name, scores in climbed.scores.items()},
-    )
+    chosen, some = climbed.chosen, tables.of_objects(climbed.chosen)
+    scores = {name: jnp.asarray(scores, jnp.float32) for name, scores in climbed.scores.items()}
     compared = [policy for policy in ladder(BY_ASCENT) if policy.name in COMPARED or policy in BY_ASCENT]
     console.print(f"Walking {len(chosen)} test objects by differentiable rendering")
-    found = run_grid(
-        jax.random.key(config.seed),
-        table,
-        statistics.graph,
-        None,
-        compared,
-        draws=config.draws,
-        max_views=min(config.max_views, int(can_reach.sum())),
-        reachable=None if can_reach.all() else jnp.asarray(can_reach),
-    )
-    found["random"], _ = exactly_random(found["random"], table.logits, table.label, can_reach)
+    setting = Setting.of(statistics.graph, None, config)
+    found, _ = setting.with_random(replace(some.stacked(), ascent_scores=scores), compared)
     return Ascents(
         objects=len(chosen),
         views_without_surface=climbed.without_surface,

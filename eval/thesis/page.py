@@ -9,8 +9,8 @@ import matplotlib.pyplot as plt
 
 from data_pipeline.files import write_bytes, write_text
 from eval.report.html import commands, document, drawn, embedded, table
-from eval.thesis.figures import FIGURES, FigureInputs, ThesisFigure
-from eval.thesis.layout import ThesisTable
+from eval.thesis.figures import FIGURES
+from eval.thesis.layout import FigureInputs, ThesisFigure, ThesisTable
 from eval.thesis.tables import all_tables, markdown, shown_cells
 
 CHAPTERS = (

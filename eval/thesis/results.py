@@ -5,20 +5,18 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, Int
 
 from data_pipeline.dataset.statistics import DatasetStatistics
 from eval.numbers.comparison import class_mean, interval_of
-from eval.numbers.study import HEADLINE_CT, HEADLINE_MV, exactly_random, headline_confusion
+from eval.numbers.study import HEADLINE_CT, HEADLINE_MV, Setting, headline_confusion
 from eval.tables import ViewTables
 from eval.thesis.timing import Measured
-from eval.walks.grid import FIRST_MV, THRESHOLDS, GridConfig, Results, run_grid
+from eval.walks.grid import FIRST_MV, THRESHOLDS, GridConfig, Results
 from eval.walks.ladder import SCRAMBLED, ladder
-from mevs_jax.geometry.viewpoints import ViewGraph
-from mevs_jax.policies.registry import PolicyRecord, policy_record
+from mevs_jax.policies.registry import policy_record
 from mevs_jax.selection.loop import ViewTable
 from train.many.thesis import BACKBONES, FRAMES, PIPELINE, Frame
 
@@ -247,20 +245,6 @@ POLICIES = ("random", "random_with_repetition", "predicted_entropy", "oracle_ent
 """The policies of `ladder` that the thesis evaluates."""
 
 
-def walk(
-    lattice: LatticeTables, graph: ViewGraph, config: GridConfig, frame: Frame, policies: Sequence[PolicyRecord]
-) -> dict[str, Results]:
-    """The grid (backbones, objects, MV, CT) of every policy; random selection in exact expectation where possible."""
-    table = lattice.stacked(frame)
-    max_views = min(config.max_views, lattice.entropy.shape[1])
-    key = jax.random.key(config.seed)
-    found = run_grid(key, table, graph, None, policies, max_views=max_views, draws=config.draws)
-    if "random" in found:
-        everywhere = np.ones(lattice.entropy.shape[1], bool)
-        found["random"], _ = exactly_random(found["random"], table.logits, table.label, everywhere)
-    return found
-
-
 def _gain(policy: Results, base: Results, field: str = "right") -> Gain:
     """Difference between two policies, with intervals over objects."""
     each = np.asarray(getattr(policy, field)) - np.asarray(getattr(base, field))
@@ -301,11 +285,11 @@ def pipeline(
     test: LatticeTables, validation: LatticeTables, statistics: DatasetStatistics, config: GridConfig
 ) -> Pipeline:
     """The thesis's multi-view grid on one lattice: Tables 7–8 and 10–15, and the confusion matrices of Fig. 23."""
-    graph = statistics.graph
+    setting = Setting.of(statistics.graph, None, config)
     policies = [*(policy for policy in ladder() if policy.name in POLICIES), SCRAMBLED]
-    found = walk(test, graph, config, "world", policies)
-    camera = walk(test, graph, config, "camera", [policy for policy in policies if policy.knows == "networks"])
-    chosen = walk(validation, graph, config, "world", [policy_record("predicted_entropy")])
+    found, _ = setting.with_random(test.stacked("world"), policies)
+    camera = setting.walk(test.stacked("camera"), [policy for policy in policies if policy.knows == "networks"])
+    chosen = setting.walk(validation.stacked("world"), [policy_record("predicted_entropy")])
     max_views = found["random"].after.shape[-1]
     headline_mv = min(HEADLINE_MV, max_views)
     confusions = {

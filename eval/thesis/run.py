@@ -25,7 +25,7 @@ from eval.machine import NO_ACCELERATOR, machine
 from eval.rendering.ascent import METHODS
 from eval.settings import Settings
 from eval.tables import objects_of
-from eval.thesis.figures import FigureInputs
+from eval.thesis.layout import FigureInputs
 from eval.thesis.page import write_thesis_report
 from eval.thesis.results import BackboneTraining, LatticeTables, ThesisResults, grids_of
 from eval.thesis.seeds import csv_over_trainings, folders_of, over_trainings, table_of

@@ -111,6 +111,11 @@ def read_object(
     return right[FIRST_MV - 1 :], used[FIRST_MV - 1 :], after, travelled
 
 
+def of_backbones(tables: ViewTable) -> ViewTable:
+    """The tables of objects with an axis of backbones; of one backbone if they have none."""
+    return tables if tables.logits.ndim == 4 else replace(tables, logits=tables.logits[:, None])
+
+
 def run_grid(
     key: Array,
     tables: ViewTable,
@@ -126,10 +131,10 @@ def run_grid(
 
     Args:
         key: for random policies.
-        tables: view tables with a leading axis of objects; logits (objects, backbones, views, classes). Predicted entropies may
-            have an axis of backbones too: a backbone is then a whole system, such as one of several trainings.
+        tables: view tables with a leading axis of objects; logits may have an axis of backbones after it. Predicted entropies may
+            have that axis too: a backbone is then a whole system, such as one of several trainings.
         graph: the candidate views.
-        knowledge: statistics of other objects, with a leading axis of backbones; None if no policy needs them.
+        knowledge: statistics of other objects, with a leading axis of backbones if logits have it; None if no policy needs them.
         policies: the policies, whose names differ.
         max_views: the largest MV.
         draws: walks of a random policy from each start view.
@@ -138,6 +143,8 @@ def run_grid(
     Returns:
         Results by policy. Unreachable start views have weight zero.
     """
+    if tables.logits.ndim == 3:
+        tables, knowledge = of_backbones(tables), jax.tree.map(lambda leaf: leaf[None], knowledge)
     objects, starts = (np.arange(len(tables.label)), tables), len(graph.points)
     most = _WALKS_IN_CACHE if jax.default_backend() == "cpu" else _WALKS_AT_ONCE
 

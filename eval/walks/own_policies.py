@@ -149,7 +149,7 @@ def _faults_along(
     key: Array,
     policy: Policy,
     graph: ViewGraph,
-    knowledge: Knowledge,
+    knowledge: Knowledge | None,
     reachable: Bool[Array, " views"] | None,
 ) -> Bool[Array, "starts 2"]:
     """Whether scores along walks are NaN, and whether they rank no view, since all candidates have the same infinite score.
@@ -182,7 +182,7 @@ def check_scores(
     tables: ViewTable,
     walks: Int[np.ndarray, "objects starts steps"],
     graph: ViewGraph,
-    knowledge: Knowledge,
+    knowledge: Knowledge | None,
     reachable: Bool[AnyArray, " views"] | None,
 ) -> None:
     """Checks the scores of a user's policy along walks, the first of each start view.

@@ -15,6 +15,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from data_pipeline.files import keep_json
 from eval.learned.stage import learn_to_choose
 from eval.settings import TINY
 from eval.stages import ascend_on_objects, report
@@ -77,7 +78,7 @@ def test_networks_for_another_number_of_views_are_refused(whole, tmp_path, refus
 
 
 @pytest.mark.slow
-def test_learning_writes_a_page_and_is_not_repeated(studied, tmp_path):
+def test_learning_writes_a_page_and_is_not_repeated(studied, tmp_path, capsys):
     """What `mevs study learned` adds to a run, with ablations and classes that are left out."""
     out = tmp_path / "run"
     shutil.copytree(studied, out)
@@ -87,6 +88,12 @@ def test_learning_writes_a_page_and_is_not_repeated(studied, tmp_path):
     assert learn_to_choose(LEARNED, out).read_text() == page
     assert summary.stat().st_mtime_ns == made_once
     assert "Learned fusion and view selection" in report(LEARNED, "tiny", out).read_text()
+    trained_again = out / "learned" / "seed_0" / "recogniser" / "summary.json"
+    keep_json(trained_again, json.loads(trained_again.read_text()) | {"best_epoch": 99})
+    capsys.readouterr()
+    assert "Learned fusion and view selection" not in report(LEARNED, "tiny", out).read_text()
+    left_out = f"so the report leaves it out; make it again with: mevs study learned --out {out}"
+    assert left_out in " ".join(capsys.readouterr().err.split())
     said = [
         "6 candidate views",
         "Unknown yaw",

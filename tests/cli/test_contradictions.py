@@ -77,9 +77,9 @@ def test_a_report_says_what_was_done(whole, tmp_path, refuses):
     content["settings"]["classifier"]["optimiser"]["epochs"] = 2
     content["settings"]["evaluation"]["draws"] = 5
     (out / "run.json").write_text(json.dumps(content))
-    assert "metrics.json was made with other settings (evaluation.draws 2, not 5); make it again with" in refuses(
-        "report", "--out", out
-    )
+    said = "metrics.json is stale (its settings were others: evaluation.draws 2, not 5); make it again with: mevs eval --out"
+    assert said in refuses("report", "--out", out)
+    assert said in refuses("export", "--out", out, "--to", tmp_path / "system")
 
 
 def test_what_a_run_of_version_0_1_was_made_with_is_compared_with_the_options(whole, tmp_path, refuses, at_once):

@@ -148,6 +148,8 @@ def test_an_encoder_is_the_classifier_of_a_run(evaluated, data, whole, tmp_path,
     assert f"classifier: <code>nets.py:net</code> (source {summary['encoder']['source']})" in page
     assert "ResNet" not in page
     # Edited, it is another network: the run goes on with the numbers of the one that was trained, and trains no other.
+    path.write_text("an edit that is not finished")
+    ended(at_once("report", "--out", out))  # which computes nothing with it
     path.write_text(ENCODER.replace("::4, ::4", "1::4, ::4"))
     ended(at_once("eval", "--out", out))
     assert json.loads((out / "run.json").read_text())["encoder"] == run["encoder"]

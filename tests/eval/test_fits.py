@@ -7,6 +7,7 @@ is planted.
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -15,10 +16,14 @@ import pytest
 from flax import nnx
 
 import eval.learned.measure as measuring
+import eval.learned.study as studying
+import eval.runs as of_run
+import train.choosing.stages as choosing
+from data_pipeline.errors import DataError
 from eval.learned.study import novel_classes, novel_metrics, order_of_fused, study, walk_metrics
 from eval.learned.walks import OnLattice, Walking, by_network
 from eval.numbers.comparison import views_to_reach
-from eval.numbers.confidence import stopping
+from eval.numbers.confidence import stops_of
 from eval.settings import TINY
 from eval.tables import save_view_tables
 from eval.walks.grid import Results
@@ -26,9 +31,11 @@ from eval.walks.knowledge import order_of_sums
 from mevs_jax import fibonacci_sphere
 from tests.reference.choosing import CLASSES, some_policy
 from tests.reference.evaluation import some_tables
-from tests.reference.made_up_study import Study
+from tests.reference.made_up_study import STUDIED, Study
 from train.choosing.features import Features
+from train.choosing.stages import Stages
 from train.results.identity import VERSIONS
+from train.results.records import as_json
 
 VIEWS = 16
 """So many that oracles and costs are tried from some start views only."""
@@ -57,6 +64,16 @@ def test_a_fixed_order_serves_every_class_alike(adding):
     within = order_of_sums(told, labels, reachable)
     assert within.views[0] == common
     assert sorted(within.views) == np.flatnonzero(reachable).tolist()
+
+
+def test_an_order_of_any_length_is_fitted_by_one_program(adding, monkeypatch):
+    shapes, real = set(), studying.over_objects
+    monkeypatch.setattr(
+        studying, "over_objects", lambda *given, **how: shapes.add(given[3].shape) or real(*given, **how)
+    )
+    data = features_of(np.arange(8) % CLASSES, np.tile(np.arange(VIEWS) % 3 > 0, (8, 1)))
+    assert sorted(order_of_fused(adding, data, 3).views) == list(range(VIEWS))
+    assert shapes == {(3,)}
 
 
 def test_temperatures_serve_every_class_alike():
@@ -110,7 +127,7 @@ def test_policies_without_classes_are_tested_on_objects_of_these(adding):
     for pair, right in (((0, 2), 1.0), ((1, 3), 0.0)):
         each = novel_classes(adding, [(pair, policy)], policy, test, Walking(2, 1))
         assert {one.shape for one in each.values()} == {(2, np.isin(labels, pair).sum())}
-        (row,) = novel_metrics(each, [pair], labels)["pairs"]
+        (row,) = as_json(novel_metrics(each, [pair], labels))["pairs"]
         assert row["objects"] == np.isin(labels, pair).sum()
         assert row["random"] == row["trained_without"] == row["trained_with"] == [right] * 2
 
@@ -135,14 +152,17 @@ def test_the_risk_that_is_allowed_is_that_of_those_who_stop():
     """Of every object half of the walks stop, and of these one in two is wrong."""
     confidence = np.tile([[0.95], [0.95], [0.1], [0.1]], (6, 1, 1))
     right = np.tile([[True], [False], [True], [False]], (6, 1, 1))
-    (row,) = stopping(confidence, right, [0.1])
-    assert (row["sure"], row["error"]) == (0.5, 0.5)
-    assert row["excess"] == pytest.approx([0.25 - 0.1 * 0.5] * 2, abs=1e-6)
+    (row,) = stops_of(confidence, right, [0.1])
+    assert (row.sure, row.error) == (0.5, 0.5)
+    assert row.excess == pytest.approx([0.25 - 0.1 * 0.5] * 2, abs=1e-6)
 
 
 @pytest.mark.slow
 def test_walks_are_computed_anew_when_what_they_are_of_was(tmp_path, monkeypatch):
-    """The data set and the recogniser, the view policies, or PointNet++; and when they mean something else."""
+    """The data set and the recogniser, the view policies, or PointNet++; and when they mean something else.
+
+    The metrics of the study are then stale, and a report says why; view tables of networks that are there no more are refused.
+    """
     config = replace(TINY.learned, max_views=3, draws=1, ablations=("look_ahead",), novel=1)
     stages, computed = Study(None, tmp_path, monkeypatch, config).stages, list[str]()
     made = {"networks": 0, "policies": 0, "tables": 0}
@@ -155,26 +175,63 @@ def test_walks_are_computed_anew_when_what_they_are_of_was(tmp_path, monkeypatch
         computed.append("novel")
         return {name: np.ones((3, 4)) for name in ("random", "trained_with")}
 
-    def computed_with() -> list[str]:
-        for split in ("val", "test"):
-            tables = replace(some_tables(), made_by=str(made["tables"]))
+    def evaluated() -> None:
+        for split in measuring.SPLITS:
+            tables = replace(some_tables(), made_by=of_run.tables_made_by(STUDIED, tmp_path))
             save_view_tables(tmp_path / "tables" / f"{split}.npz", tables)
+
+    def measured() -> dict[str, Any]:
         computed.clear()
-        measuring.measure(stages)
-        return sorted(computed)
+        metrics = {"seeds": [measuring.measure(stages)], "settings": as_json(config)}
+        assert measuring.why_stale(metrics, [stages]) is None
+        return metrics
 
     monkeypatch.setattr(measuring, "made_by", lambda *given: str(made["networks"]))
-    monkeypatch.setattr(measuring, "read_json", lambda path: {"identity": made["policies"]})
+    monkeypatch.setattr(of_run, "made_by", lambda *given: str(made["tables"]))
+    monkeypatch.setattr(measuring, "read_json", lambda path: {"identity": {"made_by": made["policies"]}})
     monkeypatch.setattr(measuring, "_decision", lambda stages: {})
     monkeypatch.setattr(measuring, "study", walk)
     monkeypatch.setattr(measuring, "novel_classes", walk_novel)
     every = ["lattice"] * 5 + ["novel"]
-    assert computed_with() == every
-    assert computed_with() == []  # everything is there
+    evaluated()
+    metrics = measured()
+    assert sorted(computed) == every
+    measured()
+    assert computed == []  # everything is there
     for name in made:
         made[name] += 1
+        if name == "tables":
+            with pytest.raises(DataError, match=r"val\.npz is stale .*; make it again with: mevs eval --out"):
+                measured()
+        evaluated()
+        reason = "its settings were others: policies" if name == "policies" else "the data, networks or results that"
+        assert measuring.why_stale(metrics, [stages]).startswith(reason)
+        metrics = measured()
         # PointNet++ is used with known and unknown pose, and in ablations; others are of other views.
-        assert computed_with() == (["lattice"] * 3 if name == "tables" else every), name
-    monkeypatch.setitem(VERSIONS, "walks", VERSIONS["walks"] + 1)
-    assert computed_with() == every
-    assert computed_with() == []
+        assert sorted(computed) == (["lattice"] * 3 if name == "tables" else every), name
+    for kind in ("walks", "features"):
+        monkeypatch.setitem(VERSIONS, kind, VERSIONS[kind] + 1)
+        assert measuring.why_stale(metrics, [stages]), kind
+        metrics = measured()
+        assert sorted(computed) == every, kind
+    measured()
+    assert computed == []
+    monkeypatch.setitem(VERSIONS, "network", VERSIONS["network"] + 1)  # of view policies, which are not trained here
+    assert "it is of version 1 of such results" in measuring.why_stale(metrics, [stages])
+    assert measuring.why_stale(metrics | {"settings": as_json(replace(config, draws=2))}, [stages]).startswith(
+        "its settings"
+    )
+    assert not {"arrays"} & set(metrics["seeds"][0]["lattices"]["6"])
+
+
+def test_classes_without_test_objects_are_not_left_out(tmp_path, monkeypatch):
+    """No policy is trained without them, and nothing is walked."""
+    stages = Study(None, tmp_path, monkeypatch, replace(TINY.learned, novel=5)).stages
+    assert measuring._pairs(stages) == [(0, 1)]
+    counts = {"a": 0, "b": 0, "c": 8}
+    monkeypatch.setattr(
+        choosing, "load_statistics", lambda _: replace(STUDIED, counts=STUDIED.counts | {"test": counts})
+    )
+    stages = Stages(stages.config, stages.dataset, tmp_path)
+    assert measuring._pairs(stages) == []
+    assert measuring.novel_together([stages]) is None

@@ -9,7 +9,6 @@ from functools import cache, partial
 from pathlib import Path
 from typing import Any
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -265,7 +264,7 @@ def test_policies_of_users_know_validation_objects(change, monkeypatch):
                 EvaluationInputs(tables, VALIDATION, STATISTICS.graph, SETTINGS.evaluation),
                 {"fixed_order": POLICIES["fixed_order"]},
             )
-    assert known[0].order.shape == (1, VIEWS)
+    assert known[0].order.shape == (VIEWS,)
     check_fitted(*known)
 
 
@@ -303,7 +302,7 @@ def test_no_half_of_the_validation_objects_is_walked_with_knowledge_of_itself(mo
     walked = []
 
     def run_grid(key, tables, graph, knowledge, policies, **rest):
-        walked.append((np.asarray(tables.logits[:, 0]), knowledge))
+        walked.append((np.asarray(tables.logits), knowledge))
         return walk_grid_anyhow(key, tables, graph, knowledge, policies, **rest)
 
     monkeypatch.setattr(system, "run_grid", run_grid)
@@ -313,7 +312,7 @@ def test_no_half_of_the_validation_objects_is_walked_with_knowledge_of_itself(mo
         others = ~np.isin(VALIDATION.logits[:, 0, 0], logits[:, 0, 0])
         assert others.sum() == OBJECTS - len(logits)
         expected = learn(jnp.asarray(VALIDATION.logits[others]), jnp.asarray(VALIDATION.labels[others]))
-        check_fitted(jax.tree.map(lambda leaf: leaf[0], knowledge), expected)
+        check_fitted(knowledge, expected)
 
 
 def best_after_views(after_views: dict[str, list[float]]) -> str:
@@ -329,7 +328,6 @@ def test_the_best_policy_is_not_the_one_that_is_best_on_test_objects(runs):
 
 def test_no_figure_of_test_objects_decides_what_a_system_uses(monkeypatch):
     """Whichever policy wins on test objects, and however far."""
-    classify, predict = of_run.tasks(SETTINGS, STATISTICS)
     trained, made = networks(), []
     monkeypatch.setattr(system, "run_grid", walk_grid_anyhow)
     on_validation = system.walk_validation(VALIDATION, STATISTICS.graph, 4)
@@ -337,7 +335,7 @@ def test_no_figure_of_test_objects_decides_what_a_system_uses(monkeypatch):
     monkeypatch.setattr(of_run.Run, "tables", lambda *_: VALIDATION)
     monkeypatch.setattr(of_run.Run, "classifier", lambda _: trained["classifier"])
     monkeypatch.setattr(of_run.Run, "predictor", lambda _: trained["entropy"])
-    run = of_run.Run(Path("run"), STATISTICS, classify, predict)
+    run = of_run.Run(Path("run"), STATISTICS, SETTINGS)
     for winner in system.USABLE:
         after = {name: [float(name == winner)] * 4 for name in system.USABLE}
         figures = {"objects": OBJECTS, "single_view": float(winner == "random"), "after_views": after}

@@ -28,7 +28,7 @@ from data_pipeline.objects.recipes import FurniturePiece
 from eval.learned.walks import OnLattice
 from eval.settings import TINY
 from eval.tables import ViewTables
-from eval.walks.grid import Results, read_object
+from eval.walks.grid import Results, of_backbones, read_object
 from mevs_jax.geometry.viewpoints import ViewGraph
 from mevs_jax.policies.base import as_tree
 from mevs_jax.policies.registry import PolicyRecord
@@ -190,15 +190,15 @@ def walk_grid_anyhow(
     Args:
         second: the second view of all walks of some policies; what else they see is random, too.
     """
-    objects, backbones, views, _ = tables.logits.shape
-    found = {}
+    shown, found = of_backbones(tables), {}
+    objects, backbones, views, _ = shown.logits.shape
     for policy in policies:
         given = _given(tables, policy.knows == "truth"), graph, knowledge, policy.name, sorted(rest.items())
         seed = seed_of((jax.random.key_data(key), given))
         planted = (second or {}).get(policy.name)
         one = some_walks(seed, objects * backbones, range(views), views, rest["max_views"], planted)
         walks = jnp.asarray(one.reshape(backbones, objects, views, -1))
-        found[policy.name] = Results(*_read(tables, graph.distances, walks), walks[:, :, :, None])
+        found[policy.name] = Results(*_read(shown, graph.distances, walks), walks[:, :, :, None])
     return found
 
 

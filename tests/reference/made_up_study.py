@@ -16,6 +16,7 @@ from scipy.spatial.transform import Rotation
 
 import eval.learned.measure as measuring
 import eval.learned.system as exporting
+import eval.runs as of_run
 import train.choosing.stages as choosing
 from eval.settings import TINY
 from mevs_jax import fibonacci_sphere
@@ -84,7 +85,7 @@ class Study:
         self._change, self._policies = change, dict[Path, nnx.Module]()
         statistics = other_statistics(STUDIED) if change else STUDIED
         dataset = replace(TINY.dataset, capture=replace(TINY.dataset.capture, views=VIEWS))
-        for module in (choosing, measuring, exporting):
+        for module in (choosing, measuring, exporting, of_run):
             for name, replacement in {
                 "load_statistics": lambda folder: statistics,
                 "made_by": lambda statistics, *networks: " ".join(str(folder.relative_to(out)) for folder in networks),
@@ -95,7 +96,7 @@ class Study:
                 "warn_of_chance": lambda *given: None,
                 "network_outputs": self._outputs,
                 "train_policies": self._trained,
-                "train_all_by_q_learning": self._trained,
+                "train_by_q_learning": self._trained,
                 "is_stored": lambda folder, identity: False,
                 "trained_once": self._trained_once,
             }.items():

@@ -23,7 +23,7 @@ from tests.reference.choosing import CLASSES, fusion_of, some_features
 from tests.reference.weights import untrained
 from train.choosing.averaged import AveragedConfig, Fitting, fit_together
 from train.choosing.calibrated import calibrated
-from train.choosing.policy import PolicyConfig, train_policy
+from train.choosing.policy import Lesson, PolicyConfig, train_policies
 from train.choosing.q_learning import QLearningConfig, train_by_q_learning
 from train.results.chance import Chance, warn_of_chance, wilson_interval
 from train.results.finite import all_finite, check_outputs, check_results, place_not_finite
@@ -79,14 +79,14 @@ def test_averaged_weights_are_never_untrained_nor_infinite(worth, validates):
         fit(nnx.State({"a": jnp.ones(3), "b": jnp.full(2, worth)}), data, checks)
 
 
-@pytest.mark.parametrize("train", [train_policy, pytest.param(train_by_q_learning, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("train", [train_policies, pytest.param(train_by_q_learning, marks=pytest.mark.slow)])
 def test_a_policy_that_diverges_is_named(train):
-    config = {train_policy: PolicyConfig, train_by_q_learning: QLearningConfig}[train](
+    config = {train_policies: PolicyConfig, train_by_q_learning: QLearningConfig}[train](
         width=8, heads=2, blocks=1, most_seen=2, walks=1, rounds=1, epochs=4, batch_size=8, learning_rate=1e38
     )
-    option = "--learned.policy.learning-rate" if train is train_policy else "--learned.q-learning.learning-rate"
+    option = "--learned.policy.learning-rate" if train is train_policies else "--learned.q-learning.learning-rate"
     with pytest.raises(Diverged, match=rf"the view policy \(it\), round 1 of 1, diverged .* lower {option} \(1e\+38"):
-        train(config, [(fusion_of(5, CLASSES), some_features(16))], name="view policy (it)")
+        train(config, [Lesson(0, [(fusion_of(5, CLASSES), some_features(16))], name="view policy (it)")])
 
 
 def test_a_fusion_is_not_calibrated_on_beliefs_that_are_not_finite():

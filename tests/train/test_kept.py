@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import ast
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -199,7 +201,7 @@ def test_arrays_that_were_edited_are_computed_again(tmp_path, capsys):
 @pytest.mark.parametrize(
     ("now", "version", "sentence"),
     [
-        ({"made_by": "other networks"}, 1, "the data or the networks that it was made from are others now"),
+        ({"made_by": "other networks"}, 1, "the data, networks or results that it was made from are others now"),
         ({"reach": {"lowest": 20}}, 1, "its settings were others: reach.lowest 0, not 20"),
         ({}, 2, "it is of version 1 of such results, and this program has version 2"),
     ],
@@ -227,8 +229,12 @@ def test_arrays_of_another_version_are_computed_anew(tmp_path, monkeypatch, caps
     monkeypatch.setitem(VERSIONS, "tables", 2)
     assert kept_array(path, stamp_of("tables", "made"), lambda: np.ones(1))[0] == 1
     assert "it is of version 1 of such results" in " ".join(capsys.readouterr().err.split())
-    assert kept_array(path, stamp_of("tables", "other"), lambda: np.full(1, 2.0))[0] == 2
-    assert "the networks that it was made from are others now" in " ".join(capsys.readouterr().err.split())
+    assert (
+        kept_array(path, stamp_of("tables", "other 1.0"), lambda: np.full(1, 2.0))[0] == 2
+    )  # with a dot, as FITTED_AS has
+    assert "the data, networks or results that it was made from are others now" in " ".join(
+        capsys.readouterr().err.split()
+    )
 
 
 @dataclass(frozen=True)
@@ -244,3 +250,13 @@ def test_a_record_is_kept_under_its_identity(tmp_path, capsys):
     keep_json(path, {"share": 1.0, "identity": {"version": 1}})  # of another form
     assert kept_record(path, Value, {"version": 1}, lambda: Value(3.0)) == Value(3.0)
     assert "another form" in " ".join(capsys.readouterr().err.split())
+
+
+def test_every_kind_of_result_has_a_version_that_is_used():
+    root, used = Path(__file__).parents[2], set()
+    for path in (*(root / "train").rglob("*.py"), *(root / "eval").rglob("*.py")):
+        for node in ast.walk(ast.parse(path.read_text())):
+            called = isinstance(node, ast.Call) and isinstance(node.func, ast.Name) and node.func.id
+            if called in ("identity_of", "stamp_of") and isinstance(node.args[0], ast.Constant):
+                used.add(node.args[0].value)
+    assert used == set(VERSIONS)

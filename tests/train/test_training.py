@@ -90,7 +90,10 @@ def test_a_stopped_run_ends_as_if_it_had_not_been(quick, whole, tmp_path, monkey
     monkeypatch.undo()
     with (tmp_path / "metrics.jsonl").open("a") as file:
         file.write('{"step": 99999, "half a line')  # killed while writing
+    validated = []
+    monkeypatch.setattr(train.loop, "validate", lambda *given: validated.append(1) or real_validate(*given))
     summary = train_in(tmp_path)
+    assert len(validated) == summary["epoch"] - 1  # the first epoch is not trained again
 
     expected = json.loads((whole / "summary.json").read_text())
     assert summary | {"seconds": 0} == expected | {"seconds": 0}
@@ -135,7 +138,9 @@ def test_a_finished_run_may_be_lengthened(quick, tmp_path, capsys):
     quick(epochs=1)[1](tmp_path / "lengthened")
     task, train_in = quick(epochs=2, patience=9)
     summary = train_in(tmp_path / "lengthened")
-    assert "(task.optimiser.epochs 1, not 2; task.optimiser.patience" in " ".join(capsys.readouterr().err.split())
+    said = " ".join(capsys.readouterr().err.split())
+    assert "(task.optimiser.epochs 1, not 2; task.optimiser.patience" in said
+    assert "resuming after epoch 1" in said
     expected = train_in(tmp_path / "whole")
     for key in ("epoch", "steps", "best_epoch", "best"):
         assert summary[key] == expected[key], key
@@ -154,7 +159,7 @@ def test_a_finished_run_may_be_lengthened(quick, tmp_path, capsys):
             train_in(tmp_path / "lengthened", task=other)
 
 
-def test_an_interrupted_run_may_go_on_in_parts_and_half_precision(quick, tmp_path, monkeypatch):
+def test_an_interrupted_run_may_go_on_in_parts_and_half_precision(quick, tmp_path, monkeypatch, capsys):
     """What is there stays as it was until an epoch was trained so."""
     real, calls = train.loop.validate, itertools.count(1)
 
@@ -173,7 +178,9 @@ def test_an_interrupted_run_may_go_on_in_parts_and_half_precision(quick, tmp_pat
         smaller(tmp_path)
     assert config_of(tmp_path)["task"]["optimiser"]["parts"] == 1
     monkeypatch.undo()
+    capsys.readouterr()
     assert smaller(tmp_path)["epoch"] == 2
+    assert "resuming after epoch 1" in " ".join(capsys.readouterr().err.split())
     assert config_of(tmp_path)["task"]["optimiser"]["parts"] == 2
 
 

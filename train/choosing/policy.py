@@ -241,46 +241,34 @@ def new_policy(config: PolicyConfig, classes: int, posed: bool = True, cloud: in
     )
 
 
-def train_policy(
-    config: PolicyConfig,
-    parts: Sequence[Seen],
-    validation: Seen | None = None,
-    name: str = "view policy",
-) -> Trained:
-    """Returns the policy after all rounds, and the losses by round and epoch.
-
-    Args:
-        parts: objects to learn from, each part with features and fusion of a recogniser that was trained without it.
-        validation: other objects, which decide which epoch is best; if None, the last epoch is taken.
-        name: name of the policy, for messages.
-
-    Raises:
-        Diverged: if a loss or a weight is infinite or NaN.
-    """
-    return train_policies(config, [Lesson(config.seed, parts, validation, name)])[0]
-
-
 @dataclass(frozen=True)
 class Lesson:
     """What one of several policies that are trained together learns from.
 
     Attributes:
         seed: of its weights, walks and batches.
-        parts, validation, name: as of `train_policy`.
+        parts: objects to learn from, each part with features and fusion of a recogniser that was trained without it.
+        validation: other objects, which decide which epoch is best; if None, the last epoch is taken.
+        name: of the policy, for messages.
     """
 
     seed: int
     parts: Sequence[Seen]
-    validation: Seen | None
-    name: str
+    validation: Seen | None = None
+    name: str = "view policy"
 
 
 def train_policies(config: PolicyConfig, lessons: Sequence[Lesson]) -> list[Trained]:
-    """Returns for each lesson what `train_policy` returns; the policies are trained together (`fit_together`).
+    """Returns for each lesson the policy after all rounds, and its losses by round and epoch.
+
+    The policies are trained together (`fit_together`).
 
     Args:
         config: of all policies; each lesson has a seed of its own.
         lessons: all with as many objects, views and parts.
+
+    Raises:
+        Diverged: if a loss or a weight is infinite or NaN.
     """
     return in_rounds(config, lessons, _gather, _fit)
 

@@ -138,21 +138,8 @@ def _exploring(
     return jnp.where(jax.random.bernoulli(whether, share), any_view, greedy(key, state, scene))
 
 
-def train_by_q_learning(
-    config: QLearningConfig,
-    parts: Sequence[Seen],
-    validation: Seen | None = None,
-    name: str = "view policy",
-) -> Trained:
-    """Returns the network after all rounds, for use with `by="state"`, and the losses by round and epoch.
-
-    Arguments are those of `train_policy`.
-    """
-    return train_all_by_q_learning(config, [Lesson(config.seed, parts, validation, name)])[0]
-
-
-def train_all_by_q_learning(config: QLearningConfig, lessons: Sequence[Lesson]) -> list[Trained]:
-    """Returns for each lesson what `train_by_q_learning` returns; the networks are trained together, as by `train_policies`."""
+def train_by_q_learning(config: QLearningConfig, lessons: Sequence[Lesson]) -> list[Trained]:
+    """Returns a network for each lesson, as `train_policies` does, for use with `by="state"`."""
     return in_rounds(config, lessons, _gather, _fit)
 
 

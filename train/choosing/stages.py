@@ -37,13 +37,13 @@ from train.choosing.expected import FITTED_AS, fit_expected_views
 from train.choosing.features import Features
 from train.choosing.looks import answers, embed, see, see_changed, see_in_reality, see_rotated
 from train.choosing.policy import Lesson, PolicyConfig, Seen, Trained, new_policy, train_policies
-from train.choosing.q_learning import QLearningConfig, train_all_by_q_learning
+from train.choosing.q_learning import QLearningConfig, train_by_q_learning
 from train.choosing.variants import VARIANTS
 from train.loop import fit, load_best
 from train.many.seeds import train_seeds
 from train.results.chance import warn_of_chance
 from train.results.finite import check_outputs
-from train.results.identity import made_by
+from train.results.identity import identity_of, made_by, stamp_of
 from train.results.kept import kept_array
 from train.results.networks import is_stored, trained_once
 from train.results.outputs import Ask, network_outputs
@@ -188,7 +188,7 @@ class Stages:
             ask = see if self.upright is None else see_rotated(self._viewpoints)
         seen = kept_array(
             self.folder / "features" / f"{name}.npz",
-            made_by(load_statistics(data), folder),
+            stamp_of("features", made_by(load_statistics(data), folder)),
             lambda: network_outputs(data, split, task, self.recogniser(fold), ask, chosen).astype(np.float32),
         )
         check_outputs(seen, task.name, f"objects in the features {name}")
@@ -234,7 +234,7 @@ class Stages:
 
         path = self.folder / "features" / "expected_views.npz"
         made = f"{made_by(self.statistics, self.recogniser_folder())} {FITTED_AS}"
-        return ExpectedViews(jnp.asarray(kept_array(path, made, fitted)))
+        return ExpectedViews(jnp.asarray(kept_array(path, stamp_of("features", made), fitted)))
 
     def pose_head(self) -> PoseHead | None:
         """Returns the recogniser's network for the pose of objects; None if it has none."""
@@ -273,7 +273,7 @@ class Stages:
         task = EntropyTask.of(self.entropy, statistics.views, statistics.entropy_max, statistics.camera)
         found = kept_array(
             self.out / "learned" / "clouds" / f"{data.name}_{split}.npz",
-            made_by(load_statistics(data), folder),
+            stamp_of("features", made_by(load_statistics(data), folder)),
             lambda: network_outputs(data, split, task, load_best(task, folder), embed).astype(np.float32),
         )
         return jnp.asarray(check_outputs(found, task.name, f"{split} objects"))
@@ -315,7 +315,8 @@ class Stages:
             assert self.entropy is not None
             made, cloud = [*made, self.out / "entropy"], self.entropy.network.global_layers[-1]
         changed = self.config.changed if variant.changed and variant.learns_from == "validation" else 0
-        identity = {"made_by": made_by(self.statistics, *made), "of": asdict(config), "changed": changed}
+        made_from = stamp_of("features", made_by(self.statistics, *made))
+        identity = identity_of("network", made_by=made_from, of=asdict(config), changed=changed)
         left_out = [
             *(f"without_{label}" for label in without),
             *([] if aside is None else [f"aside_{aside[0]}_of_{aside[1]}"]),
@@ -378,7 +379,7 @@ def trained_policies(jobs: Sequence[PolicyJob]) -> list[ViewPolicy]:
     def train(some: Sequence[PolicyJob]) -> list[Trained]:
         config, lessons = some[0].config, [job.lesson() for job in some]
         if isinstance(config, QLearningConfig):
-            return train_all_by_q_learning(config, lessons)
+            return train_by_q_learning(config, lessons)
         return train_policies(config, lessons)
 
     together = cache(lambda: train(waiting))

@@ -47,12 +47,12 @@ def identity_of(kind: str, **content: Any) -> dict[str, Any]:
 
 def stamp_of(kind: str, made: str) -> str:
     """Returns what names the origin of arrays that are kept without JSON: what made them, and the version of their kind."""
-    return made if VERSIONS[kind] == 1 else f"{made}.{VERSIONS[kind]}"
+    return made if VERSIONS[kind] == 1 else f"{made}@{VERSIONS[kind]}"
 
 
 def why_other_stamp(was: str, now: str) -> str | None:
     """Returns why arrays with one stamp are not those of another, in a few words; None if they are the same."""
-    (made_before, _, before), (made_now, _, version) = was.partition("."), now.partition(".")
+    (made_before, _, before), (made_now, _, version) = was.partition("@"), now.partition("@")
     return why_other(
         {"version": int(before or 1), "made_by": made_before}, {"version": int(version or 1), "made_by": made_now}
     )
@@ -72,7 +72,7 @@ def why_other(was: Any, now: Any) -> str | None:
     made_from = ("made_by", "tables_made_by", "by_view")
     if settings := {place: pair for place, pair in found.items() if place.split(".")[0] not in made_from}:
         return f"its settings were others: {in_words(settings)}" if all(settings) else "its settings were others"
-    return "the data or the networks that it was made from are others now"
+    return "the data, networks or results that it was made from are others now"
 
 
 def why(error: Exception) -> str:

@@ -93,24 +93,40 @@ def kept(
     return load(path)
 
 
-def kept_json(path: Path, identity: Any, compute: Callable[[], dict[str, Any]]) -> dict[str, Any]:
+def kept_json(
+    path: Path,
+    identity: Any,
+    compute: Callable[[], Any],
+    read: Callable[[dict[str, Any]], Any] = lambda content: content,
+) -> Any:
     """Returns the content of a JSON file; computes it first unless the file's `"identity"` is `identity`.
 
     Args:
-        compute: returns the content. The identity is added as the last entry, or replaces an `"identity"` entry in its place.
+        compute: returns the content, or a pair of it and the arrays beside it. The identity is added as the last entry, or
+            replaces an `"identity"` entry in its place.
+        read: makes the result of the content. A file that it raises for is made again.
     """
-    return _kept_content(path, identity, lambda: (compute(), None), lambda content: content)
+    identity = as_json(identity)
+
+    def load(path: Path) -> Any:
+        content = read_json(path)
+        reason = why_other(content["identity"], identity)
+        return reason, read(content) if reason is None else None
+
+    def save(path: Path, made: Any) -> None:
+        content, arrays = made if isinstance(made, tuple) else (made, None)
+        if arrays is not None:
+            written = npz_bytes(**arrays)
+            write_bytes(path.with_suffix(".npz"), written)
+            content = content | {_ARRAYS: check_of(written)}
+        keep(path, json_of(content | {"identity": identity}))
+
+    return kept(path, load, save, lambda stored: stored[0], compute)[1]
 
 
 def kept_record(path: Path, kind: type[Result], identity: Any, compute: Callable[[], Result]) -> Result:
-    """Returns the record in a JSON file; computes it first unless the file's `"identity"` is `identity`.
-
-    Args:
-        kind: the class of the record, as `from_json` reads it. A file that holds something else is made again.
-    """
-    return _kept_content(
-        path, identity, lambda: (as_json(compute()), None), lambda content: record_in(kind, content, path)
-    )
+    """As `kept_json` for a record, whose class is `kind`."""
+    return kept_json(path, identity, lambda: as_json(compute()), lambda content: record_in(kind, content, path))
 
 
 def record_in(kind: type[Result], content: dict[str, Any], path: Path) -> Result:
@@ -126,7 +142,11 @@ def kept_with_arrays(
     The JSON file holds the check of the arrays and is written last. Arrays of another result are therefore never taken for those
     of this one, wherever a job ends.
     """
-    return _kept_content(path, identity, compute, lambda content: (content, arrays_beside(path, content)))
+
+    def read(content: dict[str, Any]) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
+        return {name: value for name, value in content.items() if name != _ARRAYS}, arrays_beside(path, content)
+
+    return kept_json(path, identity, compute, read)
 
 
 def arrays_beside(path: Path, content: dict[str, Any]) -> dict[str, np.ndarray]:
@@ -142,29 +162,6 @@ def arrays_beside(path: Path, content: dict[str, Any]) -> dict[str, np.ndarray]:
         raise Unreadable(path, f"{beside.name} holds other arrays than those that were stored with it")
     with np.load(beside) as stored:
         return {name: stored[name] for name in stored.files}
-
-
-def _kept_content(
-    path: Path, identity: Any, compute: Callable[[], Any], read: Callable[[dict[str, Any]], Result]
-) -> Result:
-    """Returns what `read` makes of a JSON file. `compute` gives its content, and the arrays beside it or None."""
-    identity = as_json(identity)
-
-    def load(path: Path) -> Any:
-        content = read_json(path)
-        reason = why_other(content["identity"], identity)
-        return reason, read(content) if reason is None else None
-
-    def save(path: Path, made: Any) -> None:
-        content, arrays = made
-        if arrays is not None:
-            written = npz_bytes(**arrays)
-            write_bytes(path.with_suffix(".npz"), written)
-            content = content | {_ARRAYS: check_of(written)}
-        keep(path, json_of(content | {"identity": identity}))
-
-    found: Any = kept(path, load, save, lambda stored: stored[0], compute)
-    return found[1]
 
 
 def kept_array(path: Path, made: str, compute: Callable[[], np.ndarray]) -> np.ndarray:

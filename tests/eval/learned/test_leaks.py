@@ -69,7 +69,7 @@ def tables_of(split: str) -> ViewTables:
     random, objects = np.random.default_rng(len(split)), OBJECTS_OF[split]
     arrays = [random.random(shape).astype(np.float32) for shape in ((objects, VIEWS, VIEWS), (objects, VIEWS))]
     logits = np.zeros((objects, VIEWS, CLASSES), np.float32)
-    return ViewTables([""] * objects, np.zeros(objects, np.int32), logits, *arrays)
+    return ViewTables([""] * objects, np.zeros(objects, np.int32), logits, *arrays, made_by="classifier entropy")
 
 
 def measured_with(change: str | None, out: Path) -> Measured:
@@ -121,7 +121,7 @@ def measured_with(change: str | None, out: Path) -> Measured:
         patch.setattr(measuring, "study", study)
         patch.setattr(measuring, "novel_classes", novel_classes)
         patch.setattr(measuring, "_decision", lambda stages: {})
-        patch.setattr(measuring, "read_json", lambda path: {"identity": path.parent.name})
+        patch.setattr(measuring, "read_json", lambda path: {"identity": {"policy": path.parent.name}})
         patch.setattr(studying, "walk_all", walk_all)
         patch.setattr(stopping, "walk_all", walk_all)
         patch.setattr(studying, "_refit", refit)

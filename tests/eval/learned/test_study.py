@@ -25,10 +25,12 @@ from tests.reference.made_up_study import STUDIED
 from train.choosing.expected import fit_expected_views
 from train.choosing.features import Features
 from train.choosing.policy import (
+    Lesson,
     PolicyConfig,
-    train_policy,
+    train_policies,
     walk,
 )
+from train.results.records import as_json
 
 
 def expected_of(data: Features) -> ExpectedViews:
@@ -48,7 +50,7 @@ def test_what_looking_was_worth_is_learned_and_the_study_says_so(adding):
     config = PolicyConfig(
         width=16, heads=2, blocks=1, most_seen=3, walks=2, rounds=2, epochs=12, batch_size=64, learning_rate=5e-3
     )
-    policy, histories = train_policy(config, parts, (adding, validation))
+    ((policy, histories),) = train_policies(config, [Lesson(0, parts, (adding, validation))])
     assert len(histories) == 2
     assert histories[-1][-1]["gain"] < 0.7 * histories[0][0]["gain"]
     expected = expected_of(parts[0][1])
@@ -124,7 +126,7 @@ def test_what_looking_was_worth_is_learned_and_the_study_says_so(adding):
     def of_pairs(some, expected):
         own = [(pair, method) for pair in some]
         each = novel_classes(adding, own, method, OnLattice(test), Walking(3, 2), expected)
-        return novel_metrics(each, some, test.labels)
+        return as_json(novel_metrics(each, some, test.labels))
 
     without = of_pairs(pairs, expected)
     by_expected = without["gain"].pop("expected_views")["difference"]
@@ -152,7 +154,7 @@ def test_rules_are_compared_where_they_are_as_accurate():
     assert stops_at(knows.value >= 0.9).tolist() == [[1, 1]] * objects
     assert stops_at(knows.value >= 0.99).tolist() == [[2, 2]] * objects  # never: to the end
     assert [share.mean() for share in knows.stopped(0.1)] == [0, 1]
-    (row,) = compare_rules([sure_late] * 2, [knows] * 2, [0.8])
+    (row,) = as_json(compare_rules([sure_late] * 2, [knows] * 2, [0.8]))
     assert (row["accuracy"], row["views"]) == (1, 3)
     assert (row["ours"]["accuracy"], row["ours"]["views"]) == (1, 2)
     assert row["ours"]["views_difference"] == {"difference": -1, "interval": [-1, -1]}

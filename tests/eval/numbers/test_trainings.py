@@ -52,7 +52,7 @@ def test_all_trainings_at_once_walk_as_each_does_alone(each, found):
     assert policies == ladder()
     for number, inputs in enumerate(each):
         setting = Setting.of(inputs.graph, inputs.validation, inputs.config)
-        alone, _ = setting.with_random(inputs.tables, ladder())
+        alone, _ = setting.with_random(inputs.tables.stacked(), ladder())
         for name, result in alone.items():
             for field in ("right", "used", "after", "travelled"):
                 mine, theirs = getattr(results[name], field)[number], getattr(result, field)[0]

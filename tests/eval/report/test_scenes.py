@@ -44,7 +44,7 @@ def walks(tables):
 
 def test_walks_are_those_of_the_evaluation(tables, walks):
     setting = Setting.of(some_statistics(tables).graph, tables, GridConfig(max_views=STEPS))
-    evaluated = setting.walk(tables, [policy_record("information_gain")])["information_gain"]
+    evaluated = setting.walk(tables.stacked(), [policy_record("information_gain")])["information_gain"]
     starts = np.arange(OBJECTS) % VIEWS
     np.testing.assert_array_equal(walks.views, np.asarray(evaluated.views)[0, np.arange(OBJECTS), starts, 0])
 

@@ -30,7 +30,7 @@ def results(lattices, statistics):
 @pytest.fixture
 def inputs(lattices, statistics, results, tmp_path):
     """What the figures show."""
-    from eval.thesis.figures import FigureInputs
+    from eval.thesis.layout import FigureInputs
     from train.many.thesis import BACKBONES, FRAMES, VIEWS, ThesisFolder
 
     history = [{"epoch": e, "train/loss": 1 / e, "val/loss": 1.2 / e} for e in (1, 2, 3)]

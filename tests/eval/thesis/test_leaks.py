@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-import eval.thesis.results as thesis_results
+import eval.numbers.study as study
 import eval.thesis.run as thesis_run
 from eval.machine import machine
 from eval.settings import TINY
@@ -69,7 +69,7 @@ def results_with(change: str | None, out: Path) -> ThesisResults:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(ThesisFolder, "statistics", lambda self, views: statistics)
         without_bootstrap(patch)
-        patch.setattr(thesis_results, "run_grid", walk_grid_anyhow)
+        patch.setattr(study, "run_grid", walk_grid_anyhow)
         patch.setattr(thesis_run, "objects_of", objects_of)
         patch.setattr(thesis_run, "network_outputs", network_outputs)
         patch.setattr(thesis_run, "load_best", lambda task, folder: None)

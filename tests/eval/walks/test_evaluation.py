@@ -121,8 +121,7 @@ def test_backbones_are_walked_side_by_side(tables, graph, knowledge):
 def test_random_is_seeded_and_close_to_its_exact_expectation(tables, graph, knowledge):
     a, b = (walked(tables, graph, knowledge, "random", draws=200)["random"] for _ in range(2))
     np.testing.assert_array_equal(a.right, b.right)
-    labels = jnp.asarray(tables.labels)
-    exact, up_to = exactly_random(a, jnp.asarray(tables.logits)[:, None], labels, np.ones(VIEWS, bool))
+    exact, up_to = exactly_random(a, tables.stacked(), np.ones(VIEWS, bool))
     assert up_to == 9
     # 2,000 walks an object: a standard error of at most 0.011.
     for name in ("right", "after"):

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy.optimize import minimize, minimize_scalar
 
-from eval.numbers.confidence import RISKS, confidence_of, stopping
+from eval.numbers.confidence import RISKS, confidence_of, stops_of
 from mevs_jax import (
     calibration_error_by_chance,
     discounted,
@@ -149,11 +149,11 @@ def test_the_mean_of_probabilities_is_one():
 def test_stopping_keeps_count_of_its_promises():
     confidence = np.array([[[0.6, 0.99], [0.95, 0.2]], [[0.99, 0.99], [0.3, 0.4]]])
     right = np.array([[[False, True], [False, True]], [[True, True], [False, True]]])
-    row = stopping(confidence, right)[RISKS.index(0.05)]
-    assert row["sure"] == pytest.approx(3 / 4)
-    assert row["error"] == pytest.approx(1 / 3)  # of the three that were sure, one was wrong
-    assert row["views"] == pytest.approx((2 + 1 + 1 + 2) / 4)
-    assert row["accuracy"] == pytest.approx(3 / 4)  # the one that was never sure answers at its end
+    row = stops_of(confidence, right)[RISKS.index(0.05)]
+    assert row.sure == pytest.approx(3 / 4)
+    assert row.error == pytest.approx(1 / 3)  # of the three that were sure, one was wrong
+    assert row.views == pytest.approx((2 + 1 + 1 + 2) / 4)
+    assert row.accuracy == pytest.approx(3 / 4)  # the one that was never sure answers at its end
 
 
 def test_calibrated_stopping_keeps_promises_that_the_sum_breaks():

@@ -15,11 +15,12 @@ from mevs_jax.models import ViewPolicy
 from tests.reference.choosing import CLASSES, SEEN, VIEWS, asked, fusion_of, moved, some_features
 from train.choosing.policy import (
     Choices,
+    Lesson,
     PolicyConfig,
     choices_along,
     graph_of,
     policy_loss,
-    train_policy,
+    train_policies,
     unseen,
 )
 from train.results.networks import trained_once
@@ -40,7 +41,8 @@ def test_clouds_are_told_beside_their_views(random):
         asked(*known)
     data = replace(some_features(12), clouds=jnp.asarray(random.normal(size=(12, VIEWS, 7)), jnp.float32))
     config = PolicyConfig(width=16, heads=2, blocks=1, most_seen=2, rounds=1, epochs=1, batch_size=8)
-    trained, _ = train_policy(config, [(fusion_of(5, CLASSES), data)], (fusion_of(5, CLASSES), data))
+    seen = fusion_of(5, CLASSES), data
+    ((trained, _),) = train_policies(config, [Lesson(0, [seen], seen)])
     assert trained.cloud is not None
 
 

@@ -13,9 +13,7 @@ from flax import nnx
 from mevs_jax.models import ViewPolicy
 from mevs_jax.policies.learned import of_network
 from tests.reference.choosing import CLASSES, asked, fused, moved, some_features, telling
-from train.choosing.policy import (
-    walk,
-)
+from train.choosing.policy import Lesson, walk
 from train.choosing.q_learning import QLearningConfig, temporal_difference, train_by_q_learning, transitions_along
 
 
@@ -50,7 +48,8 @@ def test_temporal_differences_are_those_of_a_plain_loop(fusion, policy, random):
 @pytest.mark.slow
 def test_q_learning_finds_the_telling_view_too(adding):
     config = QLearningConfig(width=16, heads=2, blocks=1, most_seen=2, walks=4, rounds=2, epochs=6, learning_rate=5e-3)
-    network, histories = train_by_q_learning(config, [(adding, telling(160, 0))], (adding, telling(80, 1)))
+    lesson = Lesson(0, [(adding, telling(160, 0))], (adding, telling(80, 1)))
+    ((network, histories),) = train_by_q_learning(config, [lesson])
     assert len(histories) == 2
     data, key = telling(120, 2), jax.random.key(0)
     chosen = walk(key, adding, data, of_network(network, jnp.float32(1), "state"), 2, 4)

@@ -9,14 +9,11 @@ from flax import nnx
 
 import train.choosing.averaged as averaged
 from tests.reference.choosing import CLASSES, fusion_of, some_features
-from train.choosing.policy import Lesson, PolicyConfig, train_policies, train_policy
-from train.choosing.q_learning import QLearningConfig, train_all_by_q_learning, train_by_q_learning
+from train.choosing.policy import Lesson, PolicyConfig, train_policies
+from train.choosing.q_learning import QLearningConfig, train_by_q_learning
 
 SMALL = {"width": 16, "heads": 2, "blocks": 1, "most_seen": 2, "walks": 1, "rounds": 2, "epochs": 2, "batch_size": 8}
-WAYS = {
-    train_policies: (train_policy, PolicyConfig(**SMALL)),
-    train_all_by_q_learning: (train_by_q_learning, QLearningConfig(**SMALL)),
-}
+WAYS = {train_policies: PolicyConfig(**SMALL), train_by_q_learning: QLearningConfig(**SMALL)}
 
 
 @pytest.mark.slow
@@ -25,14 +22,14 @@ WAYS = {
 def test_policies_that_are_trained_together_end_as_alone(together, way, monkeypatch):
     """With other objects, other walks, and validation objects for one half."""
     monkeypatch.setattr(averaged, "way_for", lambda mesh: way)
-    alone, config = WAYS[together]
+    config = WAYS[together]
     fusion = fusion_of(5, CLASSES)
     lessons = [
         Lesson(seed, [(fusion, some_features(12, seed))], (fusion, some_features(8, 9)), f"number {seed}")
         for seed in (3, 4)
     ]
     found = together(config, lessons)
-    single, histories = alone(type(config)(**SMALL, seed=4), lessons[1].parts, lessons[1].validation, lessons[1].name)
+    ((single, histories),) = together(type(config)(**SMALL, seed=4), lessons[1:])
     networks = [network for network, _ in (*found, (single, histories))]
     weights = [jax.tree_util.tree_leaves_with_path(nnx.state(network)) for network in networks]
     assert any(not np.array_equal(one, other) for (_, one), (_, other) in zip(weights[0], weights[1], strict=True))

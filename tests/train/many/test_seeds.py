@@ -20,7 +20,7 @@ from data_pipeline.dataset.statistics import load_statistics
 from data_pipeline.errors import DataError, Diverged
 from eval.settings import TINY
 from tests.reference.quick import lines, quick_tasks
-from train.loop import fit, load_best
+from train.loop import fit, load_best, steps_of_an_epoch
 from train.many.members import Group, Member, member_of, task_of
 from train.many.seeds import shared_equally, train_seeds
 from train.many.trainers import TRAINERS
@@ -118,14 +118,15 @@ def test_both_ways_of_training_members_take_the_same_steps(data):
         np.testing.assert_allclose(mine[0], theirs[0], rtol=1e-4, atol=1e-5)
 
 
-def test_an_interrupted_training_of_seeds_goes_on(data, tmp_path, monkeypatch):
+def test_an_interrupted_training_of_seeds_goes_on(data, tmp_path, monkeypatch, capsys):
     """Interrupted after the first epoch, and once more while the networks are written."""
     statistics, each = load_statistics(data), of_seeds(data, "entropy", seeds=(0, 1))
     folders, real = [tmp_path / "0", tmp_path / "1"], train.many.training.train_batches
+    epoch = steps_of_an_epoch(each[0], statistics)
     monkeypatch.setattr(
         train.many.training,
         "train_batches",
-        lambda *given, **how: _until(real(*given, **how), 5 if how["first_step"] == 0 else 100),
+        lambda *given, **how: _until(real(*given, **how), epoch + 1),
     )
     with pytest.raises(KeyboardInterrupt):
         train_seeds(each, data, statistics, folders, tmp_path / "work")
@@ -139,9 +140,11 @@ def test_an_interrupted_training_of_seeds_goes_on(data, tmp_path, monkeypatch):
         return train.many.members.export_member(group, of, best, index, *rest)
 
     monkeypatch.setattr(train.many.seeds, "export_member", export)
+    capsys.readouterr()
     with pytest.raises(KeyboardInterrupt):
         train_seeds(each, data, statistics, folders, tmp_path / "work")
     monkeypatch.undo()
+    assert "resuming after epoch 1" in " ".join(capsys.readouterr().err.split())
     assert (folders[0] / "summary.json").exists()
     assert not (folders[1] / "summary.json").exists()
     summaries = train_seeds(each, data, statistics, folders, tmp_path / "work")

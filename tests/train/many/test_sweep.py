@@ -91,7 +91,7 @@ def metrics_of(folder: Path) -> list[dict[str, str]]:
     return list(csv.DictReader((folder / "epochs.csv").open()))
 
 
-def test_a_sweep_of_version_0_1_goes_on_after_its_last_epoch(out, whole, tmp_path, monkeypatch):
+def test_a_sweep_of_version_0_1_goes_on_after_its_last_epoch(out, whole, tmp_path, monkeypatch, capsys):
     """It kept the number of epochs alone."""
     statistics, task = load_statistics(out / "data"), task_named("entropy", out)
     real_save = Checkpoints.save
@@ -104,11 +104,13 @@ def test_a_sweep_of_version_0_1_goes_on_after_its_last_epoch(out, whole, tmp_pat
     with pytest.raises(KeyboardInterrupt):
         sweep(task, out / "data", statistics, tmp_path / "before", SWEEP)
     monkeypatch.undo()
+    capsys.readouterr()
     assert sweep(task, out / "data", statistics, tmp_path / "before", SWEEP) == whole[1]
+    assert "resuming after epoch 1" in " ".join(capsys.readouterr().err.split())
     assert metrics_of(tmp_path / "before") == metrics_of(whole[0])
 
 
-def test_a_stopped_sweep_ends_as_if_it_had_not_been(out, whole, tmp_path, monkeypatch):
+def test_a_stopped_sweep_ends_as_if_it_had_not_been(out, whole, tmp_path, monkeypatch, capsys):
     """Told to end within an epoch."""
     statistics, task = load_statistics(out / "data"), task_named("entropy", out)
     epoch = steps_of_an_epoch(task, statistics)
@@ -128,7 +130,9 @@ def test_a_stopped_sweep_ends_as_if_it_had_not_been(out, whole, tmp_path, monkey
     monkeypatch.undo()
     assert not (tmp_path / "stopped" / "members.json").exists()
     assert (tmp_path / "stopped" / "latest" / str(after)).exists()
+    capsys.readouterr()
     assert sweep(task, out / "data", statistics, tmp_path / "stopped", SWEEP) == whole[1]
+    assert f"resuming after epoch 1, step {after}" in " ".join(capsys.readouterr().err.split())
     assert metrics_of(tmp_path / "stopped") == metrics_of(whole[0])
     assert sweep(task, out / "data", statistics, tmp_path / "stopped", SWEEP) == whole[1]  # not trained again
     with pytest.raises(DataError, match="other settings"):

@@ -56,7 +56,7 @@ def test_steps_on_many_devices_equal_those_on_one(data):
 
 
 @pytest.mark.slow
-def test_a_run_goes_on_with_fewer_devices(data, tmp_path):
+def test_a_run_goes_on_with_fewer_devices(data, tmp_path, capsys):
     """Four devices, told to end at a batch; then two, told to end; then one: as if one had done it all."""
     whole, moved = tmp_path / "whole", tmp_path / "moved"
     for devices, stop_at in ((4, 5), (2, 19)):
@@ -66,6 +66,7 @@ def test_a_run_goes_on_with_fewer_devices(data, tmp_path):
     task = quick_tasks(statistics)[1]
     for folder in (whole, moved):
         fit(task, data, statistics, folder)
+    assert " ".join(capsys.readouterr().err.split()).count("resuming after epoch") == 1
     for mine, theirs in zip(lines(moved), lines(whole), strict=True):
         assert mine.keys() == theirs.keys()
         for key in set(mine) - {"seconds"}:
