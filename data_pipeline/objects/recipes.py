@@ -6,6 +6,7 @@ import os
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
+from typing import ClassVar
 
 import numpy as np
 
@@ -35,6 +36,8 @@ class FurniturePiece:
 class FamilyPiece:
     """A piece of furniture10-families: of a family, which belongs to a class and a split."""
 
+    stamp: ClassVar[str] = "1"
+    """Raised when the shapes change, so that captures of the old ones are not used."""
     class_name: str
     split: str
     family: str
@@ -51,6 +54,8 @@ class FamilyPiece:
 class Stranger:
     """A shape of a kind that is none of the ten classes of furniture."""
 
+    stamp: ClassVar[str] = "1"
+    """As of `FamilyPiece`."""
     kind: str
     seed: int
 

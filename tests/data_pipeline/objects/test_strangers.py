@@ -3,15 +3,19 @@
 import subprocess
 import sys
 from collections import Counter
+from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 
+from data_pipeline.capture.workers import capture_path
 from data_pipeline.dataset.config import DataConfig
 from data_pipeline.dataset.origin import open_objects
 from data_pipeline.errors import DataError
-from data_pipeline.objects.mesh import MODELNET10_CLASSES, UNKNOWN_OBJECT, normalise
+from data_pipeline.objects.mesh import MODELNET10_CLASSES, UNKNOWN_OBJECT, ObjectEntry, normalise
 from data_pipeline.objects.names import plain_class
+from data_pipeline.objects.recipes import FamilyPiece, Stranger
 from data_pipeline.objects.sources import load_object, objects_to_test, open_source
 from data_pipeline.objects.strangers import KINDS, SPLITS, household, living, outdoors, plain, small, stranger, tools
 from mevs_jax.trained import description
@@ -72,6 +76,15 @@ def test_the_source_has_other_kinds_in_every_split():
     assert len({(entry.recipe.kind, entry.recipe.seed) for entry in source.entries}) == 200
     with pytest.raises(DataError, match="strangers needs at least 2 training"):
         open_source("strangers", train_per_class=1, test_per_class=1)
+
+
+@pytest.mark.parametrize("recipe", [Stranger("mug", 0), FamilyPiece("chair", "train", "stool", 0)])
+def test_captures_of_shapes_made_otherwise_are_not_used(recipe, monkeypatch):
+    entry = ObjectEntry("one", 0, "train", recipe)
+    before = capture_path(Path("x"), entry)
+    assert capture_path(Path("x"), replace(entry, recipe=replace(recipe))) == before
+    monkeypatch.setattr(type(recipe), "stamp", "2")
+    assert capture_path(Path("x"), entry) != before
 
 
 def test_strangers_go_beside_others():
