@@ -260,7 +260,7 @@ def check_transfer(
         classes=dict(Counter(objects.folders)),
         known_as={folder: system.classes[label] for folder, label in labels.items() if label != STRANGER},
         left_out=objects.left_out,
-        notes=[*source.notes, *source.said, *[_NONE_KNOWN] * (not known.any())],
+        notes=[*source.notes, *source.said, *[_NONE_KNOWN] * (not known.any() and source.classes != (UNKNOWN_OBJECT,))],
         **_of_known(system, objects, {name: walks.some(known) for name, walks in every.items()}, best),
         promises=promises(every[best], known, STOPS, budgets),
         unknown_objects=strangers(every[BASELINE], known),

@@ -116,7 +116,7 @@ def transfer_text(found: Transfer) -> str:
         known: [f"{name} ({count})" for name, count in found.classes.items() if (name in found.known_as) == known]
         for known in (True, False)
     }
-    lines = [f"{found.known} objects of known classes: {', '.join(named[True])}"]
+    lines = [f"{found.known} objects of known classes: {', '.join(named[True])}"] if found.known else []
     if found.strangers:
         lines.append(f"{found.strangers} objects of unknown classes: {', '.join(named[False])}")
     lines += [f"left out: {name}: {reason}" for name, reason in found.left_out.items()]
