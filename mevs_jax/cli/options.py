@@ -249,8 +249,8 @@ class RealityOptions(WithObjects):
     system: Annotated[tuple[str, ...], _arg("PATH|NAME ...", "furniture10")] = ("furniture10",)
     """trained systems, which see the same images; the first is the one that others are compared with"""
     conditions: Annotated[tuple[str, ...], _arg("NAME ...", "all")] = ()
-    """conditions: clean, roll, structured_light, stereo, stereo_strong, sphere_5, sphere_10, beside, turned, upper, table,
-    together"""
+    """conditions: clean, roll, structured_light, stereo, stereo_strong, sphere_5, sphere_10, beside, turned, part_30, part_50,
+    part_70, upper, table, together"""
     objects: Annotated[int, _arg("N", "0, all")] = 0
     """number of objects, spread over all: about 20 s for every ten, on two cores"""
     seed: Annotated[int, _arg("N", "0")] = 0

@@ -216,7 +216,9 @@ def test_a_system_meets_other_objects(system, chair, tmp_path, at_once, refuses,
     assert "1 objects of known classes: seat (1)\n1 objects of unknown classes: lamp (1)" in shown
     assert "left out: lamp/c.obj: mesh has no faces" in shown
     assert json.loads((tmp_path / "found.json").read_text())["known_as"] == {"seat": load(system).classes[0]}
-    assert "none of the classes lamp, seat is one that the system knows" in refuses(*command)
+    alone = ended(at_once(*command))
+    assert "the system knows none of these classes; if one only has another name, say so: --names FOLDER=CLASS" in alone
+    assert "objects of unknown classes that end sure" in alone
     assert "--names seat is not FOLDER=CLASS" in refuses(*command, "--names", "seat")
     assert "No such file or directory); choose another file" in refuses(
         *command, "--to", tmp_path / "none" / "found.json"

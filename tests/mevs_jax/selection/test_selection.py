@@ -371,7 +371,10 @@ def test_policies_are_registered_by_call_or_decorator_and_no_name_twice():
         with pytest.raises(ValueError, match="knows 'all', which is none of nothing, networks"):
             inspect.unwrap(register_policy)("other", decorated, knows="all")
         assert policy_named("decorated") is policy_named("called") is decorated
-        for register in (lambda: register_policy("called", decorated), lambda: register_policy("random")(decorated)):
+        for register in (
+            lambda: register_policy("called", POLICIES["farthest"]),
+            lambda: register_policy("random")(decorated),
+        ):
             with pytest.raises(ValueError, match="is taken"):
                 register()
     finally:
