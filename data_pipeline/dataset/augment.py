@@ -184,7 +184,7 @@ def views_after(
         pixel = jnp.clip(row, 0, side - 1) * side + jnp.clip(column, 0, side - 1)
         sampled = image.reshape(-1, image.shape[-1]).at[pixel].get(mode="promise_in_bounds")
         near, *normal = (jnp.where(inside, part, 0.0) for part in jnp.moveaxis(sampled, -1, 0))
-        normal, unknown = normal[:3], normal[3:]
+        normal, unknown = normal[:3], jnp.moveaxis(sampled, -1, 0)[4:]  # beside the image as at its edge
         depth = scale * (distance + 1 - 2 * near) / z
         nearness = jnp.where(near > 0, (distance + 1 - depth) / 2, 0.0)
         # Normals transform by the inverse transpose.

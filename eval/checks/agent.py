@@ -197,7 +197,7 @@ def stopping(
     Only for systems that add logits, whose beliefs follow from view tables.
     """
     walks = Walker(system).walk(tables.stacked(), policy, max_views)
-    rows = stops_of(walks.confidence, walks.right, [1 - stop for stop in stops])
+    rows = stops_of(walks.sureness, walks.right, [1 - stop for stop in stops])
     return [
         StoppingRow(stop, row.risk, row.error or 0.0, row.excess.tolist(), row.sure, row.views, row.accuracy)
         for stop, row in zip(stops, rows, strict=True)

@@ -296,7 +296,7 @@ def _rows(system: TrainedSystem, walks: dict[str, dict[str, Walks]], conditions:
     for one in conditions:
         for part, found in walks[one.name].items():
             perfect, there = walks["clean"].get(part), walks["upper" if one.upper else "clean"].get(part)
-            (stops,) = stops_of(found.confidence, found.right, [1 - STOP])
+            (stops,) = stops_of(found.sureness, found.right, [1 - STOP])
             stop = Stop(STOP, stops.error, stops.sure, stops.views)
             for views in _numbers(found):
                 right = found.accuracy[:, views - 1]

@@ -286,7 +286,7 @@ def _of_known(system: TrainedSystem, objects: Objects, walks: dict[str, Walks], 
 
 
 def _stops(walks: Walks) -> list[StoppingRow]:
-    rows = stops_of(walks.confidence, walks.right, [1 - stop for stop in STOPS])
+    rows = stops_of(walks.sureness, walks.right, [1 - stop for stop in STOPS])
     return [StoppingRow(**vars(row), stop=1 - row.risk) for row in rows]
 
 

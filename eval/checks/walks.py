@@ -51,6 +51,11 @@ class Walks:
         return Walks(*(getattr(self, one.name)[objects] for one in fields(self)))
 
     @property
+    def sureness(self) -> Float[np.ndarray, "objects walks steps"]:
+        """The confidence in a known class; 0 where an agent would say that the object is unknown."""
+        return np.where(self.unknown, 0.0, self.confidence)
+
+    @property
     def accuracy(self) -> Float[np.ndarray, "objects steps"]:
         """Mean over the walks around each object."""
         return self.right.mean(axis=1)

@@ -18,14 +18,13 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from mevs_jax.agent.candidates import aimed, candidates_of, mask_of, pose_towards
-from mevs_jax.agent.present import Present, sphere_of
+from mevs_jax.agent.present import Present, check_shown, sphere_of
 from mevs_jax.agent.programs import Programs
 from mevs_jax.agent.records import Belief, History, Reason, Step, plain
 from mevs_jax.arguments import number, numbers, whole
 from mevs_jax.arrays import AnyArray, AnyVector
 from mevs_jax.beliefs.strangeness import STRANGE
-from mevs_jax.geometry.cameras import in_sphere
-from mevs_jax.geometry.canonical import convert
+from mevs_jax.geometry.canonical import convert, share_of_sphere
 from mevs_jax.geometry.inputs import check_depth
 from mevs_jax.geometry.source_view import DepthImage
 from mevs_jax.geometry.sphere import Sphere
@@ -286,9 +285,11 @@ class Agent:
             bool(np.isfinite(placed).all()) and bool(placed[:3, 3].any()),
             "pose is not finite, or at the object's centre",
         )
-        _check(bool((image > 0).any()), "depth shows nothing of the object: no pixel is above 0")
-        unknown = np.mean(np.isnan(image), where=np.asarray(in_sphere(self.system.description.camera, side)))
-        return self._add(image, placed, float(unknown), begun)
+        check_shown(image, self.system)
+        unknown = share_of_sphere(np.isnan(image), self.system.description.camera)
+        told = self.system.description.told_unknown
+        _check(told or unknown <= 0.5, f"{unknown:.0%} of the object's sphere is unknown; this system needs half of it")
+        return self._add(image, placed, unknown, begun)
 
     def _check_budget(self) -> None:
         _check(

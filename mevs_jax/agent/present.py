@@ -13,7 +13,7 @@ from mevs_jax.geometry.cameras import in_sphere
 from mevs_jax.geometry.canonical import CanonicalView, combined, convert
 from mevs_jax.geometry.source_view import DepthImage
 from mevs_jax.geometry.sphere import Sphere, estimate_sphere, upright
-from mevs_jax.trained.situation import Candidates, Memory
+from mevs_jax.trained.situation import REPEATED, Candidates, Memory
 from mevs_jax.trained.system import TrainedSystem
 
 _REACH = 1.3
@@ -23,7 +23,7 @@ _LEAST = 0.5
 """Share of an object's sphere that an image must show, and of a mask's pixels that must have a depth, for networks that are not
 told what is unknown."""
 _LEAST_PIXELS = 0.005
-"""Share of the sphere's pixels that must show the object, for networks that are told what is unknown."""
+"""Share of the sphere's pixels that must show the object."""
 _PART = 0.25
 """An image that does not show more than this share of the sphere shows a part, which is seen together with other parts."""
 _ASIDE = 0.5
@@ -45,7 +45,8 @@ class Present:
         failed: directions (3,), in its frame, from which no view could be taken.
         points: (points, 3) of its surface in the world, if its sphere is estimated from them; None if it is known.
         images: from which they are.
-        parts: images that show a part, by direction: each as seen from the direction of the first.
+        parts: the views so far, each combined from images that show parts, if networks are told what is unknown.
+        merged: directions (3,), in its frame, of images that became parts of views from other directions.
         shown: share of the sphere that is known in each view, by its slot in the memory.
     """
 
@@ -57,7 +58,8 @@ class Present:
     failed: list[np.ndarray] = field(default_factory=list)
     points: np.ndarray | None = None
     images: list[DepthImage] = field(default_factory=list)
-    parts: list[list[CanonicalView]] = field(default_factory=list)
+    parts: list[CanonicalView] = field(default_factory=list)
+    merged: list[np.ndarray] = field(default_factory=list)
     shown: dict[int, float] = field(default_factory=dict)
 
     @property
@@ -71,20 +73,15 @@ class Present:
         return away / np.linalg.norm(away)
 
     def has_failed(self, where: Candidates) -> Bool[np.ndarray, " candidates"]:
-        """Which candidates could not be reached although they were chosen."""
-        failed = np.reshape(self.failed, (-1, 3))
+        """Which candidates could not be reached although they were chosen, or gave a part of another view."""
+        failed = np.reshape([*self.failed, *self.merged], (-1, 3))
         return (np.asarray(where.directions) @ failed.T > np.cos(float(where.same))).any(axis=1)
 
     def seen(self, system: TrainedSystem, image: DepthImage) -> CanonicalView:
         """A new image as the data set's camera would have taken it; raises `ValueError` if it shows too little of the object."""
         view = convert(image, self.sphere, system.description.camera)
+        check_shown(view.depth, system)
         if system.description.told_unknown:
-            pixels = np.asarray(in_sphere(system.description.camera, len(view.depth))).sum()
-            if (shown := (view.depth > 0).sum()) < _LEAST_PIXELS * pixels:
-                raise ValueError(
-                    f"only {shown} of the {pixels} pixels of the object's sphere show the object; aim the camera at its center, "
-                    "move closer, or check the mask"
-                )
             return view
         if view.in_image < _LEAST:
             raise ValueError(
@@ -102,16 +99,22 @@ class Present:
 
     def with_parts(self, system: TrainedSystem, image: DepthImage, view: CanonicalView) -> CanonicalView:
         """A new view; if it shows a part of the object, together with the parts that were seen from about its direction."""
-        if not system.description.told_unknown or view.unknown <= _PART:
+        if not system.description.told_unknown:
             return view
-        for seen in self.parts:
-            if seen[0].direction @ view.direction > np.cos(_ASIDE):
+        for number, seen in enumerate(self.parts):
+            apart = 2 * np.arcsin(min(1.0, float(np.linalg.norm(seen.direction - view.direction)) / 2))
+            if apart < REPEATED and view.unknown <= _PART:
+                self.parts[number] = view
+                return view
+            if apart < REPEATED or (apart < _ASIDE and min(seen.unknown, view.unknown) > _PART):
                 try:
-                    seen.append(convert(image, self.sphere, system.description.camera, seen[0].direction))
+                    part = convert(image, self.sphere, system.description.camera, seen.direction)
                 except ValueError:  # nothing of it can be seen from there
                     continue
-                return combined(seen, system.description.camera)
-        self.parts.append([view])
+                self.parts[number] = combined([seen, part], system.description.camera)
+                self.merged.append(self.towards(np.asarray(image.pose, float)) @ self.sphere.rotation)
+                return self.parts[number]
+        self.parts.append(view)
         return view
 
     def placed(self, system: TrainedSystem, view: CanonicalView) -> Float[np.ndarray, "4 4"]:
@@ -134,20 +137,31 @@ class Present:
             near &= shown @ sphere.axis > image.floor
         assert self.points is not None
         points = np.concatenate([self.points, shown[near][:: max(1, int(near.sum()) // 5000)]])
-        again = replace(self, points=points, images=[*self.images, image])
+        again = replace(self, points=points, images=[*self.images, image], parts=[*self.parts], merged=[*self.merged])
         center, radius = sphere_of(points, sphere.rotation)
         if np.linalg.norm(center - sphere.position) + abs(radius - sphere.radius) < 0.01 * sphere.radius:
-            return again, self.seen(system, image)
+            return again, again.with_parts(system, image, self.seen(system, image))
         again.sphere, again.memory = replace(sphere, center=center, radius=radius), self.programs.blank()
-        again.shown = {}
-        views = [convert(one, again.sphere, system.description.camera) for one in self.images]
-        view, poses = again.seen(system, image), [again.placed(system, one) for one in views]
+        again.shown, again.parts, again.merged = {}, [], []
+        newest, camera = again.seen(system, image), system.description.camera
+        views = [again.with_parts(system, one, convert(one, again.sphere, camera)) for one in self.images]
+        poses = [again.placed(system, one) for one in views]
         for one, pose in zip(views, poses, strict=True):
             again.memory, _ = self.programs.see(system.parts, again.memory, one.image, pose, again.known_radius)
             again.shown[int(again.memory.latest)] = 1 - one.unknown
         history.depths[:], history.poses[:] = [one.image for one in views], poses
         history.options["reset"] |= {"center": center.tolist(), "radius": float(radius)}
-        return again, view
+        return again, again.with_parts(system, image, newest)
+
+
+def check_shown(depth: Float[np.ndarray, "side side"], system: TrainedSystem) -> None:
+    """Raises `ValueError` for an image of the data set's camera that shows next to nothing of the object."""
+    shown, pixels = int((depth > 0).sum()), int(np.asarray(in_sphere(system.description.camera, len(depth))).sum())
+    if shown < _LEAST_PIXELS * pixels:
+        raise ValueError(
+            f"only {shown} of the {pixels} pixels of the object's sphere show the object; aim the camera at its center, move "
+            "closer, or check the mask"
+        )
 
 
 def sphere_of(points: np.ndarray, rotation: np.ndarray) -> tuple[np.ndarray, float]:

@@ -35,7 +35,7 @@ class Belief(ByContent):
         strangeness: share of the known objects that look less strange after as many views, in [0, 1]; NaN if it is not measured.
         known: False if the object is stranger than the agent's limit `unknown`, or most likely of the class of unknown objects.
         evidence: how much of the object was seen, in views that show all of its sphere.
-        unseen: share of the object's sphere that the latest image does not show, in [0, 1].
+        unseen: share of the object's sphere that the latest view does not show, in [0, 1]; a view may be combined from images.
         latency_ms: time that the call took, which is not compared.
     """
 
@@ -84,7 +84,7 @@ class History(ByContent):
         options: of the agent and of `reset`.
         events: one dictionary for each call, in order: `observe`, `decide` or `mark_failed`, with its result; of `decide`, also
             the expected `gains` of all candidates, and their `directions` in the object's frame if they were given.
-        depths: (views, side, side) the images that the networks received, in radii.
+        depths: (views, side, side) the images that the networks received, in radii; those of parts are combined.
         poses: (views, 4, 4) their poses in the object's frame.
     """
 

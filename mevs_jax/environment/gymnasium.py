@@ -187,7 +187,7 @@ def _in_numpy(observation: EnvironmentObservation) -> dict[str, Any]:
     return found
 
 
-def _are_indices(size: int, values: np.ndarray) -> np.ndarray:
+def _are_indices(size: int, values: np.ndarray) -> Any:
     return (values >= 0) & (values < size) & (values == np.floor(values))
 
 

@@ -138,11 +138,16 @@ def convert(
     direction, steps = (own, _MOST_STEPS) if towards is None else (np.asarray(towards, np.float32), _STEPS_ASIDE)
     with jax.default_matmul_precision("highest"):  # accelerators round more, by pixels
         inverse = _without_small_holes(*_inverse_depth(window), window.rays)
-        depth, known, pose, in_image, unknown = jax.device_get(_render(window, inverse, direction, camera, steps))
+        depth, known, pose, in_image = jax.device_get(_render(window, inverse, direction, camera, steps))
     if not depth.any():
         raise ValueError(why_empty(window))
     depth = np.round(depth * DEPTH_SCALE) * DEPTH_STEP  # to the bit as the data set's views are read
-    return CanonicalView(depth, known, pose, direction, float(in_image), float(unknown))
+    return CanonicalView(depth, known, pose, direction, float(in_image), share_of_sphere(~known, camera))
+
+
+def share_of_sphere(pixels: Bool[np.ndarray, "side side"], camera: ViewCamera) -> float:
+    """The share of some pixels among those that look at the object's sphere."""
+    return float(np.mean(pixels, where=np.asarray(in_sphere(camera, len(pixels)))))
 
 
 def combined(views: Sequence[CanonicalView], camera: ViewCamera) -> CanonicalView:
@@ -152,11 +157,9 @@ def combined(views: Sequence[CanonicalView], camera: ViewCamera) -> CanonicalVie
     """
     depths = np.stack([np.where(view.depth > 0, view.depth, np.inf) for view in views]).min(axis=0)
     known = np.any([view.known for view in views], axis=0)
-    unknown = np.mean(~known, where=np.asarray(in_sphere(camera, camera.resolution)))
     depth = np.where(np.isfinite(depths), depths, np.float32(0)).astype(np.float32)
-    return replace(
-        views[0], depth=depth, known=known, unknown=float(unknown), in_image=max(view.in_image for view in views)
-    )
+    unknown, in_image = share_of_sphere(~known, camera), max(view.in_image for view in views)
+    return replace(views[0], depth=depth, known=known, unknown=unknown, in_image=in_image)
 
 
 @partial(jax.jit, static_argnames=("camera", "most_steps"))
@@ -167,7 +170,7 @@ def _render(
     camera: ViewCamera,
     most_steps: int,
 ) -> tuple[Array, ...]:
-    """Returns depth, known, pose, in_image and unknown of a `CanonicalView`."""
+    """Returns depth, known, pose and in_image of a `CanonicalView`."""
     surface = _surface(inverse, window.rays)
     pose = look_at_origin(camera.distance * direction)
     directions = pixel_directions(camera.at(pose)).reshape(-1, 3)
@@ -183,9 +186,9 @@ def _render(
     left, right, top, bottom = window.limits
     seen = (column >= left) & (column <= right) & (row >= top) & (row <= bottom)
     count = jnp.maximum(jnp.sum(disc), 1)
-    in_image, unknown = jnp.sum(disc & seen) / count, jnp.sum(disc & ~known) / count
+    in_image = jnp.sum(disc & seen) / count
     shape = (camera.resolution, camera.resolution)
-    return depth.reshape(shape), (known | (inside <= 0)).reshape(shape), pose, in_image, unknown
+    return depth.reshape(shape), (known | (inside <= 0)).reshape(shape), pose, in_image
 
 
 @jax.jit

@@ -15,7 +15,7 @@ from tests.mevs_jax.trained import making
 @pytest.fixture(scope="module")
 def history(system, tmp_path_factory):
     """A walk of three views around a ball, saved and loaded."""
-    agent = system.agent(stop=2, max_views=3)
+    agent = system.agent(stop=2, max_views=3, unknown=None)
     agent.reset(center=(0, 0, 0), radius=1.0, yaw=0.0)
     for index in (1, 5, 7):
         agent.observe_view(making.depth_of_ball(system.viewpoints[index]), system.poses[index].astype(np.float32))
