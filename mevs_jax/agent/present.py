@@ -159,7 +159,7 @@ def check_shown(depth: Float[np.ndarray, "side side"], system: TrainedSystem) ->
     shown, pixels = int((depth > 0).sum()), int(np.asarray(in_sphere(system.description.camera, len(depth))).sum())
     if shown < _LEAST_PIXELS * pixels:
         raise ValueError(
-            f"only {shown} of the {pixels} pixels of the object's sphere show the object; aim the camera at its center, move "
+            f"depth shows the object at only {shown} of the {pixels} pixels of its sphere; aim the camera at its center, move "
             "closer, or check the mask"
         )
 
