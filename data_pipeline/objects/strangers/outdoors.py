@@ -56,7 +56,7 @@ def bus(random: Random) -> Parts:
     count, rows = int(random.integers(4, 9)), (1.4,) if high < 4 else (1.2, 2.9)
     for x in np.linspace(-0.42, 0.42, count) * long:
         parts += [box(long / count * 0.7, 0.06, 0.8, x, s * wide / 2, z) for s in (-1, 1) for z in rows]
-    return parts + [box(long * 0.3, wide * 0.6, 0.25, 0, 0, high)] * either(random)
+    return parts + [box(long * 0.3, wide * 0.6, 0.25, 0, 0, float(high))] * either(random)
 
 
 def bicycle(random: Random) -> Parts:

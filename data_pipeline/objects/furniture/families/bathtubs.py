@@ -103,7 +103,9 @@ def tub_alcove(random: Random) -> Parts:
     """A built-in tub: a deck wider than the basin, a panel in front, tiles or a ledge at a side."""
     width, depth, height = _tub_size(random)
     power, ledge = draws(random, (3, 30), (0.05, 0.16))
-    parts: Parts = [_vessel(random, superellipse(power), width, depth, height, random.uniform(0.85, 0.95), ledge)]
+    parts: Parts = [
+        _vessel(random, superellipse(float(power)), width, depth, height, random.uniform(0.85, 0.95), ledge)
+    ]
     parts += [
         box(width, 0.02, height, 0, -depth / 2 + 0.01),
         box(0.02, depth, height, width / 2 - 0.01),
@@ -135,7 +137,7 @@ def tub_corner(random: Random) -> Parts:
 def tub_round(random: Random) -> Parts:
     """A round or nearly square tub, with or without a ring of panels and a step."""
     width, height = draws(random, (1.2, 1.7), (0.5, 0.75))
-    outline = superellipse(random.choice([2.0, 2.0, 5.0]))
+    outline = superellipse(float(random.choice([2.0, 2.0, 5.0])))
     parts: Parts = [
         _vessel(
             random,
@@ -155,7 +157,7 @@ def tub_round(random: Random) -> Parts:
 def tub_soaking(random: Random) -> Parts:
     """A short deep tub with straight walls, of wood with hoops or of stone, with a bench."""
     width, depth, height = draws(random, (0.9, 1.25), (0.7, 0.95), (0.62, 0.85))
-    outline = superellipse(random.choice([2.0, 4.0, 40.0]))
+    outline = superellipse(float(random.choice([2.0, 4.0, 40.0])))
     parts: Parts = [_vessel(random, outline, width, depth, height, random.uniform(0.85, 1), random.uniform(0.03, 0.06))]
     for z in (0.25, 0.75) if random.random() < 0.5 else ():
         parts.append(prism(outline, width * 1.01, depth * 1.01, 0.03, 0, 0, z * height))
@@ -204,7 +206,7 @@ def tub_sunken(random: Random) -> Parts:
     """A basin in a platform with steps, or with a broad deck."""
     width, depth, height = _tub_size(random)
     deck = random.uniform(0.12, 0.35)
-    outline = superellipse(random.choice([2.0, 3.0, 20.0]))
+    outline = superellipse(float(random.choice([2.0, 3.0, 20.0])))
     tub = _vessel(random, outline, width, depth, height, 0.9, 0.04)
     w, d = width + 2 * deck, depth + 2 * deck
     angles = np.arctan2(outline[:, 1] * depth, outline[:, 0] * width)

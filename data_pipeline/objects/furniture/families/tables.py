@@ -25,7 +25,7 @@ def table_pedestal(random: Random) -> Parts:
     """A round, oval or square top on one support."""
     radius, height, thick = draws(random, (0.35, 0.75), (0.55, 0.78), (0.02, 0.05))
     top = prism(
-        superellipse(random.choice([2.0, 2.0, 4.0, 30.0])),
+        superellipse(float(random.choice([2.0, 2.0, 4.0, 30.0]))),
         2 * radius,
         2 * radius * random.uniform(0.7, 1),
         thick,
@@ -41,7 +41,7 @@ def table_refectory(random: Random) -> Parts:
     width, depth, height, thick = board(random)
     width, style = width * random.uniform(1, 1.5), random.integers(3)
     span, under = width * random.uniform(0.55, 0.8), height - thick
-    parts = [prism(superellipse(random.choice([5.0, 40.0])), width, depth, thick, 0, 0, under)]
+    parts = [prism(superellipse(float(random.choice([5.0, 40.0]))), width, depth, thick, 0, 0, under)]
     if style == 0:
         parts += ends(span, depth * 0.8, under, random.uniform(0.05, 0.09))
     elif style == 1:
@@ -79,7 +79,7 @@ def table_glass(random: Random) -> Parts:
     """A thin top on legs that cross below its middle or at its ends, or on a frame of tube."""
     width, depth, height, _ = board(random)
     height, style, r = height * random.uniform(0.55, 1), random.integers(3), random.uniform(0.012, 0.025)
-    parts = [prism(superellipse(random.choice([2.0, 5.0, 40.0])), width, depth, 0.014, 0, 0, height - 0.014)]
+    parts = [prism(superellipse(float(random.choice([2.0, 5.0, 40.0]))), width, depth, 0.014, 0, 0, height - 0.014)]
     if style == 0:
         x, y = width * 0.36, depth * 0.36
         return parts + [rod((s * x, t * y, 0), (-s * x, -t * y, height - 0.014), r) for s in (-1, 1) for t in (-1, 1)]
@@ -181,7 +181,7 @@ def table_drum(random: Random) -> Parts:
 def table_side(random: Random) -> Parts:
     """A small high table on three or four slender legs, with a shelf, a rim or a drawer."""
     width, height = draws(random, (0.35, 0.55), (0.48, 0.68))
-    outline = superellipse(random.choice([2.0, 6.0, 40.0]))
+    outline = superellipse(float(random.choice([2.0, 6.0, 40.0])))
     parts = [prism(outline, width, width, 0.025, 0, 0, height - 0.025)]
     parts += four_legs(
         width * 0.68, width * 0.68, height - 0.02, random.uniform(0.02, 0.035), splay=float(random.choice([0.0, 0.05]))
@@ -208,7 +208,7 @@ def table_nest(random: Random) -> Parts:
 def table_conference(random: Random) -> Parts:
     """A long top, boat-shaped, oval or rectangular, on panels or drums."""
     width, depth, height, thick = draws(random, (1.8, 2.6), (0.9, 1.25), (0.7, 0.77), (0.03, 0.07))
-    outline = superellipse(random.choice([2.0, 3.0, 5.0, 40.0]))
+    outline = superellipse(float(random.choice([2.0, 3.0, 5.0, 40.0])))
     parts, under = [prism(outline, width, depth, thick, 0, 0, height - thick)], height - thick
     foot = CIRCLE if random.random() < 0.4 else SQUARE
     size = (0.5, 0.5) if foot is CIRCLE else (random.uniform(0.05, 0.2), depth * 0.6)

@@ -80,7 +80,7 @@ def _cistern(random: Random, width: float, base: float, y: float) -> Parts:
     """A tank with its back at `y`: rounded, tapering, or oval, with a lid, and a lever or a button."""
     depth, height = draws(random, (0.15, 0.21), (0.3, 0.42))
     wide, power, taper = width * random.uniform(0.95, 1.35), random.choice([3.0, 6.0, 40.0]), random.uniform(0.8, 1)
-    outline, middle = superellipse(power), y - depth / 2
+    outline, middle = superellipse(float(power)), y - depth / 2
     parts = [
         loft(
             outline,
