@@ -137,7 +137,7 @@ def as_in_reality(
     sensed = sense(noise, depth, pose, camera, SensorConfig(kind, 1.0, config.distance), strength, surface)
     unknown |= (depth > 0) & (sensed == 0)
     if config.unseen:
-        unknown |= unseen_part(jax.random.fold_in(noise, 1), len(depth), config.unseen)
+        unknown |= unseen_part(jax.random.fold_in(noise, 1), in_sphere(camera, len(depth)), config.unseen)
         unknown |= (sensed == 0) & jax.random.bernoulli(jax.random.fold_in(noise, 2), _BARE)
     depth = jnp.asarray(jax.lax.optimization_barrier(jnp.where(unknown, jnp.nan, sensed)))
     offset = jax.random.ball(where, 3) * strength * config.sphere
@@ -166,20 +166,19 @@ def hidden(key: Array, depth: Float[Array, "side side"], most: float | Array) ->
     return jnp.where((across < first + width * (last - first)) & (width > 0), value, depth)
 
 
-def unseen_part(key: Array, side: int, most: float) -> Bool[Array, "{side} {side}"]:
+def unseen_part(key: Array, disc: Bool[AnyArray, "side side"], most: float) -> Bool[Array, "side side"]:
     """Returns the pixels that an image does not show; none in half of the images.
 
-    They are one side of the image, all outside of a window, a blob, or patches without measured depth. Their share is that of a
-    disc as large as the object's sphere in the image.
+    They are one side of the image, all outside of a window, a blob, or patches without measured depth.
 
     Args:
         key: of the image.
-        side: pixels along each side.
-        most: largest share.
+        disc: pixels that look at the object's sphere.
+        most: largest share of these.
     """
     some, amount, sort, angle, middle, stretch, wave = jax.random.split(key, 7)
     share = jax.random.bernoulli(some) * jax.random.uniform(amount, maxval=most)
-    at = (jnp.arange(side) + 0.5) * 2 / side - 1
+    at = (jnp.arange(len(disc)) + 0.5) * 2 / len(disc) - 1
     x, y = jnp.meshgrid(at, at)
     turn = jax.random.uniform(angle, maxval=2 * jnp.pi)
     along, across = jnp.cos(turn) * x + jnp.sin(turn) * y, jnp.cos(turn) * y - jnp.sin(turn) * x
@@ -188,7 +187,6 @@ def unseen_part(key: Array, side: int, most: float) -> Bool[Array, "{side} {side
     patches = jnp.sum(jnp.sin(waves[0] * x + waves[1] * y + 10 * waves[2]), axis=0)
     window, blob = jnp.maximum(jnp.abs(x - a), factor * jnp.abs(y - b)), -jnp.hypot(along - a, factor * (across - b))
     field = jnp.stack([along, window, blob, patches])[jax.random.randint(sort, (), 0, 4)]
-    disc = x**2 + y**2 < 1
 
     def halve(_: Array, ends: tuple[Array, Array]) -> tuple[Array, Array]:
         half = (ends[0] + ends[1]) / 2

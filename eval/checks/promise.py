@@ -40,7 +40,7 @@ class PromiseRow:
 
 @dataclass(frozen=True)
 class StrangerRow:
-    """How well objects of unknown classes are told from the others after some random views.
+    """How well objects of unknown classes are separated from the others after some random views.
 
     Attributes:
         auroc: area under the ROC curve (½ is chance, 1 perfect) of one walk of each object, averaged over walks.
@@ -99,7 +99,7 @@ def _mean(values: np.ndarray) -> float | None:
 
 
 def strangers(walks: Walks, known: Bool[np.ndarray, " objects"], views: Sequence[int] = (1, 2, 4)) -> Strangers | None:
-    """How well unknown objects are told from the others on walks; None if one kind is missing, or nothing tells them."""
+    """How well unknown objects are separated from the others on walks; None if one kind is missing or no score exists."""
     if known.all() or not known.any() or np.isnan(walks.strange).any():
         return None
     rows = []

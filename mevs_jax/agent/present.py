@@ -156,7 +156,7 @@ class Present:
 
 def check_shown(depth: Float[np.ndarray, "side side"], system: TrainedSystem) -> None:
     """Raises `ValueError` for an image of the data set's camera that shows next to nothing of the object."""
-    shown, pixels = int((depth > 0).sum()), int(np.asarray(in_sphere(system.description.camera, len(depth))).sum())
+    shown, pixels = int((depth > 0).sum()), int(in_sphere(system.description.camera, len(depth)).sum())
     if shown < _LEAST_PIXELS * pixels:
         raise ValueError(
             f"depth shows the object at only {shown} of the {pixels} pixels of its sphere; aim the camera at its center, move "

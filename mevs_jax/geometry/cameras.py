@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import lru_cache
 
 import flax.struct
 import jax
@@ -141,10 +142,12 @@ def pixel_directions(camera: Camera) -> Float[Array, "resolution resolution 3"]:
     return jnp.stack([x, y, jnp.ones_like(x)], axis=-1) @ camera.pose[:3, :3].T
 
 
-def in_sphere(camera: ViewCamera, side: int) -> Bool[Array, "{side} {side}"]:
-    """Which pixels of an image with `side` pixels along each side look at the object's sphere."""
-    square = jnp.sum(jnp.square(pixel_directions(camera.at(jnp.eye(4), side))), axis=-1)
-    return square * (camera.distance**2 - 1) <= camera.distance**2
+@lru_cache(maxsize=32)
+def in_sphere(camera: ViewCamera, side: int) -> Bool[np.ndarray, "{side} {side}"]:
+    """Which pixels of an image with `side` pixels along each side look at the object's sphere; computed once for each camera."""
+    with jax.ensure_compile_time_eval():  # it may be asked for first within a compiled function
+        square = jnp.sum(jnp.square(pixel_directions(camera.at(jnp.eye(4), side))), axis=-1)
+        return np.asarray(square * (camera.distance**2 - 1) <= camera.distance**2)
 
 
 def unproject(

@@ -147,7 +147,7 @@ def convert(
 
 def share_of_sphere(pixels: Bool[np.ndarray, "side side"], camera: ViewCamera) -> float:
     """The share of some pixels among those that look at the object's sphere."""
-    return float(np.mean(pixels, where=np.asarray(in_sphere(camera, len(pixels)))))
+    return float(np.mean(pixels, where=in_sphere(camera, len(pixels))))
 
 
 def combined(views: Sequence[CanonicalView], camera: ViewCamera) -> CanonicalView:

@@ -145,9 +145,9 @@ def test_half_of_the_images_show_a_part_of_the_sphere(images):
 
 def test_the_shares_do_not_depend_on_the_object_and_its_images_are_told_apart():
     keys = jax.random.split(jax.random.key(1), 64)
-    parts = np.asarray(jax.vmap(lambda key: unseen_part(key, 32, 0.8))(keys))
+    parts = np.asarray(jax.vmap(lambda key: unseen_part(key, in_sphere(CAMERA, 32), 0.8))(keys))
     assert len({part.tobytes() for part in parts if part.any()}) == (parts.any(axis=(1, 2))).sum()
-    assert not np.asarray(jax.vmap(lambda key: unseen_part(key, 32, 0.0))(keys)).any()
+    assert not np.asarray(jax.vmap(lambda key: unseen_part(key, in_sphere(CAMERA, 32), 0.0))(keys)).any()
 
 
 def test_a_fifth_channel_says_what_is_unknown(images):

@@ -137,7 +137,7 @@ def test_sensors_add_errors_of_the_size_of_their_strength(placed, clean, name):
 
 @pytest.mark.parametrize("share", [30, 50, 70])
 def test_a_share_of_the_sphere_is_not_seen_and_the_rest_as_it_is(share, placed, clean):
-    disc, shares = np.asarray(in_sphere(CAMERA, CAMERA.resolution)), []
+    disc, shares = in_sphere(CAMERA, CAMERA.resolution), []
     for seed in range(4):
         for image, other in zip(seen(BY_NAME[f"part_{share}"], placed, seed), clean, strict=True):
             unknown = np.isnan(image)
