@@ -83,20 +83,23 @@ def furniture10(train_per_class: int, test_per_class: int) -> ObjectSource:
     Raises:
         DataError: if there are fewer than 2 training pieces or no test pieces per class.
     """
-    _check_numbers("furniture10", train_per_class, test_per_class)
+    counts = _pieces("furniture10", train_per_class, test_per_class)
     entries = (
         ObjectEntry(f"{name}_{split}_{index:04d}", label, split, FurniturePiece(name, first + index))
         for label, name in enumerate(MODELNET10_CLASSES)
-        for split, count, first in (("train", train_per_class, 0), ("test", test_per_class, 1_000_000))
+        for split in SOURCE_SPLITS
+        for count, first in [counts[split]]
         for index in range(count)
     )
     return ObjectSource("furniture10", MODELNET10_CLASSES, tuple(entries))
 
 
-def _check_numbers(name: str, train_per_class: int, test_per_class: int) -> None:
+def _pieces(name: str, train_per_class: int, test_per_class: int) -> dict[str, tuple[int, int]]:
+    """Number of pieces per class of each split, and the first of their seeds, which no two splits share."""
     if train_per_class < 2 or test_per_class < 1:
         needed = "at least 2 training pieces and 1 test piece per class"
         raise DataError(f"{name} needs {needed}, got {train_per_class} and {test_per_class}")
+    return {"train": (train_per_class, 0), "val": (test_per_class, 2_000_000), "test": (test_per_class, 1_000_000)}
 
 
 _FAMILIES_OF: dict[str, dict[str, tuple[str, ...]]] = {
@@ -122,8 +125,7 @@ def furniture_families(name: str, train_per_class: int, test_per_class: int) -> 
     """
     from data_pipeline.objects.furniture.families import FAMILIES  # imported late: it needs trimesh
 
-    _check_numbers(name, train_per_class, test_per_class)
-    counts = {"train": (train_per_class, 0), "val": (test_per_class, 2_000_000), "test": (test_per_class, 1_000_000)}
+    counts = _pieces(name, train_per_class, test_per_class)
     entries: list[ObjectEntry] = []
     for label, of_class in enumerate(MODELNET10_CLASSES):
         for split, kinds in _FAMILIES_OF[name].items():
@@ -145,8 +147,7 @@ def strangers(train_per_class: int, test_per_class: int) -> ObjectSource:
     """
     from data_pipeline.objects.strangers import KINDS  # imported late: it needs trimesh
 
-    _check_numbers("strangers", train_per_class, test_per_class)
-    counts = {"train": (train_per_class, 0), "val": (test_per_class, 2_000_000), "test": (test_per_class, 1_000_000)}
+    counts = _pieces("strangers", train_per_class, test_per_class)
     entries: list[ObjectEntry] = []
     for split, (count, first) in counts.items():
         kinds = itertools.cycle([name for name, kind in KINDS.items() if kind.split == split])
