@@ -18,7 +18,8 @@ from mpl_toolkits.mplot3d.art3d import Poly3DCollection
 
 import mevs_jax
 from data_pipeline.objects.furniture import furniture
-from mevs_jax.agent.looking import Walk, unit_triangles
+from mevs_jax.agent.looking import Walk
+from mevs_jax.geometry.triangles import unit_triangles
 
 INK, GREY, MARK, LIGHT = "#1b2a41", "#6b7785", "#c1440e", "#c9d1da"
 PIECE = ("table", 900)

@@ -252,7 +252,7 @@ def check_transfer(
         system=system.name,
         data=data,
         posed=posed,
-        metres=None if np.isnan(metres) or system.description.size is None else metres,
+        metres=None if np.isnan(metres) or not system.description.uses_size else metres,
         best=best,
         objects=len(objects.names),
         known=int(known.sum()),

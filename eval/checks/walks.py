@@ -102,12 +102,14 @@ def beliefs_along(
     parts: Parts, table: ViewTable, views: Int[Array, " steps"], posed: bool = True
 ) -> Float[Array, "steps classes"]:
     """Beliefs after each view of a walk on the table of one object."""
-    if not parts.fusion:
+    if not parts.fusion and parts.gallery is None:
         return running_sum(table.logits[views])
     assert table.features is not None
-    fusion, points = parts.fusion["posed" if posed else "unposed"], parts.viewpoints[views]
     present = jnp.tril(jnp.ones((len(views), len(views)), bool))
     features = table.features[views]
+    if (gallery := parts.gallery) is not None:
+        return jax.vmap(lambda seen: gallery.beliefs(gallery.evidence(features, seen, posed)))(present)
+    fusion, points = parts.fusion["posed" if posed else "unposed"], parts.viewpoints[views]
     return jax.vmap(lambda seen: fusion(features, points, seen))(present)
 
 
@@ -148,7 +150,8 @@ class Walker:
         steps, firsts = min(steps, int(can_reach.sum())), jnp.asarray(np.flatnonzero(can_reach))
         objects = np.arange(len(tables.label)), tables
         shared = self.system.parts, every_walk(firsts, draws), jnp.asarray(can_reach), jax.random.key(seed)
-        return Walks(*over_objects(self._around(policy, posed), objects, *shared, at_once=_AT_ONCE, steps=steps))
+        at_once = _AT_ONCE if self.system.parts.gallery is None else 1  # whose predictions fill the cache
+        return Walks(*over_objects(self._around(policy, posed), objects, *shared, at_once=at_once, steps=steps))
 
     def _around_by(self, policy: str, posed: bool) -> Callable[..., tuple[Array, ...]]:
         system, graph = self.system, self.system.graph

@@ -113,6 +113,8 @@ class Agent:
             size = self.max_candidates = whole(self.max_candidates, rule, 1, MOST_CANDIDATES)
         shaded = self.system.description.image.content == "image"
         _check(not shaded, "this system reads shaded images, which a depth camera does not give; train one on depth")
+        enrolled = self.system.parts.gallery is None or len(self.system.classes) > 1
+        _check(enrolled, "no objects are enrolled in this system; mevs_jax.enrol returns one that knows yours")
         self._turn = RLock()
         self.size = max(len(self.system.viewpoints), size)
         self._resets, self.key = 0, jax.random.key(self.seed)
@@ -167,7 +169,7 @@ class Agent:
             center, radius, up, yaw: as of `Sphere`. Without a yaw, policies that need the object's own frame cannot be used, and
                 `best` is the system's best without it.
             true_size: False for a model of an object at another scale, whose radius says nothing about its class. This matters
-                for systems that use the size alone (`system.description.size`).
+                for systems that use the size alone (`system.description.uses_size`).
 
         Raises:
             ValueError: for an argument out of its range, or a policy that cannot be used without the yaw.
@@ -300,7 +302,7 @@ class Agent:
     def _add(self, depth: np.ndarray, pose: np.ndarray, unseen: float, begun: float) -> Belief:
         of = self._current
         of.memory, said = of.programs.see(self.system.parts, of.memory, depth, pose, of.known_radius)
-        (probabilities, strangeness), count, slot = jax.device_get((said, of.memory.count, of.memory.latest))
+        (probabilities, strangeness, yaws), count, slot = jax.device_get((said, of.memory.count, of.memory.latest))
         label = int(probabilities.argmax())
         of.shown[int(slot)] = 1 - unseen
         belief = Belief(
@@ -314,6 +316,7 @@ class Agent:
             known=label != self.system.description.unknown_class and not (self.unknown and strangeness > self.unknown),
             evidence=sum(of.shown.values()),
             unseen=float(unseen),
+            pose=of.pose_of(self.system, label, yaws),
             latency_ms=1e3 * (time.perf_counter() - begun),
         )
         self.history.depths.append(depth)

@@ -19,6 +19,7 @@ from mevs_jax.arrays import ByContent
 from mevs_jax.geometry.cameras import ViewCamera, look_at_origin
 from mevs_jax.geometry.source_view import DepthImage
 from mevs_jax.geometry.sphere import Sphere, estimate_sphere
+from mevs_jax.geometry.triangles import centred_triangles
 from mevs_jax.rendering.depth import pad_triangles, render_depth
 from mevs_jax.trained.system import TrainedSystem
 
@@ -90,7 +91,7 @@ def look(
     if first is not None:
         views = len(system.viewpoints)
         first = whole(first, f"first must be a view from 0 to {views - 1}", 0, views - 1)
-    triangles, radius = _centred(vertices, faces)
+    triangles, radius = centred_triangles(vertices, faces)
     padded = jnp.asarray(pad_triangles(triangles))
     camera = system.description.camera
     known = 1.0
@@ -124,39 +125,6 @@ def _walk(
 def _depth(triangles: Array, pose: Array, camera: ViewCamera) -> Array:
     depth = render_depth(triangles, camera.at(pose)).depth
     return jnp.where(jnp.isfinite(depth), depth, 0.0)
-
-
-def unit_triangles(
-    vertices: Float[np.ndarray, "vertices 3"], faces: Int[np.ndarray, "faces 3"]
-) -> Float[np.ndarray, "faces 3 3"]:
-    """Triangles of a mesh, centred on its bounding box and scaled into the unit sphere, as the data sets are.
-
-    Raises:
-        ValueError: for a mesh without faces, with indices out of range, with corners that are not finite, or without a size.
-    """
-    return _centred(vertices, faces)[0]
-
-
-def _centred(
-    vertices: Float[np.ndarray, "vertices 3"], faces: Int[np.ndarray, "faces 3"]
-) -> tuple[Float[np.ndarray, "faces 3 3"], float]:
-    """`unit_triangles`, and the distance of the furthest corner from the centre."""
-    vertices, faces = numbers(vertices), np.asarray(faces)
-    if vertices.ndim != 2 or vertices.shape[1] != 3 or faces.ndim != 2 or faces.shape[1] != 3 or not len(faces):
-        raise ValueError(
-            f"a mesh needs vertices (n, 3) and triangles (m, 3), at least one, got shapes {vertices.shape} and {faces.shape}"
-        )
-    if faces.dtype.kind not in "iu" or faces.min() < 0 or faces.max() >= len(vertices):
-        raise ValueError(f"the triangles must be indices of the {len(vertices)} vertices")
-    corners = vertices[faces]
-    if not np.isfinite(corners).all():
-        raise ValueError("the mesh has coordinates that are not finite")
-    low, high = corners.min(axis=(0, 1)), corners.max(axis=(0, 1))
-    corners = corners - (low + high) / 2
-    radius = np.linalg.norm(corners, axis=-1).max()
-    if not 0 < radius < np.inf:
-        raise ValueError("the mesh is a single point")
-    return (corners / radius).astype(np.float32), float(radius)
 
 
 @dataclass(frozen=True, eq=False)

@@ -9,6 +9,7 @@ from jaxtyping import Bool, Float
 
 from mevs_jax.agent.programs import Programs
 from mevs_jax.agent.records import Belief, History
+from mevs_jax.enrolment.pose import ObjectPose, object_pose
 from mevs_jax.geometry.cameras import in_sphere
 from mevs_jax.geometry.canonical import CanonicalView, combined, convert
 from mevs_jax.geometry.source_view import DepthImage
@@ -124,6 +125,13 @@ class Present:
         pose = turn @ view.pose
         off = np.abs(system.poses - pose).max(axis=(1, 2))
         return system.poses[off.argmin()] if off.min() < _AT_VIEWPOINT else pose
+
+    def pose_of(self, system: TrainedSystem, label: int, yaws: np.ndarray) -> ObjectPose | None:
+        """The pose of the object if it is an enrolled one, from the log-probabilities of the yaws of each."""
+        gallery = system.parts.gallery
+        if gallery is None or label >= len(yaws):
+            return None
+        return object_pose(yaws[label], int(gallery.symmetries[label]), self.sphere)
 
     def refined(self, system: TrainedSystem, image: DepthImage, history: History) -> tuple[Present, CanonicalView]:
         """The object with its sphere estimated again, by the points of a new image too, and the new view.

@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from mevs_jax.enrolment.beliefs import gain_among
 from mevs_jax.geometry.viewpoints import ViewGraph
 from mevs_jax.policies.base import Observation, Policy, Scene, SelectionState
 from mevs_jax.policies.informed import information_gain
@@ -51,8 +52,9 @@ class Steps:
         pose: Float[Array, "4 4"],
         radius: Float[Array, ""],
         temperatures: Float[Array, " counts"],
-    ) -> tuple[Memory, tuple[Array, Array]]:
-        """The memory after a view; calibrated probabilities and strangeness.
+    ) -> tuple[Memory, tuple[Array, Array, Array]]:
+        """The memory after a view; calibrated probabilities, strangeness, and log-probabilities of the yaws of each object of a
+        gallery.
 
         The radius is in metres, NaN if the size is unknown. The last of the temperatures holds for more views.
         """
@@ -64,7 +66,11 @@ class Steps:
         strangeness = jnp.float32(jnp.nan)
         if parts.strangeness is not None:
             strangeness = parts.strangeness.of(memory.seen.logits, memory.present)
-        return memory, (probabilities, strangeness)
+        yaws = jnp.zeros((0, 0))
+        if (gallery := parts.gallery) is not None:
+            assert memory.seen.features is not None
+            yaws = gallery.hypotheses(gallery.evidence(memory.seen.features, memory.present, self.posed))
+        return memory, (probabilities, strangeness, yaws)
 
     def choose_next(
         self,
@@ -95,7 +101,9 @@ class Steps:
         first = jnp.argmax(jnp.where(left, jnp.concatenate([self._first(parts, candidates), slots]) - costs, -jnp.inf))
         chosen = jnp.where(jnp.any(left), jnp.where(memory.count > 0, index, first), -1)
         known, gains = scene.knowledge, jnp.full(number, jnp.nan)
-        if known is not None and (known.expected_logits is not None or known.by_pose is not None):
+        if parts.gallery is not None:
+            gains = gain_among(parts.gallery, self.posed)(key, state, scene)[:number]
+        elif known is not None and (known.expected_logits is not None or known.by_pose is not None):
             gains = information_gain(key, state, scene)[:number]
         return chosen, gains
 

@@ -14,6 +14,7 @@ import numpy as np
 from jaxtyping import Float
 
 from mevs_jax.arrays import ByContent
+from mevs_jax.enrolment.pose import ObjectPose
 
 Reason = Literal["", "sure", "budget", "nothing reachable", "unknown object"]
 """Why an agent is done; empty while it is not."""
@@ -36,6 +37,7 @@ class Belief(ByContent):
         known: False if the object is stranger than the agent's limit `unknown`, or most likely of the class of unknown objects.
         evidence: how much of the object was seen, in views that show all of its sphere.
         unseen: share of the object's sphere that the latest view does not show, in [0, 1]; a view may be combined from images.
+        pose: of the most likely object, if it is an enrolled one.
         latency_ms: time that the call took, which is not compared.
     """
 
@@ -49,6 +51,7 @@ class Belief(ByContent):
     known: bool
     evidence: float
     unseen: float
+    pose: ObjectPose | None
     latency_ms: float = field(compare=False)
 
 
@@ -157,6 +160,8 @@ def plain(record: Belief | Step) -> dict[str, Any]:
     """A record as values that JSON can hold; None for numbers that are not finite."""
 
     def of(value: Any) -> Any:
+        if isinstance(value, dict):
+            return {name: of(part) for name, part in value.items()}
         if isinstance(value, np.ndarray):
             return value.tolist()
         return None if isinstance(value, float) and not np.isfinite(value) else value

@@ -12,9 +12,10 @@ from mevs_jax.cli.failure import Unusable
 from mevs_jax.cli.parsing import Invocation
 
 if TYPE_CHECKING:
+    from eval.checks.instances import Instances
     from eval.checks.reality import Reality, SceneRow, Stop
     from eval.checks.transfer import Transfer
-    from mevs_jax.cli.options import RealityOptions, TransferOptions
+    from mevs_jax.cli.options import InstancesOptions, RealityOptions, TransferOptions
 
 
 def live(call: Invocation) -> None:
@@ -72,7 +73,7 @@ def transfer(options: TransferOptions) -> None:
     if options.to is not None:
         check_file(options.to)
     system = load_system(options.system)
-    if options.metres and system.description.size is None:
+    if options.metres and not system.description.uses_size:
         raise Unusable(f"{options.system} does not use sizes; leave out --metres")
     found = check_transfer(
         system,
@@ -87,6 +88,61 @@ def transfer(options: TransferOptions) -> None:
     if options.to is not None:
         write_json(options.to, as_json(found))
     print(json.dumps(as_json(found)) if options.json else transfer_text(found))
+
+
+def instances(options: InstancesOptions) -> None:
+    """Enrols objects and measures how well they are recognised."""
+    import warnings
+
+    from data_pipeline.files import write_json
+    from eval.checks.instances import study_instances
+    from mevs_jax.cli.tools import load_system
+    from mevs_jax.enrolment.enrolling import AlikeWarning
+    from mevs_jax.geometry.cameras import ViewCamera
+    from train.results.records import as_json
+    from train.tasks.matcher import MatcherConfig, fit_matcher, objects_system
+
+    if options.shapes < 40:
+        raise Unusable(f"--shapes must be at least 40, got {options.shapes}")
+    system = options.system
+    if options.fit:
+        config = MatcherConfig(shapes=options.shapes, calibration_shapes=options.shapes // 4)
+        camera = ViewCamera(resolution=64)
+        objects_system(fit_matcher(config, camera), camera).save(options.to / "objects")
+        system = str(options.to / "objects")
+        print(f"Trained system: {(options.to / 'objects').absolute()}")
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", AlikeWarning)
+        found = study_instances(load_system(system), options.data, up=options.up, sizes=options.sizes)
+    write_json(options.to / "instances.json", as_json(found))
+    print(instances_text(found))
+
+
+def instances_text(found: Instances) -> str:
+    """The figures of `study_instances`, for a terminal."""
+    lines = [f"left out: {name}: {reason}" for name, reason in found.left_out.items()]
+    lines.append(f"{'enrolled from':<22}{'objects':>8}{'policy':>18}{'1':>8}{'2':>8}{'3':>8}{'4 views':>9}  gain at 2")
+    for one in found.measured:
+        for policy in dict.fromkeys(row.policy for row in one.policies):
+            rows = [row for row in one.policies if row.policy == policy]
+            right = "".join(f"{100 * row.accuracy:>8.1f}" for row in rows)
+            low, high = (100 * limit for limit in rows[1].gain_interval)
+            lines.append(
+                f"{one.condition:<22}{one.enrolled:>8}{policy:>18}{right}   {100 * rows[1].gain:+.1f} [{low:+.1f}, {high:+.1f}]"
+            )
+        yaw = ", ".join(f"{100 * row.right:.0f}" for row in one.poses)
+        lines.append(
+            f"  yaw within 10°: {yaw} % after 1, 2, 3, 4 random views ({one.poses[0].objects} objects not round)"
+        )
+        sure = next(row for row in one.promises if (row.stop, row.views) == (0.95, 4))
+        wrong = "–" if sure.wrong is None else f"{100 * sure.wrong:.1f}"
+        lines.append(
+            f"  a third not enrolled, stop 0.95, up to 4 views: sure {100 * (sure.sure or 0):.0f} %, of these wrong {wrong} %; "
+            f"unknown {100 * (sure.refused or 0):.0f} %; of the others sure {100 * (sure.strangers_sure or 0):.1f} %"
+        )
+        for row in one.unknown_objects.after if one.unknown_objects else []:
+            lines.append(f"  AUROC of unknown objects after {row.views}: {row.auroc:.3f}")
+    return "\n".join(lines)
 
 
 def renamed(names: Sequence[str]) -> tuple[tuple[str, str], ...]:

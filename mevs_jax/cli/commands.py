@@ -73,6 +73,13 @@ COMMANDS = {
         tool=True,
         needs_study=False,
     ),
+    "enrol": Command(
+        "teach a system your objects from meshes or depth images, without training",
+        "EnrolOptions",
+        "tools:enrol",
+        tool=True,
+        needs_study=False,
+    ),
     "export": Command(
         "write the trained system of a run into a folder of its own",
         "ExportOptions",
@@ -99,6 +106,12 @@ COMMANDS = {
         "StudyOptions",
         "studies:rendering",
         ("dataset", "rendering", "evaluation"),
+    ),
+    "study instances": Command(
+        "how well enrolled objects are told apart; learns what they are enrolled with anew, if asked",
+        "InstancesOptions",
+        "checks:instances",
+        tool=True,
     ),
     "study published-code": Command(
         "what the thesis's published code changes; evaluate and report again",

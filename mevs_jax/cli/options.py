@@ -208,6 +208,26 @@ class LookOptions:
 
 
 @dataclass(frozen=True, kw_only=True)
+class EnrolOptions:
+    """Options of `mevs enrol`."""
+
+    objects: Annotated[tyro.conf.Positional[tuple[str, ...]], _arg("NAME=FILE ...")] = ()
+    """objects by name: a mesh in metres, or an .npz of depth images as of `mevs look --depth`"""
+    to: Annotated[Path, _arg("DIR")]
+    """folder of the system of enrolled objects that is written, for --system of other commands; one that is there is replaced"""
+    system: Annotated[str, _arg("PATH|NAME", "objects, which comes with the package")] = "objects"
+    """what the objects are added to: the system that comes with the package, or a folder of enrolled objects"""
+    remove: Annotated[tuple[str, ...], _arg("NAME ...")] = ()
+    """objects of --system to leave out"""
+    rename: Annotated[tuple[str, ...], _arg("OLD=NEW ...")] = ()
+    """objects of --system that get another name"""
+    up: Up = "auto"
+    """the upward axis of the meshes"""
+    metres: Annotated[float, _arg("M", "1")] = 1.0
+    """metres in one unit of the meshes, 0.001 for millimetres; 0: sizes say nothing"""
+
+
+@dataclass(frozen=True, kw_only=True)
 class WithObjects:
     """Checks of trained systems on other objects."""
 
@@ -238,6 +258,26 @@ class TransferOptions(WithObjects):
     """number of views of each walk"""
     to: Annotated[Path | None, _arg("FILE")] = None
     """write all figures into this .json file"""
+
+
+@dataclass(frozen=True, kw_only=True)
+class InstancesOptions:
+    """Options of `mevs study instances`."""
+
+    data: Annotated[str, _arg("SOURCE", "strangers, built in")] = "strangers"
+    """objects, each of which is enrolled: a folder or zip of meshes in class folders, or built-in ones"""
+    up: Up = "auto"
+    """the upward axis of the meshes"""
+    system: Annotated[str, _arg("PATH|NAME", "objects, which comes with the package")] = "objects"
+    """the system that objects are enrolled with"""
+    sizes: Annotated[tuple[int, ...], _arg("N ...", "all")] = ()
+    """numbers of objects to enrol, besides all"""
+    fit: Flag = False
+    """first learn the system that objects are enrolled with, from procedural shapes, and write it into TO/objects"""
+    shapes: Annotated[int, _arg("N", "1000")] = 1000
+    """procedural shapes to learn from with --fit; a quarter as many of other kinds calibrate"""
+    to: Annotated[Path, _arg("DIR", "runs/instances")] = Path("runs/instances")
+    """folder for the figures (instances.json) and what is learned"""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -15,7 +15,7 @@ from mevs_jax.deploy.compiled import keep_compiled
 
 if TYPE_CHECKING:
     from mevs_jax.agent import Walk
-    from mevs_jax.cli.options import ExportOptions, LookOptions
+    from mevs_jax.cli.options import EnrolOptions, ExportOptions, LookOptions
     from mevs_jax.trained import TrainedSystem
 
 
@@ -36,7 +36,7 @@ def look(options: LookOptions) -> None:
     with suppress(OSError):  # without a place to keep programs in, they are compiled again
         keep_compiled()
     system = load_system(options.system)
-    if options.metres and system.description.size is None:
+    if options.metres and not system.description.uses_size:
         raise Unusable(f"{options.system} does not use sizes; leave out --metres")
     given = {name: getattr(options, name) for name in ("policy", "stop", "max_views")}
     given |= {} if options.unknown is None else {"unknown": options.unknown}
@@ -131,6 +131,63 @@ def load_system(name: str | Path) -> TrainedSystem:
         return mevs_jax.load(name)
     except (ValueError, OSError, ImportError) as error:
         raise Unusable(str(error)) from error
+
+
+def enrol(options: EnrolOptions) -> None:
+    """Writes a system that knows some objects."""
+    import warnings
+
+    from mevs_jax.enrolment import enrolling
+
+    if not (options.objects or options.remove or options.rename):
+        raise Unusable("mevs enrol needs objects: NAME=FILE ..., or --remove NAME, or --rename OLD=NEW")
+    if not 0 <= options.metres < float("inf"):
+        raise Unusable(f"--metres is the metres in one unit of the meshes, 0.001 for millimetres, got {options.metres}")
+    given = {name: _shape_of(Path(file), options) for name, file in _pairs(options.objects, "NAME=FILE")}
+    if len(given) < len(options.objects):
+        raise Unusable("two objects have one name; choose another for one of them")
+    system = load_system(options.system)
+    try:
+        if options.remove:
+            system = enrolling.remove(system, options.remove)
+        if options.rename:
+            system = enrolling.rename(system, dict(_pairs(options.rename, "OLD=NEW")))
+        with warnings.catch_warnings(record=True) as said:
+            warnings.simplefilter("always", enrolling.AlikeWarning)
+            if given:
+                system = enrolling.enrol(given, system, true_size=options.metres > 0)
+        system.save(options.to)
+    except (ValueError, FileExistsError, ImportError) as error:
+        raise Unusable(str(error)) from error
+    except OSError as error:
+        raise Unusable(f"cannot write {options.to} ({error.strerror}); choose another folder") from error
+    for warning in said:
+        print(f"Note: {warning.message}")
+    known = ", ".join(system.classes[:-1]) or "none"
+    print(
+        f"Enrolled: {known}\nTrained system: {options.to.absolute()} (recognise with: mevs look --system {options.to})"
+    )
+
+
+def _pairs(given: tuple[str, ...], form: str) -> list[tuple[str, str]]:
+    pairs = [one.partition("=") for one in given]
+    for (name, equals, value), one in zip(pairs, given, strict=True):
+        if not (name and equals and value):
+            raise Unusable(f"{one!r} is not {form}")
+    return [(name, value) for name, _, value in pairs]
+
+
+def _shape_of(path: Path, options: EnrolOptions) -> Any:
+    """An object as `mevs_jax.enrol` takes it, from a file."""
+    if path.suffix.lower() == ".npz":
+        from mevs_jax.agent import Frames
+
+        try:
+            return Frames.of(read_arrays(path))
+        except ValueError as error:
+            raise Unusable(f"{path}: {error}") from error
+    vertices, faces = read_mesh(path, options.up)
+    return vertices * (options.metres or 1.0), faces
 
 
 def export(options: ExportOptions) -> None:

@@ -44,9 +44,9 @@ def export(
 ) -> Path:
     """Writes the programs of a system into a folder; returns the folder.
 
-    `recognise` maps depth images to features and calibrated probabilities of single views, `entropies` maps clouds to the
-    entropies of all views (if the system predicts them), and `decide` is one step of an agent: a new view changes the memory,
-    and the next view is chosen.
+    `recognise` maps depth images to features and calibrated probabilities of single views (unless the system is a gallery),
+    `entropies` maps clouds to the entropies of all views (if the system predicts them), and `decide` is one step of an agent: a
+    new view changes the memory, and the next view is chosen.
 
     Args:
         system: from `mevs_jax.load`.
@@ -68,7 +68,9 @@ def export(
         raise ImportError("writing StableHLO needs flatbuffers: pip install mevs-jax[export]") from error
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
-    programs = {"recognise": _recognise(system), "decide": _decide(system, policy, max_views)}
+    programs = {"decide": _decide(system, policy, max_views)}
+    if system.parts.encoder is not None:
+        programs["recognise"] = _recognise(system)
     if system.parts.entropy is not None:
         programs["entropies"] = _entropies(system)
     manifest: dict[str, Any] = {
@@ -127,7 +129,7 @@ def _arguments(inputs: Sequence[dict[str, Any]]) -> list[Any]:
 def _radius(system: TrainedSystem, shape: Sequence[Any]) -> list[dict[str, Any]]:
     """The input of a system that uses the size of objects; none for another one."""
     about = "of the object in metres; NaN if its size is unknown"
-    return [_array("radius", shape, about)] if system.description.size else []
+    return [_array("radius", shape, about)] if system.description.uses_size else []
 
 
 def _recognise(system: TrainedSystem) -> _Program:
@@ -138,7 +140,7 @@ def _recognise(system: TrainedSystem) -> _Program:
     def recognise(depth: Array, radius: Array | float = jnp.nan) -> dict[str, Array]:
         radii = jnp.broadcast_to(jnp.asarray(radius), depth.shape[:1])
         features = features_of(parts, depth, radii, of)
-        logits = logits_of(parts, parts.encoder.module, features) / parts.single
+        logits = logits_of(parts, features) / parts.single
         return {"features": features, "probabilities": jax.nn.softmax(logits, axis=-1)}
 
     return (
@@ -148,7 +150,7 @@ def _recognise(system: TrainedSystem) -> _Program:
             *_radius(system, ["b"]),
         ],
         [
-            _array("features", ["b", 8 * of.encoder.width], "of each view"),
+            _array("features", ["b", of.features], "of each view"),
             _array("probabilities", ["b", len(of.classes)], "of the classes, from each view alone"),
         ],
     )
@@ -181,7 +183,7 @@ def _decide(system: TrainedSystem, policy: str, max_views: int) -> _Program:
         memory: Any, depth: Array, pose: Array, reachable: Array, cost: Array, seed: Array, radius: Any = jnp.nan
     ) -> dict[str, Any]:
         before = jax.tree.unflatten(structure, [memory[name] for name in names])
-        after, (probabilities, strangeness) = programs.steps.see_view(
+        after, (probabilities, strangeness, _) = programs.steps.see_view(
             parts, before, depth, pose, jnp.asarray(radius, jnp.float32), programs.temperatures(parts)
         )
         following, gains = programs.steps.choose_next(

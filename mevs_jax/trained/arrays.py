@@ -13,6 +13,7 @@ from flax import nnx
 
 from mevs_jax.beliefs.fusing import CalibratedFusion
 from mevs_jax.beliefs.strangeness import LEVELS, Strangeness
+from mevs_jax.enrolment.gallery import HEIGHTS, PIXELS, YAWS, Gallery, Matcher
 from mevs_jax.models.expected_views import ExpectedViews
 from mevs_jax.policies.base import Knowledge
 from mevs_jax.trained.description import Description
@@ -27,7 +28,7 @@ _MOST_DEGREE = 16
 
 def arrays_of(parts: Parts) -> dict[str, Any]:
     """All arrays by names joined with dots; those of a network by their place in it."""
-    known, fusion = parts.knowledge, parts.fusion.get("posed")
+    known, fusion, gallery = parts.knowledge, parts.fusion.get("posed"), parts.gallery
     if known is not None and (known.order is None or known.by_pose is not None):
         raise ValueError("the knowledge of a trained system is an order of its viewpoints and a class × view table")
     return _flat(
@@ -49,6 +50,8 @@ def arrays_of(parts: Parts) -> dict[str, Any]:
             "temperatures": parts.temperatures,
             "expected": parts.expected and parts.expected.coefficients,
             "size": parts.size,
+            "gallery": gallery and {"images": gallery.images, "radii": gallery.radii},
+            "matcher": gallery and dict(vars(gallery.matcher)),
             QUANTILES: parts.strangeness and parts.strangeness.quantiles,
         },
     )
@@ -112,13 +115,13 @@ class _Arrays:
 def parts_of(description: Description, arrays: dict[str, np.ndarray]) -> Parts:
     """The parts that a description and the arrays of a file make, all of which must be as described."""
     of, take = description, _Arrays(arrays)
-    classes, features = len(of.classes), 8 * of.encoder.width
+    classes, features = len(of.classes), of.features
     viewpoints = take.take("viewpoints", (None, 3))
     if len(viewpoints) < 2 or float(jnp.abs(jnp.linalg.norm(viewpoints, axis=1) - 1).max()) > 1e-3:
         raise ValueError("viewpoints are not at least two unit vectors")
     expected = _expected(of, take)
     parts = Parts(
-        encoder=take.network("encoder", partial(of.encoder.network, classes)),
+        encoder=None if of.encoder is None else take.network("encoder", partial(of.encoder.network, classes)),
         viewpoints=viewpoints,
         neighbours=take.take("neighbours", (len(viewpoints), len(viewpoints)), bool),
         single=take.positive("single", ()),
@@ -134,15 +137,29 @@ def parts_of(description: Description, arrays: dict[str, np.ndarray]) -> Parts:
         knowledge=_knowledge(take, classes, viewpoints, expected),
         temperatures=_temperatures(take),
         strangeness=Strangeness(take.take(QUANTILES, (None, LEVELS))) if QUANTILES in arrays else None,
+        gallery=_gallery(take, classes - 1) if of.kind == "gallery" else None,
     )
     take.finish()
     return parts
 
 
+def _gallery(take: _Arrays, objects: int) -> Gallery:
+    matcher = Matcher(
+        projection=take.take("matcher.projection", (PIXELS, None)),
+        floor=take.positive("matcher.floor", ()),
+        heat=take.take("matcher.heat", (3,)),
+        stranger=take.take("matcher.stranger", (4,)),
+        unseen=take.positive("matcher.unseen", ()),
+        size=take.positive("matcher.size", ()),
+    )
+    images = take.take("gallery.images", (objects, HEIGHTS, YAWS, PIXELS), np.uint8)
+    return Gallery.of(matcher, images, take.take("gallery.radii", (objects,)))
+
+
 def _fusion(of: Description, take: _Arrays) -> dict[str, CalibratedFusion]:
     if of.fusion is None:
         return {}
-    classes, features = len(of.classes), 8 * of.encoder.width
+    classes, features = len(of.classes), of.features
     network = take.network("fusion.weights", partial(of.fusion.network, features, classes))
     prior, single = take.take("fusion.prior", (classes,)), take.take("single", ())
     temperatures = {name: take.positive(f"fusion.temperatures.{name}", (None,)) for name in ("posed", "unposed")}

@@ -45,11 +45,45 @@ from the object's centre, z up in the image.
 * The figures are of perfect depth. Noise, missing depth and wrong centres cost accuracy.
 * Confidence is calibrated on validation objects of the same source.
 """
+_GALLERY = """---
+library_name: mevs_jax
+tags: [active-recognition, next-best-view, depth, enrolment, jax]
+---
+
+# Recognition of enrolled objects by chosen views
+
+```python
+import mevs_jax
+
+system = mevs_jax.load("PATH OF THIS FOLDER")
+more = mevs_jax.enrol({{"mug": (vertices, faces)}}, system)  # without training
+agent = more.agent()
+```
+
+* Objects: {objects}. Everything else is an `{unknown}`.
+* Views are compared with those of the objects at every yaw, by a matcher that was learned from procedural shapes with the
+  errors of real images. There is no network.
+* Camera: {camera.resolution}×{camera.resolution} pixels, field of view {camera.field_of_view:g}°, {camera.distance:g} radii \
+from the object's centre, z up in the image.
+* Weights: {megabytes:.1f} MB. Made with {versions}.
+
+## Limits
+
+* Objects are told apart by their shape, and by their size where it is known; colour is not used. A depth camera cannot tell
+  some objects apart: `mevs_jax.enrolment.alike` names them.
+* Objects are upright. Their yaw may be unknown, a tilt may not.
+* Confidence is calibrated on procedural shapes of other kinds.
+"""
 
 
 def model_card(description: Description, size: int) -> str:
     """Returns the card as Markdown, for weights of `size` bytes."""
     of, sizes = description, description.size
+    if of.kind == "gallery":
+        *objects, unknown = of.classes
+        known = {"objects": ", ".join(objects) or "none yet", "unknown": unknown, "camera": of.camera}
+        made = ", ".join(f"{name} {version}" for name, version in of.made_with.items())
+        return _GALLERY.format(**known, megabytes=size / 1e6, versions=made)
     told = "* Size: the object's radius, where it is given, from {0.smallest:g} to {0.largest:g} m.\n"
     return _CARD.format(
         of=of,

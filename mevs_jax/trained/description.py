@@ -6,6 +6,7 @@ import json
 from dataclasses import asdict, dataclass, field
 from typing import Any, Literal
 
+from mevs_jax.enrolment.gallery import comparisons
 from mevs_jax.geometry.cameras import ViewCamera
 from mevs_jax.geometry.inputs import SizeInput
 from mevs_jax.models.shapes import PointNet2Shape, PoseShape, ResNetShape, SetFusionShape, ViewPolicyShape
@@ -73,11 +74,12 @@ class Description:
 
     Attributes:
         form: version of the folder's form.
-        kind: `classifier`: logits of single views are added; `recogniser`: a network fuses the features of all views.
+        kind: `classifier`: logits of single views are added; `recogniser`: a network fuses the features of all views; `gallery`:
+            views are compared with those of enrolled objects, without a network.
         classes: names of the classes, by label.
         camera: of the views that the networks were trained with.
         image: input of the classifier or recogniser.
-        encoder: its shape.
+        encoder: its shape; None for a gallery.
         fusion: shape of the set fusion, for a recogniser.
         size: how the object's radius is used, for a recogniser that was trained with it.
         pose: shape of the network that finds the yaw of objects, for a recogniser that was trained with it.
@@ -94,11 +96,11 @@ class Description:
     """
 
     form: int
-    kind: Literal["classifier", "recogniser"]
+    kind: Literal["classifier", "recogniser", "gallery"]
     classes: tuple[str, ...]
     camera: ViewCamera
     image: ImageInput
-    encoder: ResNetShape
+    encoder: ResNetShape | None
     best: str
     best_unposed: str
     chosen_by: str
@@ -115,8 +117,18 @@ class Description:
 
     @property
     def told_unknown(self) -> bool:
-        """Whether its networks are told what an image does not show, so that images may show a part of the object."""
-        return self.image.channels == 5
+        """Whether it is told what an image does not show, so that images may show a part of the object."""
+        return self.image.channels == 5 or self.kind == "gallery"
+
+    @property
+    def uses_size(self) -> bool:
+        """Whether the object's radius in metres says something about its class."""
+        return self.size is not None or self.kind == "gallery"
+
+    @property
+    def features(self) -> int:
+        """Length of what is kept of each view for the fusion."""
+        return comparisons(len(self.classes) - 1) if self.encoder is None else 8 * self.encoder.width
 
     @property
     def unknown_class(self) -> int | None:

@@ -6,6 +6,7 @@ Nothing in a folder is executed, and nothing is allocated before the shapes in t
 
 from __future__ import annotations
 
+import glob
 import hashlib
 import json
 import os
@@ -16,12 +17,13 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
+from mevs_jax.enrolment.gallery import SIDE
 from mevs_jax.plain import from_plain
 from mevs_jax.policies.registry import POLICIES
 from mevs_jax.trained.arrays import DESCRIPTION, WEIGHTS, parts_of
 from mevs_jax.trained.description import FORM, Description
 from mevs_jax.trained.system import EXPECTED_VIEWS, TrainedSystem
-from mevs_jax.trained.writing import CARD, hash_of
+from mevs_jax.trained.writing import BEFORE, CARD, hash_of
 
 SHIPPED = Path(__file__).parents[1] / "systems"
 """Folder of the systems that come with the package, by name."""
@@ -79,7 +81,9 @@ def _folder_of(path: str | Path) -> Path:
     if isinstance(path, str) and path.startswith(HUB):
         return _from_hub(path.removeprefix(HUB))
     folder = Path(path)
-    for place in (folder, folder / "system", folder / "learned" / "system"):
+    # A computer that stopped while a system was replaced may have left the old one alone, under another name.
+    kept = [] if folder.exists() else sorted(folder.parent.glob(f".{glob.escape(folder.name)}.*{BEFORE}"))
+    for place in (folder, folder / "system", folder / "learned" / "system", *kept):
         if (place / DESCRIPTION).exists():
             return place
     if (folder / "run.json").exists():
@@ -195,17 +199,23 @@ def _read_description(folder: Path) -> tuple[Description, Any]:
 def check(description: Description) -> None:
     """Raises `ValueError` if a description contradicts itself."""
     of, camera, classes, size = description, description.camera, description.classes, description.size
+    gallery = of.kind == "gallery"
     own = {*of.view_policies, *[EXPECTED_VIEWS] * (of.fusion is not None)}
     unknown = [name for name in (of.best, of.best_unposed) if name not in POLICIES and name not in own]
     sound = {
         "the camera is impossible": 1 <= camera.resolution <= MOST_PIXELS
         and 0 < camera.field_of_view < 180
         and 1 < camera.distance < 1e3,
-        "there are fewer than two classes, or two of one name": 2 <= len(set(classes)) == len(classes),
+        "there are fewer than two classes, or two of one name": 2 - gallery <= len(set(classes)) == len(classes),
+        "a gallery has an unknown object as its last class": not gallery or of.unknown_class == len(classes) - 1,
+        "a gallery has no networks": not gallery
+        or not (of.encoder or of.fusion or of.pose or of.entropy or of.view_policies),
+        "a system has an encoder, or is a gallery": gallery == (of.encoder is None),
+        "the camera's resolution is no multiple of that of a gallery": not gallery or camera.resolution % SIDE == 0,
         f"there are more than {MOST_CLASSES} classes": len(classes) <= MOST_CLASSES,
         "depth and normals have 4 or 5 channels": of.image.content != "depth_and_normals"
         or of.image.channels in (4, 5),
-        "encoder and image differ in their channels": of.encoder.channels == of.image.channels,
+        "encoder and image differ in their channels": of.encoder is None or of.encoder.channels == of.image.channels,
         "the size is impossible, or used by another kind than a recogniser": size is None
         or (of.fusion is not None and 0 < size.smallest < size.largest < 1e9 and 2 <= size.steps <= 1000),
         "nothing but a recogniser finds poses": of.pose is None or of.fusion is not None,
@@ -220,7 +230,7 @@ def check(description: Description) -> None:
     for shape in (of.encoder, of.fusion, of.pose, of.entropy, *of.view_policies.values()):
         if shape is not None:
             _check_sizes(asdict(shape))
-    largest = [camera.resolution**2 * max(of.encoder.width, of.image.channels)]
+    largest = [camera.resolution**2 * max(of.encoder.width if of.encoder else 1, of.image.channels)]
     if of.entropy is not None:
         largest += [level.centres * level.samples * max(level.layers, default=1) for level in of.entropy.abstractions]
     if of.pose is not None:

@@ -13,6 +13,7 @@ from jaxtyping import Array, Float, Int
 
 from mevs_jax.beliefs.fusing import CalibratedFusion
 from mevs_jax.beliefs.strangeness import Strangeness
+from mevs_jax.enrolment.gallery import Gallery
 from mevs_jax.geometry.inputs import depth_and_normals, depth_image, view_cloud
 from mevs_jax.models.expected_views import ExpectedViews
 from mevs_jax.models.pose import yaw_evidence
@@ -43,7 +44,7 @@ class Parts:
     """Everything of a trained system that is made of arrays.
 
     Attributes:
-        encoder: ResNet, from an image to features and logits.
+        encoder: ResNet, from an image to features and logits; None for a gallery.
         viewpoints: (views, 3) unit vectors from the object to the candidate cameras.
         neighbours: (views, views) True for neighbours on the view graph.
         entropy: PointNet++, from a cloud to the entropies of all views.
@@ -56,9 +57,10 @@ class Parts:
         expected: what a recogniser is expected to say of each class from any direction.
         temperatures: by name of the policy, (views,): temperature of the belief after 1, 2, … views of its walks.
         strangeness: compares logits with those of known objects.
+        gallery: enrolled objects, which views are compared with in place of an encoder.
     """
 
-    encoder: Network
+    encoder: Network | None
     viewpoints: Float[Array, "views 3"]
     neighbours: Array
     single: Float[Array, ""]
@@ -71,6 +73,7 @@ class Parts:
     expected: ExpectedViews | None = None
     temperatures: dict[str, Array] = flax.struct.field(default_factory=dict)
     strangeness: Strangeness | None = None
+    gallery: Gallery | None = None
 
     def knowledge_by_pose(self, directions: Float[Array, "views 3"]) -> Knowledge | None:
         """What is known about views in directions of the world for objects of unknown yaw; None if nothing is."""
@@ -102,9 +105,10 @@ def image_of(depth: Float[Array, "side side"], of: Description) -> Float[Array, 
     return depth_image(depth, of.camera, of.image.channels)
 
 
-def logits_of(parts: Parts, encoder: Any, features: Float[Array, "*batch features"]) -> Float[Array, "*batch classes"]:
+def logits_of(parts: Parts, features: Float[Array, "*batch features"]) -> Float[Array, "*batch classes"]:
     """The logits of single views; all classes are equally likely before the first view."""
-    logits = encoder.head(features)
+    assert parts.encoder is not None
+    logits = parts.encoder.module.head(features)
     return logits - parts.fusion["posed"].prior if parts.fusion else logits
 
 
@@ -113,6 +117,7 @@ def features_of(
 ) -> Float[Array, "*batch features"]:
     """The features of single views; arguments as of `observe`."""
     images = jnp.vectorize(lambda one: image_of(one, of), signature="(h,w)->(h,w,c)")(depth)
+    assert parts.encoder is not None
     features = parts.encoder.module.features(images)
     return features if of.size is None or parts.size is None else features + of.size.code(radius) @ parts.size
 
@@ -135,13 +140,17 @@ def observe(
         of: the description of the system.
         with_entropy: whether predicted entropies are needed, if it has them.
     """
+    direction = pose[:3, 3] / jnp.linalg.norm(pose[:3, 3])
+    if parts.gallery is not None:
+        compared = parts.gallery.compared(depth, direction, of.camera.distance, radius)
+        evidence = parts.gallery.evidence(compared[None], jnp.ones(1, bool), posed=False)
+        return Observation(parts.gallery.beliefs(evidence), features=compared)
     features = features_of(parts, depth, radius, of)
-    cloud, entropies, evidence = of.cloud, None, None
+    cloud, entropies, yaws = of.cloud, None, None
     if with_entropy and cloud is not None and parts.entropy is not None:
         pixels = sample_pixels(depth, cloud.points)
         seen = view_cloud(pixels, depth.reshape(-1)[pixels], pose, of.camera, cloud.frame, cloud.directions)
         entropies = parts.entropy.module(seen)
     if parts.pose is not None:
-        direction = pose[:3, 3] / jnp.linalg.norm(pose[:3, 3])
-        evidence = yaw_evidence(parts.pose.module(features, direction[2]), direction)
-    return Observation(logits_of(parts, parts.encoder.module, features), entropies, features, pose_evidence=evidence)
+        yaws = yaw_evidence(parts.pose.module(features, direction[2]), direction)
+    return Observation(logits_of(parts, features), entropies, features, pose_evidence=yaws)

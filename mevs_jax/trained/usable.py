@@ -13,6 +13,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
+from mevs_jax.enrolment.beliefs import by_hypotheses, gain_among
 from mevs_jax.policies.base import Observation, Policy
 from mevs_jax.policies.informed import expected_views
 from mevs_jax.policies.learned import learned
@@ -26,6 +27,9 @@ AND_TABLE = "learned_and_table"
 """The policy that averages the gains by the network `learned` and by what views are expected to show."""
 EXPECTED_VIEWS = "expected_views"
 """The policy by what a recogniser is expected to say (`mevs_jax.policies.informed.expected_views`)."""
+
+INFORMATION_GAIN = "information_gain"
+"""The registered policy, which is exact over the hypotheses of a gallery."""
 
 
 @dataclass(frozen=True)
@@ -65,6 +69,8 @@ def policy_of(description: Description, parts: Parts, name: str, posed: bool) ->
             raise ValueError("its network needs the object's yaw")
         by = "table" if name == AND_TABLE else "belief"
         return learned(parts.view_policies[network].module, parts.single, by=by)  # type: ignore[arg-type]
+    if name == INFORMATION_GAIN and parts.gallery is not None:
+        return gain_among(parts.gallery, posed)
     if name == EXPECTED_VIEWS and parts.expected is not None:
         return expected_views
     if name not in POLICIES:
@@ -76,15 +82,17 @@ def policy_of(description: Description, parts: Parts, name: str, posed: bool) ->
 
 def fusion_of(parts: Parts, posed: bool) -> Fuse:
     """`TrainedSystem.fuse` of a system with these arrays."""
+    if parts.gallery is not None:
+        return by_hypotheses(parts.gallery, posed)
     return by_attention(parts.fusion["posed" if posed else "unposed"]) if parts.fusion else sum_of_logits
 
 
 def example_of(description: Description, parts: Parts, with_entropy: bool) -> Observation:
     """An observation of zeros, for its shapes."""
-    classes, features = len(description.classes), 8 * description.encoder.width
     entropies = jnp.zeros(len(parts.viewpoints)) if with_entropy else None
     evidence = None if parts.pose is None else jnp.zeros(parts.pose.module.shape)
-    return Observation(jnp.zeros(classes), entropies, jnp.zeros(features), pose_evidence=evidence)
+    logits, features = jnp.zeros(len(description.classes)), jnp.zeros(description.features)
+    return Observation(logits, entropies, features, pose_evidence=evidence)
 
 
 def shared(policy: Policy) -> Policy:

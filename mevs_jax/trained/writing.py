@@ -20,6 +20,8 @@ from mevs_jax.trained.description import Description
 from mevs_jax.trained.parts import Parts
 
 CARD, PROGRAMS = "README.md", "stablehlo"
+BEFORE = ".before"
+"""Ends the name of a folder that is being replaced."""
 Programs = Callable[[Any, Path], object]
 """Writes the compiled programs of a system into a folder, as `mevs_jax.export.export` does."""
 
@@ -58,7 +60,7 @@ def _put_in_place(made: Path, folder: Path) -> None:
     """Renames a folder to another name. A folder of this name is removed once the new one stands, and stays if it cannot."""
     before = None
     if folder.is_dir():
-        before = made.with_name(f"{made.name}.before")
+        before = made.with_name(made.name + BEFORE)
         folder.rename(before)
     try:
         made.rename(folder)

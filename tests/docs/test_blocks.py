@@ -84,6 +84,7 @@ def world_of(page: str, whole: Path) -> dict:
     pose = np.array(mevs_jax.look_at_origin(np.array([0.3, -0.2, 0.25], np.float32)), float)
     pose[:3, 3] += CENTER
     depth, _ = look(pose)
+    piece = furniture("desk", 900)
     tables = load_view_tables(whole / "tables" / "test.npz")
     return {
         "look_from": look if page == "README.md" else lambda pose: (*look(pose), pose),
@@ -91,6 +92,10 @@ def world_of(page: str, whole: Path) -> dict:
         "depth": depth,
         "K": K,
         "T_world_camera": pose,
+        "pose": pose,
+        "vertices": np.asarray(piece.vertices) * 0.15,
+        "faces": np.asarray(piece.faces),
+        "frames": [mevs_jax.DepthImage(*look(pose), pose, mask=look(pose)[0] < np.inf)],
         "points": CENTER + RADIUS * np.random.default_rng(0).uniform(-0.5, 0.5, (500, 3)),
         "tables": tables.stacked(),
         "graph": mevs_jax.ViewGraph.from_points(mevs_jax.fibonacci_sphere(tables.logits.shape[1])),

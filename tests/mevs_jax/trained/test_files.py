@@ -107,6 +107,15 @@ def test_a_system_is_not_lost_where_the_new_one_cannot_stand(written, tmp_path, 
     assert sorted(tmp_path.iterdir()) == before
 
 
+def test_a_system_is_found_if_the_computer_stopped_while_it_was_replaced(written, tmp_path):
+    made, folder = written
+    shutil.copytree(folder, tmp_path / ".mine.k3x9.before")
+    assert load(tmp_path / "mine").description == made.description
+    (tmp_path / "mine").mkdir()
+    with pytest.raises(FileNotFoundError, match="is no trained system"):
+        load(tmp_path / "mine")
+
+
 def test_names_of_the_package_win_over_folders(written, tmp_path, monkeypatch):
     made, folder = written
     shutil.copytree(folder, tmp_path / "furniture10")

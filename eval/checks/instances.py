@@ -1,0 +1,291 @@
+"""How well enrolled objects are told apart, from meshes and from a few depth images: `mevs study instances`."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import partial
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from data_pipeline.capture.casting import capture
+from data_pipeline.dataset.inputs import metric_depth
+from data_pipeline.dataset.reality import RealityAugmentation, realistic_views
+from data_pipeline.errors import DataError, EmptyMesh, reason_of
+from data_pipeline.objects.formats import Up
+from data_pipeline.objects.mesh import Mesh
+from data_pipeline.objects.sources import load_object, objects_to_test
+from data_pipeline.progress import progress_bar
+from eval.checks.agent import STOPS
+from eval.checks.promise import PromiseRow, Strangers, promises, strangers
+from eval.checks.walks import BASELINE, AccuracyRow, Observer, Walker, Walks, rows_of
+from mevs_jax.enrolment.enrolling import enrol
+from mevs_jax.enrolment.gallery import YAWS
+from mevs_jax.geometry.cameras import ViewCamera
+from mevs_jax.geometry.source_view import DepthImage
+from mevs_jax.selection.loop import ViewTable
+from mevs_jax.trained import TrainedSystem
+from train.tasks.matcher import turned_rig
+
+VIEWS = (1, 2, 3, 4)
+POLICIES = (BASELINE, "farthest", "information_gain")
+_WITHIN = np.radians(10)
+"""A yaw is right if it is off by at most this much."""
+_LEVEL = -0.1
+"""Least height of the directions that depth images for enrolment are taken from: tables hide what is below."""
+
+
+@dataclass(frozen=True)
+class Condition:
+    """What objects are enrolled from, and how they are seen.
+
+    Attributes:
+        name: of the condition.
+        frames: number of depth images that objects are enrolled from; 0 for their meshes.
+        unseen: largest share of the sphere that half of the views do not show.
+        sized: whether the objects' true size is known, with the error of the sphere.
+        errors: whether views, and the images that objects are enrolled from, have the errors of real ones.
+    """
+
+    name: str
+    frames: int = 0
+    unseen: float = 0.0
+    sized: bool = False
+    errors: bool = True
+
+    @property
+    def reality(self) -> RealityAugmentation:
+        """The errors of the views; the sphere is off by up to 5 % of the radius."""
+        strength = 1.0 if self.errors else 0.0
+        return RealityAugmentation(strength, sphere=0.05, floor=0.0, hidden=0.0, unseen=self.unseen)
+
+
+CONDITIONS = (
+    Condition("mesh, perfect views", errors=False),
+    Condition("mesh"),
+    Condition("mesh, true size", sized=True),
+    Condition("mesh, parts", unseen=0.7),
+    Condition("3 images", frames=3),
+    Condition("8 images", frames=8),
+    Condition("20 images", frames=20),
+)
+"""Views have the errors of real images, but for the first; an object's yaw is never known."""
+
+
+@dataclass(frozen=True)
+class PoseRow:
+    """Share of walks whose yaw is right within 10°, up to the object's symmetry, if the object is right; round ones left out."""
+
+    views: int
+    right: float
+    objects: int
+
+
+@dataclass(frozen=True)
+class Measured:
+    """One condition and one size of the gallery.
+
+    Attributes:
+        condition: its name.
+        enrolled: number of objects.
+        policies: accuracy among them, and gain over random views.
+        poses: of random views.
+        promises, unknown_objects: where a third of the objects is not enrolled.
+    """
+
+    condition: str
+    enrolled: int
+    policies: list[AccuracyRow]
+    poses: list[PoseRow]
+    promises: list[PromiseRow]
+    unknown_objects: Strangers | None
+
+
+@dataclass(frozen=True)
+class Instances:
+    """`instances.json`: the objects, those left out with their reasons, and what was measured."""
+
+    system: str
+    data: str
+    objects: list[str]
+    left_out: dict[str, str]
+    measured: list[Measured]
+
+
+class Seen(NamedTuple):
+    """Views of an object at a random yaw, with errors."""
+
+    depth: Float[np.ndarray, "views side side"]
+    radius: float
+    yaw: float
+
+
+def study_instances(
+    system: TrainedSystem,
+    data: str,
+    *,
+    up: Up = "auto",
+    sizes: Sequence[int] = (),
+    conditions: Sequence[Condition] = CONDITIONS,
+    yaws: int = 2,
+    seed: int = 0,
+) -> Instances:
+    """Enrols objects with a system and measures how well they are recognised, each of them as a class of its own.
+
+    Args:
+        system: that objects are enrolled with, as `objects`.
+        data: meshes, as of `mevs check transfer`; their classes do not matter.
+        up: upward axis of the meshes.
+        sizes: numbers of objects to enrol, drawn at random; all that there are, besides.
+        conditions: what to measure.
+        yaws: how often each object is walked around, at a random yaw each.
+        seed: of objects, yaws and errors.
+
+    Raises:
+        DataError: if fewer than 3 objects can be used.
+    """
+    source, left_out = objects_to_test(data, up), dict[str, str]()
+    meshes: dict[str, Mesh] = {}
+    for entry in source.entries:
+        try:
+            meshes[entry.name] = load_object(entry)
+        except (DataError, EmptyMesh) as error:
+            left_out[entry.name] = reason_of(error)
+    if len(meshes) < 3:
+        raise DataError(f"{data} has {len(meshes)} objects that can be used, and 3 are needed")
+    random, measured = np.random.default_rng(seed), []
+    chosen = [random.permutation(len(meshes))[:size] for size in sorted({*sizes}) if 3 <= size < len(meshes)]
+    with progress_bar("conditions") as bar:
+        line = bar.add_task("Measure", total=len(conditions) * (len(chosen) + 1), note="")
+        for condition in conditions:
+            for some in [*chosen, np.arange(len(meshes))]:
+                named = {list(meshes)[place]: list(meshes.values())[place] for place in some}
+                measured.append(_measure(system, named, condition, yaws, seed))
+                bar.advance(line)
+    return Instances(system.name, data, list(meshes), left_out, measured)
+
+
+def _measure(system: TrainedSystem, meshes: dict[str, Mesh], condition: Condition, yaws: int, seed: int) -> Measured:
+    names, camera = list(meshes), system.description.camera
+    random, see = np.random.default_rng([seed, len(names)]), partial(_seen, system, condition)
+    seen = [
+        see(mesh, random.uniform(0, 2 * np.pi), jax.random.key(int(random.integers(2**31))))
+        for mesh in meshes.values()
+        for _ in range(yaws)
+    ]
+    shapes = {name: _shape(mesh, condition, camera, random) for name, mesh in meshes.items()}
+    labels = np.repeat(np.arange(len(names)), yaws)
+    everything = enrol(shapes, system, true_size=condition.sized)
+    tables = _tables(everything, seen, labels, condition)
+    walks = _by_object(_walks(everything, tables, POLICIES, max(VIEWS)), len(names))
+    enrolled = np.sort(random.permutation(len(names))[: -(-2 * len(names) // 3)])
+    known = np.isin(np.arange(len(names)), enrolled)
+    place = np.where(known, np.cumsum(known) - 1, -1)[labels]
+    some = enrol({names[index]: shapes[names[index]] for index in enrolled}, system, true_size=condition.sized)
+    fewer = _by_object(
+        _walks(some, _tables(some, seen, place, condition), (BASELINE, "information_gain"), 8), len(names)
+    )
+    return Measured(
+        condition=condition.name,
+        enrolled=len(names),
+        policies=rows_of(walks, VIEWS),
+        poses=_poses(everything, tables, labels, np.array([one.yaw for one in seen])),
+        promises=promises(fewer["information_gain"], known, STOPS, (1, 2, 4, 8)),
+        unknown_objects=strangers(fewer[BASELINE], known),
+    )
+
+
+def _seen(system: TrainedSystem, condition: Condition, mesh: Mesh, yaw: float, key: jax.Array) -> Seen:
+    camera = system.description.camera
+    depth = jnp.asarray(capture(mesh, turned_rig(camera, system.viewpoints, yaw)).depth)
+    if not condition.errors:
+        return Seen(np.asarray(metric_depth(depth)), mesh.radius, yaw)
+    real = _realistic(key, depth, jnp.asarray(system.poses), camera, condition.reality)
+    off = float(jax.random.uniform(jax.random.fold_in(key, 1), minval=-0.05, maxval=0.05))
+    return Seen(np.asarray(real), mesh.radius * (1 + off), yaw)
+
+
+@partial(jax.jit, static_argnames=("camera", "reality"))
+def _realistic(
+    key: jax.Array, depth: jax.Array, poses: jax.Array, camera: ViewCamera, reality: RealityAugmentation
+) -> jax.Array:
+    return realistic_views(key, {"depth": depth, "pose": poses}, camera, reality, len(depth))[0]
+
+
+def _shape(
+    mesh: Mesh, condition: Condition, camera: ViewCamera, random: np.random.Generator
+) -> tuple[np.ndarray, np.ndarray] | list[DepthImage]:
+    """What an object is enrolled from: its mesh in metres, or depth images from around it, above the level of its centre."""
+    if not condition.frames:
+        return mesh.vertices * mesh.radius, mesh.faces
+    directions = random.normal(size=(50 * condition.frames, 3))
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    directions = _spread(directions[directions[:, 2] > _LEVEL], condition.frames)
+    rig = turned_rig(camera, directions, 0.0)
+    depth, hit = jnp.asarray(capture(mesh, rig).depth), capture(mesh, rig).depth > 0
+    reality = RealityAugmentation(1.0 if condition.errors else 0.0, sphere=0.0, floor=0.0, hidden=0.0)
+    key = jax.random.key(int(random.integers(2**31)))
+    real = np.asarray(_realistic(key, depth, jnp.asarray(rig.poses), camera, reality))
+    poses = rig.poses.astype(float)
+    poses[:, :3, 3] *= mesh.radius
+    return [
+        DepthImage(image * mesh.radius, camera.intrinsics, pose, mask=mask)
+        for image, pose, mask in zip(real, poses, hit, strict=True)
+    ]
+
+
+def _spread(directions: Float[np.ndarray, "all 3"], count: int) -> Float[np.ndarray, "some 3"]:
+    """Some directions, each as far as can be from those before."""
+    chosen = [0]
+    while len(chosen) < count:
+        chosen.append(int((directions @ directions[chosen].T).max(axis=1).argmin()))
+    return directions[chosen]
+
+
+def _tables(system: TrainedSystem, seen: Sequence[Seen], labels: np.ndarray, condition: Condition) -> ViewTable:
+    observer = Observer(system)
+    for one in seen:
+        observer.add(one.depth, one.radius if condition.sized else np.nan)
+    return observer.tables(labels)
+
+
+def _walks(system: TrainedSystem, tables: ViewTable, policies: Sequence[str], steps: int) -> dict[str, Walks]:
+    walker = Walker(system)
+    return {name: walker.walk(tables, name, steps, posed=False) for name in policies}
+
+
+def _by_object(walks: dict[str, Walks], objects: int) -> dict[str, Walks]:
+    """Walks around an object at several yaws as walks around one object."""
+    return {
+        name: Walks(*(array.reshape(objects, -1, *array.shape[2:]) for array in vars(found).values()))
+        for name, found in walks.items()
+    }
+
+
+def _poses(
+    system: TrainedSystem,
+    tables: ViewTable,
+    labels: Int[np.ndarray, " walks"],
+    yaws: Float[np.ndarray, " walks"],
+) -> list[PoseRow]:
+    """How often the likeliest yaw of the right object is right, after some random views."""
+    gallery = system.parts.gallery
+    assert gallery is not None
+    assert tables.features is not None
+    symmetry = np.asarray(gallery.symmetries)[labels]
+    counted, random, rows = symmetry < YAWS, np.random.default_rng(0), []
+    evidence = jax.jit(lambda views: gallery.hypotheses(gallery.evidence(views, jnp.ones(len(views), bool), False)))
+    for count in VIEWS:
+        off = np.full(len(labels), np.nan)
+        for walk in np.flatnonzero(counted):
+            views = random.permutation(len(system.viewpoints))[:count]
+            found = np.asarray(evidence(tables.features[walk, views]))[labels[walk]].argmax() * 2 * np.pi / YAWS
+            turns = symmetry[walk]
+            off[walk] = abs(np.angle(np.exp(1j * turns * (found - yaws[walk])))) / turns
+        right: Bool[np.ndarray, " walks"] = off[counted] <= _WITHIN
+        rows.append(PoseRow(count, float(right.mean()) if counted.any() else np.nan, len(set(labels[counted]))))
+    return rows

@@ -1,0 +1,36 @@
+"""Fusion and policy of a system of enrolled objects."""
+
+from __future__ import annotations
+
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from mevs_jax.enrolment.gallery import Evidence, Gallery
+from mevs_jax.policies.base import Policy, Scene, SelectionState, required
+from mevs_jax.selection.loop import Fuse
+
+
+def by_hypotheses(gallery: Gallery, posed: bool) -> Fuse:
+    """Returns the fusion whose belief is the log-probabilities of the objects and of an unknown one; see `Gallery.beliefs`."""
+
+    def fuse(state: SelectionState, scene: Scene) -> Float[Array, " classes"]:
+        del scene
+        return gallery.beliefs(evidence_of(gallery, state, posed))
+
+    return fuse
+
+
+def gain_among(gallery: Gallery, posed: bool) -> Policy:
+    """Returns the policy of the largest expected information gain over objects and yaws; see `Gallery.gains`."""
+
+    def gain(key: Array, state: SelectionState, scene: Scene) -> Float[Array, " views"]:
+        del key
+        return gallery.gains(evidence_of(gallery, state, posed), scene.graph.points)
+
+    return gain
+
+
+def evidence_of(gallery: Gallery, state: SelectionState, posed: bool) -> Evidence:
+    """What the views of a walk say of each hypothesis."""
+    compared = required(state.seen.features, "Observation.features")
+    return gallery.evidence(compared, jnp.arange(len(state.views)) < state.count, posed)

@@ -1,0 +1,331 @@
+"""What enrolled objects look like from all directions, and how well each of them explains a view, at every yaw.
+
+A gallery holds, for each object, small depth images from a grid of directions around it. A *hypothesis* is an object at a yaw.
+It predicts the image of any camera, by interpolation between the images of the grid. The difference between a view and its
+prediction is Gaussian, with a covariance that a `Matcher` learned from other objects: it has the errors of the sensor, of the
+object's believed sphere, and of the interpolation in it.
+
+How strong the errors are differs from object to object and is not known, so the likelihood of a walk is a power of the mean
+squared difference of its views (a Student t distribution). The power does not grow in proportion to the number of views, since
+errors of one object are not independent across views: what a gallery does not know of an object is missing from each of them.
+"""
+
+from __future__ import annotations
+
+import math
+
+import flax.struct
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int, UInt8
+
+from mevs_jax.arrays import AnyArray
+
+SIDE = 16
+"""Pixels of the images of a gallery, along each side."""
+PIXELS = 2 * SIDE**2
+"""Numbers of an image: the depth of each pixel, and the share of it that shows the object."""
+STEPS, UNKNOWN = 254, 255
+"""A stored number of 1, and one that is not known."""
+YAWS, HEIGHTS = 36, 13
+"""The grid of directions: azimuths, which are the yaws of the hypotheses too; and elevations from −90° to 90°."""
+_NEAR_POLE = math.radians(89.9)
+"""Elevation of the highest and lowest images: at a pole itself, no direction in an image is upwards."""
+_POLE = -math.pi / 2
+"""Azimuth from which a camera near the upper pole has the same image as one at it, and the negative of that at the lower one; see
+`mevs_jax.geometry.cameras.look_at_origin`."""
+MOST_HYPOTHESES = 64
+"""The likeliest hypotheses, which the expected gain of a view is computed from."""
+WEIGHTS = np.repeat(np.array([1.0, 0.5], np.float32), SIDE**2)
+"""Weights of the depth of a pixel, which is from 0 to 1, and of the share of it that shows the object."""
+ALIKE = 0.25
+"""Objects look alike if the squared white difference of their images is less than this on average."""
+_IMPOSSIBLE = 1e6
+"""Squared difference of hypotheses that are ruled out."""
+_LEAST = 0.01
+"""Smallest share of an image that counts as known."""
+
+
+def comparisons(objects: int) -> int:
+    """How many numbers are kept of a view: for each object, one for each yaw and one for its size; and what the view shows."""
+    return objects * (YAWS + 1) + 1
+
+
+def grid_directions() -> Float[np.ndarray, "cells 3"]:
+    """Unit vectors from an object to the cameras of its gallery, azimuths within elevations."""
+    elevation = np.linspace(-np.pi / 2, np.pi / 2, HEIGHTS).clip(-_NEAR_POLE, _NEAR_POLE)[:, None]
+    azimuth = 2 * np.pi * np.arange(YAWS) / YAWS
+    flat, up = np.cos(elevation), np.broadcast_to(np.sin(elevation), (HEIGHTS, YAWS))
+    return np.stack([flat * np.cos(azimuth), flat * np.sin(azimuth), up], axis=-1).reshape(-1, 3)
+
+
+def small_image(
+    depth: Float[AnyArray, "side side"], distance: float
+) -> tuple[Float[Array, " pixels"], Float[Array, " pixels"]]:
+    """A view as galleries hold it, and which of its numbers are known (1 or 0).
+
+    Args:
+        depth: in radii along the optical axis, 0 where nothing is hit, NaN where unknown; its side is a multiple of `SIDE`.
+        distance: of the camera from the object's centre, in radii.
+    """
+    depth = jnp.asarray(depth)
+    block = len(depth) // SIDE
+    blocks = depth.reshape(SIDE, block, SIDE, block).transpose(0, 2, 1, 3).reshape(SIDE**2, block**2)
+    known, hit = ~jnp.isnan(blocks), blocks > 0
+    number = jnp.maximum(jnp.sum(known, axis=1), 1)
+    near = jnp.sum(jnp.where(hit, (distance + 1 - blocks) / 2, 0.0), axis=1) / number
+    share = jnp.sum(hit, axis=1) / number
+    seen = (2 * jnp.sum(known, axis=1) >= block**2).astype(jnp.float32)
+    return jnp.concatenate([near, share]), jnp.concatenate([seen, seen])
+
+
+def stored_image(depth: Float[AnyArray, "side side"], distance: float) -> UInt8[Array, " pixels"]:
+    """`small_image` in steps of 1/254, and `UNKNOWN` where it is not known."""
+    image, known = small_image(depth, distance)
+    return jnp.where(known > 0, jnp.round(jnp.clip(image, 0, 1) * STEPS), UNKNOWN).astype(jnp.uint8)
+
+
+@flax.struct.dataclass
+class Matcher:
+    """How a view is compared with predictions, learned once from objects of all kinds.
+
+    Attributes:
+        projection: (pixels, features) makes differences of images white: of unit covariance.
+        floor: () squared difference below which hypotheses are about equally good.
+        heat: (3,) coefficients of the logarithm of the power of a walk's likelihood, of 1, log views and log objects.
+        stranger: (4,) coefficients of the log-odds that an object is none of those enrolled: of 1, log views, log objects, and
+            the logarithm of the best hypothesis' squared difference.
+        unseen: () the squared difference that counts where a prediction is not known.
+        size: () standard deviation of the logarithm of an object's measured radius.
+    """
+
+    projection: Float[Array, "pixels features"]
+    floor: Float[Array, ""]
+    heat: Float[Array, " 3"]
+    stranger: Float[Array, " 4"]
+    unseen: Float[Array, ""]
+    size: Float[Array, ""]
+
+    def power(self, count: Float[AnyArray, "*walks"], objects: int) -> Float[Array, "*walks"]:
+        """Of the likelihood of a walk of `count` views, among so many objects."""
+        return jnp.exp(self.heat @ _numbers(count, objects))
+
+    def strange_odds(self, apart: Float[Array, ""], count: Float[AnyArray, ""], objects: int) -> Float[Array, ""]:
+        """Log-odds that an object is none of those enrolled, by the squared difference of the best hypothesis."""
+        return self.stranger[:3] @ _numbers(count, objects) + self.stranger[3] * jnp.log(apart + 1e-6)
+
+
+@flax.struct.dataclass
+class Evidence:
+    """What the views of a walk say of each hypothesis.
+
+    Attributes:
+        apart: (objects, yaws) mean squared white difference.
+        size: (objects,) squared deviation of the logarithm of the radius, in standard deviations; 1 where a size is not known.
+        count: number of views, each by the share of its image that is known.
+    """
+
+    apart: Float[Array, "objects yaws"]
+    size: Float[Array, " objects"]
+    count: Float[Array, ""]
+
+
+def _numbers(count: Float[AnyArray, "*walks"], objects: int) -> Float[Array, "..."]:
+    views = jnp.log(jnp.asarray(count, jnp.float32))
+    return jnp.stack(jnp.broadcast_arrays(jnp.float32(1), views, jnp.log(jnp.float32(max(objects, 1)))))
+
+
+@flax.struct.dataclass
+class Gallery:
+    """Enrolled objects.
+
+    Attributes:
+        matcher: compares views.
+        images: (objects, heights, yaws, pixels) from each direction of the grid, as `stored_image`.
+        features: (objects, heights, yaws, features) the same, projected.
+        radii: (objects,) in metres; 0 where the true size is not known.
+        symmetries: (objects,) number of yaws at which each looks alike.
+    """
+
+    matcher: Matcher
+    images: UInt8[Array, "objects heights yaws pixels"]
+    features: Float[Array, "objects heights yaws features"]
+    radii: Float[Array, " objects"]
+    symmetries: Int[Array, " objects"]
+
+    @classmethod
+    def of(cls, matcher: Matcher, images: UInt8[AnyArray, "objects heights yaws pixels"], radii: AnyArray) -> Gallery:
+        """The gallery of some images."""
+        features = jnp.zeros((0, HEIGHTS, YAWS, matcher.projection.shape[1]))
+        if len(images):
+            features = jnp.stack([_filled(one) @ (WEIGHTS[:, None] * matcher.projection) for one in images])
+        symmetries = jnp.array([symmetry_of(one) for one in np.asarray(features)], jnp.int32)
+        return cls(matcher, jnp.asarray(images, jnp.uint8), features, jnp.asarray(radii, jnp.float32), symmetries)
+
+    def compared(
+        self,
+        depth: Float[Array, "side side"],
+        direction: Float[Array, " 3"],
+        distance: float,
+        radius: Float[AnyArray, ""],
+    ) -> Float[Array, " comparisons"]:
+        """What is kept of a view: for each object, its squared differences from the prediction at each yaw, and from its size;
+        and, last, the share of the image that is known.
+
+        Differences are white: a square is 1 on average if the hypothesis is right. Pixels that are unknown in the view are left
+        out, and the others count more in their place. Where only the prediction is unknown, `Matcher.unseen` counts.
+
+        Args:
+            depth: in radii, as of `small_image`.
+            direction: unit vector from the object to the camera.
+            distance: of the camera, in radii.
+            radius: of the object in metres; NaN if it is unknown.
+        """
+        return self.compared_image(*small_image(depth, distance), direction, radius)
+
+    def compared_image(
+        self,
+        image: Float[Array, " pixels"],
+        known: Float[Array, " pixels"],
+        direction: Float[Array, " 3"],
+        radius: float | Float[AnyArray, ""] = np.nan,
+    ) -> Float[Array, " comparisons"]:
+        """`compared`, of a `small_image`."""
+        predicted, unknown = interpolated(self.images, direction), interpolated(self.images == UNKNOWN, direction)
+        both = known * (unknown == 0)
+        white = (both * (predicted / STEPS - image)) @ (WEIGHTS[:, None] * self.matcher.projection)
+        seen, share = jnp.mean(both, axis=-1), jnp.mean(known)
+        apart = jnp.mean(jnp.square(white), axis=-1) / jnp.maximum(seen, _LEAST)
+        apart += (1 - seen / jnp.maximum(share, _LEAST)) * (self.matcher.unseen - apart)
+        told = (self.radii > 0) & (jnp.asarray(radius) > 0)
+        ratio = jnp.where(told, radius, 1.0) / jnp.where(told, self.radii, 1.0)
+        size = jnp.where(told, jnp.square(jnp.log(ratio) / self.matcher.size), 1.0)
+        return jnp.append(jnp.concatenate([apart, size[:, None]], axis=1).reshape(-1), share)
+
+    def evidence(
+        self, compared: Float[Array, "views comparisons"], present: Bool[Array, " views"], posed: bool
+    ) -> Evidence:
+        """What some views, of which the first is present, say together; `posed` if the object's yaw is known to be 0.
+
+        A view counts by what it shows.
+        """
+        shares = jnp.where(present, jnp.maximum(compared[:, -1], _LEAST), 0.0)
+        count = jnp.maximum(jnp.sum(shares), _LEAST)
+        values = compared[:, :-1].reshape(-1, len(self.radii), YAWS + 1)
+        apart = jnp.einsum("v,voy->oy", shares / count, values[..., :-1])
+        return Evidence(apart + jnp.where(posed & (jnp.arange(YAWS) > 0), _IMPOSSIBLE, 0.0), values[0, :, -1], count)
+
+    def hypotheses(self, evidence: Evidence) -> Float[Array, "objects yaws"]:
+        """Log-probabilities of objects and yaws, if the object is none unknown."""
+        power = self.matcher.power(evidence.count, len(self.radii))
+        likelihood = -power * jnp.log(evidence.apart + self.matcher.floor) - 0.5 * evidence.size[:, None]
+        return jax.nn.log_softmax(likelihood, axis=(0, 1))
+
+    def beliefs(self, evidence: Evidence) -> Float[Array, " classes"]:
+        """Log-probabilities of the objects and, last, of an unknown object."""
+        hypotheses = self.hypotheses(evidence)
+        best = jnp.argmax(hypotheses)
+        odds = self.matcher.strange_odds(evidence.apart.reshape(-1)[best], evidence.count, len(self.radii))
+        odds += 0.5 * (evidence.size[best // YAWS] - 1)
+        known = jax.scipy.special.logsumexp(hypotheses, axis=1) + jax.nn.log_sigmoid(-odds)
+        return jnp.append(known, jax.nn.log_sigmoid(odds))
+
+    def gains(self, evidence: Evidence, directions: Float[Array, "candidates 3"]) -> Float[Array, " candidates"]:
+        """Expected decrease of the entropy over objects in nats by one more view, if the object is none unknown.
+
+        Each of the likeliest hypotheses is taken to be true in turn: it says what a camera at a candidate would see, and so what
+        the belief would become. As in Denzler and Brown (2002), over objects and yaws; exact but for the errors of the view,
+        which are as large as the best hypothesis' so far.
+
+        Args:
+            evidence: of the views so far.
+            directions: unit vectors from the object to the candidates.
+        """
+        objects, count = len(self.radii), evidence.count
+        flat = self.hypotheses(evidence).reshape(-1)
+        now, index = jax.lax.top_k(flat, min(MOST_HYPOTHESES, flat.size))
+        now = jax.nn.log_softmax(now)
+        before = evidence.apart.reshape(-1)[index]
+        seen = _seen(self.features, directions, index // YAWS, index % YAWS)
+        products = jnp.einsum("cmf,cnf->cmn", seen, seen) / seen.shape[-1]
+        squares = jnp.diagonal(products, axis1=1, axis2=2)
+        apart = jnp.maximum(squares[:, :, None] + squares[:, None, :] - 2 * products, 0.0) + jnp.min(before)
+        apart = (count * before + apart) / (count + 1)
+        likelihood = -self.matcher.power(count + 1, objects) * jnp.log(apart + self.matcher.floor)
+        after = jax.nn.log_softmax(likelihood - 0.5 * evidence.size[index // YAWS], axis=-1)
+        same = (index[:, None] // YAWS == index // YAWS).astype(jnp.float32)
+
+        def entropy(logarithms: Float[Array, "*batch hypotheses"]) -> Float[Array, "*batch"]:
+            weights = jnp.exp(logarithms)
+            return -jnp.sum(weights * jnp.log(jnp.maximum(weights @ same, 1e-30)), axis=-1)
+
+        return entropy(now) - entropy(after) @ jnp.exp(now)
+
+
+def differences_by_turn(
+    one: Float[np.ndarray, "heights yaws features"], other: Float[np.ndarray, "heights yaws features"]
+) -> Float[np.ndarray, " yaws"]:
+    """Mean squared difference of two objects' images if the second is turned by each yaw; without those from straight below."""
+    one, other = one[1:], other[1:]
+    # The products for all turns at once, by the Fourier transform over yaws.
+    spectrum = np.fft.rfft(one, axis=1) * np.conj(np.fft.rfft(other, axis=1))
+    products = np.fft.irfft(spectrum, n=YAWS, axis=1).sum(axis=(0, 2))
+    return np.maximum((one**2).sum() + (other**2).sum() - 2 * products, 0) / one.size
+
+
+def symmetry_of(features: Float[np.ndarray, "heights yaws features"]) -> int:
+    """The largest number of equal turns at each of which an object looks alike: a divisor of `YAWS`."""
+    alike = differences_by_turn(features, features) < ALIKE
+    return max(turns for turns in range(1, YAWS + 1) if YAWS % turns == 0 and alike[:: YAWS // turns].all())
+
+
+def _filled(images: UInt8[AnyArray, "heights yaws pixels"]) -> Float[Array, "heights yaws pixels"]:
+    """The images of an object, with its mean over all directions where they are not known."""
+    images = jnp.asarray(images)
+    known = images != UNKNOWN
+    values = jnp.where(known, images, 0) / STEPS
+    mean = jnp.sum(values, axis=(0, 1)) / jnp.maximum(jnp.sum(known, axis=(0, 1)), 1)
+    return jnp.where(known, values, mean)
+
+
+def interpolated(grid: Array, direction: Float[Array, " 3"]) -> Float[Array, "objects yaws numbers"]:
+    """Values of a grid in a direction, for an object at each yaw: interpolated between four directions of the grid."""
+    height, azimuth = _place(direction)
+    below, up = _between(height, HEIGHTS - 1)
+    rows = (1 - up) * grid[:, below] + up * grid[:, jnp.minimum(below + 1, HEIGHTS - 1)]
+    before, along = _between(azimuth, YAWS)
+    at = before - jnp.arange(YAWS)
+    return (1 - along) * rows[:, at % YAWS] + along * rows[:, (at + 1) % YAWS]
+
+
+def _seen(
+    grid: Float[Array, "objects heights yaws features"],
+    directions: Float[Array, "candidates 3"],
+    objects: Int[Array, " hypotheses"],
+    yaws: Int[Array, " hypotheses"],
+) -> Float[Array, "candidates hypotheses features"]:
+    """`interpolated` of some hypotheses, in some directions."""
+    height, azimuth = _place(directions)
+    (below, up), (before, along) = _between(height, HEIGHTS - 1), _between(azimuth, YAWS)
+    at = before[:, None] - yaws
+
+    def row(level: Array) -> Array:
+        first, second = (grid[objects[None], level[:, None], (at + step) % YAWS] for step in (0, 1))
+        return first + along[:, None, None] * (second - first)
+
+    lower, upper = row(below), row(jnp.minimum(below + 1, HEIGHTS - 1))
+    return lower + up[:, None, None] * (upper - lower)
+
+
+def _place(direction: Float[Array, "*batch 3"]) -> tuple[Float[Array, "*batch"], Float[Array, "*batch"]]:
+    """Elevation and azimuth of directions, in steps of the grid."""
+    height = (jnp.arcsin(jnp.clip(direction[..., 2], -1, 1)) / jnp.pi + 0.5) * (HEIGHTS - 1)
+    azimuth = jnp.arctan2(direction[..., 1], direction[..., 0])
+    azimuth = jnp.where(jnp.abs(direction[..., 2]) > 1 - 1e-6, _POLE * jnp.sign(direction[..., 2]), azimuth)
+    return height, azimuth * (YAWS / (2 * jnp.pi))
+
+
+def _between(place: Array, most: int) -> tuple[Array, Array]:
+    whole = jnp.clip(jnp.floor(place), -most, most)
+    return whole.astype(jnp.int32), place - whole

@@ -1,0 +1,50 @@
+"""Meshes as triangles in the unit sphere, as the data sets have them."""
+
+from __future__ import annotations
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from mevs_jax.arguments import numbers
+
+_FLAT = 1e-12
+"""A face is without area if its area is below this share of the square of the mesh's extent."""
+
+
+def unit_triangles(
+    vertices: Float[np.ndarray, "vertices 3"], faces: Int[np.ndarray, "faces 3"]
+) -> Float[np.ndarray, "faces 3 3"]:
+    """Triangles of a mesh, centred on its bounding box and scaled into the unit sphere, as the data sets are.
+
+    Faces without area are left out.
+
+    Raises:
+        ValueError: for a mesh without faces, with indices out of range, with corners that are not finite, or without an area.
+    """
+    return centred_triangles(vertices, faces)[0]
+
+
+def centred_triangles(vertices: np.ndarray, faces: np.ndarray) -> tuple[Float[np.ndarray, "faces 3 3"], float]:
+    """`unit_triangles`, and the distance of the furthest corner from the centre."""
+    vertices, faces = numbers(vertices), np.asarray(faces)
+    if vertices.ndim != 2 or vertices.shape[1] != 3 or faces.ndim != 2 or faces.shape[1] != 3 or not len(faces):
+        raise ValueError(
+            f"a mesh needs vertices (n, 3) and triangles (m, 3), at least one, got shapes {vertices.shape} and {faces.shape}"
+        )
+    if faces.dtype.kind not in "iu" or faces.min() < 0 or faces.max() >= len(vertices):
+        raise ValueError(f"the triangles must be indices of the {len(vertices)} vertices")
+    corners = vertices[faces]
+    if not np.isfinite(corners).all():
+        raise ValueError("the mesh has coordinates that are not finite")
+    extent = np.ptp(corners, axis=(0, 1)).max()
+    if not 0 < extent < np.inf:
+        raise ValueError("the mesh is a single point")
+    shape = (corners - corners[0, 0]) / extent
+    area = np.linalg.norm(np.cross(shape[:, 1] - shape[:, 0], shape[:, 2] - shape[:, 0]), axis=1)
+    corners = corners[area > _FLAT]
+    if not len(corners):
+        raise ValueError("the mesh has no area: all its triangles are lines or points")
+    low, high = corners.min(axis=(0, 1)), corners.max(axis=(0, 1))
+    corners = corners - (low + high) / 2
+    radius = np.linalg.norm(corners, axis=-1).max()
+    return (corners / radius).astype(np.float32), float(radius)

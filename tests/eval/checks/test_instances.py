@@ -1,0 +1,49 @@
+"""Enrolled objects are measured: from meshes and from depth images, with strangers among them."""
+
+from __future__ import annotations
+
+import warnings
+
+import numpy as np
+import pytest
+
+from eval.checks.instances import Condition, study_instances
+from mevs_jax.cli.checks import instances_text
+from mevs_jax.enrolment import AlikeWarning
+from tests.mevs_jax.enrolment.conftest import CAMERA, matcher  # noqa: F401
+from train.tasks.matcher import objects_system
+
+
+@pytest.mark.slow
+def test_objects_are_measured_from_meshes_and_from_images(matcher, tmp_path):  # noqa: F811
+    from data_pipeline.objects.furniture import furniture
+
+    for number, name in enumerate(("chair", "bathtub", "table", "toilet")):
+        (tmp_path / name).mkdir()
+        furniture(name, 40 + number).export(tmp_path / name / f"{name}.ply")
+    (tmp_path / "chair" / "broken.ply").write_text("ply")
+    conditions = [Condition("mesh, perfect views", errors=False), Condition("3 images", frames=3, sized=True)]
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", AlikeWarning)
+        found = study_instances(
+            objects_system(matcher, CAMERA, views=12), str(tmp_path), sizes=(3, 4), conditions=conditions, yaws=1
+        )
+    assert len(found.objects) == 4
+    assert [*found.left_out] == ["broken"] or len(found.left_out) == 1
+    assert [(one.condition, one.enrolled) for one in found.measured] == [
+        ("mesh, perfect views", 3),
+        ("mesh, perfect views", 4),
+        ("3 images", 3),
+        ("3 images", 4),
+    ]
+    perfect = found.measured[1]
+    by_policy = {row.policy: row.accuracy for row in perfect.policies if row.views == 4}
+    assert min(by_policy.values()) > 0.9
+    assert perfect.poses[-1].right > 0.9
+    assert perfect.unknown_objects is not None
+    assert perfect.unknown_objects.objects == 1
+    assert all(0 <= row.auroc <= 1 for row in perfect.unknown_objects.after)
+    text = instances_text(found)
+    assert "3 images" in text
+    assert "information_gain" in text
+    assert np.isfinite([row.accuracy for one in found.measured for row in one.policies]).all()

@@ -1,0 +1,181 @@
+"""What a gallery predicts, and what follows from views, beside slow and plain computations of the same."""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from data_pipeline.capture.casting import capture
+from data_pipeline.objects.mesh import normalise
+from mevs_jax.enrolment.gallery import (
+    HEIGHTS,
+    PIXELS,
+    SIDE,
+    STEPS,
+    UNKNOWN,
+    WEIGHTS,
+    YAWS,
+    Gallery,
+    Matcher,
+    grid_directions,
+    interpolated,
+    small_image,
+    stored_image,
+)
+from mevs_jax.trained import TrainedSystem
+from tests.mevs_jax.enrolment.conftest import CAMERA
+from train.tasks.matcher import turned_rig
+
+
+def test_small_images_are_means_of_known_pixels() -> None:
+    random = np.random.default_rng(0)
+    depth = np.where(random.random((64, 64)) < 0.3, 0.0, random.uniform(1, 3, (64, 64))).astype(np.float32)
+    depth[random.random((64, 64)) < 0.4] = np.nan
+    depth[:8, :8] = np.nan
+    image, known = (np.asarray(part).reshape(2, SIDE, SIDE) for part in small_image(depth, 2.0))
+    for row in range(SIDE):
+        for column in range(SIDE):
+            block = depth[4 * row : 4 * row + 4, 4 * column : 4 * column + 4]
+            told = block[~np.isnan(block)]
+            assert known[0, row, column] == known[1, row, column] == (len(told) >= 8)
+            if len(told):
+                near = np.where(told > 0, (3 - told) / 2, 0)
+                np.testing.assert_allclose(image[:, row, column], [near.mean(), (told > 0).mean()], atol=1e-6)
+    stored = np.asarray(stored_image(depth, 2.0)).reshape(2, SIDE, SIDE)
+    assert (stored[:, :2, :2] == UNKNOWN).all()
+    assert (stored[known.astype(bool)] <= STEPS).all()
+
+
+def test_predictions_are_the_images_of_the_grid_and_mixtures_between() -> None:
+    grid = np.random.default_rng(1).random((2, HEIGHTS, YAWS, 3)).astype(np.float32)
+    directions = grid_directions().reshape(HEIGHTS, YAWS, 3)
+    for height, azimuth in ((6, 0), (3, 35), (12, 7), (0, 20)):
+        predicted = np.asarray(interpolated(jnp.asarray(grid), jnp.asarray(directions[height, azimuth], jnp.float32)))
+        for yaw in range(YAWS):  # an object that is turned to the left is seen from further to its right
+            level = {0: 0.4 / 60, 12: 12 - 0.4 / 60}.get(height, height)  # the outermost images are 0.1° from the poles
+            low, up = int(level), level - int(level)
+            rows = (1 - up) * grid[:, low] + up * grid[:, min(low + 1, HEIGHTS - 1)]
+            np.testing.assert_allclose(predicted[:, yaw], rows[:, (azimuth - yaw) % YAWS], atol=1e-3)
+    between = np.array([np.cos(np.radians(5)), np.sin(np.radians(5)), 0], np.float32)
+    half = (grid[:, 6, 0] + grid[:, 6, 1]) / 2
+    np.testing.assert_allclose(np.asarray(interpolated(jnp.asarray(grid), jnp.asarray(between)))[:, 0], half, atol=1e-4)
+
+
+def test_a_view_from_a_pole_is_predicted_with_the_roll_that_cameras_have_there(known: TrainedSystem, shapes) -> None:
+    gallery = known.parts.gallery
+    assert gallery is not None
+    mesh = normalise(*shapes["knob"], "knob")
+    for height in (-1.0, 1.0):
+        direction = np.array([0, 0, height], np.float32)
+        depth = capture(mesh, turned_rig(CAMERA, direction[None], 0.0)).depth[0] * np.float32(1e-4)
+        told = np.asarray(gallery.compared(jnp.asarray(depth), jnp.asarray(direction), 2.0, jnp.float32(jnp.nan)))
+        assert told[:-1].reshape(3, YAWS + 1)[0, :YAWS].argmin() == 0
+
+
+def _compared_slowly(gallery: Gallery, depth: np.ndarray, direction: np.ndarray, radius: float) -> np.ndarray:
+    image, known = (np.asarray(part) for part in small_image(depth, 2.0))
+    matcher, images = gallery.matcher, np.asarray(gallery.images)
+    predicted = np.asarray(interpolated(jnp.asarray(images, jnp.float32), jnp.asarray(direction)))
+    hidden = np.asarray(interpolated(jnp.asarray(images == UNKNOWN, jnp.float32), jnp.asarray(direction))) > 0
+    rows = []
+    for object_ in range(len(images)):
+        row = []
+        for yaw in range(YAWS):
+            both = (known > 0) & ~hidden[object_, yaw]
+            apart = np.where(both, (predicted[object_, yaw] / STEPS - image) * WEIGHTS, 0)
+            squares = np.mean((apart @ np.asarray(matcher.projection)) ** 2) / max(both.mean(), 0.01)
+            shared = both.sum() / max(known.sum(), 1)
+            row.append(shared * squares + (1 - shared) * float(matcher.unseen))
+        own = float(gallery.radii[object_])
+        told = own > 0 and radius > 0
+        row.append((np.log(radius / own) / float(matcher.size)) ** 2 if told else 1.0)
+        rows.append(row)
+    return np.append(np.ravel(rows), known.mean())
+
+
+def test_views_are_compared_where_both_are_known(matcher: Matcher) -> None:
+    random = np.random.default_rng(2)
+    images = random.integers(0, STEPS + 1, (3, HEIGHTS, YAWS, PIXELS), dtype=np.uint8)
+    images[1, :, :18, : SIDE * SIDE // 2] = UNKNOWN
+    gallery = Gallery.of(matcher, images, np.array([0.1, 0.0, 0.2]))
+    depth = random.uniform(1, 3, (64, 64)).astype(np.float32)
+    depth[:, :20] = np.nan
+    direction = np.array([0.48, -0.6, 0.64], np.float32)
+    for radius in (0.15, np.nan):
+        told = gallery.compared(jnp.asarray(depth), jnp.asarray(direction), 2.0, jnp.float32(radius))
+        np.testing.assert_allclose(told, _compared_slowly(gallery, depth, direction, radius), rtol=2e-3)
+
+
+def _beliefs_slowly(gallery: Gallery, compared: np.ndarray, posed: bool) -> tuple[np.ndarray, np.ndarray]:
+    matcher, objects = gallery.matcher, len(gallery.radii)
+    shows, values = compared[:, -1], compared[:, :-1].reshape(len(compared), objects, YAWS + 1)
+    apart = sum(share * value[:, :-1] for share, value in zip(shows, values, strict=True)) / shows.sum()
+    numbers = np.array([1, np.log(shows.sum()), np.log(objects)])
+    power = np.exp(np.asarray(matcher.heat) @ numbers)
+    weights = np.exp(-0.5 * values[0, :, -1:]) / (apart + float(matcher.floor)) ** power
+    if posed:
+        weights[:, 1:] = 0
+    weights /= weights.sum()
+    best = np.unravel_index(weights.argmax(), weights.shape)
+    odds = np.asarray(matcher.stranger) @ np.append(numbers, np.log(apart[best])) + (values[0, best[0], -1] - 1) / 2
+    unknown = 1 / (1 + np.exp(-odds))
+    return np.append(weights.sum(axis=1) * (1 - unknown), unknown), weights
+
+
+@pytest.mark.parametrize("posed", [False, True])
+def test_beliefs_are_those_of_all_hypotheses(matcher: Matcher, posed: bool) -> None:
+    random = np.random.default_rng(3)
+    gallery = Gallery.of(matcher, np.zeros((4, HEIGHTS, YAWS, PIXELS), np.uint8), np.zeros(4))
+    compared = random.uniform(0.5, 3, (3, 4 * (YAWS + 1) + 1)).astype(np.float32)
+    compared[:, -1] = [1.0, 0.4, 0.7]
+    shown = jnp.concatenate([jnp.asarray(compared), jnp.full((2, compared.shape[1]), jnp.inf)])  # slots without a view
+    evidence = gallery.evidence(jnp.where(jnp.isinf(shown), 9.0, shown), jnp.arange(5) < 3, posed)
+    expected, weights = _beliefs_slowly(gallery, compared, posed)
+    np.testing.assert_allclose(np.exp(gallery.beliefs(evidence)), expected, rtol=1e-4, atol=1e-6)
+    np.testing.assert_allclose(np.exp(gallery.hypotheses(evidence)), weights, rtol=1e-3, atol=1e-6)
+
+
+def test_gains_are_those_of_every_hypothesis_taken_as_true(known: TrainedSystem) -> None:
+    gallery = known.parts.gallery
+    assert gallery is not None
+    random = np.random.default_rng(4)
+    compared = random.uniform(0.4, 0.5, (1, 3 * (YAWS + 1) + 1)).astype(np.float32)
+    values = compared[:, :-1].reshape(3, YAWS + 1)
+    values[:, :-1] = 30.0  # but for a few hypotheses, so that all that count are among the likeliest
+    for object_, yaw in ((0, 0), (0, 9), (1, 0), (1, 18), (2, 5)):
+        values[object_, yaw] = random.uniform(0.4, 0.5)
+    compared[:, -1] = 1.0
+    directions = np.asarray(known.viewpoints[:6], np.float32)
+    evidence = gallery.evidence(jnp.asarray(compared), jnp.ones(1, bool), False)
+    gains = np.asarray(gallery.gains(evidence, jnp.asarray(directions)))
+
+    def entropy(weights: np.ndarray) -> float:
+        by_object = weights.sum(axis=1)
+        return float(-np.sum(by_object * np.log(np.maximum(by_object, 1e-30))))
+
+    now = np.exp(np.asarray(gallery.hypotheses(evidence)))
+    apart, floor = np.asarray(evidence.apart), float(gallery.matcher.floor)
+    power = float(gallery.matcher.power(jnp.float32(2), 3))
+    for gain, direction in zip(gains, directions, strict=True):
+        seen = np.asarray(interpolated(gallery.features, jnp.asarray(direction)))
+        expected = entropy(now)
+        for object_, yaw in np.argwhere(now > 1e-7):
+            more = np.mean((seen - seen[object_, yaw]) ** 2, axis=-1) + apart.min()
+            after = np.exp(-0.5 * np.asarray(evidence.size)[:, None]) / ((apart + more) / 2 + floor) ** power
+            expected -= now[object_, yaw] * entropy(after / after.sum())
+        assert gain == pytest.approx(expected, abs=2e-3)
+
+
+def test_views_of_what_tells_objects_apart_are_worth_most(known: TrainedSystem, shapes) -> None:
+    """From the left, a box with a knob on its right looks like one without: the camera goes to the right."""
+    gallery = known.parts.gallery
+    assert gallery is not None
+    left = np.array([[-0.96, 0, 0.28]], np.float32)
+    depth = capture(normalise(*shapes["knob"], "knob"), turned_rig(CAMERA, left, 0.0)).depth[0] * np.float32(1e-4)
+    told = gallery.compared(jnp.asarray(depth), jnp.asarray(left[0]), 2.0, jnp.float32(jnp.nan))
+    evidence = gallery.evidence(told[None], jnp.ones(1, bool), posed=True)
+    gains = np.asarray(jax.jit(gallery.gains)(evidence, jnp.asarray(known.viewpoints)))
+    assert known.viewpoints[gains.argmax()][0] > 0
+    assert gains.max() > 2 * max(gains[known.viewpoints[:, 0] < -0.8].max(), 0.0)

@@ -1,0 +1,277 @@
+"""Learns how views are compared with those of enrolled objects (`mevs_jax.enrolment.gallery.Matcher`), from procedural shapes.
+
+What is learned is how views of *any* object differ from what its gallery predicts. Shapes of some kinds give the covariance of
+these differences; shapes of other kinds, of which some are enrolled and some are not, say how far the result can be trusted.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from importlib.metadata import version
+from itertools import product
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int, UInt8
+from scipy.linalg import eigh
+from scipy.optimize import minimize
+from scipy.special import log_softmax, logsumexp
+
+from data_pipeline.capture.casting import Rig, capture
+from data_pipeline.dataset.reality import RealityAugmentation, realistic_views
+from data_pipeline.objects.mesh import ObjectEntry
+from data_pipeline.objects.sources import furniture_families, load_object, strangers
+from mevs_jax.enrolment.gallery import (
+    HEIGHTS,
+    PIXELS,
+    STEPS,
+    WEIGHTS,
+    YAWS,
+    Gallery,
+    Matcher,
+    interpolated,
+    small_image,
+)
+from mevs_jax.enrolment.meshes import images_of_mesh
+from mevs_jax.geometry.cameras import ViewCamera, cameras_at, pixel_directions
+from mevs_jax.geometry.viewpoints import fibonacci_sphere, hull_edges
+from mevs_jax.trained.description import FORM, UNKNOWN_OBJECT, DataDescription, Description, ImageInput
+from mevs_jax.trained.parts import Parts
+from mevs_jax.trained.system import TrainedSystem
+from mevs_jax.trained.usable import INFORMATION_GAIN
+
+_SPLITS = ("train", "val")
+_RIDGE = 1e-5
+"""Added to variances of differences, which are of images from 0 to 1."""
+_QUANTILE = 0.1
+"""What is not known counts as the quantile of the differences of wrong objects: neither like the object nor unlike it."""
+_ENROLLED, _VIEWS = (0.05, 0.15, 0.4, 0.8), (1, 2, 3, 4, 8)
+"""Shares of the shapes for calibration that are enrolled, and numbers of views of each."""
+
+
+@dataclass(frozen=True)
+class MatcherConfig:
+    """Settings of the matcher and of what it learns from."""
+
+    shapes: int = 1000
+    """procedural shapes whose differences give the covariance, of all kinds for training, by turns"""
+    calibration_shapes: int = 240
+    """shapes of other kinds that calibrate it"""
+    views: int = 24
+    """views of each shape, around it at a random yaw"""
+    features: int = 32
+    """numbers that a view is reduced to"""
+    size: float = 0.05
+    """standard deviation of the logarithm of a measured radius"""
+    reality: RealityAugmentation = RealityAugmentation(strength=1.0, sphere=0.05, floor=0.02, hidden=0.05, unseen=0.5)
+    """the errors of the views"""
+
+
+class Sighted(NamedTuple):
+    """A shape in a gallery, and views of it.
+
+    Attributes:
+        name: of the shape.
+        gallery: from all directions.
+        yaw: of the shape in its views, as the nearest of the gallery's.
+        images, known: of the views, as `small_image`.
+        directions: from the shape to the cameras, as they are believed.
+    """
+
+    name: str
+    gallery: UInt8[np.ndarray, "heights yaws pixels"]
+    yaw: int
+    images: Float[np.ndarray, "views pixels"]
+    known: Bool[np.ndarray, "views pixels"]
+    directions: Float[np.ndarray, "views 3"]
+
+
+def kinds_in_turn(split: str, count: int, seed: int) -> list[ObjectEntry]:
+    """Procedural shapes of all kinds of a split, furniture and others, in a random order."""
+    most = max(2, -(-count // 10))
+    sources = furniture_families("furniture10-families", most, most), strangers(most, most)
+    entries = [entry for source in sources for entry in source.entries if entry.split == split]
+    order = np.random.default_rng([_SPLITS.index(split), seed]).permutation(len(entries))
+    return [entries[place] for place in order[:count]]
+
+
+def turned_rig(camera: ViewCamera, directions: Float[np.ndarray, "views 3"], yaw: float) -> Rig:
+    """Cameras that see an upright object as those in some directions see it when it is turned by a yaw."""
+    cosine, sine = np.cos(yaw), np.sin(yaw)
+    around = directions @ np.array([[cosine, -sine, 0], [sine, cosine, 0], [0, 0, 1]])
+    cameras = cameras_at(
+        around.astype(np.float32), distance=camera.distance, resolution=camera.resolution, field_of_view=camera.radians
+    )
+    rays = jax.vmap(pixel_directions)(cameras)
+    return Rig(np.asarray(cameras.pose, np.float32), np.asarray(rays, np.float32), camera.radians)
+
+
+def sighted(entries: Sequence[ObjectEntry], config: MatcherConfig, camera: ViewCamera, seed: int) -> Iterator[Sighted]:
+    """Shapes with their galleries, and their views with the errors of real images."""
+    directions = fibonacci_sphere(config.views).astype(np.float32)
+    poses = jnp.asarray(cameras_at(directions, distance=camera.distance).pose)
+
+    @jax.jit
+    def seen(key: Array, depth: Array) -> tuple[Array, Array, Array]:
+        batch = {"depth": depth, "pose": poses}
+        real, placed = realistic_views(key, batch, camera, config.reality, config.views)
+        images, known = jax.vmap(partial(small_image, distance=camera.distance))(real)
+        away = placed[:, :3, 3]
+        return images, known > 0, away / jnp.linalg.norm(away, axis=1, keepdims=True)
+
+    random = np.random.default_rng(seed)
+    for number, entry in enumerate(entries):
+        mesh = load_object(entry)
+        yaw = random.uniform(0, 2 * np.pi)
+        depth = capture(mesh, turned_rig(camera, directions, yaw)).depth
+        found = map(np.asarray, seen(jax.random.fold_in(jax.random.key(seed), number), jnp.asarray(depth)))
+        images, _ = images_of_mesh(mesh.vertices, mesh.faces, camera)
+        yield Sighted(entry.name, images, round(yaw * YAWS / (2 * np.pi)) % YAWS, *found)
+
+
+def fit_matcher(config: MatcherConfig, camera: ViewCamera, seed: int = 0) -> Matcher:
+    """Learns a matcher; takes about a third of a second of one core for each shape."""
+    train = sighted(kinds_in_turn("train", config.shapes, seed), config, camera, seed)
+    projection = fit_projection(train, config.features)
+    val = [*sighted(kinds_in_turn("val", config.calibration_shapes, seed), config, camera, seed + 1)]
+    nothing = jnp.float32(1)
+    blank = Matcher(projection, nothing, jnp.zeros(3), jnp.zeros(4), nothing, jnp.float32(config.size))
+    return calibrated(blank, val, camera, seed)
+
+
+def fit_projection(shapes: Iterator[Sighted], features: int) -> Float[Array, "pixels features"]:
+    """What makes differences between views and their predictions white, where different shapes differ most beside them.
+
+    This is Fisher's linear discriminant: the leading generalised eigenvectors of the covariances of differences between images of
+    two shapes, and of differences between an image and what is predicted of the same shape.
+    """
+
+    @jax.jit
+    def differences(gallery: Array, yaw: Array, images: Array, known: Array, directions: Array) -> Array:
+        predicted = jax.vmap(lambda direction: interpolated(gallery[None], direction)[0, yaw] / STEPS)(directions)
+        return jnp.where(known, images - predicted, 0.0) * WEIGHTS
+
+    products, images, count = np.zeros((PIXELS, PIXELS)), [], 0
+    random = np.random.default_rng(0)
+    for one in shapes:
+        apart = np.asarray(differences(one.gallery, one.yaw, one.images, one.known, one.directions), float)
+        products, count = products + apart.T @ apart, count + len(apart)
+        turned = random.integers(0, YAWS, HEIGHTS)
+        images.append(one.gallery[np.arange(HEIGHTS), turned] / STEPS * WEIGHTS)
+    others = (np.stack(images) - np.roll(images, 1, axis=0)).reshape(-1, PIXELS)
+    between, within = others.T @ others / len(others), products / count + _RIDGE * np.eye(PIXELS)
+    _, axes = eigh(between, within, subset_by_index=(PIXELS - features, PIXELS - 1))
+    return jnp.asarray(axes, jnp.float32)
+
+
+class _Walks(NamedTuple):
+    """Evidence from walks around shapes, of which some are enrolled, and which of those each shape is; −1 for none."""
+
+    apart: Float[np.ndarray, "walks objects yaws"]
+    shown: Float[np.ndarray, " walks"]
+    label: Int[np.ndarray, " walks"]
+
+
+def calibrated(matcher: Matcher, shapes: Sequence[Sighted], camera: ViewCamera, seed: int) -> Matcher:
+    """The matcher with powers of likelihoods and odds of unknown objects as shapes that it was not fitted on need them."""
+    gallery = Gallery.of(matcher, np.stack([one.gallery for one in shapes]), np.zeros(len(shapes)))
+    apart, shows = _tables(gallery, shapes)
+    wrong = apart.min(axis=-1)[~np.eye(len(shapes), dtype=bool)[:, None].repeat(shows.shape[1], axis=1)]
+    matcher = replace(matcher, unseen=jnp.float32(np.quantile(wrong, _QUANTILE)))
+    walks = [*_some_walks(apart, shows, seed)]
+
+    def power(x: np.ndarray) -> float:
+        return float(np.mean([_known_loss(_with_power(matcher, x), walk) for walk in walks]))
+
+    start, limits = np.array([1.6, 0.3, 0.0, -1.0]), [(-5, 5), (-2, 2), (-1, 1), (-4, 2)]
+    found = minimize(power, start, method="Nelder-Mead", bounds=limits, options={"maxiter": 300}).x
+    matcher = _with_power(matcher, found)
+    inputs, unknown = (np.concatenate(arrays) for arrays in zip(*map(_stranger_inputs, walks), strict=True))
+    weights = np.where(unknown, 0.5 / unknown.mean(), 0.5 / (1 - unknown.mean()))
+
+    def loss(x: np.ndarray) -> float:
+        return float(np.mean(weights * np.logaddexp(0, np.where(unknown, -1, 1) * (inputs @ x))))
+
+    return replace(matcher, stranger=jnp.asarray(minimize(loss, np.zeros(4)).x, jnp.float32))
+
+
+def _tables(gallery: Gallery, shapes: Sequence[Sighted]) -> tuple[np.ndarray, np.ndarray]:
+    """Squared differences (shapes, views, objects, yaws) of all views of all shapes, and what each view shows."""
+
+    @jax.jit
+    def of_shape(gallery: Gallery, images: Array, known: Array, directions: Array) -> Array:
+        return jax.lax.map(lambda view: gallery.compared_image(*view), (images, known, directions))
+
+    found = [of_shape(gallery, one.images, one.known.astype(np.float32), one.directions) for one in shapes]
+    values = np.stack([np.asarray(one) for one in found])
+    return values[..., :-1].reshape(*values.shape[:2], len(shapes), YAWS + 1)[..., :-1], values[..., -1]
+
+
+def _some_walks(apart: np.ndarray, shows: np.ndarray, seed: int) -> Iterator[_Walks]:
+    """Random views of all shapes, of which some are enrolled."""
+    random, (shapes, views) = np.random.default_rng(seed), shows.shape
+    for share, count in product(_ENROLLED, _VIEWS):
+        enrolled = np.sort(random.permutation(shapes)[: max(2, round(share * shapes))])
+        label = np.full(shapes, -1)
+        label[enrolled] = np.arange(len(enrolled))
+        seen = np.argsort(random.random((shapes, views)), axis=1)[:, :count]
+        some = np.take_along_axis(apart[:, :, enrolled], seen[..., None, None], axis=1)
+        weights = np.take_along_axis(shows, seen, axis=1)
+        total = weights.sum(axis=1)
+        yield _Walks(np.einsum("sv,svoy->soy", weights / total[:, None], some), total, label)
+
+
+def _with_power(matcher: Matcher, x: np.ndarray) -> Matcher:
+    return replace(matcher, heat=jnp.asarray(x[:3], jnp.float32), floor=jnp.float32(np.exp(x[3])))
+
+
+def _log_probabilities(matcher: Matcher, walks: _Walks) -> Float[np.ndarray, "walks objects"]:
+    """Of the objects, if each is one of those enrolled."""
+    power = np.asarray(matcher.power(walks.shown, walks.apart.shape[1]))[:, None, None]
+    return np.asarray(log_softmax(logsumexp(-power * np.log(walks.apart + float(matcher.floor)), axis=2), axis=1))
+
+
+def _known_loss(matcher: Matcher, walks: _Walks) -> float:
+    known = walks.label >= 0
+    return float(-_log_probabilities(matcher, walks)[known, walks.label[known]].mean())
+
+
+def _stranger_inputs(walks: _Walks) -> tuple[np.ndarray, np.ndarray]:
+    """What the odds of an unknown object depend on, and whether it is one."""
+    best = np.log(walks.apart.min(axis=(1, 2)) + 1e-6)
+    ones, objects = np.ones(len(best)), np.full(len(best), np.log(walks.apart.shape[1]))
+    return np.stack([ones, np.log(walks.shown), objects, best], axis=1), walks.label < 0
+
+
+def objects_system(matcher: Matcher, camera: ViewCamera, views: int = 40) -> TrainedSystem:
+    """The system that objects are enrolled with: without any yet."""
+    points = fibonacci_sphere(views)
+    nothing = np.zeros((0, HEIGHTS, YAWS, PIXELS), np.uint8)
+    parts = Parts(
+        encoder=None,
+        viewpoints=jnp.asarray(points, jnp.float32),
+        neighbours=jnp.asarray(hull_edges(points)),
+        single=jnp.float32(1),
+        temperatures={"random": jnp.ones(1)},
+        gallery=Gallery.of(matcher, nothing, np.zeros(0)),
+    )
+    description = Description(
+        form=FORM,
+        kind="gallery",
+        classes=(UNKNOWN_OBJECT,),
+        camera=camera,
+        image=ImageInput("depth", 1),
+        encoder=None,
+        best=INFORMATION_GAIN,
+        best_unposed=INFORMATION_GAIN,
+        chosen_by="its gain is computed for the enrolled objects themselves",
+        data=DataDescription("enrolled objects", "", {"enrolled": 0}),
+        made_by=hashlib.sha256(np.asarray(matcher.projection).tobytes()).hexdigest()[:16],
+        made_with={name: version(name) for name in ("jax", "mevs-jax")},
+    )
+    return TrainedSystem(description, parts, "objects")
