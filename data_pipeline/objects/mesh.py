@@ -8,7 +8,7 @@ from typing import Protocol, runtime_checkable
 import numpy as np
 
 from data_pipeline.errors import DamagedMesh, EmptyMesh, naming
-from data_pipeline.objects.formats.polygons import check_indices
+from data_pipeline.objects.formats.polygons import check_indices, have_area
 
 MODELNET10_CLASSES = ("bathtub", "bed", "chair", "desk", "dresser", "monitor", "night_stand", "sofa", "table", "toilet")
 """The classes of ModelNet10 and of furniture10, in alphabetical order, which is the order of labels."""
@@ -78,15 +78,11 @@ class ObjectSource:
     said: tuple[str, ...] = ()
 
 
-def normalise(vertices: np.ndarray, faces: np.ndarray, where: str) -> Mesh:
-    """Returns the mesh centred on its bounding box and scaled into the unit sphere.
-
-    Vertices that no face uses and faces without area are removed. `where` names the mesh in error messages.
+def surface_of(vertices: np.ndarray, faces: np.ndarray, where: str) -> tuple[np.ndarray, np.ndarray]:
+    """Returns the vertices, float64, and faces of a mesh without vertices that no face uses and faces without area.
 
     Raises:
-        DamagedMesh: if a coordinate that a face uses is not finite or too large, or a face refers to a vertex that does not
-            exist.
-        EmptyMesh: if there are no faces, or none has an area.
+        As `normalise`.
     """
     vertices, faces = np.asarray(vertices, np.float64), np.asarray(faces, np.int64)
     if len(vertices) == 0:
@@ -95,22 +91,38 @@ def normalise(vertices: np.ndarray, faces: np.ndarray, where: str) -> Mesh:
         raise EmptyMesh(f"mesh has no faces: it is a point cloud of {len(vertices)} points")
     with naming(where):
         check_indices(faces, len(vertices))
-    used, compact = np.unique(faces, return_inverse=True)
-    vertices, faces = vertices[used], compact.reshape(faces.shape)
+    vertices, faces = _used(vertices, faces)
     if not np.isfinite(vertices).all():
         bad = f"{int((~np.isfinite(vertices).all(axis=1)).sum())} vertices that are not finite (NaN or infinite)"
         raise DamagedMesh(f"{where} has {bad}; repair it or take it away")
     if np.abs(vertices).max() > LARGEST_COORDINATE:
         raise DamagedMesh(f"{where} has coordinates beyond {LARGEST_COORDINATE:g}; repair it or take it away")
+    if np.ptp(vertices, axis=0).max() < SMALLEST_RADIUS:
+        raise EmptyMesh("mesh is a single point")
+    seen = have_area(vertices, faces)
+    if not seen.any():
+        raise EmptyMesh("mesh has no area: all its faces are degenerate")
+    return _used(vertices, faces[seen])
+
+
+def _used(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    used, compact = np.unique(faces, return_inverse=True)
+    return vertices[used], compact.reshape(faces.shape)
+
+
+def normalise(vertices: np.ndarray, faces: np.ndarray, where: str) -> Mesh:
+    """Returns the mesh centred on its bounding box and scaled into the unit sphere.
+
+    Vertices that no face uses and faces without area are removed before. `where` names the mesh in error messages.
+
+    Raises:
+        DamagedMesh: if a coordinate that a face uses is not finite or too large, or a face refers to a vertex that does not
+            exist.
+        EmptyMesh: if there are no faces, or none has an area.
+    """
+    vertices, faces = surface_of(vertices, faces, where)
     low, high = vertices.min(axis=0), vertices.max(axis=0)
     centred = vertices - (low + high) / 2
     radius = np.linalg.norm(centred, axis=1).max()
-    if radius < SMALLEST_RADIUS:
-        raise EmptyMesh("mesh is a single point")
-    centred /= radius
-    corners = centred[faces]
-    area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1) / 2
-    if area.sum() < 1e-9:
-        raise EmptyMesh("mesh has no area: all its faces are degenerate")
     extent = (high - low).astype(np.float32)
-    return Mesh(centred.astype(np.float32), faces[area > 0].astype(np.int32), extent, float(radius))
+    return Mesh((centred / radius).astype(np.float32), faces.astype(np.int32), extent, float(radius))

@@ -10,8 +10,9 @@ from typing import ClassVar
 
 import numpy as np
 
-from data_pipeline.errors import Damage, DamagedMesh, naming
+from data_pipeline.errors import Damage, DamagedMesh, EmptyMesh, naming
 from data_pipeline.objects.formats import MESH_SUFFIXES, Up, parse_mesh
+from data_pipeline.objects.mesh import surface_of
 from data_pipeline.objects.names import shown
 
 LARGEST_FILE = 2 << 30
@@ -79,7 +80,7 @@ class MeshFile:
 
 
 def read_mesh(path: str | Path, up: Up = "auto") -> tuple[np.ndarray, np.ndarray]:
-    """Returns the vertices (n, 3), z up, and triangles (m, 3) of a mesh file.
+    """Returns the vertices (n, 3), z up, and triangles (m, 3) of a mesh file, of which all triangles have an area.
 
     Args:
         path: a file of one of the formats of `data_pipeline.objects.formats`.
@@ -91,7 +92,11 @@ def read_mesh(path: str | Path, up: Up = "auto") -> tuple[np.ndarray, np.ndarray
     if Path(path).suffix.lower() not in MESH_SUFFIXES:
         known = f"a mesh that is read here ({', '.join(MESH_SUFFIXES)})"
         raise DamagedMesh(f"{shown(str(path))} has no suffix of {known}; convert it to one of them")
-    return MeshFile(str(path), up=up).load()
+    where = shown(str(path))
+    try:
+        return surface_of(*MeshFile(str(path), up=up).load(), where)
+    except EmptyMesh as reason:
+        raise DamagedMesh(f"{where} cannot be used: {reason}; choose a mesh with faces") from reason
 
 
 def read_with(content_of: Callable[[str], bytes], path: str, where: str, up: Up) -> tuple[np.ndarray, np.ndarray]:

@@ -16,7 +16,7 @@ from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path, PurePosixPath
 
-from data_pipeline.errors import DataError, EmptyMesh
+from data_pipeline.errors import DataError
 from data_pipeline.objects.archives import list_zip
 from data_pipeline.objects.folders import list_folder
 from data_pipeline.objects.formats import AXIS_DECLARED, MESH_SUFFIXES, Up
@@ -40,7 +40,7 @@ from data_pipeline.objects.mesh import (
     normalise,
 )
 from data_pipeline.objects.names import kind_of_ignored, plain_class, say_ignored, shown
-from data_pipeline.objects.recipes import FamilyPiece, FurniturePiece, MeshFile, Stranger
+from data_pipeline.objects.recipes import FamilyPiece, FurniturePiece, Stranger, read_mesh
 from data_pipeline.objects.splits import divide
 from data_pipeline.objects.voxels import voxel_archive
 
@@ -328,11 +328,7 @@ def open_source(
         return voxel_archive(path.resolve())
     if path.suffix.lower() not in MESH_SUFFIXES:
         raise DataError(f"{data} is not a data set; --data takes a folder of class folders, a .zip or a .npz")
-    vertices, faces = MeshFile(str(path), up=up).load()  # raises if it is damaged
-    try:
-        normalise(vertices, faces, str(path))
-    except EmptyMesh as reason:
-        raise DataError(f"{data} cannot be used: {reason}; --data takes a folder of meshes with faces") from reason
+    read_mesh(path, up)  # raises if it is damaged
     raise DataError(f"{data} is a single mesh; --data takes a folder laid out as {_LAID_OUT}")
 
 

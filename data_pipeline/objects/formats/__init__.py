@@ -1,12 +1,14 @@
 """Readers of mesh formats: the one place where foreign files become arrays.
 
 One module reads one format. docs/data.md has a table of what each format promises: what is read, ignored and refused.
-Libraries read what they read right: pycollada COLLADA, DracoPy Draco, mapbox-earcut concave polygons. OFF, OBJ, STL, PLY and
-glTF have readers of our own, since trimesh and assimp lose or misread parts of the files of `tests/data_pipeline/objects`, or
-read truncated files without a word. Tests compare them with trimesh and with the counts that the files declare.
+Libraries read what they read right: DracoPy Draco, mapbox-earcut concave polygons. All formats have readers of our own, since
+trimesh, assimp and pycollada lose or misread parts of the files of `tests/data_pipeline/objects`, or read truncated files without
+a word. Tests compare them with trimesh, pycollada and the counts that the files declare.
 
-A reader returns the vertices (n, 3) and triangles (m, 3) of a file's content. It raises `Damage`, or a `ValueError` whose message
-is the reason why the content is not of its format; readers of glTF, COLLADA and 3MF may also raise what their libraries raise.
+A reader returns the vertices (n, 3) and triangles (m, 3) of a file's content. It raises `Damage`, `EmptyMesh` if it knows why
+there are no triangles, or a `ValueError` whose message is the reason why the content is not of its format; readers of glTF,
+COLLADA and 3MF may also raise what their libraries raise. What a file holds and a reader does not read is ignored only if it is
+named there as no geometry; a line, element or extension that is not known is an error.
 """
 
 from __future__ import annotations
@@ -16,7 +18,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from data_pipeline.errors import Damage, DamagedMesh, DataError, kind_and_reason_of, naming
+from data_pipeline.errors import Damage, DamagedMesh, DataError, EmptyMesh, kind_and_reason_of, naming
 from data_pipeline.objects.formats.dae import parse_dae
 from data_pipeline.objects.formats.gltf import parse_gltf
 from data_pipeline.objects.formats.obj import parse_obj
@@ -72,6 +74,7 @@ def parse_mesh(
 
     Raises:
         DamagedMesh: if the file is not a readable mesh or is truncated.
+        EmptyMesh: if it has no triangles, and the reader knows why.
     """
     with naming(where):
         for begin, command in _POINTERS.items():
@@ -105,10 +108,9 @@ def _foreign(content: bytes, suffix: str, sibling: Callable[[str], bytes]) -> An
         if suffix == ".dae":
             return parse_dae(content)
         return (*parse_3mf(content), "z") if suffix == ".3mf" else (*parse_gltf(content, sibling), "y")
-    except (Damage, DataError):
+    except (Damage, DataError, EmptyMesh):
         raise
     except Exception as error:
         kind = "glTF" if suffix in (".glb", ".gltf") else suffix
-        raise Damage(
-            f"is not a readable {kind} mesh ({kind_and_reason_of(error)}); repair it or take it away"
-        ) from error
+        reason = str(error) if type(error) is ValueError else kind_and_reason_of(error)
+        raise Damage(f"is not a readable {kind} mesh ({reason}); repair it or take it away") from error

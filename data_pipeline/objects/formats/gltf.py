@@ -1,8 +1,9 @@
 """glTF 2.0 and GLB: the triangles of the default scene, with all transforms, y up.
 
 Read are triangles, strips and fans, indexed or not; matrices and translation, rotation, scale of nodes; sparse accessors;
-KHR_mesh_quantization; KHR_draco_mesh_compression (by DracoPy); EXT_mesh_gpu_instancing; skins in their rest pose. Materials,
-animations, morph targets, points and lines are ignored. A file that requires any other extension of its geometry is refused.
+KHR_mesh_quantization; KHR_draco_mesh_compression (by DracoPy); EXT_mesh_gpu_instancing; KHR_node_visibility; skins in their rest
+pose; morph targets by their default weights. Materials, animations, points and lines are ignored. A file that requires any other
+extension of its geometry is refused.
 
 Source: glTF 2.0 specification, Khronos Group (ISO/IEC 12113:2022), sections 3.5 to 3.7.
 """
@@ -14,19 +15,23 @@ import json
 import math
 import urllib.parse
 from collections.abc import Callable
+from contextlib import suppress
 from typing import Any
 
 import numpy as np
 
-from data_pipeline.errors import Damage, cut_short
-from data_pipeline.objects.formats.polygons import check_indices, fan_triangles, merged, strip_triangles
+from data_pipeline.errors import Damage, DamagedMesh, EmptyMesh, cut_short
+from data_pipeline.objects.formats.polygons import check_indices, fan_triangles, merged, moved, strip_triangles
+from data_pipeline.objects.formats.text import is_filler
 
 _COMPONENTS = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
 _WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT2": 4, "MAT3": 9, "MAT4": 16}
-_DRACO, _INSTANCING = "KHR_draco_mesh_compression", "EXT_mesh_gpu_instancing"
-_READ = (_DRACO, _INSTANCING, "KHR_mesh_quantization")
+_INDICES = (5121, 5123, 5125)
+_DRACO, _INSTANCING, _VISIBILITY = "KHR_draco_mesh_compression", "EXT_mesh_gpu_instancing", "KHR_node_visibility"
+_READ = (_DRACO, _INSTANCING, _VISIBILITY, "KHR_mesh_quantization")
 _HARMLESS = ("KHR_materials_", "KHR_texture_", "EXT_texture_", "MSFT_texture_", "KHR_lights_", "KHR_xmp", "EXT_lights_",
-             "KHR_animation", "KHR_node_", "MSFT_packing", "KHR_techniques_", "ADOBE_materials")  # fmt: skip
+             "KHR_animation", "KHR_node_hoverability", "KHR_node_selectability", "MSFT_packing", "KHR_techniques_",
+             "ADOBE_materials")  # fmt: skip
 """Beginnings of the names of extensions that leave the geometry as it is."""
 
 MOST_ELEMENTS, MOST_ZEROS, MOST_COPIES = 50_000_000, 5_000_000, 100_000
@@ -43,12 +48,14 @@ def parse_gltf(content: bytes, sibling: Callable[[str], bytes]) -> tuple[np.ndar
 def _chunks(content: bytes) -> tuple[Any, bytes]:
     """Returns the JSON document and the binary chunk."""
     if content[:4] != b"glTF":
-        return json.loads(content.decode("utf-8-sig")), b""
+        return _json(content.decode("utf-8-sig")), b""
     if int.from_bytes(content[4:8], "little") != 2:
         raise Damage(f"is a GLB file of version {content[4]}, not 2; export it again as glTF 2.0")
     declared = int.from_bytes(content[8:12], "little")
     if declared > len(content):
         raise cut_short(f"{len(content)} of {declared} bytes are there")
+    if not is_filler(content[declared:]):
+        raise Damage(f"is not a readable glTF mesh: it declares {declared} bytes and holds more; export it again")
     document, binary, at = None, b"", 12
     while at + 8 <= declared:
         length, kind = int.from_bytes(content[at : at + 4], "little"), content[at + 4 : at + 8]
@@ -56,11 +63,23 @@ def _chunks(content: bytes) -> tuple[Any, bytes]:
             raise Damage("is not a readable glTF mesh: a chunk goes beyond its end; export it again")
         chunk = content[at + 8 : at + 8 + length]
         if kind == b"JSON" and document is None:
-            document = json.loads(chunk.decode())
+            document = _json(chunk.decode())
         elif kind == b"BIN\0" and not binary:
             binary = chunk
         at += 8 + length
     return document, binary
+
+
+def _json(text: str) -> Any:
+    """Returns a document, in which no name stands twice in one place."""
+
+    def once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+        names = dict(pairs)
+        if len(names) < len(pairs):
+            raise ValueError(f"a part with the names {', '.join(sorted(names))[:60]} has one of them twice")
+        return names
+
+    return json.loads(text, object_pairs_hook=once)
 
 
 class _Reader:
@@ -95,15 +114,27 @@ class _Reader:
             content = self.binary
         elif uri is None:
             raise Damage(f"has no data for buffer {index}; export it again")
-        elif uri.startswith("data:"):
+        elif uri[:5].lower() == "data:":
             head, _, body = uri.partition(",")
-            content = base64.b64decode(body) if head.endswith(";base64") else urllib.parse.unquote_to_bytes(body)
+            content = urllib.parse.unquote_to_bytes(body)
+            if head.lower().endswith(";base64"):
+                content = base64.b64decode(b"".join(content.split()), validate=True)
         else:
-            content = self.sibling(urllib.parse.unquote(uri))
+            content = self._beside(uri)
         if len(content) < entry["byteLength"]:
             raise cut_short(f"buffer {index} has {len(content)} of {entry['byteLength']} bytes")
         self.buffers[index] = content
         return content
+
+    def _beside(self, uri: str) -> bytes:
+        """Returns the content of another file, whose name may be written with escapes such as `%20`, or as it is."""
+        try:
+            return self.sibling(urllib.parse.unquote(uri))
+        except DamagedMesh:
+            if "%" in uri:
+                with suppress(DamagedMesh):
+                    return self.sibling(uri)
+            raise
 
     def view(self, index: Any) -> tuple[bytes, int]:
         """Returns the bytes of a buffer view and the distance of its elements, 0 if they are packed."""
@@ -149,8 +180,14 @@ class _Reader:
         if self.elements > MOST_ELEMENTS:
             raise Damage(f"unfolds to more than {MOST_ELEMENTS:,} elements; export a simpler mesh")
 
-    def primitive(self, entry: Any) -> tuple[np.ndarray, np.ndarray, dict[str, np.ndarray]] | None:
-        """Returns the vertices, triangles and skin of a primitive, or None for points and lines."""
+    def _indices(self, index: Any) -> np.ndarray:
+        entry = self.item("accessors", index)
+        if entry["componentType"] not in _INDICES or entry["type"] != "SCALAR" or entry.get("normalized"):
+            raise ValueError(f"indices are {entry['type']} of the type {entry['componentType']}, not unsigned integers")
+        return self.accessor(index)[:, 0]
+
+    def primitive(self, entry: Any) -> tuple[np.ndarray, np.ndarray, dict[str, np.ndarray], Any] | None:
+        """Returns the vertices, triangles and skin of a primitive, and itself; or None for points and lines."""
         mode, attributes = entry.get("mode", 4), entry["attributes"]
         if mode not in (4, 5, 6) or "POSITION" not in attributes:
             if mode not in range(7):
@@ -161,17 +198,33 @@ class _Reader:
             vertices, indices = self._draco(draco, entry)
         else:
             vertices = self.accessor(attributes["POSITION"])
-            indices = self.accessor(entry["indices"])[:, 0] if "indices" in entry else np.arange(len(vertices))
+            indices = self._indices(entry["indices"]) if "indices" in entry else np.arange(len(vertices))
         if vertices.shape[1:] != (3,):
             raise ValueError("positions are not VEC3")
         indices = indices.astype(np.int64)
-        if mode == 4:
-            triangles = indices[: len(indices) // 3 * 3].reshape(-1, 3)
-        else:
-            triangles = (strip_triangles if mode == 5 else fan_triangles)(indices)
+        if len(indices) % 3 if mode == 4 else 0 < len(indices) < 3 or draco is not None:
+            raise ValueError(f"{len(indices)} corners are no whole number of triangles in mode {mode}")
+        triangles = indices.reshape(-1, 3) if mode == 4 else (strip_triangles if mode == 5 else fan_triangles)(indices)
         check_indices(triangles, len(vertices))
         skin = {name: self.accessor(at) for name, at in attributes.items() if name.startswith(("JOINTS_", "WEIGHTS_"))}
-        return vertices.astype(np.float64), triangles, skin
+        return vertices.astype(np.float64), triangles, skin, entry
+
+    def _morphed(self, vertices: np.ndarray, entry: Any, weights: Any) -> np.ndarray:
+        """Returns the vertices of a primitive with its morph targets, by weights that a node or mesh has without animation."""
+        if not any(weights):
+            return vertices
+        targets = entry.get("targets", [])
+        if len(targets) != len(weights) or _DRACO in entry.get("extensions", {}):
+            raise Damage(
+                f"has {len(weights)} weights of {len(targets)} morph targets, not read; export it without them"
+            )
+        for weight, target in zip(weights, targets, strict=True):
+            if weight and "POSITION" in target:
+                by = self.accessor(target["POSITION"])
+                if by.shape != vertices.shape:
+                    raise ValueError("a morph target has another number of vertices than its mesh")
+                vertices = vertices + weight * by.astype(np.float64)
+        return vertices
 
     def _draco(self, draco: Any, entry: Any) -> tuple[np.ndarray, np.ndarray]:
         import DracoPy
@@ -193,30 +246,36 @@ class _Reader:
     def matrix(self, node: Any) -> np.ndarray:
         """Returns the transform of a node into its parent's frame, (4, 4)."""
         if "matrix" in node:
-            return np.array(node["matrix"], np.float64).reshape(4, 4).T
+            found = np.array(node["matrix"], np.float64).reshape(4, 4).T
+            if (np.abs(found[3] - (0, 0, 0, 1)) > 1e-6).any():
+                raise Damage("has a matrix whose last row is not 0 0 0 1; export it again")
+            return found
         return _transform(
             np.array([node.get("translation", (0, 0, 0))], np.float64),
             np.array([node.get("rotation", (0, 0, 0, 1))], np.float64),
             np.array([node.get("scale", (1, 1, 1))], np.float64),
         )[0]
 
-    def placed(self) -> dict[int, np.ndarray]:
-        """Returns the nodes of the default scene, by number, with their transforms into the world."""
+    def placed(self) -> tuple[dict[int, np.ndarray], set[int]]:
+        """Returns the nodes of the default scene, by number, with their transforms into the world; and which are hidden."""
         nodes = self.document.get("nodes", [])
         if "scenes" in self.document:
             roots = self.item("scenes", self.document.get("scene", 0)).get("nodes", [])
         else:
             roots = sorted(set(range(len(nodes))) - {child for node in nodes for child in node.get("children", [])})
         found: dict[int, np.ndarray] = {}
-        todo = [(root, np.eye(4)) for root in roots[::-1]]
+        hidden: set[int] = set()
+        todo = [(root, np.eye(4), False) for root in roots[::-1]]
         while todo:
-            index, parent = todo.pop()
+            index, parent, unseen = todo.pop()
             if index in found:
                 raise ValueError(f"node {index} is in the scene twice")
             node = self.item("nodes", index)
             found[index] = parent @ self.matrix(node)
-            todo += [(child, found[index]) for child in node.get("children", [])[::-1]]
-        return found
+            if unseen := unseen or not node.get("extensions", {}).get(_VISIBILITY, {}).get("visible", True):
+                hidden.add(index)
+            todo += [(child, found[index], unseen) for child in node.get("children", [])[::-1]]
+        return found, hidden
 
     def instances(self, node: Any) -> np.ndarray:
         """Returns the transforms of the copies of a node's mesh into the node's frame, (copies, 4, 4)."""
@@ -238,25 +297,28 @@ class _Reader:
 
     def meshes(self) -> tuple[np.ndarray, np.ndarray]:
         """Returns the vertices and triangles of all meshes in the scene."""
-        placed = self.placed()
+        placed, hidden = self.placed()
         parts: list[tuple[np.ndarray, np.ndarray]] = []
         read: dict[int, list[Any]] = {}
-        for index, world in placed.items():
-            node = self.item("nodes", index)
-            if "mesh" not in node:
-                continue
-            mesh = node["mesh"]
+        nodes = {index: self.item("nodes", index) for index in placed if index not in hidden}
+        shown = {index: node for index, node in nodes.items() if "mesh" in node}
+        if not shown and (meshes := self.document.get("meshes")):
+            raise EmptyMesh(f"mesh has no faces: its scene shows none of its {len(meshes)} meshes")
+        for index, node in shown.items():
+            world, mesh = placed[index], node["mesh"]
+            content = self.item("meshes", mesh)
             if mesh not in read:
-                primitives = [self.primitive(entry) for entry in self.item("meshes", mesh)["primitives"]]
+                primitives = [self.primitive(entry) for entry in content["primitives"]]
                 read[mesh] = [primitive for primitive in primitives if primitive is not None]
             copies = self.instances(node)
-            for vertices, triangles, skin in read[mesh]:
+            for vertices, triangles, skin, entry in read[mesh]:
                 self._spend(len(copies) * (len(vertices) + len(triangles)))
+                vertices = self._morphed(vertices, entry, node.get("weights", content.get("weights", ())))
                 if "skin" in node and skin:
                     parts.append((self._skinned(vertices, skin, self.item("skins", node["skin"]), placed), triangles))
                     continue
                 for copy in world @ copies:
-                    parts.append((vertices @ copy[:3, :3].T + copy[:3, 3], triangles))
+                    parts.append((moved(vertices, copy), triangles))
         return merged(parts)
 
     def _skinned(
@@ -272,8 +334,8 @@ class _Reader:
             weights = skin[name.replace("JOINTS_", "WEIGHTS_")].astype(np.float64)
             for at in range(4):
                 matrices = joints[skin[name][:, at].astype(np.int64)]
-                moved = np.einsum("nij,nj->ni", matrices[:, :3, :3], vertices) + matrices[:, :3, 3]
-                posed, total = posed + weights[:, at, None] * moved, total + weights[:, at, None]
+                places = np.einsum("nij,nj->ni", matrices[:, :3, :3], vertices) + matrices[:, :3, 3]
+                posed, total = posed + weights[:, at, None] * places, total + weights[:, at, None]
         return posed / np.where(total == 0, 1, total)
 
 

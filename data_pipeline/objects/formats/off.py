@@ -3,12 +3,23 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Iterator
 
 import numpy as np
 
 from data_pipeline.errors import Damage, cut_short
 from data_pipeline.objects.formats.polygons import triangulate
-from data_pipeline.objects.formats.text import columns, numbers, text_of, whole_numbers, without_comments
+from data_pipeline.objects.formats.text import (
+    is_filler,
+    lines_of,
+    number,
+    numbers,
+    quoted,
+    starts_of,
+    text_of,
+    whole_number,
+    without_comments,
+)
 
 _HEADER = re.compile(r"(?P<kinds>(?:ST|C|N|4|st|c|n(?=off))*)(?P<dimensions>n)?(?i:OFF)(?P<rest>.*)", re.DOTALL)
 """Kinds: ST texture coordinates, C colours, N normals after the coordinates of a vertex, 4 a fourth, homogeneous coordinate."""
@@ -17,25 +28,23 @@ _HEADER = re.compile(r"(?P<kinds>(?:ST|C|N|4|st|c|n(?=off))*)(?P<dimensions>n)?(
 def parse_off(content: bytes) -> tuple[np.ndarray, np.ndarray]:
     """Reads OFF, COFF, NOFF, CNOFF, STOFF and combinations.
 
-    What follows the coordinates of a vertex or the corners of a face is ignored. Also reads counts on the first line as in
-    ModelNet (`OFF490 518 0`) and comments in any encoding.
+    Colours, normals and texture coordinates are ignored. A vertex or face may be written over several lines, and a line may hold
+    several vertices, but none begins or ends within a line of others: a number too many in one line and one too few in the next
+    is an error. Also reads counts on the first line as in ModelNet (`OFF490 518 0`) and comments in any encoding.
     """
     first = content.removeprefix(b"\xef\xbb\xbf")[:64].split(b"\n", 1)[0].split()
     if len(first) > 1 and first[1].upper() == b"BINARY":
         return _parse_binary(content)
-    lines = without_comments(text_of(content, "an OFF")).split("\n")
-    lines = [line for line in lines if line and not line.isspace()]
+    lines = lines_of(without_comments(text_of(content, "an OFF")))
     kinds, rest = _header(lines[0].strip() if lines else "")
-    (vertex_count, face_count), body = _counts([rest, *lines[1:]])
-    vertex_lines, face_lines = body[:vertex_count], body[vertex_count : vertex_count + face_count]
-    if len(vertex_lines) < vertex_count or (vertex_lines and len(vertex_lines[-1].split()) < 3):
-        whole = sum(len(line.split()) >= 3 for line in vertex_lines)
-        raise cut_short(f"{whole} of {vertex_count} vertices are there")
-    vertices = _cartesian(columns(vertex_lines, 4 if "4" in kinds else 3))
-    corners, sizes = _faces(face_lines)
-    if len(sizes) < face_count:
-        raise cut_short(f"{len(sizes)} of {face_count} faces are there")
-    return vertices, triangulate(vertices, corners, sizes)
+    wrong: Exception | None = None
+    for vertex_count, face_count, body in _bodies([rest, *lines[1:]]):
+        for width in _widths(kinds, body[:vertex_count]):
+            try:
+                return _read(body, vertex_count, face_count, width, 4 if "4" in kinds else 3)
+            except (Damage, ValueError) as error:  # in the first way that the file may be meant
+                wrong = wrong or error
+    raise wrong or ValueError("its counts are missing")
 
 
 def _header(line: str) -> tuple[str, str]:
@@ -48,50 +57,97 @@ def _header(line: str) -> tuple[str, str]:
     return header["kinds"], header["rest"]
 
 
+def _bodies(lines: list[str]) -> Iterator[tuple[int, int, list[str]]]:
+    """Returns the numbers of vertices and faces, and the lines that follow: with and without a number of edges after them."""
+    words, used = lines[0].split(), 1
+    while len(words) < 2 and used < min(4, len(lines)):
+        words += lines[used].split()
+        used += 1
+    try:
+        counts = [whole_number(word) for word in words[:3]]
+    except ValueError:
+        counts = []
+    if len(counts) < 2 or min(counts[:2]) < 0:
+        raise ValueError("its counts are missing")
+    after = [" ".join(words[3:])] if len(words) > 3 else []  # the vertices begin in the line of the counts
+    yield counts[0], counts[1], [*after, *lines[used:]]
+    if len(words) == 2 and used < len(lines) and len(lines[used].split()) == 1:
+        yield counts[0], counts[1], lines[used + 1 :]
+
+
+def _widths(kinds: str, lines: list[str]) -> list[int]:
+    """Returns how many numbers a vertex may have: as many as all lines have, if these are alike, or by the kinds."""
+    least = 4 if "4" in kinds else 3
+    in_lines = {len(line.split()) for line in lines}
+    by_kind = least + 3 * ("N" in kinds.upper()) + 2 * ("ST" in kinds.upper())
+    widths = [by_kind + 3, by_kind + 4] if "C" in kinds.upper() else [by_kind]
+    return list(dict.fromkeys([*(width for width in in_lines if len(in_lines) == 1 and width >= least), *widths]))
+
+
+def _read(lines: list[str], vertex_count: int, face_count: int, width: int, kept: int) -> tuple[np.ndarray, np.ndarray]:
+    """Returns vertices and triangles, if every vertex has `width` numbers, of which the first `kept` are its coordinates."""
+    counts = np.array([len(line.split()) for line in lines], np.int64)
+    ends = np.cumsum(counts)
+    used = int(np.searchsorted(ends, vertex_count * width)) + 1 if vertex_count else 0
+    begin, end = starts_of(counts)[:used], ends[:used]
+    whole = (begin % width == 0) & (end % width == 0)
+    torn = np.flatnonzero(~whole & (begin // width != (end - 1) // width))
+    if len(torn):
+        at = torn[0] - int(begin[torn[0]] % width > 0)  # the line before has too few
+        raise ValueError(f"the line {quoted(lines[at])} has {counts[at]} numbers instead of {width}")
+    if used > len(lines) or (used and end[-1] != vertex_count * width):
+        raise cut_short(f"{int(ends[-1]) // width if len(ends) else 0} of {vertex_count} vertices are there")
+    vertices = numbers(lines[:used])[0].reshape(-1, width)[:, :kept]
+    corners, sizes, after = _faces(lines[used:], face_count)
+    if len(sizes) < face_count:
+        raise cut_short(f"{len(sizes)} of {face_count} faces are there")
+    if used + after < len(lines):
+        raise Damage(f"declares {vertex_count} vertices and {face_count} faces, and holds more; export it again")
+    vertices = _cartesian(vertices)
+    return vertices, triangulate(vertices, corners, sizes)
+
+
 def _cartesian(points: np.ndarray) -> np.ndarray:
     """Returns points (n, 3) from such, or from homogeneous coordinates (n, 4)."""
     with np.errstate(all="ignore"):
         return points[:, :3] / points[:, 3:] if points.shape[1] == 4 else points
 
 
-def _counts(lines: list[str]) -> tuple[tuple[int, int], list[str]]:
-    """Returns the numbers of vertices and faces, and the lines that follow them; `lines` begin after the header."""
-    words, used = lines[0].split(), 1
-    while len(words) < 2 and used < min(4, len(lines)):
-        words += lines[used].split()
-        used += 1
-    try:
-        counts = int(words[0]), int(words[1])  # the number of edges is not needed
-    except (IndexError, ValueError):
-        counts = -1, -1
-    if min(counts) < 0:
-        raise ValueError("its counts are missing")
-    return counts, lines[used:]
+def _faces(lines: list[str], face_count: int) -> tuple[np.ndarray, np.ndarray, int]:
+    """Returns the corners of all faces, their number in each, and the number of lines read.
 
-
-def _faces(lines: list[str]) -> tuple[np.ndarray, np.ndarray]:
-    """Returns the corners of all faces and their number in each, up to the first face that is cut short.
-
-    Colours may follow the corners of a face.
+    Colours of one, three or four numbers may follow the corners of a face. There are fewer faces if the last is cut short.
     """
     try:
-        values = numbers("\n".join(lines), np.int64)
-        if len(values) == 4 * len(lines) and (values[::4] == 3).all():
-            return values.reshape(-1, 4)[:, 1:].reshape(-1), np.full(len(lines), 3)
-    except ValueError:  # colours may be fractions or words
+        values, counts = numbers(lines[:face_count], np.int64)
+        if (counts == 4).all() and (values[::4] == 3).all():
+            return values.reshape(-1, 4)[:, 1:].reshape(-1), np.full(len(counts), 3), len(counts)
+    except ValueError:  # colours may be fractions
         pass
-    corners: list[str] = []
+    corners: list[int] = []
     sizes: list[int] = []
-    for line in lines:
-        words = line.split()
-        size = int(words[0])
+    colours: dict[int, str] = {}
+    at = 0
+    while len(sizes) < face_count and at < len(lines):
+        words, first = lines[at].split(), at
+        size = whole_number(words[0])
         if size < 0:
             raise ValueError(f"a face has {size} corners")
+        at += 1
+        while len(words) < size + 1 and at < len(lines):
+            words += lines[at].split()
+            at += 1
         if len(words) < size + 1:
             break
-        corners += words[1 : size + 1]
+        colour = [number(word) for word in words[size + 1 :]]
+        if len(colour) not in (0, 1, 3, 4) or (colour and (at > first + 1 or size < 3)):
+            raise ValueError(f"the face {quoted(lines[first])} has {len(words)} numbers instead of {size + 1}")
+        corners += [whole_number(word) for word in words[1 : size + 1]]
         sizes.append(size)
-    return whole_numbers(corners), np.array(sizes, np.int64)
+        colours.setdefault(len(colour), lines[first])
+    if 1 in colours and len(colours) > 1:  # one number more is a colour only if all faces have one
+        raise ValueError(f"the face {quoted(colours[1])} has one number more than its corners, and others have none")
+    return np.array(corners, np.int64), np.array(sizes, np.int64), at
 
 
 def _parse_binary(content: bytes) -> tuple[np.ndarray, np.ndarray]:
@@ -117,4 +173,6 @@ def _parse_binary(content: bytes) -> tuple[np.ndarray, np.ndarray]:
         corners += values[at + 1 : after]
         sizes.append(size)
         at = after + 1 + values[after]  # the number of colour components, and they
+    if not is_filler(body[4 * (end + at) :]):
+        raise Damage(f"declares {vertex_count} vertices and {face_count} faces, and holds more; export it again")
     return vertices, triangulate(vertices, np.array(corners, np.int64), np.array(sizes, np.int64))

@@ -4,24 +4,25 @@ from __future__ import annotations
 
 import re
 import struct
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 from data_pipeline.errors import Damage, cut_short
 from data_pipeline.objects.formats.polygons import check_indices, strip_triangles, triangulate
-from data_pipeline.objects.formats.text import number, numbers
+from data_pipeline.objects.formats.text import is_filler, lines_of, numbers, quoted, starts_of
 
 _TYPES = {
     "char": "i1", "int8": "i1", "uchar": "u1", "uint8": "u1", "short": "i2", "int16": "i2", "ushort": "u2", "uint16": "u2",
     "int": "i4", "int32": "i4", "uint": "u4", "uint32": "u4", "float": "f4", "float32": "f4", "double": "f8", "float64": "f8",
     "int64": "i8", "uint64": "u8",
 }  # fmt: skip
-_CODES = dict(zip(("i1", "u1", "i2", "u2", "i4", "u4", "i8", "u8", "f8"), "bBhHiIqQd", strict=True))
+_CODES = dict(zip(("i1", "u1", "i2", "u2", "i4", "u4", "i8", "u8"), "bBhHiIqQ", strict=True))
 """How `struct` names the types of lengths."""
 
 _ORDERS = {"ascii": "ascii", "binary_little_endian": "<", "binary_big_endian": ">"}
+_SHAPES = ("face", "faces", "tristrips")
 _INDICES = ("vertex_indices", "vertex_index", "vertexindices", "indices")
 
 
@@ -57,18 +58,22 @@ class _List:
 
 
 def parse_ply(content: bytes) -> tuple[np.ndarray, np.ndarray]:
-    """Reads a PLY file. The numbers of a text become those of a binary file, of 8 bytes each."""
+    """Reads a PLY file."""
     order, elements, start = _header(content)
-    data, at = (content, start) if order != "ascii" else (_numbers(content[start:]).view(np.uint8), 0)
     found: dict[str, dict[str, Any]] = {}
+    lines = lines_of(content[start:].decode("latin-1").replace("\r", "\n")) if order == "ascii" else []
+    at = 0 if order == "ascii" else start
     for element in elements:
         if not element.properties or not element.count:
             continue
-        stored = element
         if order == "ascii":
-            eight = [_Property(one.name, "f8", one.length and "f8") for one in element.properties]
-            stored = replace(element, properties=eight)
-        found[element.name], at = _rows(data, at, stored, "=" if order == "ascii" else order)
+            found[element.name] = _of_lines(lines[at : at + element.count], element, at + element.count >= len(lines))
+            at += element.count
+        else:
+            found[element.name], at = _rows(content, at, element, order)
+    if at < len(lines) or (order != "ascii" and not is_filler(content[at:])):
+        more = f"more than the rows that its header declares ({_counts(elements)})"
+        raise Damage(f"is not a readable .ply mesh: it holds {more}; export it again")
     vertex = found.get("vertex", {})
     if not all(isinstance(vertex.get(axis), np.ndarray) for axis in "xyz"):
         raise ValueError("it has no vertices x, y, z")
@@ -79,15 +84,19 @@ def parse_ply(content: bytes) -> tuple[np.ndarray, np.ndarray]:
     return vertices, _triangles(vertices, elements, found)
 
 
+def _counts(elements: list[_Element]) -> str:
+    return ", ".join(f"{element.count} of {element.name!r}" for element in elements)
+
+
 def _triangles(vertices: np.ndarray, elements: list[_Element], found: dict[str, Any]) -> np.ndarray:
     parts = [np.zeros((0, 3), np.int64)]
     for element in elements:
-        if element.name not in ("face", "faces", "tristrips") or element.name not in found:
+        if element.name not in _SHAPES or element.name not in found:
             continue
-        lists = [one.name for one in element.lists]
-        named = [name for name in lists if name.lower() in _INDICES] or lists
-        if not named:
-            why = f"its element {element.name!r} has no list of vertices"
+        lists = [one.name for one in element.lists if one.kind[0] != "f"]
+        named = [one.name for one in element.lists if one.name.lower() in _INDICES] or lists
+        if len(named) != 1:
+            why = f"its element {element.name!r} has {len(named)} lists of vertices"
             raise Damage(f"is not a readable .ply mesh: {why}; export it again")
         corners: _List = found[element.name][named[0]]
         values = corners.values
@@ -101,6 +110,9 @@ def _triangles(vertices: np.ndarray, elements: list[_Element], found: dict[str, 
             continue
         for strip in np.split(values, np.cumsum(corners.counts)[:-1]):  # −1 ends a strip within a list
             parts += [strip_triangles(part[part >= 0]) for part in np.split(strip, np.flatnonzero(strip == -1))]
+    others = [element for element in elements if element.name not in _SHAPES and element.name != "vertex"]
+    if unread := next((one.name for one in others if one.lists and one.count and len(parts) == 1), None):
+        raise Damage(f"has no faces, but an element {unread!r} that is not read; export it again with faces")
     triangles = np.concatenate(parts)
     check_indices(triangles, len(vertices))
     return triangles
@@ -149,19 +161,39 @@ def _header(content: bytes) -> tuple[str, list[_Element], int]:
     return order, elements, last.end() + len(content) - len(body)
 
 
-def _numbers(body: bytes) -> np.ndarray:
-    """Returns all numbers of the data of a text file, up to the first word that is none."""
-    text = body.decode("latin-1")
-    try:
-        return numbers(text)
-    except ValueError:
-        found: list[float] = []
-        for word in text.split():
-            try:
-                found.append(number(word))
-            except ValueError:
-                break
-        return np.array(found)
+def _of_lines(lines: list[str], element: _Element, last: bool) -> dict[str, Any]:
+    """Returns the properties of the rows of an element of a text file, each of which is a line.
+
+    Args:
+        last: whether the file ends with these lines.
+    """
+    values, counts = numbers(lines)
+    starts, padded = starts_of(counts), np.append(values, 0.0)
+    ends, at = starts + counts, starts
+    places: list[tuple[_Property, np.ndarray, np.ndarray]] = []
+    for one in element.properties:
+        many = np.ones(len(lines), np.int64)
+        if one.length:
+            length = padded[np.minimum(at, len(values))]
+            wrong = np.flatnonzero((at < ends) & ~((length >= 0) & (length == np.floor(length))))
+            if len(wrong):
+                raise ValueError(f"a list {one.name!r} has the length {length[wrong[0]]:.15g}")
+            many, at = np.where(at < ends, length.clip(0, 2**40), 0).astype(np.int64), at + 1
+        places.append((one, at, many))
+        at = at + many
+    wrong = np.flatnonzero(at != ends)
+    if len(wrong) and not (last and wrong[0] == len(lines) - 1 and at[-1] > ends[-1]):
+        row, line = wrong[0], quoted(lines[wrong[0]])
+        row_has = f"the line {line} of its element {element.name!r} has {counts[row]} numbers"
+        raise ValueError(f"{row_has} instead of {at[row] - starts[row]}")
+    if len(lines) < element.count or len(wrong):
+        raise element.cut(len(lines) - len(wrong))
+    found: dict[str, Any] = {}
+    for one, first, many in places:
+        within = np.arange(many.sum()) - np.repeat(starts_of(many), many)
+        taken = values[np.repeat(first, many) + within]
+        found[one.name] = _List(taken, many) if one.length else taken
+    return found
 
 
 def _rows(data: Any, at: int, element: _Element, order: str) -> tuple[dict[str, Any], int]:
@@ -206,18 +238,18 @@ def _walk(data: Any, at: int, element: _Element, order: str, rows: int) -> tuple
                 if at + length.size > len(data):
                     raise element.cut(row)
                 (count,) = length.unpack_from(data, at)
-                if not count >= 0 or count != int(min(count, 2**53)):  # of a text, any number
-                    raise ValueError(f"a list {one.name!r} has the length {count:.15g}")
+                if count < 0:
+                    raise ValueError(f"a list {one.name!r} has the length {count}")
                 at += length.size
-                counts[one.name].append(int(count))
+                counts[one.name].append(count)
             starts[one.name].append(at)
-            at += int(count) * item
+            at += count * item
         if at > len(data):
             raise element.cut(row)
     found: dict[str, Any] = {}
     for one, length, item in steps:
         places, many = np.array(starts[one.name], np.int64), np.array(counts.get(one.name, [1] * rows), np.int64)
-        within = np.arange(many.sum()) - np.repeat(np.cumsum(many) - many, many)
+        within = np.arange(many.sum()) - np.repeat(starts_of(many), many)
         anywhere = np.ndarray(max(len(data) - item + 1, 0), order + one.kind, data, 0, (1,))
         values = anywhere[np.repeat(places, many) + item * within]
         found[one.name] = _List(values, many) if length else values

@@ -13,6 +13,9 @@ MOST_WORK = 600_000_000
 """Largest sum of squared numbers of corners of the concave polygons of a file. Ear clipping needs time in proportion to it if a
 polygon crosses itself; this is a few seconds."""
 
+_FLAT = 1e-6
+"""Height of a triangle, as a share of its longest edge, up to which it has no area: a needle that is never seen."""
+
 
 def check_indices(indices: np.ndarray, vertex_count: int) -> None:
     """Raises `Damage` if an index of a vertex is negative or beyond the last vertex."""
@@ -23,9 +26,31 @@ def check_indices(indices: np.ndarray, vertex_count: int) -> None:
 def merged(parts: Sequence[tuple[np.ndarray, np.ndarray]]) -> tuple[np.ndarray, np.ndarray]:
     """Returns the vertices and triangles of several meshes as those of one."""
     first = np.cumsum([0, *(len(vertices) for vertices, _ in parts)])
-    moved = [triangles + at for (_, triangles), at in zip(parts, first, strict=False)]
+    shifted = [triangles + at for (_, triangles), at in zip(parts, first, strict=False)]
     vertices = np.concatenate([np.zeros((0, 3)), *(vertices for vertices, _ in parts)])
-    return vertices, np.concatenate([np.zeros((0, 3), np.int64), *moved])
+    return vertices, np.concatenate([np.zeros((0, 3), np.int64), *shifted])
+
+
+def have_area(vertices: np.ndarray, triangles: np.ndarray) -> np.ndarray:
+    """Returns which triangles (m,) have an area, beyond what rounding of their corners makes; all whose corners are not finite.
+
+    A triangle without area may reach anywhere and is never seen, so neither the centre nor the size of a mesh follows from it.
+    """
+    corners = vertices[triangles]
+    single = (vertices == vertices.astype(np.float32)).all()  # such as those of binary files
+    with np.errstate(all="ignore"):
+        reach = np.abs(corners).max(axis=(1, 2), initial=0)
+        edges = corners - np.roll(corners, 1, axis=1)
+        longest = np.linalg.norm(edges, axis=2).max(axis=1, initial=0)
+        units = edges / longest[:, None, None]
+        height = np.linalg.norm(np.cross(units[:, 0], units[:, 1]), axis=1)  # as a share of the longest edge
+        least = np.maximum(_FLAT, 4 * np.finfo(np.float32 if single else np.float64).eps * reach / longest)
+        return (height > least) | ~np.isfinite(reach)
+
+
+def moved(vertices: np.ndarray, place: np.ndarray) -> np.ndarray:
+    """Returns vertices (n, 3) after a transform (4, 4)."""
+    return vertices @ place[:3, :3].T + place[:3, 3]
 
 
 def triangulate(vertices: np.ndarray, corners: np.ndarray, counts: np.ndarray) -> np.ndarray:

@@ -8,10 +8,17 @@ import re
 import numpy as np
 
 from data_pipeline.errors import Damage, cut_short
-from data_pipeline.objects.formats.text import columns, text_of
+from data_pipeline.objects.formats.text import columns, is_filler, lines_of, quoted, text_of
 
 _TRIANGLE = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
-_CORNER = re.compile(r"^[ \t]*vertex[ \t]+(.*)", re.IGNORECASE | re.MULTILINE)
+_KINDS = {
+    "s": r"solid\b(?!.*\bfacet\s+normal\b).*", "f": r"facet(\s+normal(\s+\S+){3})?", "o": r"outer\s+loop", "v": r"vertex\s.*",
+    "l": r"end\s?loop", "e": r"end\s?facet", "S": r"end\s?solid\b.*",
+}  # fmt: skip
+_LINE = re.compile("|".join(rf"(?P<{kind}>{form})" for kind, form in _KINDS.items()), re.IGNORECASE)
+_SOLIDS = re.compile(r"(?:s(?:fovvvle)*+S)*+")
+_BEGUN = re.compile(_SOLIDS.pattern + r"(?:s(?:fovvvle)*+(?:f(?:o(?:v(?:v(?:v(?:le?)?)?)?)?)?)?)?")
+"""The kinds of the lines of a whole file, and of one that may end early."""
 
 
 def parse_stl(content: bytes) -> tuple[np.ndarray, np.ndarray]:
@@ -33,9 +40,9 @@ def _corners(content: bytes) -> np.ndarray:
     there = (len(content) - 84) // 50
     if there < count:
         raise cut_short(f"{there} of {count} triangles are there")
-    if len(content) - 84 - 50 * count < 50:  # bytes that fill the file up
+    if is_filler(content[84 + 50 * count :]):
         return _of_binary(content, count)
-    raise Damage(f"is not a readable .stl mesh: it declares {count} triangles and holds {there}; export it again")
+    raise Damage(f"is not a readable .stl mesh: it declares {count} triangles and holds more; export it again")
 
 
 def _of_binary(content: bytes, count: int) -> np.ndarray:
@@ -44,13 +51,14 @@ def _of_binary(content: bytes, count: int) -> np.ndarray:
 
 
 def _of_text(text: str) -> np.ndarray:
-    words = (r"solid", r"end ?solid", r"facet", r"end ?facet")
-    patterns = (re.compile(rf"^[ \t]*{word}\b", re.MULTILINE) for word in words)
-    opened, closed, facets, whole = (len(pattern.findall(text.lower())) for pattern in patterns)
-    if closed < opened or whole < facets:
-        raise cut_short(f"{whole} of {facets} facets and {closed} of {opened} solids end")
-    vertices = columns(_CORNER.findall(text), 3)
-    if len(vertices) != 3 * facets:
-        corners = f"it has {len(vertices)} corners in {facets} facets"
-        raise Damage(f"is not a readable .stl mesh: {corners}; export it again")
-    return vertices
+    lines = [line.strip() for line in lines_of(text)]
+    found = [_LINE.fullmatch(line) for line in lines]
+    kinds = "".join(one.lastgroup or "" if one else "?" for one in found)
+    if _SOLIDS.fullmatch(kinds) is None:
+        begun = _BEGUN.match(kinds)
+        at = begun.end() if begun else 0
+        if at >= len(kinds) - kinds.endswith("?"):  # the last line may be cut
+            whole, solids = f"{kinds.count('e')} of {kinds.count('f')} facets", kinds.count("s")
+            raise cut_short(f"{whole} and {kinds.count('S')} of {solids} solids end")
+        raise Damage(f"is not a readable .stl mesh: the line {quoted(lines[at])} is out of place; export it again")
+    return columns([line[6:] for line, kind in zip(lines, kinds, strict=True) if kind == "v"], 3)

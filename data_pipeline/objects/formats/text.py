@@ -5,18 +5,26 @@ from __future__ import annotations
 import codecs
 import re
 import warnings
-from collections.abc import Iterable
 from contextlib import suppress
+from typing import Any
 
 import numpy as np
 
 from data_pipeline.errors import Damage
 
-_NOT_A_NUMBER = re.compile(r"[+-]?(nan(\(.*\))?|\d+\.#(QNAN|SNAN|IND|R)\d*)", re.IGNORECASE)
+_NUMBER = re.compile(r"[+-]?((\d+\.?\d*|\.\d+)(e[+-]?\d+)?|inf(inity)?)", re.IGNORECASE | re.ASCII)
+"""What all readers take for a number; `float` also reads `2_0` and digits of other scripts."""
+
+_NOT_A_NUMBER = re.compile(r"[+-]?(nan(\(.*\))?|\d+\.#(QNAN|SNAN|IND|R)\d*)", re.IGNORECASE | re.ASCII)
 """Spellings of NaN that C libraries print, such as `-nan(ind)` and `1.#QNAN`; `float` reads only `nan`."""
+
+_WHOLE = re.compile(r"[+-]?[0-9]+")
 
 _COMMENT = re.compile(r"(?<!\d\.)#.*")
 """A comment to the end of its line, as against a spelling of NaN."""
+
+_FILLER = b"\0\r\n\t \x1a"
+"""Bytes that fill a file up behind its end."""
 
 
 def text_of(content: bytes, kind: str) -> str:
@@ -28,7 +36,7 @@ def text_of(content: bytes, kind: str) -> str:
     if content.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
         text = content.decode("utf-16", errors="replace")
     else:
-        text = content.removeprefix(codecs.BOM_UTF8).decode("latin-1")
+        text = content.removeprefix(codecs.BOM_UTF8).rstrip(b"\x1a").decode("latin-1")  # 1a ends a text of DOS
     if "\0" in text or "\ufffd" in text:
         raise Damage(f"is not {kind} mesh: it holds bytes that are not text; repair it or take it away")
     return text.replace("\r\n", "\n").replace("\r", "\n") if "\r" in text else text
@@ -39,41 +47,68 @@ def without_comments(text: str) -> str:
     return _COMMENT.sub("", text) if "#" in text else text
 
 
+def lines_of(text: str) -> list[str]:
+    """Returns the lines of a text that are not blank."""
+    return [line for line in text.split("\n") if line and not line.isspace()]
+
+
+def quoted(line: str) -> str:
+    """Returns the begin of a line for a message."""
+    return repr(line.strip()[:40])
+
+
+def is_filler(rest: bytes) -> bool:
+    """Returns whether the bytes behind the end of a binary mesh hold nothing."""
+    return not rest.strip(_FILLER)
+
+
 def number(word: str) -> float:
     """Returns the number that a word spells, in any spelling of NaN."""
-    try:
+    if _NUMBER.fullmatch(word):
         return float(word)
-    except ValueError:
-        if _NOT_A_NUMBER.fullmatch(word):
-            return float("nan")
-        raise ValueError(f"{word[:40]!r} is not a number") from None
+    if _NOT_A_NUMBER.fullmatch(word):
+        return float("nan")
+    raise ValueError(f"{word[:40]!r} is not a number")
 
 
-def whole_numbers(words: Iterable[str]) -> np.ndarray:
-    """Returns the integers that words spell, int64; those of more than 62 bits become smaller."""
-    return np.array([int(word) for word in words], object).clip(-(2**62), 2**62).astype(np.int64)
+def whole_number(word: str) -> int:
+    """Returns the integer that a word spells; one of more than 62 bits becomes smaller."""
+    if not _WHOLE.fullmatch(word):
+        raise ValueError(f"{word[:40]!r} is not a whole number")
+    return max(min(int(word), 2**62), -(2**62))
 
 
-def numbers(text: str, kind: type = np.float64) -> np.ndarray:
-    """Returns all numbers of a text, separated by white space, as float64 or int64."""
-    if not text or text.isspace():
-        return np.zeros(0, kind)
+def numbers(lines: list[str], kind: type[Any] = np.float64) -> tuple[np.ndarray, np.ndarray]:
+    """Returns all numbers of some lines, float64 or int64, and how many there are in each line."""
+    counts = np.array([len(line.split()) for line in lines], np.int64)
+    if not counts.sum():
+        return np.zeros(0, kind), counts
+    text = "\n".join(lines)
     with warnings.catch_warnings():
         warnings.simplefilter("error", DeprecationWarning)  # how NumPy before 2.3 says that it stopped early
         with suppress(ValueError, DeprecationWarning):
-            return np.fromstring(text, kind, sep=" ")  # ten times as fast as words one by one
-    words = text.split()
-    return whole_numbers(words) if kind is np.int64 else np.array([number(word) for word in words], np.float64)
+            values = np.fromstring(text, kind, sep=" ")  # ten times as fast as words one by one
+            if len(values) == counts.sum():  # it takes `1-2` for two numbers
+                return values, counts
+    read = whole_number if kind is np.int64 else number
+    return np.array([read(word) for word in text.split()], kind), counts
 
 
-def columns(lines: list[str], wanted: int) -> np.ndarray:
-    """Returns the first `wanted` numbers of every line, (lines, wanted) float64; further words of a line are ignored."""
-    with suppress(ValueError):  # words after the wanted ones may be anything
-        values = numbers("\n".join(lines))
-        if len(values) == wanted * len(lines) and all(len(lines[at].split()) == wanted for at in (0, -1) if lines):
-            return values.reshape(-1, wanted)
-    words = [line.split()[:wanted] for line in lines]
-    for line, found in zip(lines, words, strict=True):
-        if len(found) < wanted:
-            raise ValueError(f"the line {line.strip()[:40]!r} has {len(found)} numbers instead of {wanted}")
-    return np.array([[number(word) for word in found] for found in words], np.float64).reshape(-1, wanted)
+def starts_of(counts: np.ndarray) -> np.ndarray:
+    """Returns where each of some runs begins, from their lengths."""
+    return np.cumsum(counts) - counts
+
+
+def columns(lines: list[str], wanted: int, *more: int) -> np.ndarray:
+    """Returns the first `wanted` numbers of every line, (lines, wanted) float64.
+
+    Args:
+        more: how many numbers a line may have instead of `wanted`; those after the wanted ones are ignored.
+    """
+    counts = np.array([len(line.split()) for line in lines], np.int64)
+    wrong = np.flatnonzero(~np.isin(counts, (wanted, *more)))
+    if len(wrong):
+        line = lines[wrong[0]]
+        raise ValueError(f"the line {quoted(line)} has {counts[wrong[0]]} numbers instead of {wanted}")
+    values, _ = numbers(lines)
+    return values[starts_of(counts)[:, None] + np.arange(wanted)]
