@@ -32,6 +32,7 @@ from data_pipeline.dataset.config import check_viewpoints, identity_of
 from data_pipeline.dataset.origin import changes_between, state_of
 from data_pipeline.dataset.origin import open_objects as open_objects
 from data_pipeline.dataset.proof import (
+    CAPTURES,
     SHARDS,
     SOURCE_STATE,
     damage_of_settings,
@@ -332,7 +333,7 @@ def prepare(config: DataConfig, folder: Path, beam: str | None = None) -> Datase
         found = found_in(folder, damage)
         if isinstance(found, DatasetStatistics):
             if is_first():
-                shutil.rmtree(folder / "captures", ignore_errors=True)  # left by a run that was stopped before
+                shutil.rmtree(folder / CAPTURES, ignore_errors=True)  # left by a run that was stopped before
             _say_changes(config, folder)
             return found
         _check_source(config, folder, found)
@@ -342,7 +343,7 @@ def prepare(config: DataConfig, folder: Path, beam: str | None = None) -> Datase
 
 def _made(config: DataConfig, folder: Path, identity: dict[str, Any], beam: Any) -> DatasetStatistics:
     """Makes the data set and returns its statistics. Several processes share the captures; the first writes the shards."""
-    captures, made_with, shards = folder / "captures", folder / "config.json", folder / SHARDS
+    captures, made_with, shards = folder / CAPTURES, folder / "config.json", folder / SHARDS
     if not is_first():
         wait_for_all("the source is there")
     source, state = open_objects(config), state_of(config)

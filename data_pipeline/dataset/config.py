@@ -65,6 +65,8 @@ def made_with_other_settings(config: DataConfig, folder: Path) -> dict[str, tupl
 
     There are none if there is no data set, or its settings cannot be read. Settings that only one of them has are left out.
     """
+    if not (folder / SUMMARY).exists():
+        return {}
     try:
         was = read_json(folder / "config.json")
     except (FileNotFoundError, Unreadable):

@@ -34,6 +34,9 @@ from data_pipeline.progress import console
 SHARDS = "shards"
 """Folder of the shards in the folder of a data set."""
 
+CAPTURES = "captures"
+"""Folder of the captures in the folder of a data set that is not finished."""
+
 SOURCE_STATE = "source.json"
 """File name of the state of the source's files in the folder of a data set."""
 
@@ -158,6 +161,8 @@ def state_before(folder: Path) -> dict[str, str] | None:
 def damage_of_settings(folder: Path, identity: dict[str, Any]) -> str | None:
     """Returns why it is not known with which settings the data set in `folder` was made; None if with these, or there is none.
 
+    Of a run that did not finish, captures fit also if damaged files are left out now and were not before.
+
     Raises:
         DataError: if it was made with other settings.
     """
@@ -167,7 +172,11 @@ def damage_of_settings(folder: Path, identity: dict[str, Any]) -> str | None:
         if was == identity:
             return None
         if isinstance(was, dict):
-            differs = f" ({in_words(differences(was, as_read(identity)))})"
+            found = differences(was, as_read(identity))
+            if not (folder / SUMMARY).exists():
+                _check_unfinished(folder, found)
+                return None
+            differs = f" ({in_words(found)})"
     except FileNotFoundError:
         if not (folder / SUMMARY).exists():
             return None
@@ -182,6 +191,16 @@ def damage_of_settings(folder: Path, identity: dict[str, Any]) -> str | None:
     if not differs and path.name not in checks_in(folder):
         return damage
     raise DataError(f"{folder} has a data set made with other settings{differs}; choose another --out, or delete it")
+
+
+def _check_unfinished(folder: Path, differs: dict[str, tuple[Any, Any]]) -> None:
+    """Raises `DataError` if captures of a run that did not finish do not fit the settings, whose differences are given."""
+    begun = any((folder / name).is_dir() and any((folder / name).iterdir()) for name in (CAPTURES, SHARDS))
+    if begun and differs != {"skip_damaged": (False, True)}:
+        raise DataError(
+            f"{folder} has captures of a run with other settings that did not finish ({in_words(differs)}); give the same again "
+            f"to go on with it, delete the folder, or choose another --out"
+        )
 
 
 def found_in(folder: Path, damage: str | None) -> DatasetStatistics | str:

@@ -115,7 +115,10 @@ def read_arrays(path: Path) -> dict[str, np.ndarray]:
         with np.load(path, allow_pickle=False) as stored:
             if not hasattr(stored, "files"):
                 raise ValueError("it is a single array")
-            return {name: stored[name] for name in stored.files}
+            arrays = {name: stored[name] for name in stored.files}
+        if other := next((name for name, member in arrays.items() if not isinstance(member, np.ndarray)), None):
+            raise ValueError(f"its member {other!r} is no array")
+        return arrays
     except FileNotFoundError as error:
         raise Unusable(f"there is no file {path}") from error
     except Exception as error:  # the content of a damaged file decides which

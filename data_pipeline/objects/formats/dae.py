@@ -33,8 +33,11 @@ MOST_NODES = 1_000_000
 
 _SHAPES = ("triangles", "tristrips", "trifans", "polylist", "polygons")
 _IGNORED = ("source", "vertices", "lines", "linestrips", "extra")
+_IN_SHAPES = ("input", "p", "ph", "vcount", "extra")
 _TRANSFORMS = {"matrix": 16, "translate": 3, "rotate": 4, "scale": 3}
 """Transforms of nodes, and how many numbers they have."""
+
+_IN_NODES = (*_TRANSFORMS, "skew", "lookat", "asset", "instance_camera", "instance_light", "evaluate_scene", "extra")
 
 
 def parse_dae(content: bytes) -> tuple[np.ndarray, np.ndarray, str]:
@@ -83,6 +86,8 @@ class _Reader:
         geometries = self.root.findall("library_geometries/geometry")
         uses = self.root.findall("scene/instance_visual_scene")
         scenes = [self.target(use, "visual_scene") for use in uses]
+        if len(uses) > 1:
+            raise Damage(f"shows {len(uses)} scenes at once; export it again")
         if not uses:
             scenes = self.root.findall("library_visual_scenes/visual_scene")
             if len(scenes) > 1:
@@ -107,18 +112,18 @@ class _Reader:
                 raise Damage("has a node within itself, or too many nodes; export a simpler mesh")
             below = []
             for child in node:
-                if child.tag in _TRANSFORMS:
-                    place = place @ _matrix(child)
-                elif child.tag in ("skew", "lookat"):
-                    unread = child.tag
-                elif child.tag == "node":
-                    below.append((child, place, unread, depth + 1))
-                elif child.tag == "instance_node":
-                    below.append((self.target(child, "node"), place, unread, depth + 1))
+                place = place @ _matrix(child) if child.tag in _TRANSFORMS else place
+                unread = child.tag if child.tag in ("skew", "lookat") else unread
+            for child in node:
+                if child.tag in ("node", "instance_node"):
+                    inner = child if child.tag == "node" else self.target(child, "node")
+                    below.append((inner, place, unread, depth + 1))
                 elif child.tag in ("instance_geometry", "instance_controller"):
                     if unread:
                         raise Damage(f"places a mesh by <{unread}>, which is not read; export it with matrices")
                     self._place(self.target(child, child.tag.removeprefix("instance_")), place)
+                elif child.tag not in _IN_NODES:
+                    raise Damage(f"has a node with <{child.tag[:40]}>, which is not read; export it again")
             todo += below[::-1]
 
     def _place(self, thing: Element, place: np.ndarray) -> None:
@@ -251,6 +256,8 @@ def _triangles(shape: Element, vertices: np.ndarray, name: str) -> np.ndarray:
     """Returns the triangles of an element such as <polylist>; `name` is the address of the vertices."""
     if shape.find("ph") is not None:
         raise Damage("has polygons with holes, which are not read; export it as triangles")
+    if other := next((child.tag for child in shape if child.tag not in _IN_SHAPES), None):
+        raise Damage(f"has a <{shape.tag}> with <{other[:40]}>, which is not read; export it as triangles")
     offsets = [whole_number(use.get("offset", "").strip()) for use in shape.iterfind("input")]
     corner = [use for use in shape.iterfind("input") if use.get("semantic") == "VERTEX"]
     if len(corner) != 1 or corner[0].get("source") != name:

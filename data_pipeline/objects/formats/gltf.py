@@ -34,6 +34,14 @@ _HARMLESS = ("KHR_materials_", "KHR_texture_", "EXT_texture_", "MSFT_texture_", 
              "ADOBE_materials")  # fmt: skip
 """Beginnings of the names of extensions that leave the geometry as it is."""
 
+_NAMES = (
+    "accessors attributes buffer bufferView bufferViews buffers byteLength byteOffset byteStride children componentType count "
+    "extensions extensionsRequired indices inverseBindMatrices joints matrix mesh meshes mode nodes normalized primitives "
+    "rotation scale scene scenes skin skins sparse targets translation type uri values weights"
+)
+_PLAIN = {name.lower(): name for name in _NAMES.split()}
+"""Names of parts that are read. One in other capitals would be ignored, as glTF ignores names that it does not define."""
+
 MOST_ELEMENTS, MOST_ZEROS, MOST_COPIES = 50_000_000, 5_000_000, 100_000
 """Largest numbers of vertices and triangles of a scene together, of elements of an accessor without data, and of instances of
 one mesh. A small file can declare any number."""
@@ -82,6 +90,14 @@ def _json(text: str) -> Any:
     return json.loads(text, object_pairs_hook=once)
 
 
+def _checked(entry: Any) -> Any:
+    """Returns a part of a document, whose names are not in other capitals than glTF's."""
+    for name in entry if isinstance(entry, dict) else ():
+        if (plain := _PLAIN.get(name.lower(), name)) != name:
+            raise ValueError(f"a part has the name {name!r}, which glTF writes {plain!r}")
+    return entry
+
+
 class _Reader:
     """Reads the meshes of one document."""
 
@@ -90,7 +106,7 @@ class _Reader:
             raise Damage("is not a readable glTF mesh: it has no asset; repair it or take it away")
         if not str(document["asset"].get("version", "")).startswith("2."):
             raise Damage(f"is not glTF 2.0 but {document['asset'].get('version')!r}; export it as glTF 2.0")
-        self.document, self.binary, self.sibling = document, binary, sibling
+        self.document, self.binary, self.sibling = _checked(document), binary, sibling
         self.buffers: dict[int, bytes] = {}
         self.elements = 0
         for name in document.get("extensionsRequired", []):
@@ -102,7 +118,7 @@ class _Reader:
         """Returns one entry of a list of the document, such as accessor 3."""
         if type(index) is not int or index < 0:
             raise ValueError(f"{index!r} is no index of {kind}")
-        return self.document[kind][index]
+        return _checked(self.document[kind][index])
 
     def buffer(self, index: Any) -> bytes:
         """Returns the content of a buffer: the binary chunk, a data URI, or another file."""
@@ -184,20 +200,28 @@ class _Reader:
         entry = self.item("accessors", index)
         if entry["componentType"] not in _INDICES or entry["type"] != "SCALAR" or entry.get("normalized"):
             raise ValueError(f"indices are {entry['type']} of the type {entry['componentType']}, not unsigned integers")
-        return self.accessor(index)[:, 0]
+        return self._stored(index)[:, 0]
+
+    def _stored(self, index: Any) -> np.ndarray:
+        """Returns the elements of an accessor that has data. One without is all zeros, which would be a single point."""
+        if {"bufferView", "sparse"}.isdisjoint(self.item("accessors", index)):
+            raise ValueError(f"accessor {index} has no data")
+        return self.accessor(index)
 
     def primitive(self, entry: Any) -> tuple[np.ndarray, np.ndarray, dict[str, np.ndarray], Any] | None:
         """Returns the vertices, triangles and skin of a primitive, and itself; or None for points and lines."""
-        mode, attributes = entry.get("mode", 4), entry["attributes"]
-        if mode not in (4, 5, 6) or "POSITION" not in attributes:
-            if mode not in range(7):
-                raise ValueError(f"a primitive has mode {mode!r}")
+        mode, attributes = _checked(entry).get("mode", 4), entry["attributes"]
+        if mode not in range(7):
+            raise ValueError(f"a primitive has mode {mode!r}")
+        if mode < 4:
             return None
+        if "POSITION" not in attributes:
+            raise ValueError("a primitive has no attribute POSITION")
         draco = entry.get("extensions", {}).get(_DRACO)
         if draco is not None:
             vertices, indices = self._draco(draco, entry)
         else:
-            vertices = self.accessor(attributes["POSITION"])
+            vertices = self._stored(attributes["POSITION"])
             indices = self._indices(entry["indices"]) if "indices" in entry else np.arange(len(vertices))
         if vertices.shape[1:] != (3,):
             raise ValueError("positions are not VEC3")

@@ -106,6 +106,11 @@ def _triangles(vertices: np.ndarray, elements: list[_Element], found: dict[str, 
             values = values.clip(-1.0, 2.0**53)
         values = values.astype(np.int64)
         if element.name != "tristrips":
+            if (
+                corners.counts < 3
+            ).any():  # so look the rows of a file with another number of vertices than it declares
+                least = corners.counts.min()
+                raise Damage(f"has a face of {least} corners; repair it or take it away")
             parts.append(triangulate(vertices, values, corners.counts))
             continue
         for strip in np.split(values, np.cumsum(corners.counts)[:-1]):  # −1 ends a strip within a list

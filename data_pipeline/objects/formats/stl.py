@@ -57,7 +57,7 @@ def _of_text(text: str) -> np.ndarray:
     if _SOLIDS.fullmatch(kinds) is None:
         begun = _BEGUN.match(kinds)
         at = begun.end() if begun else 0
-        if at >= len(kinds) - kinds.endswith("?"):  # the last line may be cut
+        if at and at >= len(kinds) - kinds.endswith("?"):  # the last line may be cut
             whole, solids = f"{kinds.count('e')} of {kinds.count('f')} facets", kinds.count("s")
             raise cut_short(f"{whole} and {kinds.count('S')} of {solids} solids end")
         raise Damage(f"is not a readable .stl mesh: the line {quoted(lines[at])} is out of place; export it again")

@@ -152,6 +152,8 @@ def _children(parent: Element, *names: str) -> list[Element]:
 
 def _values(element: Element, names: tuple[str, ...], read: Any) -> list[Any]:
     """Returns attributes of an element as numbers."""
+    if lost := [name for name in names if name not in element.attrib]:
+        raise ValueError(f"a <{element.tag.rpartition('}')[2]}> has no {lost[0]!r}")
     return [read(element.attrib[name].strip()) for name in names]
 
 
