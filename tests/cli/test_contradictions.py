@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import shutil
 
 import pytest
@@ -12,6 +13,7 @@ from eval.consistency import check_made_with
 from eval.run_file import load_run, save_run
 from eval.settings import TINY
 from mevs_jax.cli import parsing
+from tests.data_pipeline.objects.making import box, members, off, write
 
 
 def files_of(out):
@@ -126,3 +128,12 @@ def test_what_a_sweep_tries_does_not_become_the_run(whole, tmp_path):
         kept = load_run(out).settings
         assert kept.classifier.optimiser.epochs == (2 if trained else 9)
         assert (kept.sweep.members, kept.entropy.network.points) == (3, 32)
+
+
+def test_damaged_files_are_left_out_as_the_run_that_found_them_advises(at_once, refuses, tmp_path):
+    files = members() | {"rack/train/rack_9.off": off(*box())[:50]}
+    small = ("--views", 3, "--dataset.capture.resolution", 16)
+    data = ("data", "--data", write(tmp_path / "set", files), "--out", tmp_path / "run", *small)
+    told = re.search(r"or leave such objects out with (--\S+)$", refuses(*data))
+    assert "1 left out" in at_once(*data, told[1]).stderr
+    assert load_run(tmp_path / "run").settings.dataset.skip_damaged

@@ -7,6 +7,7 @@ import inspect
 import json
 import re
 import shutil
+import zipfile
 
 import jax.numpy as jnp
 import numpy as np
@@ -142,6 +143,9 @@ def test_what_cannot_be_looked_at_is_one_sentence(system, chair, frames, refuses
     assert "no file" in refuses("look", "--system", system, "--depth", tmp_path / "none.npz")
     (tmp_path / "text.npz").write_text("text")
     assert "is no .npz of arrays" in refuses("look", "--system", system, "--depth", tmp_path / "text.npz")
+    with zipfile.ZipFile(tmp_path / "member.npz", "w") as archive:
+        archive.writestr("depth.npy", b"\x92NUMPY")
+    assert "its member 'depth' is no array" in refuses("look", "--system", system, "--depth", tmp_path / "member.npz")
     for change, message in (
         ({"depth": None}, "there is no array 'depth'"),
         ({"radius": None}, "center and radius of the object belong together"),

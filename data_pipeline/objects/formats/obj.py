@@ -77,7 +77,7 @@ def _corners(lines: list[str]) -> tuple[np.ndarray, np.ndarray]:
     counts = np.array([len(line.split()) for line in lines], np.int64)
     joined = "\n".join(lines)
     if "/" in joined:
-        _check_alike(lines, counts.tolist())
+        _check_alike(lines, joined)
     try:
         corners, _ = numbers(_OTHER_CORNERS.sub("", joined).split("\n") if "/" in joined else lines, np.int64)
     except ValueError as error:
@@ -85,13 +85,14 @@ def _corners(lines: list[str]) -> tuple[np.ndarray, np.ndarray]:
     return corners, counts
 
 
-def _check_alike(lines: list[str], counts: list[int]) -> None:
+def _check_alike(lines: list[str], joined: str) -> None:
     """Raises `Damage` if a corner is no indices with slashes between them, or might be half of one, as in `1/ 2`."""
-    for line, count in zip(lines, counts, strict=True):
+    if _HALF.search(joined) is None and _SLASHES.issuperset(_WHOLE.sub("", joined).split()):
+        return
+    for line in lines:
         halves = len(_HALF.findall(line))
-        if (halves and (halves != count or _NO_VERTEX.search(line))) or not _SLASHES.issuperset(
-            _WHOLE.sub("", line).split()
-        ):
+        apart = halves and (halves != len(line.split()) or _NO_VERTEX.search(line))
+        if apart or not _SLASHES.issuperset(_WHOLE.sub("", line).split()):
             raise Damage(f"has the face {quoted(line)}, whose corners are not written alike; repair it or take it away")
 
 

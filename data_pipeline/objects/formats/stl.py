@@ -12,8 +12,8 @@ from data_pipeline.objects.formats.text import columns, is_filler, lines_of, quo
 
 _TRIANGLE = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
 _KINDS = {
-    "s": r"solid\b(?!.*\bfacet\s+normal\b).*", "f": r"facet(\s+normal(\s+\S+){3})?", "o": r"outer\s+loop", "v": r"vertex\s.*",
-    "l": r"end\s?loop", "e": r"end\s?facet", "S": r"end\s?solid\b.*",
+    "v": r"vertex\s.*", "f": r"facet(\s+normal(\s+\S+){3})?", "o": r"outer\s+loop", "l": r"end\s?loop", "e": r"end\s?facet",
+    "s": r"solid\b(?!.*\bfacet\s+normal\b).*", "S": r"end\s?solid\b.*",
 }  # fmt: skip
 _LINE = re.compile("|".join(rf"(?P<{kind}>{form})" for kind, form in _KINDS.items()), re.IGNORECASE)
 _SOLIDS = re.compile(r"(?:s(?:fovvvle)*+S)*+")
