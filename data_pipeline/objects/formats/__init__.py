@@ -113,4 +113,5 @@ def _foreign(content: bytes, suffix: str, sibling: Callable[[str], bytes]) -> An
     except Exception as error:
         kind = "glTF" if suffix in (".glb", ".gltf") else suffix
         reason = str(error) if type(error) is ValueError else kind_and_reason_of(error)
+        reason = f"it has no {error}" if isinstance(error, KeyError) else reason
         raise Damage(f"is not a readable {kind} mesh ({reason}); repair it or take it away") from error

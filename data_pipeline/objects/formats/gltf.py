@@ -116,8 +116,8 @@ class _Reader:
 
     def item(self, kind: str, index: Any) -> Any:
         """Returns one entry of a list of the document, such as accessor 3."""
-        if type(index) is not int or index < 0:
-            raise ValueError(f"{index!r} is no index of {kind}")
+        if type(index) is not int or not 0 <= index < len(self.document.get(kind, [])):
+            raise ValueError(f"{index!r} is no index of its {kind}")
         return _checked(self.document[kind][index])
 
     def buffer(self, index: Any) -> bytes:

@@ -37,10 +37,10 @@ def parse_obj(content: bytes) -> tuple[np.ndarray, np.ndarray]:
     if "\\" in text:
         text = re.sub(r"\\[ \t]*\n", " ", text)  # a statement may go on in the next line
     vertex_lines, face_lines = _VERTEX.findall(text), _FACE.findall(text)
-    if not vertex_lines:
-        raise Damage("is not a readable .obj mesh (it has no vertices); repair it or take it away")
     if (unknown := _UNKNOWN.search(text)) is not None:
         raise Damage(f"has the line {quoted(unknown[0])}, which is not read; repair the line or take it away")
+    if not vertex_lines:
+        raise Damage("is not a readable .obj mesh (it has no vertices); repair it or take it away")
     vertices = _vertices(vertex_lines)
     corners, counts = _corners(face_lines)
     if len(counts) and counts[-1] < 3 and _FACE.findall(text[text.rstrip().rfind("\n") + 1 :]):

@@ -11,7 +11,7 @@ import numpy as np
 
 from data_pipeline.errors import Damage, cut_short
 from data_pipeline.objects.formats.polygons import check_indices, strip_triangles, triangulate
-from data_pipeline.objects.formats.text import is_filler, lines_of, numbers, quoted, starts_of
+from data_pipeline.objects.formats.text import is_filler, lines_of, numbers, quoted, starts_of, whole_number
 
 _TYPES = {
     "char": "i1", "int8": "i1", "uchar": "u1", "uint8": "u1", "short": "i2", "int16": "i2", "ushort": "u2", "uint16": "u2",
@@ -143,7 +143,7 @@ def _header(content: bytes) -> tuple[str, list[_Element], int]:
                 case ["format", name, *_]:
                     order = _ORDERS[name]
                 case ["element", name, count, *_]:
-                    elements.append(_Element(name, int(count), []))
+                    elements.append(_Element(name, whole_number(count), []))
                 case ["property", "list", length, kind, *_]:
                     elements[-1].properties.append(_Property(words[-1], _TYPES[kind], _TYPES[length]))
                 case ["property", kind, *_]:

@@ -109,6 +109,7 @@ def test_numbers_are_those_that_all_readers_take():
     ("content", "suffix", "message"),
     [
         ("v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\nF 1 3 2\n", ".obj", "the line 'F 1 3 2', which is not read"),
+        ("V 0 0 0\nV 1 0 0\nV 0 1 0\nF 1 2 3\n", ".obj", "the line 'V 0 0 0'"),
         ("v 0 0 0\nV 1 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n", ".obj", "the line 'V 1 0 0'"),
         ("v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\nsurf 0 1 0 1 1 2 3\n", ".obj", "the line 'surf 0 1 0 1 1 2 3'"),
         ("v 0 0 0\nv 1 0 0\nv 0 1 0\nv\nf 1 2 3\n", ".obj", "has 0 numbers instead of 3"),
@@ -129,6 +130,7 @@ def test_numbers_are_those_that_all_readers_take():
         (PLY.replace(b"3 0 2 1\n", b"3 0 2\n"), ".ply", "the line '3 0 2' of its element 'face' has 3 numbers instead"),
         (PLY.replace(b"3 0 2 1\n", b"2 0 2\n"), ".ply", "has a face of 2 corners"),
         (PLY.replace(b"element face", b"element Face"), ".ply", "an element 'Face' that is not read"),
+        (PLY.replace(b"vertex 4", b"vertex 0_4"), ".ply", "the line 'element vertex 0_4'"),
         (PLY.replace(b"int vertex_indices", b"float x"), ".ply", "has 0 lists of vertices"),
         (ply(*TETRAHEDRON, "<") + b"more", ".ply", "more than the rows that its header declares"),
         (stl(*TETRAHEDRON) + b"more", ".stl", "declares 4 triangles and holds more"),
