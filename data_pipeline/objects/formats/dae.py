@@ -168,6 +168,8 @@ def _only(parent: Element, name: str) -> Element:
 
 def _numbers(element: Element, kind: type[Any] = np.float64) -> np.ndarray:
     """Returns the numbers of an element, which are as many as it declares."""
+    if len(element):
+        raise ValueError(f"a <{element.tag}> holds other elements")
     values, _ = numbers([element.text or ""], kind)
     _check_count(element, len(values))
     return values
@@ -245,8 +247,10 @@ def _points(mesh: Element, names: set[str | None]) -> np.ndarray:
     )
     axes = [(param.get("name") or "").upper() for param in accessor.iterfind("param")]
     named = [at for at, axis in enumerate(axes) if axis] or list(range(len(axes)))  # numbers without a name are skipped
-    if [axes[at] for at in named] not in (["X", "Y", "Z"], ["", "", ""]) or named[-1] >= stride:
+    if [axes[at] for at in named] not in (["X", "Y", "Z"], ["", "", ""]):
         raise ValueError(f"its positions have the axes {axes} and not X, Y, Z")
+    if named[-1] >= stride:
+        raise ValueError(f"its positions have {len(axes)} numbers each, and a stride of {stride}")
     if min(count, offset) < 0 or offset + stride * count > len(values):
         raise Damage(f"declares {count} positions, and holds {len(values)} numbers; export it again")
     return values[offset : offset + stride * count].reshape(count, stride)[:, named]

@@ -104,8 +104,11 @@ class _Reader:
     def __init__(self, document: Any, binary: bytes, sibling: Callable[[str], bytes]):
         if not isinstance(document, dict) or "asset" not in document:
             raise Damage("is not a readable glTF mesh: it has no asset; repair it or take it away")
-        if not str(document["asset"].get("version", "")).startswith("2."):
-            raise Damage(f"is not glTF 2.0 but {document['asset'].get('version')!r}; export it as glTF 2.0")
+        asset = document["asset"]
+        least = asset.get("minVersion", "2.0")
+        if not str(asset.get("version", "")).startswith("2.") or least != "2.0":
+            version = asset.get("version") if least == "2.0" else least
+            raise Damage(f"is not glTF 2.0 but {version!r}; export it as glTF 2.0")
         self.document, self.binary, self.sibling = _checked(document), binary, sibling
         self.buffers: dict[int, bytes] = {}
         self.elements = 0
@@ -270,6 +273,8 @@ class _Reader:
     def matrix(self, node: Any) -> np.ndarray:
         """Returns the transform of a node into its parent's frame, (4, 4)."""
         if "matrix" in node:
+            if not node.keys().isdisjoint(("translation", "rotation", "scale")):
+                raise ValueError("a node has a matrix and other transforms")
             found = np.array(node["matrix"], np.float64).reshape(4, 4).T
             if (np.abs(found[3] - (0, 0, 0, 1)) > 1e-6).any():
                 raise Damage("has a matrix whose last row is not 0 0 0 1; export it again")

@@ -13,6 +13,9 @@ from data_pipeline.objects.formats.text import columns, numbers, quoted, text_of
 _VERTEX = re.compile(r"^[^\S\n]*v(?:[^\S\n]+(.*))?$", re.MULTILINE)
 _FACE = re.compile(r"^[^\S\n]*fo?(?:[^\S\n]+(.*))?$", re.MULTILINE)
 _LINE = re.compile(r"^[^\S\n]*[lL][^\S\n]", re.MULTILINE)
+_SWALLOWED = re.compile(r"\\[ \t]*\n([^\S\n]*(?:v|fo?)[^\S\n].*)")
+"""A vertex or face after a line that ends with a backslash, as the name of a file may."""
+
 _OTHERS = (
     "vt vn vp l p g o s mg usemtl mtllib usemap maplib cstype deg bmat step curv curv2 parm trim hole scrv sp end con bevel "
     "c_interp d_interp lod shadow_obj trace_obj ctech stech"
@@ -35,6 +38,8 @@ def parse_obj(content: bytes) -> tuple[np.ndarray, np.ndarray]:
     """Reads all groups and objects of an OBJ file together."""
     text = without_comments(text_of(content, "an OBJ"))
     if "\\" in text:
+        if (swallowed := _SWALLOWED.search(text)) is not None:
+            raise Damage(f"has a line that goes on with {quoted(swallowed[1])}; take away the backslash before it")
         text = re.sub(r"\\[ \t]*\n", " ", text)  # a statement may go on in the next line
     vertex_lines, face_lines = _VERTEX.findall(text), _FACE.findall(text)
     if (unknown := _UNKNOWN.search(text)) is not None:

@@ -79,8 +79,11 @@ def parse_ply(content: bytes) -> tuple[np.ndarray, np.ndarray]:
         raise ValueError("it has no vertices x, y, z")
     kinds = {one.name: one.kind for element in elements if element.name == "vertex" for one in element.properties}
     with np.errstate(all="ignore"):  # numbers of text have the precision that the header declares
-        columns = [vertex[axis].astype("f4" if kinds[axis] == "f4" else "f8") for axis in "xyz"]
-    vertices = np.stack(columns, axis=1).astype(np.float64)
+        columns = [vertex[axis].astype(kinds[axis]).astype(np.float64) for axis in "xyz"]
+    for axis, column in zip("xyz", columns, strict=True):
+        if kinds[axis][0] != "f" and (column != vertex[axis]).any():
+            raise ValueError(f"a vertex has a coordinate {axis} that is no number of the type that the header declares")
+    vertices = np.stack(columns, axis=1)
     return vertices, _triangles(vertices, elements, found)
 
 
