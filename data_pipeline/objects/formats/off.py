@@ -94,7 +94,8 @@ def _read(lines: list[str], vertex_count: int, face_count: int, width: int, kept
     torn = np.flatnonzero(~whole & (begin // width != (end - 1) // width))
     if len(torn):
         at = torn[0] - int(begin[torn[0]] % width > 0)  # the line before has too few
-        raise ValueError(f"the line {quoted(lines[at])} has {counts[at]} numbers instead of {width}")
+        line = f"the line {quoted(lines[at])} has {counts[at]} numbers instead of {width}"
+        raise ValueError(f"{line}, as one of its {vertex_count} vertices")
     if used > len(lines) or (used and end[-1] != vertex_count * width):
         raise cut_short(f"{int(ends[-1]) // width if len(ends) else 0} of {vertex_count} vertices are there")
     vertices = numbers(lines[:used])[0].reshape(-1, width)[:, :kept]

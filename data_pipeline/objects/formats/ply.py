@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from data_pipeline.errors import Damage, cut_short
+from data_pipeline.errors import Damage, EmptyMesh, cut_short
 from data_pipeline.objects.formats.polygons import check_indices, strip_triangles, triangulate
 from data_pipeline.objects.formats.text import is_filler, lines_of, numbers, quoted, starts_of, whole_number
 
@@ -120,7 +120,7 @@ def _triangles(vertices: np.ndarray, elements: list[_Element], found: dict[str, 
             parts += [strip_triangles(part[part >= 0]) for part in np.split(strip, np.flatnonzero(strip == -1))]
     others = [element for element in elements if element.name not in _SHAPES and element.name != "vertex"]
     if unread := next((one.name for one in others if one.lists and one.count and len(parts) == 1), None):
-        raise Damage(f"has no faces, but an element {unread!r} that is not read; export it again with faces")
+        raise EmptyMesh(f"mesh has no faces: its element {unread!r} is not read")
     triangles = np.concatenate(parts)
     check_indices(triangles, len(vertices))
     return triangles
@@ -133,7 +133,8 @@ def _header(content: bytes) -> tuple[str, list[_Element], int]:
     if first is None:
         raise ValueError("it does not begin with 'ply'")
     newline = first[1]
-    last = re.search(re.escape(newline) + rb"[ \t]*end_header[ \t]*" + re.escape(newline), body)
+    blank = rb"[ \t\r]*" if newline == b"\n" else rb"[ \t]*"  # some writers end the last line of the header otherwise
+    last = re.search(re.escape(newline) + rb"[ \t]*end_header" + blank + re.escape(newline), body)
     if last is None:
         raise ValueError("its header does not end")
     order, elements = "", list[_Element]()
@@ -192,8 +193,8 @@ def _of_lines(lines: list[str], element: _Element, last: bool) -> dict[str, Any]
     wrong = np.flatnonzero(at != ends)
     if len(wrong) and not (last and wrong[0] == len(lines) - 1 and at[-1] > ends[-1]):
         row, line = wrong[0], quoted(lines[wrong[0]])
-        row_has = f"the line {line} of its element {element.name!r} has {counts[row]} numbers"
-        raise ValueError(f"{row_has} instead of {at[row] - starts[row]}")
+        row_has = f"the line {line} has {counts[row]} numbers instead of {at[row] - starts[row]}"
+        raise ValueError(f"{row_has}, as one of its {element.count} rows of {element.name!r}")
     if len(lines) < element.count or len(wrong):
         raise element.cut(len(lines) - len(wrong))
     found: dict[str, Any] = {}

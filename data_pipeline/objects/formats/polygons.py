@@ -50,7 +50,8 @@ def have_area(vertices: np.ndarray, triangles: np.ndarray) -> np.ndarray:
 
 def moved(vertices: np.ndarray, place: np.ndarray) -> np.ndarray:
     """Returns vertices (n, 3) after a transform (4, 4)."""
-    return vertices @ place[:3, :3].T + place[:3, 3]
+    with np.errstate(all="ignore"):  # vertices that no face uses may be NaN
+        return vertices @ place[:3, :3].T + place[:3, 3]
 
 
 def triangulate(vertices: np.ndarray, corners: np.ndarray, counts: np.ndarray) -> np.ndarray:

@@ -205,6 +205,7 @@ MIXED = (BOX[0], [[0, 1, 3], [0, 3, 2], *BOX[1][1:]])
 def test_ply_with_lists_of_any_length(shape, order):
     check(ply(*shape, order), ".ply")
     check(ply(*shape, order, comment="Jürgen \x85".encode("latin-1")), ".ply")
+    check(ply(*shape, order).replace(b"end_header\n", b"end_header\r\n"), ".ply")
     check(ply(*shape, order).replace(b"uchar int", b"uint8 int32").replace(b"vertex_indices", b"vertex_index"), ".ply")
 
 

@@ -127,15 +127,18 @@ def test_numbers_are_those_that_all_readers_take():
         (OFF.replace(b"3 0 2 1\n", b"3 0 2 1 3\n"), ".off", "has one number more than its corners"),
         (OFF.replace(b"3 0 2 1\n", b"3 0 2 1 3 3\n"), ".off", "has 6 numbers instead of 4"),
         (OFF.replace(b"0.0 2.0 0.0", b"0 2 0 9"), ".off", "the line '0 2 0 9' has 4 numbers instead of 3"),
-        (PLY.replace(b"0.0 2.0 0.0", b"0 2 0 9"), ".ply", "of its element 'vertex' has 4 numbers instead of 3"),
-        (PLY.replace(b"3 0 2 1\n", b"3 0 2\n"), ".ply", "the line '3 0 2' of its element 'face' has 3 numbers instead"),
+        (
+            PLY.replace(b"0.0 2.0 0.0", b"0 2 0 9"),
+            ".ply",
+            "has 4 numbers instead of 3, as one of its 4 rows of 'vertex'",
+        ),
+        (PLY.replace(b"3 0 2 1\n", b"3 0 2\n"), ".ply", "the line '3 0 2' has 3 numbers instead of 4, as one"),
         (PLY.replace(b"3 0 2 1\n", b"2 0 2\n"), ".ply", "has a face of 2 corners"),
         (
             PLY.replace(b"float x", b"uchar x").replace(b"1.0 0.0", b"0.5 0.0"),
             ".ply",
             "a coordinate x that is no number of",
         ),
-        (PLY.replace(b"element face", b"element Face"), ".ply", "an element 'Face' that is not read"),
         (PLY.replace(b"vertex 4", b"vertex 0_4"), ".ply", "the line 'element vertex 0_4'"),
         (PLY.replace(b"int vertex_indices", b"float x"), ".ply", "has 0 lists of vertices"),
         (ply(*TETRAHEDRON, "<") + b"more", ".ply", "more than the rows that its header declares"),
@@ -166,6 +169,11 @@ def test_obj_with_other_blanks_statements_in_capitals_and_the_end_of_dos():
     assert surface(content, ".obj") == surface(OBJ, ".obj")
     with pytest.raises(EmptyMesh, match="no faces: it has 2 lines"):
         read("v 0 0 0\nv 1 0 0\nl 1 2\nl 2 1\n", ".obj")
+
+
+def test_faces_under_another_name_are_named():
+    with pytest.raises(EmptyMesh, match="no faces: its element 'Face' is not read"):
+        read(PLY.replace(b"element face", b"element Face"), ".ply")
 
 
 # ---------------------------------------------------------------------------------------------------------- faces without area
