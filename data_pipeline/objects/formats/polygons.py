@@ -31,6 +31,10 @@ def merged(parts: Sequence[tuple[np.ndarray, np.ndarray]]) -> tuple[np.ndarray, 
     return vertices, np.concatenate([np.zeros((0, 3), np.int64), *shifted])
 
 
+_NEARLY_FLAT = 0.01
+"""Share by which the area of a polygon's triangles may differ from that of the polygon in its plane."""
+
+
 def have_area(vertices: np.ndarray, triangles: np.ndarray) -> np.ndarray:
     """Returns which triangles (m,) have an area, beyond what rounding of their corners makes; all whose corners are not finite.
 
@@ -107,7 +111,10 @@ def _fan_is_exact(vertices: np.ndarray, fans: np.ndarray) -> np.ndarray:
 
 
 def _clipped(vertices: np.ndarray, polygon: np.ndarray, fan: np.ndarray) -> np.ndarray:
-    """Returns the triangles of one polygon by ear clipping, filled up with triangles without area; the fan if there are none."""
+    """Returns the triangles of one polygon by ear clipping, filled up with triangles without area.
+
+    The fan, if there are none, or corners are left out that are not in line: the polygon is not flat, or crosses itself.
+    """
     with np.errstate(all="ignore"):
         normal = _normals(vertices, fan).sum(axis=0)
         points = vertices[polygon] - vertices[polygon[0]]
@@ -122,7 +129,8 @@ def _clipped(vertices: np.ndarray, polygon: np.ndarray, fan: np.ndarray) -> np.n
         return fan
     filled = np.full(fan.shape, polygon[0])
     filled[: len(ears) // 3] = polygon[ears.astype(np.int64)].reshape(-1, 3)
-    return filled
+    area, whole = np.linalg.norm(_normals(vertices, filled), axis=1).sum(), np.linalg.norm(normal)
+    return filled if len(ears) == fan.size or abs(area - whole) <= _NEARLY_FLAT * whole else fan
 
 
 def strip_triangles(indices: np.ndarray) -> np.ndarray:

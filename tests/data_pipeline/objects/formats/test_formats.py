@@ -111,6 +111,18 @@ def test_tilted_concave_polygons():
     assert area(vertices, triangles) == pytest.approx(U_AREA * 1e-6, rel=1e-6)
 
 
+def test_corners_of_polygons_that_are_not_flat_are_kept():
+    """A square and a corner above its edge, in one polygon, which ear clipping in its plane would cut off."""
+    vertices = np.array([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0], [0, 1, 1]], float)
+    _, triangles = parse_mesh(off(vertices, [[0, 1, 2, 3, 4]]), ".off", "sail.off")
+    assert set(triangles[area_of(vertices, triangles) > 0].reshape(-1)) == {0, 1, 2, 3, 4}
+
+
+def area_of(vertices, triangles):
+    a, b, c = (vertices[triangles[:, at]] for at in range(3))
+    return np.linalg.norm(np.cross(b - a, c - a), axis=1)
+
+
 def test_polygons_without_area_or_corners_do_no_harm():
     vertices = np.array([[0, 0, 0], [1, 0, 0], [2, 0, 0], [3, 0, 0], [0, 1, 0]], float)
     faces = [[0, 1, 2, 3], [0], [0, 1], [0, 0, 0, 0, 0], [0, 1, 4]]
