@@ -88,7 +88,7 @@ def numbers(lines: list[str], kind: type[Any] = np.float64) -> tuple[np.ndarray,
         warnings.simplefilter("error", DeprecationWarning)  # how NumPy before 2.3 says that it stopped early
         with suppress(ValueError, DeprecationWarning):
             values = np.fromstring(text, kind, sep=" ")  # ten times as fast as words one by one
-            if len(values) == counts.sum():  # it takes `1-2` for two numbers
+            if len(values) == counts.sum():  # it takes `- 2` for one number
                 return values, counts
     read = whole_number if kind is np.int64 else number
     return np.array([read(word) for word in text.split()], kind), counts

@@ -319,6 +319,8 @@ def test_3mf_builds_its_items_alone():
     check(
         packed(model(f"{both}{group}</components></object>", '<item objectid="3"/>')), ".3mf", (26, 2, 3), 2 * BOX_AREA
     )
+    twice = '<item objectid="3" transform="2 0 0 0 1 0 0 0 1 0 0 0"/>'  # and the transforms of its components
+    check(packed(model(f"{both}{group}</components></object>", twice)), ".3mf", (52, 2, 3), 2 * 2 * (4 + 6 + 6))
     assert "none of its 2 objects is built" in refused(packed(model(both, "")), ".3mf", EmptyMesh)
     for kind in ("support", "solidsupport"):
         resources = thing("1") + thing("2", 20, kind)

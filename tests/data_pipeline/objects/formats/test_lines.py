@@ -10,7 +10,7 @@ import pytest
 
 from data_pipeline.errors import DamagedMesh, EmptyMesh
 from data_pipeline.objects.formats import parse_mesh
-from data_pipeline.objects.formats.text import number, whole_number
+from data_pipeline.objects.formats.text import number, numbers, whole_number
 from data_pipeline.objects.mesh import normalise
 from data_pipeline.objects.recipes import read_mesh
 from tests.data_pipeline.objects.making import BOX_AREA, area, box, check, extent, obj, off, ply, stl, triangles_of
@@ -100,6 +100,8 @@ def test_numbers_are_those_that_all_readers_take():
     for word in ("1_0", "١", "1.", "", "0x1", "1e1"):
         with pytest.raises(ValueError, match="is not a whole number"):
             whole_number(word)
+    with pytest.raises(ValueError, match="'-' is not a whole number"):
+        numbers(["1 - 2"], np.int64)
     for word in ("1_0", "١", "e5", ".", "", "0x1", "infinit"):
         with pytest.raises(ValueError, match="is not a number"):
             number(word)
@@ -126,6 +128,7 @@ def test_numbers_are_those_that_all_readers_take():
         (OFF + b"3 0 1 2\n", ".off", "declares 4 vertices and 4 faces, and holds more"),
         (OFF.replace(b"3 0 2 1\n", b"3 0 2 1 3\n"), ".off", "has one number more than its corners"),
         (OFF.replace(b"3 0 2 1\n", b"3 0 2 1 3 3\n"), ".off", "has 6 numbers instead of 4"),
+        ("OFF\n3 2 0\n0 0 0\n1 0 0\n0 1 0\n3 0 1 2 3\n1 2 0\n", ".off", "the face '1 2 0' has 3 numbers instead of 2"),
         (OFF.replace(b"0.0 2.0 0.0", b"0 2 0 9"), ".off", "the line '0 2 0 9' has 4 numbers instead of 3"),
         (
             PLY.replace(b"0.0 2.0 0.0", b"0 2 0 9"),
