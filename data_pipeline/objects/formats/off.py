@@ -7,7 +7,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from data_pipeline.errors import Damage, cut_short
+from data_pipeline.errors import Damage, EmptyMesh, cut_short
 from data_pipeline.objects.formats.polygons import triangulate
 from data_pipeline.objects.formats.text import (
     is_filler,
@@ -104,6 +104,8 @@ def _read(lines: list[str], vertex_count: int, face_count: int, width: int, kept
         raise cut_short(f"{len(sizes)} of {face_count} faces are there")
     if used + after < len(lines):
         raise Damage(f"declares {vertex_count} vertices and {face_count} faces, and holds more; export it again")
+    if face_count and (sizes < 3).all():
+        raise EmptyMesh(f"mesh has no faces: its {face_count} polygons have fewer than three corners")
     vertices = _cartesian(vertices)
     return vertices, triangulate(vertices, corners, sizes)
 

@@ -119,7 +119,9 @@ def _triangles(vertices: np.ndarray, elements: list[_Element], found: dict[str, 
         for strip in np.split(values, np.cumsum(corners.counts)[:-1]):  # −1 ends a strip within a list
             parts += [strip_triangles(part[part >= 0]) for part in np.split(strip, np.flatnonzero(strip == -1))]
     others = [element for element in elements if element.name not in _SHAPES and element.name != "vertex"]
-    if unread := next((one.name for one in others if one.lists and one.count and len(parts) == 1), None):
+    if unread := next(
+        (one.name for one in others if one.count and (one.lists or one.name == "edge") and len(parts) == 1), None
+    ):
         raise EmptyMesh(f"mesh has no faces: its element {unread!r} is not read")
     triangles = np.concatenate(parts)
     check_indices(triangles, len(vertices))

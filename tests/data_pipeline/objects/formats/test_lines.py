@@ -174,7 +174,12 @@ def test_obj_with_other_blanks_statements_in_capitals_and_the_end_of_dos():
         read("v 0 0 0\nv 1 0 0\nl 1 2\nl 2 1\n", ".obj")
 
 
-def test_faces_under_another_name_are_named():
+def test_what_is_there_in_place_of_faces_is_named():
+    with pytest.raises(EmptyMesh, match="no faces: its 2 polygons have fewer than three corners"):
+        read(off(TETRAHEDRON[0], [[0, 1], [2, 3]]), ".off")
+    edges = PLY.replace(b"element face 4\nproperty list uchar int vertex_indices", b"element edge 1\nproperty int a")
+    with pytest.raises(EmptyMesh, match="no faces: its element 'edge' is not read"):
+        read(edges[: edges.index(b"3 0 2 1")] + b"1\n", ".ply")
     with pytest.raises(EmptyMesh, match="no faces: its element 'Face' is not read"):
         read(PLY.replace(b"element face", b"element Face"), ".ply")
 
