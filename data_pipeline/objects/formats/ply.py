@@ -106,23 +106,20 @@ def _triangles(vertices: np.ndarray, elements: list[_Element], found: dict[str, 
         if values.dtype.kind == "f":
             if not (values == np.floor(values)).all():  # nor NaN
                 raise Damage("has a face whose corners are not whole numbers; repair it or take it away")
-            values = values.clip(-1.0, 2.0**53)
+            values = values.clip(-2.0, 2.0**53)
         values = values.astype(np.int64)
         if element.name != "tristrips":
-            if (
-                corners.counts < 3
-            ).any():  # so look the rows of a file with another number of vertices than it declares
-                least = corners.counts.min()
+            if (least := corners.counts.min()) < 3:  # as in a file that declares more vertices than it has
                 raise Damage(f"has a face of {least} corners; repair it or take it away")
             parts.append(triangulate(vertices, values, corners.counts))
             continue
+        check_indices(values[values != -1], len(vertices))
         for strip in np.split(values, np.cumsum(corners.counts)[:-1]):  # −1 ends a strip within a list
             parts += [strip_triangles(part[part >= 0]) for part in np.split(strip, np.flatnonzero(strip == -1))]
-    others = [element for element in elements if element.name not in _SHAPES and element.name != "vertex"]
-    if unread := next(
-        (one.name for one in others if one.count and (one.lists or one.name == "edge") and len(parts) == 1), None
-    ):
-        raise EmptyMesh(f"mesh has no faces: its element {unread!r} is not read")
+    others = [one.name for one in elements if one.count and (one.lists or one.name == "edge") and one.name != "vertex"]
+    others = [name for name in others if name not in _SHAPES]
+    if len(parts) == 1 and others:
+        raise EmptyMesh(f"mesh has no faces: its element {others[0]!r} is not read")
     triangles = np.concatenate(parts)
     check_indices(triangles, len(vertices))
     return triangles

@@ -261,11 +261,15 @@ def test_ply_triangle_strips(order):
     head = ply(BOX[0], [[0]], order)
     head = head.replace(b"element face 1\nproperty list uchar int", b"element tristrips 1\nproperty list int int")
     body = head[: -5 if order != "ascii" else -len(b"1 0\n")]
-    if order == "ascii":
-        content = body + f"{len(strips)} {' '.join(map(str, strips))}\n".encode()
-    else:
-        content = body + struct.pack(f"{order}{len(strips) + 1}i", len(strips), *strips)
-    check(content, ".ply")
+
+    def packed(strips: list[int]) -> bytes:
+        if order == "ascii":
+            return body + f"{len(strips)} {' '.join(map(str, strips))}\n".encode()
+        return body + struct.pack(f"{order}{len(strips) + 1}i", len(strips), *strips)
+
+    check(packed(strips), ".ply")
+    with pytest.raises(DamagedMesh, match="vertices beyond its 8"):
+        parse_mesh(packed([-2 if at == -1 else at for at in strips]), ".ply", "thing.ply")
 
 
 @pytest.mark.parametrize(
