@@ -29,7 +29,7 @@ from mevs_jax.beliefs.metrics import bootstrap_means as bootstrap_means
 from mevs_jax.beliefs.metrics import class_accuracy as class_accuracy
 from mevs_jax.beliefs.metrics import confusion_matrix as confusion_matrix
 from mevs_jax.deploy.compiled import keep_compiled as keep_compiled
-from mevs_jax.enrolment.enrolling import enrol as enrol
+from mevs_jax.enrolment import enrol as enrol
 from mevs_jax.environment.pure import ActiveRecognition as ActiveRecognition
 from mevs_jax.environment.pure import EnvironmentObservation as EnvironmentObservation
 from mevs_jax.environment.pure import EnvironmentState as EnvironmentState

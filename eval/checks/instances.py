@@ -23,8 +23,8 @@ from data_pipeline.progress import progress_bar
 from eval.checks.agent import STOPS
 from eval.checks.promise import PromiseRow, Strangers, promises, strangers
 from eval.checks.walks import BASELINE, AccuracyRow, Observer, Walker, Walks, rows_of
-from mevs_jax.enrolment.enrolling import enrol
-from mevs_jax.enrolment.gallery import YAWS
+from mevs_jax.enrolment import enrol
+from mevs_jax.gallery.matching import YAWS
 from mevs_jax.geometry.cameras import ViewCamera
 from mevs_jax.geometry.source_view import DepthImage
 from mevs_jax.selection.loop import ViewTable

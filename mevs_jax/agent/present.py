@@ -9,7 +9,7 @@ from jaxtyping import Bool, Float
 
 from mevs_jax.agent.programs import Programs
 from mevs_jax.agent.records import Belief, History
-from mevs_jax.enrolment.pose import ObjectPose, object_pose
+from mevs_jax.gallery.pose import ObjectPose, object_pose
 from mevs_jax.geometry.cameras import in_sphere
 from mevs_jax.geometry.canonical import CanonicalView, combined, convert
 from mevs_jax.geometry.source_view import DepthImage

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from mevs_jax.enrolment.beliefs import gain_among
+from mevs_jax.gallery.beliefs import gain_among
 from mevs_jax.geometry.viewpoints import ViewGraph
 from mevs_jax.policies.base import Observation, Policy, Scene, SelectionState
 from mevs_jax.policies.informed import information_gain

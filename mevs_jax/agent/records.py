@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Float
 
 from mevs_jax.arrays import ByContent
-from mevs_jax.enrolment.pose import ObjectPose
+from mevs_jax.gallery.pose import ObjectPose
 
 Reason = Literal["", "sure", "budget", "nothing reachable", "unknown object"]
 """Why an agent is done; empty while it is not."""

@@ -97,7 +97,7 @@ def instances(options: InstancesOptions) -> None:
     from data_pipeline.files import write_json
     from eval.checks.instances import study_instances
     from mevs_jax.cli.tools import load_system
-    from mevs_jax.enrolment.enrolling import AlikeWarning
+    from mevs_jax.enrolment import AlikeWarning
     from mevs_jax.geometry.cameras import ViewCamera
     from train.results.records import as_json
     from train.tasks.matcher import MatcherConfig, fit_matcher, objects_system

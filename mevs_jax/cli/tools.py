@@ -140,7 +140,7 @@ def enrol(options: EnrolOptions) -> None:
     """Writes a system that knows some objects."""
     import warnings
 
-    from mevs_jax.enrolment import enrolling
+    from mevs_jax import enrolment
 
     if not (options.objects or options.remove or options.rename):
         raise Unusable("mevs enrol needs objects: NAME=FILE ..., or --remove NAME, or --rename OLD=NEW")
@@ -152,13 +152,13 @@ def enrol(options: EnrolOptions) -> None:
     system = load_system(options.system)
     try:
         if options.remove:
-            system = enrolling.remove(system, options.remove)
+            system = enrolment.remove(system, options.remove)
         if options.rename:
-            system = enrolling.rename(system, dict(_pairs(options.rename, "OLD=NEW")))
+            system = enrolment.rename(system, dict(_pairs(options.rename, "OLD=NEW")))
         with warnings.catch_warnings(record=True) as said:
-            warnings.simplefilter("always", enrolling.AlikeWarning)
+            warnings.simplefilter("always", enrolment.AlikeWarning)
             if given:
-                system = enrolling.enrol(given, system, true_size=options.metres > 0)
+                system = enrolment.enrol(given, system, true_size=options.metres > 0)
         system.save(options.to)
     except (ValueError, FileExistsError, ImportError) as error:
         raise Unusable(str(error)) from error

@@ -13,7 +13,7 @@ from flax import nnx
 
 from mevs_jax.beliefs.fusing import CalibratedFusion
 from mevs_jax.beliefs.strangeness import LEVELS, Strangeness
-from mevs_jax.enrolment.gallery import HEIGHTS, PIXELS, YAWS, Gallery, Matcher
+from mevs_jax.gallery.matching import HEIGHTS, PIXELS, YAWS, Gallery, Matcher
 from mevs_jax.models.expected_views import ExpectedViews
 from mevs_jax.policies.base import Knowledge
 from mevs_jax.trained.description import Description

@@ -6,7 +6,7 @@ import json
 from dataclasses import asdict, dataclass, field
 from typing import Any, Literal
 
-from mevs_jax.enrolment.gallery import comparisons
+from mevs_jax.gallery.matching import comparisons
 from mevs_jax.geometry.cameras import ViewCamera
 from mevs_jax.geometry.inputs import SizeInput
 from mevs_jax.models.shapes import PointNet2Shape, PoseShape, ResNetShape, SetFusionShape, ViewPolicyShape

@@ -17,7 +17,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from mevs_jax.enrolment.gallery import SIDE
+from mevs_jax.gallery.matching import SIDE
 from mevs_jax.plain import from_plain
 from mevs_jax.policies.registry import POLICIES
 from mevs_jax.trained.arrays import DESCRIPTION, WEIGHTS, parts_of

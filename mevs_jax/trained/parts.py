@@ -13,7 +13,7 @@ from jaxtyping import Array, Float, Int
 
 from mevs_jax.beliefs.fusing import CalibratedFusion
 from mevs_jax.beliefs.strangeness import Strangeness
-from mevs_jax.enrolment.gallery import Gallery
+from mevs_jax.gallery.matching import Gallery
 from mevs_jax.geometry.inputs import depth_and_normals, depth_image, view_cloud
 from mevs_jax.models.expected_views import ExpectedViews
 from mevs_jax.models.pose import yaw_evidence

@@ -13,7 +13,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from mevs_jax.enrolment.beliefs import by_hypotheses, gain_among
+from mevs_jax.gallery.beliefs import by_hypotheses, gain_among
 from mevs_jax.policies.base import Observation, Policy
 from mevs_jax.policies.informed import expected_views
 from mevs_jax.policies.learned import learned

@@ -8,8 +8,8 @@ import pytest
 import mevs_jax
 from data_pipeline.objects.furniture.solids import box, joined
 from tests.cli.conftest import ended
-from tests.mevs_jax.enrolment.conftest import CAMERA, matcher  # noqa: F401
-from tests.mevs_jax.enrolment.test_enrolling import AROUND, frames_of
+from tests.mevs_jax.gallery.conftest import CAMERA, matcher  # noqa: F401
+from tests.mevs_jax.gallery.test_enrolment import AROUND, frames_of
 from train.tasks.matcher import objects_system
 
 

@@ -1,4 +1,4 @@
-"""Learns how views are compared with those of enrolled objects (`mevs_jax.enrolment.gallery.Matcher`), from procedural shapes.
+"""Learns how views are compared with those of enrolled objects (`mevs_jax.gallery.matching.Matcher`), from procedural shapes.
 
 What is learned is how views of *any* object differ from what its gallery predicts. Shapes of some kinds give the covariance of
 these differences; shapes of other kinds, of which some are enrolled and some are not, say how far the result can be trusted.
@@ -26,7 +26,7 @@ from data_pipeline.capture.casting import Rig, capture
 from data_pipeline.dataset.reality import RealityAugmentation, realistic_views
 from data_pipeline.objects.mesh import ObjectEntry
 from data_pipeline.objects.sources import furniture_families, load_object, strangers
-from mevs_jax.enrolment.gallery import (
+from mevs_jax.gallery.matching import (
     HEIGHTS,
     PIXELS,
     STEPS,
@@ -37,7 +37,7 @@ from mevs_jax.enrolment.gallery import (
     interpolated,
     small_image,
 )
-from mevs_jax.enrolment.meshes import images_of_mesh
+from mevs_jax.gallery.meshes import images_of_mesh
 from mevs_jax.geometry.cameras import ViewCamera, cameras_at, pixel_directions
 from mevs_jax.geometry.viewpoints import fibonacci_sphere, hull_edges
 from mevs_jax.trained.description import FORM, UNKNOWN_OBJECT, DataDescription, Description, ImageInput

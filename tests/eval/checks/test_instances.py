@@ -10,7 +10,7 @@ import pytest
 from eval.checks.instances import Condition, study_instances
 from mevs_jax.cli.checks import instances_text
 from mevs_jax.enrolment import AlikeWarning
-from tests.mevs_jax.enrolment.conftest import CAMERA, matcher  # noqa: F401
+from tests.mevs_jax.gallery.conftest import CAMERA, matcher  # noqa: F401
 from train.tasks.matcher import objects_system
 
 

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from data_pipeline.objects.furniture.solids import box, joined
-from mevs_jax.enrolment.enrolling import enrol
-from mevs_jax.enrolment.gallery import PIXELS, Matcher
+from mevs_jax.enrolment import enrol
+from mevs_jax.gallery.matching import PIXELS, Matcher
 from mevs_jax.geometry.cameras import ViewCamera
 from mevs_jax.trained import TrainedSystem
 from train.tasks.matcher import objects_system

@@ -5,7 +5,7 @@ from __future__ import annotations
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from mevs_jax.enrolment.gallery import Evidence, Gallery
+from mevs_jax.gallery.matching import Evidence, Gallery
 from mevs_jax.policies.base import Policy, Scene, SelectionState, required
 from mevs_jax.selection.loop import Fuse
 

@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, UInt8
 
-from mevs_jax.enrolment.gallery import HEIGHTS, PIXELS, SIDE, YAWS, grid_directions, stored_image
+from mevs_jax.gallery.matching import HEIGHTS, PIXELS, SIDE, YAWS, grid_directions, stored_image
 from mevs_jax.geometry.cameras import ViewCamera, cameras_at, pixel_directions
 from mevs_jax.geometry.source_view import DepthImage
 from mevs_jax.geometry.sphere import Sphere, upright

@@ -13,9 +13,9 @@ from jaxtyping import Float, UInt8
 
 from mevs_jax.agent.looking import Frames
 from mevs_jax.arrays import AnyArray, AnyVector
-from mevs_jax.enrolment.frames import images_of_frames
-from mevs_jax.enrolment.gallery import ALIKE, Gallery, differences_by_turn
-from mevs_jax.enrolment.meshes import images_of_mesh
+from mevs_jax.gallery.frames import images_of_frames
+from mevs_jax.gallery.matching import ALIKE, Gallery, differences_by_turn
+from mevs_jax.gallery.meshes import images_of_mesh
 from mevs_jax.geometry.cameras import ViewCamera
 from mevs_jax.geometry.source_view import DepthImage
 from mevs_jax.geometry.sphere import Sphere, estimate_sphere, upright

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, UInt8
 
-from mevs_jax.enrolment.gallery import HEIGHTS, PIXELS, YAWS, grid_directions, stored_image
+from mevs_jax.gallery.matching import HEIGHTS, PIXELS, YAWS, grid_directions, stored_image
 from mevs_jax.geometry.cameras import ViewCamera, cameras_at, pixel_directions
 from mevs_jax.geometry.triangles import centred_triangles
 

@@ -12,15 +12,15 @@ from data_pipeline.capture.casting import capture
 from data_pipeline.objects.furniture.solids import box, cylinder, joined
 from data_pipeline.objects.mesh import normalise
 from mevs_jax.agent import Frames
-from mevs_jax.enrolment.enrolling import AlikeWarning, alike, enrol, remove, rename
-from mevs_jax.enrolment.frames import images_of_frames
-from mevs_jax.enrolment.gallery import UNKNOWN, YAWS, small_image
-from mevs_jax.enrolment.meshes import images_of_mesh
+from mevs_jax.enrolment import AlikeWarning, alike, enrol, remove, rename
+from mevs_jax.gallery.frames import images_of_frames
+from mevs_jax.gallery.matching import UNKNOWN, YAWS, small_image
+from mevs_jax.gallery.meshes import images_of_mesh
 from mevs_jax.geometry.cameras import cameras_at
 from mevs_jax.geometry.source_view import DepthImage
 from mevs_jax.geometry.sphere import Sphere
 from mevs_jax.trained import TrainedSystem
-from tests.mevs_jax.enrolment.conftest import CAMERA
+from tests.mevs_jax.gallery.conftest import CAMERA
 from train.tasks.matcher import turned_rig
 
 AROUND = np.array([[0.8, 0, 0.6], [-0.4, 0.7, 0.6], [-0.4, -0.7, 0.6], [0, 0.6, -0.8]])

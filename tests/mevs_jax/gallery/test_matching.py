@@ -9,7 +9,7 @@ import pytest
 
 from data_pipeline.capture.casting import capture
 from data_pipeline.objects.mesh import normalise
-from mevs_jax.enrolment.gallery import (
+from mevs_jax.gallery.matching import (
     HEIGHTS,
     PIXELS,
     SIDE,
@@ -25,7 +25,7 @@ from mevs_jax.enrolment.gallery import (
     stored_image,
 )
 from mevs_jax.trained import TrainedSystem
-from tests.mevs_jax.enrolment.conftest import CAMERA
+from tests.mevs_jax.gallery.conftest import CAMERA
 from train.tasks.matcher import turned_rig
 
 
