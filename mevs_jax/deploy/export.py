@@ -25,7 +25,6 @@ from mevs_jax.agent.candidates import candidates_of
 from mevs_jax.agent.programs import Programs
 from mevs_jax.arguments import whole
 from mevs_jax.deploy import exported as loader
-from mevs_jax.points.ops import portable
 from mevs_jax.trained.parts import features_of, logits_of
 from mevs_jax.trained.system import TrainedSystem
 
@@ -85,8 +84,7 @@ def export(
         "programs": {},
     }
     for name, (function, inputs, outputs) in programs.items():
-        with portable():
-            exported = jax.export.export(jax.jit(function), platforms=list(platforms))(*_arguments(inputs))
+        exported = jax.export.export(jax.jit(function), platforms=list(platforms))(*_arguments(inputs))
         content = bytes(exported.serialize())
         (folder / f"{name}.stablehlo").write_bytes(content)
         manifest["programs"][name] = {
