@@ -87,7 +87,7 @@ def read_check(path: Path) -> CompileCheck:
 
 
 def grown(now: CompileCheck, before: CompileCheck) -> list[str]:
-    """Returns sentences on the programs that move more bytes than before, by more than a quarter, or compile no more.
+    """Returns sentences on the programs that move or hold more bytes than before, by more than a quarter, or compile no more.
 
     Raises:
         DataError: if they are of other targets.
@@ -98,9 +98,14 @@ def grown(now: CompileCheck, before: CompileCheck) -> list[str]:
     for name, old in before.programs.items():
         if name in now.refused:
             said.append(f"{name} was compiled before, and is not now ({now.refused[name]})")
-        elif name in now.programs and (new := now.programs[name]).traffic_bytes > GROWTH * old.traffic_bytes:
-            more = new.traffic_bytes / old.traffic_bytes - 1 if old.traffic_bytes else float("inf")
-            said.append(f"{name} moves {new.traffic_bytes:.3g} bytes instead of {old.traffic_bytes:.3g} ({more:+.0%})")
+        elif name in now.programs:
+            new = now.programs[name]
+            compared = ("moves", old.traffic_bytes, new.traffic_bytes), ("holds", old.peak_bytes, new.peak_bytes)
+            said += [
+                f"{name} {does} {after:.3g} bytes instead of {earlier:.3g} ({after / earlier - 1:+.0%})"
+                for does, earlier, after in compared
+                if earlier and after and after > GROWTH * earlier
+            ]
     return said
 
 

@@ -93,20 +93,17 @@ def _of_system(name: str, policy: str, batch: int) -> Make:
     return make
 
 
-def _grid(tables: ViewTable, graph: ViewGraph) -> Array:
+def _grid(logits: Array, entropies: Array, entropy: Array, labels: Array) -> Array:
     """The thesis's policy on all objects, from all start views."""
-    policy, config = POLICIES["predicted_entropy"], GridConfig()
-    one = partial(results_of_object, draws=1, max_views=config.max_views)
-    of = lambda numbered: one(numbered, jax.random.key(0), policy, graph, None, None)  # noqa: E731
-    return jax.vmap(of)((jnp.arange(_OBJECTS), tables)).right
+    graph, policy = ViewGraph.from_points(fibonacci_sphere(_VIEWS)), POLICIES["predicted_entropy"]
+    one = partial(results_of_object, draws=1, max_views=GridConfig().max_views)
+    each = lambda *numbered: one(numbered, jax.random.key(0), policy, graph, None, None).right  # noqa: E731
+    return jax.vmap(each)(jnp.arange(_OBJECTS), ViewTable(logits, entropies, entropy, labels))
 
 
-def _tables() -> tuple[ViewTable, ViewGraph]:
-    logits, entropies, entropy, label = _shapes(
-        (_OBJECTS, 1, _VIEWS, _CLASSES), (_OBJECTS, _VIEWS, _VIEWS), (_OBJECTS, _VIEWS), (_OBJECTS,)
-    )
-    label = jax.ShapeDtypeStruct(label.shape, jnp.int32)
-    return ViewTable(logits, entropies, entropy, label), ViewGraph.from_points(fibonacci_sphere(_VIEWS))
+def _tables() -> list[jax.ShapeDtypeStruct]:
+    tables = _shapes((_OBJECTS, 1, _VIEWS, _CLASSES), (_OBJECTS, _VIEWS, _VIEWS), (_OBJECTS, _VIEWS))
+    return [*tables, jax.ShapeDtypeStruct((_OBJECTS,), jnp.int32)]
 
 
 def _slope(picture: Callable[[Array, Camera], Array]) -> Callable[[Array, Array], Array]:

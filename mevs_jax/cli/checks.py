@@ -376,9 +376,9 @@ def _compiled_row(name: str, program: Compiled) -> tuple[str, ...]:
         f"{program.compile_seconds:.1f} s",
         scaled(program.peak_bytes, "B"),
         scaled(program.flop, "FLOP"),
-        scaled(program.traffic_bytes, "B"),
-        f"{program.flop_per_byte:.3g}",
-        f"{1e3 * program.least_seconds:.3g} ms {'by traffic' if program.bound_by_memory else 'by arithmetic'}",
+        "–" if program.traffic_bytes is None else scaled(program.traffic_bytes, "B"),
+        "–" if program.flop_per_byte is None else f"{program.flop_per_byte:.3g}",
+        f"{1e3 * program.least_seconds:.3g} ms",
     )
 
 

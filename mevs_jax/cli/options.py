@@ -308,7 +308,7 @@ class CompileOptions:
     to: Annotated[Path | None, _arg("FILE")] = None
     """write all figures into this .json file"""
     against: Annotated[Path | None, _arg("FILE")] = None
-    """fail if a program moves a quarter more bytes than in this file, which --to has written"""
+    """fail if a program moves or holds a quarter more bytes than in this file, which --to has written"""
     json: Flag = False
     """print all figures as JSON"""
 

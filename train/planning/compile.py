@@ -50,22 +50,20 @@ class Compiled:
     Attributes:
         compile_seconds: that tracing and compiling took.
         peak_bytes: the most memory that it needs at one time.
-        flop: floating-point operations.
-        traffic_bytes: bytes that its operations read and write.
-        flop_per_byte: of these, arithmetic intensity.
-        least_seconds: that it needs at the chip's peak rates.
-        bound_by_memory: whether its traffic takes longer at these rates than its arithmetic.
+        flop: floating-point operations; for a GPU those before it was compiled, without those of kernels.
+        traffic_bytes: bytes that its operations read and write; None for a GPU, of which XLA does not count them.
         contents: what it sends, calls and repeats.
+        flop_per_byte: arithmetic intensity.
+        least_seconds: that it needs at the chip's peak rates.
     """
 
     compile_seconds: float
     peak_bytes: int
     flop: float
-    traffic_bytes: float
-    flop_per_byte: float
-    least_seconds: float
-    bound_by_memory: bool
+    traffic_bytes: float | None
     contents: Contents
+    flop_per_byte: float | None
+    least_seconds: float
 
 
 def compile_for(target: Target, program: Program) -> Compiled:
@@ -78,18 +76,27 @@ def compile_for(target: Target, program: Program) -> Compiled:
     jax.config.update("jax_enable_compilation_cache", False)  # what was compiled before would take no time
     with target.lowering():
         traced = jax.jit(program.function, donate_argnums=program.donated).trace(*program.arguments)
-        compiled = traced.lower(lowering_platforms=(target.platform,)).compile()
+        lowered = traced.lower(lowering_platforms=(target.platform,))
+        compiled = lowered.compile()
     seconds = time.perf_counter() - before
-    costs, memory = compiled.cost_analysis() or {}, compiled.memory_analysis()
-    flop, traffic = (max(0.0, float(costs.get(name, 0.0))) for name in ("flops", "bytes accessed"))
-    by_arithmetic, by_memory = flop / target.chip.flop, traffic / target.chip.bandwidth
+    counted = compiled.cost_analysis()
+    flop = float(_flop_of(lowered) if counted is None else counted.get("flops", 0.0))
+    traffic = None if counted is None else float(counted["bytes accessed"])
     return Compiled(
         compile_seconds=seconds,
-        peak_bytes=int(memory.peak_memory_in_bytes),
+        peak_bytes=int(compiled.memory_analysis().peak_memory_in_bytes),
         flop=flop,
         traffic_bytes=traffic,
-        flop_per_byte=flop / traffic if traffic else 0.0,
-        least_seconds=max(by_arithmetic, by_memory),
-        bound_by_memory=by_memory >= by_arithmetic,
         contents=Contents.of(compiled.as_text()),
+        flop_per_byte=flop / traffic if traffic else None,
+        least_seconds=max(flop / target.chip.flop, (traffic or 0.0) / target.chip.bandwidth),
     )
+
+
+def _flop_of(lowered: jax.stages.Lowered) -> float:
+    """XLA's count before it compiles. `lowered.cost_analysis()` asks a device, which is not here; this asks the CPU."""
+    from jax._src.lib import _jax
+
+    program: Any = lowered.compiler_ir("hlo")
+    counted = _jax.hlo_module_cost_analysis(jax.devices("cpu")[0].client, program.as_hlo_module())
+    return max(0.0, counted.get("flops", 0.0))  # −1 for what holds kernels alone

@@ -119,7 +119,8 @@ class Target:
         """
         jax.config.update("jax_platforms", "cpu")  # else the plugin looks for its device
         if self.platform == "tpu":
-            os.environ |= {"TPU_SKIP_MDS_QUERY": "1"} | _QUIET
+            for variable, value in _WITHOUT_A_HOST.items():
+                os.environ.setdefault(variable, value)
             given = {"platform": "tpu", "topology_name": self.topology}
         else:
             given = {"platform": "cuda", "topology": self.topology, "target_config": _DESCRIPTION_OF_H100}
@@ -139,7 +140,7 @@ class Target:
 
         known = xla_bridge.canonicalize_platform
         # JAX takes "gpu" for the kind of GPU that is here, and there is none (jax-ml/jax#23971).
-        xla_bridge.canonicalize_platform = lambda name: "cuda" if name == "gpu" else known(name)
+        xla_bridge.canonicalize_platform = lambda platform: "cuda" if platform == "gpu" else known(platform)
         try:
             with jax.sharding.use_abstract_mesh(mesh):  # JAX 0.12 asks which GPU it lowers kernels for
                 yield
@@ -147,8 +148,12 @@ class Target:
             xla_bridge.canonicalize_platform = known
 
 
-_QUIET = {"TPU_WORKER_HOSTNAMES": "localhost", "TPU_LOG_DIR": "disabled", "TF_CPP_MIN_LOG_LEVEL": "3"}
-"""libtpu asks for the host's names, and writes what it finds to the terminal."""
+_WITHOUT_A_HOST = {
+    "TPU_SKIP_MDS_QUERY": "1",
+    "TPU_WORKER_HOSTNAMES": "localhost",
+    "TPU_ACCELERATOR_TYPE": "v5litepod-4",  # of any kind
+}
+"""What libtpu asks of the host of a TPU, and else complains about; it changes nothing that is compiled."""
 
 
 def mesh_of(devices: list[Any]) -> Mesh:
