@@ -59,8 +59,8 @@ def _training(settings: Settings, task_of: Callable[[Any], Task]) -> Make:
         statistics = planned_statistics(settings.dataset, 10**6)
         task = task_of(statistics)
         config = task.optimiser
-        parts = math.lcm(mesh.shape[DATA] * config.parts, config.parts * task.group, config.views_per_object)
-        batch = parts * -(-config.batch_size // parts)
+        unit = math.lcm(mesh.shape[DATA] * config.parts, config.parts * task.group, config.views_per_object)
+        batch = unit * -(-config.batch_size // unit)
         task = replace(task, optimiser=replace(config, batch_size=batch))  # type: ignore[type-var]
         structure, state = abstract_state(task)
         whole, split = NamedSharding(mesh, PartitionSpec()), NamedSharding(mesh, PartitionSpec(DATA))
