@@ -45,4 +45,5 @@ def _render(
         shaded = jnp.where(hit, jnp.round(255 * (AMBIENT + (1 - AMBIENT) * jnp.clip(facing, 0, 1))), 0)
         return stored.astype(jnp.uint16), shaded.astype(jnp.uint8)
 
-    return jax.lax.map(view, poses, batch_size=1 if jax.default_backend() == "cpu" else _VIEWS_PER_BATCH)
+    several = partial(jax.lax.map, view, batch_size=_VIEWS_PER_BATCH)
+    return jax.lax.platform_dependent(poses, cpu=partial(jax.lax.map, view, batch_size=1), default=several)

@@ -94,8 +94,7 @@ def _scores(method: str, things: Array, points: Array, config: RenderingConfig) 
         found = ascend_on_sphere(METHODS[method], thing, config.starts, config.resolution)
         return view_scores(found.poses, found.values, points)
 
-    at_once = None if jax.default_backend() == "cpu" else len(things)
-    return jax.lax.map(one, things, batch_size=at_once)
+    return jax.lax.platform_dependent(things, cpu=partial(jax.lax.map, one), default=jax.vmap(one))
 
 
 def _surface(points: np.ndarray, camera: np.ndarray, faces: int) -> np.ndarray | None:

@@ -151,13 +151,13 @@ def run_grid(
     def results(policy: PolicyRecord) -> Results:
         own = policy.draws(draws)
         shared, at_once = (key, as_tree(policy.score), graph, knowledge, reachable), min(256, most // (starts * own))
-        found = over_objects(_results_of, objects, *shared, at_once=at_once, draws=own, max_views=max_views)
+        found = over_objects(results_of_object, objects, *shared, at_once=at_once, draws=own, max_views=max_views)
         return jax.tree.map(lambda leaf: jnp.asarray(leaf.swapaxes(0, 1)), found)
 
     return {policy.name: results(policy) for policy in policies}
 
 
-def _results_of(
+def results_of_object(
     one: tuple[Int[Array, ""], ViewTable],
     key: Array,
     policy: Policy,

@@ -1,4 +1,4 @@
-"""Checks: `mevs check live`, `mevs check agent`, `mevs check transfer`, `mevs check reality`."""
+"""Checks: `mevs check live`, `mevs check agent`, `mevs check transfer`, `mevs check reality`, `mevs check compile`; and `mevs study instances`."""
 
 from __future__ import annotations
 
@@ -12,10 +12,12 @@ from mevs_jax.cli.failure import Unusable
 from mevs_jax.cli.parsing import Invocation
 
 if TYPE_CHECKING:
+    from eval.checks.compiling import CompileCheck
     from eval.checks.instances import Instances
     from eval.checks.reality import Reality, SceneRow, Stop
     from eval.checks.transfer import Transfer
-    from mevs_jax.cli.options import InstancesOptions, RealityOptions, TransferOptions
+    from mevs_jax.cli.options import CompileOptions, InstancesOptions, RealityOptions, TransferOptions
+    from train.planning.compile import Compiled
 
 
 def live(call: Invocation) -> None:
@@ -323,3 +325,74 @@ def _policy_lines(found: Transfer) -> list[str]:
         if name != "random":
             lines.append(" " * width + "".join(f"{_percent(row.gain, row.gain_interval, '+'):>23}" for row in rows))
     return lines
+
+
+def compiling(options: CompileOptions) -> None:
+    """Compiles programs for devices that are not here, and compares them with earlier ones."""
+    from train.planning.targets import Target
+
+    target = Target.of(options.target)  # before anything is imported that takes long
+    from data_pipeline.files import write_json
+    from eval.checks.compiling import check_compile, chosen_programs, grown, read_check
+    from train.results.records import as_json
+
+    chosen_programs(options.only)
+    if options.to is not None:
+        check_file(options.to)
+    before = read_check(options.against) if options.against is not None else None
+    found = check_compile(target, options.only)
+    if options.to is not None:
+        write_json(options.to, as_json(found))
+    print(json.dumps(as_json(found)) if options.json else compile_text(found))
+    if before is not None and (said := grown(found, before)):
+        raise Unusable(f"programs have grown since {options.against}: {'; '.join(said)}")
+    if found.refused:
+        raise Unusable(f"XLA cannot compile {', '.join(found.refused)} for {found.target}; its reasons are above")
+
+
+def compile_text(found: CompileCheck) -> str:
+    """What became of programs, for a terminal."""
+    titles = ("program", "compiled in", "peak memory", "arithmetic", "traffic", "FLOP/B", "at least")
+    rows = [titles, *(_compiled_row(name, program) for name, program in found.programs.items())]
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    made_with = ", ".join(f"{package} {version}" for package, version in found.made_with.items())
+    lines = [f"{found.target}, {found.devices} device{'s' * (found.devices > 1)}; {made_with}", ""]
+    for (name, *cells), program in zip(rows, [None, *found.programs.values()], strict=True):
+        shown = [cell.rjust(width) for cell, width in zip(cells, widths[1:], strict=True)]
+        lines.append("  ".join([name.ljust(widths[0]), *shown]))
+        if program is not None and (said := _said_of(program)):
+            lines.append(f"    {said}")
+    lines += [f"{name} cannot be compiled: {reason}" for name, reason in found.refused.items()]
+    return "\n".join(
+        [*lines, "", "Figures are XLA's, of one device; the body of a loop counts once (docs/performance.md)."]
+    )
+
+
+def _compiled_row(name: str, program: Compiled) -> tuple[str, ...]:
+    from mevs_jax.cli.planning import scaled
+
+    return (
+        name,
+        f"{program.compile_seconds:.1f} s",
+        scaled(program.peak_bytes, "B"),
+        scaled(program.flop, "FLOP"),
+        "–" if program.traffic_bytes is None else scaled(program.traffic_bytes, "B"),
+        "–" if program.flop_per_byte is None else f"{program.flop_per_byte:.3g}",
+        f"{1e3 * program.least_seconds:.3g} ms",
+    )
+
+
+def _said_of(program: Compiled) -> str:
+    """What a program sends, calls and repeats."""
+    from mevs_jax.cli.planning import scaled
+
+    of = program.contents
+    said = [f"{one.count} {kind} ({scaled(one.bytes, 'B')})" for kind, one in of.collectives.items()]
+    said += [f"{count} {called}" for called, count in of.custom_calls.items()]
+    if of.loops:
+        said.append(
+            f"{of.loops} loop{'s' * (of.loops > 1)}" + f", {of.open_loops} of unknown length" * (of.open_loops > 0)
+        )
+    if of.host_transfers:
+        said.append(f"{of.host_transfers} transfers from or to the host")
+    return "; ".join(said)

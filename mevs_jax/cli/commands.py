@@ -145,6 +145,12 @@ COMMANDS = {
         "checks:reality",
         tool=True,
     ),
+    "check compile": Command(
+        "compile programs for TPUs or GPUs that are not here; what they need",
+        "CompileOptions",
+        "checks:compiling",
+        tool=True,
+    ),
     "draw ascent": Command(
         "ascend to the best view of one object by a renderer's gradient; draw it",
         "WithViews",

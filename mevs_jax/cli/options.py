@@ -297,6 +297,22 @@ class RealityOptions(WithObjects):
     """seed of noise, wrong centres, and random walks"""
 
 
+@dataclass(frozen=True, kw_only=True)
+class CompileOptions:
+    """Options of `mevs check compile`."""
+
+    target: Annotated[str, _arg("DEVICES")]
+    """what to compile for: gpu:h100, or a slice of TPUs, as tpu:v5e:8x8 (v5e, v5p, v6e)"""
+    only: Annotated[tuple[str, ...], _arg("NAME ...", "all")] = ()
+    """programs, by their names or what these begin with, as train or ball-query"""
+    to: Annotated[Path | None, _arg("FILE")] = None
+    """write all figures into this .json file"""
+    against: Annotated[Path | None, _arg("FILE")] = None
+    """fail if a program moves or holds a quarter more bytes than in this file, which --to has written"""
+    json: Flag = False
+    """print all figures as JSON"""
+
+
 @dataclass(frozen=True)
 class ExportOptions:
     """Options of `mevs export`."""

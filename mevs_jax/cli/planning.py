@@ -126,14 +126,14 @@ def _views(views: int, objects: float) -> str:
 
 
 def _bytes(number: float) -> str:
-    return _scaled(number, "B")
+    return scaled(number, "B")
 
 
 def _flop(number: float) -> str:
-    return _scaled(number, "FLOP") if number else "not counted"
+    return scaled(number, "FLOP") if number else "not counted"
 
 
-def _scaled(number: float, unit: str) -> str:
+def scaled(number: float, unit: str) -> str:
     """A number with three digits and a prefix, such as 44.7 MB."""
     prefixes = iter("kMGTPE")
     prefix = ""

@@ -25,7 +25,6 @@ from mevs_jax.agent.candidates import candidates_of
 from mevs_jax.agent.programs import Programs
 from mevs_jax.arguments import whole
 from mevs_jax.deploy import exported as loader
-from mevs_jax.points.ops import portable
 from mevs_jax.trained.parts import features_of, logits_of
 from mevs_jax.trained.system import TrainedSystem
 
@@ -68,11 +67,6 @@ def export(
         raise ImportError("writing StableHLO needs flatbuffers: pip install mevs-jax[export]") from error
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
-    programs = {"decide": _decide(system, policy, max_views)}
-    if system.parts.encoder is not None:
-        programs["recognise"] = _recognise(system)
-    if system.parts.entropy is not None:
-        programs["entropies"] = _entropies(system)
     manifest: dict[str, Any] = {
         "form": FORM,
         "classes": list(system.classes),
@@ -84,9 +78,9 @@ def export(
         "made_with": {"jax": version("jax"), "mevs-jax": version("mevs-jax")},
         "programs": {},
     }
-    for name, (function, inputs, outputs) in programs.items():
-        with portable():
-            exported = jax.export.export(jax.jit(function), platforms=list(platforms))(*_arguments(inputs))
+    (b,) = jax.export.symbolic_shape("b")
+    for name, (function, inputs, outputs) in programs_of(system, policy, max_views).items():
+        exported = jax.export.export(jax.jit(function), platforms=list(platforms))(*arguments_like(inputs, b))
         content = bytes(exported.serialize())
         (folder / f"{name}.stablehlo").write_bytes(content)
         manifest["programs"][name] = {
@@ -106,7 +100,7 @@ _FRAMES = {
     "camera": "x right, y down, z forward (OpenCV); poses map the camera's frame to the object's",
 }
 
-_Program = tuple[Callable[..., Any], list[dict[str, Any]], list[dict[str, Any]]]
+Program = tuple[Callable[..., Any], list[dict[str, Any]], list[dict[str, Any]]]
 """A function, and its inputs and outputs as the manifest describes them."""
 
 
@@ -114,9 +108,8 @@ def _array(name: str, shape: Sequence[Any], about: str, dtype: str = "float32") 
     return {"name": name, "shape": list(shape), "dtype": dtype, "about": about}
 
 
-def _arguments(inputs: Sequence[dict[str, Any]]) -> list[Any]:
-    """The shapes of inputs, for any extent `b`."""
-    (b,) = jax.export.symbolic_shape("b")
+def arguments_like(inputs: Sequence[dict[str, Any]], b: Any) -> list[Any]:
+    """The shapes of inputs, for an extent `b`."""
 
     def of(one: dict[str, Any]) -> Any:
         if "arrays" in one:
@@ -126,13 +119,23 @@ def _arguments(inputs: Sequence[dict[str, Any]]) -> list[Any]:
     return [of(one) for one in inputs]
 
 
+def programs_of(system: TrainedSystem, policy: str, max_views: int) -> dict[str, Program]:
+    """The programs of a system by name, as in `export`."""
+    programs = {"decide": _decide(system, policy, max_views)}
+    if system.parts.encoder is not None:
+        programs["recognise"] = _recognise(system)
+    if system.parts.entropy is not None:
+        programs["entropies"] = _entropies(system)
+    return programs
+
+
 def _radius(system: TrainedSystem, shape: Sequence[Any]) -> list[dict[str, Any]]:
     """The input of a system that uses the size of objects; none for another one."""
     about = "of the object in metres; NaN if its size is unknown"
     return [_array("radius", shape, about)] if system.description.uses_size else []
 
 
-def _recognise(system: TrainedSystem) -> _Program:
+def _recognise(system: TrainedSystem) -> Program:
     """Depth images to features and calibrated probabilities of single views."""
     of, parts = system.description, system.parts
     side = of.camera.resolution
@@ -156,7 +159,7 @@ def _recognise(system: TrainedSystem) -> _Program:
     )
 
 
-def _entropies(system: TrainedSystem) -> _Program:
+def _entropies(system: TrainedSystem) -> Program:
     """Clouds to the predicted entropies of all views."""
     cloud, network, views = system.description.cloud, system.parts.entropy, len(system.viewpoints)
     assert cloud is not None
@@ -171,7 +174,7 @@ def _entropies(system: TrainedSystem) -> _Program:
     )
 
 
-def _decide(system: TrainedSystem, policy: str, max_views: int) -> _Program:
+def _decide(system: TrainedSystem, policy: str, max_views: int) -> Program:
     """One step of an agent whose candidates are the system's viewpoints."""
     programs, parts = Programs(system, policy, True, max_views), system.parts
     views, side = len(system.viewpoints), system.description.camera.resolution

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import partial
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -40,28 +40,58 @@ class Convolution(nnx.Module):
         return convolve(x, (kernel if factor is None else kernel * factor).astype(x.dtype), self.stride)
 
 
+@partial(jax.custom_vjp, nondiff_argnums=(2,))
 def convolve(
     x: Float[Array, "batch height width inputs"], kernel: Float[Array, "size size inputs outputs"], stride: int
 ) -> Float[Array, "batch rows columns outputs"]:
-    """Convolution, padded by half the kernel's size.
+    """Convolution, padded by half the kernel's size, in the way of the platform that a program is compiled for."""
+    on_cpu = partial(_best_on_cpu(x, kernel, stride).forwards, stride=stride)
+    return jax.lax.platform_dependent(x, kernel, cpu=on_cpu, default=partial(_convolve, stride=stride))
 
-    On CPU, the way depends on the shapes. XLA's convolution of small maps is slow (64 maps of 2×2 by 512 channels: 357 ms; tap by
-    tap 1.5), and so are its gradients of weights (256 maps of 16×16 by 32: 15 ms; from patches that stay in the cache 8).
+
+def _backwards(stride: int, residuals: tuple[Array, Array], cotangent: Array) -> tuple[Array, Array]:
+    on_cpu = partial(_best_on_cpu(*residuals, stride).backwards, stride=stride)
+    elsewhere = partial(_gradient_of(_convolve), stride=stride)
+    return jax.lax.platform_dependent(*residuals, cotangent, cpu=on_cpu, default=elsewhere)
+
+
+convolve.defvjp(lambda x, kernel, stride: (convolve(x, kernel, stride), (x, kernel)), _backwards)
+
+
+class _Way(NamedTuple):
+    """A way to compute a convolution.
+
+    Attributes:
+        forwards: a function of images, kernel and stride.
+        backwards: a function of images, kernel, cotangent and stride; returns the cotangents of images and kernel.
     """
-    if jax.default_backend() != "cpu":
-        return _convolve(x, kernel, stride)
+
+    forwards: Callable[..., Array]
+    backwards: Callable[..., tuple[Array, Array]]
+
+
+def _gradient_of(forwards: Callable[..., Array]) -> Callable[..., tuple[Array, Array]]:
+    return lambda x, kernel, cotangent, stride: jax.vjp(partial(forwards, stride=stride), x, kernel)[1](cotangent)
+
+
+def _best_on_cpu(x: Array, kernel: Array, stride: int) -> _Way:
+    """The way on CPU, which depends on the shapes.
+
+    XLA's convolution of small maps is slow (64 maps of 2×2 by 512 channels: 357 ms; tap by tap 1.5), and so are its gradients of
+    weights (256 maps of 16×16 by 32: 15 ms; from patches that stay in the cache 8).
+    """
     size, images = kernel.shape[0], x.shape[0]
     places = -(-x.shape[1] // stride) * -(-x.shape[2] // stride)
     # While a program is exported, the number of images is a symbol.
     if isinstance(images, int) and 2 * images * places * kernel.size >= _MUCH:
         wide = min(kernel.shape[2:]) >= _TILED_CHANNELS and x.dtype == jnp.float32
         if size == 3 and stride == 1 and places > _TINY_MAP and wide:
-            return _tiled(x, kernel)
+            return _Way(_tiled, _tiled_backwards)
         if size == 3 and (stride > 1 or places <= _SMALL_MAP):
-            return _tap_by_tap(x, kernel, stride)
+            return _Way(_tap_by_tap, _tap_by_tap_backwards)
     elif places <= _SMALL_MAP or size == 1:
-        return _product(x, kernel, stride)
-    return _convolve_on_cpu(x, kernel, stride)
+        return _Way(_product, _gradient_of(_product))
+    return _Way(_convolve, _from_patches)
 
 
 def _convolve(x: Array, kernel: Array, stride: int) -> Array:
@@ -99,7 +129,6 @@ def _taps(x: Array, size: int, stride: int) -> list[tuple[int, slice, slice, lis
     return found
 
 
-@partial(jax.custom_vjp, nondiff_argnums=(2,))
 def _tap_by_tap(x: Array, kernel: Array, stride: int) -> Array:
     """Convolution as one matrix product for each tap of the kernel, of those inputs alone that the tap reads.
 
@@ -113,8 +142,7 @@ def _tap_by_tap(x: Array, kernel: Array, stride: int) -> Array:
     return out
 
 
-def _tap_by_tap_backwards(stride: int, residuals: tuple[Array, Array], cotangent: Array) -> tuple[Array, Array]:
-    x, kernel = residuals
+def _tap_by_tap_backwards(x: Array, kernel: Array, cotangent: Array, stride: int) -> tuple[Array, Array]:
     size, (_, height, width, inputs), (rows, columns) = kernel.shape[0], x.shape, cotangent.shape[1:3]
     of_x, of_taps = jnp.zeros((), x.dtype), [jnp.zeros(kernel.shape[2:], x.dtype)] * (size * size)
     for tap, down, right, (_, above, beside, _) in _taps(x, size, stride):
@@ -125,9 +153,6 @@ def _tap_by_tap_backwards(stride: int, residuals: tuple[Array, Array], cotangent
         around = [(down.start, height - down.stop, stride - 1), (right.start, width - right.stop, stride - 1)]
         of_x = of_x + jax.lax.pad(product, jnp.zeros((), x.dtype), [(0, 0, 0), *around, (0, 0, 0)])
     return of_x, jnp.stack(of_taps).reshape(kernel.shape)
-
-
-_tap_by_tap.defvjp(lambda x, kernel, stride: (_tap_by_tap(x, kernel, stride), (x, kernel)), _tap_by_tap_backwards)
 
 
 def _patches(x: Array, size: int, stride: int) -> Float[Array, "places patch"]:
@@ -154,14 +179,8 @@ def _shifted(x: Array, size: int, stride: int) -> list[Array]:
     ]
 
 
-@partial(jax.custom_vjp, nondiff_argnums=(2,))
-def _convolve_on_cpu(x: Array, kernel: Array, stride: int) -> Array:
-    """`_convolve` with the gradient of the weights as matrix products of patches, some images at a time."""
-    return _convolve(x, kernel, stride)
-
-
-def _backwards(stride: int, residuals: tuple[Array, Array], cotangent: Array) -> tuple[Array, Array]:
-    x, kernel = residuals
+def _from_patches(x: Array, kernel: Array, cotangent: Array, stride: int) -> tuple[Array, Array]:
+    """The gradient of `_convolve`, that of the weights as matrix products of patches, some images at a time."""
     (of_x,) = jax.vjp(lambda x: _convolve(x, kernel, stride), x)[1](cotangent)
     return of_x, _of_kernel(x, cotangent, kernel.shape[0], stride).astype(kernel.dtype)
 
@@ -194,9 +213,6 @@ def _sum_over_parts(of: Callable[[Array, Array], Any], x: Array, cotangent: Arra
         lambda shape: jnp.zeros(shape.shape, shape.dtype), jax.eval_shape(of, parts[0][0], parts[1][0])
     )
     return jax.lax.scan(lambda total, part: (jax.tree.map(jnp.add, total, of(*part)), None), nothing, parts)[0]
-
-
-_convolve_on_cpu.defvjp(lambda x, kernel, stride: (_convolve(x, kernel, stride), (x, kernel)), _backwards)
 
 
 _OF_INPUTS = ((1, 0, -1, 0), (0, 1, 1, 0), (0, -1, 1, 0), (0, 1, 0, -1))
@@ -240,17 +256,15 @@ def _from_tiles(x: Array, kernels: list[list[Array]], axis: int) -> Array:
     return out.reshape(batch, 2 * shape[1], 2 * shape[2], -1)[:, :height, :width]
 
 
-@jax.custom_vjp
-def _tiled(x: Array, kernel: Array) -> Array:
-    """Convolution with a 3×3 kernel by Winograd's algorithm, in 4/9 of the multiplications.
+def _tiled(x: Array, kernel: Array, stride: int) -> Array:
+    """Convolution with a 3×3 kernel and a `stride` of 1, by Winograd's algorithm, in 4/9 of the multiplications.
 
     Rounding errors are a few times those of the sum itself, some 1e-6 of the largest output.
     """
     return _from_tiles(x, _in_both(_OF_KERNEL, [[kernel[i, j] for j in range(3)] for i in range(3)]), 0)
 
 
-def _tiled_backwards(residuals: tuple[Array, Array], cotangent: Array) -> tuple[Array, Array]:
-    x, kernel = residuals
+def _tiled_backwards(x: Array, kernel: Array, cotangent: Array, stride: int) -> tuple[Array, Array]:
     flipped = _in_both(_OF_KERNEL, [[kernel[2 - i, 2 - j] for j in range(3)] for i in range(3)])
     of_x = _from_tiles(cotangent, flipped, 1)
     of_kernels = _sum_over_parts(_of_transformed, x, cotangent, x[0].size * x.dtype.itemsize)
@@ -268,17 +282,19 @@ def _of_transformed(x: Array, cotangent: Array) -> list[Array]:
     return [jnp.matmul(jnp.stack(tiles).mT, jnp.stack(products)) for tiles, products in rows]
 
 
-_tiled.defvjp(lambda x, kernel: (_tiled(x, kernel), (x, kernel)), _tiled_backwards)
-
-
 def pool(x: Float[Array, "batch height width channels"]) -> Float[Array, "batch rows columns channels"]:
     """Maxima of 3×3 at every second row and column, padded by one. Among equal values, the first in the order of rows and
     columns receives the gradient, as in PyTorch.
-
-    On CPU, XLA takes 32 ms for 64 maps of 32×32 by 64 with their gradient, this way 5.
     """
-    if jax.default_backend() != "cpu":
-        return nnx.max_pool(x, (3, 3), strides=(2, 2), padding=((1, 1), (1, 1)))
+    return jax.lax.platform_dependent(x, cpu=_pool_on_cpu, default=_pool)
+
+
+def _pool(x: Array) -> Array:
+    return nnx.max_pool(x, (3, 3), strides=(2, 2), padding=((1, 1), (1, 1)))
+
+
+def _pool_on_cpu(x: Array) -> Array:
+    """XLA takes 32 ms for 64 maps of 32×32 by 64 with their gradient, this way 5."""
     height, width = x.shape[1:3]
     x = jnp.pad(x, ((0, 0), (0, height % 2), (0, width % 2), (0, 0)), constant_values=-jnp.inf)
     return _pool_along(_pool_along(x, 2), 1)

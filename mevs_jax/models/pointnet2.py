@@ -138,16 +138,13 @@ def _first_layer(
     return product(gathered.reshape(-1, columns), kernel[:columns]).reshape(*gathered.shape[:-1], -1)
 
 
-def _map(function: Callable, clouds: Any, at_once: int = 1) -> Any:
-    """Applies `function` to every cloud in inference, in batches.
+def _map(function: Callable, clouds: Any, at_once: int) -> Any:
+    """Applies `function` to every cloud in inference, in batches of `at_once`.
 
-    On CPU the batches are small (`at_once`) so that they stay in the cache. On accelerators they hold 64 clouds, which keeps the
-    device busy and bounds the memory (64 clouds of the thesis's size take 2 GB). A symbolic number of clouds, in exported
-    programs, cannot be divided into batches: clouds are then processed one by one.
+    A symbolic number of clouds, in exported programs, cannot be divided into batches: clouds are then processed one by one.
     """
-    if not isinstance(jax.tree.leaves(clouds)[0].shape[0], int):
-        return jax.lax.map(function, clouds)
-    return jax.lax.map(function, clouds, batch_size=at_once if jax.default_backend() == "cpu" else 64)
+    symbolic = not isinstance(jax.tree.leaves(clouds)[0].shape[0], int)
+    return jax.lax.map(function, clouds, batch_size=None if symbolic else at_once)
 
 
 def _abstract(
@@ -157,8 +154,9 @@ def _abstract(
     *,
     level: Abstraction,
     layers: list[tuple[Array, Array]],
+    pieces: int,
 ) -> Float[Array, "centres outputs"]:
-    """One level of one cloud in inference; on CPU in pieces of a few centres."""
+    """One level of one cloud in inference, in equal pieces of its centres."""
     neighbours = ball_query(points, centres, level.radius, level.samples)
     kernel, bias = layers[0]
     passed = _passed(points, features, kernel)
@@ -169,15 +167,12 @@ def _abstract(
         x = _infer(layers[1:], jax.nn.relu(x).astype(features.dtype))
         return jnp.max(x.reshape(*piece[1].shape, -1), axis=1)
 
-    pieces = _pieces(level)
     split = jax.tree.map(lambda array: array.reshape(pieces, -1, array.shape[-1]), (centres, neighbours))
     return jax.lax.map(some, split).reshape(level.centres, -1)
 
 
 def _pieces(level: Abstraction) -> int:
-    """Number of equal pieces that a level's centres are processed in; on CPU, of at most 4,096 neighbours, or of one centre."""
-    if jax.default_backend() != "cpu":
-        return 1
+    """Number of equal pieces of a level's centres, of at most 4,096 neighbours or of one centre, which stay in a CPU's cache."""
     fewest = min(-(-level.centres * level.samples // 4096), level.centres)
     return next(count for count in range(fewest, level.centres + 1) if level.centres % count == 0)
 
@@ -287,14 +282,21 @@ class PointNet2(TrainedByCall):
 
     def _embed(self, clouds: Float[Array, "clouds points columns"]) -> Float[Array, "clouds embedding"]:
         """The embeddings of a batch of clouds, with batch norm by the running statistics."""
+        small, large = (partial(self._embed_in_parts, in_cache=fits) for fits in (True, False))
+        return jax.lax.platform_dependent(clouds, cpu=small, default=large)
+
+    def _embed_in_parts(self, clouds: Array, *, in_cache: bool) -> Array:
+        """`_embed` in parts that stay in a CPU's cache; or else of up to 64 clouds, which keep an accelerator busy and bound its
+        memory (64 clouds of the thesis's size take 2 GB)."""
         points, features = clouds[..., :3], clouds[..., 3:].astype(self.dtype or clouds.dtype)
         for level, perceptron in zip(self.levels, self.perceptrons, strict=True):
             sample = partial(farthest_point_sample, k=level.centres)
             at_once = 4 if points.shape[1] <= LARGE else 1  # four larger clouds leave the cache
-            chosen = _map(sample, points, at_once) if jax.default_backend() == "cpu" else jax.vmap(sample)(points)
+            chosen = _map(sample, points, at_once) if in_cache else jax.vmap(sample)(points)
             centres = jnp.take_along_axis(points, chosen[..., None], axis=1)
-            abstract = partial(_abstract, level=level, layers=perceptron.folded())
-            features = _map(lambda cloud, abstract=abstract: abstract(*cloud), (points, features, centres))
+            pieces = _pieces(level) if in_cache else 1
+            abstract = partial(_abstract, level=level, layers=perceptron.folded(), pieces=pieces)
+            features = _map(lambda cloud, of=abstract: of(*cloud), (points, features, centres), 1 if in_cache else 64)
             points = centres
         everything = jnp.concatenate([points.astype(features.dtype), features], axis=-1)
         return jnp.max(_infer(self.whole.folded(), everything), axis=1)

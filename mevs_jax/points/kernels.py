@@ -1,4 +1,4 @@
-"""Point operations as Pallas kernels for one GPU, with the results of `mevs_jax.points.ops`, which selects them.
+"""Point operations as Pallas kernels for one GPU, with the results of `mevs_jax.points.ops`; `lowered` selects them.
 
 They are fast for two reasons that a compiler of array programs does not find: a cloud's distances stay in the registers of one
 block during all of farthest-point sampling, and a ball query stops as soon as its slots are full.
@@ -17,8 +17,6 @@ from jaxtyping import Array, Float, Int
 
 from mevs_jax.points.distances import squared_distance
 
-LARGEST_CLOUD = 16_384
-"""The largest number of points whose coordinates and distances fit into the registers of one block."""
 _CENTRES, _CHUNK = 16, 128  # of a ball query: centres per block, points per step
 
 
@@ -33,7 +31,7 @@ def _columns(points: Float[Array, "points 3"], count: int, fill: float) -> Float
 
 
 def farthest_point_sample(points: Float[Array, "points 3"], k: int, *, interpret: bool = False) -> Int[Array, " {k}"]:
-    """`points.ops.farthest_point_sample` for at most `LARGEST_CLOUD` points; `interpret` runs it slowly on any device."""
+    """`points.ops.farthest_point_sample` for at most `ops.LARGEST_OF_KERNEL` points; `interpret` runs it slowly on any device."""
     count = points.shape[0]
     columns = _columns(points, _power_of_two(count), 0.0)
     return pl.pallas_call(

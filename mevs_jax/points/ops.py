@@ -7,17 +7,11 @@ weights trained with those can be used:
 * ball query takes the first `k` points, in index order, that lie strictly within the radius, and fills empty slots with the
   first of them, or with point 0 if there is none.
 
-On one GPU both run as kernels (`mevs_jax.points.kernels`); on other devices, for larger clouds and in float64, as array
+In programs for one GPU both are kernels (`mevs_jax.points.kernels`); for other devices, larger clouds and float64, array
 programs. All return the same indices, since all compare the same distances (`mevs_jax.points.distances`).
 """
 
 from __future__ import annotations
-
-from collections.abc import Iterator
-from contextlib import contextmanager
-from contextvars import ContextVar
-from functools import partial
-from types import ModuleType
 
 import jax
 import jax.numpy as jnp
@@ -28,31 +22,11 @@ from mevs_jax.arrays import AnyArray
 from mevs_jax.points import farthest
 from mevs_jax.points.bits import WORD, bits_until, set_bits
 from mevs_jax.points.distances import square, squared_distance
+from mevs_jax.points.lowered import kernel_on_one_gpu
 
-_PORTABLE: ContextVar[bool] = ContextVar("portable", default=False)
-
-
-@contextmanager
-def portable() -> Iterator[None]:
-    """Within it, what is traced uses array operations alone, which run on every platform, and no kernels."""
-    token = _PORTABLE.set(True)
-    try:
-        yield
-    finally:
-        _PORTABLE.reset(token)
-
-
-def _on_one_gpu(points: Array) -> bool:
-    """Whether a kernel may be used: the compiler cannot split a kernel over several devices."""
-    if _PORTABLE.get():
-        return False
-    return jax.default_backend() == "gpu" and jax.device_count() == 1 and points.dtype == jnp.float32
-
-
-def _kernels() -> ModuleType:
-    from mevs_jax.points import kernels  # late: Pallas takes half a second to import, which a CPU does not need
-
-    return kernels
+LARGEST_OF_KERNEL = 16_384
+"""The largest number of points whose coordinates and distances fit into the registers of one block of a GPU."""
+_FARTHEST = kernel_on_one_gpu("farthest_point_sample", farthest.sample)
 
 
 def farthest_point_sample(points: Float[AnyArray, "points 3"], k: int) -> Int[Array, " {k}"]:
@@ -73,7 +47,7 @@ def farthest_point_sample(points: Float[AnyArray, "points 3"], k: int) -> Int[Ar
     """
     k = whole(k, "farthest_point_sample needs k >= 1", 1, 2**31 - 1)
     _check_cloud("farthest_point_sample", points)
-    if isinstance(points, jax.core.Tracer) or jax.default_backend() != "cpu":
+    if isinstance(points, jax.core.Tracer) or not _is_on_cpu(points):
         return _farthest(points, k)
     try:
         with jax.ensure_compile_time_eval():
@@ -85,16 +59,17 @@ def farthest_point_sample(points: Float[AnyArray, "points 3"], k: int) -> Int[Ar
         return _farthest(points, k)
 
 
+def _is_on_cpu(points: AnyArray) -> bool:
+    """Whether an array that is not traced is on a CPU, or will be put there."""
+    devices = points.devices() if isinstance(points, jax.Array) else jax.local_devices()
+    return all(device.platform == "cpu" for device in devices)
+
+
 def _farthest(points: Float[AnyArray, "points 3"], k: int) -> Int[Array, " {k}"]:
-    count = points.shape[0]
     points = jax.lax.stop_gradient(jnp.asarray(points))
-    if _on_one_gpu(points) and count <= (point_kernels := _kernels()).LARGEST_CLOUD:
-        return jax.lax.platform_dependent(
-            points,
-            cuda=partial(point_kernels.farthest_point_sample, k=k),
-            default=partial(farthest.sample, k=k),
-        )
-    return farthest.sample(points, k)
+    if points.dtype != jnp.float32 or points.shape[0] > LARGEST_OF_KERNEL:
+        return farthest.sample(points, k)
+    return _FARTHEST(points, k=k, shape=(k,))
 
 
 def _farthest_of_known(points: Float[AnyArray, "points 3"], k: int) -> Int[Array, " {k}"]:
@@ -143,13 +118,10 @@ def ball_query(
     # A point that is not finite is no neighbour of any centre, and a centre that is not finite has none.
     points = jnp.where(jnp.isfinite(points), points, jnp.inf)
     centres = jnp.where(jnp.isfinite(centres), centres, -jnp.inf)
-    squared_radius = square(jnp.asarray(radius, points.dtype))
-    arguments = (points, centres, squared_radius)
-    if _on_one_gpu(points):
-        return jax.lax.platform_dependent(
-            *arguments, cuda=partial(_kernels().ball_query, k=k), default=partial(_query_of_array, k=k)
-        )
-    return _query_of_array(*arguments, k)
+    squared_radius = square(jax.lax.stop_gradient(jnp.asarray(radius, points.dtype)))
+    if points.dtype != jnp.float32:
+        return _query_of_array(points, centres, squared_radius, k)
+    return _BALL_QUERY(points, centres, squared_radius, k=k, shape=(centres.shape[0], k))
 
 
 def _query_of_array(
@@ -170,6 +142,9 @@ def _query_of_array(
     bit = jnp.uint32(1) << jnp.arange(WORD, dtype=jnp.uint32)
     words = jnp.sum(jnp.where(hit, bit[:, None], jnp.uint32(0)), axis=1, dtype=jnp.uint32)
     return jax.vmap(_first_hits, in_axes=(0, None))(words, k)
+
+
+_BALL_QUERY = kernel_on_one_gpu("ball_query", _query_of_array)
 
 
 def _first_hits(words: UInt32[Array, " words"], k: int) -> Int[Array, " {k}"]:

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import partial
 
 import flax.struct
 import jax
@@ -68,11 +69,6 @@ def _softplus_jvp(primals: tuple[Array], tangents: tuple[Array]) -> tuple[Array,
     return jnp.maximum(x, 0) + jnp.log1p(small), jnp.where(x >= 0, 1, small) / (1 + small) * along
 
 
-def _pieces(side: int) -> tuple[int, int]:
-    """Pixels per side of a tile, and faces per step; on CPU both are small so that the arrays stay in the cache."""
-    return (16, 16) if jax.default_backend() == "cpu" else (side, 256)
-
-
 def _near_tiles(
     corners: Float[Array, "faces 3 3"], camera: Camera, margin: float, tile: int
 ) -> tuple[Int[Array, "tiles faces"], Int[Array, " tiles"]]:
@@ -107,10 +103,17 @@ def render_mesh(
         camera: the camera.
         softness: widths of the transitions between faces.
     """
-    triangles = jnp.asarray(triangles)
+    small = partial(_in_pieces, softness=softness, tile=16, at_once=16)  # arrays that stay in a CPU's cache
+    large = partial(_in_pieces, softness=softness, tile=camera.resolution, at_once=256)
+    return jax.lax.platform_dependent(jnp.asarray(triangles), camera, cpu=small, default=large)
+
+
+def _in_pieces(
+    triangles: Float[Array, "faces 3 3"], camera: Camera, *, softness: Softness, tile: int, at_once: int
+) -> SoftRendering:
+    """`render_mesh` in tiles of so many pixels per side, with so many faces per step."""
     corners = (triangles - camera.pose[:3, 3]) @ camera.pose[:3, :3]
     side = camera.resolution
-    tile, at_once = _pieces(side)
     listed, counts = _near_tiles(jax.lax.stop_gradient(corners), camera, _FAR * softness.edge, tile)
     listed = jnp.pad(listed, ((0, 0), (0, -len(corners) % at_once)), constant_values=len(corners))
     corners = jnp.pad(corners, ((0, 1), (0, 0), (0, 0)))  # the last face stands for none

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 
 import flax.struct
 import jax
@@ -116,10 +117,15 @@ def ascend(
         walk = jax.lax.while_loop(lambda walk: (walk.step < steps) & (walk.calm < patience), climb, begun)
         return walk.valued(objective(walk.pose))  # the objective at the last pose has not been evaluated yet
 
-    if at_once is None:
-        at_once = 1 if jax.default_backend() == "cpu" else len(starts)
-    # A batch of one is a `vmap` too, in which both branches of a `cond` are computed; None avoids that.
-    walks = jax.lax.map(climb_from, starts, batch_size=at_once if at_once > 1 else None)
+    def climb_all(starts: Array, at_once: int) -> _Walk:
+        # A batch of one is a `vmap` too, in which both branches of a `cond` are computed; None avoids that.
+        return jax.lax.map(climb_from, starts, batch_size=at_once if at_once > 1 else None)
+
+    if at_once is not None:
+        walks = climb_all(starts, at_once)
+    else:
+        every = partial(climb_all, at_once=len(starts))
+        walks = jax.lax.platform_dependent(starts, cpu=partial(climb_all, at_once=1), default=every)
     return Ascent(walks.best, walks.best_value, walks.path, walks.path_values, walks.step)
 
 

@@ -4,7 +4,7 @@ Memory of a device is that of the state, gradients, the views of a batch, and wh
 as JAX saves it. What XLA plans differs: it fuses operations, lays arrays out anew, and needs room while it computes. On a CPU its
 own figure (`compiled.memory_analysis()`) was 0.8 to 1.4 times the one here, for both networks of `tiny`, `small` and `thesis`,
 when it was told to save memory (`XLA_FLAGS=--xla_cpu_enable_concurrency_optimized_scheduler=false`). By default it spends memory
-to compute more at once: 1.0 to 1.5 times, and 2.1 times for the ResNet-18 of `thesis`.
+to compute more at once: 1.0 to 1.6 times, and 2.1 times for the ResNet-18 of `thesis`.
 """
 
 from __future__ import annotations

@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from jax.sharding import AbstractDevice, AbstractMesh, PartitionSpec
+from jax.sharding import AbstractDevice, AbstractMesh, AxisType, NamedSharding, PartitionSpec
 
 from mevs_jax import ball_query, farthest_point_sample
 from mevs_jax.points import farthest
@@ -174,7 +174,7 @@ def test_kernels_give_the_same_indices(kind, points, k, radius, samples, random)
         np.testing.assert_array_equal(group, numpy_rules.ball_query(cloud, centre, radius, samples))
 
 
-def test_one_gpu_runs_the_kernels_and_nothing_else_does(monkeypatch):
+def test_one_gpu_runs_the_kernels_and_nothing_else_does():
     """What is lowered for a GPU; whether it runs there is not seen here."""
 
     def both(cloud):
@@ -182,20 +182,22 @@ def test_one_gpu_runs_the_kernels_and_nothing_else_does(monkeypatch):
 
     h100 = AbstractDevice(device_kind="NVIDIA H100 80GB HBM3", num_cores=None, platform="gpu")
 
-    def lowered(points, platform, dtype=np.float32):
-        # JAX 0.12 asks which GPU it lowers kernels for. A function of its own, since JAX remembers what it traced.
+    def lowered(points, platform, dtype=np.float32, devices=1):
+        everywhere = NamedSharding(AbstractMesh((devices,), ("data",), (AxisType.Auto,)), PartitionSpec())
+        cloud = jax.ShapeDtypeStruct((points, 3), dtype, sharding=everywhere)
+        # JAX 0.12 asks which GPU it lowers kernels for.
         with jax.sharding.use_abstract_mesh(AbstractMesh((), (), abstract_device=h100)):
-            traced = jax.jit(lambda cloud: both(cloud)).trace(jax.ShapeDtypeStruct((points, 3), dtype))
+            traced = jax.jit(both).trace(cloud)  # once for all platforms
             return traced.lower(lowering_platforms=(platform,)).as_text().count("xla.gpu.triton")
 
-    assert lowered(1000, "cuda") == 0
-    monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
     assert lowered(1000, "cuda") == 2
+    assert lowered(1000, "tpu") == 0
     assert lowered(20_000, "cuda") == 1  # too large a cloud for the registers of a block
     assert lowered(1000, "cuda", np.float16) == 0
     assert lowered(1000, "cpu") == 0
-    monkeypatch.setattr(jax, "device_count", lambda: 8)
-    assert lowered(1000, "cuda") == 0
+    assert lowered(1000, "cuda", devices=8) == 0
+    exported = jax.export.export(jax.jit(both), platforms=["cuda"])(jax.ShapeDtypeStruct((1000, 3), np.float32))
+    assert "triton" not in exported.mlir_module()  # which would run with this version of JAX alone
 
 
 def test_points_that_are_not_finite_are_no_neighbours():

@@ -87,13 +87,14 @@ def test_no_seams_show_between_faces():
 
 
 @pytest.mark.usefixtures("fully_compiled")
-def test_tiles_make_one_image(monkeypatch):
+def test_tiles_make_one_image():
     """What is left out of a tile is not seen there: one tile for all and small ones, that do not fit the image, show the same."""
     pose = camera_at(fibonacci_sphere(5)[1], 40).pose
 
     def look(side, at_once):
-        monkeypatch.setattr(mesh_renderer, "_pieces", lambda _: (side, at_once))
-        see = lambda step: render_mesh(triangles_of("chair"), Camera(orbit(pose, step), resolution=40))  # noqa: E731
+        draw = partial(mesh_renderer._in_pieces, softness=Softness(), tile=side, at_once=at_once)
+        triangles = jnp.asarray(triangles_of("chair"))
+        see = lambda step: draw(triangles, Camera(orbit(pose, step), resolution=40))  # noqa: E731
         return jax.jit(lambda step, along: jax.jvp(see, (step,), (along,)))(jnp.zeros(2), jnp.array([0.6, 0.8]))
 
     (seen, slopes), (whole, whole_slopes) = look(16, 16), look(40, 1024)

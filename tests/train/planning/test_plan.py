@@ -70,7 +70,7 @@ def test_devices_share_a_plan():
 @pytest.mark.parametrize(
     ("preset", "network", "most"),
     [
-        pytest.param("tiny", 0, 1.5, marks=pytest.mark.slow),
+        pytest.param("tiny", 0, 1.7, marks=pytest.mark.slow),
         ("tiny", 1, 1.5),
         ("small", 1, 1.5),
         pytest.param("small", 0, 1.5, marks=pytest.mark.slow),
