@@ -17,7 +17,7 @@ import jax
 import numpy as np
 from jaxtyping import Bool, Float
 
-from mevs_jax.agent.candidates import aimed, candidates_of, mask_of, pose_towards
+from mevs_jax.agent.candidates import aimed, candidates_of, costs_of, mask_of, pose_towards
 from mevs_jax.agent.present import Present, check_shown, sphere_of
 from mevs_jax.agent.programs import Programs
 from mevs_jax.agent.records import Belief, History, Reason, Step, plain
@@ -356,7 +356,7 @@ class Agent:
         allowed = (
             np.array([reachable(pose) for pose in poses], bool) if callable(reachable) else mask_of(reachable, number)
         )
-        costs = self._costs(cost, number)
+        costs = costs_of(cost, number, self.gain_per_cost)
         reason, index, gains = self._reason(), -1, np.zeros(0)
         if not reason:
             index, gains = self._choose(where, allowed & useful & np.isfinite(costs), costs)
@@ -373,18 +373,6 @@ class Agent:
             step = Step(poses[index], of.towards(poses[index]), index, float(gains[index]), False, "", elapsed)
         self.history.events.append(event | {"step": plain(step)})
         return step
-
-    def _costs(self, cost: AnyVector | None, number: int) -> Float[np.ndarray, " candidates"]:
-        """Costs of candidates as they are given, infinite where they cannot be reached."""
-        costs = np.zeros(number) if cost is None else numbers(cost).reshape(-1)
-        _check(costs.shape == (number,), f"cost has {costs.size} values; there are {number} candidates")
-        _check(not np.isnan(costs).any(), "cost has values that are NaN, or no numbers")
-        finite = costs[np.isfinite(costs)]
-        worth = self.gain_per_cost > 0 or not len(finite) or bool(np.ptp(finite) == 0)
-        _check(
-            worth, "costs differ, but gain_per_cost is 0; make the agent with the gain that one unit of cost is worth"
-        )
-        return costs
 
     def _choose(self, where: Candidates, allowed: np.ndarray, costs: np.ndarray) -> tuple[int, np.ndarray]:
         """The best of the allowed candidates, −1 without one, and the expected gains."""

@@ -8,7 +8,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float
 
-from mevs_jax.arrays import AnyArray
+from mevs_jax.arguments import numbers
+from mevs_jax.arrays import AnyArray, AnyVector
 from mevs_jax.geometry.source_view import first_wrong_pose
 from mevs_jax.geometry.viewpoints import great_circle_distances, hull_edges
 from mevs_jax.trained.situation import REPEATED, SAME, Candidates
@@ -117,6 +118,25 @@ def candidates_of(system: TrainedSystem, directions: Float[np.ndarray, "candidat
         jnp.asarray(padded(_weights(points, system.viewpoints), 1)),
         jnp.float32(max(min(spacing / 2, 0.2), REPEATED)),
     )
+
+
+def costs_of(cost: AnyVector | None, number: int, gain_per_cost: float) -> Float[np.ndarray, " candidates"]:
+    """Costs of candidates as they are given, infinite where they cannot be reached.
+
+    Raises:
+        ValueError: for another number of them, for NaN, or if they differ and nothing says what a unit is worth.
+    """
+    costs = np.zeros(number) if cost is None else numbers(cost).reshape(-1)
+    finite = costs[np.isfinite(costs)]
+    if costs.shape != (number,):
+        raise ValueError(f"cost has {costs.size} values; there are {number} candidates")
+    if np.isnan(costs).any():
+        raise ValueError("cost has values that are NaN, or no numbers")
+    if gain_per_cost == 0 and len(finite) and np.ptp(finite) > 0:
+        raise ValueError(
+            "costs differ, but gain_per_cost is 0; make the agent with the gain that one unit of cost is worth"
+        )
+    return costs
 
 
 def _neighbours(points: np.ndarray, distances: np.ndarray, nearest: np.ndarray) -> np.ndarray:

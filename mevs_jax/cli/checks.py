@@ -1,4 +1,4 @@
-"""Checks: `mevs check live`, `mevs check agent`, `mevs check transfer`, `mevs check reality`, `mevs check compile`; and `mevs study instances`."""
+"""Checks (`mevs check live`, `agent`, `transfer`, `reality`, `compile`), and `mevs study instances`."""
 
 from __future__ import annotations
 
