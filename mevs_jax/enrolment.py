@@ -125,14 +125,11 @@ def alike(system: TrainedSystem, apart: float = ALIKE) -> list[tuple[str, str]]:
     """Pairs of enrolled objects that a depth camera can hardly tell apart."""
     gallery, names = _gallery_of(system), system.classes
     features, radii = np.asarray(gallery.features), np.asarray(gallery.radii)
-    pairs = []
-    for second in range(1, len(features)):
-        for first in range(second):
-            sizes = radii[[first, second]]
-            steps = abs(np.log(sizes[1] / sizes[0])) / float(gallery.matcher.size) if sizes.all() else 0.0
-            if steps < 2 and differences_by_turn(features[first], features[second]).min() < apart:
-                pairs.append((names[first], names[second]))
-    return pairs
+    told = (radii > 0) & (radii[:, None] > 0)
+    sizes = np.log(np.where(radii > 0, radii, 1.0))
+    of_one_size = ~told | (np.abs(sizes - sizes[:, None]) < 2 * float(gallery.matcher.size))
+    similar = of_one_size & (differences_by_turn(features).min(axis=2) < apart)
+    return [(names[first], names[second]) for first, second in np.argwhere(np.triu(similar, 1))]
 
 
 def _images(shape: Any, camera: ViewCamera, up: AnyVector) -> tuple[UInt8[np.ndarray, "heights yaws pixels"], float]:

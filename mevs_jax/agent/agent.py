@@ -66,6 +66,8 @@ class Agent:
         max_views: the budget: largest number of images of an object, views that are taken again included.
         unknown: an object that is stranger than this share of the known objects is an `unknown object`, in (0, 1]; None: never.
             By default 0.95, or None for a system that has a class of unknown objects, or that cannot tell them.
+        target: name of an enrolled object, or of a class, if nothing but whether it is this one matters: the agent is then sure
+            when its probability is at least `stop` or at most 1 − `stop`, and `Belief.name` says which.
         gain_per_cost: expected gain that one unit of a candidate's cost is worth, in units of the policy's scores (nats for
             `information_gain` and learned policies).
         distance: of the next cameras from the object's centre, in metres; by default that of the training views in radii.
@@ -87,6 +89,7 @@ class Agent:
     stop: float = 0.95
     max_views: int = 8
     unknown: Any = "default"
+    target: str | None = None
     gain_per_cost: float = 0.0
     distance: float | None = None
     max_candidates: int | None = None
@@ -102,6 +105,9 @@ class Agent:
         if self.unknown is not None:
             self.unknown = number(self.unknown, "unknown must be in (0, 1] or None", lambda share: 0 < share <= 1)
             _check(can_tell, "this system cannot tell unknown objects: leave out unknown")
+        names: tuple[str | None, ...] = (None, *self.system.classes)
+        _check(self.target in names, f"target must be one of {', '.join(self.system.classes)[:500]}, or None")
+        self._target = None if self.target is None else names.index(self.target) - 1
         at_least = "gain_per_cost must be at least 0"
         self.gain_per_cost = number(self.gain_per_cost, at_least, lambda gain: 0 <= gain < np.inf)
         if self.distance is not None:
@@ -126,7 +132,7 @@ class Agent:
 
     def _program(self, posed: bool) -> Programs:
         if posed not in self._programs:
-            self._programs[posed] = Programs(self.system, self.policy, posed, self.max_views)
+            self._programs[posed] = Programs(self.system, self.policy, posed, self.max_views, self._target)
         return self._programs[posed]
 
     @_one_at_a_time
@@ -189,7 +195,7 @@ class Agent:
         self._object = Present(sphere, program, program.blank(), true_size)
         options = {"center": sphere.position.tolist(), "radius": sphere.radius, "up": np.asarray(sphere.up).tolist()}
         options |= {} if true_size else {"true_size": False}
-        named = ("stop", "max_views", "unknown", "gain_per_cost", "distance", "seed")
+        named = ("stop", "max_views", "unknown", "target", "gain_per_cost", "distance", "seed")
         policy = self.policy if isinstance(self.policy, str) else getattr(self.policy, "__name__", "a function")
         mine = {"policy": policy} | {name: getattr(self, name) for name in named}
         self.history = History(self.system.name, {"agent": mine, "reset": options | {"yaw": sphere.yaw}})
@@ -390,9 +396,10 @@ class Agent:
         if belief is None:
             return ""
         enough = belief.evidence >= _ENOUGH or not self.system.description.told_unknown
-        sure = belief.confidence >= self.stop and enough
+        target = None if self._target is None else float(belief.probabilities[self._target])
+        sure = (belief.confidence if target is None else max(target, 1 - target)) >= self.stop and enough
         spent = belief.images >= self.max_views
-        if not belief.known and (sure or spent):
+        if not belief.known and target is None and (sure or spent):
             return "unknown object"
         return "sure" if sure else "budget" if spent else ""
 

@@ -21,7 +21,7 @@ from mevs_jax.trained.description import Description
 from mevs_jax.trained.parts import Parts, observe
 from mevs_jax.trained.situation import REPEATED, Candidates, Memory, angles, situation
 from mevs_jax.trained.system import TrainedSystem
-from mevs_jax.trained.usable import fusion_of, policy_of, resolved, shared
+from mevs_jax.trained.usable import INFORMATION_GAIN, fusion_of, policy_of, resolved, shared
 
 
 @dataclass(frozen=True)
@@ -35,6 +35,7 @@ class Steps:
         posed: whether the yaw is known.
         entropy: whether entropies are predicted.
         most: largest number of views.
+        target: label of the enrolled object that alone matters, if there is one.
     """
 
     description: Description
@@ -43,6 +44,7 @@ class Steps:
     posed: bool
     entropy: bool
     most: int
+    target: int | None = None
 
     def see_view(
         self,
@@ -93,6 +95,9 @@ class Steps:
         state, scene = situation(parts, memory, candidates, failed, allowed, self.posed)
         policy, number, slots = self.policy, len(candidates.directions), jnp.zeros(self.most)
         run = policy_of(self.description, parts, policy, self.posed) if isinstance(policy, str) else policy
+        among = None if parts.gallery is None else gain_among(parts.gallery, self.posed, self.target)
+        if among is not None and policy == INFORMATION_GAIN:
+            run = among
         assert scene.reachable is not None
         left, costs = scene.reachable & ~state.attempted, jnp.concatenate([cost, slots])
         scores = run(jax.random.fold_in(key, state.count), state, scene) - costs
@@ -101,8 +106,8 @@ class Steps:
         first = jnp.argmax(jnp.where(left, jnp.concatenate([self._first(parts, candidates), slots]) - costs, -jnp.inf))
         chosen = jnp.where(jnp.any(left), jnp.where(memory.count > 0, index, first), -1)
         known, gains = scene.knowledge, jnp.full(number, jnp.nan)
-        if parts.gallery is not None:
-            gains = gain_among(parts.gallery, self.posed)(key, state, scene)[:number]
+        if among is not None:
+            gains = among(key, state, scene)[:number]
         elif known is not None and (known.expected_logits is not None or known.by_pose is not None):
             gains = information_gain(key, state, scene)[:number]
         return chosen, gains
@@ -128,7 +133,7 @@ def _choose(steps: Steps) -> Any:
 class Programs:
     """The compiled steps for one policy, and a known or unknown yaw."""
 
-    def __init__(self, system: TrainedSystem, policy: str | Policy, posed: bool, most: int):
+    def __init__(self, system: TrainedSystem, policy: str | Policy, posed: bool, most: int, target: int | None = None):
         entropy = system.parts.entropy is not None and posed
         if entropy and system.why_not(policy, posed, False) is None:
             entropy = False  # the policy does not use predicted entropies
@@ -143,8 +148,8 @@ class Programs:
             registered = POLICIES.get(policy)
         else:
             policy = shared(policy)
-        self.steps = Steps(system.description, policy, registered, posed, entropy, most)
-        self._see = _see(replace(self.steps, policy="", registered=None))  # the same for all policies
+        self.steps = Steps(system.description, policy, registered, posed, entropy, most, target)
+        self._see = _see(replace(self.steps, policy="", registered=None, target=None))  # the same for all policies
         self.choose = _choose(self.steps)
 
     def see(self, parts: Parts, memory: Memory, depth: np.ndarray, pose: np.ndarray, radius: float) -> Any:

@@ -108,7 +108,7 @@ COMMANDS = {
         ("dataset", "rendering", "evaluation"),
     ),
     "study instances": Command(
-        "how well enrolled objects are told apart; learns what they are enrolled with anew, if asked",
+        "how well enrolled objects are told apart",
         "InstancesOptions",
         "checks:instances",
         tool=True,

@@ -20,12 +20,12 @@ def by_hypotheses(gallery: Gallery, posed: bool) -> Fuse:
     return fuse
 
 
-def gain_among(gallery: Gallery, posed: bool) -> Policy:
+def gain_among(gallery: Gallery, posed: bool, target: int | None = None) -> Policy:
     """Returns the policy of the largest expected information gain over objects and yaws; see `Gallery.gains`."""
 
     def gain(key: Array, state: SelectionState, scene: Scene) -> Float[Array, " views"]:
         del key
-        return gallery.gains(evidence_of(gallery, state, posed), scene.graph.points)
+        return gallery.gains(evidence_of(gallery, state, posed), scene.graph.points, target)
 
     return gain
 

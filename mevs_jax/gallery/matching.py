@@ -231,7 +231,9 @@ class Gallery:
         known = jax.scipy.special.logsumexp(hypotheses, axis=1) + jax.nn.log_sigmoid(-odds)
         return jnp.append(known, jax.nn.log_sigmoid(odds))
 
-    def gains(self, evidence: Evidence, directions: Float[Array, "candidates 3"]) -> Float[Array, " candidates"]:
+    def gains(
+        self, evidence: Evidence, directions: Float[Array, "candidates 3"], target: int | None = None
+    ) -> Float[Array, " candidates"]:
         """Expected decrease of the entropy over objects in nats by one more view, if the object is none unknown.
 
         Each of the likeliest hypotheses is taken to be true in turn: it says what a camera at a candidate would see, and so what
@@ -241,6 +243,7 @@ class Gallery:
         Args:
             evidence: of the views so far.
             directions: unit vectors from the object to the candidates.
+            target: the object that alone matters: what counts is whether it is this one.
         """
         objects, count = len(self.radii), evidence.count
         flat = self.hypotheses(evidence).reshape(-1)
@@ -254,7 +257,8 @@ class Gallery:
         apart = (count * before + apart) / (count + 1)
         likelihood = -self.matcher.power(count + 1, objects) * jnp.log(apart + self.matcher.floor)
         after = jax.nn.log_softmax(likelihood - 0.5 * evidence.size[index // YAWS], axis=-1)
-        same = (index[:, None] // YAWS == index // YAWS).astype(jnp.float32)
+        answer = index // YAWS if target is None else index // YAWS == target
+        same = (answer[:, None] == answer).astype(jnp.float32)
 
         def entropy(logarithms: Float[Array, "*batch hypotheses"]) -> Float[Array, "*batch"]:
             weights = jnp.exp(logarithms)
@@ -264,19 +268,20 @@ class Gallery:
 
 
 def differences_by_turn(
-    one: Float[np.ndarray, "heights yaws features"], other: Float[np.ndarray, "heights yaws features"]
-) -> Float[np.ndarray, " yaws"]:
-    """Mean squared difference of two objects' images if the second is turned by each yaw; without those from straight below."""
-    one, other = one[1:], other[1:]
+    features: Float[np.ndarray, "objects heights yaws features"],
+) -> Float[np.ndarray, "objects objects yaws"]:
+    """Mean squared difference of each two objects' images if the second is turned by each yaw; without those from below."""
+    seen = features[:, 1:]
     # The products for all turns at once, by the Fourier transform over yaws.
-    spectrum = np.fft.rfft(one, axis=1) * np.conj(np.fft.rfft(other, axis=1))
-    products = np.fft.irfft(spectrum, n=YAWS, axis=1).sum(axis=(0, 2))
-    return np.maximum((one**2).sum() + (other**2).sum() - 2 * products, 0) / one.size
+    spectra = np.fft.rfft(seen, axis=2)
+    both = np.einsum("ahwf,bhwf->abw", spectra, np.conj(spectra), optimize=True)
+    products, squares = np.fft.irfft(both, n=YAWS, axis=2), np.square(seen).sum(axis=(1, 2, 3))
+    return np.maximum(squares[:, None, None] + squares[:, None] - 2 * products, 0) / max(seen[:1].size, 1)
 
 
 def symmetry_of(features: Float[np.ndarray, "heights yaws features"]) -> int:
     """The largest number of equal turns at each of which an object looks alike: a divisor of `YAWS`."""
-    alike = differences_by_turn(features, features) < ALIKE
+    alike = differences_by_turn(features[None])[0, 0] < ALIKE
     return max(turns for turns in range(1, YAWS + 1) if YAWS % turns == 0 and alike[:: YAWS // turns].all())
 
 

@@ -128,7 +128,9 @@ def test_bad_input_gets_one_sentence_and_exit_code_2(tmp_path, make, message, re
 def test_unknown_words_are_refused_and_help_reads_well(tmp_path, refuses, at_once):
     assert "unknown command 'fly'" in refuses("fly")
     assert "unknown preset 'huge'" in refuses("run", "--preset", "huge")
-    assert "followed by one of thesis, learned, rendering, published-code; none was given" in refuses("study")
+    assert "followed by one of thesis, learned, rendering, instances, published-code; none was given" in refuses(
+        "study"
+    )
     assert "'fly' is none of them" in refuses("check", "fly")
     assert "no data set in" in refuses("train", "--out", tmp_path)
     assert "cannot join the other processes" in refuses("train", "--distributed", "--out", tmp_path)
@@ -151,7 +153,9 @@ def test_a_command_shows_its_own_options(name, at_once):
     assert len(shown.stdout.splitlines()) <= 80
     command = COMMANDS[ALIASES.get(name, name)]
     assert ("--preset" in shown.stdout) != command.tool
-    assert ("--data " in shown.stdout) == ("dataset" in command.settings or name in ("check transfer", "check reality"))
+    assert ("--data " in shown.stdout) == (
+        "dataset" in command.settings or name in ("check transfer", "check reality", "study instances")
+    )
     for group in command.settings:
         assert f"--{group}.*" in shown.stdout
 

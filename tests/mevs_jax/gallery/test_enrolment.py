@@ -89,6 +89,16 @@ def test_enrolled_objects_are_recognised_at_any_yaw_and_others_are_not(known: Tr
     assert (reason, belief.known) == ("unknown object", False)
 
 
+def test_an_agent_may_ask_for_one_object_alone(known: TrainedSystem, shapes) -> None:
+    reason, belief = walk(known, shapes["knob"], yaw=1.0, target="knob")
+    assert (reason, belief.name) == ("sure", "knob")
+    reason, belief = walk(known, shapes["tall"], yaw=1.0, target="knob")
+    assert reason == "sure"
+    assert belief.probabilities[0] < 0.05
+    with pytest.raises(ValueError, match="target must be one of knob, plain, tall, unknown object"):
+        known.agent(target="cup")
+
+
 def test_true_sizes_count(known: TrainedSystem, shapes) -> None:
     """An object of the shape of a known one, but half as large, is another one."""
     radius = float(known.parts.gallery.radii[2])

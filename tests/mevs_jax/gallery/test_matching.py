@@ -19,10 +19,12 @@ from mevs_jax.gallery.matching import (
     YAWS,
     Gallery,
     Matcher,
+    differences_by_turn,
     grid_directions,
     interpolated,
     small_image,
     stored_image,
+    symmetry_of,
 )
 from mevs_jax.trained import TrainedSystem
 from tests.mevs_jax.gallery.conftest import CAMERA
@@ -166,6 +168,23 @@ def test_gains_are_those_of_every_hypothesis_taken_as_true(known: TrainedSystem)
             after = np.exp(-0.5 * np.asarray(evidence.size)[:, None]) / ((apart + more) / 2 + floor) ** power
             expected -= now[object_, yaw] * entropy(after / after.sum())
         assert gain == pytest.approx(expected, abs=2e-3)
+
+
+def test_differences_by_turn_are_those_of_turned_images() -> None:
+    features = np.random.default_rng(5).normal(size=(3, HEIGHTS, YAWS, 2))
+    features[2] = np.roll(features[0], 12, axis=1)
+    found = differences_by_turn(features)
+    for turn in (0, 5, 24):
+        slowly = np.mean((features[0, 1:] - np.roll(features[1, 1:], turn, axis=1)) ** 2)
+        assert found[0, 1, turn] == pytest.approx(slowly)
+    assert found[0, 2].argmin() == 24
+    assert found[0, 2, 24] == pytest.approx(0, abs=1e-9)
+
+
+@pytest.mark.parametrize("turns", [1, 2, 3, 4, 12, 36])
+def test_symmetries_are_equal_turns(turns: int) -> None:
+    part = np.random.default_rng(turns).normal(size=(HEIGHTS, YAWS // turns, 3))
+    assert symmetry_of(np.tile(part, (1, turns, 1))) == turns
 
 
 def test_views_of_what_tells_objects_apart_are_worth_most(known: TrainedSystem, shapes) -> None:

@@ -39,8 +39,8 @@ def _level(cells: np.ndarray) -> np.ndarray:
 
 
 def test_differences_become_white():
-    shapes = made_up(40, 0.02, 2)
-    projection = np.asarray(fit_projection(iter(shapes), FEATURES - 1))
+    shapes = made_up(40, 0.06, 2)
+    projection = np.asarray(fit_projection(iter(shapes), FEATURES - 2))
     apart = []
     for one in shapes:
         heights, azimuths = np.unravel_index(
@@ -51,7 +51,7 @@ def test_differences_become_white():
         predicted = one.gallery[heights, (azimuths - one.yaw) % YAWS] / STEPS
         apart.append(((one.images - predicted) * WEIGHTS @ projection)[middle])
     covariance = np.cov(np.concatenate(apart).T)
-    np.testing.assert_allclose(covariance, np.eye(FEATURES - 1), atol=0.25)
+    np.testing.assert_allclose(covariance, np.eye(FEATURES - 2), atol=0.25)
 
 
 def test_calibration_makes_probabilities_true_and_strangers_unknown():
