@@ -43,7 +43,6 @@ from mevs_jax.geometry.viewpoints import fibonacci_sphere, hull_edges
 from mevs_jax.trained.description import FORM, UNKNOWN_OBJECT, DataDescription, Description, ImageInput
 from mevs_jax.trained.parts import Parts
 from mevs_jax.trained.system import TrainedSystem
-from mevs_jax.trained.usable import INFORMATION_GAIN
 
 _SPLITS = ("train", "val")
 _RIDGE = 1e-5
@@ -267,9 +266,9 @@ def objects_system(matcher: Matcher, camera: ViewCamera, views: int = 40) -> Tra
         camera=camera,
         image=ImageInput("depth", 1),
         encoder=None,
-        best=INFORMATION_GAIN,
-        best_unposed=INFORMATION_GAIN,
-        chosen_by="its gain is computed for the enrolled objects themselves",
+        best="farthest",
+        best_unposed="farthest",
+        chosen_by="it needs no knowledge; expected gain was not better",
         data=DataDescription("enrolled objects", "", {"enrolled": 0}),
         made_by=hashlib.sha256(np.asarray(matcher.projection).tobytes()).hexdigest()[:16],
         made_with={name: version(name) for name in ("jax", "mevs-jax")},
