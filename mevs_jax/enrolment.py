@@ -83,7 +83,7 @@ def enrol(
         if {one, other} & set(objects):
             warnings.warn(
                 f"{one} and {other} look alike to a depth camera: an answer between them is hardly ever sure. Enrol one "
-                "of them, or tell them apart by other means",
+                "of them, or distinguish them by other means",
                 AlikeWarning,
                 stacklevel=2,
             )

@@ -7,16 +7,17 @@ so holes and flipped triangles of CAD models do no harm.
 A capture stores for each view the depth as 16-bit integers in units of 1/10,000 (the thesis's format) and a shaded image. The
 partial cloud of a view is not stored: it is the depth unprojected with the pose (`mevs_jax.unproject`). The thesis's
 method, an Open3D window, is in `data_pipeline.capture.visualizer`. Capture workers import this module, so it must not import
-JAX, which would slow their start; only `rig_for`, which workers do not call, needs it.
+JAX, which would slow their start; only `rig_for` and `rig_at`, which workers do not call, need it.
 """
 
 from __future__ import annotations
 
 import zlib
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -25,13 +26,15 @@ from data_pipeline.capture.viewpoints import viewpoints_of
 from data_pipeline.files import npz_bytes, write_bytes
 from data_pipeline.objects.mesh import Mesh
 from data_pipeline.objects.open3d_parts import load_open3d
+from mevs_jax.geometry.casting import Cast, cast_inside, embree
+
+if TYPE_CHECKING:
+    from mevs_jax.geometry.cameras import Camera
 
 AMBIENT = 0.25
 """Grey level, in [0, 1], of a surface seen edge-on."""
 
 _RAYS_PER_BATCH = 100_000
-_ROUNDING = 1e-3
-"""Radii by which a hit may be outside of the unit sphere."""
 
 
 @dataclass(frozen=True)
@@ -105,9 +108,7 @@ def rig_for(config: CaptureConfig) -> Rig:
         ValueError: if the lattice cannot have this number of views.
     """
     check_camera(config)
-    import jax
-
-    from mevs_jax.geometry.cameras import cameras_at, pixel_directions
+    from mevs_jax.geometry.cameras import cameras_at
 
     cameras = cameras_at(
         viewpoints_of(config).points.astype(np.float32),
@@ -115,17 +116,18 @@ def rig_for(config: CaptureConfig) -> Rig:
         resolution=config.resolution,
         field_of_view=np.deg2rad(config.field_of_view),
     )
+    return replace(rig_at(cameras), turned=config.turned)
+
+
+def rig_at(cameras: Camera) -> Rig:
+    """Returns some cameras as arrays."""
+    import jax
+
+    from mevs_jax.geometry.cameras import pixel_directions
+
     directions = jax.vmap(pixel_directions)(cameras)
-    return Rig(
-        np.asarray(cameras.pose, np.float32),
-        np.asarray(directions, np.float32),
-        float(np.deg2rad(config.field_of_view)),
-        config.turned,
-    )
-
-
-Cast = Callable[[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]
-"""Maps origins and directions (rays, 3) to depths (rays,), inf for a miss, and the indices of the triangles hit (rays,)."""
+    poses = np.asarray(cameras.pose, np.float32)
+    return Rig(poses, np.asarray(directions, np.float32), float(cameras.field_of_view))
 
 
 Caster = Callable[[Mesh], Cast]
@@ -147,18 +149,7 @@ def cast_open3d(mesh: Mesh) -> Cast:
 
 def cast_embree(mesh: Mesh) -> Cast:
     """Ray casting with trimesh's Embree binding."""
-    from embreex.mesh_construction import TriangleMesh
-    from embreex.rtcore_scene import EmbreeScene
-
-    scene = EmbreeScene()
-    TriangleMesh(scene, np.ascontiguousarray(mesh.vertices), np.ascontiguousarray(mesh.faces))
-
-    def cast(origins: np.ndarray, directions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        hits = scene.run(np.ascontiguousarray(origins), np.ascontiguousarray(directions), output=1)
-        missed = hits["primID"] < 0
-        return np.where(missed, np.inf, hits["tfar"]).astype(np.float32), hits["primID"].astype(np.int64)
-
-    return cast
+    return embree(mesh.vertices, mesh.faces)
 
 
 @cache
@@ -189,7 +180,7 @@ def capture(mesh: Mesh, rig: Rig, caster: Caster | None = None) -> Capture:
         ends = np.cumsum([len(view_rays) for view_rays in rays])
         directions = np.concatenate(rays)
         origins = np.repeat(rig.poses[batch_views, :3, 3], np.diff(ends, prepend=0), axis=0)
-        found, triangle = _cast_inside(cast, origins, directions)
+        found, triangle = cast_inside(cast, origins, directions)
         hit = np.flatnonzero(np.isfinite(found))
         shades = np.zeros(len(found), np.uint8)
         shades[hit] = shade(normals[triangle[hit]], directions[hit])
@@ -199,25 +190,6 @@ def capture(mesh: Mesh, rig: Rig, caster: Caster | None = None) -> Capture:
             depth[view][window] = stored.reshape(depth[view][window].shape)
             image[view][window] = shaded.reshape(depth[view][window].shape)
     return Capture(depth, image, mesh.extent, mesh.radius)
-
-
-def _cast_inside(cast: Cast, origins: np.ndarray, directions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Casts rays at a mesh inside the unit sphere.
-
-    Embree now and then returns a hit far from a triangle that is seen edge-on. Such hits are outside of the sphere; these rays
-    are cast again from where they may enter it.
-    """
-    found, triangle = cast(origins, directions)
-    distance = np.linalg.norm(origins, axis=1)
-    near, far = distance - 1 - _ROUNDING, distance + 1 + _ROUNDING
-    wrong = np.flatnonzero(np.isfinite(found) & ((found < near) | (found > far)))
-    if len(wrong):
-        ahead = near[wrong].astype(np.float32)
-        again, hit = cast(origins[wrong] + ahead[:, None] * directions[wrong], directions[wrong])
-        found, triangle = found.copy(), triangle.copy()
-        found[wrong] = np.where(again + ahead <= far[wrong], again + ahead, np.inf)
-        triangle[wrong] = hit
-    return found, triangle
 
 
 def _windows(vertices: np.ndarray, rig: Rig) -> list[tuple[slice, slice]]:

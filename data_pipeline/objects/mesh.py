@@ -8,7 +8,8 @@ from typing import Protocol, runtime_checkable
 import numpy as np
 
 from data_pipeline.errors import DamagedMesh, EmptyMesh, naming
-from data_pipeline.objects.formats.polygons import check_indices, have_area
+from data_pipeline.objects.formats.polygons import check_indices
+from mevs_jax.geometry.faces import have_area
 
 MODELNET10_CLASSES = ("bathtub", "bed", "chair", "desk", "dresser", "monitor", "night_stand", "sofa", "table", "toilet")
 """The classes of ModelNet10 and of furniture10, in alphabetical order, which is the order of labels."""

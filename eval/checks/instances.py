@@ -1,4 +1,4 @@
-"""How well enrolled objects are told apart, from meshes and from a few depth images: `mevs study instances`."""
+"""How well enrolled objects are recognised, from meshes and from a few depth images: `mevs study instances`."""
 
 from __future__ import annotations
 
@@ -226,15 +226,15 @@ def _shape(
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
     directions = _spread(directions[directions[:, 2] > _LEVEL], condition.frames)
     rig = turned_rig(camera, directions, 0.0)
-    depth, hit = jnp.asarray(capture(mesh, rig).depth), capture(mesh, rig).depth > 0
+    depth = capture(mesh, rig).depth
     reality = RealityAugmentation(1.0 if condition.errors else 0.0, sphere=0.0, floor=0.0, hidden=0.0)
     key = jax.random.key(int(random.integers(2**31)))
-    real = np.asarray(_realistic(key, depth, jnp.asarray(rig.poses), camera, reality))
+    real = np.asarray(_realistic(key, jnp.asarray(depth), jnp.asarray(rig.poses), camera, reality))
     poses = rig.poses.astype(float)
     poses[:, :3, 3] *= mesh.radius
     return [
         DepthImage(image * mesh.radius, camera.intrinsics, pose, mask=mask)
-        for image, pose, mask in zip(real, poses, hit, strict=True)
+        for image, pose, mask in zip(real, poses, depth > 0, strict=True)
     ]
 
 

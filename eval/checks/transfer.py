@@ -7,12 +7,10 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, Int
 
-from data_pipeline.capture.casting import Rig, capture
+from data_pipeline.capture.casting import capture, rig_at
 from data_pipeline.dataset.inputs import metric_depth
 from data_pipeline.errors import DataError, EmptyMesh, reason_of
 from data_pipeline.objects.formats import Up
@@ -26,7 +24,6 @@ from eval.checks.walks import BASELINE, AccuracyRow, Observer, Walker, Walks, ro
 from eval.numbers.confidence import stops_of
 from eval.numbers.metrics import Stop
 from eval.system import USABLE
-from mevs_jax.geometry.cameras import pixel_directions
 from mevs_jax.selection.loop import ViewTable
 from mevs_jax.trained import TrainedSystem
 from mevs_jax.trained.description import UNKNOWN_OBJECT
@@ -180,9 +177,7 @@ def see_objects(system: TrainedSystem, source: ObjectSource, labels: Mapping[str
     Raises:
         DataError: if none is left.
     """
-    camera, poses = system.description.camera, jnp.asarray(system.poses)
-    directions = jax.vmap(lambda pose: pixel_directions(camera.at(pose)))(poses)
-    rig = Rig(np.asarray(poses, np.float32), np.asarray(directions, np.float32), camera.radians)
+    rig = rig_at(system.description.camera.at(system.poses))
     left_out = {name: reason for by_name in source.left_out.values() for name, reason in by_name.items()}
     names, folders, observer = [], [], Observer(system)
     with progress_bar("objects") as bar:

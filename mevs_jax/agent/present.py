@@ -46,7 +46,7 @@ class Present:
         failed: directions (3,), in its frame, from which no view could be taken.
         points: (points, 3) of its surface in the world, if its sphere is estimated from them; None if it is known.
         images: from which they are.
-        parts: the views so far, each combined from images that show parts, if networks are told what is unknown.
+        parts: the views so far, each combined from images that show parts, if networks receive a mask of unknown pixels.
         merged: directions (3,), in its frame, of images that became parts of views from other directions.
         shown: share of the sphere that is known in each view, by its slot in the memory.
     """

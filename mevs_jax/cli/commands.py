@@ -108,7 +108,7 @@ COMMANDS = {
         ("dataset", "rendering", "evaluation"),
     ),
     "study instances": Command(
-        "how well enrolled objects are told apart",
+        "how well enrolled objects are recognised",
         "InstancesOptions",
         "checks:instances",
         tool=True,

@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Array, Float, UInt8
 
 from mevs_jax.gallery.matching import HEIGHTS, PIXELS, SIDE, YAWS, grid_directions, stored_image
-from mevs_jax.geometry.cameras import ViewCamera, cameras_at, pixel_directions
+from mevs_jax.geometry.cameras import ViewCamera, pixel_directions
 from mevs_jax.geometry.source_view import DepthImage
 from mevs_jax.geometry.sphere import Sphere, upright
 
@@ -49,7 +49,7 @@ def images_of_frames(
         total, weight, hits = _fused(total, weight, depth, K, pose, floor)
         if not int(hits):
             raise ValueError(f"frame {number} shows nothing inside the object's sphere")
-    poses = np.asarray(cameras_at(grid_directions(), distance=camera.distance).pose).reshape(HEIGHTS, YAWS, 4, 4)
+    poses = np.asarray(camera.around(grid_directions()).pose).reshape(HEIGHTS, YAWS, 4, 4)
     rows = [_images(total, weight, jnp.asarray(row), camera) for row in poses]
     return np.asarray(jnp.stack(rows)).reshape(HEIGHTS, YAWS, PIXELS)
 

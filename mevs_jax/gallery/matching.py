@@ -2,8 +2,8 @@
 
 A gallery holds, for each object, small depth images from a grid of directions around it. A *hypothesis* is an object at a yaw.
 It predicts the image of any camera, by interpolation between the images of the grid. The difference between a view and its
-prediction is Gaussian, with a covariance that a `Matcher` learned from other objects: it has the errors of the sensor, of the
-object's believed sphere, and of the interpolation in it.
+prediction is reduced to a few numbers, which a `Matcher` learned from other objects: those in which shapes differ most beside the
+errors of the sensor, of the object's believed sphere, and of the interpolation.
 
 How strong the errors are differs from object to object and is not known, so the likelihood of a walk is a power of the mean
 squared difference of its views (a Student t distribution). The power does not grow in proportion to the number of views, since
@@ -111,9 +111,24 @@ class Matcher:
         """Of the likelihood of a walk of `count` views, among so many objects."""
         return jnp.exp(self.heat @ _numbers(count, objects))
 
-    def strange_odds(self, apart: Float[Array, ""], count: Float[AnyArray, ""], objects: int) -> Float[Array, ""]:
-        """Log-odds that an object is none of those enrolled, by the squared difference of the best hypothesis."""
-        return self.stranger[:3] @ _numbers(count, objects) + self.stranger[3] * jnp.log(apart + 1e-6)
+    def likelihood(
+        self, apart: Float[AnyArray, "..."], count: Float[AnyArray, "*walks"], objects: int
+    ) -> Float[Array, "..."]:
+        """Logarithm of the likelihood of walks under hypotheses, which the last two axes of their squared differences are of."""
+        return -self.power(count, objects)[..., None, None] * jnp.log(apart + self.floor)
+
+    @staticmethod
+    def strangeness(
+        apart: Float[AnyArray, "*walks"], count: Float[AnyArray, "*walks"], objects: int
+    ) -> Float[Array, "numbers *walks"]:
+        """What the odds of an unknown object depend on, in the order of `stranger`, from the best hypothesis' difference."""
+        return jnp.concatenate([_numbers(count, objects), jnp.log(jnp.asarray(apart) + 1e-6)[None]])
+
+    def strange_odds(
+        self, apart: Float[AnyArray, "*walks"], count: Float[AnyArray, "*walks"], objects: int
+    ) -> Float[Array, "..."]:
+        """Log-odds that an object is none of those enrolled."""
+        return self.stranger @ self.strangeness(apart, count, objects)
 
 
 @flax.struct.dataclass
@@ -218,9 +233,8 @@ class Gallery:
 
     def hypotheses(self, evidence: Evidence) -> Float[Array, "objects yaws"]:
         """Log-probabilities of objects and yaws, if the object is none unknown."""
-        power = self.matcher.power(evidence.count, len(self.radii))
-        likelihood = -power * jnp.log(evidence.apart + self.matcher.floor) - 0.5 * evidence.size[:, None]
-        return jax.nn.log_softmax(likelihood, axis=(0, 1))
+        likelihood = self.matcher.likelihood(evidence.apart, evidence.count, len(self.radii))
+        return jax.nn.log_softmax(likelihood - 0.5 * evidence.size[:, None], axis=(0, 1))
 
     def beliefs(self, evidence: Evidence) -> Float[Array, " classes"]:
         """Log-probabilities of the objects and, last, of an unknown object."""
@@ -255,7 +269,7 @@ class Gallery:
         squares = jnp.diagonal(products, axis1=1, axis2=2)
         apart = jnp.maximum(squares[:, :, None] + squares[:, None, :] - 2 * products, 0.0) + jnp.min(before)
         apart = (count * before + apart) / (count + 1)
-        likelihood = -self.matcher.power(count + 1, objects) * jnp.log(apart + self.matcher.floor)
+        likelihood = self.matcher.likelihood(apart, count + 1, objects)
         after = jax.nn.log_softmax(likelihood - 0.5 * evidence.size[index // YAWS], axis=-1)
         answer = index // YAWS if target is None else index // YAWS == target
         same = (answer[:, None] == answer).astype(jnp.float32)

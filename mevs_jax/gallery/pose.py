@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Float
 
 from mevs_jax.arrays import ByContent
-from mevs_jax.geometry.sphere import Sphere
+from mevs_jax.geometry.sphere import Sphere, turned
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,8 +44,7 @@ def object_pose(yaws: Float[np.ndarray, " yaws"], symmetry: int, sphere: Sphere)
     equal = (np.angle(mean) + 2 * np.pi * np.arange(symmetry)) / symmetry
     likeliest = around[probability.argmax()]
     yaw = equal[np.cos(equal - likeliest).argmax()] if length > 1e-6 else likeliest
-    cosine, sine = np.cos(yaw), np.sin(yaw)
     pose = np.eye(4)
-    pose[:3, :3] = sphere.rotation @ np.array([[cosine, -sine, 0], [sine, cosine, 0], [0, 0, 1]])
+    pose[:3, :3] = sphere.rotation @ turned(yaw)
     pose[:3, 3] = sphere.position
     return ObjectPose(pose, float(yaw % (2 * np.pi)), float(spread), symmetry)

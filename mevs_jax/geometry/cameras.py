@@ -89,6 +89,10 @@ class ViewCamera:
         middle = (self.resolution - 1) / 2
         return np.array([[focal, 0, middle], [0, focal, middle], [0, 0, 1]])
 
+    def around(self, directions: Float[AnyArray, "views 3"]) -> Camera:
+        """Returns the pinhole cameras that look at the object's centre from some directions, unit vectors from there."""
+        return cameras_at(directions, distance=self.distance, resolution=self.resolution, field_of_view=self.radians)
+
     def at(self, pose: Float[AnyArray, "*batch 4 4"], resolution: int | None = None) -> Camera:
         """Returns the pinhole camera at `pose`, with another resolution where one is given."""
         return Camera(jnp.asarray(pose), self.radians, resolution or self.resolution)

@@ -59,13 +59,18 @@ class Sphere(ByContent):
     @cached_property
     def rotation(self) -> Float[np.ndarray, "3 3"]:
         """From the object's frame to the world; an unknown yaw counts as 0."""
-        cosine, sine = np.cos(self.yaw or 0.0), np.sin(self.yaw or 0.0)
-        return upright(self.up).T @ np.array([[cosine, -sine, 0], [sine, cosine, 0], [0, 0, 1]])
+        return upright(self.up).T @ turned(self.yaw or 0.0)
 
     @property
     def axis(self) -> Float[np.ndarray, " 3"]:
         """The upward direction as a unit vector."""
         return self.rotation[:, 2]
+
+
+def turned(yaw: float) -> Float[np.ndarray, "3 3"]:
+    """The rotation about z by an angle in radians."""
+    cosine, sine = np.cos(yaw), np.sin(yaw)
+    return np.array([[cosine, -sine, 0], [sine, cosine, 0], [0, 0, 1]])
 
 
 def upright(up: AnyVector) -> Float[np.ndarray, "3 3"]:

@@ -6,9 +6,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from mevs_jax.arguments import numbers
-
-_FLAT = 1e-12
-"""A face is without area if its area is below this share of the square of the mesh's extent."""
+from mevs_jax.geometry.faces import have_area
 
 
 def unit_triangles(
@@ -36,12 +34,9 @@ def centred_triangles(vertices: np.ndarray, faces: np.ndarray) -> tuple[Float[np
     corners = vertices[faces]
     if not np.isfinite(corners).all():
         raise ValueError("the mesh has coordinates that are not finite")
-    extent = np.ptp(corners, axis=(0, 1)).max()
-    if not 0 < extent < np.inf:
+    if not 0 < np.ptp(corners, axis=(0, 1)).max() < np.inf:
         raise ValueError("the mesh is a single point")
-    shape = (corners - corners[0, 0]) / extent
-    area = np.linalg.norm(np.cross(shape[:, 1] - shape[:, 0], shape[:, 2] - shape[:, 0]), axis=1)
-    corners = corners[area > _FLAT]
+    corners = corners[have_area(vertices, faces)]
     if not len(corners):
         raise ValueError("the mesh has no area: all its triangles are lines or points")
     low, high = corners.min(axis=(0, 1)), corners.max(axis=(0, 1))

@@ -69,8 +69,8 @@ from the object's centre, z up in the image.
 
 ## Limits
 
-* Objects are told apart by their shape, and by their size where it is known; colour is not used. A depth camera cannot tell
-  some objects apart: `mevs_jax.enrolment.alike` names them.
+* Objects are distinguished by their shape, and by their size where it is known; colour is not used. Some objects look alike to
+  a depth camera: `mevs_jax.enrolment.alike` names them.
 * Objects are upright. Their yaw may be unknown, a tilt may not.
 * Confidence is calibrated on procedural shapes of other kinds.
 """

@@ -14,7 +14,6 @@ from jaxtyping import Array, Float
 
 from mevs_jax.arguments import check, known
 from mevs_jax.arrays import AnyArray
-from mevs_jax.geometry.cameras import cameras_at
 from mevs_jax.geometry.inputs import check_depth
 from mevs_jax.geometry.viewpoints import ViewGraph, great_circle_distances
 from mevs_jax.policies.base import Observation, Policy
@@ -88,7 +87,7 @@ class TrainedSystem:
     @cached_property
     def poses(self) -> Float[np.ndarray, "views 4 4"]:
         """Poses of the camera at the viewpoints, in the frame of an upright object, in radii."""
-        return np.asarray(cameras_at(self.viewpoints, distance=self.description.camera.distance).pose)
+        return np.asarray(self.description.camera.around(self.viewpoints).pose)
 
     @cached_property
     def graph(self) -> ViewGraph:

@@ -22,7 +22,7 @@ from scipy.linalg import eigh
 from scipy.optimize import minimize
 from scipy.special import log_softmax, logsumexp
 
-from data_pipeline.capture.casting import Rig, capture
+from data_pipeline.capture.casting import Rig, capture, rig_at
 from data_pipeline.dataset.reality import RealityAugmentation, realistic_views
 from data_pipeline.objects.mesh import ObjectEntry
 from data_pipeline.objects.sources import furniture_families, load_object, strangers
@@ -38,7 +38,8 @@ from mevs_jax.gallery.matching import (
     small_image,
 )
 from mevs_jax.gallery.meshes import images_of_mesh
-from mevs_jax.geometry.cameras import ViewCamera, cameras_at, pixel_directions
+from mevs_jax.geometry.cameras import ViewCamera
+from mevs_jax.geometry.sphere import turned
 from mevs_jax.geometry.viewpoints import fibonacci_sphere, hull_edges
 from mevs_jax.trained.description import FORM, UNKNOWN_OBJECT, DataDescription, Description, ImageInput
 from mevs_jax.trained.parts import Parts
@@ -75,14 +76,12 @@ class Sighted(NamedTuple):
     """A shape in a gallery, and views of it.
 
     Attributes:
-        name: of the shape.
         gallery: from all directions.
         yaw: of the shape in its views, as the nearest of the gallery's.
         images, known: of the views, as `small_image`.
         directions: from the shape to the cameras, as they are believed.
     """
 
-    name: str
     gallery: UInt8[np.ndarray, "heights yaws pixels"]
     yaw: int
     images: Float[np.ndarray, "views pixels"]
@@ -101,19 +100,13 @@ def kinds_in_turn(split: str, count: int, seed: int) -> list[ObjectEntry]:
 
 def turned_rig(camera: ViewCamera, directions: Float[np.ndarray, "views 3"], yaw: float) -> Rig:
     """Cameras that see an upright object as those in some directions see it when it is turned by a yaw."""
-    cosine, sine = np.cos(yaw), np.sin(yaw)
-    around = directions @ np.array([[cosine, -sine, 0], [sine, cosine, 0], [0, 0, 1]])
-    cameras = cameras_at(
-        around.astype(np.float32), distance=camera.distance, resolution=camera.resolution, field_of_view=camera.radians
-    )
-    rays = jax.vmap(pixel_directions)(cameras)
-    return Rig(np.asarray(cameras.pose, np.float32), np.asarray(rays, np.float32), camera.radians)
+    return rig_at(camera.around((directions @ turned(yaw)).astype(np.float32)))
 
 
 def sighted(entries: Sequence[ObjectEntry], config: MatcherConfig, camera: ViewCamera, seed: int) -> Iterator[Sighted]:
     """Shapes with their galleries, and their views with the errors of real images."""
     directions = fibonacci_sphere(config.views).astype(np.float32)
-    poses = jnp.asarray(cameras_at(directions, distance=camera.distance).pose)
+    poses = camera.around(directions).pose
 
     @jax.jit
     def seen(key: Array, depth: Array) -> tuple[Array, Array, Array]:
@@ -130,7 +123,7 @@ def sighted(entries: Sequence[ObjectEntry], config: MatcherConfig, camera: ViewC
         depth = capture(mesh, turned_rig(camera, directions, yaw)).depth
         found = map(np.asarray, seen(jax.random.fold_in(jax.random.key(seed), number), jnp.asarray(depth)))
         images, _ = images_of_mesh(mesh.vertices, mesh.faces, camera)
-        yield Sighted(entry.name, images, round(yaw * YAWS / (2 * np.pi)) % YAWS, *found)
+        yield Sighted(images, round(yaw * YAWS / (2 * np.pi)) % YAWS, *found)
 
 
 def fit_matcher(config: MatcherConfig, camera: ViewCamera, seed: int = 0) -> Matcher:
@@ -140,7 +133,7 @@ def fit_matcher(config: MatcherConfig, camera: ViewCamera, seed: int = 0) -> Mat
     val = [*sighted(kinds_in_turn("val", config.calibration_shapes, seed), config, camera, seed + 1)]
     nothing = jnp.float32(1)
     blank = Matcher(projection, nothing, jnp.zeros(3), jnp.zeros(4), nothing, jnp.float32(config.size))
-    return calibrated(blank, val, camera, seed)
+    return calibrated(blank, val, seed)
 
 
 def fit_projection(shapes: Iterator[Sighted], features: int) -> Float[Array, "pixels features"]:
@@ -176,7 +169,7 @@ class _Walks(NamedTuple):
     label: Int[np.ndarray, " walks"]
 
 
-def calibrated(matcher: Matcher, shapes: Sequence[Sighted], camera: ViewCamera, seed: int) -> Matcher:
+def calibrated(matcher: Matcher, shapes: Sequence[Sighted], seed: int) -> Matcher:
     """The matcher with powers of likelihoods and odds of unknown objects as shapes that it was not fitted on need them."""
     gallery = Gallery.of(matcher, np.stack([one.gallery for one in shapes]), np.zeros(len(shapes)))
     apart, shows = _tables(gallery, shapes)
@@ -231,8 +224,8 @@ def _with_power(matcher: Matcher, x: np.ndarray) -> Matcher:
 
 def _log_probabilities(matcher: Matcher, walks: _Walks) -> Float[np.ndarray, "walks objects"]:
     """Of the objects, if each is one of those enrolled."""
-    power = np.asarray(matcher.power(walks.shown, walks.apart.shape[1]))[:, None, None]
-    return np.asarray(log_softmax(logsumexp(-power * np.log(walks.apart + float(matcher.floor)), axis=2), axis=1))
+    likelihood = np.asarray(matcher.likelihood(walks.apart, walks.shown, walks.apart.shape[1]))
+    return np.asarray(log_softmax(logsumexp(likelihood, axis=2), axis=1))
 
 
 def _known_loss(matcher: Matcher, walks: _Walks) -> float:
@@ -242,9 +235,8 @@ def _known_loss(matcher: Matcher, walks: _Walks) -> float:
 
 def _stranger_inputs(walks: _Walks) -> tuple[np.ndarray, np.ndarray]:
     """What the odds of an unknown object depend on, and whether it is one."""
-    best = np.log(walks.apart.min(axis=(1, 2)) + 1e-6)
-    ones, objects = np.ones(len(best)), np.full(len(best), np.log(walks.apart.shape[1]))
-    return np.stack([ones, np.log(walks.shown), objects, best], axis=1), walks.label < 0
+    best = walks.apart.min(axis=(1, 2))
+    return np.asarray(Matcher.strangeness(best, walks.shown, walks.apart.shape[1]), float).T, walks.label < 0
 
 
 def objects_system(matcher: Matcher, camera: ViewCamera, views: int = 40) -> TrainedSystem:

@@ -8,7 +8,7 @@ import numpy as np
 
 from data_pipeline.errors import Damage, EmptyMesh, cut_short
 from data_pipeline.objects.formats.polygons import triangulate
-from data_pipeline.objects.formats.text import columns, numbers, quoted, text_of, without_comments
+from data_pipeline.objects.formats.text import WHOLE, columns, numbers, quoted, text_of, without_comments
 
 _VERTEX = re.compile(r"^[^\S\n]*v(?:[^\S\n]+(.*))?$", re.MULTILINE)
 _FACE = re.compile(r"^[^\S\n]*fo?(?:[^\S\n]+(.*))?$", re.MULTILINE)
@@ -27,7 +27,6 @@ _UNKNOWN = re.compile(
 """A line that is neither geometry nor one of the statements that are ignored. Surfaces and other files (`surf`, `call`) are
 geometry that is not read."""
 
-_WHOLE = re.compile(r"[+-]?[0-9]+")
 _SLASHES = {"/", "//"}
 _NO_VERTEX, _HALF = re.compile(r"(?<!\S)/"), re.compile(r"(?<!\S)/|/(?!\S)")
 _OTHER_CORNERS = re.compile(r"/\S*")
@@ -92,12 +91,12 @@ def _corners(lines: list[str]) -> tuple[np.ndarray, np.ndarray]:
 
 def _check_alike(lines: list[str], joined: str) -> None:
     """Raises `Damage` if a corner is no indices with slashes between them, or might be half of one, as in `1/ 2`."""
-    if _HALF.search(joined) is None and _SLASHES.issuperset(_WHOLE.sub("", joined).split()):
+    if _HALF.search(joined) is None and _SLASHES.issuperset(WHOLE.sub("", joined).split()):
         return
     for line in lines:
         halves = len(_HALF.findall(line))
         apart = halves and (halves != len(line.split()) or _NO_VERTEX.search(line))
-        if apart or not _SLASHES.issuperset(_WHOLE.sub("", line).split()):
+        if apart or not _SLASHES.issuperset(WHOLE.sub("", line).split()):
             raise Damage(f"has the face {quoted(line)}, whose corners are not written alike; repair it or take it away")
 
 

@@ -8,13 +8,11 @@ import mapbox_earcut
 import numpy as np
 
 from data_pipeline.errors import Damage
+from data_pipeline.objects.formats.text import starts_of
 
 MOST_WORK = 600_000_000
 """Largest sum of squared numbers of corners of the concave polygons of a file. Ear clipping needs time in proportion to it if a
 polygon crosses itself; this is a few seconds."""
-
-_FLAT = 1e-6
-"""Height of a triangle, as a share of its longest edge, up to which it has no area: a needle that is never seen."""
 
 
 def check_indices(indices: np.ndarray, vertex_count: int) -> None:
@@ -33,23 +31,6 @@ def merged(parts: Sequence[tuple[np.ndarray, np.ndarray]]) -> tuple[np.ndarray, 
 
 _NEARLY_FLAT = 0.01
 """Share by which the area of a polygon's triangles may differ from that of the polygon in its plane."""
-
-
-def have_area(vertices: np.ndarray, triangles: np.ndarray) -> np.ndarray:
-    """Returns which triangles (m,) have an area, beyond what rounding of their corners makes; all whose corners are not finite.
-
-    A triangle without area may reach anywhere and is never seen, so neither the centre nor the size of a mesh follows from it.
-    """
-    corners = vertices[triangles]
-    single = (vertices == vertices.astype(np.float32)).all()  # such as those of binary files
-    with np.errstate(all="ignore"):
-        reach = np.abs(corners).max(axis=(1, 2), initial=0)
-        edges = corners - np.roll(corners, 1, axis=1)
-        longest = np.linalg.norm(edges, axis=2).max(axis=1, initial=0)
-        units = edges / longest[:, None, None]
-        height = np.linalg.norm(np.cross(units[:, 0], units[:, 1]), axis=1)  # as a share of the longest edge
-        least = np.maximum(_FLAT, 4 * np.finfo(np.float32 if single else np.float64).eps * reach / longest)
-        return (height > least) | ~np.isfinite(reach)
 
 
 def moved(vertices: np.ndarray, place: np.ndarray) -> np.ndarray:
@@ -76,9 +57,8 @@ def triangulate(vertices: np.ndarray, corners: np.ndarray, counts: np.ndarray) -
     if (counts == 3).all():
         return corners.reshape(-1, 3)
     check_indices(corners, len(vertices))
-    starts = np.cumsum(counts) - counts
     sizes = np.maximum(counts - 2, 0)
-    offsets = np.cumsum(sizes) - sizes
+    starts, offsets = starts_of(counts), starts_of(sizes)
     triangles = np.zeros((int(sizes.sum()), 3), np.int64)
     work = 0
     for size in np.unique(counts[counts >= 3]).tolist():

@@ -18,7 +18,7 @@ _NUMBER = re.compile(r"[+-]?((\d+\.?\d*|\.\d+)(e[+-]?\d+)?|inf(inity)?)", re.IGN
 _NOT_A_NUMBER = re.compile(r"[+-]?(nan(\(.*\))?|\d+\.#(QNAN|SNAN|IND|R)\d*)", re.IGNORECASE | re.ASCII)
 """Spellings of NaN that C libraries print, such as `-nan(ind)` and `1.#QNAN`; `float` reads only `nan`."""
 
-_WHOLE = re.compile(r"[+-]?[0-9]+")
+WHOLE = re.compile(r"[+-]?[0-9]+")
 
 _COMMENT = re.compile(r"(?<!\d\.)#.*")
 """A comment to the end of its line, as against a spelling of NaN."""
@@ -73,7 +73,7 @@ def number(word: str) -> float:
 
 def whole_number(word: str) -> int:
     """Returns the integer that a word spells; one of more than 62 bits becomes smaller."""
-    if not _WHOLE.fullmatch(word):
+    if not WHOLE.fullmatch(word):
         raise ValueError(f"{word[:40]!r} is not a whole number")
     return max(min(int(word), 2**62), -(2**62))
 

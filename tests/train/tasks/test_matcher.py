@@ -21,7 +21,7 @@ def made_up(count: int, noise: float, seed: int) -> list[Sighted]:
     patterns = np.random.default_rng(0).uniform(0, 1, (FEATURES, PIXELS))
     errors = np.random.default_rng(1).normal(size=(FEATURES, FEATURES)) @ patterns
     shapes = []
-    for number in range(count):
+    for _ in range(count):
         mixture = random.dirichlet(np.ones(FEATURES), (HEIGHTS, YAWS))
         gallery = np.round(STEPS * mixture @ patterns).astype(np.uint8)
         cells, yaw = random.integers(0, HEIGHTS * YAWS, 12), int(random.integers(YAWS))
@@ -30,7 +30,7 @@ def made_up(count: int, noise: float, seed: int) -> list[Sighted]:
         amount = noise * random.uniform(0.2, 1)
         images = seen + amount * random.normal(size=(12, FEATURES)) @ errors
         known = np.ones((12, PIXELS), bool)
-        shapes.append(Sighted(f"{number}", gallery, yaw, images.astype(np.float32), known, _level(cells)))
+        shapes.append(Sighted(gallery, yaw, images.astype(np.float32), known, _level(cells)))
     return shapes
 
 
@@ -58,7 +58,7 @@ def test_calibration_makes_probabilities_true_and_strangers_unknown():
     train, val, test = made_up(40, 0.03, 3), made_up(30, 0.03, 4), made_up(30, 0.03, 5)
     one = jnp.float32(1)
     blank = Matcher(fit_projection(iter(train), FEATURES), one, jnp.zeros(3), jnp.zeros(4), one, 0.05 * one)
-    matcher = calibrated(blank, val, ViewCamera(64), 0)
+    matcher = calibrated(blank, val, 0)
     assert float(matcher.unseen) > 0
     assert float(matcher.stranger[3]) > 0.3  # the larger the difference, the stranger
     gallery = Gallery.of(matcher, np.stack([shape.gallery for shape in test[:20]]), np.zeros(20))
