@@ -21,7 +21,7 @@ from mevs_jax.trained.description import Description
 from mevs_jax.trained.parts import Parts, observe
 from mevs_jax.trained.situation import REPEATED, Candidates, Memory, angles, situation
 from mevs_jax.trained.system import TrainedSystem
-from mevs_jax.trained.usable import INFORMATION_GAIN, fusion_of, policy_of, resolved, shared
+from mevs_jax.trained.usable import fusion_of, policy_of, resolved, shared
 
 
 @dataclass(frozen=True)
@@ -93,11 +93,9 @@ class Steps:
             key: of random policies.
         """
         state, scene = situation(parts, memory, candidates, failed, allowed, self.posed)
-        policy, number, slots = self.policy, len(candidates.directions), jnp.zeros(self.most)
-        run = policy_of(self.description, parts, policy, self.posed) if isinstance(policy, str) else policy
-        among = None if parts.gallery is None else gain_among(parts.gallery, self.posed, self.target)
-        if among is not None and policy == INFORMATION_GAIN:
-            run = among
+        run, number, slots = self.policy, len(candidates.directions), jnp.zeros(self.most)
+        if isinstance(run, str):
+            run = policy_of(self.description, parts, run, self.posed, self.target)
         assert scene.reachable is not None
         left, costs = scene.reachable & ~state.attempted, jnp.concatenate([cost, slots])
         scores = run(jax.random.fold_in(key, state.count), state, scene) - costs
@@ -106,8 +104,8 @@ class Steps:
         first = jnp.argmax(jnp.where(left, jnp.concatenate([self._first(parts, candidates), slots]) - costs, -jnp.inf))
         chosen = jnp.where(jnp.any(left), jnp.where(memory.count > 0, index, first), -1)
         known, gains = scene.knowledge, jnp.full(number, jnp.nan)
-        if among is not None:
-            gains = among(key, state, scene)[:number]
+        if parts.gallery is not None:
+            gains = gain_among(parts.gallery, self.posed, self.target)(key, state, scene)[:number]
         elif known is not None and (known.expected_logits is not None or known.by_pose is not None):
             gains = information_gain(key, state, scene)[:number]
         return chosen, gains

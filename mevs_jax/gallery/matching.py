@@ -120,7 +120,7 @@ class Matcher:
     @staticmethod
     def strangeness(
         apart: Float[AnyArray, "*walks"], count: Float[AnyArray, "*walks"], objects: int
-    ) -> Float[Array, "numbers *walks"]:
+    ) -> Float[Array, "..."]:
         """What the odds of an unknown object depend on, in the order of `stranger`, from the best hypothesis' difference."""
         return jnp.concatenate([_numbers(count, objects), jnp.log(jnp.asarray(apart) + 1e-6)[None]])
 

@@ -60,8 +60,13 @@ def resolved(description: Description, policy: str, posed: bool) -> str:
     return description.best if posed else description.best_unposed
 
 
-def policy_of(description: Description, parts: Parts, name: str, posed: bool) -> Policy:
-    """`TrainedSystem.policy` of a system with this description and these arrays."""
+def policy_of(description: Description, parts: Parts, name: str, posed: bool, target: int | None = None) -> Policy:
+    """`TrainedSystem.policy` of a system with this description and these arrays.
+
+    Args:
+        description, parts, name, posed: as there.
+        target: label of the enrolled object that alone matters; None if all do.
+    """
     name = resolved(description, name, posed)
     network = "learned" if name == AND_TABLE else name
     if network in parts.view_policies:
@@ -70,7 +75,7 @@ def policy_of(description: Description, parts: Parts, name: str, posed: bool) ->
         by = "table" if name == AND_TABLE else "belief"
         return learned(parts.view_policies[network].module, parts.single, by=by)  # type: ignore[arg-type]
     if name == INFORMATION_GAIN and parts.gallery is not None:
-        return gain_among(parts.gallery, posed)
+        return gain_among(parts.gallery, posed, target)
     if name == EXPECTED_VIEWS and parts.expected is not None:
         return expected_views
     if name not in POLICIES:
