@@ -101,8 +101,9 @@ def fully_compiled() -> Iterator[None]:
 
 
 def made_once(factory: pytest.TempPathFactory, name: str, make: Callable[[Path], None]) -> Path:
-    """A folder that the first worker to need it makes, for all workers of this test session. It must not be written to.
+    """This worker's copy of a folder that the first worker to need it makes. It must not be written to.
 
+    It is a copy because a command locks the folder that it runs in, also while it changes nothing there.
     With `MEVS_TEST_MADE=DIRECTORY` several sessions that test the same code share it, as in CI.
     """
     shared = factory.getbasetemp()
@@ -118,7 +119,7 @@ def made_once(factory: pytest.TempPathFactory, name: str, make: Callable[[Path],
             shutil.rmtree(folder, ignore_errors=True)
             make(folder)
             done.touch()
-    return folder
+    return shutil.copytree(folder, factory.mktemp(name) / name)
 
 
 @pytest.fixture(scope="session")
