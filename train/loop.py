@@ -190,7 +190,8 @@ class _Training:
     @property
     def is_finished(self) -> bool:
         config = self.task.optimiser
-        return self.epoch >= config.epochs or self.epoch - self.progress["best_epoch"] >= config.patience
+        waited = self.epoch - self.progress["best_epoch"]
+        return self.epoch >= config.epochs or (bool(config.patience) and waited >= config.patience)
 
     def resume(self, checkpoints: Checkpoints) -> None:
         """Continues from the latest checkpoint, if there is one.
@@ -240,7 +241,8 @@ class _Training:
         progress = self.progress
         progress["epoch"] += 1
         progress["seconds"] += time.perf_counter() - started
-        if progress["best_loss"] is None or checked["loss"] < progress["best_loss"]:
+        best = progress["best_loss"]
+        if best is None or not self.task.optimiser.patience or checked["loss"] < best:
             progress |= {"best_loss": checked["loss"], "best_epoch": self.epoch, "best": checked}
             checkpoints.save("best", self.step, self.state, progress)
         config, first = self.task.optimiser, self.task.hyperparameters.learning_rate

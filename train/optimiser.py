@@ -19,7 +19,8 @@ class OptimiserConfig:
     epochs: int = 50
     """maximal number of epochs"""
     patience: int = 5
-    """epochs without a better validation loss before training stops"""
+    """epochs without a better validation loss before training stops; it ends with the weights of the best epoch. 0: it does all
+    epochs and ends with its last weights, where validation is too small or too different to choose by"""
     batch_size: int = 16
     """views in a batch, over all devices"""
     parts: int = 1

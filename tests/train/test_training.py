@@ -184,12 +184,18 @@ def test_an_interrupted_run_may_go_on_in_parts_and_half_precision(quick, tmp_pat
     assert config_of(tmp_path)["task"]["optimiser"]["parts"] == 2
 
 
-def test_training_stops_when_validation_gets_no_better(quick, tmp_path, monkeypatch):
-    losses = iter([1.0, 0.9, 0.95, 0.92, 0.1])
+@pytest.mark.parametrize(("patience", "epoch", "best"), [(2, 4, 2), (0, 5, 5)])
+def test_training_stops_when_validation_gets_no_better(quick, tmp_path, monkeypatch, patience, epoch, best):
+    """Or does all epochs without patience, and ends with its last weights."""
+    losses = iter([1.0, 0.9, 0.95, 0.92, 0.91])
     monkeypatch.setattr(train.loop, "validate", lambda *_: {"loss": next(losses)})
-    summary = quick(epochs=9, patience=2)[1](tmp_path)
-    assert (summary["epoch"], summary["best_epoch"]) == (4, 2)
-    assert summary["stopped_early"]
+    task, train_in = quick(epochs=5, patience=patience)
+    summary = train_in(tmp_path)
+    assert (summary["epoch"], summary["best_epoch"]) == (epoch, best)
+    assert summary["stopped_early"] == (epoch < 5)
+    kept, last = (Checkpoints(tmp_path).latest_step(name) for name in ("best", "latest"))
+    assert (kept == last) == (best == epoch)
+    load_best(task, tmp_path)
 
 
 def test_networks_of_another_size_are_described(quick, whole, data, tmp_path):

@@ -67,8 +67,12 @@ class Member:
         return self.best["loss"] if self.best and not self.diverged else float("inf")
 
     def is_training(self, patience: int) -> bool:
-        """Whether the member is still trained: it has not diverged, was not dropped, and improved within `patience` epochs."""
-        return not self.diverged and not self.dropped and self.epochs - self.best_epoch < patience
+        """Whether the member is still trained: it has not diverged, was not dropped, and improved within `patience` epochs.
+
+        A patience of 0 never ends.
+        """
+        waits = not patience or self.epochs - self.best_epoch < patience
+        return waits and not self.diverged and not self.dropped
 
 
 def member_of(task: SweepTask) -> Member:
@@ -180,15 +184,16 @@ class Together:
         return np.array([member.is_training(patience) for member in self.members])
 
     def after_epoch(
-        self, training: np.ndarray, means: dict[str, Any], checked: dict[str, Any], finite: np.ndarray
+        self, training: np.ndarray, means: dict[str, Any], checked: dict[str, Any], finite: np.ndarray, patience: int
     ) -> np.ndarray:
-        """Takes the results of an epoch; returns for each member whether this is its best epoch so far.
+        """Takes the results of an epoch; returns for each member whether its weights are to be kept: its best ones so far.
 
         Args:
             training: whether each member was trained in this epoch.
             means: training metrics by name, each (members,).
             checked: validation metrics by name, each (members,).
             finite: whether all weights of each member are finite.
+            patience: of the training; 0 keeps the last weights.
         """
         better = np.zeros(len(self.members), bool)
         for index in np.flatnonzero(training):
@@ -199,7 +204,7 @@ class Together:
             member = replace(self.members[index], epochs=self.epoch)
             if not_finite(trained | now) or not finite[index]:
                 member = replace(member, diverged=True)
-            elif now["loss"] < member.loss:
+            elif not patience or now["loss"] < member.loss:
                 better[index] = True
                 member = replace(member, best=now, best_epoch=self.epoch)
             self.members[index] = member

@@ -79,7 +79,7 @@ def train_members(
                 if preemption.after_step() and of.step % epoch_steps:
                     save_and_end_if_asked(started)
             bar.advance(line, lead.end() * views)
-            _finish_epoch(of, training, trainer, batches, epoch_steps)
+            _finish_epoch(of, training, trainer, batches, epoch_steps, optimiser.patience)
             if halving and of.epoch in {max(1, optimiser.epochs // share) for share in (8, 4, 2)}:
                 of.halve()
             best, still = min(member.loss for member in of.members), of.training(optimiser.patience).sum()
@@ -90,13 +90,15 @@ def train_members(
     return of, on_host(trainer.saved()[1])
 
 
-def _finish_epoch(of: Together, training: np.ndarray, trainer: Trainer, batches: _Batches, epoch_steps: int) -> None:
+def _finish_epoch(
+    of: Together, training: np.ndarray, trainer: Trainer, batches: _Batches, epoch_steps: int, patience: int
+) -> None:
     """Validates the members that are training, and keeps the weights of those that are better than before."""
     means = {name: sums / epoch_steps for name, sums in trainer.sums().items()}
     with np.errstate(invalid="ignore"):  # of members that have stopped
         checked = weighted_means([trainer.evaluate(*given) for given in batches.validation(trainer.places)])
     of.epoch += 1
-    trainer.keep(of.after_epoch(training, means, checked, trainer.finite()))
+    trainer.keep(of.after_epoch(training, means, checked, trainer.finite(), patience))
 
 
 class _Batches:

@@ -167,12 +167,17 @@ def test_members_that_diverge_late_are_never_the_best():
     checked = {"loss": np.array([0.01, 0.01, np.inf, 0.35])}
     together = Together(members, [[] for _ in members], epoch=2)
     finite = np.array([False, True, True, True])
-    better = together.after_epoch(np.ones(4, bool), means, checked, finite)
+    better = together.after_epoch(np.ones(4, bool), means, checked, finite, patience=5)
     after = together.members
     assert [member.diverged for member in after] == [True, True, True, False]
     np.testing.assert_array_equal(better, [False, False, False, True])
     assert min(after, key=lambda member: member.loss) is after[3]
     assert sweep_table(after).count("diverged") == 3
+
+    worse = {"loss": np.full(4, 9.0)}
+    kept = together.after_epoch(better, {"loss": np.ones(4)}, worse, np.ones(4, bool), patience=0)
+    np.testing.assert_array_equal(kept, better)  # without patience the last weights are kept
+    assert together.members[3].is_training(0)
 
 
 def test_configurations_fill_their_ranges(out):
