@@ -38,8 +38,8 @@ class DataConfig:
     up: Up = "auto"
     """which axis of mesh files is up: the one that the format declares (glTF, COLLADA), else z (auto), or always z or y"""
     split: str = ""
-    """for a folder or zip without train and test folders: the share of training objects of each class, such as 0.8, or a .json
-    or .csv list of splits"""
+    """for a folder or zip without train and test folders: the share of training objects of each class, such as 0.8; or 1, to
+    train and test on the same objects, turned, where a class has one or few; or a .json or .csv list of splits"""
     more: tuple[str, ...] = ()
     """further sources of any of these kinds, whose objects are added: classes of one name are one class; or strangers: shapes
     that belong to no class, as many as of ten classes"""

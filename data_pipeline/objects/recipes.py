@@ -12,7 +12,7 @@ import numpy as np
 
 from data_pipeline.errors import Damage, DamagedMesh, EmptyMesh, naming
 from data_pipeline.objects.formats import MESH_SUFFIXES, Up, parse_mesh
-from data_pipeline.objects.mesh import surface_of
+from data_pipeline.objects.mesh import Recipe, surface_of
 from data_pipeline.objects.names import shown
 
 LARGEST_FILE = 2 << 30
@@ -77,6 +77,25 @@ class MeshFile:
 
     def load(self) -> tuple[np.ndarray, np.ndarray]:
         return read_with(_content, self.path, shown(self.path), self.up)
+
+
+@dataclass(frozen=True)
+class Turned:
+    """The mesh of another recipe, turned about the vertical axis by an angle in radians."""
+
+    recipe: Recipe
+    angle: float
+
+    @property
+    def stamp(self) -> str:
+        """The state of the file that it is read from, and the angle."""
+        return f"{getattr(self.recipe, 'stamp', '')} turned by {self.angle:.6f}"
+
+    def load(self) -> tuple[np.ndarray, np.ndarray]:
+        vertices, faces = self.recipe.load()
+        x, y, z = np.asarray(vertices, np.float64).reshape(-1, 3).T
+        cos, sin = np.cos(self.angle), np.sin(self.angle)
+        return np.stack([cos * x - sin * y, sin * x + cos * y, z], axis=1), faces
 
 
 def read_mesh(path: str | Path, up: Up = "auto") -> tuple[np.ndarray, np.ndarray]:

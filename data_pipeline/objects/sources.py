@@ -40,8 +40,8 @@ from data_pipeline.objects.mesh import (
     normalise,
 )
 from data_pipeline.objects.names import kind_of_ignored, plain_class, say_ignored, shown
-from data_pipeline.objects.recipes import FamilyPiece, FurniturePiece, Stranger, read_mesh
-from data_pipeline.objects.splits import divide
+from data_pipeline.objects.recipes import FamilyPiece, FurniturePiece, Stranger, Turned, read_mesh
+from data_pipeline.objects.splits import SAME_OBJECTS, divide
 from data_pipeline.objects.voxels import voxel_archive
 
 _LAID_OUT = "<class>/train/*.off and <class>/test/*.off"
@@ -178,11 +178,12 @@ def _arranged(listing: Listing, name: str, where: str, reading: Reading) -> Obje
         placed, notes = _all_tested(placed)
     elif reading.split and not (reading.keep_splits and with_splits):
         placed = divide(placed, reading.split, reading.seed, where)
+        notes = (SAME_OBJECTS,) if any(isinstance(one.recipe, Turned) for one in placed) else ()
     elif not with_splits:
         folders = {one.class_name for one in placed if one.class_name}
         there = f"{len(found)} meshes in {len(folders)} class folders and no meshes laid out as {_LAID_OUT}"
-        advice = "add --dataset.split 0.8 to train on 80 % of each class, or a .json or .csv list of splits"
-        raise DataError(f"{where} has {there}; {advice}")
+        advice = "add --dataset.split 0.8 to train on 80 % of each class, 1 to train and test on the same objects"
+        raise DataError(f"{where} has {there}; {advice}, or a .json or .csv list of splits")
     placed = sorted(without_copies(placed), key=lambda one: (one.class_name, one.split, one.parts))
     members = [one for one in placed if one.recipe is not None and one.class_name and one.split]
     _check_classes(placed, members, where, all_tested=reading.all_tested)

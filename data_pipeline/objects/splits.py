@@ -14,7 +14,14 @@ import numpy as np
 
 from data_pipeline.errors import DataError
 from data_pipeline.objects.layout import SPLIT_FOLDERS, Found
+from data_pipeline.objects.recipes import Turned
 
+_TURNS = ("train", "train", "val", "train", "train", "test", "train")
+"""Splits of an object that is in all of them, in the order of the angles by which it is turned."""
+SAME_OBJECTS = (
+    "--dataset.split 1: each object is for training, validation and testing, turned otherwise in each; what is measured "
+    "says how well these very objects are recognised from other directions, and nothing about others of their classes"
+)
 _NAME_COLUMNS = ("path", "name", "file", "filename", "object", "model", "modelid", "model_id", "id", "object_id", "uid")
 
 
@@ -23,7 +30,8 @@ def divide(found: Sequence[Found], option: str, seed: int, where: str) -> list[F
 
     Args:
         found: files, with their classes.
-        option: a share of training objects such as `0.8`, or the path of a JSON or CSV list.
+        option: a share of training objects such as `0.8`; `1` for training and testing on the same objects; or the path of a
+            JSON or CSV list.
         seed: seed of the choice by share.
         where: name of the source for error messages.
 
@@ -34,10 +42,22 @@ def divide(found: Sequence[Found], option: str, seed: int, where: str) -> list[F
         share = float(option)
     except ValueError:
         return _by_list(found, Path(option).expanduser())
-    if not 0 < share < 1:
+    if not 0 < share <= 1:
         advice = "give a number between 0 and 1, such as 0.8"
         raise DataError(f"--dataset.split {option} is no share of training objects; {advice}")
-    return _by_share(found, share, seed, where)
+    return _by_share(found, share, seed, where) if share < 1 else _by_turns(found)
+
+
+def _by_turns(found: Sequence[Found]) -> list[Found]:
+    """Each object for all splits, turned about the vertical axis by another angle in each place."""
+    return [
+        replace(
+            one, split=split, identity=(one.identity, place), recipe=one.recipe and Turned(one.recipe, place * step)
+        )
+        for step in [2 * np.pi / len(_TURNS)]
+        for one in found
+        for place, split in enumerate(_TURNS if one.class_name else ("",))
+    ]
 
 
 def _group(one: Found) -> tuple[str, ...]:
@@ -59,7 +79,8 @@ def _by_share(found: Sequence[Found], share: float, seed: int, where: str) -> li
             continue
         if len(own) < 2:
             few = f"class {name} has {len(own)} object, and --dataset.split needs 2 or more"
-            raise DataError(f"{where}: {few}; add some, or remove the class")
+            same = "or give --dataset.split 1 to train and test on the same objects"
+            raise DataError(f"{where}: {few}; add some, remove the class, {same}")
         count = min(max(round(share * len(own)), 1), len(own) - 1)
         training |= {own[at] for at in random.permutation(len(own))[:count]}
 

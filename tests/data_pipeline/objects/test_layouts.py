@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from data_pipeline.dataset.builder import split_objects
@@ -227,7 +229,28 @@ def test_wrong_lists_are_described(tmp_path, content, message):
     assert "\n" not in str(caught.value)
 
 
-@pytest.mark.parametrize("option", ["0", "1", "1.5", "-0.1", "nan", "eighty", "list.txt"])
+def test_one_object_a_class_is_trained_and_tested_on_from_other_directions(tmp_path):
+    root = write(tmp_path / "set", {f"{name}/{name}.off": off(*box((3, 1, 2))) for name in ("mug", "rack")})
+    with pytest.raises(DataError, match=r"class mug has 1 object, .* give --dataset.split 1 to") as caught:
+        opened(root, split="0.8")
+    source = opened(root, split=re.search(r"give --dataset.split (\S+)", str(caught.value))[1])
+    assert [len(of_split(source, split)) for split in ("train", "val", "test")] == [10, 2, 2]
+    assert len({entry.name for entry in source.entries}) == 14
+    assert "these very objects" in source.notes[0]
+    assert not source.left_out
+    mugs = [entry for entry in source.entries if entry.label == 0]
+    assert len({entry.recipe.stamp for entry in mugs}) == 7  # of which captures are kept apart
+    angles = []
+    for mesh in map(load_object, mugs):
+        edges = np.diff(mesh.vertices[mesh.faces], axis=1).reshape(-1, 3)
+        level = edges[np.abs(edges[:, 2]) < 1e-6]
+        lengths = np.linalg.norm(level, axis=1)
+        x, y = level[np.abs(lengths / lengths.min() - 3).argmin(), :2]  # along the long side
+        angles.append(np.arctan2(y, x) % np.pi)
+    assert np.diff(np.sort(angles)).min() == pytest.approx(np.pi / 7, abs=1e-5)
+
+
+@pytest.mark.parametrize("option", ["0", "1.01", "1.5", "-0.1", "nan", "eighty", "list.txt"])
 def test_wrong_shares_are_described(tmp_path, option):
     with pytest.raises(DataError, match=r"--dataset.split .* 0.8"):
         opened(shapenet(tmp_path / "set"), split=option)
