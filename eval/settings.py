@@ -51,7 +51,7 @@ cores train PointNet++ of this size on 7 clouds per second, which is five hours 
 
 
 _BRIEF = OptimiserConfig(
-    epochs=8, batch_size=64, epoch_views=8, validation_views=4, weight_decay=0.02, schedule="cosine"
+    epochs=8, batch_size=64, epoch_views=8, epoch_steps=30, validation_views=4, weight_decay=0.02, schedule="cosine"
 )
 
 
@@ -76,6 +76,7 @@ SMALL = Settings(
             batch_size=32,
             views_per_object=2,
             epoch_views=4,
+            epoch_steps=30,
             validation_views=2,
             learning_rate=2e-3,
             schedule="cosine",

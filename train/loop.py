@@ -314,15 +314,32 @@ def validate(evaluate_step: Callable, state: TrainState, batches: Iterable, mesh
 
 
 def steps_of_an_epoch(task: Task, statistics: DatasetStatistics) -> int:
-    """Returns the number of steps between two validations: enough for `epoch_views` views (or all) of each training object."""
+    """Returns the number of steps between two validations: enough for `epoch_views` views (or all) of each training object.
+
+    There are at least `epoch_steps`.
+    """
+    return max(_steps_by_views(task, statistics), task.optimiser.epoch_steps)
+
+
+def _steps_by_views(task: Task, statistics: DatasetStatistics) -> int:
     config, objects = task.optimiser, statistics.objects_of(training_splits(task.batches))
     objects = len(objects_kept(objects, task.batches))
     return steps_per_epoch(objects * (config.epoch_views or statistics.views) // config.views_per_object, task.batches)
 
 
+def content_on(task: Task, statistics: DatasetStatistics) -> dict[str, Any]:
+    """Returns a task as JSON keeps it, with `epoch_steps` where the objects of a data set are so few that it matters."""
+    content, least = content_of(task), task.optimiser.epoch_steps
+    if least > _steps_by_views(task, statistics):
+        content["optimiser"]["epoch_steps"] = least
+    return content
+
+
 def identity_of(task: Task, statistics: DatasetStatistics, start: StartingWeights | None = None) -> dict[str, Any]:
     """Returns what identifies a run, as stored in its `config.json`: task, data set, starting weights."""
-    return as_read({"task": content_of(task), "data": statistics.fingerprint, "start": start and start.name})
+    return as_read(
+        {"task": content_on(task, statistics), "data": statistics.fingerprint, "start": start and start.name}
+    )
 
 
 def check_training(task: Task, statistics: DatasetStatistics, layout: Layout) -> None:

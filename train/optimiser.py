@@ -31,6 +31,8 @@ class OptimiserConfig:
     CPU"""
     epoch_views: int = 0
     """views of each training object in an epoch; 0: all"""
+    epoch_steps: int = 0
+    """least number of steps of an epoch: where there are few objects, each gives more views than `epoch_views`"""
     validation_views: int = 0
     """views of each validation object that are evaluated after an epoch; 0: all"""
     method: Literal["adam", "muon"] = "adam"

@@ -21,7 +21,7 @@ from data_pipeline.errors import DataError, Diverged
 from eval.runs import tasks
 from eval.settings import TINY
 from tests.reference.quick import lines, quick_tasks
-from train.loop import fit, load_best, steps_of_an_epoch
+from train.loop import content_on, fit, load_best, steps_of_an_epoch
 from train.optimiser import OptimiserConfig
 from train.results.identity import config_of
 from train.running.checkpoints import Checkpoints
@@ -196,6 +196,18 @@ def test_training_stops_when_validation_gets_no_better(quick, tmp_path, monkeypa
     kept, last = (Checkpoints(tmp_path).latest_step(name) for name in ("best", "latest"))
     assert (kept == last) == (best == epoch)
     load_best(task, tmp_path)
+
+
+def test_few_objects_are_seen_often_enough(quick, data):
+    """An epoch has a least number of steps, which is part of what a training is where it matters, and only there."""
+    statistics, task = load_statistics(data), quick()[0]
+    steps, plain = steps_of_an_epoch(task, statistics), content_on(task, statistics)
+    for least, expected, content in ((steps, steps, None), (3 * steps, 3 * steps, 3 * steps)):
+        longer = replace(task, optimiser=replace(task.optimiser, epoch_steps=least))
+        assert steps_of_an_epoch(longer, statistics) == expected
+        found = content_on(longer, statistics)
+        assert found["optimiser"].pop("epoch_steps", None) == content
+        assert found == plain
 
 
 def test_networks_of_another_size_are_described(quick, whole, data, tmp_path):

@@ -19,6 +19,7 @@ from data_pipeline.distributed import agreed, is_first, wait_for_all
 from data_pipeline.errors import DataError, Diverged, Unreadable, reason_of
 from data_pipeline.files import as_read, keep_json, read_json, write_text
 from data_pipeline.progress import console
+from train.loop import content_on
 from train.many.members import (
     Group,
     Member,
@@ -30,7 +31,7 @@ from train.many.members import (
     member_of,
 )
 from train.many.training import train_members
-from train.results.identity import content_of, why
+from train.results.identity import why
 from train.results.networks import check_config
 from train.running.devices import device_mesh
 from train.tasks.entropy import EntropyTask
@@ -215,7 +216,9 @@ def sweep(
         Diverged: if every member diverged.
     """
     members = draw_members(config, task)
-    identity = as_read({"task": content_of(task), "sweep": _identity(config, task), "data": statistics.fingerprint})
+    identity = as_read(
+        {"task": content_on(task, statistics), "sweep": _identity(config, task), "data": statistics.fingerprint}
+    )
     check_config(folder, identity, "a sweep made")
     if (made := _finished(folder)) is not None:
         return made

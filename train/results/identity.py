@@ -91,8 +91,12 @@ IN_A_SUMMARY = {"epoch", "best_loss", "best_epoch", "best", "seconds", "steps", 
 
 
 def content_of(task: Any) -> dict[str, Any]:
-    """Returns a task as JSON keeps it; what was added since version 0.1 and is off is left out, as it was then."""
+    """Returns a task as JSON keeps it; what was added since version 0.1 and is off is left out, as it was then.
+
+    So is `epoch_steps`, which matters for few objects alone; see `train.loop.content_on`.
+    """
     content = as_read(asdict(task))
+    content["optimiser"].pop("epoch_steps")
     return {name: value for name, value in content.items() if value or name not in ("reality", "size", "azimuths")}
 
 
