@@ -34,6 +34,7 @@ from eval.tables import ViewTables
 from mevs_jax.models.expected_views import ExpectedViews
 from mevs_jax.models.view_policy import expected_gain
 from mevs_jax.policies.registry import PolicyRecord
+from mevs_jax.trained.description import UNKNOWN_OBJECT
 from train.choosing.expected import FITTED_AS
 from train.choosing.features import Features
 from train.choosing.stages import Aside, Stages, lattice_data
@@ -206,8 +207,14 @@ class _Walks:
                 config.fitting_starts,
                 self.with_costs and [VIEW_COSTS, MOVEMENT_COSTS],
                 FITTED_AS,
+                *["promising"] * self.promising,
             ],
         )
+
+    @property
+    def promising(self) -> bool:
+        """Whether temperatures keep what confidences promise, since there are objects of no class."""
+        return UNKNOWN_OBJECT in self.stages.statistics.classes
 
     def _walk(self) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
         stages, config, (method, *_) = self.stages, self.stages.config, self.variants
@@ -220,7 +227,13 @@ class _Walks:
             stages.fusion(posed=self.posed),
             [self._policy(name) for name in self.variants],
             lattices,
-            Walking(config.max_views, config.draws, fitting_starts=config.fitting_starts, seed=stages.seed),
+            Walking(
+                config.max_views,
+                config.draws,
+                fitting_starts=config.fitting_starts,
+                seed=stages.seed,
+                promising=self.promising,
+            ),
             fusions={name: stages.fusion(summed=True) for name in self.variants if VARIANTS[name].summed},
             apart=[self._policy(method, (part, APART)) for part in range(APART)] if self.with_costs else (),
             others=not self.ablations,

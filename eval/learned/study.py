@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import jax
@@ -40,6 +41,7 @@ from mevs_jax.beliefs.calibration import (
     class_weights,
     expected_calibration_error,
     fit_temperature,
+    keep_promise,
     log_likelihood,
 )
 from mevs_jax.beliefs.fusing import CalibratedFusion
@@ -57,26 +59,30 @@ _STARTS_OF_EACH = 4
 """Start views of each object that the best fixed order is fitted on; over all objects, every view is one as often."""
 
 
-@jax.jit
-def _refit(beliefs: Array, labels: Array) -> Float[Array, " steps"]:
+@partial(jax.jit, static_argnames="promising")
+def _refit(beliefs: Array, labels: Array, promising: bool = False) -> Float[Array, " steps"]:
     flat = beliefs.reshape(-1, *beliefs.shape[2:])
     truth = jnp.repeat(labels, beliefs.shape[1])
-    return jax.vmap(fit_temperature, (1, None, None))(flat, truth, class_weights(truth, flat.shape[-1]))
+    found = jax.vmap(fit_temperature, (1, None, None))(flat, truth, class_weights(truth, flat.shape[-1]))
+    return jax.vmap(keep_promise, (1, None, 0))(flat, truth, found) if promising else found
 
 
 def walk_metrics(
-    beliefs: Sequence[Float[AnyArray, "_objects _walks steps classes"]], labels: Sequence[Int[AnyArray, " _objects"]]
+    beliefs: Sequence[Float[AnyArray, "_objects _walks steps classes"]],
+    labels: Sequence[Int[AnyArray, " _objects"]],
+    promising: bool = False,
 ) -> tuple[dict[str, Any], list[Signal], Float[np.ndarray, "steps objects"]]:
     """Metrics of one policy.
 
     Args:
         beliefs, labels: of walks over validation objects, on which temperatures are fitted, and over test objects.
+        promising: whether temperatures are those of `keep_promise`, as where some objects are of no class.
 
     Returns:
         The metrics on test objects, the calibrated confidences on both, and for each test object the mean log-probability of its
         class.
     """
-    temperatures = _refit(beliefs[0], labels[0])
+    temperatures = _refit(beliefs[0], labels[0], promising)
     signals = [
         confidences(belief / temperatures[:, None], known) for belief, known in zip(beliefs, labels, strict=True)
     ]
@@ -279,7 +285,7 @@ def _walked(
         views = walk_all(key, policy, fusion, data, knowledge, max_views=steps, draws=walking.draws, every=every)
         walks.append(views)
         beliefs.append(beliefs_of(fusion, data.features, views))
-    metrics, signals, likelihood = walk_metrics(beliefs, [data.features.labels for data in lattices])
+    metrics, signals, likelihood = walk_metrics(beliefs, [data.features.labels for data in lattices], walking.promising)
     right = signals[1].right
     by_start = right.reshape(len(right), -1, policy.draws(walking.draws), right.shape[-1]).mean(axis=2)
     from_some = by_start if tries else by_start[:, :: walking.every_nth]

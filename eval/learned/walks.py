@@ -78,6 +78,7 @@ class Walking:
         every_nth: oracles, and walks with a movement cost, begin at every n-th view.
         fitting_starts: temperatures are fitted on walks from every n-th view.
         seed: of random policies.
+        promising: whether temperatures are those of `keep_promise`.
     """
 
     max_views: int
@@ -86,6 +87,7 @@ class Walking:
     every_nth: int = 1
     fitting_starts: int = 1
     seed: int = 0
+    promising: bool = False
 
     def on(self, views: int) -> Walking:
         """The same on a lattice of so many views: no walk is longer, and oracles begin at about `_TRYING_STARTS` of them."""

@@ -17,6 +17,10 @@ from mevs_jax.arrays import AnyArray
 
 BINS = 15
 """Number of bins of the expected calibration error (Guo et al. 2017)."""
+PROMISED = (0.9, 0.95, 0.99)
+"""Confidences at which `keep_promise` checks that answers are right as often as they say."""
+_RANGE, _FINENESS = 2.0, 72
+"""`keep_promise` tries so many temperatures, from so many times the given one down to one part in so many of it."""
 _IMPOSSIBLE = -1e9
 """Log-probability in place of −inf, relative to that of another class: its product with the probability 0 is 0."""
 
@@ -161,6 +165,35 @@ def fit_temperature(
     ends = jnp.log(jnp.array(0.01)), jnp.log(jnp.array(100.0))
     low, high = jax.lax.fori_loop(0, 24, halve, ends)
     return jnp.exp(-(low + high) / 2)
+
+
+def keep_promise(
+    beliefs: Float[AnyArray, "n classes"], labels: Int[AnyArray, " n"], temperature: float | Float[AnyArray, ""]
+) -> Float[Array, ""]:
+    """The temperature near another one with which answers are as sure as they may be, and not wrong more often than they say.
+
+    Where errors have heavy tails, the likeliest temperature makes confident answers less confident than they deserve. So the
+    temperature is lowered step by step from twice the given one, to half of it at most, as long as of the answers with a
+    confidence of at least p at most the share 1 − p is wrong, for each p of `PROMISED`. This controls the risk of answers that
+    are acted on, as conformal risk control does (Angelopoulos et al. 2022), on the objects that it is fitted on.
+
+    Args:
+        beliefs, labels: as of `fit_temperature`.
+        temperature: to begin from.
+    """
+    _check_beliefs(beliefs, labels)
+    beliefs, labels = jnp.asarray(beliefs), jnp.asarray(labels)
+    right = jnp.argmax(beliefs, axis=-1) == labels
+
+    def holds(temperature: Array) -> Bool[Array, ""]:
+        confidence = jnp.exp(jnp.max(jax.nn.log_softmax(beliefs / temperature, axis=-1), axis=-1))
+        sure = confidence >= jnp.array(PROMISED)[:, None]
+        wrong, all_sure = jnp.sum(sure & ~right, axis=1), jnp.sum(sure, axis=1)
+        return jnp.all(wrong <= (1 - jnp.array(PROMISED)) * all_sure)
+
+    tried = temperature * _RANGE ** jnp.linspace(1.0, -1.0, _FINENESS)
+    kept = jnp.cumprod(jax.lax.map(holds, tried))
+    return tried[jnp.maximum(jnp.sum(kept).astype(jnp.int32) - 1, 0)]
 
 
 def fit_exponent(

@@ -19,6 +19,7 @@ from mevs_jax import (
     negative_log_likelihood,
     reliability,
 )
+from mevs_jax.beliefs.calibration import PROMISED, keep_promise
 from mevs_jax.beliefs.fusing import running_sum
 from tests.reference import numpy_rules
 
@@ -94,6 +95,31 @@ def test_the_temperature_is_the_most_likely_one():
         )
         assert scaled_nll(beliefs, labels, found) <= best.fun + 1e-6
         assert found == pytest.approx(np.exp(best.x), rel=2e-3)
+
+
+def is_kept(beliefs: np.ndarray, labels: np.ndarray, temperature: float) -> bool:
+    """Whether of the answers that are at least so sure no more are wrong than that allows."""
+    odds = np.exp((beliefs - beliefs.max(axis=1, keepdims=True)) / temperature)
+    confidences, right = (odds / odds.sum(axis=1, keepdims=True)).max(axis=1), beliefs.argmax(axis=1) == labels
+    sure = [right[confidences >= level] for level in PROMISED]
+    return all((~some).sum() <= (1 - level) * len(some) for some, level in zip(sure, PROMISED, strict=True))
+
+
+@pytest.mark.parametrize(
+    ("tail", "start", "held"), [(0.0, 1.0, True), (0.3, 3.0, True), (0.3, 1.0, False), (1.0, 0.01, False)]
+)
+def test_a_promise_is_kept_by_the_lowest_temperature_that_keeps_it(tail, start, held):
+    """It is lowered as long as the promise is kept; from one at which it is broken, it is raised as far as allowed."""
+    random = np.random.default_rng(5)
+    labels = random.integers(0, 5, 3000)
+    beliefs = random.normal(0, 1, (3000, 5)) * np.where(random.random((3000, 1)) < tail / 2, 4, 1)
+    beliefs[np.arange(3000), labels] += 4
+    found = float(keep_promise(beliefs.astype(np.float32), labels, start))
+    tried = start * 2 ** np.linspace(1, -1, 72)
+    kept = [is_kept(beliefs.astype(np.float32).astype(float), labels, one) for one in tried]
+    first = kept.index(False) if False in kept else len(kept)
+    assert found == pytest.approx(tried[max(first - 1, 0)], rel=1e-5)
+    assert kept[0] == held
 
 
 def test_a_temperature_that_was_put_in_is_found_again():
