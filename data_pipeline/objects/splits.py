@@ -16,8 +16,8 @@ from data_pipeline.errors import DataError
 from data_pipeline.objects.layout import SPLIT_FOLDERS, Found
 from data_pipeline.objects.recipes import Turned
 
-_TURNS = ("train", "train", "val", "train", "train", "test", "train")
-"""Splits of an object that is in all of them, in the order of the angles by which it is turned."""
+_ENOUGH, _LEAST_TURNS = 300, 5
+"""Training objects that few are made into by turns, and the least number of turns of each."""
 SAME_OBJECTS = (
     "--dataset.split 1: each object is for training, validation and testing, turned otherwise in each; what is measured "
     "says how well these very objects are recognised from other directions, and nothing about others of their classes"
@@ -50,14 +50,16 @@ def divide(found: Sequence[Found], option: str, seed: int, where: str) -> list[F
 
 def _by_turns(found: Sequence[Found]) -> list[Found]:
     """Each object for all splits, turned about the vertical axis by another angle in each place."""
-    return [
-        replace(
-            one, split=split, identity=(one.identity, place), recipe=one.recipe and Turned(one.recipe, place * step)
-        )
-        for step in [2 * np.pi / len(_TURNS)]
-        for one in found
-        for place, split in enumerate(_TURNS if one.class_name else ("",))
-    ]
+    objects = sum(bool(one.class_name) for one in found)
+    places = max(_LEAST_TURNS, -(-_ENOUGH // max(objects, 1))) + 2
+    splits = ["val" if at == places // 3 else "test" if at == 2 * places // 3 else "train" for at in range(places)]
+
+    def turned(one: Found) -> list[Found]:
+        recipes = [one.recipe and Turned(one.recipe, 2 * np.pi * at / places) for at in range(places)]
+        each = enumerate(zip(splits, recipes, strict=True))
+        return [replace(one, split=split, recipe=recipe, identity=(one.identity, at)) for at, (split, recipe) in each]
+
+    return [each for one in found for each in (turned(one) if one.class_name else [one])]
 
 
 def _group(one: Found) -> tuple[str, ...]:

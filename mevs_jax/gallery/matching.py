@@ -8,6 +8,9 @@ errors of the sensor, of the object's believed sphere, and of the interpolation.
 How strong the errors are differs from object to object and is not known, so the likelihood of a walk is a power of the mean
 squared difference of its views (a Student t distribution). The power does not grow in proportion to the number of views, since
 errors of one object are not independent across views: what a gallery does not know of an object is missing from each of them.
+
+Some views cannot be predicted as exactly as others: small errors of the sphere and of the yaw change the image more. So a squared
+difference is divided by the one that such errors make, besides those of the sensor.
 """
 
 from __future__ import annotations
@@ -41,6 +44,9 @@ WEIGHTS = np.repeat(np.array([1.0, 0.5], np.float32), SIDE**2)
 """Weights of the depth of a pixel, which is from 0 to 1, and of the share of it that shows the object."""
 ALIKE = 0.25
 """Objects look alike if the squared white difference of their images is less than this on average."""
+_OFF, _TURNED = 0.02, 0.05
+"""Standard deviations of errors that remain: of the sphere's centre along each axis and of its radius, in radii; of the yaw, in
+radians, as hypotheses are 10° apart."""
 _IMPOSSIBLE = 1e6
 """Squared difference of hypotheses that are ruled out."""
 _LEAST = 0.01
@@ -159,6 +165,7 @@ class Gallery:
         matcher: compares views.
         images: (objects, heights, yaws, pixels) from each direction of the grid, as `stored_image`.
         features: (objects, heights, yaws, features) the same, projected.
+        variations: (objects, heights, yaws) mean square by which features differ for a slightly wrong sphere and yaw.
         radii: (objects,) in metres; 0 where the true size is not known.
         symmetries: (objects,) number of yaws at which each looks alike.
     """
@@ -166,17 +173,23 @@ class Gallery:
     matcher: Matcher
     images: UInt8[Array, "objects heights yaws pixels"]
     features: Float[Array, "objects heights yaws features"]
+    variations: Float[Array, "objects heights yaws"]
     radii: Float[Array, " objects"]
     symmetries: Int[Array, " objects"]
 
     @classmethod
     def of(cls, matcher: Matcher, images: UInt8[AnyArray, "objects heights yaws pixels"], radii: AnyArray) -> Gallery:
         """The gallery of some images."""
-        features = jnp.zeros((0, HEIGHTS, YAWS, matcher.projection.shape[1]))
+        project = jnp.asarray(WEIGHTS[:, None]) * matcher.projection
+        features = jnp.zeros((0, HEIGHTS, YAWS, project.shape[1]))
+        variations = features[..., 0]
         if len(images):
-            features = jnp.stack([_filled(one) @ (WEIGHTS[:, None] * matcher.projection) for one in images])
+            filled = [_filled(one) for one in images]
+            features = jnp.stack([one @ project for one in filled])
+            variations = jnp.stack([_variation(*pair, project) for pair in zip(filled, features, strict=True)])
         symmetries = jnp.array([symmetry_of(one) for one in np.asarray(features)], jnp.int32)
-        return cls(matcher, jnp.asarray(images, jnp.uint8), features, jnp.asarray(radii, jnp.float32), symmetries)
+        sizes = jnp.asarray(radii, jnp.float32)
+        return cls(matcher, jnp.asarray(images, jnp.uint8), features, variations, sizes, symmetries)
 
     def compared(
         self,
@@ -188,8 +201,8 @@ class Gallery:
         """What is kept of a view: for each object, its squared differences from the prediction at each yaw, and from its size;
         and, last, the share of the image that is known.
 
-        Differences are white: a square is 1 on average if the hypothesis is right. Pixels that are unknown in the view are left
-        out, and the others count more in their place. Where only the prediction is unknown, `Matcher.unseen` counts.
+        Differences are white: a square is about 1 on average if the hypothesis is right. Pixels that are unknown in the view are
+        left out, and the others count more in their place. Where only the prediction is unknown, `Matcher.unseen` counts.
 
         Args:
             depth: in radii, as of `small_image`.
@@ -211,7 +224,8 @@ class Gallery:
         both = known * (unknown == 0)
         white = (both * (predicted / STEPS - image)) @ (WEIGHTS[:, None] * self.matcher.projection)
         seen, share = jnp.mean(both, axis=-1), jnp.mean(known)
-        apart = jnp.mean(jnp.square(white), axis=-1) / jnp.maximum(seen, _LEAST)
+        expected = 1 + interpolated(self.variations[..., None], direction)[..., 0]
+        apart = jnp.mean(jnp.square(white), axis=-1) / (expected * jnp.maximum(seen, _LEAST))
         apart += (1 - seen / jnp.maximum(share, _LEAST)) * (self.matcher.unseen - apart)
         told = (self.radii > 0) & (jnp.asarray(radius) > 0)
         ratio = jnp.where(told, radius, 1.0) / jnp.where(told, self.radii, 1.0)
@@ -251,8 +265,8 @@ class Gallery:
         """Expected decrease of the entropy over objects in nats by one more view, if the object is none unknown.
 
         Each of the likeliest hypotheses is taken to be true in turn: it says what a camera at a candidate would see, and so what
-        the belief would become. As in Denzler and Brown (2002), over objects and yaws; exact but for the errors of the view,
-        which are as large as the best hypothesis' so far.
+        the belief would become. As in Denzler and Brown (2002), over objects and yaws; exact but for the errors of the view, of
+        which is assumed that they are as large as the best hypothesis' so far, where views can be predicted as exactly.
 
         Args:
             evidence: of the views so far.
@@ -264,10 +278,13 @@ class Gallery:
         now, index = jax.lax.top_k(flat, min(MOST_HYPOTHESES, flat.size))
         now = jax.nn.log_softmax(now)
         before = evidence.apart.reshape(-1)[index]
-        seen = _seen(self.features, directions, index // YAWS, index % YAWS)
+        known = jnp.concatenate([self.features, self.variations[..., None]], axis=-1)
+        seen = _seen(known, directions, index // YAWS, index % YAWS)
+        seen, expected = seen[..., :-1], 1 + seen[..., -1]
         products = jnp.einsum("cmf,cnf->cmn", seen, seen) / seen.shape[-1]
         squares = jnp.diagonal(products, axis1=1, axis2=2)
-        apart = jnp.maximum(squares[:, :, None] + squares[:, None, :] - 2 * products, 0.0) + jnp.min(before)
+        apart = jnp.maximum(squares[:, :, None] + squares[:, None, :] - 2 * products, 0.0)
+        apart = (apart + jnp.min(before) * expected[:, :, None]) / expected[:, None, :]
         apart = (count * before + apart) / (count + 1)
         likelihood = self.matcher.likelihood(apart, count + 1, objects)
         after = jax.nn.log_softmax(likelihood - 0.5 * evidence.size[index // YAWS], axis=-1)
@@ -306,6 +323,38 @@ def _filled(images: UInt8[AnyArray, "heights yaws pixels"]) -> Float[Array, "hei
     values = jnp.where(known, images, 0) / STEPS
     mean = jnp.sum(values, axis=(0, 1)) / jnp.maximum(jnp.sum(known, axis=(0, 1)), 1)
     return jnp.where(known, values, mean)
+
+
+def _variation(
+    images: Float[Array, "heights yaws pixels"],
+    features: Float[Array, "heights yaws features"],
+    project: Float[Array, "pixels features"],
+) -> Float[Array, "heights yaws"]:
+    """Mean square of the change of features by errors with the standard deviations `_OFF` and `_TURNED`."""
+    turned = (jnp.roll(features, -1, axis=1) - jnp.roll(features, 1, axis=1)) * (YAWS / (4 * jnp.pi))
+    moved = jnp.einsum("hycp,pf->hycf", _changes(images), project)
+    return jnp.mean(_TURNED**2 * jnp.square(turned) + _OFF**2 * jnp.sum(jnp.square(moved), axis=2), axis=-1)
+
+
+def _changes(images: Float[Array, "*grid pixels"]) -> Float[Array, "*grid 4 pixels"]:
+    """Derivatives of small images by the place of the object, to the right, down and forwards in radii, and by its log size.
+
+    To first order, for a camera two radii away whose image the object's sphere touches.
+    """
+    both = images.reshape(*images.shape[:-1], 2, SIDE, SIDE)  # depth, and share
+    padded = jnp.pad(both, [(0, 0)] * (both.ndim - 2) + [(1, 1), (1, 1)], mode="edge")
+    across = (padded[..., 1:-1, 2:] - padded[..., 1:-1, :-2]) / 2
+    down = (padded[..., 2:, 1:-1] - padded[..., :-2, 1:-1]) / 2
+    at = jnp.arange(SIDE) - (SIDE - 1) / 2
+    outwards, focal = across * at + down * at[:, None], SIDE / 2 / math.tan(math.pi / 6)
+    near, share = both[..., :1, :, :], both[..., 1:, :, :]
+    nothing = jnp.zeros_like(share)
+    nearer, deeper = (
+        jnp.concatenate([-share / 2, nothing], axis=-3),
+        jnp.concatenate([near - share / 2, nothing], axis=-3),
+    )
+    each = -focal / 2 * across, -focal / 2 * down, outwards / 2 + nearer, -outwards + deeper
+    return jnp.stack([one.reshape(images.shape) for one in each], axis=-2)
 
 
 def interpolated(grid: Array, direction: Float[Array, " 3"]) -> Float[Array, "objects yaws numbers"]:

@@ -234,20 +234,19 @@ def test_one_object_a_class_is_trained_and_tested_on_from_other_directions(tmp_p
     with pytest.raises(DataError, match=r"class mug has 1 object, .* give --dataset.split 1 to") as caught:
         opened(root, split="0.8")
     source = opened(root, split=re.search(r"give --dataset.split (\S+)", str(caught.value))[1])
-    assert [len(of_split(source, split)) for split in ("train", "val", "test")] == [10, 2, 2]
-    assert len({entry.name for entry in source.entries}) == 14
+    assert [len(of_split(source, split)) for split in ("train", "val", "test")] == [300, 2, 2]
+    assert len({entry.name for entry in source.entries}) == 304
     assert "these very objects" in source.notes[0]
     assert not source.left_out
     mugs = [entry for entry in source.entries if entry.label == 0]
-    assert len({entry.recipe.stamp for entry in mugs}) == 7  # of which captures are kept apart
-    angles = []
-    for mesh in map(load_object, mugs):
-        edges = np.diff(mesh.vertices[mesh.faces], axis=1).reshape(-1, 3)
-        level = edges[np.abs(edges[:, 2]) < 1e-6]
-        lengths = np.linalg.norm(level, axis=1)
-        x, y = level[np.abs(lengths / lengths.min() - 3).argmin(), :2]  # along the long side
-        angles.append(np.arctan2(y, x) % np.pi)
-    assert np.diff(np.sort(angles)).min() == pytest.approx(np.pi / 7, abs=1e-5)
+    assert len({entry.recipe.stamp for entry in mugs}) == 152  # of which captures are kept apart
+    angles = sorted(entry.recipe.angle for entry in mugs)
+    np.testing.assert_allclose(angles, 2 * np.pi * np.arange(152) / 152)
+    test = next(entry.recipe for entry in mugs if entry.split == "test")
+    first, last = test.recipe.load()[0], test.load()[0]
+    for before, after in zip(first, last, strict=True):
+        turned = (before[0] + 1j * before[1]) * np.exp(1j * test.angle)
+        np.testing.assert_allclose(after, [turned.real, turned.imag, before[2]], atol=1e-9)
 
 
 @pytest.mark.parametrize("option", ["0", "1.01", "1.5", "-0.1", "nan", "eighty", "list.txt"])

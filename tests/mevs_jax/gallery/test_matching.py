@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -9,6 +11,7 @@ import pytest
 
 from data_pipeline.capture.casting import capture
 from data_pipeline.objects.mesh import normalise
+from mevs_jax.enrolment import enrol
 from mevs_jax.gallery.matching import (
     HEIGHTS,
     PIXELS,
@@ -19,6 +22,7 @@ from mevs_jax.gallery.matching import (
     YAWS,
     Gallery,
     Matcher,
+    _changes,
     differences_by_turn,
     grid_directions,
     interpolated,
@@ -26,6 +30,7 @@ from mevs_jax.gallery.matching import (
     stored_image,
     symmetry_of,
 )
+from mevs_jax.geometry.cameras import look_at_origin
 from mevs_jax.trained import TrainedSystem
 from tests.mevs_jax.gallery.conftest import CAMERA
 from train.tasks.matcher import turned_rig
@@ -81,6 +86,7 @@ def _compared_slowly(gallery: Gallery, depth: np.ndarray, direction: np.ndarray,
     matcher, images = gallery.matcher, np.asarray(gallery.images)
     predicted = np.asarray(interpolated(jnp.asarray(images, jnp.float32), jnp.asarray(direction)))
     hidden = np.asarray(interpolated(jnp.asarray(images == UNKNOWN, jnp.float32), jnp.asarray(direction))) > 0
+    expected = 1 + np.asarray(interpolated(gallery.variations[..., None], jnp.asarray(direction)))[..., 0]
     rows = []
     for object_ in range(len(images)):
         row = []
@@ -88,6 +94,7 @@ def _compared_slowly(gallery: Gallery, depth: np.ndarray, direction: np.ndarray,
             both = (known > 0) & ~hidden[object_, yaw]
             apart = np.where(both, (predicted[object_, yaw] / STEPS - image) * WEIGHTS, 0)
             squares = np.mean((apart @ np.asarray(matcher.projection)) ** 2) / max(both.mean(), 0.01)
+            squares /= expected[object_, yaw]
             shared = both.sum() / max(known.sum(), 1)
             row.append(shared * squares + (1 - shared) * float(matcher.unseen))
         own = float(gallery.radii[object_])
@@ -108,6 +115,31 @@ def test_views_are_compared_where_both_are_known(matcher: Matcher) -> None:
     for radius in (0.15, np.nan):
         told = gallery.compared(jnp.asarray(depth), jnp.asarray(direction), 2.0, jnp.float32(radius))
         np.testing.assert_allclose(told, _compared_slowly(gallery, depth, direction, radius), rtol=2e-3)
+
+
+def test_images_change_with_the_sphere_and_the_yaw_as_expected(blank: TrainedSystem, shapes) -> None:
+    """Beside images of the object moved, made larger and turned; at edges, images change less smoothly than assumed."""
+    mesh = normalise(*shapes["knob"], "knob")
+    direction = np.array([0.6, 0.48, 0.64], np.float32)
+    rotation = np.asarray(look_at_origin(2 * direction))[:3, :3]
+
+    def seen(moved: np.ndarray | tuple[float, ...] = (0, 0, 0), scale: float = 1.0, yaw: float = 0.0) -> np.ndarray:
+        other = replace(mesh, vertices=(mesh.vertices * scale + rotation @ moved).astype(np.float32))
+        depth = capture(other, turned_rig(CAMERA, direction[None], yaw)).depth[0] * np.float32(1e-4)
+        return np.asarray(small_image(depth, 2.0)[0])
+
+    step = 0.06
+    slopes = [(seen(moved=step * axis) - seen(moved=-step * axis)) / (2 * step) for axis in np.eye(3)]
+    slopes.append((seen(scale=1 + step) - seen(scale=1 - step)) / (2 * step))
+    for found, expected in zip(np.asarray(_changes(jnp.asarray(seen()))), slopes, strict=True):
+        assert np.corrcoef(found, expected)[0, 1] > 0.75
+        assert 0.5 < np.linalg.norm(found) / np.linalg.norm(expected) < 1.2
+    project = WEIGHTS[:, None] * np.asarray(blank.parts.gallery.matcher.projection)
+    turn = (seen(yaw=np.radians(10)) - seen(yaw=-np.radians(10))) / np.radians(20)
+    squares = [(0.05 * turn @ project) ** 2, *[(0.02 * slope @ project) ** 2 for slope in slopes]]
+    gallery = enrol({"knob": shapes["knob"]}, blank).parts.gallery
+    found = float(interpolated(gallery.variations[..., None], jnp.asarray(direction))[0, 0, 0])
+    assert 0.4 < found / np.mean(np.sum(squares, axis=0)) < 1.2
 
 
 def _beliefs_slowly(gallery: Gallery, compared: np.ndarray, posed: bool) -> tuple[np.ndarray, np.ndarray]:
@@ -162,9 +194,11 @@ def test_gains_are_those_of_every_hypothesis_taken_as_true(known: TrainedSystem)
     power = float(gallery.matcher.power(jnp.float32(2), 3))
     for gain, direction in zip(gains, directions, strict=True):
         seen = np.asarray(interpolated(gallery.features, jnp.asarray(direction)))
+        errors = 1 + np.asarray(interpolated(gallery.variations[..., None], jnp.asarray(direction)))[..., 0]
         expected = entropy(now)
         for object_, yaw in np.argwhere(now > 1e-7):
-            more = np.mean((seen - seen[object_, yaw]) ** 2, axis=-1) + apart.min()
+            more = np.mean((seen - seen[object_, yaw]) ** 2, axis=-1) + apart.min() * errors[object_, yaw]
+            more /= errors
             after = np.exp(-0.5 * np.asarray(evidence.size)[:, None]) / ((apart + more) / 2 + floor) ** power
             expected -= now[object_, yaw] * entropy(after / after.sum())
         assert gain == pytest.approx(expected, abs=2e-3)
