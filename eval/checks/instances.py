@@ -171,7 +171,7 @@ def study_instances(
 
 def _measure(system: TrainedSystem, meshes: dict[str, Mesh], condition: Condition, yaws: int, seed: int) -> Measured:
     names, camera = list(meshes), system.description.camera
-    random, see = np.random.default_rng([seed, len(names)]), partial(_seen, system, condition)
+    random, see = np.random.default_rng([seed, len(names)]), partial(seen_with_errors, system, condition)
     seen = [
         see(mesh, random.uniform(0, 2 * np.pi), jax.random.key(int(random.integers(2**31))))
         for mesh in meshes.values()
@@ -199,7 +199,7 @@ def _measure(system: TrainedSystem, meshes: dict[str, Mesh], condition: Conditio
     )
 
 
-def _seen(system: TrainedSystem, condition: Condition, mesh: Mesh, yaw: float, key: jax.Array) -> Seen:
+def seen_with_errors(system: TrainedSystem, condition: Condition, mesh: Mesh, yaw: float, key: jax.Array) -> Seen:
     camera = system.description.camera
     depth = jnp.asarray(capture(mesh, turned_rig(camera, system.viewpoints, yaw)).depth)
     if not condition.errors:
