@@ -29,10 +29,11 @@ from mevs_jax.geometry.cameras import ViewCamera
 from mevs_jax.geometry.source_view import DepthImage
 from mevs_jax.selection.loop import ViewTable
 from mevs_jax.trained import TrainedSystem
+from mevs_jax.trained.usable import BELIEF_ORACLE
 from train.tasks.matcher import turned_rig
 
 VIEWS = (1, 2, 3, 4)
-POLICIES = (BASELINE, "farthest", "information_gain")
+POLICIES = (BASELINE, "farthest", "information_gain", BELIEF_ORACLE)
 _WITHIN = np.radians(10)
 """A yaw is right if it is off by at most this much."""
 _LEVEL = -0.1

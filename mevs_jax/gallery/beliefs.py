@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
@@ -28,6 +29,27 @@ def gain_among(gallery: Gallery, posed: bool, target: int | None = None) -> Poli
         return gallery.gains(evidence_of(gallery, state, posed), scene.graph.points, target)
 
     return gain
+
+
+def oracle_among(gallery: Gallery, posed: bool) -> Policy:
+    """Returns the label-free oracle: the view after which the belief is closest to the belief after all views.
+
+    See `mevs_jax.policies.oracles.belief_oracle`.
+    """
+
+    def closest(key: Array, state: SelectionState, scene: Scene) -> Float[Array, " views"]:
+        del key
+        every, seen = required(scene.features, "Scene.features"), required(state.seen.features, "Observation.features")
+        present = jnp.arange(len(state.views)) < state.count
+        final = jnp.exp(gallery.beliefs(gallery.evidence(every, jnp.ones(len(every), bool), posed)))
+
+        def after(view: Array) -> Float[Array, ""]:
+            with_it = gallery.evidence(jnp.concatenate([seen, view[None]]), jnp.append(present, True), posed)
+            return final @ gallery.beliefs(with_it)
+
+        return jax.lax.map(after, every)
+
+    return closest
 
 
 def evidence_of(gallery: Gallery, state: SelectionState, posed: bool) -> Evidence:

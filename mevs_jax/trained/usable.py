@@ -13,7 +13,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from mevs_jax.gallery.beliefs import by_hypotheses, gain_among
+from mevs_jax.gallery.beliefs import by_hypotheses, gain_among, oracle_among
 from mevs_jax.policies.base import Observation, Policy
 from mevs_jax.policies.informed import expected_views
 from mevs_jax.policies.learned import learned
@@ -30,6 +30,8 @@ EXPECTED_VIEWS = "expected_views"
 
 INFORMATION_GAIN = "information_gain"
 """The registered policy, which is exact over the hypotheses of a gallery."""
+BELIEF_ORACLE = "belief_oracle"
+"""The registered policy; around enrolled objects, by the beliefs of the gallery."""
 
 
 @dataclass(frozen=True)
@@ -74,8 +76,10 @@ def policy_of(description: Description, parts: Parts, name: str, posed: bool, ta
             raise ValueError("its network needs the object's yaw")
         by = "table" if name == AND_TABLE else "belief"
         return learned(parts.view_policies[network].module, parts.single, by=by)  # type: ignore[arg-type]
-    if name == INFORMATION_GAIN and parts.gallery is not None:
+    if parts.gallery is not None and name == INFORMATION_GAIN:
         return gain_among(parts.gallery, posed, target)
+    if parts.gallery is not None and name == BELIEF_ORACLE:
+        return oracle_among(parts.gallery, posed)
     if name == EXPECTED_VIEWS and parts.expected is not None:
         return expected_views
     if name not in POLICIES:

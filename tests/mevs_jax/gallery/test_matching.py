@@ -31,6 +31,7 @@ from mevs_jax.gallery.matching import (
     symmetry_of,
 )
 from mevs_jax.geometry.cameras import look_at_origin
+from mevs_jax.policies.base import Observation, Scene, SelectionState
 from mevs_jax.trained import TrainedSystem
 from tests.mevs_jax.gallery.conftest import CAMERA
 from train.tasks.matcher import turned_rig
@@ -232,3 +233,22 @@ def test_views_of_what_tells_objects_apart_are_worth_most(known: TrainedSystem, 
     gains = np.asarray(jax.jit(gallery.gains)(evidence, jnp.asarray(known.viewpoints)))
     assert known.viewpoints[gains.argmax()][0] > 0
     assert gains.max() > 2 * max(gains[known.viewpoints[:, 0] < -0.8].max(), 0.0)
+
+
+def test_the_oracle_comes_closest_to_the_belief_after_all_views(known: TrainedSystem) -> None:
+    gallery = known.parts.gallery
+    assert gallery is not None
+    every = np.random.default_rng(6).uniform(0.2, 2, (7, 3 * (YAWS + 1) + 1)).astype(np.float32)
+    nothing, seen = jnp.zeros(4), Observation(jnp.zeros((4, 4)), features=jnp.asarray(every[[3, 5, 0, 0]]))
+    latest = Observation(nothing, features=jnp.asarray(every[5]))
+    views = jnp.array([3, 5, -1, -1])
+    state = SelectionState(jnp.int32(2), views[1], jnp.isin(jnp.arange(7), views), nothing, latest, views, seen)
+    scene = Scene(known.graph, features=jnp.asarray(every))
+    scores = known.policy("belief_oracle", posed=False)(jax.random.key(0), state, scene)
+
+    def belief(views: list[int]) -> np.ndarray:
+        return _beliefs_slowly(gallery, every[views], posed=False)[0]
+
+    final = belief([*range(7)])
+    expected = [final @ np.log(belief([3, 5, view])) for view in range(7)]
+    np.testing.assert_allclose(scores, expected, rtol=2e-3)
