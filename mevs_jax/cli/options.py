@@ -325,5 +325,7 @@ class ExportOptions:
     """or a trained system, as for mevs look"""
     half: Flag = False
     """store the networks in float16, which halves the folder"""
+    measured: Annotated[tuple[Path, ...], _arg("FILE ...")] = ()
+    """results of `mevs check transfer --to FILE` with this system, for its card"""
     stablehlo: Flag = False
     """also write the compiled programs for CPU, CUDA and TPU, which need JAX and NumPy alone"""

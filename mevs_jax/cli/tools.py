@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import importlib.util
 import json
+from collections.abc import Sequence
 from contextlib import suppress
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -204,6 +206,7 @@ def export(options: ExportOptions) -> None:
     else:
         assert options.system is not None
         system = load_system(options.system)
+    system = _with_measured(system, options.measured)
     try:
         system.save(options.to, half=options.half, programs=write_programs if options.stablehlo else None)
     except (FileExistsError, ImportError) as error:
@@ -212,6 +215,21 @@ def export(options: ExportOptions) -> None:
         raise Unusable(f"cannot write {options.to} ({error.strerror}); choose another folder") from error
     size = sum(path.stat().st_size for path in options.to.rglob("*") if path.is_file())
     print(f"Trained system: {options.to.absolute()} ({size / 1e6:.1f} MB)")
+
+
+def _with_measured(system: TrainedSystem, paths: Sequence[Path]) -> TrainedSystem:
+    """The system whose description says what was measured on objects of other sources."""
+    from mevs_jax.trained.card import ELSEWHERE, elsewhere
+
+    if not paths:
+        return system
+    try:
+        measured = [elsewhere(Path(path).read_text()) for path in paths]
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        files = ", ".join(map(str, paths))
+        raise Unusable(f"{files}: not all are results of mevs check transfer --to FILE ({error})") from error
+    evaluation = system.description.evaluation | {ELSEWHERE: measured}
+    return replace(system, description=replace(system.description, evaluation=evaluation))
 
 
 def _system_of_run(out: Path) -> TrainedSystem:

@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+import json
+from pathlib import PurePath
+from typing import Any
+
 from mevs_jax.markdown import markdown_table
 from mevs_jax.trained.description import Description
 
@@ -41,10 +45,18 @@ from the object's centre, z up in the image.
 
 {figures}## Limits
 
-* Only these classes are known. Detection of objects of other classes was not measured for this system.
-* The figures are of perfect depth. Noise, missing depth and wrong centres cost accuracy.
+* Only these classes are known. {strangers}
+* The figures are of perfect depth. Noise, missing depth and wrong centres cost accuracy.{parts}
 * Confidence is calibrated on validation objects of the same source.
 """
+_STRANGERS = {
+    True: "Other objects are an `unknown object`, as far as those that it was trained on resemble them.",
+    False: "Detection of objects of other classes was not measured for this system.",
+}
+_PARTS = " Images may show a part of the object; pixels of unknown depth are an input of their own."
+ELSEWHERE = "elsewhere"
+"""The entry of `Description.evaluation` with what was measured on objects of other sources, as by `elsewhere`."""
+_STOP = 0.95
 _GALLERY = """---
 library_name: mevs_jax
 tags: [active-recognition, next-best-view, depth, enrolment, jax]
@@ -98,8 +110,44 @@ def model_card(description: Description, size: int) -> str:
         kind=_KINDS[of.kind],
         megabytes=size / 1e6,
         versions=", ".join(f"{name} {version}" for name, version in of.made_with.items()),
-        figures=_figures(of),
+        figures=_figures(of) + _elsewhere(of),
+        strangers=_STRANGERS[of.unknown_class is not None],
+        parts=_PARTS * of.told_unknown,
     )
+
+
+def elsewhere(written: str) -> dict[str, Any]:
+    """What a card says of the results that `mevs check transfer --to FILE` wrote.
+
+    Raises:
+        ValueError, KeyError, TypeError: for anything else.
+    """
+    found = json.loads(written)
+    last = max((row for row in found["promises"] if row["stop"] == _STOP), key=lambda row: row["views"])
+    shares = {name: last[name] for name in ("wrong", "sure", "refused", "strangers_sure", "strangers_refused")}
+    about = {"source": PurePath(found["data"]).stem, "views": last["views"]}
+    return about | {"known": found["known"], "strangers": found["strangers"]} | shares
+
+
+def _elsewhere(description: Description) -> str:
+    measured = description.evaluation.get(ELSEWHERE)
+    if not measured:
+        return ""
+
+    def percent(share: float | None) -> str:
+        return "–" if share is None else f"{100 * share:.1f} %"
+
+    head = ["objects", "number", f"sure at {_STOP:g}", "of these wrong", "unknown object"]
+    rows = []
+    for one in measured:
+        where = f"{one['source']}, up to {one['views']} views"
+        if one["known"]:
+            rows.append([where, str(one["known"]), *(percent(one[name]) for name in ("sure", "wrong", "refused"))])
+        if one["strangers"]:
+            wrong = "all" if one["strangers_sure"] else "–"
+            shares = percent(one["strangers_sure"]), wrong, percent(one["strangers_refused"])
+            rows.append([f"{where}: of no known class", str(one["strangers"]), *shares])
+    return f"Agents by the default policy, by `mevs check transfer`:\n\n{markdown_table(head, rows)}\n\n"
 
 
 def _figures(description: Description) -> str:
