@@ -24,7 +24,6 @@ from mevs_jax.points.ops import ball_query, farthest_point_sample
 from mevs_jax.policies.registry import POLICIES
 from mevs_jax.rendering import march, render_depth, render_mesh
 from mevs_jax.selection.loop import ViewTable
-from mevs_jax.trained import TrainedSystem
 from train.planning.compile import Program, shapes_on
 from train.planning.costs import views_like
 from train.planning.plan import planned_statistics
@@ -78,16 +77,14 @@ def _recogniser(statistics: Any) -> Task:
     return RecogniserTask.of(SMALL.learned.recogniser, len(statistics.classes), statistics.camera)
 
 
-@cache
-def _system() -> TrainedSystem:
-    return mevs_jax.load("furniture10")
+_system = cache(mevs_jax.load)
 
 
-def _of_system(name: str, policy: str, batch: int) -> Make:
-    """A program of the system that comes with the package, as it is exported."""
+def _of_system(name: str, policy: str, batch: int, system: str = "furniture10") -> Make:
+    """A program of a system that comes with the package, as it is exported."""
 
     def make(mesh: Mesh) -> Program:
-        function, inputs, _ = programs_of(_system(), policy, 8)[name]
+        function, inputs, _ = programs_of(_system(system), policy, 8)[name]
         return _on_one(function, lambda: arguments_like(inputs, batch))(mesh)
 
     return make
@@ -118,9 +115,9 @@ PROGRAMS: dict[str, Make] = {
         lambda cloud, centres: ball_query(cloud, centres, 0.2, 64), lambda: _shapes((4096, 3), (512, 3))
     ),
     "recognise": _of_system("recognise", "best", 40),
-    "entropies": _of_system("entropies", "best", 40),
-    "decide": _of_system("decide", "best", 1),
-    "decide-expected-views": _of_system("decide", "information_gain", 1),
+    "entropies": _of_system("entropies", "best", 40, "furniture10_classifier"),
+    "decide": _of_system("decide", "information_gain", 1, "furniture10_classifier"),
+    "decide-expected-views": _of_system("decide", "best", 1),
     "grid": _on_one(_grid, _tables),
     "render-depth": _on_one(
         lambda triangles, pose: render_depth(triangles, Camera(pose)).depth, lambda: _shapes((4096, 3, 3), (4, 4))

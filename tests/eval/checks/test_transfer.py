@@ -87,7 +87,7 @@ def test_walks_without_yaw_use_policies_that_need_none(others):
     system = mevs_jax.load("furniture10")
     found = check_transfer(system, str(others), renamed={"couch": "sofa"}, posed=False, max_views=2, draws=1)
     assert found.best == system.description.best_unposed
-    assert "information_gain" not in {row.policy for row in found.policies}
+    assert "fixed_order" not in {row.policy for row in found.policies}
 
 
 def test_names_of_classes(tmp_path):
