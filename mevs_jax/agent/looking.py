@@ -5,12 +5,13 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import partial
+from pathlib import Path
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int, Shaped
+from jaxtyping import Array, Bool, Float, Int, Shaped
 
 from mevs_jax.agent.agent import Agent
 from mevs_jax.agent.records import Belief, History, Reason, Step
@@ -24,6 +25,8 @@ from mevs_jax.rendering.depth import pad_triangles, render_depth
 from mevs_jax.trained.system import TrainedSystem
 
 MOST_FRAMES = 512
+FEWEST_POINTS = 16
+"""Points within its sphere by which an image shows an object."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -156,23 +159,7 @@ class Frames(ByContent):
         Raises:
             ValueError: for missing arrays, or arrays of other shapes.
         """
-        for name in ("depth", "K", "T_world_camera"):
-            if name not in stored:
-                raise ValueError(f"there is no array {name!r}; it holds {', '.join(stored) or 'nothing'}")
-        depth, poses, K = np.asarray(stored["depth"]), *(numbers(stored[name]) for name in ("T_world_camera", "K"))
-        number = len(depth) if depth.ndim == 3 else 0
-        if not 1 <= number <= MOST_FRAMES:
-            raise ValueError(
-                f"depth must be (frames, height, width) with 1 to {MOST_FRAMES} frames, got shape {depth.shape}"
-            )
-        if poses.shape != (number, 4, 4):
-            raise ValueError(f"T_world_camera must be ({number}, 4, 4), got shape {poses.shape}")
-        if K.shape not in ((3, 3), (number, 3, 3)):
-            raise ValueError(f"K must be (3, 3) or ({number}, 3, 3), got shape {K.shape}")
-        K = np.broadcast_to(K, (number, 3, 3))
-        mask = np.asarray(stored["mask"]) if "mask" in stored else None
-        if mask is not None and mask.shape != depth.shape:
-            raise ValueError(f"mask must have the shape of depth, {depth.shape}, got {mask.shape}")
+        depth, K, poses, mask = images_in(stored)
         up, yaw = stored.get("up", np.array((0.0, 0.0, 1.0))), _number(stored, "yaw")
         if "center" in stored and "radius" in stored:
             center, radius = stored["center"], _number(stored, "radius")
@@ -192,6 +179,73 @@ class Frames(ByContent):
         mask = None if self.mask is None else self.mask[index]
         return DepthImage(self.depth[index], self.K[index], self.T_world_camera[index], mask, self.floor)
 
+    def shown(self) -> Bool[np.ndarray, " frames"]:
+        """Which of them show some points within the object's sphere; raises `ValueError` if none does."""
+        shown = np.zeros(len(self.depth), bool)
+        for index in range(len(shown)):
+            points = self.image(index).points() - self.sphere.position
+            inside = np.linalg.norm(points, axis=1) < self.sphere.radius
+            if self.floor is not None:
+                inside &= points @ self.sphere.axis > self.floor - self.sphere.position @ self.sphere.axis
+            shown[index] = np.sum(inside) >= FEWEST_POINTS
+        if not shown.any():
+            raise ValueError("no frame shows anything within the object's sphere; check its center, radius and floor")
+        return shown
+
+    def only(self, chosen: Bool[np.ndarray, " frames"]) -> Frames:
+        """Some of them."""
+        parts = (
+            part if part is None else part[chosen] for part in (self.depth, self.K, self.T_world_camera, self.mask)
+        )
+        depth, K, poses, mask = parts
+        return Frames(depth, K, poses, self.sphere, mask, self.floor)
+
+
+def read_arrays(path: Path) -> dict[str, np.ndarray]:
+    """The arrays of an .npz file; nothing in it is executed.
+
+    Raises:
+        ValueError: for any other file.
+    """
+    try:
+        with np.load(path, allow_pickle=False) as stored:
+            if not hasattr(stored, "files"):
+                raise ValueError("it is a single array")
+            arrays = {name: stored[name] for name in stored.files}
+        if other := next((name for name, member in arrays.items() if not isinstance(member, np.ndarray)), None):
+            raise ValueError(f"its member {other!r} is no array")
+        return arrays
+    except FileNotFoundError as error:
+        raise ValueError(f"there is no file {path}") from error
+    except Exception as error:  # the content of a damaged file decides which
+        reason = (str(error).strip() or type(error).__name__).splitlines()[0][:120]
+        raise ValueError(f"{path} is no .npz of arrays that can be read ({reason})") from error
+
+
+def images_in(stored: dict[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray | None]:
+    """Depth, K and T_world_camera of each frame, and the masks or None, from arrays by name.
+
+    Raises:
+        ValueError: for missing arrays, or arrays of other shapes.
+    """
+    for name in ("depth", "K", "T_world_camera"):
+        if name not in stored:
+            raise ValueError(f"there is no array {name!r}; it holds {', '.join(stored) or 'nothing'}")
+    depth, poses, K = np.asarray(stored["depth"]), *(numbers(stored[name]) for name in ("T_world_camera", "K"))
+    number = len(depth) if depth.ndim == 3 else 0
+    if not 1 <= number <= MOST_FRAMES:
+        raise ValueError(
+            f"depth must be (frames, height, width) with 1 to {MOST_FRAMES} frames, got shape {depth.shape}"
+        )
+    if poses.shape != (number, 4, 4):
+        raise ValueError(f"T_world_camera must be ({number}, 4, 4), got shape {poses.shape}")
+    if K.shape not in ((3, 3), (number, 3, 3)):
+        raise ValueError(f"K must be (3, 3) or ({number}, 3, 3), got shape {K.shape}")
+    mask = np.asarray(stored["mask"]) if "mask" in stored else None
+    if mask is not None and mask.shape != depth.shape:
+        raise ValueError(f"mask must have the shape of depth, {depth.shape}, got {mask.shape}")
+    return depth, np.broadcast_to(K, (number, 3, 3)), poses, mask
+
 
 def _number(stored: dict[str, np.ndarray], name: str) -> Any:
     """A number, or None if it is not stored."""
@@ -202,18 +256,21 @@ def _number(stored: dict[str, np.ndarray], name: str) -> Any:
     return number(stored[name], f"{name} must be a finite number")
 
 
-def look_at_frames(agent: Agent, frames: Frames, *, first: int = 0) -> Walk:
+def look_at_frames(
+    agent: Agent, frames: Frames, *, first: int = 0, usable: Bool[np.ndarray, " frames"] | None = None
+) -> Walk:
     """Recognises an object from recorded images, of which the agent chooses the next.
 
     Args:
         agent: with at least as many `max_candidates` as there are frames.
         frames: the recorded images.
         first: the first frame.
+        usable: which of the others may be chosen; by default all.
     """
     count = len(frames.depth)
     first = whole(first, f"first must be a frame from 0 to {count - 1}", 0, count - 1)
     agent.begin(frames.sphere)
-    left, left_out = np.ones(count, bool), dict[int, str]()
+    left, left_out = np.ones(count, bool) if usable is None else usable.copy(), dict[int, str]()
 
     def take(index: int) -> Belief | None:
         left[index] = False

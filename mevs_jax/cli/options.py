@@ -172,18 +172,40 @@ class TrainOptions(WithNetworks, WithOthers):
     """with --plan: print the plan as JSON, in bytes and operations"""
 
 
-@dataclass(frozen=True)
-class LookOptions:
+_XYZ = tuple[float, float, float]
+
+
+@dataclass(frozen=True, kw_only=True)
+class RecordingOptions:
+    """Where the object is in recorded depth images, and what their files do not say."""
+
+    center: Annotated[_XYZ | None, _arg("X Y Z", "as the file says, or from its mask")] = None
+    """of recorded depth images: the object's center in the world, in metres, with --radius"""
+    radius: Annotated[float | None, _arg("R", "as the file says, or from its mask")] = None
+    """of recorded depth images: metres from the object's center to its furthest point"""
+    upward: Annotated[_XYZ | None, _arg("X Y Z", "as the file says, or 0 0 1")] = None
+    """of recorded depth images: the upward direction in the world"""
+    floor: Annotated[float | None, _arg("H", "as the file says, or none")] = None
+    """of recorded depth images: height of the supporting surface along the upward direction; below it is not the object"""
+    every: Annotated[int, _arg("N", "1")] = 1
+    """of a folder of depth images: read each n-th image only"""
+    depth_unit: Annotated[float | None, _arg("M", "0.001; 0.0002 for TUM; as BOP's scene says")] = None
+    """of a folder of depth images: metres in one unit of their pixels"""
+    intrinsics: Annotated[tuple[float, float, float, float] | None, _arg("FX FY CX CY", "as the files say")] = None
+    """of a folder of depth images: the camera's intrinsics in pixels"""
+
+
+@dataclass(frozen=True, kw_only=True)
+class LookOptions(RecordingOptions):
     """Options of `mevs look`."""
 
     system: System = "furniture10"
     """the trained system: a folder, a run, a name that comes with the package, or hf://owner/name on the Hugging Face hub"""
     mesh: Annotated[Path | None, _arg("FILE")] = None
     """a mesh to recognise: .off, .obj, .stl, .ply, .glb, .gltf, .dae or .3mf; it is rendered from the views that are chosen"""
-    depth: Annotated[Path | None, _arg("FILE")] = None
-    """recorded depth images to choose from, in an .npz: depth (n, h, w) in metres, K, T_world_camera (n, 4, 4), and center with
-    radius, or mask; optionally up, yaw (else unknown) and floor"""
-    first: Annotated[int | None, _arg("VIEW", "chosen; 0 for recorded images")] = None
+    depth: Annotated[Path | None, _arg("PATH")] = None
+    """recorded depth images to choose from: an .npz, a folder as of 7-Scenes or TUM, or PATH#OBJECT of BOP (docs/frames.md)"""
+    first: Annotated[int | None, _arg("VIEW", "chosen; for recorded images, the first that shows the object")] = None
     """the first view"""
     policy: Annotated[str, _arg("NAME", "best, which the system names")] = "best"
     """the policy that chooses views"""
@@ -208,11 +230,11 @@ class LookOptions:
 
 
 @dataclass(frozen=True, kw_only=True)
-class EnrolOptions:
+class EnrolOptions(RecordingOptions):
     """Options of `mevs enrol`."""
 
     objects: Annotated[tyro.conf.Positional[tuple[str, ...]], _arg("NAME=FILE ...")] = ()
-    """objects by name: a mesh in metres, or an .npz of depth images as of `mevs look --depth`"""
+    """objects by name: a mesh in metres, or depth images as of `mevs look --depth`"""
     to: Annotated[Path, _arg("DIR")]
     """folder of the system of enrolled objects that is written, for --system of other commands; one that is there is replaced"""
     system: Annotated[str, _arg("PATH|NAME", "objects, which comes with the package")] = "objects"

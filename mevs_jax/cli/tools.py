@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib.util
 import json
+import sys
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import replace
@@ -16,8 +17,8 @@ from mevs_jax.cli.failure import Unusable
 from mevs_jax.deploy.compiled import keep_compiled
 
 if TYPE_CHECKING:
-    from mevs_jax.agent import Walk
-    from mevs_jax.cli.options import EnrolOptions, ExportOptions, LookOptions
+    from mevs_jax.agent import Frames, Walk
+    from mevs_jax.cli.options import EnrolOptions, ExportOptions, LookOptions, RecordingOptions
     from mevs_jax.trained import TrainedSystem
 
 
@@ -34,7 +35,7 @@ def look(options: LookOptions) -> None:
     if options.metres < 0 or (options.metres and options.depth is not None):
         raise Unusable("--metres is the metres in one unit of a --mesh, 0.001 for millimetres; images are in metres")
     mesh = read_mesh(options.mesh, options.up) if options.mesh is not None else None
-    stored = read_arrays(options.depth) if options.depth is not None else None
+    frames, names = frames_in(options.depth, options) if options.depth is not None else (None, ())
     with suppress(OSError):  # without a place to keep programs in, they are compiled again
         keep_compiled()
     system = load_system(options.system)
@@ -48,10 +49,15 @@ def look(options: LookOptions) -> None:
 
             walk = look_at_mesh(system, *mesh, first=options.first, metres=options.metres or None, **given)
         else:
-            walk = _look_at_frames(system, stored, options, given)
+            assert frames is not None
+            walk = _look_at_frames(system, frames, options.first, shown_in(frames) if names else None, given)
     except ValueError as error:
         raise Unusable(f"{source}: {error}") from error
-    print(json.dumps(as_json(walk, source.name)) if options.json else f"{source.name}\n{walk}")
+    taken = [names[view] for view in walk.views] if names else []
+    if options.json:
+        print(json.dumps(as_json(walk, source.name) | ({"frames": taken} if names else {})))
+    else:
+        print("\n".join([source.name, str(walk), *(["frames: " + ", ".join(taken)] if names else [])]))
     try:
         if options.save is not None:
             walk.history.save(options.save)
@@ -79,13 +85,16 @@ def check_drawing(path: Path) -> None:
         raise Unusable("drawing a walk needs matplotlib: pip install matplotlib")
 
 
-def _look_at_frames(system: TrainedSystem, stored: Any, options: LookOptions, given: dict[str, Any]) -> Walk:
-    from mevs_jax.agent import Frames, look_at_frames
+def _look_at_frames(
+    system: TrainedSystem, frames: Frames, first: int | None, usable: np.ndarray | None, given: dict[str, Any]
+) -> Walk:
+    from mevs_jax.agent import look_at_frames
 
-    frames = Frames.of(stored)
+    if first is None:
+        first = 0 if usable is None else int(usable.argmax())
     given["max_views"] = min(given["max_views"], len(frames.depth))
     agent = system.agent(**given, max_candidates=max(128, len(frames.depth)))
-    return look_at_frames(agent, frames, first=options.first or 0)
+    return look_at_frames(agent, frames, first=first, usable=usable)
 
 
 def as_json(walk: Walk, name: str) -> dict[str, Any]:
@@ -111,21 +120,58 @@ def read_mesh(path: Path, up: str) -> tuple[np.ndarray, np.ndarray]:
     return read_mesh(path, up)  # type: ignore[arg-type]
 
 
-def read_arrays(path: Path) -> dict[str, np.ndarray]:
-    """The arrays of an .npz file; nothing in it is executed."""
+def frames_in(path: Path, options: RecordingOptions) -> tuple[Frames, tuple[str, ...]]:
+    """Recorded depth images, and their names if they are of a folder. Options go before what files say of the object."""
+    from mevs_jax.agent.looking import Frames, read_arrays
+
+    given = {name: getattr(options, name) for name in ("center", "radius", "floor")} | {"up": options.upward}
+    given = {name: np.array(value, float) for name, value in given.items() if value is not None}
+    names: tuple[str, ...] = ()
     try:
-        with np.load(path, allow_pickle=False) as stored:
-            if not hasattr(stored, "files"):
-                raise ValueError("it is a single array")
-            arrays = {name: stored[name] for name in stored.files}
-        if other := next((name for name, member in arrays.items() if not isinstance(member, np.ndarray)), None):
-            raise ValueError(f"its member {other!r} is no array")
-        return arrays
-    except FileNotFoundError as error:
-        raise Unusable(f"there is no file {path}") from error
-    except Exception as error:  # the content of a damaged file decides which
-        reason = (str(error).strip() or type(error).__name__).splitlines()[0][:120]
-        raise Unusable(f"{path} is no .npz of arrays that can be read ({reason})") from error
+        if is_archive(path):
+            if options.every != 1 or options.depth_unit is not None or options.intrinsics is not None:
+                raise ValueError("an .npz is in metres, with K; --every, --depth-unit and --intrinsics are for folders")
+            stored = read_arrays(path)
+        else:
+            stored, names = _recorded(path, options)
+            if "center" not in given and "mask" not in stored:
+                raise ValueError(
+                    "images do not say where the object is; give --center X Y Z and --radius R in metres, or choose an object of "
+                    "a BOP scene as PATH#NUMBER"
+                )
+        return Frames.of(stored | given), names
+    except ValueError as error:
+        raise Unusable(str(error) if str(path) in str(error) else f"{path}: {error}") from error
+
+
+def is_archive(path: Path) -> bool:
+    """Whether a file of recorded images is an .npz, which the library reads by itself."""
+    return path.suffix.lower() == ".npz"
+
+
+def _recorded(path: Path, options: RecordingOptions) -> tuple[dict[str, np.ndarray], tuple[str, ...]]:
+    """Arrays and names of a folder's images, by the study's readers."""
+    from mevs_jax.cli.main import has_checkout
+
+    if not has_checkout():
+        raise Unusable(
+            "folders of images are read by a checkout of the project, not by the package alone; give an .npz"
+        )
+    from data_pipeline.frames.reading import read_frames
+
+    intrinsics = None if options.intrinsics is None else np.array(options.intrinsics, float)
+    recording = read_frames(path, every=options.every, metres=options.depth_unit, intrinsics=intrinsics)
+    for note in recording.notes:
+        print(f"Note: {path}: {note}", file=sys.stderr)
+    return recording.arrays(), recording.names
+
+
+def shown_in(frames: Frames) -> np.ndarray:
+    """Which frames show the object; says how many do not."""
+    shown = frames.shown()
+    if lost := np.sum(~shown):
+        print(f"Note: {lost} of {len(shown)} images do not show the object, and are left out", file=sys.stderr)
+    return shown
 
 
 def load_system(name: str | Path) -> TrainedSystem:
@@ -151,6 +197,8 @@ def enrol(options: EnrolOptions) -> None:
     given = {name: _shape_of(Path(file), options) for name, file in _pairs(options.objects, "NAME=FILE")}
     if len(given) < len(options.objects):
         raise Unusable("two objects have one name; choose another for one of them")
+    if options.center is not None and len(options.objects) > 1:
+        raise Unusable("--center says where one object is; enrol one at a time, with --system of those before it")
     system = load_system(options.system)
     try:
         if options.remove:
@@ -184,11 +232,12 @@ def _pairs(given: tuple[str, ...], form: str) -> list[tuple[str, str]]:
 
 def _shape_of(path: Path, options: EnrolOptions) -> Any:
     """An object as `mevs_jax.enrol` takes it, from a file."""
-    if path.suffix.lower() == ".npz":
-        from mevs_jax.agent import Frames
-
+    if is_archive(path):
+        return frames_in(path, options)[0]
+    if path.is_dir() or ("#" in path.name and not path.exists()):
+        frames = frames_in(path, options)[0]
         try:
-            return Frames.of(read_arrays(path))
+            return frames.only(shown_in(frames))
         except ValueError as error:
             raise Unusable(f"{path}: {error}") from error
     vertices, faces = read_mesh(path, options.up)

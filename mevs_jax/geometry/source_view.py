@@ -47,7 +47,7 @@ class DepthImage(ByContent):
         if np.ma.isMaskedArray(self.depth):
             raise ValueError("depth is a masked array, whose mask would be lost; give depth.filled(numpy.nan)")
         _check_images(np.asarray(self.depth), None if self.mask is None else np.asarray(self.mask))
-        _check_intrinsics(_finite(self.K, "K", (3, 3)))
+        checked_intrinsics(self.K)
         checked_pose(self.pose)
         if self.floor is not None:
             _finite(self.floor, "floor", ())
@@ -171,12 +171,15 @@ def _check_images(image: np.ndarray, mask: np.ndarray | None) -> None:
         raise ValueError(f"mask has {what}; give True for the pixels of the object and False for the others")
 
 
-def _check_intrinsics(K: np.ndarray) -> None:
+def checked_intrinsics(intrinsics: AnyArray) -> np.ndarray:
+    """The intrinsics in float64; raises `ValueError` unless they are [[fx, s, cx], [0, fy, cy], [0, 0, 1]]."""
+    K = _finite(intrinsics, "K", (3, 3))
     if K[1, 0] != 0 or (K[2] != (0, 0, 1)).any() or K[0, 0] <= 0 or K[1, 1] <= 0:
         raise ValueError(
             "K is not [[fx, s, cx], [0, fy, cy], [0, 0, 1]] in pixels with positive fx and fy; check that it is not transposed, "
             f"got {K.tolist()}"
         )
+    return K
 
 
 def checked_pose(T_world_camera: AnyArray) -> np.ndarray:
