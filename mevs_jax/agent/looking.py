@@ -25,6 +25,8 @@ from mevs_jax.rendering.depth import pad_triangles, render_depth
 from mevs_jax.trained.system import TrainedSystem
 
 MOST_FRAMES = 512
+MOST_SAID = 8
+"""Frames of a walk that are printed with the reason why they were left out."""
 FEWEST_POINTS = 16
 """Points within its sphere by which an image shows an object."""
 
@@ -62,7 +64,9 @@ class Walk(ByContent):
             f"view {view:3d}: {belief.name} {100 * belief.confidence:.1f} %"
             for view, belief in zip(self.views, self.beliefs, strict=True)
         ]
-        lines += [f"view {view:3d}: left out, {why}" for view, why in self.left_out.items()]
+        left_out = list(self.left_out.items())
+        lines += [f"view {view:3d}: left out, {why}" for view, why in left_out[:MOST_SAID]]
+        lines += [f"{len(left_out) - MOST_SAID} more views: left out"] * (len(left_out) > MOST_SAID)
         count = f"{len(self.views)} view{'s' * (len(self.views) > 1)}"
         lines.append(f"{self.name}, {100 * self.confidence:.1f} % confident after {count} ({self.reason})")
         return "\n".join(lines)
@@ -179,18 +183,37 @@ class Frames(ByContent):
         mask = None if self.mask is None else self.mask[index]
         return DepthImage(self.depth[index], self.K[index], self.T_world_camera[index], mask, self.floor)
 
-    def shown(self) -> Bool[np.ndarray, " frames"]:
-        """Which of them show some points within the object's sphere; raises `ValueError` if none does."""
+    def shown(self, least: float = 0.0) -> Bool[np.ndarray, " frames"]:
+        """Which of them show some points within the object's sphere.
+
+        Args:
+            least: share of the sphere that has to be inside the image.
+
+        Raises:
+            ValueError: if none does.
+        """
         shown = np.zeros(len(self.depth), bool)
         for index in range(len(shown)):
-            points = self.image(index).points() - self.sphere.position
-            inside = np.linalg.norm(points, axis=1) < self.sphere.radius
-            if self.floor is not None:
-                inside &= points @ self.sphere.axis > self.floor - self.sphere.position @ self.sphere.axis
-            shown[index] = np.sum(inside) >= FEWEST_POINTS
+            if self._in_image(index) >= least:
+                points = self.image(index).points() - self.sphere.position
+                inside = np.linalg.norm(points, axis=1) < self.sphere.radius
+                if self.floor is not None:
+                    inside &= points @ self.sphere.axis > self.floor - self.sphere.position @ self.sphere.axis
+                shown[index] = np.sum(inside) >= FEWEST_POINTS
         if not shown.any():
             raise ValueError("no frame shows anything within the object's sphere; check its center, radius and floor")
         return shown
+
+    def _in_image(self, index: int) -> float:
+        """The share of the disc across the sphere, parallel to the image, that is inside the image."""
+        across = np.stack(np.meshgrid(*[np.linspace(-1, 1, 32)] * 2), axis=-1).reshape(-1, 2)
+        disc = np.pad(across[np.linalg.norm(across, axis=1) < 1], ((0, 0), (0, 1))) * self.sphere.radius
+        pose = self.T_world_camera[index]
+        x, y, z = self.K[index] @ ((self.sphere.position - pose[:3, 3]) @ pose[:3, :3] + disc).T
+        height, width = self.depth.shape[1:]
+        return float(
+            np.mean((z > 0) & (x > -z / 2) & (x < (width - 0.5) * z) & (y > -z / 2) & (y < (height - 0.5) * z))
+        )
 
     def only(self, chosen: Bool[np.ndarray, " frames"]) -> Frames:
         """Some of them."""

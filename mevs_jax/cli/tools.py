@@ -50,7 +50,9 @@ def look(options: LookOptions) -> None:
             walk = look_at_mesh(system, *mesh, first=options.first, metres=options.metres or None, **given)
         else:
             assert frames is not None
-            walk = _look_at_frames(system, frames, options.first, shown_in(frames) if names else None, given)
+            least = 0.0 if system.description.told_unknown else 0.5
+            usable = shown_in(frames, least) if names else None
+            walk = _look_at_frames(system, frames, options.first, usable, given)
     except ValueError as error:
         raise Unusable(f"{source}: {error}") from error
     taken = [names[view] for view in walk.views] if names else []
@@ -166,11 +168,12 @@ def _recorded(path: Path, options: RecordingOptions) -> tuple[dict[str, np.ndarr
     return recording.arrays(), recording.names
 
 
-def shown_in(frames: Frames) -> np.ndarray:
-    """Which frames show the object; says how many do not."""
-    shown = frames.shown()
+def shown_in(frames: Frames, least: float = 0.0) -> np.ndarray:
+    """Which frames show the object, and at least a share of its sphere; says how many do not."""
+    shown = frames.shown(least)
     if lost := np.sum(~shown):
-        print(f"Note: {lost} of {len(shown)} images do not show the object, and are left out", file=sys.stderr)
+        enough = f" at least {100 * least:.0f} % of" * (least > 0)
+        print(f"Note: {lost} of {len(shown)} images do not show{enough} the object, and are left out", file=sys.stderr)
     return shown
 
 
