@@ -160,20 +160,26 @@ def stacked(shots: list[Shot], notes: list[str]) -> Recording:
     Raises:
         DataError: for an image that cannot be read or shows nothing, or images of different sizes.
     """
-    kept, depths, masks = [], [], []
+    kept: list[Shot] = []
+    depths: list[np.ndarray] = []
+    masks: list[np.ndarray] = []
     for shot in shots:
-        depth = depth_in(shot)
-        mask = np.ones(depth.shape, bool) if shot.mask is None else mask_in(shot.mask)
-        for path, shape in ((shot.image, depth.shape), (shot.mask, mask.shape)):
-            if shape != (first := depths[0] if depths else depth).shape:
+        depth, mask = depth_in(shot), None if shot.mask is None else mask_in(shot.mask)
+        first = depths[0] if depths else depth
+        for path, image in ((shot.image, depth), (shot.mask, mask)):
+            if image is not None and image.shape != first.shape:
                 raise DataError(
-                    f"{path} has {shape[1]}×{shape[0]} pixels, images before it {first.shape[1]}×{first.shape[0]}; "
+                    f"{path} has {image.shape[1]}×{image.shape[0]} pixels, images before it {first.shape[1]}×{first.shape[0]}; "
                     "all images of a recording have one size"
                 )
-        if (mask & (depth > 0)).any():
-            kept.append(shot), depths.append(depth), masks.append(mask)
+        if mask is not None:
+            if not (mask & (depth > 0)).any():
+                continue
+            masks.append(mask)
+        kept.append(shot)
+        depths.append(depth)
     if not kept:
-        raise DataError(f"no mask beside {shots[0].mask} shows a measured pixel; choose another object")
+        raise DataError(f"no mask such as {shots[0].mask} shows a measured pixel; choose another object")
     if hidden := len(shots) - len(kept):
         notes = [*notes, f"{hidden} of {len(shots)} images do not show the object, and are left out"]
     return Recording(
@@ -181,7 +187,7 @@ def stacked(shots: list[Shot], notes: list[str]) -> Recording:
         np.stack([shot.K for shot in kept]),
         np.stack([shot.pose for shot in kept]),
         tuple(shot.image.name for shot in kept),
-        np.stack(masks) if kept[0].mask is not None else None,
+        np.stack(masks) if masks else None,
         np.array([shot.time for shot in kept]) if kept[0].time is not None else None,
         notes=tuple(notes),
     )

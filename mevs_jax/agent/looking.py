@@ -217,10 +217,8 @@ class Frames(ByContent):
 
     def only(self, chosen: Bool[np.ndarray, " frames"]) -> Frames:
         """Some of them."""
-        parts = (
-            part if part is None else part[chosen] for part in (self.depth, self.K, self.T_world_camera, self.mask)
-        )
-        depth, K, poses, mask = parts
+        mask = None if self.mask is None else self.mask[chosen]
+        depth, K, poses = self.depth[chosen], self.K[chosen], self.T_world_camera[chosen]
         return Frames(depth, K, poses, self.sphere, mask, self.floor)
 
 

@@ -7,7 +7,7 @@ import json
 import sys
 from collections.abc import Sequence
 from contextlib import suppress
-from dataclasses import replace
+from dataclasses import fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -34,6 +34,8 @@ def look(options: LookOptions) -> None:
     assert source is not None
     if options.metres < 0 or (options.metres and options.depth is not None):
         raise Unusable("--metres is the metres in one unit of a --mesh, 0.001 for millimetres; images are in metres")
+    if options.mesh is not None:
+        refuse_recording_options(options, "--mesh")
     mesh = read_mesh(options.mesh, options.up) if options.mesh is not None else None
     frames, names = frames_in(options.depth, options) if options.depth is not None else (None, ())
     with suppress(OSError):  # without a place to keep programs in, they are compiled again
@@ -146,6 +148,17 @@ def frames_in(path: Path, options: RecordingOptions) -> tuple[Frames, tuple[str,
         raise Unusable(str(error) if str(path) in str(error) else f"{path}: {error}") from error
 
 
+def refuse_recording_options(options: RecordingOptions, other: str) -> None:
+    """Raises `Unusable` if an option says something of recorded images, where there are none."""
+    from mevs_jax.cli.options import RecordingOptions
+
+    for option in fields(RecordingOptions):
+        if getattr(options, option.name) != option.default:
+            raise Unusable(
+                f"--{option.name.replace('_', '-')} is for recorded depth images, not for {other}; leave it out"
+            )
+
+
 def is_archive(path: Path) -> bool:
     """Whether a file of recorded images is an .npz, which the library reads by itself."""
     return path.suffix.lower() == ".npz"
@@ -243,6 +256,7 @@ def _shape_of(path: Path, options: EnrolOptions) -> Any:
             return frames.only(shown_in(frames))
         except ValueError as error:
             raise Unusable(f"{path}: {error}") from error
+    refuse_recording_options(options, f"the mesh {path}")
     vertices, faces = read_mesh(path, options.up)
     return vertices * (options.metres or 1.0), faces
 

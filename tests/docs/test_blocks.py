@@ -19,6 +19,7 @@ from data_pipeline.objects.mesh import normalise
 from eval.checks.camera import Shot, cast_shot
 from mevs_jax.cli.commands import ALIASES, COMMANDS
 from mevs_jax.cli.parsing import parse, tool_options
+from tests.data_pipeline.frames.forms import bop
 
 ROOT = Path(__file__).resolve().parents[2]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
@@ -116,6 +117,7 @@ def test_documented_python_runs(page, whole, tmp_path, monkeypatch):
         pytest.importorskip("ap_gym", reason="its second block needs the extra gym")
     piece = furniture("chair", 900)
     piece.export(tmp_path / "chair.obj")
+    bop(tmp_path / "ycbv" / "test" / "000048")
     (path,) = (one for one in PAGES if one.name == page)
     world = world_of(page, whole)
     for number, block in enumerate(re.findall(r"```python\n(.*?)```", path.read_text(), re.DOTALL)):
