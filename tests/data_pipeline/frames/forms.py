@@ -85,7 +85,7 @@ def tum(folder: Path) -> Path:
 
 
 def bop(folder: Path, placed: bool = True) -> Path:
-    """The ball is object 5, after object 1; its frame is turned and lies at its centre."""
+    """The ball is object 5, after or before object 1; its frame is turned and lies at its centre."""
     (folder / "depth").mkdir(parents=True)
     (folder / "mask_visib").mkdir()
     object_pose = np.eye(4)
@@ -93,12 +93,13 @@ def bop(folder: Path, placed: bool = True) -> Path:
     cameras, truth = {}, {}
     for number, (depth, mask, pose) in enumerate(zip(*depth_and_mask(), poses(), strict=True)):
         write_png(folder / "depth" / f"{number:06d}.png", depth, 0.0001)
-        Image.fromarray(mask.astype(np.uint8) * 255).save(folder / "mask_visib" / f"{number:06d}_000001.png")
+        place = (number + 1) % 2
+        Image.fromarray(mask.astype(np.uint8) * 255).save(folder / "mask_visib" / f"{number:06d}_{place:06d}.png")
         cameras[number] = {"cam_K": K.ravel().tolist(), "depth_scale": 0.1}
         if placed:
             cameras[number] |= _entry("w2c", np.linalg.inv(pose))
         seen = _entry("m2c", np.linalg.inv(pose) @ object_pose)
-        truth[number] = [{"obj_id": 1} | seen, {"obj_id": OBJECT} | seen]
+        truth[number] = [{"obj_id": one} | seen for one in ((OBJECT, 1), (1, OBJECT))[place]]
     (folder / "scene_camera.json").write_text(json.dumps(cameras))
     (folder / "scene_gt.json").write_text(json.dumps(truth))
     return folder

@@ -240,8 +240,8 @@ FAULTS = {
     ),
     "no mask": (
         forms.bop,
-        lambda one: (one / "mask_visib/000001_000001.png").unlink(),
-        "there is no image .*000001_000001.png",
+        lambda one: (one / "mask_visib/000001_000000.png").unlink(),
+        "there is no image .*000001_000000.png",
     ),
     "distortion of BOP": (
         forms.bop,
@@ -250,12 +250,12 @@ FAULTS = {
     ),
     "an object that moves": (
         forms.bop,
-        _json("scene_gt.json", lambda truth: truth["1"][1].update(cam_t_m2c=[0, 0, 1500.0])),
+        _json("scene_gt.json", lambda truth: truth["1"][0].update(cam_t_m2c=[0, 0, 1500.0])),
         "object 5 of .* moves by",
     ),
     "two of one object": (
         forms.bop,
-        _json("scene_gt.json", lambda truth: truth["1"][0].update(obj_id=5)),
+        _json("scene_gt.json", lambda truth: truth["1"][1].update(obj_id=5)),
         "image 1 has object 5 2 times",
     ),
 }
