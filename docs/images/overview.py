@@ -108,7 +108,7 @@ def draw_curves(axes: Any) -> None:
 
 
 def main() -> None:
-    system, piece = mevs_jax.load("furniture10"), furniture(*PIECE)
+    system, piece = mevs_jax.load("furniture10_classifier"), furniture(*PIECE)
     walk = mevs_jax.look(system, piece.vertices, piece.faces, policy="information_gain", stop=0.95, max_views=5)
     print(walk)
     count = len(walk.views)
