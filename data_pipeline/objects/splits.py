@@ -43,23 +43,23 @@ def divide(found: Sequence[Found], option: str, seed: int, where: str) -> list[F
     except ValueError:
         return _by_list(found, Path(option).expanduser())
     if not 0 < share <= 1:
-        advice = "give a number between 0 and 1, such as 0.8"
+        advice = "give a number between 0 and 1, such as 0.8, or 1 to train and test on the same objects"
         raise DataError(f"--dataset.split {option} is no share of training objects; {advice}")
     return _by_share(found, share, seed, where) if share < 1 else _by_turns(found)
 
 
 def _by_turns(found: Sequence[Found]) -> list[Found]:
     """Each object for all splits, turned about the vertical axis by another angle in each place."""
-    objects = sum(bool(one.class_name) for one in found)
+    objects = sum(bool(one.class_name and one.recipe) for one in found)
     places = max(_LEAST_TURNS, -(-_ENOUGH // max(objects, 1))) + 2
     splits = ["val" if at == places // 3 else "test" if at == 2 * places // 3 else "train" for at in range(places)]
 
     def turned(one: Found) -> list[Found]:
-        recipes = [one.recipe and Turned(one.recipe, 2 * np.pi * at / places) for at in range(places)]
+        recipes = [Turned(one.recipe, 2 * np.pi * at / places) for at in range(places) if one.recipe]
         each = enumerate(zip(splits, recipes, strict=True))
         return [replace(one, split=split, recipe=recipe, identity=(one.identity, at)) for at, (split, recipe) in each]
 
-    return [each for one in found for each in (turned(one) if one.class_name else [one])]
+    return [each for one in found for each in (turned(one) if one.class_name and one.recipe else [one])]
 
 
 def _group(one: Found) -> tuple[str, ...]:

@@ -114,10 +114,12 @@ PROGRAMS: dict[str, Make] = {
     "ball-query": _on_one(
         lambda cloud, centres: ball_query(cloud, centres, 0.2, 64), lambda: _shapes((4096, 3), (512, 3))
     ),
-    "recognise": _of_system("recognise", "best", 40),
+    "recognise": _of_system("recognise", "best", 40, "furniture10_classifier"),
     "entropies": _of_system("entropies", "best", 40, "furniture10_classifier"),
-    "decide": _of_system("decide", "information_gain", 1, "furniture10_classifier"),
-    "decide-expected-views": _of_system("decide", "best", 1),
+    "decide": _of_system("decide", "best", 1, "furniture10_classifier"),
+    "decide-expected-views": _of_system("decide", "information_gain", 1, "furniture10_classifier"),
+    "recognise-fused": _of_system("recognise", "best", 40),
+    "decide-fused": _of_system("decide", "best", 1),
     "grid": _on_one(_grid, _tables),
     "render-depth": _on_one(
         lambda triangles, pose: render_depth(triangles, Camera(pose)).depth, lambda: _shapes((4096, 3, 3), (4, 4))

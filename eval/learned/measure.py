@@ -49,6 +49,9 @@ SPLITS = "val", "test"
 APART = 2
 """Parts of the validation objects; stopping rules are fitted on walks of policies that were trained without their objects."""
 
+_ENOUGH = 100
+"""Validation objects that it takes to say how often confident answers are wrong."""
+
 
 def why_stale(metrics: dict[str, Any], seeds: Sequence[Stages]) -> str | None:
     """Why metrics of the study are not of these settings and of the networks that are there, in a few words; None if they are.
@@ -213,8 +216,9 @@ class _Walks:
 
     @property
     def promising(self) -> bool:
-        """Whether temperatures keep what confidences promise, since there are objects of no class."""
-        return UNKNOWN_OBJECT in self.stages.statistics.classes
+        """Whether temperatures keep what confidences promise, since there are objects of no class, and many for validation."""
+        statistics = self.stages.statistics
+        return UNKNOWN_OBJECT in statistics.classes and statistics.objects_of(("val",)) >= _ENOUGH
 
     def _walk(self) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
         stages, config, (method, *_) = self.stages, self.stages.config, self.variants

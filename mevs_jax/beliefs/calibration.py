@@ -17,8 +17,8 @@ from mevs_jax.arrays import AnyArray
 
 BINS = 15
 """Number of bins of the expected calibration error (Guo et al. 2017)."""
-PROMISED = (0.9, 0.95, 0.99)
-"""Confidences at which `keep_promise` checks that answers are right as often as they say."""
+PROMISED = (90, 95, 99)
+"""Confidences in % at which `keep_promise` checks that answers are right as often as they say."""
 _RANGE, _FINENESS = 2.0, 72
 """`keep_promise` tries so many temperatures, from so many times the given one down to one part in so many of it."""
 _IMPOSSIBLE = -1e9
@@ -174,8 +174,9 @@ def keep_promise(
 
     Where errors have heavy tails, the likeliest temperature makes confident answers less confident than they deserve. So the
     temperature is lowered step by step from twice the given one, to half of it at most, as long as of the answers with a
-    confidence of at least p at most the share 1 − p is wrong, for each p of `PROMISED`. This controls the risk of answers that
-    are acted on, as conformal risk control does (Angelopoulos et al. 2022), on the objects that it is fitted on.
+    confidence of at least p at most the share 1 − p is wrong, for each p of `PROMISED`. It is twice the given one if that is not
+    enough. This controls the risk of answers that are acted on, as conformal risk control does (Angelopoulos et al. 2022), but on
+    the objects that it is fitted on: it needs many of them. All classes count, that of unknown objects too.
 
     Args:
         beliefs, labels: as of `fit_temperature`.
@@ -187,9 +188,10 @@ def keep_promise(
 
     def holds(temperature: Array) -> Bool[Array, ""]:
         confidence = jnp.exp(jnp.max(jax.nn.log_softmax(beliefs / temperature, axis=-1), axis=-1))
-        sure = confidence >= jnp.array(PROMISED)[:, None]
+        percent = jnp.array(PROMISED)
+        sure = confidence >= percent[:, None] / 100
         wrong, all_sure = jnp.sum(sure & ~right, axis=1), jnp.sum(sure, axis=1)
-        return jnp.all(wrong <= (1 - jnp.array(PROMISED)) * all_sure)
+        return jnp.all(100 * wrong <= (100 - percent) * all_sure)
 
     tried = temperature * _RANGE ** jnp.linspace(1.0, -1.0, _FINENESS)
     kept = jnp.cumprod(jax.lax.map(holds, tried))

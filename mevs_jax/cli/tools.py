@@ -289,6 +289,8 @@ def _with_measured(system: TrainedSystem, paths: Sequence[Path]) -> TrainedSyste
 
     if not paths:
         return system
+    if system.description.kind == "gallery":
+        raise Unusable("--measured is of systems of classes; enrolled objects are measured by mevs study instances")
     try:
         measured = [elsewhere(Path(path).read_text()) for path in paths]
     except (OSError, ValueError, KeyError, TypeError) as error:

@@ -8,7 +8,11 @@ from jaxtyping import Array, Float
 
 from mevs_jax.gallery.matching import Evidence, Gallery
 from mevs_jax.policies.base import Policy, Scene, SelectionState, required
+from mevs_jax.policies.uninformed import farthest_view
 from mevs_jax.selection.loop import Fuse
+
+_TIE = 1e-4
+"""Nats that a radian is worth."""
 
 
 def by_hypotheses(gallery: Gallery, posed: bool) -> Fuse:
@@ -22,11 +26,14 @@ def by_hypotheses(gallery: Gallery, posed: bool) -> Fuse:
 
 
 def gain_among(gallery: Gallery, posed: bool, target: int | None = None) -> Policy:
-    """Returns the policy of the largest expected information gain over objects and yaws; see `Gallery.gains`."""
+    """Returns the policy of the largest expected information gain over objects and yaws; see `Gallery.gains`.
+
+    Where views are worth about the same, as if there is one object, the farthest from those seen comes first.
+    """
 
     def gain(key: Array, state: SelectionState, scene: Scene) -> Float[Array, " views"]:
-        del key
-        return gallery.gains(evidence_of(gallery, state, posed), scene.graph.points, target)
+        gains = gallery.gains(evidence_of(gallery, state, posed), scene.graph.points, target)
+        return gains + _TIE * jnp.minimum(farthest_view(key, state, scene), jnp.pi)
 
     return gain
 

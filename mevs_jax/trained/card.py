@@ -125,7 +125,11 @@ def elsewhere(written: str) -> dict[str, Any]:
     found = json.loads(written)
     last = max((row for row in found["promises"] if row["stop"] == _STOP), key=lambda row: row["views"])
     shares = {name: last[name] for name in ("wrong", "sure", "refused", "strangers_sure", "strangers_refused")}
-    about = {"source": PurePath(found["data"]).stem, "views": last["views"]}
+    about = {
+        "source": PurePath(found["data"]).name.removesuffix(".zip"),
+        "views": last["views"],
+        "posed": found["posed"],
+    }
     return about | {"known": found["known"], "strangers": found["strangers"]} | shares
 
 
@@ -140,7 +144,8 @@ def _elsewhere(description: Description) -> str:
     head = ["objects", "number", f"sure at {_STOP:g}", "of these wrong", "unknown object"]
     rows = []
     for one in measured:
-        where = f"{one['source']}, up to {one['views']} views"
+        yaw = "known" if one["posed"] else "unknown"
+        where = f"{one['source']}, yaw {yaw}, up to {one['views']} views"
         if one["known"]:
             rows.append([where, str(one["known"]), *(percent(one[name]) for name in ("sure", "wrong", "refused"))])
         if one["strangers"]:
@@ -158,5 +163,5 @@ def _figures(description: Description) -> str:
     head = ["", *(f"{count} view{'s' * (count > 1)}" for count in range(1, most + 1))]
     rows = [["`" + name + "`", *(f"{100 * share:.1f}" for share in shares)] for name, shares in after.items()]
     objects = description.evaluation.get("objects", "the")
-    about = f"Share of {objects} test objects recognised, in %, from all first views:"
+    about = f"Share of {objects} test objects recognised, in %, from all first views, their yaw known:"
     return f"## Evaluation\n\n{about}\n\n{markdown_table(head, rows)}\n\n"

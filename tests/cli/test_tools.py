@@ -193,12 +193,12 @@ def test_a_card_says_what_was_measured_elsewhere(system, at_once, refuses, tmp_p
     row = {"stop": 0.95, "views": 8, "wrong": 0.021, "sure": 0.5, "refused": 0.03}
     rows = [row | {"views": 1, "sure": 0.1}, row | {"strangers_sure": 0.004, "strangers_refused": 0.9}]
     rows[0] |= {"strangers_sure": None, "strangers_refused": None}
-    found = {"data": "/my/objects.zip", "known": 39, "strangers": 12, "promises": rows}
+    found = {"data": "/my/objects.zip", "posed": False, "known": 39, "strangers": 12, "promises": rows}
     (tmp_path / "found.json").write_text(json.dumps(found))
     ended(at_once("export", "--system", system, "--measured", tmp_path / "found.json", "--to", tmp_path / "mine"))
     card = (tmp_path / "mine" / "README.md").read_text()
-    assert "| objects, up to 8 views | 39 | 50.0 % | 2.1 % | 3.0 % |" in card
-    assert "| objects, up to 8 views: of no known class | 12 | 0.4 % | all | 90.0 % |" in card
+    assert "| objects, yaw unknown, up to 8 views | 39 | 50.0 % | 2.1 % | 3.0 % |" in card
+    assert "| objects, yaw unknown, up to 8 views: of no known class | 12 | 0.4 % | all | 90.0 % |" in card
     again = load(tmp_path / "mine")
     assert again.description.evaluation["elsewhere"][0]["sure"] == 0.5
     (tmp_path / "other.json").write_text("[]")

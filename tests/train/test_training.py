@@ -149,6 +149,7 @@ def test_a_finished_run_may_be_lengthened(quick, tmp_path, capsys):
     for change in (
         {"epochs": 1},
         {"patience": 3},
+        {"patience": 0},
         {"parts": 2},
         {"compute": "bfloat16"},
         {"epochs": 3, "seed": 1},
@@ -196,6 +197,9 @@ def test_training_stops_when_validation_gets_no_better(quick, tmp_path, monkeypa
     kept, last = (Checkpoints(tmp_path).latest_step(name) for name in ("best", "latest"))
     assert (kept == last) == (best == epoch)
     load_best(task, tmp_path)
+    if not patience:  # its weights are not the best, which more patience would have to keep
+        with pytest.raises(DataError, match="other settings"):
+            quick(epochs=5, patience=7)[1](tmp_path)
 
 
 def test_few_objects_are_seen_often_enough(quick, data):

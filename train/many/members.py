@@ -69,7 +69,7 @@ class Member:
     def is_training(self, patience: int) -> bool:
         """Whether the member is still trained: it has not diverged, was not dropped, and improved within `patience` epochs.
 
-        A patience of 0 never ends.
+        With a patience of 0 it never stops early.
         """
         waits = not patience or self.epochs - self.best_epoch < patience
         return waits and not self.diverged and not self.dropped

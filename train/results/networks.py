@@ -127,7 +127,8 @@ def goes_on_with(folder: Path, identity: dict[str, Any]) -> dict[str, tuple[Any,
     if identity["task"]["optimiser"]["schedule"] != "cosine":
         longer.add("task.optimiser.epochs")
     for where, (before, now) in found.items():
-        is_longer = where in longer and isinstance(before, int) and before < now
+        # A patience of 0 is no shorter one: its weights are the last, which no longer wait makes the best.
+        is_longer = where in longer and isinstance(before, int) and 0 < before < now
         if not is_longer and (done or where not in ("task.optimiser.parts", "task.optimiser.compute")):
             return {}
     return found if has_save(folder / "latest") else {}

@@ -101,8 +101,8 @@ def is_kept(beliefs: np.ndarray, labels: np.ndarray, temperature: float) -> bool
     """Whether of the answers that are at least so sure no more are wrong than that allows."""
     odds = np.exp((beliefs - beliefs.max(axis=1, keepdims=True)) / temperature)
     confidences, right = (odds / odds.sum(axis=1, keepdims=True)).max(axis=1), beliefs.argmax(axis=1) == labels
-    sure = [right[confidences >= level] for level in PROMISED]
-    return all((~some).sum() <= (1 - level) * len(some) for some, level in zip(sure, PROMISED, strict=True))
+    sure = [right[confidences >= level / 100] for level in PROMISED]
+    return all(100 * (~some).sum() <= (100 - level) * len(some) for some, level in zip(sure, PROMISED, strict=True))
 
 
 @pytest.mark.parametrize(

@@ -11,6 +11,7 @@ import pytest
 
 from data_pipeline.capture.casting import capture
 from data_pipeline.objects.mesh import normalise
+from mevs_jax.agent.looking import look
 from mevs_jax.enrolment import enrol
 from mevs_jax.gallery.matching import (
     HEIGHTS,
@@ -252,3 +253,14 @@ def test_the_oracle_comes_closest_to_the_belief_after_all_views(known: TrainedSy
     final = belief([*range(7)])
     expected = [final @ np.log(belief([3, 5, view])) for view in range(7)]
     np.testing.assert_allclose(scores, expected, rtol=2e-3)
+
+
+def test_one_object_is_looked_at_from_all_sides(blank: TrainedSystem, shapes) -> None:
+    """There is nothing to tell it apart from but what is unknown."""
+    alone = enrol({"knob": shapes["knob"]}, blank)
+    walks = [
+        look(alone, *shapes["tall"], policy=policy, first=7, stop=0.999999, max_views=5)
+        for policy in ("information_gain", "farthest")
+    ]
+    assert walks[0].views == walks[1].views
+    assert len(walks[0].views) == 5
