@@ -75,7 +75,7 @@ def test_programs_that_grew_by_more_than_a_quarter_are_named():
 
 def test_programs_are_chosen_by_how_their_names_begin():
     assert chosen_programs([]) == list(PROGRAMS)
-    assert chosen_programs(["decide", "ball"]) == ["ball-query", "decide", "decide-expected-views"]
+    assert chosen_programs(["decide", "ball"]) == ["ball-query", "decide", "decide-expected-views", "decide-fused"]
     with pytest.raises(DataError, match="--only walk: there is no such program; they are farthest-points, ball-query"):
         chosen_programs(["ball", "walk"])
 
