@@ -38,6 +38,9 @@ class SensorConfig:
     """magnitude of all errors: 0 for none, 1 as published, more for a worse sensor"""
     distance: float = 1.0
     """metres from the camera to the object's centre: errors grow with it"""
+    radius: float | None = None
+    """metres of the object's radius; None: so many that the sensor is as many radii away as the camera of the images. Of a small
+    object far away, errors are larger in radii"""
 
 
 @dataclass(frozen=True)
@@ -111,7 +114,7 @@ def sense(
         key: of this image.
         depth: along the optical axis, in radii, 0 where nothing is hit.
         pose: camera to object.
-        config: the sensor; its distance gives the size of a radius in metres.
+        config: the sensor, and the size of the object.
         strength: overrides `config.strength`.
         surface: key of the object's dark areas, the same for all of its views; other areas in every view if left out.
     """
@@ -120,12 +123,14 @@ def sense(
         return depth
     strength = jnp.asarray(config.strength if strength is None else strength, jnp.float32)
     keys = dict(zip(("across", "along", "mix", "mixed", "lost", "dark"), jax.random.split(key, 6), strict=True))
-    scale = config.distance / camera.distance  # metres in a radius
-    metres, angle = depth * scale, _angle(depth, camera)
+    near = config.distance / camera.distance  # the radius of an object that looks as large from there
+    scale = config.radius or near  # metres in a radius
+    shift = config.distance - camera.distance * scale
+    metres, angle = jnp.where(depth > 0, depth * scale + shift, 0.0), _angle(depth, camera)
     sensor = REALSENSE
     if config.kind == "structured-light":
         sensor = KINECT
-        metres, angle = _displaced(keys["across"], metres, angle, strength, camera)
+        metres, angle = _displaced(keys["across"], metres, angle, strength * near / scale, camera)
     found = metres + strength * axial_deviation(metres, angle, config.kind) * jax.random.normal(
         keys["along"], depth.shape
     )
@@ -138,7 +143,7 @@ def sense(
     )
     dark = _dark(keys["dark"] if surface is None else surface, depth, pose, camera, _share(_DARK, strength))
     seen = (metres > 0) & ~dark & (jax.random.uniform(keys["lost"], depth.shape) < kept) & (found > 0)
-    return jnp.where(seen, found / scale, 0.0)
+    return jnp.where(seen, (found - shift) / scale, 0.0)
 
 
 def _share(share: float | Array, strength: Array) -> Array:
@@ -161,7 +166,7 @@ def _displaced(
     strength: Array,
     camera: ViewCamera,
 ) -> tuple[Float[Array, "height width"], Float[Array, "height width"]]:
-    """Depth and angle of a place beside each pixel: what lateral noise shows there."""
+    """Depth and angle of a place beside each pixel: what lateral noise of a strength shows there."""
     side = len(metres)
     pixels_of_sensor = camera.at(jnp.eye(4), side).focal_length / KINECT.focal
     offset = strength * pixels_of_sensor * lateral_deviation(angle) * jax.random.normal(key, (2, side, side))

@@ -79,7 +79,12 @@ def used_reality(config: RealityAugmentation, option: str) -> RealityAugmentatio
 
 
 def realistic_views(
-    key: Array, batch: Mapping[str, Array], camera: ViewCamera, config: RealityAugmentation, views: int = 1
+    key: Array,
+    batch: Mapping[str, Array],
+    camera: ViewCamera,
+    config: RealityAugmentation,
+    views: int = 1,
+    radius: float | None = None,
 ) -> tuple[Float[Array, "batch side side"], Float[Array, "batch 4 4"]]:
     """Returns a batch of stored views with the errors that `config` describes.
 
@@ -89,6 +94,7 @@ def realistic_views(
     Args:
         batch: with `depth` and `pose`, the views of an object one after another.
         views: number of views of each object in the batch.
+        radius: of the objects in metres, as of `SensorConfig`.
 
     Returns:
         Depth in radii, 0 where nothing is hit and NaN where it is unknown what is there; and the poses that the robot believes
@@ -100,7 +106,7 @@ def realistic_views(
     keys = jax.random.split(of_views, len(depth))
 
     def by(kind: Kind) -> Callable[[], tuple[Array, Array]]:
-        one = partial(as_in_reality, camera=camera, config=config, kind=kind)
+        one = partial(as_in_reality, camera=camera, config=config, kind=kind, radius=radius)
         return lambda: jax.vmap(one)(keys, objects, depth, poses)
 
     if config.sensor == "any":
@@ -116,6 +122,7 @@ def as_in_reality(
     camera: ViewCamera,
     config: RealityAugmentation,
     kind: Kind,
+    radius: float | None = None,
 ) -> tuple[Float[Array, "side side"], Float[Array, "4 4"]]:
     """Returns a depth image with the errors that `config` describes, and the pose around the believed centre.
 
@@ -134,7 +141,7 @@ def as_in_reality(
     depth = without_floor(cut, jnp.where(unknown, 0.0, depth), pose, camera, strength * config.floor)
     # Without the barriers XLA computes each stage again for every pixel that the next one reads.
     depth = jax.lax.optimization_barrier(depth)
-    sensed = sense(noise, depth, pose, camera, SensorConfig(kind, 1.0, config.distance), strength, surface)
+    sensed = sense(noise, depth, pose, camera, SensorConfig(kind, 1.0, config.distance, radius), strength, surface)
     unknown |= (depth > 0) & (sensed == 0)
     if config.unseen:
         unknown |= unseen_part(jax.random.fold_in(noise, 1), in_sphere(camera, len(depth)), config.unseen)

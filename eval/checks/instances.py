@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import NamedTuple
 
@@ -50,6 +50,7 @@ class Condition:
         unseen: largest share of the sphere that half of the views do not show.
         sized: whether the objects' true size is known, with the error of the sphere.
         errors: whether views, and the images that objects are enrolled from, have the errors of real ones.
+        distance: metres from the sensor to the objects, whose size is true.
     """
 
     name: str
@@ -57,12 +58,15 @@ class Condition:
     unseen: float = 0.0
     sized: bool = False
     errors: bool = True
+    distance: float = 0.6
 
     @property
     def reality(self) -> RealityAugmentation:
         """The errors of the views; the sphere is off by up to 5 % of the radius."""
         strength = 1.0 if self.errors else 0.0
-        return RealityAugmentation(strength, sphere=0.05, floor=0.0, hidden=0.0, unseen=self.unseen)
+        return RealityAugmentation(
+            strength, sphere=0.05, floor=0.0, hidden=0.0, unseen=self.unseen, distance=self.distance
+        )
 
 
 CONDITIONS = (
@@ -205,16 +209,26 @@ def seen_with_errors(system: TrainedSystem, condition: Condition, mesh: Mesh, ya
     depth = jnp.asarray(capture(mesh, turned_rig(camera, system.viewpoints, yaw)).depth)
     if not condition.errors:
         return Seen(np.asarray(metric_depth(depth)), mesh.radius, yaw)
-    real = _realistic(key, depth, jnp.asarray(system.poses), camera, condition.reality)
+    real = _realistic(key, depth, jnp.asarray(system.poses), camera, condition.reality, _about(mesh.radius))
     off = float(jax.random.uniform(jax.random.fold_in(key, 1), minval=-0.05, maxval=0.05))
     return Seen(np.asarray(real), mesh.radius * (1 + off), yaw)
 
 
-@partial(jax.jit, static_argnames=("camera", "reality"))
+def _about(radius: float) -> float | None:
+    """A radius within 20 % of one in metres, so that programs are shared; None if it is unknown."""
+    return float(1.4 ** np.round(np.log(radius) / np.log(1.4))) if radius > 0 else None
+
+
+@partial(jax.jit, static_argnames=("camera", "reality", "radius"))
 def _realistic(
-    key: jax.Array, depth: jax.Array, poses: jax.Array, camera: ViewCamera, reality: RealityAugmentation
+    key: jax.Array,
+    depth: jax.Array,
+    poses: jax.Array,
+    camera: ViewCamera,
+    reality: RealityAugmentation,
+    radius: float | None,
 ) -> jax.Array:
-    return realistic_views(key, {"depth": depth, "pose": poses}, camera, reality, len(depth))[0]
+    return realistic_views(key, {"depth": depth, "pose": poses}, camera, reality, len(depth), radius)[0]
 
 
 def _shape(
@@ -228,9 +242,10 @@ def _shape(
     directions = _spread(directions[directions[:, 2] > _LEVEL], condition.frames)
     rig = turned_rig(camera, directions, 0.0)
     depth = capture(mesh, rig).depth
-    reality = RealityAugmentation(1.0 if condition.errors else 0.0, sphere=0.0, floor=0.0, hidden=0.0)
+    reality = replace(condition.reality, sphere=0.0, unseen=0.0)
     key = jax.random.key(int(random.integers(2**31)))
-    real = np.asarray(_realistic(key, jnp.asarray(depth), jnp.asarray(rig.poses), camera, reality))
+    about = _about(mesh.radius)
+    real = np.asarray(_realistic(key, jnp.asarray(depth), jnp.asarray(rig.poses), camera, reality, about))
     poses = rig.poses.astype(float)
     poses[:, :3, 3] *= mesh.radius
     return [

@@ -31,10 +31,12 @@ def sensed(keys, depth, config, pose, strength, surface):
     return jax.vmap(lambda key: sense(key, depth, pose, CAMERA, config, strength, surface))(keys)
 
 
-def measured(depth, kind, count=60, *, distance=1.0, strength=1.0, pose=FRONT, surface=None):
+def measured(depth, kind, count=60, *, distance=1.0, radius=None, strength=1.0, pose=FRONT, surface=None):
     """What a sensor measures of one image, so many times."""
     keys = jax.random.split(jax.random.key(1), count)
-    return np.asarray(sensed(keys, depth, SensorConfig(kind, distance=distance), pose, strength, surface))
+    return np.asarray(
+        sensed(keys, depth, SensorConfig(kind, distance=distance, radius=radius), pose, strength, surface)
+    )
 
 
 def plane(tilt: float, side: int = CAMERA.resolution) -> np.ndarray:
@@ -58,9 +60,11 @@ INSIDE = (slice(8, -8), slice(8, -8))
 
 
 @pytest.mark.parametrize("kind", KINDS)
-@pytest.mark.parametrize("distance", [0.6, 1.0, 2.0])
-def test_depth_of_a_wall_varies_as_published(kind, distance):
-    found = measured(plane(0.0), kind, distance=distance)[:, *INSIDE] * distance / 2
+@pytest.mark.parametrize(("distance", "radius"), [(0.6, None), (1.0, None), (2.0, None), (0.6, 0.05)])
+def test_depth_of_a_wall_varies_as_published(kind, distance, radius):
+    """In metres; so a wall behind a small object varies more in radii."""
+    found = measured(plane(0.0), kind, distance=distance, radius=radius)[:, *INSIDE]
+    found = np.where(found > 0, distance + (found - 2) * (radius or distance / 2), 0)
     off = found[found > 0] - distance
     if kind == "stereo":
         constant, step = REALSENSE.focal * REALSENSE.baseline, REALSENSE.step
