@@ -14,6 +14,7 @@ import numpy as np
 
 from data_pipeline.errors import DataError
 from data_pipeline.objects.layout import SPLIT_FOLDERS, Found
+from data_pipeline.objects.mesh import Recipe
 from data_pipeline.objects.recipes import Turned
 
 _ENOUGH, _LEAST_TURNS = 300, 5
@@ -54,12 +55,13 @@ def _by_turns(found: Sequence[Found]) -> list[Found]:
     places = max(_LEAST_TURNS, -(-_ENOUGH // max(objects, 1))) + 2
     splits = ["val" if at == places // 3 else "test" if at == 2 * places // 3 else "train" for at in range(places)]
 
-    def turned(one: Found) -> list[Found]:
-        recipes = [Turned(one.recipe, 2 * np.pi * at / places) for at in range(places) if one.recipe]
-        each = enumerate(zip(splits, recipes, strict=True))
-        return [replace(one, split=split, recipe=recipe, identity=(one.identity, at)) for at, (split, recipe) in each]
+    def turned(one: Found, recipe: Recipe) -> list[Found]:
+        return [
+            replace(one, split=split, recipe=Turned(recipe, 2 * np.pi * at / places), identity=(one.identity, at))
+            for at, split in enumerate(splits)
+        ]
 
-    return [each for one in found for each in (turned(one) if one.class_name and one.recipe else [one])]
+    return [each for one in found for each in (turned(one, one.recipe) if one.class_name and one.recipe else [one])]
 
 
 def _group(one: Found) -> tuple[str, ...]:

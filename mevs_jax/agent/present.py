@@ -20,7 +20,7 @@ from mevs_jax.trained.system import TrainedSystem
 _REACH = 1.3
 """Points up to this many radii from the estimated centre belong to the object, since an estimate from one side is too small."""
 
-_LEAST = 0.5
+LEAST = 0.5
 """Share of an object's sphere that an image must show, and of a mask's pixels that must have a depth, for networks that are not
 told what is unknown."""
 _LEAST_PIXELS = 0.005
@@ -84,14 +84,14 @@ class Present:
         check_shown(view.depth, system)
         if system.description.told_unknown:
             return view
-        if view.in_image < _LEAST:
+        if view.in_image < LEAST:
             raise ValueError(
                 f"only {view.in_image:.0%} of the object's sphere is in the image, and half of it is needed; aim the camera at "
                 "its center, or move back"
             )
         if image.mask is not None and (inside := np.asarray(image.mask, bool)).any():
             share = float(image.measured[inside].mean())
-            if share < _LEAST:
+            if share < LEAST:
                 raise ValueError(
                     f"only {share:.0%} of the mask's pixels have a measured depth, and half of them are needed; move the camera, "
                     "or take another image"

@@ -51,9 +51,10 @@ def look(options: LookOptions) -> None:
 
             walk = look_at_mesh(system, *mesh, first=options.first, metres=options.metres or None, **given)
         else:
+            from mevs_jax.agent.present import LEAST
+
             assert frames is not None
-            least = 0.0 if system.description.told_unknown else 0.5
-            usable = shown_in(frames, least) if names else None
+            usable = shown_in(frames, 0.0 if system.description.told_unknown else LEAST) if names else None
             walk = _look_at_frames(system, frames, options.first, usable, given)
     except ValueError as error:
         raise Unusable(f"{source}: {error}") from error

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from mevs_jax.gallery.matching import Evidence, Gallery
 from mevs_jax.policies.base import Policy, Scene, SelectionState, required
+from mevs_jax.policies.oracles import fused_oracle
 from mevs_jax.policies.uninformed import farthest_view
 from mevs_jax.selection.loop import Fuse
 
@@ -44,19 +44,11 @@ def oracle_among(gallery: Gallery, posed: bool) -> Policy:
     See `mevs_jax.policies.oracles.belief_oracle`.
     """
 
-    def closest(key: Array, state: SelectionState, scene: Scene) -> Float[Array, " views"]:
-        del key
-        every, seen = required(scene.features, "Scene.features"), required(state.seen.features, "Observation.features")
-        present = jnp.arange(len(state.views)) < state.count
-        final = jnp.exp(gallery.beliefs(gallery.evidence(every, jnp.ones(len(every), bool), posed)))
+    def believed(features: Array, points: Array, present: Array) -> Float[Array, " classes"]:
+        del points
+        return gallery.beliefs(gallery.evidence(features, present, posed))
 
-        def after(view: Array) -> Float[Array, ""]:
-            with_it = gallery.evidence(jnp.concatenate([seen, view[None]]), jnp.append(present, True), posed)
-            return final @ gallery.beliefs(with_it)
-
-        return jax.lax.map(after, every)
-
-    return closest
+    return fused_oracle(believed)
 
 
 def evidence_of(gallery: Gallery, state: SelectionState, posed: bool) -> Evidence:

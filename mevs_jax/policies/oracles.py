@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Literal
 
 import jax
 import jax.numpy as jnp
 from jax.tree_util import Partial
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
-from mevs_jax.beliefs.fusing import CalibratedFusion
 from mevs_jax.policies.base import (
     Policy,
     Scene,
@@ -19,6 +19,11 @@ from mevs_jax.policies.base import (
     neighbours_in_reach,
     required,
 )
+
+Believed = Callable[
+    [Float[Array, "views features"], Float[Array, "views 3"], Bool[Array, " views"]], Float[Array, " classes"]
+]
+"""Log-probabilities of the classes from features of views, their directions, and which of them are present."""
 
 
 def oracle_entropy(key: Array, state: SelectionState, scene: Scene) -> Float[Array, " views"]:
@@ -77,28 +82,28 @@ def pair_oracle(key: Array, state: SelectionState, scene: Scene) -> Float[Array,
     return jax.lax.cond(state.count % 2 == 1, best_partner, lambda: label_oracle(key, state, scene))
 
 
-def fused_oracle(fusion: CalibratedFusion, *, by: Literal["belief", "label"] = "belief") -> Policy:
+def fused_oracle(fusion: Believed, *, by: Literal["belief", "label"] = "belief") -> Policy:
     """Returns `belief_oracle` or `label_oracle` for beliefs computed by a learned fusion.
 
     Args:
-        fusion: computes the belief from `Scene.features`.
+        fusion: computes the belief from `Scene.features`, as a `mevs_jax.beliefs.fusing.CalibratedFusion`.
         by: `belief` to approach the belief after all views, `label` to maximise the probability of the true class.
     """
 
     return Partial(_by_label if by == "label" else _by_belief, fusion)
 
 
-def _by_belief(fusion: CalibratedFusion, key: Array, state: SelectionState, scene: Scene) -> Float[Array, " views"]:
+def _by_belief(fusion: Believed, key: Array, state: SelectionState, scene: Scene) -> Float[Array, " views"]:
     features, points, after = _with_one_more(fusion, state, scene)
     return after @ jnp.exp(fusion(features, points, jnp.ones(len(points), bool)))
 
 
-def _by_label(fusion: CalibratedFusion, key: Array, state: SelectionState, scene: Scene) -> Float[Array, " views"]:
+def _by_label(fusion: Believed, key: Array, state: SelectionState, scene: Scene) -> Float[Array, " views"]:
     return _with_one_more(fusion, state, scene)[2][:, required(scene.label, "Scene.label")]
 
 
 def _with_one_more(
-    fusion: CalibratedFusion, state: SelectionState, scene: Scene
+    fusion: Believed, state: SelectionState, scene: Scene
 ) -> tuple[Float[Array, "views features"], Float[Array, "views 3"], Float[Array, "views classes"]]:
     """The features of all views, their directions, and the belief after each of them."""
     features, points = required(scene.features, "Scene.features"), scene.graph.points

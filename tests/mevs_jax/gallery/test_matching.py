@@ -239,19 +239,21 @@ def test_views_of_what_tells_objects_apart_are_worth_most(known: TrainedSystem, 
 def test_the_oracle_comes_closest_to_the_belief_after_all_views(known: TrainedSystem) -> None:
     gallery = known.parts.gallery
     assert gallery is not None
-    every = np.random.default_rng(6).uniform(0.2, 2, (7, 3 * (YAWS + 1) + 1)).astype(np.float32)
+    every = np.random.default_rng(6).uniform(0.2, 2, (len(known.viewpoints), 3 * (YAWS + 1) + 1)).astype(np.float32)
     nothing, seen = jnp.zeros(4), Observation(jnp.zeros((4, 4)), features=jnp.asarray(every[[3, 5, 0, 0]]))
     latest = Observation(nothing, features=jnp.asarray(every[5]))
     views = jnp.array([3, 5, -1, -1])
-    state = SelectionState(jnp.int32(2), views[1], jnp.isin(jnp.arange(7), views), nothing, latest, views, seen)
+    state = SelectionState(
+        jnp.int32(2), views[1], jnp.isin(jnp.arange(len(every)), views), nothing, latest, views, seen
+    )
     scene = Scene(known.graph, features=jnp.asarray(every))
     scores = known.policy("belief_oracle", posed=False)(jax.random.key(0), state, scene)
 
     def belief(views: list[int]) -> np.ndarray:
         return _beliefs_slowly(gallery, every[views], posed=False)[0]
 
-    final = belief([*range(7)])
-    expected = [final @ np.log(belief([3, 5, view])) for view in range(7)]
+    final = belief([*range(len(every))])
+    expected = [final @ np.log(belief([3, 5, view])) for view in range(len(every))]
     np.testing.assert_allclose(scores, expected, rtol=2e-3)
 
 
