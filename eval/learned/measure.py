@@ -37,6 +37,7 @@ from mevs_jax.policies.registry import PolicyRecord
 from mevs_jax.trained.description import UNKNOWN_OBJECT
 from train.choosing.expected import FITTED_AS
 from train.choosing.features import Features
+from train.choosing.looks import seen_alike
 from train.choosing.stages import Aside, Stages, lattice_data
 from train.choosing.variants import VARIANTS
 from train.results.finite import check_results
@@ -337,7 +338,11 @@ def _decision_times(stages: Stages, calls: int = 200) -> dict[str, Any]:
     camera, most, recogniser = stages.dataset.capture, stages.config.max_views, stages.recogniser()
     structure, weights = nnx.split((recogniser, stages.policy()))
     fusion, classes = stages.fusion(), len(stages.statistics.classes)
-    channels = stages.config.recogniser.network.channels
+    channels, task, width = (
+        stages.config.recogniser.network.channels,
+        stages.task(),
+        recogniser.encoder.head.in_features,
+    )
     candidates = jnp.asarray(stages.statistics.viewpoints, jnp.float32)
     seen, present = candidates[:most], jnp.arange(most) < most - 1
 
@@ -352,13 +357,12 @@ def _decision_times(stages: Stages, calls: int = 200) -> dict[str, Any]:
     @jax.jit
     def from_image(weights: nnx.State, given: tuple[Array, Array, Array]) -> Array:
         image, features, logits = given
-        newest = nnx.merge(structure, weights)[0].see(depth_and_normals(image, camera, channels))
-        features, logits = features.at[most - 2].set(newest[:-classes]), logits.at[most - 2].set(newest[-classes:])
+        newest = seen_alike(nnx.merge(structure, weights)[0], task, depth_and_normals(image, camera, channels))
+        features, logits = features.at[most - 2].set(newest[:width]), logits.at[most - 2].set(newest[-classes:])
         return from_features(weights, (features, logits))
 
     depth = open_split(stages.turned, "test")[0]["depth"]
     random = np.random.default_rng(0)
-    width = recogniser.encoder.head.in_features
     inputs = [
         (depth[i % len(depth)], *(random.normal(size=(most, n)).astype(np.float32) for n in (width, classes)))
         for i in range(calls)

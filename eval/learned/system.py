@@ -97,7 +97,7 @@ def learned_system(stages: Stages, found: dict[str, Any], figures: dict[str, Any
         kind="recogniser",
         classes=tuple(stages.statistics.classes),
         camera=view_camera(stages.statistics.camera),
-        image=ImageInput("depth_and_normals", config.recogniser.network.channels),
+        image=ImageInput("depth_and_normals", config.recogniser.network.channels, config.recogniser.mirrored),
         encoder=resnet_shape(config.recogniser.network, config.recogniser.network.channels),
         best=EXPECTED_VIEWS,
         best_unposed=EXPECTED_VIEWS if finds_pose else "learned_unposed",

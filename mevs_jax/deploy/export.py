@@ -142,7 +142,7 @@ def _recognise(system: TrainedSystem) -> Program:
 
     def recognise(depth: Array, radius: Array | float = jnp.nan) -> dict[str, Array]:
         radii = jnp.broadcast_to(jnp.asarray(radius), depth.shape[:1])
-        features = features_of(parts, depth, radii, of)
+        features, _ = features_of(parts, depth, radii, of)
         logits = logits_of(parts, features) / parts.single
         return {"features": features, "probabilities": jax.nn.softmax(logits, axis=-1)}
 

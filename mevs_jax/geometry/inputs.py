@@ -96,6 +96,12 @@ def depth_and_normals(
     return jnp.concatenate([depth_image(metric, camera), normals, unknown][: channels - 2], axis=-1)
 
 
+def mirrored(images: Float[AnyArray, "*batch height width channels"]) -> Float[Array, "*batch height width channels"]:
+    """Images of `depth_and_normals` of the mirror image of each object, from the mirrored direction."""
+    flipped = jnp.asarray(images)[..., ::-1, :]
+    return flipped.at[..., 1].multiply(-1.0)
+
+
 def view_cloud(
     pixels: Int[AnyArray, " points"],
     depth: Float[AnyArray, " points"],

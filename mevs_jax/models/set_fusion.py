@@ -131,7 +131,7 @@ class SetFusion(nnx.Module):
         """Logits of the object, from the views that are present.
 
         Args:
-            features: feature vector of each view.
+            features: feature vector of each view; of longer ones the first part is used.
             directions: unit vectors from the object to the cameras.
             present: True for the views to use; the values of the others are ignored.
             key: PRNG key for dropout in training; no dropout without.
@@ -142,6 +142,7 @@ class SetFusion(nnx.Module):
         directions = jnp.where(present[..., None], jnp.asarray(directions), 0.0)
         if not posed:
             directions = relative_to_first(directions, present)[0]
+        features = features[..., : self.norm.num_features]
         keys = [None] * (len(self.blocks) + 1) if key is None else list(jax.random.split(key, len(self.blocks) + 1))
         normed = dropped(keys[-1], self.dropout, self.norm(jnp.where(present[..., None], features, 0.0)))
         tokens = self.view(normed) + self.direction(directions)
@@ -153,29 +154,6 @@ class SetFusion(nnx.Module):
             asked = 1 if number == last else x.shape[-2]  # the head reads the first token only
             x = block(x, attended, block_key, asked)
         return self.head(self.last_norm(x[..., 0, :]))
-
-
-class OfFirstFeatures(nnx.Module):
-    """A fusion that is given the first features of every view, for views whose vectors hold others after them.
-
-    Args:
-        fusion: the network.
-        features: number of features that it is given.
-    """
-
-    def __init__(self, fusion: SetFusion, features: int):
-        self.fusion, self.features = fusion, features
-
-    def __call__(
-        self,
-        features: Float[AnyArray, "*batch views features"],
-        directions: Float[AnyArray, "*batch views 3"],
-        present: Bool[AnyArray, "*batch views"],
-        *,
-        posed: bool = True,
-    ) -> Float[Array, "*batch classes"]:
-        """Logits of the object, from the views that are present; arguments as of `SetFusion`."""
-        return self.fusion(features[..., : self.features], directions, present, posed=posed)
 
 
 class SumFusion(nnx.Module):
@@ -200,5 +178,6 @@ class SumFusion(nnx.Module):
         """Logits of the object, from the views that are present; arguments as of `SetFusion`."""
         del directions, posed
         present, prior = jnp.asarray(present), self.prior[...]
-        logits = self.head(jnp.where(present[..., None], jnp.asarray(features), 0.0)) - prior
+        features = jnp.asarray(features)[..., : self.head.in_features]
+        logits = self.head(jnp.where(present[..., None], features, 0.0)) - prior
         return jnp.sum(jnp.where(present[..., None], logits, 0.0), axis=-2) + prior

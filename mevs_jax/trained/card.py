@@ -53,6 +53,7 @@ _STRANGERS = {
     True: "Other objects are an `unknown object`, as far as those that it was trained on resemble them.",
     False: "Detection of objects of other classes was not measured for this system.",
 }
+_MIRRORED = "; features are means over the image and its mirror image"
 _PARTS = " Images may show a part of the object; pixels of unknown depth are an input of their own."
 ELSEWHERE = "elsewhere"
 """The entry of `Description.evaluation` with what was measured on objects of other sources, as by `elsewhere`."""
@@ -104,7 +105,7 @@ def model_card(description: Description, size: int) -> str:
         count=len(of.classes),
         classes=", ".join(of.classes),
         objects=", ".join(f"{count} {split}" for split, count in of.data.objects.items()),
-        image=_INPUTS[of.image.content],
+        image=_INPUTS[of.image.content] + _MIRRORED * of.image.mirrored,
         channels=f"{of.image.channels} channel{'s' * (of.image.channels > 1)}",
         size="" if sizes is None else told.format(sizes),
         kind=_KINDS[of.kind],

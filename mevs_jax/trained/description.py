@@ -27,10 +27,13 @@ class ImageInput:
             does not give.
         channels: of the image; depth is repeated in all channels, except for `depth_and_normals`, which has 4, or 5 of which
             the last is 1 where it is unknown what is there.
+        mirrored: whether the features of a view are means of those of its image and of the mirror image, which shows an object
+            of the same class.
     """
 
     content: Literal["depth", "depth_and_normals", "image"]
     channels: int
+    mirrored: bool = False
 
 
 @dataclass(frozen=True)

@@ -215,6 +215,7 @@ def check(description: Description) -> None:
         f"there are more than {MOST_CLASSES} classes": len(classes) <= MOST_CLASSES,
         "depth and normals have 4 or 5 channels": of.image.content != "depth_and_normals"
         or of.image.channels in (4, 5),
+        "mirror images are of depth and normals": not of.image.mirrored or of.image.content == "depth_and_normals",
         "encoder and image differ in their channels": of.encoder is None or of.encoder.channels == of.image.channels,
         "the size is impossible, or used by another kind than a recogniser": size is None
         or (of.fusion is not None and 0 < size.smallest < size.largest < 1e9 and 2 <= size.steps <= 1000),

@@ -14,7 +14,7 @@ from jaxtyping import Array, Float, Int
 from mevs_jax.beliefs.fusing import CalibratedFusion
 from mevs_jax.beliefs.strangeness import Strangeness
 from mevs_jax.gallery.matching import Gallery
-from mevs_jax.geometry.inputs import depth_and_normals, depth_image, view_cloud
+from mevs_jax.geometry.inputs import depth_and_normals, depth_image, mirrored, view_cloud
 from mevs_jax.models.expected_views import ExpectedViews
 from mevs_jax.models.pose import yaw_evidence
 from mevs_jax.policies.base import Knowledge, Observation
@@ -114,12 +114,18 @@ def logits_of(parts: Parts, features: Float[Array, "*batch features"]) -> Float[
 
 def features_of(
     parts: Parts, depth: Float[Array, "*batch side side"], radius: Float[Array, "*batch"], of: Description
-) -> Float[Array, "*batch features"]:
-    """The features of single views; arguments as of `observe`."""
+) -> tuple[Float[Array, "*batch features"], Float[Array, "*batch features"]]:
+    """The features of single views, and those of the images as they are, which the pose can be read from.
+
+    They differ where features are means over an image and its mirror image. Arguments as of `observe`.
+    """
     images = jnp.vectorize(lambda one: image_of(one, of), signature="(h,w)->(h,w,c)")(depth)
     assert parts.encoder is not None
-    features = parts.encoder.module.features(images)
-    return features if of.size is None or parts.size is None else features + of.size.code(radius) @ parts.size
+    given = jnp.stack([images, mirrored(images)]) if of.image.mirrored else images[None]
+    features = parts.encoder.module.features(given)
+    if of.size is not None and parts.size is not None:
+        features = features + of.size.code(radius) @ parts.size
+    return jnp.mean(features, axis=0), features[0]
 
 
 def observe(
@@ -145,12 +151,12 @@ def observe(
         compared = parts.gallery.compared(depth, direction, of.camera.distance, radius)
         evidence = parts.gallery.evidence(compared[None], jnp.ones(1, bool), posed=False)
         return Observation(parts.gallery.beliefs(evidence), features=compared)
-    features = features_of(parts, depth, radius, of)
+    features, as_it_is = features_of(parts, depth, radius, of)
     cloud, entropies, yaws = of.cloud, None, None
     if with_entropy and cloud is not None and parts.entropy is not None:
         pixels = sample_pixels(depth, cloud.points)
         seen = view_cloud(pixels, depth.reshape(-1)[pixels], pose, of.camera, cloud.frame, cloud.directions)
         entropies = parts.entropy.module(seen)
     if parts.pose is not None:
-        yaws = yaw_evidence(parts.pose.module(features, direction[2]), direction)
+        yaws = yaw_evidence(parts.pose.module(as_it_is, direction[2]), direction)
     return Observation(logits_of(parts, features), entropies, features, pose_evidence=yaws)

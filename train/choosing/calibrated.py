@@ -14,7 +14,7 @@ from data_pipeline.errors import Diverged
 from mevs_jax.arrays import AnyArray
 from mevs_jax.beliefs.calibration import class_weights, fit_temperature
 from mevs_jax.beliefs.fusing import CalibratedFusion
-from mevs_jax.models.set_fusion import OfFirstFeatures, SetFusion, SumFusion
+from mevs_jax.models.set_fusion import SetFusion, SumFusion
 from train.choosing.features import Features, sets_of_size
 from train.results.finite import check_outputs
 from train.running.over_objects import over_objects
@@ -24,7 +24,7 @@ _CALIBRATED = (1, 2, 3, 4, 5, 6, 8, 12, 16, 24, 32, 40)
 
 
 def calibrated(
-    network: SetFusion | OfFirstFeatures | SumFusion,
+    network: SetFusion | SumFusion,
     validation: Features,
     prior: Float[Array, " classes"],
     posed: bool = True,

@@ -14,6 +14,7 @@ from jaxtyping import Array, Float
 
 from data_pipeline.dataset.augment import object_changes, views_after
 from data_pipeline.errors import DataError
+from mevs_jax.geometry.inputs import mirrored
 from mevs_jax.models import PointNet2, Recogniser
 from train.results.outputs import Ask
 from train.step import Batch, Task
@@ -37,18 +38,26 @@ def quarter_turns(images: Float[Array, "*batch side side channels"]) -> list[Flo
 
 
 def _see_images(network: Recogniser, task: RecogniserTask, images: Array, directions: Array, batch: Batch) -> jax.Array:
-    """Returns what `see` does.
+    """Returns what `see` does."""
+    label = batch["label"][:, None].astype(jnp.float32)
+    return jnp.concatenate([seen_alike(network, task, images, task.radii(batch)), directions, label], axis=-1)
 
-    Of a recogniser for any rotation, features and logits are means over four turns of each image. The features of the image as it
-    is, which its rotation can be read from, come after those.
+
+def seen_alike(network: Recogniser, task: RecogniserTask, images: Array, radii: Array | None = None) -> Array:
+    """Returns features and logits of every view, concatenated.
+
+    Of a recogniser for any rotation, features and logits are means over four turns of each image; of one with the setting
+    `mirrored`, over each image and its mirror image. The features of the image as it is, which the pose can be read from, come
+    after those.
     """
-    label, radii = batch["label"][:, None].astype(jnp.float32), task.radii(batch)
     seen = network.see(images, radii)
-    if task.augmentation.turn:
-        mean = (seen + sum(network.see(turned, radii) for turned in quarter_turns(images)[1:])) / 4
+    alike = quarter_turns(images)[1:] if task.augmentation.turn else []
+    alike += [mirrored(one) for one in (images, *alike)] if task.mirrored else []
+    if alike:
+        mean = (seen + sum(network.see(one, radii) for one in alike)) / (1 + len(alike))
         features = network.encoder.head.in_features
         seen = jnp.concatenate([mean[..., :features], seen[..., :features], mean[..., features:]], axis=-1)
-    return jnp.concatenate([seen, directions, label], axis=-1)
+    return seen
 
 
 def _see_changed_by(changes: Array, network: Recogniser, task: RecogniserTask, batch: Batch) -> jax.Array:

@@ -30,7 +30,7 @@ from mevs_jax.beliefs.fusing import CalibratedFusion
 from mevs_jax.models import Recogniser, ViewPolicy
 from mevs_jax.models.expected_views import ExpectedViews
 from mevs_jax.models.pose import PoseHead
-from mevs_jax.models.set_fusion import OfFirstFeatures, SetFusion, SumFusion
+from mevs_jax.models.set_fusion import SumFusion
 from train.choosing.calibrated import calibrated
 from train.choosing.config import LearnedConfig
 from train.choosing.expected import FITTED_AS, fit_expected_views
@@ -253,11 +253,7 @@ class Stages:
             if self.task(fold).reality and self.upright is None:  # half perfect images, half such as it will meet
                 real = self.features(f"{name}_in_reality", self.turned, "val", fold, ask=see_in_reality)
                 validation = validation.and_of(real)
-            network: SetFusion | OfFirstFeatures | SumFusion = recogniser.fusion
-            if summed:
-                network = SumFusion(recogniser.encoder.head, self.prior)
-            elif self.upright is not None:
-                network = OfFirstFeatures(recogniser.fusion, recogniser.encoder.head.in_features)
+            network = SumFusion(recogniser.encoder.head, self.prior) if summed else recogniser.fusion
             self._fusions[wanted] = calibrated(network, validation, self.prior, posed)
         return self._fusions[wanted]
 

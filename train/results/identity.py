@@ -97,7 +97,11 @@ def content_of(task: Any) -> dict[str, Any]:
     """
     content = as_read(asdict(task))
     content["optimiser"].pop("epoch_steps")
-    return {name: value for name, value in content.items() if value or name not in ("reality", "size", "azimuths")}
+    return {
+        name: value
+        for name, value in content.items()
+        if value or name not in ("reality", "size", "azimuths", "mirrored")
+    }
 
 
 def config_of(folder: Path) -> dict[str, Any]:

@@ -49,6 +49,9 @@ class RecogniserConfig:
     """draw equally many training objects of each class, objects of rarer classes more often; else each object equally often"""
     azimuths: int = 24
     """number of azimuths that are distinguished where the yaw of objects is unknown; 0: the pose of objects is not estimated"""
+    mirrored: bool = False
+    """once trained, features of a view are means of those of its image and of the mirror image, which shows an object of the same
+    class"""
     optimiser: OptimiserConfig = OptimiserConfig()
 
 
@@ -79,6 +82,7 @@ class RecogniserTask:
     reality: RealityAugmentation | None = None
     size: SizeConfig | None = None
     azimuths: int = 0
+    mirrored: bool = False
     name: str = "recogniser"
 
     @classmethod
@@ -99,6 +103,7 @@ class RecogniserTask:
             used_reality(config.reality, "--learned.recogniser.reality"),
             used_size(config.size, "--learned.recogniser.size"),
             config.azimuths,
+            config.mirrored,
             name,
         )
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from mevs_jax import ViewCamera, look_at_origin, partial_cloud
-from mevs_jax.geometry.inputs import SizeInput, depth_and_normals, depth_image, view_cloud
+from mevs_jax.geometry.inputs import SizeInput, depth_and_normals, depth_image, mirrored, view_cloud
 
 CAMERA = ViewCamera(resolution=16, distance=2.5)
 POSE = look_at_origin(np.array([1.5, -1.2, 1.6], np.float32) * np.float32(2.5 / np.linalg.norm([1.5, -1.2, 1.6])))
@@ -18,6 +18,13 @@ def test_depth_is_1_at_the_near_and_0_at_the_far_end_of_the_sphere():
     assert image.shape == (2, 2, 3)
     np.testing.assert_allclose(image[..., 1], [[1, 0.5], [0, 0]])
     np.testing.assert_array_equal(np.asarray(depth_and_normals(DEPTH, CAMERA))[..., :1], depth_image(DEPTH, CAMERA))
+
+
+def test_a_mirrored_image_is_that_of_the_mirrored_depth():
+    depth = DEPTH + np.linspace(0, 0.01, 256, dtype=np.float32).reshape(16, 16)
+    depth[3:6, 2:9], depth[8:, 12:] = np.nan, 0.0
+    found = np.asarray(mirrored(depth_and_normals(depth, CAMERA, 5)))
+    np.testing.assert_allclose(found, depth_and_normals(depth[:, ::-1].copy(), CAMERA, 5), atol=1e-5)
 
 
 @pytest.mark.parametrize("frame", ["world", "camera"])

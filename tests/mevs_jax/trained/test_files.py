@@ -14,8 +14,9 @@ import numpy as np
 import pytest
 
 import mevs_jax
-from mevs_jax.trained import UnreadableSystem, load, save, verify
+from mevs_jax.trained import ImageInput, UnreadableSystem, load, save, verify
 from mevs_jax.trained.arrays import DESCRIPTION, WEIGHTS
+from mevs_jax.trained.files import check
 from mevs_jax.trained.writing import hash_of
 from tests.mevs_jax.trained import making
 
@@ -40,6 +41,24 @@ def test_a_system_is_read_as_it_was_written(written):
     seen, again = made.observe(depth, pose), read.observe(depth, pose)
     np.testing.assert_array_equal(seen.logits, again.logits)
     assert sorted(path.name for path in folder.iterdir()) == ["README.md", DESCRIPTION, WEIGHTS]
+
+
+def test_a_mirrored_system_takes_an_object_and_its_mirror_image_for_one_but_for_the_pose():
+    plain = making.system("parts")
+    made = replace(plain, description=replace(plain.description, image=ImageInput("depth_and_normals", 5, mirrored=True)))
+    side = made.description.camera.resolution
+    depth = 2 + 0.3 * np.random.default_rng(0).uniform(-1, 1, (side, side)).astype(np.float32)
+    depth[:4], depth[:, -9:] = 0.0, np.nan
+    pose = np.asarray(mevs_jax.look_at_origin(2 * jnp.asarray([0.6, 0.0, 0.8])))
+    one, other, as_it_is = (
+        system.observe(image, pose) for system, image in ((made, depth), (made, depth[:, ::-1]), (plain, depth))
+    )
+    np.testing.assert_allclose(one.features, other.features, atol=1e-4)
+    np.testing.assert_allclose(one.logits, other.logits, atol=1e-3)
+    np.testing.assert_allclose(one.pose_evidence, as_it_is.pose_evidence, atol=1e-4)
+    assert np.abs(one.features - as_it_is.features).max() > 1e-2 < np.abs(one.pose_evidence - other.pose_evidence).max()
+    with pytest.raises(ValueError, match="mirror images are of depth and normals"):
+        check(replace(making.description("classifier"), image=ImageInput("depth", 1, mirrored=True)))
 
 
 def test_the_card_names_classes_camera_and_figures(written):

@@ -92,6 +92,26 @@ def test_quarter_turns_are_those_of_the_object_about_the_optical_axis(turned):
     np.testing.assert_allclose(found, expected, atol=1e-4)
 
 
+def test_features_of_a_mirrored_recogniser_are_means_over_each_image_and_its_mirror_image(turned):
+    config = replace(TINY.learned.recogniser, mirrored=True)
+    task = RecogniserTask.of(config, 10, load_statistics(turned).camera)
+    network = nnx.jit(lambda: task.network(nnx.Rngs(0)))()
+    batch = next(iter(on_device(islice(evaluation_batches(turned, "val", images="depth"), 1))))
+    flipped = {**batch, "depth": jnp.asarray(batch["depth"])[:, :, ::-1]}
+    look = nnx.jit(partial(see, task=task))
+    found, other = (np.asarray(look(network, batch=one)) for one in (batch, flipped))
+    plain = np.asarray(nnx.jit(Recogniser.see)(network, task.inputs(batch)))
+    features = network.encoder.head.in_features
+    np.testing.assert_allclose(found[:, features : 2 * features], plain[:, :features], atol=1e-4)
+    asked = [slice(0, features), slice(2 * features, 2 * features + 10)]
+    for part in asked:  # an object and its mirror image are one; normals where two neighbours are as near may differ
+        assert np.median(np.abs(found[:, part] - other[:, part])) < 1e-3 < np.median(np.abs(found[:, part]))
+    views, of_object = jnp.asarray(found[None, :, : 2 * features]), task.directions(batch)[None]
+    present = jnp.ones((1, len(found)), bool)
+    fused = network.fusion(views, of_object, present)  # is given the means alone
+    np.testing.assert_array_equal(fused, network.fusion(views[..., :features], of_object, present))
+
+
 def test_changed_objects_are_each_changed_in_a_way_of_their_own_and_the_same_every_time(turned):
     task = RecogniserTask.of(TINY.learned.recogniser, 10, load_statistics(turned).camera)
     network = nnx.jit(lambda: task.network(nnx.Rngs(0)))()
