@@ -45,7 +45,9 @@ def test_a_system_is_read_as_it_was_written(written):
 
 def test_a_mirrored_system_takes_an_object_and_its_mirror_image_for_one_but_for_the_pose():
     plain = making.system("parts")
-    made = replace(plain, description=replace(plain.description, image=ImageInput("depth_and_normals", 5, mirrored=True)))
+    made = replace(
+        plain, description=replace(plain.description, image=ImageInput("depth_and_normals", 5, mirrored=True))
+    )
     side = made.description.camera.resolution
     depth = 2 + 0.3 * np.random.default_rng(0).uniform(-1, 1, (side, side)).astype(np.float32)
     depth[:4], depth[:, -9:] = 0.0, np.nan
