@@ -2,7 +2,8 @@
 
 All environments run many episodes at once. A step of one episode counts as one step. The pure environment draws its actions in
 the compiled loop; vector environments are given actions that were drawn beforehand. Calls take turns, and rates are medians.
-Peers that are not installed (`pip install -e '.[gym]'`) are left out. The table is kept in `benchmarks/results/environment.md`.
+Peers that are not installed (`pip install -e '.[ap-gym,gymnax]'`) are left out. The table is kept in
+`benchmarks/results/environment.md`.
 
 The peers compute other observations: a glimpse of an image (CircleSquare, which needs no download), and a pole's four numbers.
 """
@@ -71,6 +72,48 @@ def pure(episodes: int, steps: int, entropies: bool) -> Measured:
     return Measured(name, episodes, episodes * steps, lambda: walk(environment, jax.random.key(0)))
 
 
+def in_form_of_gymnax(episodes: int, steps: int) -> Iterator[Measured]:
+    """The same in the form of gymnax, if it is installed."""
+    try:
+        from mevs_jax.environment.gymnax import ViewSelection
+    except ImportError as error:
+        print(f"left out: {error}", file=sys.stderr)
+        return
+    env = ViewSelection(environment_of(False))
+
+    @jax.jit
+    def walk(key: jax.Array) -> jax.Array:
+        def step(states: Any, key: jax.Array) -> tuple[Any, jax.Array]:
+            keys = jax.random.split(key, episodes + 1)
+            views = jax.random.randint(keys[-1], (episodes,), 0, VIEWS)
+            found = jax.vmap(env.step, (0, 0, 0, None))(keys[:-1], states, views, env.default_params)
+            return found[1], found[2].mean()
+
+        keys = jax.random.split(key, steps + 1)
+        _, start = jax.vmap(env.reset, (0, None))(jax.random.split(keys[-1], episodes), env.default_params)
+        return jax.lax.scan(step, start, keys[:-1])[1]
+
+    yield Measured("gymnax's form, compiled", episodes, episodes * steps, lambda: walk(jax.random.key(0)))
+
+
+def single(steps: int = 200) -> Iterator[Measured]:
+    """The environment of Gymnasium whose actions are views, if it is installed."""
+    try:
+        from mevs_jax.gymnasium import ViewSelectionEnv
+    except ImportError as error:
+        print(f"left out: {error}", file=sys.stderr)
+        return
+    env, views = ViewSelectionEnv(environment_of(False)), np.random.default_rng(0).integers(VIEWS, size=steps)
+
+    def call() -> None:
+        for number, view in enumerate(views):
+            if number % MAX_VIEWS == 0:
+                env.reset()
+            env.step(view)
+
+    yield Measured("`ViewSelectionEnv`", 1, steps, call)
+
+
 def stepping(name: str, envs: Any, actions: list[Any]) -> Measured:
     """A vector environment of Gymnasium, which takes `actions` one after another."""
     envs.reset(seed=0)
@@ -89,7 +132,7 @@ def vector(count: int) -> Iterator[Measured]:
         import ap_gym
         import gymnasium
 
-        from mevs_jax.environment.gymnasium import ActiveRecognitionVectorEnv
+        from mevs_jax.gymnasium import ActiveRecognitionVectorEnv
     except ImportError as error:
         print(f"left out: {error}", file=sys.stderr)
         return
@@ -118,7 +161,7 @@ def main(episodes: int = 4096, steps: int = 200, vectors: tuple[int, ...] = (64,
         repeats: calls of each, whose median is taken.
     """
     measured = [pure(episodes, steps, entropies) for entropies in (False, True)]
-    measured += [one for count in vectors for one in vector(count)]
+    measured += [*in_form_of_gymnax(episodes, steps), *single(), *(one for count in vectors for one in vector(count))]
     for one in measured:
         seconds_of(one.call)  # compiles
     taken = np.array([[seconds_of(one.call) for one in measured] for _ in range(repeats)])

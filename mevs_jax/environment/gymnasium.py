@@ -1,16 +1,13 @@
-"""`ActiveRecognition` for Gymnasium, as the active classification environments of `ap_gym` (extra `gym`).
+"""`ActiveRecognition` for Gymnasium (extra `gym`): views are actions, and the prediction is the belief.
 
-    environment = ActiveRecognition(tables, graph, max_views=5)
-    env = ActiveRecognitionEnv(environment)
-    envs = ActiveRecognitionVectorEnv(environment, num_envs=256)
+    env = ViewSelectionEnv(ActiveRecognition.from_run("runs/demo"))
 
-Importing this module also registers both under the name `mevs_jax/ActiveRecognition-v0`, so that
-`ap_gym.make("mevs_jax/ActiveRecognition-v0", environment=environment)` and `ap_gym.make_vec` work.
+Importing this module registers it as `mevs_jax/ViewSelection-v0`, for `gymnasium.make(name, environment=environment)`, and the
+environments of `mevs_jax.environment.active_perception` as `mevs_jax/ActiveRecognition-v0`.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import fields
 from functools import partial
 from typing import Any
@@ -18,43 +15,47 @@ from typing import Any
 import jax
 import numpy as np
 
-from mevs_jax.arguments import check, whole
-from mevs_jax.environment.pure import ActiveRecognition, EnvironmentObservation, EnvironmentState, check_action
+from mevs_jax.arguments import check
+from mevs_jax.environment.pure import ActiveRecognition, EnvironmentObservation, EnvironmentState
 
 try:
-    import ap_gym
     import gymnasium
 except ImportError as error:
     raise ImportError(
-        f"mevs_jax.gymnasium needs the packages gymnasium and ap-gym ({error}): install them with pip install 'mevs-jax[gym]'"
+        f"mevs_jax.gymnasium needs the package gymnasium ({error}): install it with pip install 'mevs-jax[gym]'"
     ) from error
 
 NAME = "mevs_jax/ActiveRecognition-v0"
-"""The name that both environments are registered under."""
-_NOT_DRAWN = "this environment draws nothing; mevs_jax.agent.viewing.view shows the walk of an agent"
+"""The name that the environments with predictions are registered under."""
+VIEW_SELECTION = "mevs_jax/ViewSelection-v0"
+"""The name that `ViewSelectionEnv` is registered under."""
+_SIDE = 96
+"""Rows of a drawing, and columns of each of its halves."""
 
 
-class ActiveRecognitionEnv(ap_gym.ActiveClassificationEnv):
-    """One episode after another, by the rules of `ActiveRecognition`.
+class ViewSelectionEnv(gymnasium.Env):
+    """One episode after another, by the rules of `ActiveRecognition`; an action is the next view alone.
 
-    Observations are dictionaries with the fields of `EnvironmentObservation` that the tables have; masks are 0 or 1. The last
-    step of an episode is `terminated`, none is `truncated`. `info` holds, besides what `ap_gym` puts into it, the `index` of the
-    object, the `distance` travelled in radians, and whether the view is a `new_view`.
+    The belief is the prediction of every step. Observations are dictionaries with the fields of `EnvironmentObservation` that the
+    tables have; masks are 0 or 1. The last step of an episode is `terminated`, none is `truncated`. `info` holds the `index` of
+    the object, its class `target`, the `loss` of the belief, whether it is `right`, the `distance` travelled in radians, and
+    whether the view is a `new_view`.
 
     Args:
         environment: the rules, the objects and the views.
+        render_mode: `ansi` for a line of text; `rgb_array` for a picture of (96, 192, 3) pixels: left the views by azimuth and
+            height, seen ones black and the current one red, right a bar for the probability of each class; None for neither.
     """
 
-    metadata: dict[str, Any] = {"render_modes": []}  # noqa: RUF012  # as Gymnasium declares it
+    metadata: dict[str, Any] = {"render_modes": ["ansi", "rgb_array"], "render_fps": 2}  # noqa: RUF012  # as Gymnasium declares it
 
-    def __init__(self, environment: ActiveRecognition):
-        _check_rules(environment)
-        super().__init__(environment.classes, gymnasium.spaces.Discrete(environment.views))
-        self.environment = environment
-        self.observation_space = _observation_space(environment)
-        if not environment.normalised:
-            self.loss_fn = ap_gym.CrossEntropyLossFn(environment.classes)
-        self._info: dict[str, Any] = {}
+    def __init__(self, environment: ActiveRecognition, render_mode: str | None = None):
+        check_rules(environment)
+        if render_mode not in (None, *self.metadata["render_modes"]):
+            raise ValueError(f"render_mode must be one of {self.metadata['render_modes']} or None, got {render_mode!r}")
+        self.environment, self.render_mode = environment, render_mode
+        self.action_space = gymnasium.spaces.Discrete(environment.views)
+        self.observation_space = observation_space(environment)
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[dict, dict[str, Any]]:
         """Begins an episode.
@@ -67,94 +68,52 @@ class ActiveRecognitionEnv(ap_gym.ActiveClassificationEnv):
             ValueError: for an index outside its range.
         """
         super().reset(seed=seed)
-        index, start = _drawn(self.environment, self.np_random, (), options)
-        self._state, observation = _begin(self.environment, index, start)
-        return _in_numpy(observation), {"index": int(index)}
+        index, start = drawn(self.environment, self.np_random, (), options)
+        self._state, observation = begin(self.environment, index, start)
+        self._seen = in_numpy(observation)
+        return self._seen, {"index": int(index)}
 
-    def _step(self, action: Any, prediction: Any) -> tuple[dict, float, bool, bool, dict[str, Any], np.int64]:
-        self._state, observation, done, info, target = _move(self.environment, self._state, np.int32(action))
-        base_reward = float(info.pop("base_reward"))
-        self._info = {name: np.asarray(value).item() for name, value in info.items()}
-        return _in_numpy(observation), base_reward, bool(done), False, {}, np.int64(target)
-
-    def step(self, action: Mapping[str, Any]) -> tuple[dict, float, bool, bool, dict[str, Any]]:
-        """Scores the prediction, moves the camera and returns (observation, reward, terminated, truncated, info).
+    def step(self, action: Any) -> tuple[dict, float, bool, bool, dict[str, Any]]:
+        """Scores the belief, moves the camera and returns (observation, reward, terminated, truncated, info).
 
         Raises:
-            ValueError: for an action without a view or prediction, a view outside its range, or a prediction that is not
-                finite or of another shape than (classes,).
+            ValueError: for a view outside its range.
             gymnasium.error.ResetNeeded: before the first `reset`.
         """
-        _check(self, action, ())
-        observation, reward, terminated, truncated, info = super().step(action)
-        # The method above returns `info` without what `_step` put into it.
-        return observation, float(reward), terminated, truncated, self._info | info
+        check_begun(self)
+        check_views(self, action, ())
+        believed = int(self._seen["belief"].argmax())
+        self._state, observation, reward, done, info = _played(self.environment, self._state, np.int32(action))
+        self._seen = in_numpy(observation)
+        target, loss = (np.asarray(info["prediction"][name]).item() for name in ("target", "loss"))
+        moved = {name: np.asarray(info[name]).item() for name in ("distance", "new_view")}
+        said = {"index": int(self._state.object_index), "target": target, "loss": loss, "right": believed == target}
+        return self._seen, float(reward), bool(done), False, said | moved
 
-    def render(self) -> None:
-        """Raises `NotImplementedError`, as there is nothing to see."""
-        raise NotImplementedError(_NOT_DRAWN)
-
-
-class ActiveRecognitionVectorEnv(ap_gym.ActiveClassificationVectorEnv):
-    """Many episodes at once, as one compiled program, by the rules of `ActiveRecognition`.
-
-    Observations and `info` are those of `ActiveRecognitionEnv` with a leading axis of episodes. After an episode has ended, the
-    next step begins another (Gymnasium's autoreset mode `NEXT_STEP`): its action is ignored, its base reward is 0, and its
-    prediction is scored with the class of the object whose episode has ended. A learner leaves this step out.
-
-    Args:
-        environment: the rules, the objects and the views.
-        num_envs: number of episodes at once.
-    """
-
-    metadata: dict[str, Any] = {  # noqa: RUF012
-        "render_modes": [],
-        "autoreset_mode": gymnasium.vector.AutoresetMode.NEXT_STEP,
-    }
-
-    def __init__(self, environment: ActiveRecognition, num_envs: int):
-        _check_rules(environment)
-        num_envs = whole(num_envs, "num_envs must be at least 1", 1, 2**31 - 1)
-        super().__init__(num_envs, environment.classes, gymnasium.spaces.Discrete(environment.views))
-        self.environment = environment
-        self.single_observation_space = _observation_space(environment)
-        self.observation_space = gymnasium.vector.utils.batch_space(self.single_observation_space, num_envs)
-        if not environment.normalised:
-            self.loss_fn = ap_gym.CrossEntropyLossFn(environment.classes)
-
-    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[dict, dict[str, Any]]:
-        """Begins all episodes; arguments as of `ActiveRecognitionEnv.reset`, with one index for all episodes or one for each."""
-        super().reset(seed=seed)
-        index, start = _drawn(self.environment, self.np_random, (self.num_envs,), options)
-        self._state, observation = _begin_all(self.environment, index, start)
-        self._ended = np.zeros(self.num_envs, bool)
-        return _in_numpy(observation), {"index": index.copy()}
-
-    def _step(self, action: Any, prediction: Any) -> tuple[dict, np.ndarray, np.ndarray, np.ndarray, dict, np.ndarray]:
-        count = self.num_envs
-        begin = np.zeros(count, np.int64), np.zeros(count, np.int64)
-        if self._ended.any():
-            begin = _drawn(self.environment, self.np_random, (count,), None)
-        self._state, observation, done, info, target = _move_all(
-            self.environment, self._state, np.asarray(action, np.int32), self._ended, begin
-        )
-        self._ended = np.array(done)
-        info = {name: np.array(value) for name, value in info.items()}
-        base_reward = info.pop("base_reward")
-        target = np.asarray(target, np.int64)
-        return _in_numpy(observation), base_reward, self._ended.copy(), np.zeros(count, bool), info, target
-
-    def step(self, action: Mapping[str, Any]) -> tuple[dict, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
-        """`ActiveRecognitionEnv.step` for all episodes."""
-        _check(self, action, (self.num_envs,))
-        return super().step(action)
-
-    def render(self) -> None:
-        """Raises `NotImplementedError`, as there is nothing to see."""
-        raise NotImplementedError(_NOT_DRAWN)
+    def render(self) -> str | np.ndarray | None:
+        """What `render_mode` says; see the class."""
+        if self.render_mode is None:
+            return None
+        check_begun(self)
+        probabilities = np.exp(self._seen["belief"])
+        view, seen = int(self._seen["view"]), int(self._seen["attempted"].sum())
+        if self.render_mode == "ansi":
+            likeliest = int(probabilities.argmax())
+            return f"view {view}, {seen} of {self.environment.views} seen: class {likeliest} with {probabilities[likeliest]:.0%}"
+        picture = np.full((_SIDE, 2 * _SIDE, 3), 255, np.uint8)
+        x, y, z = np.asarray(self.environment.graph.points).T
+        rows = np.round((1 - z) / 2 * (_SIDE - 5)).astype(int)
+        columns = np.round((np.arctan2(y, x) / (2 * np.pi) + 0.5) * (_SIDE - 5)).astype(int)
+        for at in (*np.flatnonzero(np.arange(len(rows)) != view), view):  # the current one last, above the others
+            colour = (220, 30, 30) if at == view else (0, 0, 0) if self._seen["attempted"][at] else (200, 200, 200)
+            picture[rows[at] : rows[at] + 4, columns[at] : columns[at] + 4] = colour
+        for label, height in enumerate(np.round(probabilities * (_SIDE - 2)).astype(int)):
+            left, right = (_SIDE + (label + edge) * _SIDE // len(probabilities) for edge in (0, 1))
+            picture[_SIDE - 1 - height :, left + 1 : right] = (40, 90, 200)
+        return picture
 
 
-def _observation_space(environment: ActiveRecognition) -> gymnasium.spaces.Dict:
+def observation_space(environment: ActiveRecognition) -> gymnasium.spaces.Dict:
     """The space of one observation; fields that the tables do not have are left out."""
     spaces = gymnasium.spaces
     tables = environment.tables
@@ -175,7 +134,7 @@ def _observation_space(environment: ActiveRecognition) -> gymnasium.spaces.Dict:
     return spaces.Dict(parts)
 
 
-def _in_numpy(observation: EnvironmentObservation) -> dict[str, Any]:
+def in_numpy(observation: EnvironmentObservation) -> dict[str, Any]:
     """The fields of an observation as new arrays of the types of their spaces."""
     found: dict[str, Any] = {}
     for field in fields(observation):
@@ -191,7 +150,7 @@ def _are_indices(size: int, values: np.ndarray) -> Any:
     return (values >= 0) & (values < size) & (values == np.floor(values))
 
 
-def _drawn(
+def drawn(
     environment: ActiveRecognition, random: np.random.Generator, shape: tuple[int, ...], options: dict[str, Any] | None
 ) -> tuple[np.ndarray, np.ndarray]:
     """Indices of objects and start views: those that `options` names, else random ones."""
@@ -213,59 +172,43 @@ def _drawn(
     return found[0], found[1]
 
 
-def _check(env: Any, action: Any, shape: tuple[int, ...]) -> None:
-    """Raises the errors of `ActiveRecognitionEnv.step`."""
-    environment: ActiveRecognition = env.environment
+def check_begun(env: Any) -> None:
+    """Raises `ResetNeeded` before the first `reset`."""
     if not hasattr(env, "_state"):
-        raise gymnasium.error.ResetNeeded("step was called before reset: begin the first episode with reset")
-    check_action(action, shape, environment.classes)
-    view = np.asarray(action["action"])
+        raise gymnasium.error.ResetNeeded("there is no episode before reset: begin the first one with reset")
+
+
+def check_views(env: Any, views: Any, shape: tuple[int, ...]) -> None:
+    """Raises `ValueError` unless there is a next view for one episode, or for each of some."""
+    environment: ActiveRecognition = env.environment
+    view = np.asarray(views)
     integers = view.shape == shape and np.issubdtype(view.dtype, np.integer)
     if not integers or not ((view >= 0) & (view < environment.views)).all():
         raise ValueError(f"an action is an index from 0 to {environment.views - 1}, of shape {shape}, got {view}")
 
 
-def _check_rules(environment: Any) -> None:
+def check_rules(environment: Any) -> None:
     if not isinstance(environment, ActiveRecognition):
         raise ValueError(f"environment must be a mevs_jax.ActiveRecognition, got {environment!r:.80}")
 
 
-_Moved = tuple[EnvironmentState, EnvironmentObservation, jax.Array, dict[str, jax.Array], jax.Array]
-
-
-def _start_of(environment: ActiveRecognition, index: jax.Array, start: jax.Array) -> tuple[Any, Any]:
+def start_of(environment: ActiveRecognition, index: jax.Array, start: jax.Array) -> tuple[Any, Any]:
     return environment.reset(jax.random.key(0), index, start)  # the key is not used, as nothing is drawn
 
 
-def _moved(environment: ActiveRecognition, state: EnvironmentState, action: jax.Array) -> _Moved:
-    """`environment.step` without the reward, which `ap_gym` computes: state, observation, whether it ended, info and class."""
-    nothing = {"action": action, "prediction": jax.numpy.zeros(environment.classes)}
-    state, observation, _, done, info = environment.step(jax.random.key(0), state, nothing)
-    target = info.pop("prediction")["target"]
-    return state, observation, done, info | {"index": state.object_index}, target
+def _play(environment: ActiveRecognition, state: EnvironmentState, view: jax.Array) -> tuple[Any, ...]:
+    """`environment.step` to a view, with the belief as the prediction."""
+    action = {"action": view, "prediction": environment.observe(state).belief}
+    return environment.step(jax.random.key(0), state, action)
 
 
-@jax.jit
-def _move_all(environment: ActiveRecognition, states: Any, actions: Any, ended: Any, begin: Any) -> _Moved:
-    """Moves all episodes that have not ended, and begins the others with the objects and at the views `begin`."""
+begin = jax.jit(start_of)
+_played = jax.jit(_play)
 
-    def one(state: EnvironmentState, action: jax.Array, ended: jax.Array, begin: tuple[jax.Array, jax.Array]) -> _Moved:
-        *after, done, info, target = _moved(environment, state, action)
-        info["base_reward"] = jax.numpy.where(ended, 0, info["base_reward"])
-        begun = _start_of(environment, *begin)
-        moved, seen = jax.tree.map(lambda new, old: jax.numpy.where(ended, new, old), begun, tuple(after))
-        return moved, seen, done & ~ended, info | {"index": moved.object_index}, target
-
-    return jax.vmap(one)(states, actions, ended, begin)
-
-
-_begin = jax.jit(_start_of)
-_begin_all = jax.jit(jax.vmap(_start_of, (None, 0, 0)))
-_move = jax.jit(_moved)
-
-if NAME not in gymnasium.registry:
-    gymnasium.register(
-        NAME,
-        entry_point="mevs_jax.environment.gymnasium:ActiveRecognitionEnv",
-        vector_entry_point="mevs_jax.environment.gymnasium:ActiveRecognitionVectorEnv",
-    )
+for name, home, single in (
+    (VIEW_SELECTION, "gymnasium", "ViewSelectionEnv"),
+    (NAME, "active_perception", "ActiveRecognitionEnv"),
+):
+    if name not in gymnasium.registry:
+        many = f"mevs_jax.environment.{home}:ActiveRecognitionVectorEnv" if name == NAME else None
+        gymnasium.register(name, f"mevs_jax.environment.{home}:{single}", vector_entry_point=many)

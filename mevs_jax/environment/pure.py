@@ -6,7 +6,7 @@ a step is a few array look-ups; with `jax.vmap` and `jax.jit`, millions of steps
 Actions, rewards and `info` follow the active classification environments of `ap_gym` 0.7 (Active Perception Gym,
 https://github.com/TimSchneider42/active-perception-gym). `mevs_jax.environment.gymnasium` has the same environment for Gymnasium.
 
-    environment = ActiveRecognition(tables, graph, max_views=5)
+    environment = ActiveRecognition.from_run("runs/demo")
     state, observation = environment.reset(key)
     action = {"action": next_view, "prediction": observation.belief}
     state, observation, reward, done, info = environment.step(key, state, action)
@@ -16,6 +16,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import flax.struct
@@ -157,6 +158,29 @@ class ActiveRecognition:
         check(movement_cost, "movement_cost must be at least 0", lambda cost: (cost >= 0) & (cost < np.inf))
         self.tables, self.graph, self.reachable, self.movement_cost = tables, graph, reachable, movement_cost
         self.max_views, self.normalised, self.fuse = max_views, normalised, fuse
+
+    @classmethod
+    def from_run(cls, run: str | Path, split: str = "test", *, max_views: int = 5, **options: Any) -> ActiveRecognition:
+        """The environment of the objects of a run's split, which its networks have seen from every view.
+
+        Args:
+            run: folder in which `mevs run` has been run.
+            split: `val` or `test`. Policies learn on `val`, which the networks were not trained on, and are compared on `test`.
+            max_views, options: as of the class.
+
+        Raises:
+            ValueError: for a folder that holds no finished run.
+        """
+        from mevs_jax.trained import load  # late, since an environment needs no networks
+
+        path = Path(run) / "tables" / f"{split}.npz"
+        if not path.is_file():
+            raise ValueError(f"{run} has no view tables {path.name} of a run; make them with: mevs run --out {run}")
+        with np.load(path) as stored:
+            logits, label = jnp.asarray(stored["logits"]), jnp.asarray(stored["labels"])
+            entropies = {name: jnp.asarray(stored[name]) for name in ("predicted_entropy", "entropy") if name in stored}
+        tables = ViewTable(logits, entropies.get("predicted_entropy"), entropies.get("entropy"), label)
+        return cls(tables, load(run).graph, max_views=max_views, **options)
 
     def tree_flatten(self) -> tuple[tuple[Any, ...], tuple[Any, ...]]:
         """The arrays, and what is fixed when a program is compiled."""

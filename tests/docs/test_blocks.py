@@ -114,7 +114,8 @@ def test_documented_python_runs(page, whole, tmp_path, monkeypatch):
     (tmp_path / "runs").mkdir()
     (tmp_path / "runs" / "demo").symlink_to(whole)
     if page == "environment.md":
-        pytest.importorskip("ap_gym", reason="its second block needs the extra gym")
+        for package in ("ap_gym", "gymnax"):
+            pytest.importorskip(package, reason=f"a block needs the package {package}")
     piece = furniture("chair", 900)
     piece.export(tmp_path / "chair.obj")
     bop(tmp_path / "ycbv" / "test" / "000048")

@@ -18,9 +18,9 @@ VIEWS, CLASSES, OBJECTS, MAX_VIEWS = 12, 4, 7, 4
 GRAPH = ViewGraph.from_points(fibonacci_sphere(VIEWS))
 WITHOUT = """
 import sys
-sys.modules["ap_gym"] = None
+sys.modules[{package!r}] = None
 try:
-    import mevs_jax.environment.gymnasium
+    import mevs_jax.environment.{module}
 except ImportError as error:
     print(error)
 """
@@ -37,21 +37,31 @@ def environment_of(**options) -> ActiveRecognition:
     return ActiveRecognition(tables, GRAPH, **{"max_views": MAX_VIEWS, "movement_cost": 0.1} | options)
 
 
-def test_without_the_packages_one_sentence_says_what_to_install():
-    ended = subprocess.run([sys.executable, "-c", WITHOUT], capture_output=True, text=True, timeout=300, check=True)
+@pytest.mark.parametrize(
+    ("package", "module", "extra"),
+    [
+        ("gymnasium", "gymnasium", "gym"),
+        ("ap_gym", "active_perception", "ap-gym"),
+        ("gymnax.environments", "gymnax", "gymnax"),
+    ],
+)
+def test_without_a_package_one_sentence_says_what_to_install(package, module, extra):
+    if package == "ap_gym":
+        pytest.importorskip("gymnasium", reason="Gymnasium is not installed (extra `gym`)")
+    program = WITHOUT.format(package=package, module=module)
+    ended = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=300, check=True)
     assert ended.stdout.count("\n") == 1, ended.stderr
-    assert ended.stdout.startswith("mevs_jax.gymnasium needs the packages gymnasium and ap-gym")
-    assert "pip install 'mevs-jax[gym]'" in ended.stdout
+    assert f"pip install 'mevs-jax[{extra}]'" in ended.stdout
 
 
 @pytest.fixture(scope="module")
 def gym():
     """The module; it and its packages are imported by the tests that need them alone."""
     pytest.importorskip("gymnasium", reason="Gymnasium is not installed (extra `gym`)")
-    pytest.importorskip("ap_gym", reason="ap-gym is not installed (extra `gym`)")
-    import mevs_jax.environment.gymnasium
+    pytest.importorskip("ap_gym", reason="ap-gym is not installed (extra `ap-gym`)")
+    import mevs_jax.gymnasium
 
-    return mevs_jax.environment.gymnasium
+    return mevs_jax.gymnasium
 
 
 @pytest.fixture(scope="module")
@@ -245,7 +255,7 @@ def test_misuse_is_one_sentence(gym):
         (gym.ActiveRecognitionVectorEnv(environment, 2), (2,)),
     ):
         whole = {"action": np.zeros(shape, int), "prediction": np.zeros((*shape, CLASSES))}
-        with pytest.raises(gymnasium.error.ResetNeeded, match="begin the first episode with reset"):
+        with pytest.raises(gymnasium.error.ResetNeeded, match="begin the first one with reset"):
             env.step(whole)
         for options, message in (
             ({"start": "a"}, "'start' must be between 0 and 11, got 'a'"),
