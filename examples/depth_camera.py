@@ -30,14 +30,19 @@ def take(T_world_camera: np.ndarray) -> np.ndarray:
     return cast_shot(cast, Shot(640, 480, K, T_world_camera, CENTER, RADIUS))
 
 
+def above_floor(T_world_camera: np.ndarray) -> bool:
+    """Whether the camera can go there."""
+    return T_world_camera[2, 3] > 0.6
+
+
 system = mevs_jax.load(sys.argv[1] if len(sys.argv) > 1 else "furniture10")
 agent = system.agent(stop=0.95)
 agent.warm_up()
 agent.reset(center=CENTER, radius=RADIUS, yaw=0.0)  # it faces as the training objects do; None if unknown
-step = agent.decide()
+step = agent.decide(reachable=above_floor)
 while (pose := step.T_world_camera) is not None:
     depth = take(pose)  # the robot moves its camera there
     belief = agent.observe(depth, K, pose)
     print(f"{belief.name}, {100 * belief.confidence:.1f} % ({belief.latency_ms:.0f} ms)")
-    step = agent.decide(reachable=lambda pose: pose[2, 3] > 0.6)  # above the floor
+    step = agent.decide(reachable=above_floor)
 print(f"{belief.name} after {belief.views} views: {step.reason}")

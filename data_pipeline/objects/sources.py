@@ -276,6 +276,8 @@ def mesh_zip(archive: Path, reading: Reading = Reading()) -> ObjectSource:
 def _of_meshes(data: str, reading: Reading, known: str) -> ObjectSource | None:
     """Returns the objects of a folder or zip of meshes; None for anything else that exists."""
     path = Path(os.path.expanduser(data))
+    if "://" in data:
+        raise DataError(f"objects are read from this machine's disk, not from {data}; copy them here first")
     if data not in PROCEDURAL and not os.path.exists(path):
         raise DataError(f"no such file or folder: {data}; --data takes {known}")
     if path.is_dir():

@@ -72,6 +72,7 @@ class PolicyStudy:
         policies: the policies, random selection first.
         results: the results of each on every object, by name.
         reachable: (views,) the views that the camera can visit and start from.
+        baseline: name of the policy that the others are compared with.
     """
 
     objects: list[str]
@@ -79,6 +80,7 @@ class PolicyStudy:
     policies: tuple[PolicyRecord, ...]
     results: dict[str, Results]
     reachable: Bool[np.ndarray, " views"]
+    baseline: str = BASELINE
 
     def right(self, policy: str) -> Float[np.ndarray, "objects views"]:
         """Share of a policy's walks with the right prediction after 1, 2, … views, of each object, over its start views."""
@@ -94,7 +96,7 @@ class PolicyStudy:
 
     def rows(self, by: By = "views") -> list[dict[str, Any]]:
         """Returns the numbers as a list of rows; see `to_frame`."""
-        base, ladder = self.results[BASELINE], listed(self.policies)
+        base, ladder = self.results[self.baseline], listed(self.policies)
         summaries = {name: summarise(result, self.labels) for name, result in self.results.items()}
         against = {name: difference(result, base) for name, result in self.results.items()}
         rows = tidy_rows if by == "views" else _rows_of_grid
@@ -103,7 +105,7 @@ class PolicyStudy:
     def to_frame(self, by: By = "views") -> Any:
         """Returns the numbers as a pandas `DataFrame` where pandas is installed, else as a list of dictionaries.
 
-        Shares are in [0, 1]; intervals cover 95 %, by a bootstrap over objects. The difference of a policy from random selection
+        Shares are in [0, 1]; intervals cover 95 %, by a bootstrap over objects. The difference of a policy from the baseline
         is paired by object; `low` and `high` are the ends of its interval.
 
         Args:
@@ -119,9 +121,53 @@ class PolicyStudy:
             return rows
         return pandas.DataFrame(rows)
 
+    def _accuracies(self) -> dict[str, list[dict[str, Any]]]:
+        """The rows of each policy by its title."""
+        rows = self.rows()
+        return {
+            title: [row for row in rows if row["title"] == title]
+            for title in dict.fromkeys(row["title"] for row in rows)
+        }
+
+    def to_latex(self) -> str:
+        """Returns a table of accuracies in %, after each number of views, with differences from the baseline in brackets."""
+
+        def cell(row: dict[str, Any]) -> str:
+            found = f"{100 * row['accuracy']:.1f}"
+            return found if row["policy"] == self.baseline else f"{found} ({100 * row['difference']:+.1f})"
+
+        plain = str.maketrans({"_": r"\_", "%": r"\%", "&": r"\&", "#": r"\#"})
+        lines = {title.translate(plain): [cell(row) for row in rows] for title, rows in self._accuracies().items()}
+        most = len(next(iter(lines.values())))
+        head = " & ".join(["policy", *map(str, range(1, most + 1))])
+        body = [" & ".join((title, *cells)) + r" \\" for title, cells in lines.items()]
+        begin, end = rf"\begin{{tabular}}{{l{'r' * most}}}", r"\end{tabular}"
+        return "\n".join([begin, r"\hline", head + r" \\", r"\hline", *body, r"\hline", end])
+
+    def plot(self) -> Any:
+        """Returns a Matplotlib figure: accuracy of each policy by number of views, with 95 % intervals over objects."""
+        from matplotlib.figure import Figure  # late: it takes half a second
+
+        figure = Figure(figsize=(6, 4), layout="constrained")
+        axes = figure.subplots()
+        for title, rows in self._accuracies().items():
+            views, *shares = (
+                [row[name] for row in rows] for name in ("views", "accuracy", "accuracy_low", "accuracy_high")
+            )
+            middle, low, high = (100 * np.array(share) for share in shares)
+            axes.plot(views, middle, marker=".", label=title)
+            axes.fill_between(views, low, high, alpha=0.15)
+        axes.set(xlabel="views", ylabel="accuracy (%)")
+        axes.legend(frameon=False)
+        return figure
+
 
 def evaluate_policies(
-    run: str | Path | EvaluationInputs, policies: Mapping[str, Policy], *, knows: Knows = "networks"
+    run: str | Path | EvaluationInputs,
+    policies: Mapping[str, Policy],
+    *,
+    knows: Knows = "networks",
+    baseline: str = BASELINE,
 ) -> PolicyStudy:
     """Evaluates policies, and random selection, as `mevs eval` does.
 
@@ -131,6 +177,7 @@ def evaluate_policies(
         policies: the policies by name. A registered one (`register_policy`) has the title and information that it was registered
             with.
         knows: what the others know: only a policy that knows the truth is given the label and the views not seen.
+        baseline: name of the policy that the others are compared with: random selection, or one of `policies`.
 
     Raises:
         DataError: if the run has no view tables, or a policy cannot be used; the message is one sentence.
@@ -143,13 +190,15 @@ def evaluate_policies(
         for name, policy in policies.items()
         if not _is_baseline(name, policy)
     ]
+    if baseline not in (BASELINE, *policies):
+        raise DataError(f"the baseline is one of {', '.join((BASELINE, *policies))}, not {baseline!r}")
     tables = inputs.tables
     setting = Setting.of(inputs.graph, inputs.validation, inputs.config)
     further = checked(own, setting.graph, tables.logits.shape[-1])
     compared = (policy_record(BASELINE), *further)
     results, _ = setting.with_random(tables.stacked(), compared)
     check_own(further, results, tables, setting)
-    return PolicyStudy(tables.names, tables.labels, compared, results, setting.can_reach)
+    return PolicyStudy(tables.names, tables.labels, compared, results, setting.can_reach, baseline)
 
 
 def _is_baseline(name: str, policy: Policy) -> bool:

@@ -336,14 +336,14 @@ class Agent:
         self,
         reachable: Reachable = None,
         *,
-        cost: AnyVector | None = None,
+        cost: AnyVector | Callable[[np.ndarray], float] | None = None,
         candidates: AnyArray | Sequence[AnyArray] | None = None,
     ) -> Step:
         """Chooses the next view, or ends.
 
         Args:
             reachable: which candidates can be reached: a boolean mask, indices, or a function of a pose (4, 4); all by default.
-            cost: of moving to each candidate, in any unit; `gain_per_cost` says what a unit is worth.
+            cost: of moving to each candidate, or a function of a pose (4, 4); in any unit, of which `gain_per_cost` is the worth.
             candidates: (candidates, 4, 4) poses `T_world_camera` to choose from; by default the system's viewpoints, from which
                 the camera looks at the object's centre. Poses inside its sphere or that look away from it are never chosen.
 
@@ -362,7 +362,7 @@ class Agent:
         allowed = (
             np.array([reachable(pose) for pose in poses], bool) if callable(reachable) else mask_of(reachable, number)
         )
-        costs = costs_of(cost, number, self.gain_per_cost)
+        costs = costs_of([cost(pose) for pose in poses] if callable(cost) else cost, number, self.gain_per_cost)
         reason, index, gains = self._reason(), -1, np.zeros(0)
         if not reason:
             index, gains = self._choose(where, allowed & useful & np.isfinite(costs), costs)

@@ -57,7 +57,7 @@ COMMANDS = {
         "train the classifier and the entropy predictor", "TrainOptions", "stages:train", ("classifier", "entropy")
     ),
     "sweep": Command(
-        "train many configurations of one network as one program",
+        "train many configurations of one network (--sweep.network entropy) as one program",
         "SweepOptions",
         "stages:sweep",
         ("sweep", "classifier", "entropy", "learned"),
@@ -194,11 +194,11 @@ studies, checks, drawings:
 common options:
   --out DIR               where everything is written (default runs/<preset>); a run continues there
   --preset NAME           small (default): 64×64 views and narrow networks, for a CPU; best, thesis:
-                          for an accelerator; tiny: to see it all work in a minute
+                          for an accelerator; tiny: to see it all work in minutes
   --data PATH             furniture10 (default, built in), furniture10-families (more various),
                           modelnet10 or modelnet40 (downloaded), a folder <class>/{{train,test}}/
-                          of .off, .obj, .stl, .ply or .glb, a zip of that layout, or an .npz of
-                          voxel grids
+                          of .off, .obj, .stl, .ply, .gltf, .glb, .dae or .3mf, a zip of that
+                          layout, or an .npz of voxel grids
   --archive FILE          ModelNet10.zip or ModelNet40.zip, where it has been downloaded already
   --views N               candidate viewpoints around an object (default 40)
   --pretrained FILE ...   ImageNet weights for the classifiers: torchvision's .pth or .safetensors

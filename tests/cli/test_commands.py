@@ -103,6 +103,7 @@ def weights_that_are_none(root: Path) -> list:
     ("make", "message"),
     [
         (no_such_file, "no such file or folder: .*nowhere"),
+        (lambda _: ["--data", "gs://bucket/meshes"], "read from this machine's disk, not from gs://bucket/meshes"),
         (not_a_mesh, r"jug/train/1.off is not an OFF mesh"),
         (truncated, r"jug/train/1.off is cut short"),
         (not_finite, r"jug/train/1.off has \d vertices that are not finite"),

@@ -89,6 +89,29 @@ def test_a_frame_is_of_pandas_where_that_is_installed(inputs, monkeypatch):
     assert study.to_frame("threshold") == study.rows("threshold")
 
 
+def test_differences_are_from_the_baseline_that_is_named_and_tables_and_plots_show_them(inputs):
+    study = evaluate_policies(inputs, {"a_b": opposite, "other": opposite}, baseline="a_b")
+    rows = {(row["policy"], row["views"]): row for row in study.rows()}
+    for views in range(1, 10):
+        apart = (study.right("random") - study.right("a_b"))[:, views - 1].mean()
+        assert rows["random", views]["difference"] == pytest.approx(apart, abs=1e-6)
+        assert rows["other", views]["difference"] == rows["a_b", views]["difference"] == 0
+    lines = study.to_latex().splitlines()
+    assert lines[0] == r"\begin{tabular}{lrrrrrrrrr}"
+    titles = {name: rows[name, 1]["title"] for name in ("a_b", "other")}
+    latex = {name: title.replace("_", r"\_") for name, title in titles.items()}
+    (own,) = (line for line in lines if line.startswith(f"{latex['a_b']} & "))
+    accuracies = [f"{100 * rows['a_b', views]['accuracy']:.1f}" for views in range(1, 10)]
+    assert own == " & ".join([latex["a_b"], *accuracies]) + r" \\"
+    (other,) = (line for line in lines if line.startswith(f"{latex['other']} & "))
+    assert f"{accuracies[1]} (+0.0)" in other
+    (axes,) = study.plot().axes
+    drawn = {line.get_label(): line.get_ydata() for line in axes.lines}
+    np.testing.assert_allclose(drawn[titles["a_b"]], 100 * study.right("a_b").mean(axis=0), rtol=1e-5)
+    with pytest.raises(DataError, match="the baseline is one of random, mine, not 'farthest'"):
+        evaluate_policies(inputs, {"mine": opposite}, baseline="farthest")
+
+
 def test_reach_is_that_of_the_settings(inputs):
     low = EvaluationInputs(inputs.tables, inputs.tables, inputs.graph, GridConfig(draws=2, lowest_elevation=0.0))
     study = evaluate_policies(low, {"mine": opposite})
