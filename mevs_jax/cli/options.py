@@ -201,8 +201,9 @@ class LookOptions(RecordingOptions):
 
     system: System = "furniture10"
     """the trained system: a folder, a run, a name that comes with the package, or hf://owner/name on the Hugging Face hub"""
-    mesh: Annotated[Path | None, _arg("FILE")] = None
-    """a mesh to recognise: .off, .obj, .stl, .ply, .glb, .gltf, .dae or .3mf; it is rendered from the views that are chosen"""
+    mesh: Annotated[Path | None, _arg("FILE|CLASS")] = None
+    """a mesh to recognise: .off, .obj, .stl, .ply, .glb, .gltf, .dae or .3mf, or a built-in piece by its class, as chair; it is
+    rendered from the views that are chosen"""
     depth: Annotated[Path | None, _arg("PATH")] = None
     """recorded depth images to choose from: an .npz, a folder as of 7-Scenes or TUM, or PATH#OBJECT of BOP (docs/frames.md)"""
     first: Annotated[int | None, _arg("VIEW", "chosen; for recorded images, the first that shows the object")] = None

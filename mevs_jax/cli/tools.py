@@ -16,6 +16,9 @@ import numpy as np
 from mevs_jax.cli.failure import Unusable
 from mevs_jax.deploy.compiled import keep_compiled
 
+_UNSEEN = 900
+"""Number of the built-in piece of each class; pieces with this number are in no data set."""
+
 if TYPE_CHECKING:
     from mevs_jax.agent import Frames, Walk
     from mevs_jax.cli.options import EnrolOptions, ExportOptions, LookOptions, RecordingOptions
@@ -115,13 +118,16 @@ def as_json(walk: Walk, name: str) -> dict[str, Any]:
 
 
 def read_mesh(path: Path, up: str) -> tuple[np.ndarray, np.ndarray]:
-    """Vertices and triangles of a mesh file, by the study's readers."""
+    """Vertices and triangles of a mesh file, by the study's readers, or of a built-in piece of furniture."""
     from mevs_jax.cli.main import has_checkout
 
     if not has_checkout():
         raise Unusable("meshes are read by a checkout of the project, not by the package alone; give --depth instead")
-    from data_pipeline.objects.recipes import read_mesh
+    from data_pipeline.objects.mesh import MODELNET10_CLASSES
+    from data_pipeline.objects.recipes import FurniturePiece, read_mesh
 
+    if str(path) in MODELNET10_CLASSES and not path.exists():
+        return FurniturePiece(str(path), _UNSEEN).load()
     return read_mesh(path, up)  # type: ignore[arg-type]
 
 

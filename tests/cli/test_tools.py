@@ -95,6 +95,14 @@ def test_a_mesh_is_looked_at(system, chair, at_once, tmp_path):
     assert str(again).splitlines()[-1].endswith("after 3 views (budget)")
 
 
+def test_a_built_in_piece_is_looked_at_by_its_class(system, at_once, monkeypatch, tmp_path):
+    monkeypatch.chdir(tmp_path)
+    found = json.loads(ended(at_once("look", "--system", system, "--mesh", "chair", "--max-views", 2, "--json")))
+    piece = furniture("chair", 900)
+    walk = mevs_jax.look(load(system), piece.vertices, piece.faces, max_views=2)
+    assert (found["object"], found["views"]) == ("chair", list(walk.views))
+
+
 def test_recorded_images_are_looked_at(system, frames, at_once):
     said = at_once(
         "look", "--system", system, "--depth", frames[0], "--stop", 2, "--unknown", 1, "--policy", "farthest"

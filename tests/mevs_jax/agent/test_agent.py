@@ -215,8 +215,8 @@ def test_costs_change_the_choice_by_what_a_unit_is_worth(classifier):
     for share, chosen in ((0.5, best), (2.0, second)):
         cost = np.where(np.arange(making.VIEWS) == best, share * lead / 0.25, 0.0)
         assert agent.decide(cost=cost).index == chosen
-        at = {pose.tobytes(): one for pose, one in zip(agent.poses, cost, strict=True)}
-        assert agent.decide(cost=lambda pose: at[pose.tobytes()]).index == chosen
+        by_pose = dict(zip([pose.tobytes() for pose in agent.poses], cost, strict=True))
+        assert agent.decide(cost=lambda pose, by_pose=by_pose: by_pose[pose.tobytes()]).index == chosen
     cost = np.full(making.VIEWS, np.inf)
     cost[3] = 5.0
     assert agent.decide(cost=cost).index == 3
