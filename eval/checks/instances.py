@@ -36,6 +36,8 @@ VIEWS = (1, 2, 3, 4)
 POLICIES = (BASELINE, "farthest", "information_gain", BELIEF_ORACLE)
 _WITHIN = np.radians(10)
 """A yaw is right if it is off by at most this much."""
+_RADII = 0.003, 10.0
+"""Radii of objects, in metres, that a camera could be held before."""
 _LEVEL = -0.1
 """Least height of the directions that depth images for enrolment are taken from: tables hide what is below."""
 
@@ -134,6 +136,7 @@ def study_instances(
     data: str,
     *,
     up: Up = "auto",
+    metres: float = 1.0,
     sizes: Sequence[int] = (),
     conditions: Sequence[Condition] = CONDITIONS,
     yaws: int = 2,
@@ -145,23 +148,31 @@ def study_instances(
         system: that objects are enrolled with, as `objects`.
         data: meshes, as of `mevs check transfer`; their classes do not matter.
         up: upward axis of the meshes.
+        metres: in one unit of the files.
         sizes: numbers of objects to enrol, drawn at random; all that there are, besides.
         conditions: what to measure.
         yaws: how often each object is walked around, at a random yaw each.
         seed: of objects, yaws and errors.
 
     Raises:
-        DataError: if fewer than 3 objects can be used.
+        DataError: if fewer than 3 objects can be used, or one has an impossible size.
     """
     source, left_out = objects_to_test(data, up), dict[str, str]()
     meshes: dict[str, Mesh] = {}
     for entry in source.entries:
         try:
-            meshes[entry.name] = load_object(entry)
+            mesh = load_object(entry)
+            meshes[entry.name] = replace(mesh, radius=mesh.radius * metres)
         except (DataError, EmptyMesh) as error:
             left_out[entry.name] = reason_of(error)
     if len(meshes) < 3:
         raise DataError(f"{data} has {len(meshes)} objects that can be used, and 3 are needed")
+    for name, mesh in meshes.items():
+        if mesh.radius < _RADII[0] or mesh.radius > _RADII[1]:
+            raise DataError(
+                f"{name} would be {2 * mesh.radius:.3g} metres large, and the errors of cameras depend on sizes; say how many "
+                f"metres one unit of the files is, such as --metres 0.01 for centimetres, and give all files the same unit"
+            )
     random, measured = np.random.default_rng(seed), []
     chosen = [random.permutation(len(meshes))[:size] for size in sorted({*sizes}) if 3 <= size < len(meshes)]
     with progress_bar("conditions") as bar:
@@ -251,6 +262,7 @@ def _shape(
     return [
         DepthImage(image * mesh.radius, camera.intrinsics, pose, mask=mask)
         for image, pose, mask in zip(real, poses, depth > 0, strict=True)
+        if (mask & (image > 0)).any()  # others measured nothing, and would not be taken
     ]
 
 

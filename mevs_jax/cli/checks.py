@@ -115,7 +115,8 @@ def instances(options: InstancesOptions) -> None:
         print(f"Trained system: {(options.to / 'objects').absolute()}")
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", AlikeWarning)
-        found = study_instances(load_system(system), options.data, up=options.up, sizes=options.sizes)
+        settings = {name: getattr(options, name) for name in ("up", "metres", "sizes")}
+        found = study_instances(load_system(system), options.data, **settings)
     write_json(options.to / "instances.json", as_json(found))
     print(instances_text(found))
 

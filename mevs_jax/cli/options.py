@@ -293,6 +293,8 @@ class InstancesOptions:
     """the upward axis of the meshes"""
     system: Annotated[str, _arg("PATH|NAME", "objects, which comes with the package")] = "objects"
     """the system that objects are enrolled with"""
+    metres: Annotated[float, _arg("M")] = 1.0
+    """metres in one unit of the files: the errors of cameras depend on the size of objects"""
     sizes: Annotated[tuple[int, ...], _arg("N ...", "all")] = ()
     """numbers of objects to enrol, besides all"""
     fit: Flag = False

@@ -123,7 +123,7 @@ def observation_space(environment: ActiveRecognition) -> gymnasium.spaces.Dict:
         "view": spaces.Discrete(environment.views),
         "direction": spaces.Box(-1, 1, (3,)),
         "attempted": spaces.MultiBinary(environment.views),
-        "steps": spaces.Discrete(environment.max_views, start=1),
+        "steps": spaces.Discrete(environment.max_views + 1),
     }
     if environment.reachable is not None:
         parts["reachable"] = spaces.MultiBinary(environment.views)

@@ -7,11 +7,25 @@ import warnings
 import numpy as np
 import pytest
 
+from data_pipeline.errors import DataError
 from eval.checks.instances import Condition, study_instances
 from mevs_jax.cli.checks import instances_text
 from mevs_jax.enrolment import AlikeWarning
+from mevs_jax.trained import load
+from tests.eval.checks.test_transfer import write_off
 from tests.mevs_jax.gallery.conftest import CAMERA, matcher  # noqa: F401
 from train.tasks.matcher import objects_system
+
+
+def test_objects_in_another_unit_are_refused(tmp_path):
+    from data_pipeline.objects.furniture import furniture
+
+    for name in ("chair", "sofa", "table"):
+        (tmp_path / name).mkdir()
+        piece = furniture(name, 40)
+        write_off(tmp_path / name / f"{name}.off", 100 * piece.vertices, piece.faces)
+    with pytest.raises(DataError, match=r"metres large, .* such as --metres 0\.01 for centimetres"):
+        study_instances(load("objects"), str(tmp_path))
 
 
 @pytest.mark.slow
