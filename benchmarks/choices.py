@@ -25,7 +25,7 @@ import numpy as np
 import tyro
 
 from benchmarks.reporting import RESULTS, refuse
-from data_pipeline.dataset.builder import open_split
+from data_pipeline.dataset.index import read_index
 from data_pipeline.files import read_json, write_bytes, write_text
 from eval.learned.comparison import BASELINES, ByObject, seeds_together
 from mevs_jax.markdown import markdown_table
@@ -53,7 +53,7 @@ def keep(run: Path, folder: Path) -> None:
     """Stores the results of a run's walks for each object, and those of classes that are left out."""
     for path in (run / "learned").glob("seed_*/walks_novel.json"):
         write_bytes(folder / f"{path.parent.name}_novel.json", path.read_bytes())
-    names = np.array([one["name"].decode() for one in open_split(run / "data", "test", ("name",))])
+    names = np.array(read_index(run / "data", "test", "name")["name"])
     for path in sorted((run / "learned").glob("seed_*/walks_*.npz")):
         if path.stem == "walks_novel":
             continue

@@ -6,6 +6,7 @@ process writes files and messages; the others wait for it before they read what 
 
 from __future__ import annotations
 
+import json
 import os
 import socket
 import sys
@@ -104,6 +105,19 @@ def from_all(own: np.ndarray, count: int) -> np.ndarray:
     padded[: len(own)] = own
     every = np.asarray(multihost_utils.process_allgather(padded))  # (processes, most, …)
     return every.swapaxes(0, 1).reshape(-1, *own.shape[1:])[:count]
+
+
+def by_all(own: dict[str, str]) -> dict[str, str]:
+    """Returns what all processes have found, from what each has found."""
+    if jax.process_count() == 1:
+        return own
+    content = np.frombuffer(json.dumps(own).encode(), np.uint8)
+    sizes = multihost_utils.process_allgather(np.array(len(content)))
+    every = multihost_utils.process_allgather(np.pad(content, (0, int(sizes.max()) - len(content))))
+    joined: dict[str, str] = {}
+    for size, of_one in zip(sizes, every, strict=True):
+        joined |= json.loads(bytes(of_one[:size]))
+    return joined
 
 
 def agreed(value: bool) -> bool:

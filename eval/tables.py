@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Int
 
-from data_pipeline.dataset.builder import open_split
+from data_pipeline.dataset.index import read_index
 from data_pipeline.dataset.statistics import DatasetStatistics
 from data_pipeline.errors import Diverged
 from data_pipeline.files import npz_bytes
@@ -66,10 +66,8 @@ class ViewTables:
 
 def objects_of(data: Path, split: str, statistics: DatasetStatistics) -> tuple[list[str], np.ndarray, np.ndarray]:
     """Names, labels (objects,) and normalised entropies (objects, views) of a split, in the order of the shards."""
-    examples = list(open_split(data, split, ("name", "label", "entropy")))
-    names = [example["name"].decode() for example in examples]
-    labels = np.array([example["label"] for example in examples], np.int32)
-    return names, labels, np.stack([example["entropy"] / statistics.entropy_max for example in examples])
+    found = read_index(data, split, "name", "label", "entropy")
+    return found["name"], found["label"], found["entropy"] / statistics.entropy_max
 
 
 def compute_view_tables(

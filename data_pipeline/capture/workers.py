@@ -15,21 +15,23 @@ from data_pipeline.capture.casting import Capture, Rig, capture, rig_for, save_c
 from data_pipeline.capture.settings import CaptureConfig
 from data_pipeline.capture.visualizer import capture_with_visualizer
 from data_pipeline.errors import DamagedMesh, EmptyMesh
-from data_pipeline.files import PARTIAL, npz_of, write_text
+from data_pipeline.files import npz_of, write_text
 from data_pipeline.objects.mesh import Mesh, ObjectEntry
+from data_pipeline.objects.recipes import identity_of
 from data_pipeline.objects.sources import load_object
 from data_pipeline.processes import shared, usable_cpus
 from data_pipeline.progress import progress_bar
 
 
 def capture_path(folder: Path, entry: ObjectEntry) -> Path:
-    """Returns the path of an object's capture in `folder`. It depends on the state of the object's file when it was listed.
+    """Returns the path of an object's capture, in one of 256 folders in `folder`. It depends on the content of the object's file.
 
     So a capture of a file that has changed since is not found, and the file is captured again.
     """
-    stamp = getattr(entry.recipe, "stamp", "")
+    stamp = identity_of(entry.recipe)
     state = f".{hashlib.sha256(stamp.encode()).hexdigest()[:12]}" if stamp else ""
-    return npz_of(folder, entry.name + state)
+    place = hashlib.sha256(entry.name.encode("utf-8", "surrogateescape")).hexdigest()[:2]
+    return npz_of(folder / place, entry.name + state)
 
 
 def _left_out_path(folder: Path, entry: ObjectEntry) -> Path:
@@ -70,13 +72,12 @@ def capture_entry(entry: ObjectEntry, rig: Rig, folder: Path, backend: str, skip
 
 
 def still_to_capture(entries: Sequence[ObjectEntry], folder: Path) -> list[ObjectEntry]:
-    """Returns the objects that are neither captured nor left out yet, and makes `folder` if needed."""
-    folder.mkdir(parents=True, exist_ok=True)
-    # A file that another process is writing may be gone by the time that one asks for its size.
-    found = [path for path in folder.iterdir() if not path.name.endswith(PARTIAL)]
-    present = {path.name for path in found if path.stat().st_size}
-    paths = (capture_path, _left_out_path)
-    return [entry for entry in entries if not any(path(folder, entry).name in present for path in paths)]
+    """Returns the objects that are neither captured nor left out yet."""
+
+    def is_done(path: Path) -> bool:
+        return any(one.is_file() and one.stat().st_size for one in (path, path.with_suffix(".left_out")))
+
+    return [entry for entry in entries if not is_done(capture_path(folder, entry))]
 
 
 def left_out_of(entries: Sequence[ObjectEntry], folder: Path) -> dict[str, str]:

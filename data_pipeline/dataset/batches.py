@@ -21,6 +21,7 @@ import jax
 import numpy as np
 
 from data_pipeline.dataset.builder import open_split
+from data_pipeline.dataset.index import read_index
 
 
 @dataclass(frozen=True)
@@ -141,8 +142,8 @@ class _TrainingObjects:
         self._sources, self._config = [open_split(folder, split, read) for split in splits], config
         self._kept = objects_kept(sum(map(len, self._sources)), config)
         if config.balanced:
-            labels = [example["label"] for split in splits for example in open_split(folder, split, ("label",))]
-            self._kept = equally_often(self._kept, np.array(labels)[self._kept])
+            labels = np.concatenate([read_index(folder, split, "label")["label"] for split in splits])
+            self._kept = equally_often(self._kept, labels[self._kept])
 
     def __len__(self) -> int:
         return len(self._kept)

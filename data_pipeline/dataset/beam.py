@@ -1,7 +1,7 @@
 """Creation of a data set with Apache Beam, for more objects than one machine can capture. The records are the same.
 
-Captures are written to a folder that all workers share; TFDS then reads them from there and writes shards. Both steps are Beam
-pipelines, for any runner. Install Beam with `pip install -e '.[beam]'`.
+Captures are written to a folder that all workers share; shards are then written from there. Both steps are Beam pipelines, for
+any runner. Install Beam with `pip install -e '.[beam]'`.
 """
 
 from __future__ import annotations
@@ -15,6 +15,7 @@ from typing import Any
 from data_pipeline.capture.casting import rig_for
 from data_pipeline.capture.settings import CaptureConfig
 from data_pipeline.capture.workers import capture_entry, left_out_of, say_damaged, still_to_capture
+from data_pipeline.dataset.shards import Part
 from data_pipeline.errors import DataError
 from data_pipeline.objects.mesh import ObjectEntry
 
@@ -65,8 +66,9 @@ def capture_by_beam(
     return left_out_of(entries, folder)
 
 
-def examples_by_beam(entries: Sequence[ObjectEntry], example_of: Callable[[ObjectEntry], Any]) -> Any:
-    """Returns the (key, example) pairs of a split as a Beam transform, in the form that TFDS expects."""
+def write_by_beam(parts: Sequence[Part], write: Callable[[Part], None], options: Any) -> None:
+    """Writes every shard with Beam."""
     import apache_beam as beam
 
-    return beam.Create(list(entries)) | beam.Reshuffle() | beam.Map(example_of)
+    with beam.Pipeline(options=options) as pipeline:
+        _ = pipeline | beam.Create(list(parts)) | beam.Reshuffle() | "Write" >> beam.Map(write)

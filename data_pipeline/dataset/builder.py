@@ -1,53 +1,37 @@
 """Creation of a TFDS data set from captures. One example is one object with all its views, in ArrayRecord shards.
 
-Splits are by object, so no object is in two splits. Neither writing nor reading needs TensorFlow. The statistics of the data
-set (`DatasetStatistics`) are stored next to the shards; all later stages read them from there.
+Splits are by object, so no object is in two splits. The statistics of the data set (`DatasetStatistics`) are stored next to the
+shards; all later stages read them from there.
 """
 
 from __future__ import annotations
 
 import functools
-import io
 import shutil
-import struct
-import zlib
-from collections.abc import Iterator, Sequence
-from contextlib import redirect_stdout
+from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
-from zipfile import BadZipFile
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 
-from data_pipeline.capture.casting import Capture, Rig, load_capture, rig_for
 from data_pipeline.capture.settings import CaptureConfig, check_camera
 from data_pipeline.capture.viewpoints import identified, viewpoints_of
-from data_pipeline.capture.workers import capture_all, capture_entry, capture_path, left_out_of, say_damaged
-from data_pipeline.dataset.beam import beam_options, capture_by_beam, examples_by_beam
+from data_pipeline.capture.workers import capture_all
+from data_pipeline.dataset.beam import beam_options, capture_by_beam, write_by_beam
 from data_pipeline.dataset.config import DataConfig as DataConfig
 from data_pipeline.dataset.config import check_viewpoints, identity_of
 from data_pipeline.dataset.origin import changes_between, state_of
 from data_pipeline.dataset.origin import open_objects as open_objects
-from data_pipeline.dataset.proof import (
-    CAPTURES,
-    SHARDS,
-    SOURCE_STATE,
-    damage_of_settings,
-    found_in,
-    keep_checks_of_shards,
-    open_split,
-    state_before,
-)
-from data_pipeline.dataset.statistics import SPLITS, SUMMARY, DatasetStatistics, StatisticsCollector, load_statistics
-from data_pipeline.distributed import agreed, is_first, own_share, wait_for_all
-from data_pipeline.errors import DataError, reason_of
+from data_pipeline.dataset.proof import CAPTURES, SOURCE_STATE, damage_of_settings, found_in, state_before
+from data_pipeline.dataset.proof import open_split as open_split
+from data_pipeline.dataset.shards import Part, claimed, drop_others, finish_shards, parts_of, write_part
+from data_pipeline.dataset.statistics import SUMMARY, DatasetStatistics, load_statistics, statistics_of
+from data_pipeline.distributed import agreed, by_all, is_first, own_share, wait_for_all
+from data_pipeline.errors import DataError
 from data_pipeline.files import check_of_file, keep_checks, keep_json
 from data_pipeline.objects.mesh import SOURCE_SPLITS, ObjectEntry, ObjectSource
 from data_pipeline.progress import console, progress_bar
-from mevs_jax.beliefs.entropy import level_entropy
 
 
 def split_objects(entries: Sequence[ObjectEntry], validation_share: float, seed: int) -> dict[str, list[ObjectEntry]]:
@@ -71,181 +55,55 @@ def split_objects(entries: Sequence[ObjectEntry], validation_share: float, seed:
     return split
 
 
-@jax.jit
-def _entropies(levels: jax.Array) -> jax.Array:
-    return jax.vmap(level_entropy)(levels)
-
-
-def view_entropies(capture: Capture) -> np.ndarray:
-    """Returns the depth entropy of each view in bits, (views,), exactly as in the thesis."""
-    return np.asarray(_entropies(jnp.asarray(capture.depth // 256, jnp.int32)))
-
-
-def _features(classes: Sequence[str], config: CaptureConfig) -> dict[str, Any]:
-    """Returns the TFDS features of an example."""
-    import tensorflow_datasets as tfds
-
-    views, side = config.views, config.resolution
-    tensor = tfds.features.Tensor
-    return {
-        "name": tfds.features.Text(),
-        "label": tfds.features.ClassLabel(names=list(classes)),
-        "depth": tensor(shape=(views, side, side), dtype=np.uint16, encoding="bytes"),
-        "image": tensor(shape=(views, side, side), dtype=np.uint8, encoding="bytes"),
-        "pose": tensor(shape=(views, 4, 4), dtype=np.float32),
-        "entropy": tensor(shape=(views,), dtype=np.float32),
-        "extent": tensor(shape=(3,), dtype=np.float32),
-        "radius": tensor(shape=(), dtype=np.float32),
-    }
-
-
-def _spill_without_tensorflow() -> None:
-    """Replaces the buckets in which TFDS sorts records beyond 1 GiB on disk, which use TensorFlow to open files."""
-    from tensorflow_datasets.core import shuffle
-
-    class Bucket(shuffle._Bucket):
-        """A bucket whose file is opened for each record, so that a thousand buckets do not need a thousand open files."""
-
-        def add(self, key: int, data: bytes) -> None:
-            path = Path(self._path)
-            path.parent.mkdir(parents=True, exist_ok=True)
-            with path.open("ab") as file:
-                file.write(shuffle._hkey_to_bytes(key) + struct.pack("=Q", len(data)) + data)
-            self._length += 1
-            self._size += len(data)
-
-        def read_values(self) -> Iterator[tuple[int, bytes]]:
-            if self._length:
-                with Path(self._path).open("rb") as file:
-                    while key := file.read(shuffle.HKEY_SIZE_BYTES):
-                        yield shuffle._read_hkey(key), file.read(struct.unpack("=Q", file.read(8))[0])
-
-        def del_file(self) -> None:
-            Path(self._path).unlink(missing_ok=True)
-
-    shuffle._Bucket = Bucket
-
-
-def example_of(entry: ObjectEntry, captures: Path, rig: Rig, backend: str) -> tuple[str, dict[str, Any]]:
-    """Returns the key and content of an object's record, from its capture in the folder `captures`.
-
-    A damaged capture, which a power failure may leave, is made again.
-    """
-    path = capture_path(captures, entry)
-    try:
-        capture = load_capture(path)
-    except (OSError, ValueError, KeyError, EOFError, RuntimeError, BadZipFile, zlib.error) as error:
-        console.print(f"{path} cannot be read ({reason_of(error)}), so it is made again", markup=False)
-        path.unlink(missing_ok=True)
-        if (damage := capture_entry(entry, rig, captures, backend, skip_damaged=False)) is not None:
-            raise say_damaged(damage) from error
-        capture = load_capture(path)
-    return entry.name, {
-        "name": entry.name,
-        "label": entry.label,
-        "depth": capture.depth,
-        "image": capture.image,
-        "pose": rig.poses_around(entry.name),
-        "entropy": view_entropies(capture),
-        "extent": capture.extent,
-        "radius": np.float32(capture.radius),
-    }
-
-
-@functools.cache
-def _builder_class() -> type:
-    """Returns the TFDS builder. It is defined on first use, since importing TFDS is slow."""
-    import tensorflow_datasets as tfds
-
-    tfds.disable_progress_bar()
-    _spill_without_tensorflow()
-
-    class Info(tfds.core.DatasetInfo):
-        def initialize_from_bucket(self) -> None:
-            """Does nothing: TFDS looks for known data sets here, and leaves an empty folder among the temporary files."""
-
-    class MultiViewObjects(tfds.core.GeneratorBasedBuilder):
-        """Objects captured from a lattice of viewpoints: depth, shaded image, pose and depth entropy of each view."""
-
-        VERSION = tfds.core.Version("1.0.0")
-
-        def __init__(self, *, source: ObjectSource, split, config_data: DataConfig, captures: Path, on_object, **rest):
-            self._source, self._split, self._data = source, split, config_data
-            self._on_object = on_object  # None if Beam makes the examples, in other processes
-            rig = rig_for(config_data.capture)
-            self._example_of = functools.partial(
-                example_of, captures=captures.absolute(), rig=rig, backend=config_data.capture.backend
-            )
-            super().__init__(file_format="array_record", **rest)
-
-        def _info(self):
-            features = tfds.features.FeaturesDict(_features(self._source.classes, self._data.capture))
-            return Info(builder=self, description=self.__doc__, features=features)
-
-        def _split_generators(self, dl_manager):
-            del dl_manager  # nothing to download: the captures are on disk
-            if self._on_object is None:
-                return {name: examples_by_beam(self._split[name], self._example_of) for name in SPLITS}
-            return {name: self._generate_examples(name) for name in SPLITS}
-
-        def _generate_examples(self, split: str) -> Iterator[tuple[str, dict[str, Any]]]:
-            for entry in self._split[split]:
-                name, example = self._example_of(entry)
-                self._on_object(split, name, example)
-                yield name, example
-
-    return MultiViewObjects
-
-
 def _write_shards(
-    source: ObjectSource,
-    split: dict[str, list[ObjectEntry]],
-    left_out: dict[str, dict[str, str]],
-    config: DataConfig,
-    captures: Path,
-    folder: Path,
-    beam: Any,
-) -> DatasetStatistics:
-    """Writes the shards to `folder` and returns the statistics; `beam` are pipeline options or None."""
-    import tensorflow_datasets as tfds
-
-    statistics = StatisticsCollector(len(source.classes))
+    parts: list[Part], source: ObjectSource, config: CaptureConfig, captures: Path, folder: Path, beam: Any
+) -> None:
+    """Writes all shards, which the processes share; `beam` are pipeline options or None."""
+    write = functools.partial(
+        write_part, folder=folder.absolute(), classes=source.classes, config=config, captures=captures.absolute()
+    )
+    if beam is not None:
+        write_by_beam(parts, write, beam)
+        return
     with progress_bar("objects") as bar:
-        task = bar.add_task("Writing shards", total=sum(map(len, split.values())), note="")
+        task = bar.add_task("Writing shards", total=sum(len(part.entries) for part in parts), note="")
+        for part in claimed(parts, folder):
+            write(part)
+            bar.advance(task, len(part.entries))
 
-        def on_object(name: str, key: str, example: dict[str, Any]) -> None:
-            bar.advance(task)
-            statistics.add(name, key, example)
 
-        builder = _builder_class()(
-            source=source,
-            split=split,
-            config_data=config,
-            captures=captures,
-            on_object=on_object if beam is None else None,
-            data_dir=str(folder),
-        )
-        with redirect_stdout(io.StringIO()):  # TFDS prints its output folder, twice
-            builder.download_and_prepare(download_config=tfds.download.DownloadConfig(beam_options=beam))
-        if beam is not None:
-            for name in SPLITS:
-                for example in open_split(folder.parent, name):
-                    on_object(name, example["name"].decode(), example)
+def _finish(
+    parts: list[Part],
+    source: ObjectSource,
+    left_out: dict[str, str],
+    config: DataConfig,
+    folder: Path,
+    state: dict[str, str] | None,
+) -> None:
+    """Stores what is known of the whole data set, once all shards are there."""
+    index, checks = finish_shards(parts, folder, source.classes, config.capture)
     counts = {
-        name: {c: sum(entry.label == i for entry in members) for i, c in enumerate(source.classes)}
-        for name, members in split.items()
+        split: dict(zip(source.classes, np.bincount(of["label"], minlength=len(source.classes)).tolist(), strict=True))
+        for split, of in index.items()
     }
     viewpoints = viewpoints_of(config.capture)
-    return statistics.finish(
+    statistics = statistics_of(
+        index,
         classes=list(source.classes),
         counts=counts,
-        left_out=left_out,
+        left_out=_reasons(source, left_out),
         viewpoints=viewpoints.points.tolist(),
         neighbours=None if viewpoints.neighbours is None else [list(pair) for pair in viewpoints.neighbours],
         capture=asdict(identified(config.capture)),
         source=source.name,
         notes=source.notes,
     )
+    made_with = folder / "config.json"
+    keep_checks(folder, checks | {made_with.name: check_of_file(made_with)}, only=True)
+    if state is not None:
+        keep_json(folder / SOURCE_STATE, state)
+    keep_json(folder / SUMMARY, statistics.content())
+    shutil.rmtree(folder / CAPTURES, ignore_errors=True)
 
 
 def _changes(config: DataConfig, folder: Path) -> str:
@@ -342,8 +200,8 @@ def prepare(config: DataConfig, folder: Path, beam: str | None = None) -> Datase
 
 
 def _made(config: DataConfig, folder: Path, identity: dict[str, Any], beam: Any) -> DatasetStatistics:
-    """Makes the data set and returns its statistics. Several processes share the captures; the first writes the shards."""
-    captures, made_with, shards = folder / CAPTURES, folder / "config.json", folder / SHARDS
+    """Makes the data set and returns its statistics. Several processes share the captures, and then the shards."""
+    captures, made_with = folder / CAPTURES, folder / "config.json"
     if not is_first():
         wait_for_all("the source is there")
     source, state = open_objects(config), state_of(config)
@@ -357,24 +215,22 @@ def _made(config: DataConfig, folder: Path, identity: dict[str, Any], beam: Any)
     wait_for_all("captures begin")
     if beam is None:  # several processes share the objects
         own = [source.entries[index] for index in own_share(len(source.entries))]
-        capture_all(own, config.capture, captures, skip_damaged=config.skip_damaged)
-        wait_for_all("captures end")
-        left_out = left_out_of(source.entries, captures)
+        left_out = by_all(capture_all(own, config.capture, captures, skip_damaged=config.skip_damaged))
     else:
         left_out = capture_by_beam(source.entries, config.capture, captures, beam, skip_damaged=config.skip_damaged)
     split = split_objects(
         [entry for entry in source.entries if entry.name not in left_out], config.validation_share, config.seed
     )
     _check_classes(config, source, split, left_out)
+    parts = parts_of(split, config.capture)
     if is_first():
-        (folder / SUMMARY).unlink(missing_ok=True)  # of shards that are damaged
-        keep_checks(folder, {made_with.name: check_of_file(made_with)}, only=True)
-        shutil.rmtree(shards, ignore_errors=True)  # incomplete shards of an interrupted run
-        statistics = _write_shards(source, split, _reasons(source, left_out), config, captures, shards, beam)
-        keep_checks_of_shards(folder)
-        if state is not None:
-            keep_json(folder / SOURCE_STATE, state)
-        keep_json(folder / SUMMARY, statistics.content())
-        shutil.rmtree(captures, ignore_errors=True)
+        damaged = (folder / SUMMARY).exists()
+        (folder / SUMMARY).unlink(missing_ok=True)
+        drop_others([] if damaged else parts, folder)
+    wait_for_all("shards begin")
+    _write_shards(parts, source, config.capture, captures, folder, beam)
+    wait_for_all("shards are there")
+    if is_first():
+        _finish(parts, source, left_out, config, folder, state)
     wait_for_all("a data set is made")
     return load_statistics(folder)

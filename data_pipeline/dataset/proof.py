@@ -18,11 +18,8 @@ from data_pipeline.distributed import is_first
 from data_pipeline.errors import DataError, Unreadable, reason_of
 from data_pipeline.files import (
     as_read,
-    check_of_file,
     checks_in,
     damage_in,
-    files_in,
-    keep_checks,
     keep_json,
     read_json,
     size_of_file,
@@ -42,17 +39,6 @@ SOURCE_STATE = "source.json"
 
 _LARGE = 4 * 2**30
 """Of shards with more bytes in all than this, only the sizes are compared: reading them all would take more than seconds."""
-
-
-def keep_checks_of_shards(folder: Path) -> None:
-    """Waits until all shards of a data set are on the disk, and keeps their checks."""
-    found = {}
-    for name in files_in(folder / SHARDS):
-        path = folder / SHARDS / name
-        with path.open("rb") as file:
-            os.fsync(file.fileno())
-        found[f"{SHARDS}/{name}"] = check_of_file(path)
-    keep_checks(folder, found)
 
 
 def _checked(folder: Path) -> list[str]:

@@ -1,4 +1,4 @@
-"""Statistics of a data set: its summary file, and how it is computed while shards are written."""
+"""Statistics of a data set: its summary file, and how it is computed from the index."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from data_pipeline.capture.settings import CaptureConfig
-from data_pipeline.errors import DataError, Diverged
+from data_pipeline.errors import DataError
 from data_pipeline.files import digest_of, read_json
 from data_pipeline.progress import console
 from mevs_jax.geometry.viewpoints import ViewGraph
@@ -100,51 +100,36 @@ class DatasetStatistics:
         return CaptureConfig(**self.capture)
 
 
-class StatisticsCollector:
-    """Collects what the statistics need from each object while shards are written."""
+def statistics_of(index: dict[str, dict[str, Any]], **rest: Any) -> DatasetStatistics:
+    """Returns the statistics of the objects in an index (`data_pipeline.dataset.index`), by split.
 
-    def __init__(self, classes: int):
-        self.classes = classes
-        self.objects: dict[str, dict[str, tuple[int, np.ndarray, np.ndarray]]] = {split: {} for split in SPLITS}
-
-    def add(self, split: str, name: str, example: dict[str, Any]) -> None:
-        """Adds the object `name` with its record `example`; raises `Diverged` if its entropies are not finite."""
-        if not np.isfinite(example["entropy"]).all():
-            way_out = "leave this object out of the source, or repair its mesh"
-            raise Diverged(f"the depth entropies of {name} are not finite; {way_out}")
-        points = np.count_nonzero(example["depth"], axis=(1, 2))
-        self.objects[split][name] = int(example["label"]), example["entropy"], points
-
-    def finish(self, **rest: Any) -> DatasetStatistics:
-        """Returns the statistics of the objects added; `rest` are the fields that do not depend on their views."""
-        # Sorted by name, so that floating-point sums do not depend on the order in which objects were added.
-        ordered = {split: [members[name] for name in sorted(members)] for split, members in self.objects.items()}
-        labels = np.array([label for label, _, _ in ordered["train"]])
-        points = np.stack([points for _, _, points in ordered["train"]])
-        entropies = {split: np.stack([entropy for _, entropy, _ in members]) for split, members in ordered.items()}
-        largest = float(np.max(entropies["train"])) or 1.0
-        normalised = {split: members / largest for split, members in entropies.items()}
-        train = normalised["train"]
-        members = [labels == label for label in range(self.classes)]
-        return DatasetStatistics(
-            entropy_max=largest,
-            entropy_mean=float(train.mean()),
-            entropy_std=float(train.std()),
-            entropy_histograms={
-                split: np.histogram(np.minimum(values, 1), 50, (0, 1))[0].tolist()
-                for split, values in normalised.items()
-            },
-            mean_map=train.mean(axis=0).tolist(),
-            class_mean_maps=[
-                train[own].mean(axis=0).tolist() if own.any() else [0.0] * train.shape[1] for own in members
-            ],
-            points_mean=float(points.mean()),
-            points_std=float(points.std()),
-            points_by_class=[
-                np.percentile(points[own], (5, 25, 50, 75, 95)).tolist() if own.any() else [0.0] * 5 for own in members
-            ],
-            **rest,
-        )
+    Args:
+        rest: the fields that do not depend on views.
+    """
+    # Sorted by name, so that floating-point sums do not depend on the order of the records.
+    order = {split: sorted(range(len(of["name"])), key=of["name"].__getitem__) for split, of in index.items()}
+    entropies = {split: of["entropy"][order[split]] for split, of in index.items()}
+    labels, points = (index["train"][column][order["train"]] for column in ("label", "points"))
+    largest = float(np.max(entropies["train"])) or 1.0
+    normalised = {split: members / largest for split, members in entropies.items()}
+    train = normalised["train"]
+    members = [labels == label for label in range(len(rest["classes"]))]
+    return DatasetStatistics(
+        entropy_max=largest,
+        entropy_mean=float(train.mean()),
+        entropy_std=float(train.std()),
+        entropy_histograms={
+            split: np.histogram(np.minimum(values, 1), 50, (0, 1))[0].tolist() for split, values in normalised.items()
+        },
+        mean_map=train.mean(axis=0).tolist(),
+        class_mean_maps=[train[own].mean(axis=0).tolist() if own.any() else [0.0] * train.shape[1] for own in members],
+        points_mean=float(points.mean()),
+        points_std=float(points.std()),
+        points_by_class=[
+            np.percentile(points[own], (5, 25, 50, 75, 95)).tolist() if own.any() else [0.0] * 5 for own in members
+        ],
+        **rest,
+    )
 
 
 def load_statistics(folder: Path) -> DatasetStatistics:

@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+import hashlib
 import os
+import re
+import urllib.parse
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 from typing import ClassVar
@@ -15,6 +19,7 @@ from data_pipeline.objects.formats import MESH_SUFFIXES, Up, parse_mesh
 from data_pipeline.objects.mesh import Recipe, surface_of
 from data_pipeline.objects.names import shown
 
+_BUFFER = re.compile(rb'"uri"\s*:\s*"([^"]+\.bin)"', re.IGNORECASE)
 LARGEST_FILE = 2 << 30
 """Largest size in bytes of a mesh file that is read."""
 
@@ -75,6 +80,19 @@ class MeshFile:
     stamp: str = ""
     up: Up = "auto"
 
+    @property
+    def identity(self) -> str:
+        """Hash of the content of the file, and of the buffers that a .gltf names."""
+        digest = hashlib.sha256()
+        with suppress(OSError, ValueError):  # it is read again, and then refused with a sentence
+            with open(self.path, "rb") as file:
+                digest.update(hashlib.file_digest(file, "sha256").digest())
+            if self.path.lower().endswith(".gltf"):
+                for uri in _BUFFER.findall(Path(self.path).read_bytes()):
+                    beside = Path(self.path).with_name("") / urllib.parse.unquote_to_bytes(uri).decode()
+                    digest.update(beside.read_bytes() if beside.is_file() else uri)
+        return digest.hexdigest()
+
     def load(self) -> tuple[np.ndarray, np.ndarray]:
         return read_with(_content, self.path, shown(self.path), self.up)
 
@@ -91,11 +109,21 @@ class Turned:
         """The state of the file that it is read from, and the angle."""
         return f"{getattr(self.recipe, 'stamp', '')} turned by {self.angle:.6f}"
 
+    @property
+    def identity(self) -> str:
+        """As `stamp`, by the file's content."""
+        return f"{identity_of(self.recipe)} turned by {self.angle:.6f}"
+
     def load(self) -> tuple[np.ndarray, np.ndarray]:
         vertices, faces = self.recipe.load()
         x, y, z = np.asarray(vertices, np.float64).reshape(-1, 3).T
         cos, sin = np.cos(self.angle), np.sin(self.angle)
         return np.stack([cos * x - sin * y, sin * x + cos * y, z], axis=1), faces
+
+
+def identity_of(recipe: Recipe) -> str:
+    """Returns what tells meshes of one name apart: the content of a file, the version of a shape, or nothing."""
+    return getattr(recipe, "identity", None) or getattr(recipe, "stamp", "")
 
 
 def read_mesh(path: str | Path, up: Up = "auto") -> tuple[np.ndarray, np.ndarray]:
@@ -156,10 +184,7 @@ def _content(path: str) -> bytes:
 
 
 def stamp_of(status: os.stat_result) -> str:
-    """Returns the state of a file as text: its size, and when its content and its entry in the file system last changed.
-
-    Captures of a file in another state are not used.
-    """
+    """Returns the state of a file as text: its size, and when its content and its entry in the file system last changed."""
     return f"{status.st_size}-{status.st_mtime_ns}-{status.st_ctime_ns}"
 
 

@@ -210,7 +210,7 @@ def load_ascent_scores(out: Path, statistics: DatasetStatistics, config: Renderi
     folder = _folder(out, statistics, config)
     if not folder.exists():
         return None
-    names = objects_of(out / "data", "test", statistics)[0]  # reads the whole split
+    names = objects_of(out / "data", "test", statistics)[0]
     chosen = chosen_objects(config, len(names))
     paths = [npz_of(folder, names[at]) for at in chosen]
     if not all(path.exists() for path in paths):

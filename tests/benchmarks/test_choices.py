@@ -31,9 +31,8 @@ def test_what_is_kept_says_what_the_walks_said(tmp_path, monkeypatch, random):
     arrays = {f"{name} {field.name}": getattr(one, field.name) for name, one in each.items() for field in fields(one)}
     np.savez(folder / "walks_lattice_40.npz", **arrays)
     (folder / "walks_lattice_40.json").write_text(json.dumps(found))
-    monkeypatch.setattr(
-        choices, "open_split", lambda folder, split, only: [{"name": b"chair_%d" % i} for i in range(OBJECTS)]
-    )
+    names = [f"chair_{i}" for i in range(OBJECTS)]
+    monkeypatch.setattr(choices, "read_index", lambda folder, split, *columns: {"name": names})
     monkeypatch.setattr(choices, "RESULTS", tmp_path)
     gain = {"difference": [0.0, 0.015, 0.01], "interval": [[0.0, 0.0], [0.008, 0.022], [-0.001, 0.02]]}
     novel = {"objects": OBJECTS, "pairs": [{}], "gain": {"expected_views_without": gain}}

@@ -16,7 +16,6 @@ import numpy as np
 import pytest
 import trimesh
 
-from data_pipeline.dataset.builder import open_split
 from data_pipeline.dataset.statistics import load_statistics
 from data_pipeline.distributed import from_all, own_share
 from data_pipeline.files import files_in
@@ -94,13 +93,7 @@ def test_two_processes_make_the_data_set_that_one_makes(data, tmp_path):
     assert "\nData set: " in "\n" + said
     assert files_in(both) == files_in(one)
     for name in files_in(one):
-        if "array_record" not in name:
-            assert (both / name).read_bytes() == (one / name).read_bytes(), name
-    for split in ("train", "val", "test"):  # compressed shards differ from one writing to the next
-        for mine, expected in zip(open_split(both, split), open_split(one, split), strict=True):
-            assert mine.keys() == expected.keys()
-            for key in expected:
-                np.testing.assert_array_equal(mine[key], expected[key], err_msg=key)
+        assert (both / name).read_bytes() == (one / name).read_bytes(), name
 
 
 @pytest.fixture

@@ -26,7 +26,7 @@ from data_pipeline.capture.casting import (
     save_capture,
 )
 from data_pipeline.capture.workers import capture_all, capture_entry, capture_path
-from data_pipeline.dataset.builder import view_entropies
+from data_pipeline.dataset.shards import view_entropies
 from data_pipeline.errors import DamagedMesh
 from data_pipeline.objects.mesh import Mesh, ObjectEntry, normalise
 from data_pipeline.objects.recipes import FurniturePiece, MeshFile
@@ -108,10 +108,10 @@ def test_captured_objects_are_not_captured_again_and_empty_ones_are_named(tmp_pa
     entries.append(entry("nothing", VoxelGrid(bytes(64), 8)))
     left_out = capture_all(entries, CONFIG, tmp_path, workers=2)
     assert left_out == {"nothing": "voxel grid has 0 of 512 cells filled, fewer than 5"}
-    kept = {path.name: path.stat().st_mtime_ns for path in tmp_path.iterdir()}
+    kept = {path.name: path.stat().st_mtime_ns for path in tmp_path.glob("*/*")}
     capture_path(tmp_path, entries[1]).unlink()  # as if interrupted before it
     assert capture_all(entries, CONFIG, tmp_path, workers=1) == left_out
-    now = {path.name: path.stat().st_mtime_ns for path in tmp_path.iterdir()}
+    now = {path.name: path.stat().st_mtime_ns for path in tmp_path.glob("*/*")}
     assert kept.keys() == now.keys()
     assert [name for name in kept if kept[name] != now[name]] == ["chair_1.npz"]
 

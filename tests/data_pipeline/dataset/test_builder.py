@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 
 from data_pipeline.capture.casting import Capture, CaptureConfig, capture, rig_for
-from data_pipeline.dataset.builder import open_split, prepare, split_objects, view_entropies
+from data_pipeline.dataset.builder import open_split, prepare, split_objects
+from data_pipeline.dataset.shards import view_entropies
 from data_pipeline.dataset.statistics import SPLITS, load_statistics
 from data_pipeline.errors import DataError
 from data_pipeline.objects.sources import load_object, open_source
@@ -111,23 +112,6 @@ def test_no_tensorflow_is_imported(data):
     )
     out = subprocess.run([sys.executable, "-c", code, str(data)], capture_output=True, text=True, check=True)
     assert out.stdout.strip() == "none"
-
-
-def test_more_records_than_memory_are_sorted_on_disk_and_nothing_is_left_there(tmp_path, data, monkeypatch):
-    """TFDS keeps 1 GiB of records in memory; beyond that its own code wants TensorFlow, and ours must do without."""
-    from tensorflow_datasets.core import shuffle
-
-    from data_pipeline.dataset.builder import _builder_class
-
-    _builder_class()
-    monkeypatch.setattr(shuffle, "MAX_MEM_BUFFER_SIZE", 1)
-    (tmp_path / "temporary").mkdir()
-    monkeypatch.setattr("tempfile.tempdir", str(tmp_path / "temporary"))
-    prepare(CONFIG, tmp_path / "data")
-    assert list((tmp_path / "temporary").iterdir()) == []
-    spilled, kept = open_split(tmp_path / "data", "train"), open_split(data, "train")
-    assert [spilled[i]["name"] for i in range(40)] == [kept[i]["name"] for i in range(40)]
-    np.testing.assert_array_equal(spilled[3]["depth"], kept[3]["depth"])
 
 
 def test_stored_entropies_are_the_librarys(data):

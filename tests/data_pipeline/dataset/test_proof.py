@@ -122,7 +122,7 @@ def test_a_damaged_capture_is_made_again(small, tmp_path, capsys):
     source = builder.open_objects(CONFIG)
     captures = tmp_path / "data" / "captures"
     workers.capture_all(source.entries, CONFIG.capture, captures)
-    paths = sorted(captures.iterdir())
+    paths = sorted(captures.glob("*/*"))
     paths[0].write_bytes(b"")
     flip(paths[1])
     paths[2].write_bytes(paths[2].read_bytes()[:100])
