@@ -52,23 +52,30 @@ def is_right(beliefs: Float[Array, "..."], label: Int[Array, ""], *, axis: int) 
     return jnp.all(jnp.where(before, beliefs < own, beliefs <= own), axis=0)
 
 
+_DRAWN_AT_ONCE = 2**20
+"""Numbers of draws that are in memory together."""
+
+
 def bootstrap_means(
     key: Array, values: Float[AnyArray, " objects"], *, resamples: int = 2000
 ) -> Float[Array, " {resamples}"]:
     """Means of `values` over `resamples` samples of objects, drawn with replacement.
 
     The same key draws the same objects. A `vmap` over cells of a table with one key therefore keeps the cells paired, and costs
-    one matrix product.
+    one matrix product. Samples are drawn in parts, whose memory does not grow with the number of objects.
     """
     count = values.shape[0]
     whole(count, "a bootstrap needs at least 1 value", 1, 2**31 - 1)
     whole(resamples, "resamples must be at least 1", 1, 2**31 - 1)
 
-    def times_drawn(key: Array) -> Array:
-        return jnp.zeros(count).at[jax.random.randint(key, (count,), 0, count)].add(1.0)
+    values = jnp.asarray(values)
 
-    drawn = jax.lax.map(times_drawn, jax.random.split(key, resamples), batch_size=64)
-    return jnp.matmul(drawn, jnp.asarray(values), precision="highest") / count
+    def mean_of_drawn(key: Array) -> Array:
+        drawn = jnp.zeros(count).at[jax.random.randint(key, (count,), 0, count)].add(1.0)
+        return jnp.matmul(drawn, values, precision="highest") / count
+
+    at_once = min(max(1, _DRAWN_AT_ONCE // count), 64)
+    return jax.lax.map(mean_of_drawn, jax.random.split(key, resamples), batch_size=at_once)
 
 
 def bootstrap_interval(

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+from functools import partial
+
 import jax
 import numpy as np
 import pytest
 from sklearn.metrics import accuracy_score, balanced_accuracy_score
 from sklearn.metrics import confusion_matrix as sklearn_confusion
 
-from mevs_jax import accuracy, bootstrap_interval, class_accuracy, confusion_matrix
+from mevs_jax import accuracy, bootstrap_interval, bootstrap_means, class_accuracy, confusion_matrix
+from mevs_jax.beliefs import metrics
 
 
 def test_equal_to_scikit_learn(random):
@@ -33,6 +36,26 @@ def test_the_bootstrap_interval_covers_as_it_says(random):
         low, high = interval(jax.random.key(trial), random.normal(1.0, 2.0, 80).astype(np.float32))
         hits += low <= 1.0 <= high
     assert 176 <= hits <= 200
+
+
+def test_the_bootstrap_is_that_of_one_large_table_in_memory_that_does_not_grow(random, monkeypatch):
+    """Draw by draw the same as with all numbers of draws in one table, also in parts; cells of a table stay paired."""
+    key, values = jax.random.key(3), random.normal(size=(2, 700)).astype(np.float32)
+    drawn = [np.asarray(jax.random.randint(one, (700,), 0, 700)) for one in jax.random.split(key, 300)]
+    expected = np.stack([np.bincount(one, minlength=700) for one in drawn]) @ values.T.astype(np.float64) / 700
+    for at_once in (metrics._DRAWN_AT_ONCE, 700, 5000):
+        monkeypatch.setattr(metrics, "_DRAWN_AT_ONCE", at_once)
+        found = jax.vmap(lambda one: bootstrap_means(key, one, resamples=300))(values)
+        np.testing.assert_allclose(found.T, expected, atol=1e-6)
+    monkeypatch.undo()
+
+    def bytes_of(objects: int) -> int:
+        shape = jax.ShapeDtypeStruct((objects,), np.float32)
+        compiled = jax.jit(partial(bootstrap_means, key)).lower(shape).compile()
+        return compiled.memory_analysis().temp_size_in_bytes
+
+    few, many, most = map(bytes_of, (10_000, 100_000, 1_000_000))
+    assert max(many, most) < 2 * few < 50e6
 
 
 def test_answers_that_were_not_given_are_not_counted():
