@@ -131,8 +131,11 @@ def _train(training: _Training, begin: Callable[[], None] | None) -> None:
             started = time.perf_counter()
             while training.step < (training.epoch + 1) * epoch_steps:
                 bar.advance(line, lead.limit(training.take_step(next(batches))) * views)
-                if preemption.after_step() and training.step % epoch_steps:
-                    training.save_within_epoch(checkpoints, started)
+                asked = preemption.after_step() and training.step % epoch_steps
+                # With other settings, what is there stays until an epoch was trained, since that may diverge.
+                if asked or (begin is None and config.saves_after(training.step, epoch_steps)):
+                    started = training.save_within_epoch(checkpoints, started)
+                if asked:
                     raise Preempted(f"{task.name} was asked to end after step {training.step}")
             bar.advance(line, lead.end() * views)
             if begin is not None:
@@ -180,6 +183,7 @@ class _Training:
         self._evaluate_step = jax.jit(summed_over(mesh, evaluate_step_of(task, structure)))
         self._all_finite = jax.jit(all_finite, out_shardings=NamedSharding(mesh, PartitionSpec()))
         self._validation = ValidationSet(task, data, statistics, mesh.shape[DATA])
+        self._saved = 0  # steps done at the latest checkpoint
         self.progress: dict[str, Any] = {"epoch": 0, "best_loss": None, "best_epoch": 0, "seconds": 0.0}
 
     @property
@@ -203,6 +207,7 @@ class _Training:
             return
         self.state, self.progress = saved
         self.step, best = int(self.state.step), self.progress["best_loss"]
+        self._saved = self.step
         if not self._has_finite_weights():
             raise self.diverged(
                 f"the checkpoint of the {self.task.name} after epoch {self.epoch} in {self.folder} has weights that are not "
@@ -218,11 +223,14 @@ class _Training:
         self.step += 1
         return loss
 
-    def save_within_epoch(self, checkpoints: Checkpoints, started: float) -> None:
-        """Saves the state; raises `Diverged` if it is not finite."""
-        self.progress["seconds"] += time.perf_counter() - started
+    def save_within_epoch(self, checkpoints: Checkpoints, started: float) -> float:
+        """Saves the state, with the time since `started`; returns the present time. Raises `Diverged` if it is not finite."""
+        now = time.perf_counter()
+        self.progress["seconds"] += now - started
         self._check({f"sum of the training {name}": float(total) for name, total in self.state.sums.items()})
         checkpoints.save("latest", self.step, self.state, self.progress)
+        self._saved = self.step
+        return now
 
     def finish_epoch(
         self, checkpoints: Checkpoints, log: MetricsLog, started: float
@@ -251,6 +259,7 @@ class _Training:
         log.write(self.step, entry | _prefixed("train/", means) | _prefixed("val/", checked))
         # Saved after the log is written: resuming can remove lines beyond the checkpoint, but cannot restore a missing one.
         checkpoints.save("latest", self.step, self.state, progress)
+        self._saved = self.step
         return means, checked
 
     def _has_finite_weights(self) -> bool:
@@ -261,11 +270,10 @@ class _Training:
         bad = not_finite(metrics) or ["weights"] * (not self._has_finite_weights())
         if bad:
             verb = "are" if bad[0] == "weights" else "is"
-            kept = (
-                f"the checkpoint after epoch {self.epoch} is kept in {self.folder}"
-                if self.epoch
-                else "no epoch was saved"
-            )
+            kept, within = "no epoch was saved", self._saved % self.epoch_steps
+            if self._saved:
+                after = f"step {self._saved}" if within else f"epoch {self.epoch}"
+                kept = f"the checkpoint after {after} is kept in {self.folder}"
             raise self.diverged(
                 f"the {self.task.name} diverged in epoch {self.epoch + 1}, by step {self.step}: its {bad[0]} {verb} not finite; "
                 f"{kept}"

@@ -33,6 +33,8 @@ class OptimiserConfig:
     """views of each training object in an epoch; 0: all"""
     epoch_steps: int = 0
     """least number of steps of an epoch: where there are few objects, each gives more views than `epoch_views`"""
+    checkpoint_steps: int = 1000
+    """steps between two checkpoints within an epoch: a job that is killed repeats at most so many; 0: none within an epoch"""
     validation_views: int = 0
     """views of each validation object that are evaluated after an epoch; 0: all"""
     method: Literal["adam", "muon"] = "adam"
@@ -52,6 +54,10 @@ class OptimiserConfig:
     """seed of initial weights, augmentation and dropout"""
     data_seed: int = 0
     """seed of the batches"""
+
+    def saves_after(self, step: int, epoch_steps: int) -> bool:
+        """Returns whether a checkpoint is due after so many steps of all epochs, which is not the end of one."""
+        return bool(self.checkpoint_steps and step % epoch_steps and step % self.checkpoint_steps == 0)
 
     def shifted(self, number: int) -> OptimiserConfig:
         """Returns the settings of seed number `number`, counted from these."""

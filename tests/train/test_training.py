@@ -23,7 +23,7 @@ from eval.settings import TINY
 from tests.reference.quick import lines, quick_tasks
 from train.loop import content_on, fit, load_best, steps_of_an_epoch
 from train.optimiser import OptimiserConfig
-from train.results.identity import config_of
+from train.results.identity import config_of, content_of
 from train.running.checkpoints import Checkpoints
 from train.running.preemption import Preempted
 from train.step import abstract_state
@@ -69,6 +69,40 @@ def test_training_learns(data, tmp_path):
     entropy = lines(tmp_path / "entropy")
     assert entropy[-1]["train/loss"] < 0.7 * entropy[0]["train/loss"]
     assert list((tmp_path / "classifier" / "tensorboard").iterdir())
+
+
+def test_a_run_killed_within_epochs_repeats_few_steps(quick, whole, tmp_path, monkeypatch, random):
+    """At random places; weights and log are those of a run that was never stopped."""
+
+    class Killed(BaseException):
+        pass
+
+    task, train_in = quick(checkpoint_steps=2)
+    real, done = train.loop._Training.take_step, list[int]()
+
+    def killed(self, batch):
+        if kills and random.random() < 0.3:
+            raise kills.pop()
+        done.append(self.step)
+        return real(self, batch)
+
+    monkeypatch.setattr(train.loop._Training, "take_step", killed)
+    kills, times = [Killed() for _ in range(8)], 0
+    while True:
+        try:
+            train_in(tmp_path)
+            break
+        except Killed:
+            times += 1
+    assert times >= 4
+    with Checkpoints(tmp_path) as checkpoints:
+        assert len(done) <= checkpoints.latest_step("latest") + times * task.optimiser.checkpoint_steps
+    assert content_of(task) == content_of(quick()[0])  # not part of what a training is
+    for mine, theirs in zip(lines(tmp_path), lines(whole), strict=True):
+        assert mine | {"seconds": 0} == theirs | {"seconds": 0}
+    states = [nnx.state(load_best(task, folder)) for folder in (tmp_path, whole)]
+    for mine, theirs in zip(*map(jax.tree.leaves, states), strict=True):
+        np.testing.assert_array_equal(mine, theirs)
 
 
 def test_a_stopped_run_ends_as_if_it_had_not_been(quick, whole, tmp_path, monkeypatch):

@@ -33,7 +33,7 @@ def train_members(
 ) -> tuple[Together, Any]:
     """Trains all members; returns their results, and the weights and statistics of each one's best epoch on the host.
 
-    A training that SIGTERM ended resumes after its last step, one that was interrupted otherwise after its last complete epoch.
+    A training that SIGTERM ended resumes after its last step, one that was interrupted otherwise after its last checkpoint.
 
     Args:
         group: the members.
@@ -59,11 +59,13 @@ def train_members(
             of = Together.of(saved[1], epoch_steps)
             console.print(f"{title}: resuming after epoch {of.epoch}, step {of.step}")
 
-        def save_and_end_if_asked(started: float) -> None:
-            of.seconds += time.perf_counter() - started
+        def save_and_end_if_asked(started: float) -> float:
+            now = time.perf_counter()
+            of.seconds += now - started
             checkpoints.save("latest", of.step, trainer.saved(), asdict(of))
             if preemption.asked:
                 raise Preempted(f"{title} was asked to end after step {of.step}")
+            return now
 
         views = optimiser.batch_size * (count if group.own_batches else 1)
         total, done = epoch_steps * optimiser.epochs * views, of.step * views
@@ -76,8 +78,9 @@ def train_members(
                 ended = lead.limit(trainer.train(training, batches.next(trainer.places)))
                 of.step += 1
                 bar.advance(line, ended * views)
-                if preemption.after_step() and of.step % epoch_steps:
-                    save_and_end_if_asked(started)
+                asked = preemption.after_step() and of.step % epoch_steps
+                if asked or optimiser.saves_after(of.step, epoch_steps):
+                    started = save_and_end_if_asked(started)
             bar.advance(line, lead.end() * views)
             _finish_epoch(of, training, trainer, batches, epoch_steps, optimiser.patience)
             if halving and of.epoch in {max(1, optimiser.epochs // share) for share in (8, 4, 2)}:

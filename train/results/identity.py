@@ -93,10 +93,12 @@ IN_A_SUMMARY = {"epoch", "best_loss", "best_epoch", "best", "seconds", "steps", 
 def content_of(task: Any) -> dict[str, Any]:
     """Returns a task as JSON keeps it; what was added since version 0.1 and is off is left out, as it was then.
 
-    So is `epoch_steps`, which matters for few objects alone; see `train.loop.content_on`.
+    So are `epoch_steps`, which matters for few objects alone (see `train.loop.content_on`), and `checkpoint_steps`, which changes
+    no weight.
     """
     content = as_read(asdict(task))
-    content["optimiser"].pop("epoch_steps")
+    for name in ("epoch_steps", "checkpoint_steps"):
+        content["optimiser"].pop(name)
     return {
         name: value
         for name, value in content.items()

@@ -60,19 +60,23 @@ def losses(data: Path, mesh: Mesh, steps: int) -> tuple[dict[str, list[float]], 
     return out, talk
 
 
-def fit_until(data: Path, out: Path, stop_at: int) -> None:
-    """Trains the quick predictor; at the batch of number `stop_at` the process is told to end."""
+def fit_until(data: Path, out: Path, stop_at: int, by: int = signal.SIGTERM, every: int = 1000) -> None:
+    """Trains the quick predictor; at the batch of number `stop_at` the process gets the signal `by`.
+
+    Args:
+        every: steps between checkpoints within an epoch.
+    """
     real = train.loop.train_batches
 
     def batches(*arguments, first_step: int = 0):
         for number, batch in enumerate(real(*arguments, first_step=first_step), first_step):
             if number == stop_at:
-                os.kill(os.getpid(), signal.SIGTERM)
+                os.kill(os.getpid(), by)
             yield batch
 
     train.loop.train_batches = batches
     statistics = load_statistics(data)
-    task = quick_tasks(statistics)[1]
+    task = quick_tasks(statistics, checkpoint_steps=every)[1]
     try:
         train.loop.fit(task, data, statistics, out)
     except Preempted:
@@ -91,4 +95,5 @@ if __name__ == "__main__":
     if "steps" in asked:
         print(json.dumps({name: losses(Path(asked["data"]), mesh, asked["steps"]) for name, mesh in meshes().items()}))
     else:
-        fit_until(Path(asked["data"]), Path(asked["out"]), asked["stop_at"])
+        given = {name: asked[name] for name in ("by", "every") if name in asked}
+        fit_until(Path(asked["data"]), Path(asked["out"]), asked["stop_at"], **given)

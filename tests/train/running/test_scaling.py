@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import signal
 import subprocess
 import sys
 from pathlib import Path
@@ -19,6 +20,7 @@ from tests.reference.processes import CPU
 from tests.reference.quick import lines, quick_tasks
 from tests.train.running.scaling_worker import SETTINGS
 from train.loop import fit, load_best
+from train.running.checkpoints import Checkpoints
 
 
 def work(**asked) -> subprocess.CompletedProcess:
@@ -53,6 +55,26 @@ def test_steps_on_many_devices_equal_those_on_one(data):
             assert len(losses) == steps
             assert np.std(losses) > 1e-3
             np.testing.assert_allclose(losses, alone[name], rtol=1e-5, err_msg=f"{name} on {mesh}")
+
+
+@pytest.mark.slow
+def test_a_job_that_is_killed_within_epochs_ends_with_the_same_weights(data, tmp_path):
+    """By SIGKILL, at steps apart from the checkpoints; at most so many steps as lie between two are done again."""
+    every, kills = 3, (2, 5, 7, 14, 17, 25)
+    statistics = load_statistics(data)
+    for at in kills:
+        done = work(data=data, devices=1, out=tmp_path / "killed", stop_at=at, by=int(signal.SIGKILL), every=every)
+        assert done.returncode == -signal.SIGKILL, done.stderr
+        with Checkpoints(tmp_path / "killed") as checkpoints:
+            assert at - checkpoints.latest_step("latest") <= every + 1  # one save may have been under way
+    assert work(data=data, devices=1, out=tmp_path / "killed", stop_at=10**6, every=every).returncode == 0
+    task = quick_tasks(statistics)[1]
+    assert work(data=data, devices=1, out=tmp_path / "whole", stop_at=10**6).returncode == 0
+    states = [nnx.state(load_best(task, tmp_path / name)) for name in ("killed", "whole")]
+    for mine, theirs in zip(*map(jax.tree.leaves, states), strict=True):
+        np.testing.assert_array_equal(mine, theirs)
+    for mine, theirs in zip(lines(tmp_path / "killed"), lines(tmp_path / "whole"), strict=True):
+        assert mine | {"seconds": 0} == theirs | {"seconds": 0}
 
 
 @pytest.mark.slow
