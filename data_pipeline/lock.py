@@ -67,6 +67,19 @@ def _job_in(file: int) -> dict[str, Any]:
     return content if isinstance(content, dict) else {}
 
 
+def job_of(out: Path) -> dict[str, Any] | None:
+    """Returns what the lock of a run directory says of the job that holds it; None if there is none, or its process is gone."""
+    try:
+        file = os.open(out / NAME, os.O_RDONLY)
+    except OSError:
+        return None
+    try:
+        job = _job_in(file)
+    finally:
+        os.close(file)
+    return job if job and (job.get("host") != platform.node() or _is_running(job)) else None
+
+
 def _in_use(out: Path, job: dict[str, Any], sure: bool) -> DataError:
     who = f"process {job['pid']} on {job.get('host')} ({job.get('command')})" if "pid" in job else "another job"
     wait = "wait until it ends, or choose another --out"

@@ -2,13 +2,21 @@
 
 from __future__ import annotations
 
+import json
 import sys
 import threading
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from datetime import timedelta
+from pathlib import Path
 
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, ProgressColumn, Task, TextColumn, TimeRemainingColumn
 from rich.text import Text
+
+from data_pipeline.errors import DataError
+from data_pipeline.files import write_bytes
 
 console = Console(stderr=True, highlight=False, soft_wrap=True)
 
@@ -23,12 +31,12 @@ class _Rate(ProgressColumn):
         return Text("" if speed is None else f"{speed:,.1f} {self.unit}/s", style="cyan")
 
 
-class _ProgressInLines(Progress):
-    """For logs: every so often a line for each task that is under way, in place of bars."""
+class _Watched(Progress):
+    """A bar whose state is written every few seconds for `mevs status`; for logs also as lines, in place of the bar."""
 
-    def __init__(self, unit: str):
-        super().__init__(console=console, disable=True)
-        self.unit = unit
+    def __init__(self, *columns: ProgressColumn, unit: str, in_lines: bool):
+        super().__init__(*columns, console=console, disable=in_lines)
+        self.unit, self._in_lines = unit, in_lines
         self._ended = threading.Event()
         self._writer = threading.Thread(target=self._write, daemon=True)
 
@@ -43,13 +51,36 @@ class _ProgressInLines(Progress):
         super().stop()
 
     def _write(self) -> None:
-        while not self._ended.wait(SECONDS_BETWEEN_LINES):
-            for task in self.tasks:
-                if task.started and not task.finished:
-                    console.print(line_of(task, self.unit))
+        said = time.monotonic()
+        while not self._ended.wait(min(SECONDS_BETWEEN_LINES, _SECONDS_BETWEEN_STATES)):
+            lines = [line_of(task, self.unit) for task in self.tasks if task.started and not task.finished]
+            if _status is not None:
+                with suppress(OSError, DataError):  # it is told by the work itself if nothing can be written
+                    write_bytes(_status, json.dumps({"time": time.time(), "lines": lines}).encode(), durable=False)
+            if self._in_lines and time.monotonic() - said >= SECONDS_BETWEEN_LINES:
+                said = time.monotonic()
+                for line in lines:
+                    console.print(line)
 
 
 SECONDS_BETWEEN_LINES = 30.0
+_SECONDS_BETWEEN_STATES = 5.0
+_status: Path | None = None
+
+STATUS = "status.json"
+"""File name of the state of the job that runs in a run directory."""
+
+
+@contextmanager
+def watched(out: Path) -> Iterator[None]:
+    """Lets bars write their state into the run directory `out`, until the job ends."""
+    global _status
+    _status = out / STATUS
+    try:
+        yield
+    finally:
+        _status.unlink(missing_ok=True)
+        _status = None
 
 
 def line_of(task: Task, unit: str) -> str:
@@ -65,14 +96,12 @@ def line_of(task: Task, unit: str) -> str:
 
 def progress_bar(unit: str) -> Progress:
     """A bar counted in `unit`; where standard error is no terminal, a line every 30 seconds."""
-    if not sys.stderr.isatty():
-        return _ProgressInLines(unit)
-    return Progress(
+    columns = (
         TextColumn("{task.description}"),
         BarColumn(),
         MofNCompleteColumn(),
         _Rate(unit),
         TimeRemainingColumn(),
         TextColumn("{task.fields[note]}", style="dim"),
-        console=console,
     )
+    return _Watched(*columns, unit=unit, in_lines=not sys.stderr.isatty())

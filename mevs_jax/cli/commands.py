@@ -87,6 +87,12 @@ COMMANDS = {
         tool=True,
         needs_study=False,
     ),
+    "status": Command(
+        "what goes on in a run: stage, step, rate, time left, checkpoints",
+        "StatusOptions",
+        "stages:status",
+        tool=True,
+    ),
     "report": Command("write report/index.html", "Options", "stages:report", writes_run=False),
     "study thesis": Command(
         "every network, table and figure of the thesis, beside its own numbers",

@@ -12,7 +12,7 @@ import select
 import signal
 import sys
 import zlib
-from contextlib import nullcontext, redirect_stdout
+from contextlib import redirect_stdout
 from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, NoReturn
@@ -57,6 +57,7 @@ def _run(name: str, arguments: list[str]) -> None:
         COMMANDS[name].load()(tool_options(name, arguments))
         return
     from data_pipeline.lock import locked
+    from data_pipeline.progress import watched
     from eval.consistency import check_output
     from eval.run_file import configuration
     from mevs_jax.cli.parsing import parse
@@ -80,7 +81,10 @@ def _run(name: str, arguments: list[str]) -> None:
             _run_silently(call, command)
             return
     check_output(call.out)
-    with locked(call.out, " ".join(["mevs", *call.arguments])) if command.locks else nullcontext():
+    if not command.locks:
+        _run_in(call, command)
+        return
+    with locked(call.out, " ".join(["mevs", *call.arguments])), watched(call.out):
         _run_in(call, command)
 
 

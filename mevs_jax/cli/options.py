@@ -339,6 +339,14 @@ class CompileOptions:
 
 
 @dataclass(frozen=True)
+class StatusOptions:
+    """Options of `mevs status`."""
+
+    out: Annotated[tyro.conf.Positional[Path], _arg("RUN")]
+    """the run directory"""
+
+
+@dataclass(frozen=True)
 class ExportOptions:
     """Options of `mevs export`."""
 

@@ -5,11 +5,13 @@ from __future__ import annotations
 from functools import partial
 from typing import TYPE_CHECKING
 
+from mevs_jax.cli.failure import Unusable
 from mevs_jax.cli.parsing import Invocation, keep_adopted
 
 if TYPE_CHECKING:
     from jax.sharding import Mesh
 
+    from mevs_jax.cli.options import StatusOptions
     from train.weights.starting import StartingWeights
 
 
@@ -128,3 +130,13 @@ def report(call: Invocation) -> None:
     from eval import stages
 
     print(f"Report: {stages.report(call.settings, call.preset, call.out).absolute()}")
+
+
+def status(options: StatusOptions) -> None:
+    """What goes on in a run."""
+    from train.running.status import status_of
+
+    if not options.out.is_dir():
+        raise Unusable(f"there is no run in {options.out}; give the folder that --out names")
+    for line in status_of(options.out):
+        print(line)

@@ -33,7 +33,7 @@ def _placed(leaf: Any) -> Any:
     return leaf
 
 
-def _steps(slot: Path) -> list[Path] | None:
+def steps_saved(slot: Path) -> list[Path] | None:
     """Returns the saves in the folder of a slot, none if it does not exist; None if it is no folder."""
     if not slot.exists():
         return []
@@ -42,14 +42,14 @@ def _steps(slot: Path) -> list[Path] | None:
 
 def has_save(slot: Path) -> bool:
     """Returns whether the folder of a slot holds a save."""
-    return bool(_steps(slot))
+    return bool(steps_saved(slot))
 
 
 def damage_of(slot: Path) -> str | None:
     """Returns what is damaged in the save that the folder of a slot holds; None if it is sound by its checks or has none."""
     if not slot.is_dir():
         return f"{slot} is no folder" if slot.exists() else f"{slot} is missing"
-    found = [damage_in(step) if step.is_dir() else f"{step} is no folder" for step in _steps(slot) or ()]
+    found = [damage_in(step) if step.is_dir() else f"{step} is no folder" for step in steps_saved(slot) or ()]
     return next((damage for damage in found if damage), None) if found else f"{slot} is empty"
 
 
@@ -61,7 +61,7 @@ def drop_damaged(folder: Path, consequence: str = "so training goes on from what
     """
     for name in ("latest", "best"):
         slot = folder / name
-        if _steps(slot) != [] and (damage := damage_of(slot)) is not None:
+        if steps_saved(slot) != [] and (damage := damage_of(slot)) is not None:
             _remove(slot, damage, consequence)
 
 
