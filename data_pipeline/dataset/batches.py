@@ -10,7 +10,6 @@ and validation. The option `ViewBatches.validation_by` reproduces this, to show 
 
 from __future__ import annotations
 
-import os
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import partial
@@ -22,6 +21,7 @@ import numpy as np
 
 from data_pipeline.dataset.builder import open_split
 from data_pipeline.dataset.index import read_index
+from data_pipeline.processes import usable_cpus
 
 
 @dataclass(frozen=True)
@@ -250,7 +250,7 @@ def train_batches(
     )
     # The parts of all processes, concatenated, are the batch that a single process would read.
     parts = stream.batch(per_batch // processes, batch_fn=_join)[index::processes]
-    threads = min(16, max(1, (os.cpu_count() or 1) // 2))
+    threads = min(16, max(1, usable_cpus() // 2))
     options = grain.ReadOptions(num_threads=threads, prefetch_buffer_size=16)
     return iter(parts[first_step:].to_iter_dataset(options))
 

@@ -123,7 +123,7 @@ class Turned:
 
 def identity_of(recipe: Recipe) -> str:
     """Returns what tells meshes of one name apart: the content of a file, the version of a shape, or nothing."""
-    return getattr(recipe, "identity", None) or getattr(recipe, "stamp", "")
+    return str(getattr(recipe, "identity", "") or getattr(recipe, "stamp", ""))
 
 
 def read_mesh(path: str | Path, up: Up = "auto") -> tuple[np.ndarray, np.ndarray]:
