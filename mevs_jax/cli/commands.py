@@ -87,13 +87,13 @@ COMMANDS = {
         tool=True,
         needs_study=False,
     ),
+    "report": Command("write report/index.html", "Options", "stages:report", writes_run=False),
     "status": Command(
         "what goes on in a run: stage, step, rate, time left, checkpoints",
         "StatusOptions",
         "stages:status",
         tool=True,
     ),
-    "report": Command("write report/index.html", "Options", "stages:report", writes_run=False),
     "study thesis": Command(
         "every network, table and figure of the thesis, beside its own numbers",
         "ThesisOptions",
@@ -227,7 +227,7 @@ def help_text() -> str:
 
     def lines(grouped: bool, tools: bool = False) -> str:
         shown = {
-            name: of for name, of in COMMANDS.items() if (" " in name) == grouped and (grouped or of.tool == tools)
+            name: of for name, of in COMMANDS.items() if (" " in name) == grouped and (grouped or of.needs_study != tools)
         }
         width = max(map(len, shown)) + 2
         return "\n".join(f"  {name:<{width}}{command.title}" for name, command in shown.items())
