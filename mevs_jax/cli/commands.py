@@ -227,7 +227,9 @@ def help_text() -> str:
 
     def lines(grouped: bool, tools: bool = False) -> str:
         shown = {
-            name: of for name, of in COMMANDS.items() if (" " in name) == grouped and (grouped or of.needs_study != tools)
+            name: of
+            for name, of in COMMANDS.items()
+            if (" " in name) == grouped and (grouped or of.needs_study != tools)
         }
         width = max(map(len, shown)) + 2
         return "\n".join(f"  {name:<{width}}{command.title}" for name, command in shown.items())
