@@ -68,9 +68,7 @@ def read_epoch(folder: Path, objects: int) -> None:
 def resample(folder: Path, objects: int) -> None:
     """Means of a table over resampled objects."""
     table = np.random.default_rng(0).random((CELLS, objects), np.float32)
-    jax.block_until_ready(
-        jax.jit(jax.vmap(lambda cell: bootstrap_means(jax.random.key(0), cell, resamples=500)))(table)
-    )
+    jax.block_until_ready(jax.jit(jax.vmap(lambda cell: bootstrap_means(jax.random.key(0), cell)))(table))
 
 
 STAGES: dict[str, Callable[[Path, int], object]] = {
