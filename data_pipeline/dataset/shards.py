@@ -158,15 +158,18 @@ def write_part(part: Part, folder: Path, classes: tuple[str, ...], config: Captu
     if about.get("made_of") == made_of and path.exists() and about["check"].startswith(f"{path.stat().st_size}:"):
         return
     from array_record.python.array_record_module import ArrayRecordWriter
+    from tensorflow_datasets.core.example_serializer import ExampleSerializer
 
     features, columns = _features(classes, config), dict[str, list[Any]]()
+    serialiser = ExampleSerializer(features.get_serialized_info())
     path.parent.mkdir(parents=True, exist_ok=True)
     temporary = path.with_name(f".{path.name}.{os.getpid()}{PARTIAL}")
     try:
         writer = ArrayRecordWriter(str(temporary), "group_size:1")
         for entry in part.entries:
             example = _example_of(entry, captures, _rig_for(config), config.backend)
-            writer.write(features.serialize_example(example))
+            record = serialiser.get_tf_example(features.encode_example(example))
+            writer.write(record.SerializeToString(deterministic=True))  # else each process has an order of its own
             points = np.count_nonzero(example["depth"], axis=(1, 2)).astype(np.int32)
             row = {name: example[name] for name in ("name", "label", "entropy", "extent", "radius")} | {
                 "points": points
