@@ -73,6 +73,11 @@ def _training(settings: Settings, task_of: Callable[[Any], Task]) -> Make:
     return make
 
 
+_BFLOAT16 = replace(
+    THESIS, entropy=replace(THESIS.entropy, optimiser=replace(THESIS.entropy.optimiser, compute="bfloat16"))
+)
+
+
 def _recogniser(statistics: Any) -> Task:
     return RecogniserTask.of(SMALL.learned.recogniser, len(statistics.classes), statistics.camera)
 
@@ -131,5 +136,6 @@ PROGRAMS: dict[str, Make] = {
     "train-recogniser-small": _training(SMALL, _recogniser),
     "train-classifier": _training(THESIS, lambda statistics: tasks(THESIS, statistics)[0]),
     "train-entropy": _training(THESIS, lambda statistics: tasks(THESIS, statistics)[1]),
+    "train-entropy-bfloat16": _training(_BFLOAT16, lambda statistics: tasks(_BFLOAT16, statistics)[1]),
 }
 """By name. Those of networks without a size in their name are of the thesis's."""

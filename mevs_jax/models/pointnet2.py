@@ -26,6 +26,7 @@ from mevs_jax.models.calling import TrainedByCall
 from mevs_jax.models.product import product
 from mevs_jax.points.farthest import LARGE
 from mevs_jax.points.ops import ball_query, farthest_point_sample
+from mevs_jax.points.taking import take_rows
 
 
 @dataclass(frozen=True)
@@ -74,15 +75,13 @@ class Perceptron(nnx.Module):
         self, x: Float[Array, "*batch rows columns"], *, momentum: float | Array, passed: int = 0
     ) -> Float[Array, "*batch outputs"]:
         """Maximum over rows of the outputs in training; the first `passed` linear layers have already been applied to `x`."""
-        # One long matrix instead of many small ones, so that the gradient of the weights is a single product.
-        batch = x.shape[:-1]
-        x = x.reshape(-1, x.shape[-1])
+        # Rows keep their groups: where they are one long matrix, a TPU writes the gradient of the maximum three times.
         last = len(self.linear) - 1
         for number, (linear, norm) in enumerate(zip(self.linear, self.norm, strict=True)):
             x = x if number < passed else product(x, linear.kernel[...]).astype(x.dtype)
             if number < last:
                 x = jax.nn.relu(norm(x, train=True, momentum=momentum))
-        return self.norm[last].largest(x.reshape(*batch, -1), momentum=momentum)
+        return self.norm[last].largest(x, momentum=momentum)
 
     def folded(self) -> list[tuple[Array, Array]]:
         """Weights and bias of each layer, including batch norm by its running statistics."""
@@ -131,10 +130,11 @@ def _first_layer(
     kernel: Float[Array, "inputs outputs"],
 ) -> Float[Array, "centres samples outputs"]:
     """The first layer of every neighbour: its offset from the centre and its features, times the weights `kernel`."""
+    taken = take_rows(passed, neighbours.reshape(-1)).reshape(*neighbours.shape, -1)
     if _passes_first(kernel):
-        return passed[neighbours] - _placed(centres, kernel)[:, None]
+        return taken - _placed(centres, kernel)[:, None]
     columns = passed.shape[-1]
-    gathered = passed[neighbours] - jnp.pad(centres, ((0, 0), (0, columns - 3)))[:, None]
+    gathered = taken - jnp.pad(centres, ((0, 0), (0, columns - 3)))[:, None]
     return product(gathered.reshape(-1, columns), kernel[:columns]).reshape(*gathered.shape[:-1], -1)
 
 

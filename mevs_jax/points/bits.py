@@ -28,7 +28,7 @@ def set_bits(words: UInt32[Array, " words"], until: Int[Array, " words"], ranks:
     """
     word = _first_above(until, ranks)
     before = until[word] - jax.lax.population_count(words[word]).astype(jnp.int32)
-    return word * WORD + _select_bit(words[word], ranks - before)
+    return word * WORD + select_bit(words[word], ranks - before)
 
 
 def _first_above(rising: Int[Array, " n"], values: Int[Array, " k"]) -> Int[Array, " k"]:
@@ -47,7 +47,7 @@ def _first_above(rising: Int[Array, " n"], values: Int[Array, " k"]) -> Int[Arra
     return jnp.minimum(found, count - 1)
 
 
-def _select_bit(word: UInt32[Array, " k"], rank: Int[Array, " k"]) -> Int[Array, " k"]:
+def select_bit(word: UInt32[Array, "*slots"], rank: Int[Array, "*slots"]) -> Int[Array, "*slots"]:
     """Position of the set bit of each word with the given rank (from 0), by halving."""
     position = jnp.zeros_like(rank)
     for width in (16, 8, 4, 2, 1):

@@ -7,8 +7,9 @@ weights trained with those can be used:
 * ball query takes the first `k` points, in index order, that lie strictly within the radius, and fills empty slots with the
   first of them, or with point 0 if there is none.
 
-In programs for one GPU both are kernels (`mevs_jax.points.kernels`); for other devices, larger clouds and float64, array
-programs. All return the same indices, since all compare the same distances (`mevs_jax.points.distances`).
+In programs for GPUs both are kernels (`mevs_jax.points.kernels`), in those for TPUs the first is (`mevs_jax.points.mosaic`). For
+other devices, larger clouds and float64, and in exported programs, they are array programs. All return the same indices, since
+all compare the same distances (`mevs_jax.points.distances`).
 """
 
 from __future__ import annotations
@@ -20,13 +21,14 @@ from jaxtyping import Array, Float, Int, UInt32
 from mevs_jax.arguments import check, whole
 from mevs_jax.arrays import AnyArray
 from mevs_jax.points import farthest
-from mevs_jax.points.bits import WORD, bits_until, set_bits
+from mevs_jax.points.bits import WORD, bits_until, select_bit, set_bits
 from mevs_jax.points.distances import square, squared_distance
-from mevs_jax.points.lowered import kernel_on_one_gpu
+from mevs_jax.points.lowered import with_kernels
 
 LARGEST_OF_KERNEL = 16_384
-"""The largest number of points whose coordinates and distances fit into the registers of one block of a GPU."""
-_FARTHEST = kernel_on_one_gpu("farthest_point_sample", farthest.sample)
+"""The largest number of points whose coordinates and distances fit into the registers of one block of a GPU, and the largest
+numbers of points and of chosen ones that fit into a TPU's scalar memory."""
+_FARTHEST = with_kernels("farthest_point_sample", farthest.sample)
 
 
 def farthest_point_sample(points: Float[AnyArray, "points 3"], k: int) -> Int[Array, " {k}"]:
@@ -67,7 +69,7 @@ def _is_on_cpu(points: AnyArray) -> bool:
 
 def _farthest(points: Float[AnyArray, "points 3"], k: int) -> Int[Array, " {k}"]:
     points = jax.lax.stop_gradient(jnp.asarray(points))
-    if points.dtype != jnp.float32 or points.shape[0] > LARGEST_OF_KERNEL:
+    if points.dtype != jnp.float32 or max(points.shape[0], k) > LARGEST_OF_KERNEL:
         return farthest.sample(points, k)
     return _FARTHEST(points, k=k, shape=(k,))
 
@@ -132,6 +134,42 @@ def _query_of_array(
     The hits of 32 points become the bits of one word. Prefix sums of the numbers of bits find the word of the s-th hit, and five
     halvings find the bit inside it. Only the distances need a pass over all points.
     """
+    words = _hits(points, centres, squared_radius)
+    return jax.vmap(_first_hits, in_axes=(0, None))(words, k)
+
+
+def _query_on_tpu(
+    points: Float[Array, "points 3"], centres: Float[Array, "centres 3"], squared_radius: Float[Array, ""], k: int
+) -> Int[Array, "centres {k}"]:
+    """`_query_of_array` without gathers and associative scans, which are slow on a TPU: every slot is compared with every word.
+
+    Arrays have words in rows and centres in columns, so that sums over words add whole vectors.
+    """
+    words = _hits(points, centres, squared_radius).T
+    counts = jax.lax.population_count(words)
+    number = jnp.arange(words.shape[0], dtype=jnp.int32)[:, None]
+    # A product of numbers up to 32 with ones is exact also in bfloat16, which is what a TPU multiplies.
+    until = jnp.matmul((number >= number.T).astype(jnp.float32), counts.astype(jnp.float32)).astype(jnp.int32)
+    before = until - counts.astype(jnp.int32)
+    slot = jnp.arange(k, dtype=jnp.int32)[:, None]
+    rank = jnp.where(slot < until[-1], slot, 0)
+    here = (before[:, None] <= rank) & (rank < until[:, None])  # one word of each slot and centre
+
+    def of_slots(values: Int[Array, "words #centres"]) -> Int[Array, "slots centres"]:
+        return jnp.sum(jnp.where(here, values[:, None], 0), axis=0, dtype=jnp.int32)
+
+    word = of_slots(jax.lax.bitcast_convert_type(words, jnp.int32)).astype(jnp.uint32)
+    position = of_slots(number) * WORD + select_bit(word, rank - of_slots(before))
+    return jnp.where(until[-1] > 0, position, 0).T
+
+
+_BALL_QUERY = with_kernels("ball_query", _query_of_array, arrays_on_tpu=_query_on_tpu)
+
+
+def _hits(
+    points: Float[Array, "points 3"], centres: Float[Array, "centres 3"], squared_radius: Float[Array, ""]
+) -> UInt32[Array, "centres words"]:
+    """Which points are within the radius of each centre, one bit each."""
     padded = jnp.pad(points, ((0, -points.shape[0] % WORD), (0, 0)), constant_values=jnp.inf)
     # The points of a word form a column, so that the sum over bits is vectorised over words.
     x, y, z = (padded[:, axis].reshape(-1, WORD).T for axis in range(3))
@@ -140,11 +178,7 @@ def _query_of_array(
         < squared_radius
     )
     bit = jnp.uint32(1) << jnp.arange(WORD, dtype=jnp.uint32)
-    words = jnp.sum(jnp.where(hit, bit[:, None], jnp.uint32(0)), axis=1, dtype=jnp.uint32)
-    return jax.vmap(_first_hits, in_axes=(0, None))(words, k)
-
-
-_BALL_QUERY = kernel_on_one_gpu("ball_query", _query_of_array)
+    return jnp.sum(jnp.where(hit, bit[:, None], jnp.uint32(0)), axis=1, dtype=jnp.uint32)
 
 
 def _first_hits(words: UInt32[Array, " words"], k: int) -> Int[Array, " {k}"]:

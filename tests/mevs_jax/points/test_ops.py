@@ -11,7 +11,7 @@ import pytest
 from jax.sharding import AbstractDevice, AbstractMesh, AxisType, NamedSharding, PartitionSpec
 
 from mevs_jax import ball_query, farthest_point_sample
-from mevs_jax.points import farthest
+from mevs_jax.points import farthest, mosaic, ops
 from mevs_jax.points import kernels as point_kernels
 from tests.reference import numpy_rules
 
@@ -50,11 +50,22 @@ def test_indices_equal_an_obvious_loop(kind, points, k, radius, samples, random)
     ours = np.asarray(jax.jit(jax.vmap(lambda cloud: farthest_point_sample(cloud, k)))(clouds))
     for cloud, chosen in zip(clouds, ours, strict=True):
         np.testing.assert_array_equal(chosen, numpy_rules.farthest_point_sample(cloud, k))
+    on_tpu = jax.jit(jax.vmap(lambda cloud: mosaic.farthest_point_sample(cloud, k, interpret=True)))
+    np.testing.assert_array_equal(on_tpu(clouds), ours)
+    np.testing.assert_array_equal(on_tpu(clouds[:4]), ours[:4])  # side by side
+    if kind == "random":
+        clouds[:, points // 2, 1] = np.where(random.random(125) < 0.5, np.nan, np.inf)
+        plain = jax.jit(jax.vmap(lambda cloud: farthest.sample(cloud, k)))
+        np.testing.assert_array_equal(on_tpu(clouds), plain(clouds))
 
     centres = clouds[:, :6] + (random.normal(0, 0.2, (125, 6, 3)).astype(np.float32) if kind == "random" else 0)
     groups = np.asarray(jax.jit(jax.vmap(lambda p, c: ball_query(p, c, radius, samples)))(clouds, centres))
+    within = jnp.square(jnp.float32(radius))
+    on_tpu = jax.jit(jax.vmap(lambda p, c: ops._query_on_tpu(p, c, within, samples)))
+    np.testing.assert_array_equal(on_tpu(np.where(np.isfinite(clouds), clouds, np.inf), centres), groups)
     for cloud, centre, group in zip(clouds, centres, groups, strict=True):
-        np.testing.assert_array_equal(group, numpy_rules.ball_query(cloud, centre, radius, samples))
+        with np.errstate(invalid="ignore"):
+            np.testing.assert_array_equal(group, numpy_rules.ball_query(cloud, centre, radius, samples))
 
 
 @pytest.mark.parametrize(
@@ -174,30 +185,40 @@ def test_kernels_give_the_same_indices(kind, points, k, radius, samples, random)
         np.testing.assert_array_equal(group, numpy_rules.ball_query(cloud, centre, radius, samples))
 
 
-def test_one_gpu_runs_the_kernels_and_nothing_else_does():
-    """What is lowered for a GPU; whether it runs there is not seen here."""
+def test_gpus_and_tpus_run_the_kernels_and_nothing_else_does():
+    """What is lowered for them; whether it runs there is not seen here."""
 
-    def both(cloud):
-        return farthest_point_sample(cloud, 64), ball_query(cloud, cloud[:32], 0.2, 16)
+    def both(clouds):
+        return jax.vmap(lambda cloud: (farthest_point_sample(cloud, 64), ball_query(cloud, cloud[:32], 0.2, 16)))(
+            clouds
+        )
 
     h100 = AbstractDevice(device_kind="NVIDIA H100 80GB HBM3", num_cores=None, platform="gpu")
 
-    def lowered(points, platform, dtype=np.float32, devices=1):
+    def lowered(points, platform, dtype=np.float32, devices=1, clouds=8):
+        """The number of kernels, and the shapes of the coordinates that those for farthest points receive."""
         everywhere = NamedSharding(AbstractMesh((devices,), ("data",), (AxisType.Auto,)), PartitionSpec())
-        cloud = jax.ShapeDtypeStruct((points, 3), dtype, sharding=everywhere)
+        given = jax.ShapeDtypeStruct((clouds, points, 3), dtype, sharding=everywhere)
         # JAX 0.12 asks which GPU it lowers kernels for.
         with jax.sharding.use_abstract_mesh(AbstractMesh((), (), abstract_device=h100)):
-            traced = jax.jit(both).trace(cloud)  # once for all platforms
-            return traced.lower(lowering_platforms=(platform,)).as_text().count("xla.gpu.triton")
+            traced = jax.jit(both).trace(given)  # once for all platforms
+            text = traced.lower(lowering_platforms=(platform,)).as_text()
+        return text.count("@xla.gpu.triton") + text.count("@__gpu$xla.gpu.triton") + text.count("@tpu_custom_call")
 
     assert lowered(1000, "cuda") == 2
-    assert lowered(1000, "tpu") == 0
+    assert lowered(1000, "tpu") == 1
+    for devices, clouds in ((8, 16), (8, 3)):  # each has some of the clouds, or all
+        assert lowered(1000, "cuda", devices=devices, clouds=clouds) == 2
+        assert lowered(1000, "tpu", devices=devices, clouds=clouds) == 1
     assert lowered(20_000, "cuda") == 1  # too large a cloud for the registers of a block
+    assert lowered(20_000, "tpu") == 0
     assert lowered(1000, "cuda", np.float16) == 0
     assert lowered(1000, "cpu") == 0
-    assert lowered(1000, "cuda", devices=8) == 0
-    exported = jax.export.export(jax.jit(both), platforms=["cuda"])(jax.ShapeDtypeStruct((1000, 3), np.float32))
-    assert "triton" not in exported.mlir_module()  # which would run with this version of JAX alone
+    exported = jax.export.export(jax.jit(both), platforms=["cuda", "tpu"])(
+        jax.ShapeDtypeStruct((2, 1000, 3), np.float32)
+    )
+    # These would run with this version of JAX alone.
+    assert not any(kernel in exported.mlir_module() for kernel in ("triton", "tpu_custom_call"))
 
 
 def test_points_that_are_not_finite_are_no_neighbours():
