@@ -72,7 +72,9 @@ def fuse(recording: Recording) -> Surfaces:
         ("tsdf", "weight"), (core.float32, core.float32), ((1), (1)), cell, 16, 20_000, core.Device("CPU:0")
     )
     step = max(1, recording.depth.shape[2] // _COLUMNS)
-    scale = np.diag([1 / step, 1 / step, 1])
+    scale = np.array(
+        [[1 / step, 0, 0.5], [0, 1 / step, 0.5], [0, 0, 1]]
+    )  # Open3D's pixels have their corner at whole numbers
     for depth, K, pose in zip(recording.depth[:, ::step, ::step], recording.K, recording.T_world_camera, strict=True):
         image = open3d.t.geometry.Image(core.Tensor(without_edges(depth)))
         camera = core.Tensor(scale @ K), core.Tensor(np.linalg.inv(pose))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import jax
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float
 from scipy.spatial import cKDTree
@@ -31,7 +31,7 @@ def views_of(
     local = ((surfaces.points - sphere.position) @ sphere.rotation / sphere.radius).astype(np.float32)
     cast = default_caster()(Mesh(local, own, np.ones(3), 1.0))
     outwards = surfaces.normals[own].sum(axis=1) @ sphere.rotation
-    rig = rig_at(jax.vmap(system.description.camera.at)(np.asarray(system.poses)))
+    rig = rig_at(system.description.camera.at(jnp.asarray(system.poses)))
     views = []
     for pose, directions in zip(rig.poses, rig.directions, strict=True):
         eye, rays = pose[:3, 3], directions.reshape(-1, 3)
