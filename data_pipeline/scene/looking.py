@@ -7,10 +7,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from data_pipeline.frames.recording import Recording
-from data_pipeline.scene.objects import GROUND, Scene, objects_in
+from data_pipeline.scene.objects import GROUND, Scene, ground_of, objects_by_masks, objects_in
 from data_pipeline.scene.surfaces import fuse, planes_in, upward_of
 from data_pipeline.scene.views import views_of
 from mevs_jax.agent.looking import ShowsTooLittle, Walk, look_at_views
@@ -62,13 +62,20 @@ class Sight:
         return place | said | {"views": list(self.walk.views), "pose": pose}
 
 
-def scene_in(recording: Recording, up: Float[np.ndarray, " 3"] | None = None, floor: float | None = None) -> Scene:
+def scene_in(
+    recording: Recording,
+    up: Float[np.ndarray, " 3"] | None = None,
+    floor: float | None = None,
+    masks: Int[np.ndarray, "frames height width"] | None = None,
+) -> Scene:
     """The objects of a recording.
 
     Args:
         recording: of things that stand still.
         up: (3,) upward direction of any length; by default across the ground, for cameras without roll.
         floor: height of the ground along it, in metres; by default of the lowest large level plane.
+        masks: of each image, the number of the object that a pixel shows, the same in all images, 0 for none, as a detector
+            gives them; by default objects are found by what they stand on.
 
     Raises:
         DataError: if there is no ground, or nothing on it.
@@ -76,7 +83,11 @@ def scene_in(recording: Recording, up: Float[np.ndarray, " 3"] | None = None, fl
     surfaces = fuse(recording)
     planes = planes_in(surfaces)
     upwards = upward_of(planes, recording.T_world_camera) if up is None else upright(up)[2]
-    return objects_in(surfaces, planes, upwards, floor)
+    if masks is None:
+        return objects_in(surfaces, planes, upwards, floor)
+    return objects_by_masks(
+        surfaces, recording, masks, upwards, ground_of(surfaces, planes, upwards) if floor is None else floor
+    )
 
 
 def look_at_scene(system: TrainedSystem, recording: Recording, scene: Scene, **options: Any) -> list[Sight]:

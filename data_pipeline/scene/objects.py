@@ -9,8 +9,9 @@ from jaxtyping import Bool, Float, Int
 from scipy.spatial import cKDTree
 
 from data_pipeline.errors import DataError
+from data_pipeline.frames.recording import Recording
 from data_pipeline.objects.open3d_parts import load_open3d
-from data_pipeline.scene.surfaces import Plane, Surfaces
+from data_pipeline.scene.surfaces import Plane, Surfaces, projected
 from mevs_jax.geometry.sphere import Sphere, estimate_sphere, upright
 
 _LEVEL = 0.97
@@ -94,17 +95,55 @@ def objects_in(
         )
         labels[cluster] = own
         count += own == count
-    sizes = np.bincount(labels[labels >= 0], minlength=count)
+    labels[free & (labels < 0)] = PIECE
+    return _named(surfaces, labels, up, floor, len(boards))
+
+
+def objects_by_masks(
+    surfaces: Surfaces,
+    recording: Recording,
+    masks: Int[np.ndarray, "frames height width"],
+    up: Float[np.ndarray, " 3"],
+    floor: float,
+) -> Scene:
+    """Objects that a detector has found: each point belongs to the one that most images say.
+
+    Args:
+        recording: what the surfaces are made of.
+        masks: of each image, the number of the object that a pixel shows, the same in all images; 0 for none.
+        up: (3,) unit vector.
+        floor: height of the ground along it.
+
+    Raises:
+        DataError: for masks of another shape or type, or if they show nothing.
+    """
+    if masks.shape != recording.depth.shape or masks.dtype.kind not in "iu" or masks.min() < 0:
+        raise DataError(
+            f"masks must be whole numbers from 0, of the shape of depth, {recording.depth.shape}, got {masks.dtype} {masks.shape}"
+        )
+    known = np.unique(masks)
+    votes = np.zeros((len(surfaces.points), len(known)), np.int16)
+    for mask, depth, K, pose in zip(masks, recording.depth, recording.K, recording.T_world_camera, strict=True):
+        pixel, z, measured = projected(surfaces.points, depth, K, pose)
+        seen = np.flatnonzero((pixel >= 0) & (np.abs(measured - z) < 2 * surfaces.cell))
+        votes[seen, np.searchsorted(known, mask.ravel()[pixel[seen]])] += 1
+    labels = known[votes.argmax(axis=1)].astype(int) - 1
+    return _named(surfaces, np.where(votes.any(axis=1), labels, GROUND), up, floor, 0)
+
+
+def _named(surfaces: Surfaces, labels: np.ndarray, up: np.ndarray, floor: float, boards: int) -> Scene:
+    """The scene of labelled points, of which the first labels are of boards: without pieces that are too small."""
+    sizes = np.bincount(labels[labels >= 0])
     kept = np.flatnonzero(sizes >= _LEAST)
     if not len(kept):
         raise DataError("nothing stands on the ground; check --upward and --floor, or record more images")
-    renamed = np.full(count + 1, PIECE)
-    renamed[kept], renamed[-1] = np.arange(len(kept)), GROUND
-    labels = renamed[labels]
+    renamed = np.full(len(sizes), PIECE)
+    renamed[kept] = np.arange(len(kept))
+    labels = np.where(labels < 0, labels, renamed[labels])
     spheres = []
     for number, old in enumerate(kept):
         shown = surfaces.points[labels == number]
-        if old < len(boards):  # its legs may be hidden
+        if old < boards:  # its legs may be hidden
             shown = np.concatenate([shown, shown + np.outer(floor - shown @ up, up)])
         spheres.append(Sphere(*estimate_sphere(shown, up=up), up))
     return Scene(surfaces, labels, tuple(spheres), up, floor, int(np.sum((sizes > 0) & (sizes < _LEAST))))

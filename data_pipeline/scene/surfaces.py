@@ -96,6 +96,19 @@ def without_edges(depth: Float[np.ndarray, "height width"]) -> Float[np.ndarray,
     return np.where(maximum_filter(depth, 3) - near < _EDGE * depth, depth, np.float32(0))
 
 
+def projected(
+    points: Float[np.ndarray, "points 3"], depth: Float[np.ndarray, "height width"], K: np.ndarray, pose: np.ndarray
+) -> tuple[Int[np.ndarray, " points"], Float[np.ndarray, " points"], Float[np.ndarray, " points"]]:
+    """Of points in an image: their pixel, −1 outside of it; their depth; and what was measured there, 0 outside."""
+    x, y, z = K @ ((points - pose[:3, 3]) @ pose[:3, :3]).T
+    near = np.maximum(z, 1e-6)
+    column, row = np.rint(x / near), np.rint(y / near)
+    height, width = depth.shape
+    inside = (z > 1e-6) & (column >= 0) & (row >= 0) & (column < width) & (row < height)
+    pixel = np.where(inside, row * width + column, -1).astype(np.int64)
+    return pixel, z, np.where(inside, depth.ravel()[pixel], 0)
+
+
 def planes_in(surfaces: Surfaces) -> list[Plane]:
     """The largest planes, by random triples of points."""
     open3d = load_open3d()

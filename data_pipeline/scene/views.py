@@ -11,6 +11,7 @@ from data_pipeline.capture.casting import default_caster, rig_at
 from data_pipeline.frames.recording import Recording
 from data_pipeline.objects.mesh import Mesh
 from data_pipeline.scene.objects import Scene
+from data_pipeline.scene.surfaces import projected
 from mevs_jax.geometry.sphere import Sphere
 from mevs_jax.trained.system import TrainedSystem
 
@@ -53,12 +54,8 @@ def hidden_in(scene: Scene, recording: Recording, sphere: Sphere) -> Bool[np.nda
     near = cKDTree(scene.surfaces.points).query(points, distance_upper_bound=1.5 * cell)[0]
     left = np.flatnonzero((points @ sphere.axis > scene.floor) & np.isinf(near))
     for depth, K, pose in zip(recording.depth, recording.K, recording.T_world_camera, strict=True):
-        x, y, z = K @ ((points[left] - pose[:3, 3]) @ pose[:3, :3]).T
-        z = np.maximum(z, 1e-6)
-        column, row = np.rint(x / z), np.rint(y / z)
-        shown = (z > 1e-6) & (column >= 0) & (row >= 0) & (column < depth.shape[1]) & (row < depth.shape[0])
-        shown[shown] = depth[row[shown].astype(int), column[shown].astype(int)] > z[shown] + cell / 2
-        left = left[~shown]
+        _, z, measured = projected(points[left], depth, K, pose)
+        left = left[~(measured > z + cell / 2)]
     places = np.flatnonzero(hidden)[left]
     hidden[...] = False
     hidden.flat[places] = True

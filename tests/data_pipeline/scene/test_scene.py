@@ -99,7 +99,7 @@ def test_every_thing_is_one_object_at_its_place_and_of_its_size(scene):
 
 
 def test_points_belong_to_the_thing_that_is_there(scene):
-    """Against the distance from every true box: of each object's points, 95 % are at its thing; a box begins two cells above its table."""
+    """Of each, 95 % are at its true boxes; a box on a table begins two cells above it."""
     points = scene.surfaces.points @ TURN
     for name, parts in THINGS.items():
         own = points[scene.labels == number_of(scene, name)]
@@ -147,6 +147,24 @@ def test_every_object_is_looked_at(scene, recording):
     assert all(sight.name == "unknown object" and not sight.sure for sight in seen if sight.walk is None)
     with pytest.raises(ValueError, match="not told which pixels are unknown"):
         look_at_scene(making.system("recogniser"), recording, scene)
+
+
+def test_a_detectors_masks_say_what_is_one_object(recording, scene):
+    """Boxes of pixels around the one on the table, and all else of the table as another object."""
+    from data_pipeline.scene.surfaces import projected
+
+    masks = np.zeros(recording.depth.shape, int)
+    table, box = number_of(scene, "table"), number_of(scene, "on the table")
+    for mask, depth, K_one, pose in zip(masks, recording.depth, recording.K, recording.T_world_camera, strict=True):
+        for number, called in ((table, 7), (box, 3)):
+            pixel, z, measured = projected(scene.surfaces.points[scene.labels == number], depth, K_one, pose)
+            mask.flat[pixel[(pixel >= 0) & (np.abs(z - measured) < 0.02)]] = called
+    found = scene_in(recording, masks=masks)
+    assert len(found.spheres) == 2
+    for sphere, number in zip(found.spheres, (box, table), strict=True):
+        assert np.linalg.norm(sphere.position - scene.spheres[number].position) < 0.06
+    with pytest.raises(DataError, match="of the shape of depth"):
+        scene_in(recording, masks=masks[:, 1:])
 
 
 def test_without_ground_or_objects_there_is_one_sentence(recording):
