@@ -89,8 +89,9 @@ def look(options: LookOptions) -> None:
 
 def look_at_scene(options: LookOptions) -> None:
     """Recognises every object of a recorded scene, and prints a table of them."""
+    defaults = {option.name: option.default for option in fields(options)}
     for name in ("mesh", "first", "view", "save", "metres", "center", "radius"):
-        if getattr(options, name) not in (None, False, 0.0):
+        if getattr(options, name) != defaults[name]:
             raise Unusable(f"--scene finds all objects of --depth PATH by itself; leave out --{name}")
     assert options.depth is not None
     recording, up = _recording(options.depth, options), options.upward

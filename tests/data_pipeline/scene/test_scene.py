@@ -186,3 +186,5 @@ def test_the_command_lists_objects(recording, at_once, refuses, tmp_path):  # no
     assert [line.split()[0] for line in lines[2:6]] == ["0", "1", "2", "3"]
     assert (tmp_path / "room.png").stat().st_size > 10_000
     assert "leave out --center" in refuses(*look, "--center", 0, 0, 0)
+    assert "leave out --first" in refuses(*look, "--first", 0)
+    assert "there is no file" in refuses(*look[:3], "--depth", tmp_path / "nothing.npz", "--scene")
