@@ -123,18 +123,19 @@ def draw_scene(scene: Scene, seen: list[Sight], path: Path) -> None:
     FigureCanvasAgg(figure)
     axes = figure.add_subplot()
     shown = places[scene.labels <= GROUND][::4]
-    axes.scatter(*shown[:, :2].T, s=0.3, color="#d5dbe1")
+    axes.scatter(shown[:, 0], shown[:, 1], s=0.3, color="#d5dbe1")
     for number, sight in enumerate(seen):
         own = places[scene.labels == number]
         colour = "#9aa5b1" if sight.name == "unknown object" else "#c1440e" if sight.sure else "#2a6fbb"
-        axes.scatter(*own[:, :2].T, s=0.6, color=colour)
+        axes.scatter(own[:, 0], own[:, 1], s=0.6, color=colour)
         confidence = "" if sight.walk is None else f" {100 * sight.walk.confidence:.0f} %"
         text = (
             f"{number}"
             if sight.name == "unknown object"
             else f"{number} {sight.name}{confidence}{'' if sight.sure else '?'}"
         )
-        axes.text(*own[:, :2].mean(axis=0), text, color="#1b2a41", fontsize=11, ha="center", va="center")
+        x, y = own[:, :2].mean(axis=0)
+        axes.text(x, y, text, color="#1b2a41", fontsize=11, ha="center", va="center")
     axes.set_aspect("equal")
     axes.set_xlabel("m")
     axes.set_ylabel("m")
