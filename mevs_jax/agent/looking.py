@@ -14,10 +14,12 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int, Shaped
 
 from mevs_jax.agent.agent import Agent
+from mevs_jax.agent.present import LEAST, check_shown
 from mevs_jax.agent.records import Belief, History, Reason, Step
 from mevs_jax.arguments import number, numbers, whole
 from mevs_jax.arrays import ByContent
 from mevs_jax.geometry.cameras import ViewCamera, look_at_origin
+from mevs_jax.geometry.canonical import share_of_sphere
 from mevs_jax.geometry.source_view import DepthImage
 from mevs_jax.geometry.sphere import Sphere, estimate_sphere
 from mevs_jax.geometry.triangles import centred_triangles
@@ -305,6 +307,47 @@ def look_at_frames(
     if not walk.beliefs:
         raise ValueError(f"no frame can be used; of the first, {left_out[first]}")
     return walk
+
+
+class ShowsTooLittle(ValueError):
+    """No image shows enough of an object."""
+
+
+def look_at_views(agent: Agent, sphere: Sphere, views: Float[np.ndarray, "views side side"]) -> Walk:
+    """Recognises an object from depth images at the system's viewpoints, of which the agent chooses the next.
+
+    Args:
+        agent: for objects whose yaw is not known.
+        sphere: of the object.
+        views: as of `Agent.observe_view`. The walk begins with the one that shows most. Those that show less than half of the
+            sphere, or nothing of the object, are left out.
+
+    Raises:
+        ShowsTooLittle: if none is left.
+    """
+    agent.begin(sphere)
+    camera, poses = agent.system.description.camera, agent.system.poses
+    known = np.array([1 - share_of_sphere(np.isnan(view), camera) for view in views])
+    known[[not _shows(view, agent.system) for view in views]] = 0
+    left = known >= LEAST
+    if not left.any():
+        raise ShowsTooLittle(
+            f"no view shows the object and {LEAST:.0%} of its sphere; the best shows {known.max():.0%}"
+        )
+
+    def take(index: int) -> Belief:
+        left[index] = False
+        return agent.observe_view(views[index], poses[index])
+
+    return _walk(agent, int(known.argmax()), take, lambda: agent.decide(left))
+
+
+def _shows(view: Float[np.ndarray, "side side"], system: TrainedSystem) -> bool:
+    try:
+        check_shown(view, system)
+    except ValueError:
+        return False
+    return True
 
 
 def replay(history: History, agent: Agent) -> list[Belief]:

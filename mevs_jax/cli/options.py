@@ -206,6 +206,8 @@ class LookOptions(RecordingOptions):
     rendered from the views that are chosen"""
     depth: Annotated[Path | None, _arg("PATH")] = None
     """recorded depth images to choose from: an .npz, a folder as of 7-Scenes or TUM, or PATH#OBJECT of BOP (docs/frames.md)"""
+    scene: Flag = False
+    """find and recognise every object that stands on the floor or table of --depth (docs/scene.md)"""
     first: Annotated[int | None, _arg("VIEW", "chosen; for recorded images, the first that shows the object")] = None
     """the first view"""
     policy: Annotated[str, _arg("NAME", "best, which the system names")] = "best"
@@ -223,7 +225,7 @@ class LookOptions(RecordingOptions):
     json: Flag = False
     """print the walk as JSON"""
     draw: Annotated[Path | None, _arg("FILE")] = None
-    """draw the walk into this image, .png or .svg"""
+    """draw the walk, or the scene from above, into this image, .png or .svg"""
     save: Annotated[Path | None, _arg("FILE")] = None
     """save the walk's history, which can be repeated, into this .npz"""
     view: Flag = False

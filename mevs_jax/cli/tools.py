@@ -20,6 +20,7 @@ _UNSEEN = 900
 """Number of the built-in piece of each class; pieces with this number are in no data set."""
 
 if TYPE_CHECKING:
+    from data_pipeline.frames.recording import Recording
     from mevs_jax.agent import Frames, Walk
     from mevs_jax.cli.options import EnrolOptions, ExportOptions, LookOptions, RecordingOptions
     from mevs_jax.trained import TrainedSystem
@@ -31,6 +32,8 @@ def look(options: LookOptions) -> None:
         raise Unusable("mevs look needs an object: --mesh FILE or --depth FILE, one of them")
     if options.draw is not None:
         check_drawing(options.draw)
+    if options.scene:
+        return look_at_scene(options)
     if options.view and importlib.util.find_spec("viser") is None:
         raise Unusable("--view needs viser: pip install 'mevs-jax[view]', or pip install viser")
     source = options.mesh or options.depth
@@ -46,8 +49,7 @@ def look(options: LookOptions) -> None:
     system = load_system(options.system)
     if options.metres and not system.description.uses_size:
         raise Unusable(f"{options.system} does not use sizes; leave out --metres")
-    given = {name: getattr(options, name) for name in ("policy", "stop", "max_views")}
-    given |= {} if options.unknown is None else {"unknown": options.unknown}
+    given = _agent_options(options)
     try:
         if mesh is not None:
             from mevs_jax.agent import look as look_at_mesh
@@ -83,6 +85,56 @@ def look(options: LookOptions) -> None:
         raise Unusable(
             f"cannot write {error.filename or 'the results'} ({error.strerror}); choose another file"
         ) from error
+
+
+def look_at_scene(options: LookOptions) -> None:
+    """Recognises every object of a recorded scene, and prints a table of them."""
+    defaults = {option.name: option.default for option in fields(options)}
+    for name in ("mesh", "first", "view", "save", "metres", "center", "radius"):
+        if getattr(options, name) != defaults[name]:
+            raise Unusable(f"--scene finds all objects of --depth PATH by itself; leave out --{name}")
+    assert options.depth is not None
+    recording, up = _recording(options.depth, options), options.upward
+    from data_pipeline.scene import looking
+
+    with suppress(OSError):  # without a place to keep programs in, they are compiled again
+        keep_compiled()
+    system, given = load_system(options.system), _agent_options(options)
+    try:
+        scene = looking.scene_in(recording, None if up is None else np.array(up, float), options.floor)
+        seen = looking.look_at_scene(system, recording, scene, **given)
+        if options.draw is not None:
+            looking.draw_scene(scene, seen, options.draw)
+    except ValueError as error:
+        raise Unusable(f"{options.depth}: {error}") from error
+    except OSError as error:
+        raise Unusable(
+            f"cannot write {error.filename or options.draw} ({error.strerror}); choose another file"
+        ) from error
+    if options.json:
+        objects = [sight.as_json() for sight in seen]
+        print(json.dumps({"up": scene.up.tolist(), "floor": scene.floor, "pieces": scene.pieces, "objects": objects}))
+        return
+    print(f"up {_xyz(scene.up)}, floor {scene.floor:.2f} m along it")
+    print(f"{'':3} {'object':16} {'confidence':>10}  {'why it ended':18} {'evidence':>8}  center, radius in m")
+    for number, sight in enumerate(seen):
+        said = sight.as_json()
+        confidence = "" if said["confidence"] is None else f"{100 * said['confidence']:.0f} %"
+        place = f"{_xyz(sight.sphere.position)}, {sight.sphere.radius:.2f}"
+        print(f"{number:3} {sight.name:16} {confidence:>10}  {said['reason']:18} {said['evidence']:8.1f}  {place}")
+        if said.get("pose") is not None and sight.name != "unknown object":
+            print(f"{'':20} pose {said['pose']}")
+    if scene.pieces:
+        print(f"{scene.pieces} pieces that are too small are left out")
+
+
+def _xyz(point: np.ndarray) -> str:
+    return " ".join(f"{value:.2f}" for value in point)
+
+
+def _agent_options(options: LookOptions) -> dict[str, Any]:
+    given = {name: getattr(options, name) for name in ("policy", "stop", "max_views")}
+    return given | ({} if options.unknown is None else {"unknown": options.unknown})
 
 
 def check_drawing(path: Path) -> None:
@@ -144,7 +196,8 @@ def frames_in(path: Path, options: RecordingOptions) -> tuple[Frames, tuple[str,
                 raise ValueError("an .npz is in metres, with K; --every, --depth-unit and --intrinsics are for folders")
             stored = read_arrays(path)
         else:
-            stored, names = _recorded(path, options)
+            recording = _recording(path, options)
+            stored, names = recording.arrays(), recording.names
             if "center" not in given and "mask" not in stored:
                 raise ValueError(
                     "images do not say where the object is; give --center X Y Z and --radius R in metres, or choose an object of "
@@ -171,8 +224,8 @@ def is_archive(path: Path) -> bool:
     return path.suffix.lower() == ".npz"
 
 
-def _recorded(path: Path, options: RecordingOptions) -> tuple[dict[str, np.ndarray], tuple[str, ...]]:
-    """Arrays and names of a folder's images, by the study's readers."""
+def _recording(path: Path, options: RecordingOptions) -> Recording:
+    """Recorded images, by the study's readers."""
     from mevs_jax.cli.main import has_checkout
 
     if not has_checkout():
@@ -185,7 +238,7 @@ def _recorded(path: Path, options: RecordingOptions) -> tuple[dict[str, np.ndarr
     recording = read_frames(path, every=options.every, metres=options.depth_unit, intrinsics=intrinsics)
     for note in recording.notes:
         print(f"Note: {path}: {note}", file=sys.stderr)
-    return recording.arrays(), recording.names
+    return recording
 
 
 def shown_in(frames: Frames, least: float = 0.0) -> np.ndarray:
