@@ -122,8 +122,8 @@ def meeting(geometry: Geometry, pairs: Int[np.ndarray, "pairs 2"], pixels: Pixel
 def chosen_pairs(poses: Float[np.ndarray, "images 4 4"]) -> Int[np.ndarray, "anchors ranks 2"]:
     """Pairs of images whose cameras are near each other, by the rank of how near; -1 twice where there is none.
 
-    Angles between cameras are the same in every frame and order in which poses may have been written, so most faults of poses leave
-    the pairs as they are.
+    Angles between cameras are the same in whichever frame and order poses may have been written, so most faults leave the
+    pairs as they are.
     """
     count = len(poses)
     anchors = np.unique(np.linspace(0, count - 1, min(count, ANCHORS)).astype(int))

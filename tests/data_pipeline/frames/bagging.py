@@ -98,7 +98,12 @@ class Messages:
         )
 
     def info(
-        self, K: np.ndarray = forms.K, distortion: tuple = (), model: str = "plumb_bob", width: int = forms.WIDTH
+        self,
+        K: np.ndarray = forms.K,
+        distortion: tuple = (),
+        model: str = "plumb_bob",
+        width: int = forms.WIDTH,
+        height: int = forms.HEIGHT,
     ) -> Any:
         names = dict(d=distortion, k=K.ravel(), r=np.eye(3).ravel(), p=np.pad(K, ((0, 0), (0, 1))).ravel())
         names = {name.upper() if self.ros1 else name: np.array(value, float) for name, value in names.items()}
@@ -106,7 +111,7 @@ class Messages:
         return self.make(
             "sensor_msgs/msg/CameraInfo",
             header=self.header(99.0, "optical"),
-            height=forms.HEIGHT,
+            height=height,
             width=width,
             distortion_model=model,
             binning_x=0,

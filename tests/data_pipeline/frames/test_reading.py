@@ -101,6 +101,18 @@ def test_images_without_the_object_or_that_hide_it_are_left_out(tmp_path):
     ]
 
 
+@pytest.mark.parametrize("viewpoint", [False, True])
+def test_organised_clouds_have_the_camera_that_their_points_say(viewpoint, tmp_path):
+    recording = read_frames(forms.clouds(tmp_path / "clouds", viewpoint))
+    depth, _ = forms.depth_and_mask()
+    np.testing.assert_allclose(recording.depth, depth, atol=1e-6)
+    np.testing.assert_allclose(recording.K, np.broadcast_to(forms.K, (3, 3, 3)), rtol=1e-4)
+    np.testing.assert_allclose(recording.T_world_camera, forms.poses(), atol=1e-6)
+    halved = read_frames(tmp_path / "clouds", metres=0.5, intrinsics=np.array([50.0, 51.0, 39.0, 29.0]))
+    np.testing.assert_allclose(halved.depth, depth / 2, atol=1e-6)
+    assert halved.K[0, 0, 0] == 50
+
+
 @pytest.mark.parametrize("unknown", [0, 65535])
 def test_images_without_a_measured_pixel_are_left_out_and_counted(unknown, tmp_path):
     folder = forms.seven_scenes(tmp_path / "seq-01")
@@ -292,12 +304,37 @@ FAULTS = {
         _json("scene_gt.json", lambda truth: truth["1"][0].update(cam_t_m2c=[0, 0, 1500.0])),
         "object 5 of .* moves by",
     ),
+    "a cloud that is a list": (
+        forms.clouds,
+        lambda one: _header(one, "WIDTH 80\nHEIGHT 60", "WIDTH 4800\nHEIGHT 1"),
+        "scan1.pcd is a list of 4800 points",
+    ),
+    "a cloud of another shape": (
+        forms.clouds,
+        lambda one: _header(one, "WIDTH 80\nHEIGHT 60", "WIDTH 60\nHEIGHT 80"),
+        "scan1.pcd: points are not on the rays of their pixels",
+    ),
+    "half a cloud": (
+        forms.clouds,
+        lambda one: (one / "scan1.pcd").write_bytes((one / "scan1.pcd").read_bytes()[:4000]),
+        "scan1.pcd has .* points that can be read",
+    ),
+    "clouds without poses": (
+        forms.clouds,
+        lambda one: [path.unlink() for path in one.glob("*.pose.txt")],
+        "has one pose for all clouds",
+    ),
     "two of one object": (
         forms.bop,
         _json("scene_gt.json", lambda truth: truth["1"][1].update(obj_id=5)),
         "image 1 has object 5 2 times",
     ),
 }
+
+
+def _header(folder, old, new):
+    content = (folder / "scan1.pcd").read_bytes()
+    (folder / "scan1.pcd").write_bytes(content.replace(old.encode(), new.encode()))
 
 
 def _longer(text):
