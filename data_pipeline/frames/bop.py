@@ -19,10 +19,11 @@ _MILLIMETRE = 0.001
 
 def bop(
     folder: Path, metres: float | None, intrinsics: np.ndarray | None, chosen: int | None
-) -> tuple[list[Shot], list[str]]:
-    """The shots of a scene, a folder with `scene_camera.json` and `depth/`, and the masks of the chosen object.
+) -> tuple[list[Shot], list[str], dict[str, np.ndarray]]:
+    """The shots of a scene, a folder with `scene_camera.json` and `depth/`, and the masks and sphere of the chosen object.
 
-    Where the cameras' places are not known (`cam_R_w2c`), the world is the frame of the object.
+    The sphere is that of the object's model, where the data set has a `models_info.json`. Where the cameras' places are not known
+    (`cam_R_w2c`), the world is the frame of the object.
     """
     cameras, told = _entries(folder / "scene_camera.json"), folder / "scene_camera.json"
     if extra := {path.stem for path in (folder / "depth").glob("*.png")} - {f"{number:06d}" for number in cameras}:
@@ -33,7 +34,7 @@ def bop(
             f"{told} has no cam_R_w2c and cam_t_w2c; choose an object, to which all is relative: {folder}#NUMBER"
         )
     objects = {} if chosen is None else _places(folder / "scene_gt.json", chosen)
-    shots, positions = [], []
+    shots, places = [], []
     for number, camera in sorted(cameras.items()):
         if chosen is not None and number not in objects:
             continue
@@ -50,13 +51,34 @@ def bop(
             mask = folder / "mask_visib" / f"{number:06d}_{place:06d}.png"
         pose = np.linalg.inv(_pose(camera, "w2c", where) if placed else object_pose)
         if chosen is not None:
-            positions.append((pose @ object_pose)[:3, 3])
+            places.append(pose @ object_pose)
         shots.append(Shot(folder / "depth" / f"{number:06d}.png", scale, K, where, pose, mask))
-    moved = np.linalg.norm(positions - np.median(positions, axis=0), axis=1).max() if positions else 0.0
+    positions = np.array([place[:3, 3] for place in places])
+    moved = np.linalg.norm(positions - np.median(positions, axis=0), axis=1).max() if places else 0.0
     if moved > _MOVED:
         raise DataError(f"object {chosen} of {folder} moves by {moved:.2f} m; choose one that stands still")
     lost = len(cameras) - len(shots)
-    return shots, [f"{lost} of {len(cameras)} images have no object {chosen}, and are left out"] * bool(lost)
+    notes = [f"{lost} of {len(cameras)} images have no object {chosen}, and are left out"] * bool(lost)
+    return shots, notes, {} if chosen is None else _sphere(folder, chosen, places[0])
+
+
+def _sphere(folder: Path, chosen: int, place: Float[np.ndarray, "4 4"]) -> dict[str, np.ndarray]:
+    """Centre and radius of an object in the world by its model's box and diameter; nothing if they are not told."""
+    told = folder.absolute().parents[1]
+    path = next(
+        (path for name in ("models", "models_eval") if (path := told / name / "models_info.json").exists()), None
+    )
+    if path is None:
+        return {}
+    models = _entries(path)
+    if chosen not in models:
+        raise DataError(f"{path} has no object {chosen}; it is of another data set")
+    where = f"{path}, object {chosen}"
+    low, size = (
+        np.array([_array(models[chosen], f"{kind}_{axis}", (), where) for axis in "xyz"]) for kind in ("min", "size")
+    )
+    center = place @ [*(low + size / 2) * _MILLIMETRE, 1]
+    return {"center": center[:3], "radius": _array(models[chosen], "diameter", (), where) * _MILLIMETRE / 2}
 
 
 def _places(path: Path, chosen: int) -> dict[int, tuple[int, Float[np.ndarray, "4 4"]]]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -57,6 +58,7 @@ class Shot:
         pose: (4, 4) `T_world_camera`.
         mask: a PNG that is positive at the object's pixels, or None.
         time: seconds, or None.
+        read: what returns depth in metres, 0 where unknown, where `image` is only the name of what is no PNG.
     """
 
     image: Path
@@ -66,6 +68,7 @@ class Shot:
     pose: Float[np.ndarray, "4 4"]
     mask: Path | None = None
     time: float | None = None
+    read: Callable[[], Float[np.ndarray, "height width"]] | None = None
 
 
 def numbers_in(path: Path) -> Float[np.ndarray, "rows columns"]:
@@ -124,12 +127,13 @@ def check_principal_point(K: np.ndarray, shape: tuple[int, ...], where: str) -> 
 
 def depth_in(shot: Shot) -> Float[np.ndarray, "height width"]:
     """The depth of an image in metres, 0 where it is unknown."""
-    pixels = _pixels(shot.image)
-    if pixels.ndim != 2 or pixels.dtype.itemsize < 2 or pixels.dtype.kind not in "iu":
-        raise DataError(f"{shot.image} is no depth image of 16 bits (it has {pixels.dtype}); export it as one")
-    depth = np.where(pixels == _SATURATED, 0, pixels).astype(np.float32) * np.float32(shot.metres)
-    if not depth.any():
-        raise DataError(f"{shot.image} has no measured pixel; remove this frame, with its pose")
+    if shot.read is not None:
+        depth = shot.read()
+    else:
+        pixels = _pixels(shot.image)
+        if pixels.ndim != 2 or pixels.dtype.itemsize < 2 or pixels.dtype.kind not in "iu":
+            raise DataError(f"{shot.image} is no depth image of 16 bits (it has {pixels.dtype}); export it as one")
+        depth = np.where(pixels == _SATURATED, 0, pixels).astype(np.float32) * np.float32(shot.metres)
     check_principal_point(shot.K, depth.shape, shot.camera)
     return depth
 
@@ -154,15 +158,16 @@ def _pixels(path: Path) -> np.ndarray:
         raise DataError(f"{path} cannot be read ({reason_of(error)}); copy it again, or remove this frame") from error
 
 
-def stacked(shots: list[Shot], notes: list[str]) -> Recording:
-    """Reads the images of shots. Those whose mask shows nothing that is measured are left out.
+def stacked(shots: list[Shot], notes: list[str], known: dict[str, np.ndarray]) -> Recording:
+    """Reads the images of shots. Those that measured nothing, or nothing within their mask, are left out.
 
     Raises:
-        DataError: for an image that cannot be read or shows nothing, or images of different sizes.
+        DataError: for an image that cannot be read, images of different sizes, or none that shows anything.
     """
     kept: list[Shot] = []
     depths: list[np.ndarray] = []
     masks: list[np.ndarray] = []
+    empty = 0
     for shot in shots:
         depth, mask = depth_in(shot), None if shot.mask is None else mask_in(shot.mask)
         first = depths[0] if depths else depth
@@ -172,16 +177,21 @@ def stacked(shots: list[Shot], notes: list[str]) -> Recording:
                     f"{path} has {image.shape[1]}×{image.shape[0]} pixels, images before it {first.shape[1]}×{first.shape[0]}; "
                     "all images of a recording have one size"
                 )
+        if not depth.any():
+            empty += 1
+            continue
         if mask is not None:
             if not (mask & (depth > 0)).any():
                 continue
             masks.append(mask)
         kept.append(shot)
         depths.append(depth)
+    if empty == len(shots):
+        raise DataError(f"no image such as {shots[0].image} has a measured pixel; record them again")
     if not kept:
         raise DataError(f"no mask such as {shots[0].mask} shows a measured pixel; choose another object")
-    if hidden := len(shots) - len(kept):
-        notes = [*notes, f"{hidden} of {len(shots)} images do not show the object, and are left out"]
+    for count, what in ((empty, "have no measured pixel"), (len(shots) - empty - len(kept), "do not show the object")):
+        notes = [*notes, *[f"{count} of {len(shots)} images {what}, and are left out"] * bool(count)]
     return Recording(
         np.stack(depths),
         np.stack([shot.K for shot in kept]),
@@ -189,5 +199,6 @@ def stacked(shots: list[Shot], notes: list[str]) -> Recording:
         tuple(shot.image.name for shot in kept),
         np.stack(masks) if masks else None,
         np.array([shot.time for shot in kept]) if kept[0].time is not None else None,
-        notes=tuple(notes),
+        known,
+        tuple(notes),
     )

@@ -1,4 +1,4 @@
-"""Checks (`mevs check live`, `agent`, `transfer`, `reality`, `compile`), and `mevs study instances`."""
+"""Checks (`mevs check live`, `agent`, `transfer`, `reality`, `frames`, `compile`), and `mevs study instances`."""
 
 from __future__ import annotations
 
@@ -8,15 +8,24 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import numpy as np
+
 from mevs_jax.cli.failure import Unusable
 from mevs_jax.cli.parsing import Invocation
 
 if TYPE_CHECKING:
     from eval.checks.compiling import CompileCheck
+    from eval.checks.frames import FramesCheck
     from eval.checks.instances import Instances
     from eval.checks.reality import Reality, SceneRow, Stop
     from eval.checks.transfer import Transfer
-    from mevs_jax.cli.options import CompileOptions, InstancesOptions, RealityOptions, TransferOptions
+    from mevs_jax.cli.options import (
+        CompileOptions,
+        FramesOptions,
+        InstancesOptions,
+        RealityOptions,
+        TransferOptions,
+    )
     from train.planning.compile import Compiled
 
 
@@ -326,6 +335,39 @@ def _policy_lines(found: Transfer) -> list[str]:
         if name != "random":
             lines.append(" " * width + "".join(f"{_percent(row.gain, row.gain_interval, '+'):>23}" for row in rows))
     return lines
+
+
+def frames(options: FramesOptions) -> None:
+    """Looks for faults of a recording."""
+    from eval.checks.frames import check_frames, draw_check
+    from mevs_jax.cli.tools import check_drawing, read_recording
+
+    if options.draw is not None:
+        check_drawing(options.draw)
+        check_file(options.draw)
+    recording = read_recording(options.path, options)
+    found = check_frames(recording, None if options.upward is None else np.array(options.upward))
+    if options.draw is not None:
+        draw_check(recording, options.draw)
+    print(frames_text(found))
+    if found.findings:
+        raise Unusable(f"{options.path}: " + "; ".join(f"{one.name}: {one.said}" for one in found.findings))
+
+
+def frames_text(found: FramesCheck) -> str:
+    """What `check_frames` found, for a terminal."""
+    lines = [
+        f"{found.images} images. Pairs of them, from near cameras to those far apart: share of the points of one that the other",
+        "measures; median error in % of the distance; share within 2 %; share that the other sees through:",
+        "  pairs  turned   moved  measured   error  within  through",
+    ]
+    for one in found.levels:
+        shares = "".join(
+            f"{100 * share:>{width}.1f} %" for share, width in ((one.overlap, 8), (one.error, 6), (one.agree, 6))
+        )
+        lines.append(f"{one.pairs:>7}{one.degrees:>7.1f}°{one.metres:>6.2f} m{shares}{100 * one.through:>7.1f} %")
+    lines += [f"Note: {note}" for note in found.notes]
+    return "\n".join([*lines, *["No fault was found."] * (not found.findings)])
 
 
 def compiling(options: CompileOptions) -> None:

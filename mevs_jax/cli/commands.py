@@ -151,6 +151,12 @@ COMMANDS = {
         "checks:reality",
         tool=True,
     ),
+    "check frames": Command(
+        "whether recorded depth images agree with each other; name the fault if not",
+        "FramesOptions",
+        "checks:frames",
+        tool=True,
+    ),
     "check compile": Command(
         "compile programs for TPUs or GPUs that are not here; what they need",
         "CompileOptions",

@@ -176,8 +176,20 @@ _XYZ = tuple[float, float, float]
 
 
 @dataclass(frozen=True, kw_only=True)
-class RecordingOptions:
-    """Where the object is in recorded depth images, and what their files do not say."""
+class ReadingOptions:
+    """What files of recorded depth images do not say."""
+
+    every: Annotated[int, _arg("N", "1")] = 1
+    """of a folder or bag of depth images: read each n-th image only"""
+    depth_unit: Annotated[float | None, _arg("M", "0.001; 0.0002 for TUM; as BOP or a bag says")] = None
+    """of a folder or bag of depth images: metres in one unit of their pixels"""
+    intrinsics: Annotated[tuple[float, float, float, float] | None, _arg("FX FY CX CY", "as the files say")] = None
+    """of a folder or bag of depth images: the camera's intrinsics in pixels"""
+
+
+@dataclass(frozen=True, kw_only=True)
+class RecordingOptions(ReadingOptions):
+    """Where the object is in recorded depth images."""
 
     center: Annotated[_XYZ | None, _arg("X Y Z", "as the file says, or from its mask")] = None
     """of recorded depth images: the object's center in the world, in metres, with --radius"""
@@ -187,12 +199,6 @@ class RecordingOptions:
     """of recorded depth images: the upward direction in the world"""
     floor: Annotated[float | None, _arg("H", "as the file says, or none")] = None
     """of recorded depth images: height of the supporting surface along the upward direction; below it is not the object"""
-    every: Annotated[int, _arg("N", "1")] = 1
-    """of a folder of depth images: read each n-th image only"""
-    depth_unit: Annotated[float | None, _arg("M", "0.001; 0.0002 for TUM; as BOP's scene says")] = None
-    """of a folder of depth images: metres in one unit of their pixels"""
-    intrinsics: Annotated[tuple[float, float, float, float] | None, _arg("FX FY CX CY", "as the files say")] = None
-    """of a folder of depth images: the camera's intrinsics in pixels"""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -205,7 +211,7 @@ class LookOptions(RecordingOptions):
     """a mesh to recognise: .off, .obj, .stl, .ply, .glb, .gltf, .dae or .3mf, or a built-in piece by its class, as chair; it is
     rendered from the views that are chosen"""
     depth: Annotated[Path | None, _arg("PATH")] = None
-    """recorded depth images to choose from: an .npz, a folder as of 7-Scenes or TUM, or PATH#OBJECT of BOP (docs/frames.md)"""
+    """recorded depth images to choose from: an .npz, a folder, a bag of ROS, or PATH#OBJECT of BOP (docs/frames.md)"""
     scene: Flag = False
     """find and recognise every object that stands on the floor or table of --depth (docs/scene.md)"""
     first: Annotated[int | None, _arg("VIEW", "chosen; for recorded images, the first that shows the object")] = None
@@ -322,6 +328,18 @@ class RealityOptions(WithObjects):
     """number of objects, spread over all: about 20 s for every ten, on two cores"""
     seed: Annotated[int, _arg("N", "0")] = 0
     """seed of noise, wrong centres, and random walks"""
+
+
+@dataclass(frozen=True, kw_only=True)
+class FramesOptions(ReadingOptions):
+    """Options of `mevs check frames`."""
+
+    path: Annotated[tyro.conf.Positional[Path], _arg("PATH")]
+    """recorded depth images, as for mevs look --depth"""
+    upward: Annotated[_XYZ | None, _arg("X Y Z", "as the file says, or 0 0 1")] = None
+    """the upward direction in the recording's world, which is compared with the largest surface that is seen from above"""
+    draw: Annotated[Path | None, _arg("FILE")] = None
+    """draw two pairs of images and how their surfaces agree into this image, .png or .svg"""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -22,7 +22,7 @@ _UNSEEN = 900
 if TYPE_CHECKING:
     from data_pipeline.frames.recording import Recording
     from mevs_jax.agent import Frames, Walk
-    from mevs_jax.cli.options import EnrolOptions, ExportOptions, LookOptions, RecordingOptions
+    from mevs_jax.cli.options import EnrolOptions, ExportOptions, LookOptions, ReadingOptions, RecordingOptions
     from mevs_jax.trained import TrainedSystem
 
 
@@ -193,7 +193,9 @@ def frames_in(path: Path, options: RecordingOptions) -> tuple[Frames, tuple[str,
     try:
         if is_archive(path):
             if options.every != 1 or options.depth_unit is not None or options.intrinsics is not None:
-                raise ValueError("an .npz is in metres, with K; --every, --depth-unit and --intrinsics are for folders")
+                raise ValueError(
+                    "an .npz is in metres, with K; --every, --depth-unit and --intrinsics are for folders and bags"
+                )
             stored = read_arrays(path)
         else:
             recording = _recording(path, options)
@@ -229,9 +231,13 @@ def _recording(path: Path, options: RecordingOptions) -> Recording:
     from mevs_jax.cli.main import has_checkout
 
     if not has_checkout():
-        raise Unusable(
-            "folders of images are read by a checkout of the project, not by the package alone; give an .npz"
-        )
+        raise Unusable("folders and bags are read by a checkout of the project, not by the package alone; give an .npz")
+    recording = read_recording(path, options)
+    return recording.arrays(), recording.names
+
+
+def read_recording(path: Path, options: ReadingOptions) -> Recording:
+    """A recording of any form; prints what was left out of it."""
     from data_pipeline.frames.reading import read_frames
 
     intrinsics = None if options.intrinsics is None else np.array(options.intrinsics, float)
@@ -308,9 +314,11 @@ def _pairs(given: tuple[str, ...], form: str) -> list[tuple[str, str]]:
 
 def _shape_of(path: Path, options: EnrolOptions) -> Any:
     """An object as `mevs_jax.enrol` takes it, from a file."""
+    from mevs_jax.agent.ros import BAGS
+
     if is_archive(path):
         return frames_in(path, options)[0]
-    if path.is_dir() or ("#" in path.name and not path.exists()):
+    if path.is_dir() or path.suffix.lower() in BAGS or ("#" in str(path) and not path.exists()):
         frames = frames_in(path, options)[0]
         try:
             return frames.only(shown_in(frames))

@@ -10,6 +10,7 @@ import pytest
 from mevs_jax.trained import load, save
 from tests.cli.conftest import ended
 from tests.data_pipeline.frames import forms
+from tests.eval.checks import test_frames as rooms
 from tests.mevs_jax.gallery.conftest import CAMERA, matcher  # noqa: F401
 from tests.mevs_jax.trained import making
 from train.tasks.matcher import objects_system
@@ -97,3 +98,17 @@ def test_what_is_no_recording_is_one_sentence(system, scan, refuses, tmp_path):
     sentence = refuses(*look, "--depth", scan, *SPHERE)
     assert sentence.count("frame-000001") == 1
     assert "has no pose beside it; add it" in sentence
+
+
+def test_a_recording_is_checked_and_its_fault_named(at_once, refuses, tmp_path):
+    poses = rooms.path_of_camera()[::4]
+    np.savez(tmp_path / "room.npz", depth=rooms.room(poses), K=rooms.K, T_world_camera=poses)
+    check = ("check", "frames", tmp_path / "room.npz")
+    said = ended(at_once(*check, "--draw", tmp_path / "check.png"))
+    assert said.splitlines()[-1] == "No fault was found."
+    assert (tmp_path / "check.png").exists()
+    assert "give --upward" in ended(at_once(*check, "--upward", 0, -1, 0))
+    np.savez(tmp_path / "room.npz", depth=rooms.room(poses), K=rooms.K, T_world_camera=np.linalg.inv(poses))
+    assert "room.npz: inverse poses: they are world to camera: invert them" in refuses(*check)
+    assert "no two cameras look the same way" in refuses("check", "frames", forms.seven_scenes(tmp_path / "scan"))
+    assert "check.txt is no .png" in refuses(*check, "--draw", tmp_path / "check.txt")

@@ -15,14 +15,13 @@ from data_pipeline.capture.casting import default_caster
 from data_pipeline.objects.mesh import normalise
 from data_pipeline.objects.recipes import FurniturePiece
 from eval.checks.camera import Shot, cast_shot
+from mevs_jax.agent.ros import depth_of, matrix_of
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "examples" / "ros2" / "mevs_ros"))
 from mevs_ros.recognising import (  # type: ignore[import-not-found]
     Frame,
-    depth_of,
     goal_of,
     is_at,
-    matrix_of,
     quaternion_of,
     recognise,
 )
@@ -112,20 +111,21 @@ def test_depth_is_read_from_messages(encoding, kind, unit, big, random):
     stored[:, :7] = (depth * unit).round() if unit > 1 else depth
     if kind == "f4":
         stored[0, 1] = np.nan
-    found = depth_of(encoding, 5, 7, stored.strides[0], big, stored.tobytes())
-    np.testing.assert_allclose(found, depth, atol=1e-6)
-    with pytest.raises(ValueError, match="encoding 'rgb8' cannot be read"):
-        depth_of("rgb8", 5, 7, 21, False, bytes(105))
-    with pytest.raises(ValueError, match="has 3 bytes"):
-        depth_of(encoding, 5, 7, stored.strides[0], big, b"abc")
+    message = SimpleNamespace(
+        encoding=encoding, height=5, width=7, step=stored.strides[0], is_bigendian=big, data=stored.tobytes()
+    )
+    np.testing.assert_allclose(depth_of(message), depth, atol=1e-6)
+    for change, said in (({"encoding": "rgb8"}, "encoding 'rgb8' cannot be read"), ({"data": b"abc"}, "has 3 bytes")):
+        with pytest.raises(ValueError, match=said):
+            depth_of(SimpleNamespace(**vars(message) | change))
 
 
 def test_rotations_go_to_messages_and_back():
     place = SimpleNamespace(x=1.0, y=2.0, z=3.0)
     half = np.sqrt(0.5)
-    turned = matrix_of(
-        place, SimpleNamespace(x=0.0, y=0.0, z=2 * half, w=2 * half)
-    )  # messages are not always of length one
+    turned = matrix_of(place, SimpleNamespace(x=0.0, y=0.0, z=half, w=half))
+    with pytest.raises(ValueError, match="length 2"):
+        matrix_of(place, SimpleNamespace(x=0.0, y=0.0, z=2 * half, w=2 * half))
     np.testing.assert_allclose(turned, [[0, -1, 0, 1], [1, 0, 0, 2], [0, 0, 1, 3], [0, 0, 0, 1]], atol=1e-12)
     np.testing.assert_allclose(quaternion_of(turned[:3, :3]), [0, 0, half, half], atol=1e-12)
     for turn in Rotation.random(50, random_state=np.random.RandomState(0)):

@@ -107,3 +107,22 @@ def bop(folder: Path, placed: bool = True) -> Path:
 
 def _entry(kind: str, pose: np.ndarray) -> dict:
     return {f"cam_R_{kind}": pose[:3, :3].ravel().tolist(), f"cam_t_{kind}": (1000 * pose[:3, 3]).tolist()}
+
+
+def clouds(folder: Path, viewpoint: bool = False) -> Path:
+    """Organised clouds with NaN where nothing was measured; poses in files of their own, or in the header."""
+    folder.mkdir(parents=True)
+    columns, rows = np.meshgrid(np.arange(WIDTH), np.arange(HEIGHT))
+    rays = np.stack([columns, rows, np.ones_like(rows)], axis=-1) @ np.linalg.inv(K).T
+    for number, (depth, pose) in enumerate(zip(depth_and_mask()[0], poses(), strict=True)):
+        points = np.where(depth > 0, depth, np.nan)[..., None] * rays
+        x, y, z, w = Rotation.from_matrix(pose[:3, :3]).as_quat()
+        place = " ".join(map(str, [*pose[:3, 3], w, x, y, z] if viewpoint else [0, 0, 0, 1, 0, 0, 0]))
+        header = (
+            "# .PCD v0.7\nVERSION 0.7\nFIELDS x y z\nSIZE 4 4 4\nTYPE F F F\nCOUNT 1 1 1\n"
+            f"WIDTH {WIDTH}\nHEIGHT {HEIGHT}\nVIEWPOINT {place}\nPOINTS {WIDTH * HEIGHT}\nDATA binary\n"
+        )
+        (folder / f"scan{number}.pcd").write_bytes(header.encode() + points.astype("<f4").tobytes())
+        if not viewpoint:
+            np.savetxt(folder / f"scan{number}.pose.txt", pose)
+    return folder

@@ -59,6 +59,21 @@ def test_an_object_of_a_bop_scene_has_its_masks_and_from_them_its_sphere(tmp_pat
     assert abs(sphere.radius / forms.RADIUS - 1) < 0.15
 
 
+def test_the_sphere_of_an_object_is_that_of_its_model_where_the_data_set_has_models(tmp_path):
+    """The model's frame is turned by 0.3 about z against the world, and its box lies off the frame's origin."""
+    scene = forms.bop(tmp_path / "test" / "000001")
+    (tmp_path / "models").mkdir()
+    box = {f"min_{axis}": low for axis, low in zip("xyz", (-100, -200, -200), strict=True)}
+    model = box | dict.fromkeys(("size_x", "size_y", "size_z"), 400) | {"diameter": 410}
+    (tmp_path / "models" / "models_info.json").write_text(json.dumps({"5": model}))
+    sphere = Frames.of(read_frames(f"{scene}#5").arrays()).sphere
+    assert sphere.radius == pytest.approx(0.205)
+    expected = forms.CENTER + 0.1 * np.array([np.cos(0.3), np.sin(0.3), 0])
+    np.testing.assert_allclose(sphere.position, expected, atol=1e-9)
+    with pytest.raises(DataError, match=r"models_info.json has no object 1"):
+        read_frames(f"{scene}#1")
+
+
 def test_without_places_of_the_cameras_the_world_is_the_frame_of_the_object(tmp_path):
     folder = forms.bop(tmp_path / "scene", placed=False)
     poses = read_frames(f"{folder}#5").T_world_camera
@@ -84,6 +99,44 @@ def test_images_without_the_object_or_that_hide_it_are_left_out(tmp_path):
         "1 of 3 images have no object 5",
         "1 of 2 images do not show the object",
     ]
+
+
+@pytest.mark.parametrize("viewpoint", [False, True])
+def test_organised_clouds_have_the_camera_that_their_points_say(viewpoint, tmp_path):
+    recording = read_frames(forms.clouds(tmp_path / "clouds", viewpoint))
+    depth, _ = forms.depth_and_mask()
+    np.testing.assert_allclose(recording.depth, depth, atol=1e-6)
+    np.testing.assert_allclose(recording.K, np.broadcast_to(forms.K, (3, 3, 3)), rtol=1e-4)
+    np.testing.assert_allclose(recording.T_world_camera, forms.poses(), atol=1e-6)
+    halved = read_frames(tmp_path / "clouds", metres=0.5, intrinsics=np.array([50.0, 51.0, 39.0, 29.0]))
+    np.testing.assert_allclose(halved.depth, depth / 2, atol=1e-6)
+    assert halved.K[0, 0, 0] == 50
+
+
+@pytest.mark.parametrize("unknown", [0, 65535])
+def test_images_without_a_measured_pixel_are_left_out_and_counted(unknown, tmp_path):
+    folder = forms.seven_scenes(tmp_path / "seq-01")
+    for number in (0, 2):
+        _image(f"frame-00000{number}.depth.png", np.full_like(DEPTH, unknown))(folder)
+    recording = read_frames(folder)
+    assert recording.names == ("frame-000001.depth.png",)
+    np.testing.assert_allclose(recording.T_world_camera, forms.poses()[1:2], atol=1e-12)
+    assert recording.notes == ("2 of 3 images have no measured pixel, and are left out",)
+    _image(IMAGE, np.full_like(DEPTH, unknown))(folder)
+    with pytest.raises(DataError, match=r"no image such as .* has a measured pixel"):
+        read_frames(folder)
+
+
+def test_frames_of_an_npz_without_a_measured_pixel_are_left_out_and_counted(tmp_path):
+    path = forms.npz(tmp_path)
+    with np.load(path) as stored:
+        arrays = dict(stored)
+    arrays["depth"][1] = np.nan
+    np.savez(path, **arrays)
+    recording = read_frames(path)
+    assert recording.names == ("0", "2")
+    np.testing.assert_array_equal(recording.mask, forms.depth_and_mask()[1][[0, 2]])
+    assert recording.notes == ("1 of 3 images have no measured pixel, and are left out",)
 
 
 def test_every_other_image_another_unit_and_another_camera(tmp_path):
@@ -180,8 +233,6 @@ FAULTS = {
         _image(IMAGE, DEPTH[:, :-1]),
         f"{IMAGE} has 79×60 pixels, images before it 80×60",
     ),
-    "an image of zeros": (forms.seven_scenes, _image(IMAGE, 0 * DEPTH), f"{IMAGE} has no measured pixel"),
-    "an unknown image": (forms.seven_scenes, _image(IMAGE, 65535 * DEPTH), f"{IMAGE} has no measured pixel"),
     "an image of 8 bits": (
         forms.seven_scenes,
         _image(IMAGE, DEPTH.astype(np.uint8)),
@@ -253,12 +304,37 @@ FAULTS = {
         _json("scene_gt.json", lambda truth: truth["1"][0].update(cam_t_m2c=[0, 0, 1500.0])),
         "object 5 of .* moves by",
     ),
+    "a cloud that is a list": (
+        forms.clouds,
+        lambda one: _header(one, "WIDTH 80\nHEIGHT 60", "WIDTH 4800\nHEIGHT 1"),
+        "scan1.pcd is a list of 4800 points",
+    ),
+    "a cloud of another shape": (
+        forms.clouds,
+        lambda one: _header(one, "WIDTH 80\nHEIGHT 60", "WIDTH 60\nHEIGHT 80"),
+        "scan1.pcd: points are not on the rays of their pixels",
+    ),
+    "half a cloud": (
+        forms.clouds,
+        lambda one: (one / "scan1.pcd").write_bytes((one / "scan1.pcd").read_bytes()[:4000]),
+        "scan1.pcd has .* points that can be read",
+    ),
+    "clouds without poses": (
+        forms.clouds,
+        lambda one: [path.unlink() for path in one.glob("*.pose.txt")],
+        "has one pose for all clouds",
+    ),
     "two of one object": (
         forms.bop,
         _json("scene_gt.json", lambda truth: truth["1"][1].update(obj_id=5)),
         "image 1 has object 5 2 times",
     ),
 }
+
+
+def _header(folder, old, new):
+    content = (folder / "scan1.pcd").read_bytes()
+    (folder / "scan1.pcd").write_bytes(content.replace(old.encode(), new.encode()))
 
 
 def _longer(text):
@@ -300,7 +376,7 @@ def test_other_files_and_numbers_of_objects_are_refused(tmp_path):
     [
         ({"K": np.array([[90.0, 0, 200], [0, 90, 20], [0, 0, 1]])}, "principal point"),
         ({"distortion": np.array([0.1, 0])}, "distortion has distortion"),
-        ({"depth": np.zeros((3, forms.HEIGHT, forms.WIDTH))}, "frame 0 has no measured pixel"),
+        ({"depth": np.zeros((3, forms.HEIGHT, forms.WIDTH))}, "no frame has a measured pixel"),
         ({"depth": np.ones((3, forms.HEIGHT, forms.WIDTH), np.uint16)}, "floating type"),
         ({"T_world_camera": np.stack([np.diag([1.0, 1, -1, 1])] * 3)}, "mirrors"),
         ({"T_world_camera": np.eye(4)}, r"must be \(3, 4, 4\)"),

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import threading
-import time
 
 import numpy as np
 import rclpy
@@ -15,12 +14,12 @@ from rclpy.duration import Duration
 from rclpy.executors import MultiThreadedExecutor
 from rclpy.node import Node
 from rclpy.qos import qos_profile_sensor_data
-from rclpy.time import Time
 from sensor_msgs.msg import CameraInfo, Image
 from tf2_ros import Buffer, TransformException, TransformListener
 
 import mevs_jax
-from mevs_ros.recognising import Frame, depth_of, goal_of, is_at, matrix_of, quaternion_of, recognise
+from mevs_jax.agent.ros import matrix_of
+from mevs_ros.recognising import Frames, goal_of, quaternion_of, recognise
 
 DEFAULTS = {
     "system": "furniture10",
@@ -43,7 +42,15 @@ class RecogniseNode(Node):
         super().__init__("mevs_recognise")
         for name, value in DEFAULTS.items():
             self.declare_parameter(name, value)
-        self._frames = Frames(self)
+        self._buffer = Buffer()
+        self._listener = TransformListener(self._buffer, self)
+        self._frames = Frames(
+            "rect" in self.resolve_topic_name("depth"),
+            self._pose_at,
+            lambda: 1e-9 * self.get_clock().now().nanoseconds,
+            (self._given("near_metres"), np.radians(self._given("near_degrees"))),
+            self._given("still_seconds"),
+        )
         self._busy = threading.Lock()
         self.system = mevs_jax.load(self._given("system"))
         self._agents: dict[tuple[int, float], mevs_jax.Agent] = {}
@@ -90,6 +97,16 @@ class RecogniseNode(Node):
             return GoalResponse.REJECT
         return GoalResponse.ACCEPT
 
+    def _pose_at(self, image: Image) -> np.ndarray | None:
+        """`T_world_camera` at the time of an image, not the latest one, since the camera moves."""
+        try:
+            found = self._buffer.lookup_transform(
+                self._given("world"), image.header.frame_id, image.header.stamp, Duration(seconds=0.1)
+            )
+            return matrix_of(found.transform.translation, found.transform.rotation)
+        except (TransformException, ValueError):
+            return None
+
     @staticmethod
     def _goal_of(goal: RecogniseObject.Goal):
         center = np.array([goal.center.x, goal.center.y, goal.center.z])
@@ -123,58 +140,6 @@ class RecogniseNode(Node):
             result.label, result.confidence = found.label, found.confidence
             result.views, result.reason = found.views, found.reason
             return result
-
-
-class Frames:
-    """The latest depth images with their poses, as `recognising.Camera`."""
-
-    def __init__(self, node: RecogniseNode) -> None:
-        self._node, self._info, self._depth = node, None, None
-        self._arrived = threading.Condition()
-        self._buffer = Buffer()
-        self._listener = TransformListener(self._buffer, node)
-
-    def on_info(self, info: CameraInfo) -> None:
-        self._info = info
-
-    def on_depth(self, image: Image) -> None:
-        with self._arrived:
-            self._depth = image
-            self._arrived.notify_all()
-
-    def wait_for(self, pose: np.ndarray, seconds: float, cancelled) -> Frame | None:
-        """Waits until the camera has stood at the pose for a while, and returns an image of that time, taken after this call."""
-        given, clock = self._node._given, self._node.get_clock()
-        end, called, since = time.monotonic() + seconds, clock.now(), None
-        while time.monotonic() < end and not cancelled():
-            with self._arrived:
-                arrived = self._arrived.wait(0.2)
-                image, info = self._depth, self._info
-            if not arrived or image is None or info is None:
-                continue
-            taken = Time.from_msg(image.header.stamp)
-            if taken < called or (at := self._pose_at(image)) is None:
-                continue
-            if not is_at(at, pose, given("near_metres"), np.radians(given("near_degrees"))):
-                since = None
-                continue
-            since = since or taken
-            if taken - since >= Duration(seconds=given("still_seconds")):
-                depth = depth_of(
-                    image.encoding, image.height, image.width, image.step, image.is_bigendian, bytes(image.data)
-                )
-                return Frame(depth, np.array(info.k).reshape(3, 3), at)
-        return None
-
-    def _pose_at(self, image: Image) -> np.ndarray | None:
-        """`T_world_camera` at the time of an image, not the latest one, since the camera moves."""
-        try:
-            found = self._buffer.lookup_transform(
-                self._node._given("world"), image.header.frame_id, image.header.stamp, Duration(seconds=0.1)
-            )
-        except TransformException:
-            return None
-        return matrix_of(found.transform.translation, found.transform.rotation)
 
 
 def pose_message(pose: np.ndarray, frame: str, stamp) -> PoseStamped:

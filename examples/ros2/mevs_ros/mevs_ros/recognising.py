@@ -5,6 +5,8 @@ The node (`mevs_ros.node`) gives this its topics and transforms; tests give it a
 
 from __future__ import annotations
 
+import threading
+import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, Protocol
@@ -13,6 +15,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from mevs_jax.agent import Agent
+from mevs_jax.agent.ros import depth_of, intrinsics_of
 
 
 @dataclass(frozen=True)
@@ -41,6 +44,60 @@ class Camera(Protocol):
         Raises:
             ValueError: for an image that cannot be read.
         """
+
+
+class Frames:
+    """Images with their poses from the messages of a camera, as `Camera`.
+
+    Args:
+        rectified: whether the images have no distortion; else it is undone.
+        pose_at: `T_world_camera` of an image message's frame at its time, None where it is not known.
+        now: seconds on the clock of the messages.
+        near: metres and radians by which a pose may be missed.
+        still: seconds for which the camera has to stand still there.
+    """
+
+    def __init__(
+        self,
+        rectified: bool,
+        pose_at: Callable[[Any], np.ndarray | None],
+        now: Callable[[], float],
+        near: tuple[float, float],
+        still: float,
+    ) -> None:
+        self._rectified, self._pose_at, self._now, self._near, self._still = rectified, pose_at, now, near, still
+        self._info: Any = None
+        self._image: Any = None
+        self._arrived = threading.Condition()
+
+    def on_info(self, info: Any) -> None:
+        self._info = info
+
+    def on_depth(self, image: Any) -> None:
+        with self._arrived:
+            self._image = image
+            self._arrived.notify_all()
+
+    def wait_for(self, pose: np.ndarray, seconds: float, cancelled: Callable[[], bool]) -> Frame | None:
+        """Waits until the camera has stood at the pose for a while, and returns an image of that time, taken after this call."""
+        end, called, since = time.monotonic() + seconds, self._now(), None
+        while time.monotonic() < end and not cancelled():
+            with self._arrived:
+                arrived = self._arrived.wait(0.2)
+                image, info = self._image, self._info
+            if not arrived or image is None or info is None:
+                continue
+            taken = image.header.stamp.sec + 1e-9 * image.header.stamp.nanosec
+            if taken < called or (at := self._pose_at(image)) is None:
+                continue
+            if not is_at(at, pose, *self._near):
+                since = None
+                continue
+            since = since or taken
+            if taken - since >= self._still:
+                intrinsics = intrinsics_of(info, self._rectified)
+                return Frame(intrinsics.undo(depth_of(image)), intrinsics.K, at)
+        return None
 
 
 @dataclass(frozen=True)
@@ -117,32 +174,6 @@ def recognise(
             log(f"the image cannot be used: {error}; another view is chosen")
             agent.mark_failed(step)
     return result("cancelled")
-
-
-def depth_of(encoding: str, height: int, width: int, step: int, is_bigendian: bool, data: bytes) -> np.ndarray:
-    """Metres from the fields of a `sensor_msgs/Image`; 0 where unknown.
-
-    Raises:
-        ValueError: for an encoding other than 16UC1 (millimetres) and 32FC1 (metres), or too little data.
-    """
-    kinds = {"16UC1": ("u2", 1e-3), "32FC1": ("f4", 1.0)}
-    if encoding not in kinds:
-        raise ValueError(f"depth images of encoding {encoding!r} cannot be read; publish 16UC1 (mm) or 32FC1 (m)")
-    kind, unit = kinds[encoding]
-    stored = np.dtype(("<", ">")[bool(is_bigendian)] + kind)
-    if step < width * stored.itemsize or len(data) < height * step:
-        raise ValueError(f"an image of {height} rows of {step} bytes has {len(data)} bytes, for {width} pixels each")
-    rows = np.frombuffer(data, np.uint8, height * step).reshape(height, step)[:, : width * stored.itemsize]
-    depth = np.ascontiguousarray(rows).view(stored).astype(np.float32) * np.float32(unit)
-    return np.where(np.isfinite(depth) & (depth > 0), depth, np.float32(0))
-
-
-def matrix_of(translation: Any, rotation: Any) -> np.ndarray:
-    """(4, 4) from a translation with x, y, z and a quaternion with x, y, z, w, as messages have them."""
-    pose = np.eye(4)
-    pose[:3, :3] = Rotation.from_quat([rotation.x, rotation.y, rotation.z, rotation.w]).as_matrix()
-    pose[:3, 3] = translation.x, translation.y, translation.z
-    return pose
 
 
 def quaternion_of(rotation: np.ndarray) -> tuple[float, float, float, float]:
