@@ -232,8 +232,7 @@ def _recording(path: Path, options: RecordingOptions) -> Recording:
 
     if not has_checkout():
         raise Unusable("folders and bags are read by a checkout of the project, not by the package alone; give an .npz")
-    recording = read_recording(path, options)
-    return recording.arrays(), recording.names
+    return read_recording(path, options)
 
 
 def read_recording(path: Path, options: ReadingOptions) -> Recording:
