@@ -179,8 +179,8 @@ def check_shown(
         )
     for number, (before, at) in enumerate(zip(history.depths, history.poses, strict=True)):
         apart = np.linalg.norm(at[:3, 3] / np.linalg.norm(at[:3, 3]) - pose[:3, 3] / np.linalg.norm(pose[:3, 3]))
-        either = (before > 0) & ~np.isnan(depth) | (depth > 0) & ~np.isnan(before)
-        if apart < SAME and either.any() and (share := np.mean(np.abs(before - depth)[either] > _OTHER)) > _CHANGED:
+        both = (before > 0) & (depth > 0)  # masks may show one part after the other
+        if apart < SAME and both.any() and (share := np.mean(np.abs(before - depth)[both] > _OTHER)) > _CHANGED:
             raise ValueError(
                 f"depth is another than that of image {number}, taken from there, at {share:.0%} of the object's pixels; "
                 "give each image the pose at its own time, and call reset for another object"

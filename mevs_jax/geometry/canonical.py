@@ -146,7 +146,7 @@ def convert(
         raise ValueError(why_empty(window))
     depth = np.round(depth * DEPTH_SCALE) * DEPTH_STEP  # to the bit as the data set's views are read
     unknown = share_of_sphere(~known, camera)
-    doubt = doubt_of(image, window, unknown) if towards is None else ""
+    doubt = doubt_of(image, window) if towards is None else ""
     return CanonicalView(depth, known, pose, direction, float(in_image), unknown, doubt)
 
 

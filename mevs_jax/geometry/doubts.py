@@ -23,8 +23,10 @@ _ASIDE = 0.4
 """Radii by which the middle of an outline may lie aside of the centre."""
 _WRONG_MASK = 0.2
 """Share of a mask's pixels that may show something beyond the sphere, or nothing at all (+inf)."""
-_BELOW = 0.1
-"""Share of the points in the sphere that may lie this many radii or more below the floor."""
+_BELOW, _UNDER = 0.1, 0.03
+"""Radii below the floor, and the share of the points in the sphere that may lie there."""
+_HIDDEN = 0.2
+"""Share of the sphere that may be hidden, or have no depth, where the outline is looked at."""
 _STEEPEST = 3.0
 """How many times the distance of neighbouring rays two points of one surface are apart at most."""
 _STRETCH = 1.9
@@ -33,13 +35,12 @@ _SAMPLES = 128
 """Along each side of the window."""
 
 
-def doubt_of(image: DepthImage, window: Window, unknown: float) -> str:
+def doubt_of(image: DepthImage, window: Window) -> str:
     """A sentence on what is wrong with an image, its camera or the object's sphere; empty if nothing is noticed.
 
     Args:
         image: of which the window is.
         window: the part of it that contains the sphere.
-        unknown: share of the sphere that it does not show.
     """
     if said := _of_camera(image):
         return said
@@ -62,9 +63,17 @@ def doubt_of(image: DepthImage, window: Window, unknown: float) -> str:
             "radius, or give a mask or a floor that leaves out what is beside the object"
         )
     under = measured & mask & (away <= 1)
-    if under.any() and np.mean(points[under][:, 2] < window.floor - _BELOW) > _BELOW:
+    if under.any() and np.mean(points[under][:, 2] < window.floor - _BELOW) > _UNDER:
         return "there is something below the floor within the object's sphere: check the height of the floor, center and up"
-    return _of_outline(points[inside], window.eye) if inside.any() and unknown < _WRONG_MASK else ""
+    # What hides a part of the object, what has no depth, and the border of the image may hide how far it reaches.
+    towards, square = rays @ window.eye, np.sum(rays**2, axis=-1)
+    looks = (towards < 0) & (towards**2 > square * (np.sum(window.eye**2) - 1))
+    hidden = ~measured & mask & (depth != np.inf) | measured & (away > _BEYOND) & (z * square < -towards)
+    left, right, top, bottom = window.limits
+    edge = np.minimum(number - left, right - number) < 2 * step, np.minimum(number - top, bottom - number) < 2 * step
+    ends = inside & (edge[0][None, :] | edge[1][:, None])
+    whole = looks.any() and np.mean(hidden[looks & (depth == depth)]) < _HIDDEN and ends.sum() < 3
+    return _of_outline(points[inside], window.eye) if inside.any() and whole else ""
 
 
 def _of_camera(image: DepthImage) -> str:

@@ -18,7 +18,7 @@ from mevs_jax.geometry.sphere import Sphere, upright
 
 _FIELDS = 1.0, 150.0
 """Smallest and largest field of view of a depth camera, in degrees."""
-_LEAST_ACROSS = 12
+_LEAST_ACROSS = 8
 """Pixels of the source across the object's sphere."""
 MARGIN = 0.02
 """Points up to this far outside the unit sphere belong to the object, since depth is measured with noise."""
@@ -113,14 +113,14 @@ def window_of(image: DepthImage, sphere: Sphere, grid: int) -> Window:
             f"the camera is {distance * radius:.3g} m from the object's center, inside its sphere of radius {radius:.3g} m; "
             "check the poses' units (metres), or give a smaller radius"
         )
+    size = np.shape(image.depth)[::-1]
+    spans = _sphere_in_image(-eye @ axes, K, size)
     across = 2 * min(K[0, 0], K[1, 1]) / math.sqrt(distance**2 - 1)
     if across < _LEAST_ACROSS:
         raise ValueError(
             f"the object's sphere is only {across:.1f} pixels across in the image, and {_LEAST_ACROSS} are needed; move the "
             "camera closer, take a larger image, or check K and the radius"
         )
-    size = np.shape(image.depth)[::-1]
-    spans = _sphere_in_image(-eye @ axes, K, size)
     steps = [-(-(last - first) // grid) for first, last in spans]
     (columns, rows) = (slice(first, last, step) for (first, last), step in zip(spans, steps, strict=True))
     samples, marks = np.full((grid, grid), np.nan, np.float32), np.ones((grid, grid), bool)

@@ -1,6 +1,6 @@
 """Faults of depth cameras and of what is said about them: what drivers, converters and people get wrong, in many strengths.
 
-Each fault takes what is true of an image, and returns what a caller gives instead. Those of `PAIRS` need two images.
+Each fault takes what is true of an image, and returns what a caller gives instead.
 """
 
 from __future__ import annotations

@@ -10,6 +10,7 @@ from __future__ import annotations
 import argparse
 import sys
 from collections import Counter
+from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
@@ -62,6 +63,14 @@ def main() -> None:
             except Exception as error:
                 wrong += 1
                 print(f"{kind}: {fault}: {type(error).__name__}: {error}")
+    late = rows["two images: one pose for both"] = Counter()
+    for (name, given), (_, other) in zip(views, [*views[2:], *views[:2]], strict=True):
+        with suppress(ValueError):
+            outcome(agent, given, name)
+            agent.observe(other.depth, given.K, given.pose, mask=other.mask)
+            late["silent"] += 1
+            continue
+        late["refused"] += 1
     lines = ["fault | " + " | ".join(OUTCOMES), "---" + "|---" * len(OUTCOMES)]
     lines += [f"{fault} | " + " | ".join(str(counted[one]) for one in OUTCOMES) for fault, counted in rows.items()]
     print("\n".join(lines))

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import logging
 import shutil
+import sys
 from copy import deepcopy
 from pathlib import Path
 from types import TracebackType
@@ -23,6 +24,16 @@ from train.running.preemption import interrupts_held
 
 for _name in ("absl", "asyncio"):  # Orbax logs every step, and the errors of its threads, which it raises as well
     logging.getLogger(_name).setLevel(logging.CRITICAL)
+_say_error = sys.excepthook
+
+
+def _say(kind: type[BaseException], error: BaseException, trace: TracebackType | None) -> None:
+    """Prints an error as before, but not that threads of TensorStore answer a save that has already failed with a sentence."""
+    if not (kind is RuntimeError and str(error) == "Event loop is closed"):
+        _say_error(kind, error, trace)
+
+
+sys.excepthook = _say
 
 
 def _placed(leaf: Any) -> Any:
