@@ -45,18 +45,22 @@ def doubt_of(image: DepthImage, window: Window) -> str:
     if said := _of_camera(image):
         return said
     step = max(1, len(window.depth) // _SAMPLES)
-    depth, mask = window.depth[::step, ::step] / window.radius, window.mask[::step, ::step]
+    eye, depth, mask = (
+        np.asarray(array) for array in (window.eye, window.depth[::step, ::step], window.mask[::step, ::step])
+    )
+    depth = depth / np.asarray(window.radius)
     number = np.arange(0, len(window.depth), step, dtype=np.float32)
     measured = (depth > 0) & np.isfinite(depth)
     z = np.where(measured, depth, 0)
-    rays = number[None, :, None] * window.rays[:, 0] + number[:, None, None] * window.rays[:, 1] + window.rays[:, 2]
-    points = window.eye + rays * z[..., None]
+    to_right, down, first = np.asarray(window.rays).T
+    rays = number[None, :, None] * to_right + number[:, None, None] * down + first
+    points = eye + rays * z[..., None]
     away = np.linalg.norm(points, axis=-1)
     if image.mask is not None and (said := _of_mask(np.where(depth == np.inf, depth, away), mask & (depth > 0))):
         return said
     object_ = measured & mask & (points[..., 2] >= window.floor)
     inside, outside = object_ & (away <= _BEYOND), object_ & (away > _BEYOND)
-    along = step * np.linalg.norm(window.rays[:, :2], axis=0)
+    along = step * np.linalg.norm([to_right, down], axis=1)
     if (length := _goes_on(points, z, inside, outside, along)) > _GOES_ON:
         return (
             f"the surface goes on beyond the object's sphere, along {length:.1f} radii: check K, the pose, the units, center and "
@@ -66,14 +70,14 @@ def doubt_of(image: DepthImage, window: Window) -> str:
     if under.any() and np.mean(points[under][:, 2] < window.floor - _BELOW) > _UNDER:
         return "there is something below the floor within the object's sphere: check the height of the floor, center and up"
     # What hides a part of the object, what has no depth, and the border of the image may hide how far it reaches.
-    towards, square = rays @ window.eye, np.sum(rays**2, axis=-1)
-    looks = (towards < 0) & (towards**2 > square * (np.sum(window.eye**2) - 1))
+    towards, square = rays @ eye, np.sum(rays**2, axis=-1)
+    looks = (towards < 0) & (towards**2 > square * (np.sum(eye**2) - 1))
     hidden = ~measured & mask & (depth != np.inf) | measured & (away > _BEYOND) & (z * square < -towards)
     left, right, top, bottom = window.limits
     edge = np.minimum(number - left, right - number) < 2 * step, np.minimum(number - top, bottom - number) < 2 * step
     ends = inside & (edge[0][None, :] | edge[1][:, None])
     whole = looks.any() and np.mean(hidden[looks & (depth == depth)]) < _HIDDEN and ends.sum() < 3
-    return _of_outline(points[inside], window.eye) if inside.any() and whole else ""
+    return _of_outline(points[inside], eye) if inside.any() and whole else ""
 
 
 def _of_camera(image: DepthImage) -> str:
@@ -94,15 +98,15 @@ def _of_camera(image: DepthImage) -> str:
     if not 1 / _STRETCH < K[0, 0] / K[1, 1] < _STRETCH:
         return f"K has the focal lengths {K[0, 0]:g} and {K[1, 1]:g}: check fx and fy, in pixels"
     shown = depth[np.isfinite(depth)]
-    if shown.size and shown.max() == 1 and not _in_millimetres(shown):
-        return "the largest depth is exactly 1: check whether depth is a z-buffer or was scaled to 0..1; it must be in metres"
+    if shown.size and abs(shown.max() - 1) < 1e-6 and not _in_millimetres(shown):
+        return "the largest depth is 1: check whether depth is a z-buffer or was scaled to 0..1; it must be in metres"
     return ""
 
 
 def _in_millimetres(depth: Float[np.ndarray, " pixels"]) -> bool:
     """Whether depth is of a camera that measures in steps of a millimetre or a part of it, so that 1 m is one of its values."""
     steps = 10_000 * depth[:: max(1, len(depth) // 1000)].astype(float)
-    return bool(np.abs(steps - np.round(steps)).max() < 0.01 and np.mean(depth == 1) < 0.01)
+    return bool(np.abs(steps - np.round(steps)).max() < 0.01 and np.mean(depth > 1 - 1e-6) < 0.01)
 
 
 def _of_mask(away: Float[np.ndarray, "rows columns"], mask: Bool[np.ndarray, "rows columns"]) -> str:

@@ -16,7 +16,7 @@ from mevs_jax.arguments import numbers
 from mevs_jax.arrays import AnyArray, AnyVector, ByContent
 from mevs_jax.geometry.sphere import Sphere, upright
 
-_FIELDS = 1.0, 150.0
+_FIELDS = 1.0, 158.0
 """Smallest and largest field of view of a depth camera, in degrees."""
 _LEAST_ACROSS = 8
 """Pixels of the source across the object's sphere."""

@@ -24,16 +24,16 @@ from train.running.preemption import interrupts_held
 
 for _name in ("absl", "asyncio"):  # Orbax logs every step, and the errors of its threads, which it raises as well
     logging.getLogger(_name).setLevel(logging.CRITICAL)
-_say_error = sys.excepthook
+_say_unraisable = sys.unraisablehook
 
 
-def _say(kind: type[BaseException], error: BaseException, trace: TracebackType | None) -> None:
-    """Prints an error as before, but not that threads of TensorStore answer a save that has already failed with a sentence."""
-    if not (kind is RuntimeError and str(error) == "Event loop is closed"):
-        _say_error(kind, error, trace)
+def _say(lost: sys.UnraisableHookArgs) -> None:
+    """Prints what Python cannot raise, but not that threads of TensorStore answer a save that has failed, which is said once."""
+    if not (lost.exc_type is RuntimeError and str(lost.exc_value) == "Event loop is closed"):
+        _say_unraisable(lost)
 
 
-sys.excepthook = _say
+sys.unraisablehook = _say
 
 
 def _placed(leaf: Any) -> Any:
