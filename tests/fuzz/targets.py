@@ -269,10 +269,10 @@ _PIECES = [
 
 
 @st.composite
-def mutated(draw: st.DrawFn, name: str) -> bytes:
-    """Returns an input of a reader with up to eight mutations."""
+def mutated(draw: st.DrawFn, name: str, most: int = 8) -> bytes:
+    """Returns an input of a reader with up to eight mutations, or another number of them."""
     content = bytearray(draw(st.sampled_from(starts(name))))
-    for _ in range(draw(st.integers(1, 8))):
+    for _ in range(draw(st.integers(1, most))):
         at = draw(st.integers(0, max(len(content) - 1, 0)))
         kind = draw(st.integers(0, 8))
         if kind == 0:  # one bit
