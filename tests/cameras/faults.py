@@ -387,7 +387,7 @@ ONE: dict[str, dict[str, Fault]] = {
         "up is y": _sphere(up=lambda given: (0, 1.0, 0)),
         "up is −z": _sphere(up=lambda given: (0, 0, -1.0)),
         "up leans by 20°": _sphere(up=lambda given: (0, np.sin(0.35), np.cos(0.35))),
-        "radius of no number": _sphere(radius=lambda given: None),
+        "radius is NaN": _sphere(radius=lambda given: np.nan),
         "center of two numbers": _sphere(center=lambda given: given.center[:2]),
     },
     "mask and floor": {
