@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import re
+import warnings
 import zipfile
 from collections.abc import Callable
 
@@ -75,7 +76,8 @@ def in_archive(content: bytes, draw: st.DrawFn) -> bytes:
     else:
         members[at] = name, draw(st.sampled_from(_OF_TEXT))(inside, draw)
     made = io.BytesIO()
-    with zipfile.ZipFile(made, "w") as archive:
+    with zipfile.ZipFile(made, "w") as archive, warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # a name is there twice
         for name, inside in members:
             archive.writestr(name, inside)
     return made.getvalue()
