@@ -5,7 +5,7 @@ BIN := .venv/bin
 READY := .venv/.ready
 OUT ?= runs/demo
 # A file at a time, since its tests share what is costly to make; the longest files first (tests/conftest.py).
-PYTEST := $(BIN)/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder
+PYTEST := $(BIN)/python -m pytest -rs -n 2 --dist loadfile --no-loadscope-reorder
 # Packages are installed without bytecode, which each keeps once it was imported, unless told not to: then every start of `mevs`
 # would compile them again, for 12 seconds.
 unexport PYTHONDONTWRITEBYTECODE

@@ -15,9 +15,9 @@ from typing import Any
 
 import jax
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 
-from mevs_jax.agent.candidates import aimed, candidates_of, costs_of, mask_of, pose_towards
+from mevs_jax.agent.candidates import candidates_of, costs_of, mask_of, near_object, pose_towards
 from mevs_jax.agent.present import Present, check_shown, sphere_of
 from mevs_jax.agent.programs import Programs
 from mevs_jax.agent.records import Belief, History, Reason, Step, plain
@@ -34,8 +34,10 @@ from mevs_jax.trained.system import TrainedSystem
 
 _ENOUGH = 0.15
 """How much of the object must have been seen before the agent is sure, in views that show all of its sphere."""
-MOST_VIEWS, MOST_CANDIDATES = 512, 4096
+MOST_VIEWS, MOST_CANDIDATES = 512, 100_000
 """Largest numbers of views and of candidates of an agent."""
+_MOST_DIRECTIONS = 1024
+"""Largest number of candidates that are compared, since what is known of each pair of them takes 30 bytes."""
 Reachable = AnyArray | Sequence[int] | Callable[[np.ndarray], bool] | None
 """Which candidates can be reached: a mask, indices, a function of the camera's pose (4, 4), or None for all."""
 
@@ -71,9 +73,8 @@ class Agent:
         gain_per_cost: expected gain that one unit of a candidate's cost is worth, in units of the policy's scores (nats for
             `information_gain` and learned policies).
         distance: of the next cameras from the object's centre, in metres; by default that of the training views in radii.
-        max_candidates: largest number of candidates of `decide`, at most 4096; 128 by default. A decision takes about 30 bytes ×
-            its square (0.5 GB for 4096). For an unknown yaw, a decision of a recogniser holds what it expects of each: about 300
-            bytes × candidates × the square of the number of classes.
+        max_candidates: largest number of candidates of `decide`, at most 100,000; 128 by default. Of more than 1024, those in
+            about one direction are one: the one that can be reached and costs least. So a decision takes at most 200 MB.
         seed: of random policies.
 
     Attributes:
@@ -116,7 +117,8 @@ class Agent:
         size = 128
         if self.max_candidates is not None:
             rule = f"max_candidates must be from 1 to {MOST_CANDIDATES}"
-            size = self.max_candidates = whole(self.max_candidates, rule, 1, MOST_CANDIDATES)
+            self.max_candidates = whole(self.max_candidates, rule, 1, MOST_CANDIDATES)
+            size = min(self.max_candidates, _MOST_DIRECTIONS)
         shaded = self.system.description.image.content == "image"
         _check(not shaded, "this system reads shaded images, which a depth camera does not give; train one on depth")
         enrolled = self.system.parts.gallery is None or len(self.system.classes) > 1
@@ -246,7 +248,7 @@ class Agent:
         begun, of = time.perf_counter(), self._current
         self._check_budget()
         if of.points is None:
-            view = of.with_parts(self.system, image, of.seen(self.system, image))
+            view = of.with_parts(self.system, image, of.seen(self.system, image, self.history))
         else:
             has_edge = image.mask is not None or image.floor is not None
             _check(
@@ -254,7 +256,7 @@ class Agent:
             )
             of, view = of.refined(self.system, image.copy(), self.history)
             self._object = of
-        return self._add(view.image, of.placed(self.system, view), view.unknown, begun)
+        return self._add(view.image, of.placed(self.system, view), view.unknown, begun, view.doubt)
 
     @property
     def sphere(self) -> Sphere:
@@ -293,7 +295,7 @@ class Agent:
             bool(np.isfinite(placed).all()) and bool(placed[:3, 3].any()),
             "pose is not finite, or at the object's centre",
         )
-        check_shown(image, self.system)
+        check_shown(image, self.system, placed, self.history)
         unknown = share_of_sphere(np.isnan(image), self.system.description.camera)
         told = self.system.description.told_unknown
         _check(told or unknown <= 0.5, f"{unknown:.0%} of the object's sphere is unknown; this system needs half of it")
@@ -305,7 +307,7 @@ class Agent:
             f"the budget of {self.max_views} views is spent; call reset, or make the agent with max_views above it",
         )
 
-    def _add(self, depth: np.ndarray, pose: np.ndarray, unseen: float, begun: float) -> Belief:
+    def _add(self, depth: np.ndarray, pose: np.ndarray, unseen: float, begun: float, doubt: str = "") -> Belief:
         of = self._current
         of.memory, said = of.programs.see(self.system.parts, of.memory, depth, pose, of.known_radius)
         (probabilities, strangeness, yaws), count, slot = jax.device_get((said, of.memory.count, of.memory.latest))
@@ -323,6 +325,7 @@ class Agent:
             evidence=sum(of.shown.values()),
             unseen=float(unseen),
             pose=of.pose_of(self.system, label, yaws),
+            doubt=doubt,
             latency_ms=1e3 * (time.perf_counter() - begun),
         )
         self.history.depths.append(depth)
@@ -358,14 +361,18 @@ class Agent:
         shaped = poses.ndim > 0 and (poses.ndim == 3 or not poses.size)
         _check(shaped, f"candidates must be poses (candidates, 4, 4), got {candidates!r:.80}")
         number = len(poses)
-        where, useful = (self._lattice, np.ones(number, bool)) if candidates is None else self._given(poses)
         allowed = (
             np.array([reachable(pose) for pose in poses], bool) if callable(reachable) else mask_of(reachable, number)
         )
         costs = costs_of([cost(pose) for pose in poses] if callable(cost) else cost, number, self.gain_per_cost)
+        allowed, where, kept = allowed & np.isfinite(costs), self._lattice, np.arange(number)
+        if candidates is not None and number:
+            most = max(self.size, self.max_candidates or 0)
+            where, kept, allowed = near_object(self.system, of.sphere, poses, allowed, costs, most, self.size)
         reason, index, gains = self._reason(), -1, np.zeros(0)
         if not reason:
-            index, gains = self._choose(where, allowed & useful & np.isfinite(costs), costs)
+            at, gains = self._choose(where, allowed[kept], costs[kept])
+            index = int(kept[at]) if at >= 0 else -1
             if index < 0:
                 reason = "nothing reachable" if of.belief is None or of.belief.known else "unknown object"
         elapsed = 1e3 * (time.perf_counter() - begun)
@@ -373,10 +380,10 @@ class Agent:
         if reason:
             step = Step(None, None, -1, float("nan"), True, reason, elapsed)
         else:
-            event["gains"] = [float(gain) if np.isfinite(gain) else None for gain in gains[:number]]
+            event["gains"] = [float(gain) if np.isfinite(gain) else None for gain in gains[: len(kept)]]
             if candidates is not None:
-                event["directions"] = np.asarray(where.directions)[:number].tolist()
-            step = Step(poses[index], of.towards(poses[index]), index, float(gains[index]), False, "", elapsed)
+                event["directions"] = np.asarray(where.directions)[: len(kept)].tolist()
+            step = Step(poses[index], of.towards(poses[index]), index, float(gains[at]), False, "", elapsed)
         self.history.events.append(event | {"step": plain(step)})
         return step
 
@@ -410,14 +417,6 @@ class Agent:
         distance = camera.distance * sphere.radius if self.distance is None else self.distance
         directions = self.system.viewpoints.astype(float) @ sphere.rotation.T
         return pose_towards(directions, sphere.position, distance, sphere.axis)
-
-    def _given(self, poses: np.ndarray) -> tuple[Candidates, Bool[np.ndarray, " candidates"]]:
-        """Candidates of a caller, and which of them `observe` could use."""
-        sphere = self._current.sphere
-        if not poses.size:
-            return self._lattice, np.zeros(len(poses), bool)
-        directions, useful = aimed(poses, sphere.position, sphere.radius)
-        return candidates_of(self.system, directions @ sphere.rotation, self.size), useful
 
     @_one_at_a_time
     def mark_failed(self, step: Step | AnyArray) -> None:

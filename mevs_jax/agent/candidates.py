@@ -6,12 +6,13 @@ from collections.abc import Sequence
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 
 from mevs_jax.arguments import numbers
 from mevs_jax.arrays import AnyArray, AnyVector
 from mevs_jax.geometry.source_view import first_wrong_pose
-from mevs_jax.geometry.viewpoints import great_circle_distances, hull_edges
+from mevs_jax.geometry.sphere import Sphere
+from mevs_jax.geometry.viewpoints import fibonacci_sphere, great_circle_distances, hull_edges
 from mevs_jax.trained.situation import REPEATED, SAME, Candidates
 from mevs_jax.trained.system import TrainedSystem
 
@@ -84,22 +85,46 @@ def mask_of(reachable: AnyArray | Sequence[int] | None, number: int) -> Bool[np.
     return mask
 
 
+def near_object(
+    system: TrainedSystem,
+    sphere: Sphere,
+    poses: Float[np.ndarray, "candidates 4 4"],
+    allowed: Bool[np.ndarray, " candidates"],
+    costs: Float[np.ndarray, " candidates"],
+    most: int,
+    size: int,
+) -> tuple[Candidates, Int[np.ndarray, " kept"], Bool[np.ndarray, " candidates"]]:
+    """Candidates of a caller for the compiled steps; which of them these are; and which of all `observe` could use.
+
+    Of more than `size`, those in about one direction are one: of those that are allowed the one that costs least.
+
+    Raises:
+        ValueError: for more than `most`, or as `aimed`.
+    """
+    if len(poses) > most:
+        raise ValueError(
+            f"{len(poses)} candidates do not fit the agent's {most}; make it with max_candidates={len(poses)} or more"
+        )
+    directions, useful = aimed(poses, sphere.position, sphere.radius)
+    allowed, kept = allowed & useful, np.arange(len(poses))
+    if len(poses) > size:
+        from scipy.spatial import cKDTree  # imported late: SciPy takes a fifth of a second
+
+        nearest = cKDTree(fibonacci_sphere(size)).query(directions)[1]
+        order = np.lexsort((costs, ~allowed, nearest))
+        kept = np.sort(order[np.unique(nearest[order], return_index=True)[1]])
+    return candidates_of(system, directions[kept] @ sphere.rotation, size), kept, allowed
+
+
 def candidates_of(system: TrainedSystem, directions: Float[np.ndarray, "candidates 3"] | None, size: int) -> Candidates:
     """Candidates for the compiled steps, in arrays of a length `size`.
 
     Args:
         system: whose viewpoints are the candidates where no directions are given.
-        directions: unit vectors from the object, in its frame.
-
-    Raises:
-        ValueError: for more candidates than `size`, or none.
+        directions: at most `size` unit vectors from the object, in its frame.
     """
     points = np.asarray(system.viewpoints if directions is None else directions, np.float64)
     number = len(points)
-    if not 1 <= number <= size:
-        raise ValueError(
-            f"{number} candidates do not fit the agent's {size}; make it with max_candidates={number} or more"
-        )
     own = directions is None
     distances = np.asarray(system.graph.distances) if own else great_circle_distances(points)
     nearest = (distances + 10 * np.eye(number)).min(axis=1)

@@ -66,6 +66,8 @@ class Walk(ByContent):
             f"view {view:3d}: {belief.name} {100 * belief.confidence:.1f} %"
             for view, belief in zip(self.views, self.beliefs, strict=True)
         ]
+        both = zip(self.views, self.beliefs, strict=True)
+        lines += [f"view {view:3d}: in doubt, {belief.doubt}" for view, belief in both if belief.doubt][:MOST_SAID]
         left_out = list(self.left_out.items())
         lines += [f"view {view:3d}: left out, {why}" for view, why in left_out[:MOST_SAID]]
         lines += [f"{len(left_out) - MOST_SAID} more views: left out"] * (len(left_out) > MOST_SAID)

@@ -14,7 +14,7 @@ from mevs_jax.geometry.cameras import in_sphere
 from mevs_jax.geometry.canonical import CanonicalView, combined, convert
 from mevs_jax.geometry.source_view import DepthImage
 from mevs_jax.geometry.sphere import Sphere, estimate_sphere, upright
-from mevs_jax.trained.situation import REPEATED, Candidates, Memory
+from mevs_jax.trained.situation import REPEATED, SAME, Candidates, Memory
 from mevs_jax.trained.system import TrainedSystem
 
 _REACH = 1.3
@@ -29,6 +29,8 @@ _PART = 0.25
 """An image that does not show more than this share of the sphere shows a part, which is seen together with other parts."""
 _ASIDE = 0.5
 """Largest angle in radians between directions of images that are seen together."""
+_OTHER, _CHANGED = 0.2, 0.4
+"""Radii by which depth of the same direction is another, and the share of the pixels at which it may be."""
 _AT_VIEWPOINT = 1e-5
 """Poses that differ by less, in radii, are the same to rounding. Sampling of a cloud has ties, which rounding would decide."""
 
@@ -78,10 +80,11 @@ class Present:
         failed = np.reshape([*self.failed, *self.merged], (-1, 3))
         return (np.asarray(where.directions) @ failed.T > np.cos(float(where.same))).any(axis=1)
 
-    def seen(self, system: TrainedSystem, image: DepthImage) -> CanonicalView:
-        """A new image as the data set's camera would have taken it; raises `ValueError` if it shows too little of the object."""
+    def seen(self, system: TrainedSystem, image: DepthImage, history: History) -> CanonicalView:
+        """A new image as the data set's camera would have taken it; raises `ValueError` if it shows too little of the object, or
+        something else than an image of before from there."""
         view = convert(image, self.sphere, system.description.camera)
-        check_shown(view.depth, system)
+        check_shown(view.image, system, self.placed(system, view), history)
         if system.description.told_unknown:
             return view
         if view.in_image < LEAST:
@@ -112,7 +115,8 @@ class Present:
                     part = convert(image, self.sphere, system.description.camera, seen.direction)
                 except ValueError:  # nothing of it can be seen from there
                     continue
-                self.parts[number] = combined([seen, part], system.description.camera)
+                both = combined([seen, replace(part, doubt=view.doubt)], system.description.camera)
+                self.parts[number] = both
                 self.merged.append(self.towards(np.asarray(image.pose, float)) @ self.sphere.rotation)
                 return self.parts[number]
         self.parts.append(view)
@@ -148,10 +152,10 @@ class Present:
         again = replace(self, points=points, images=[*self.images, image], parts=[*self.parts], merged=[*self.merged])
         center, radius = sphere_of(points, sphere.rotation)
         if np.linalg.norm(center - sphere.position) + abs(radius - sphere.radius) < 0.01 * sphere.radius:
-            return again, again.with_parts(system, image, self.seen(system, image))
+            return again, again.with_parts(system, image, self.seen(system, image, history))
         again.sphere, again.memory = replace(sphere, center=center, radius=radius), self.programs.blank()
         again.shown, again.parts, again.merged = {}, [], []
-        newest, camera = again.seen(system, image), system.description.camera
+        newest, camera = again.seen(system, image, History(system.name, {})), system.description.camera
         views = [again.with_parts(system, one, convert(one, again.sphere, camera)) for one in self.images]
         poses = [again.placed(system, one) for one in views]
         for one, pose in zip(views, poses, strict=True):
@@ -162,14 +166,25 @@ class Present:
         return again, again.with_parts(system, image, newest)
 
 
-def check_shown(depth: Float[np.ndarray, "side side"], system: TrainedSystem) -> None:
-    """Raises `ValueError` for an image of the data set's camera that shows next to nothing of the object."""
+def check_shown(
+    depth: Float[np.ndarray, "side side"], system: TrainedSystem, pose: Float[np.ndarray, "4 4"], history: History
+) -> None:
+    """Raises `ValueError` for an image of the data set's camera that shows next to nothing of the object, or something else than
+    an image of before from the same direction."""
     shown, pixels = int((depth > 0).sum()), int(in_sphere(system.description.camera, len(depth)).sum())
     if shown < _LEAST_PIXELS * pixels:
         raise ValueError(
             f"depth shows the object at only {shown} of the {pixels} pixels of its sphere; aim the camera at its center, move "
             "closer, or check the mask"
         )
+    for number, (before, at) in enumerate(zip(history.depths, history.poses, strict=True)):
+        apart = np.linalg.norm(at[:3, 3] / np.linalg.norm(at[:3, 3]) - pose[:3, 3] / np.linalg.norm(pose[:3, 3]))
+        both = (before > 0) & (depth > 0)  # masks may show one part after the other
+        if apart < SAME and both.any() and (share := np.mean(np.abs(before - depth)[both] > _OTHER)) > _CHANGED:
+            raise ValueError(
+                f"depth is another than that of image {number}, taken from there, at {share:.0%} of the object's pixels; "
+                "give each image the pose at its own time, and call reset for another object"
+            )
 
 
 def sphere_of(points: np.ndarray, rotation: np.ndarray) -> tuple[np.ndarray, float]:

@@ -38,6 +38,7 @@ class Belief(ByContent):
         evidence: how much of the object was seen, in views that show all of its sphere.
         unseen: share of the object's sphere that the latest view does not show, in [0, 1]; a view may be combined from images.
         pose: of the most likely object, if it is an enrolled one.
+        doubt: what is wrong with the latest image, its camera or the sphere, by what it shows; empty if nothing was noticed.
         latency_ms: time that the call took, which is not compared.
     """
 
@@ -52,6 +53,7 @@ class Belief(ByContent):
     evidence: float
     unseen: float
     pose: ObjectPose | None
+    doubt: str
     latency_ms: float = field(compare=False)
 
 

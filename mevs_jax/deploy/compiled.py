@@ -36,6 +36,9 @@ def keep_compiled(folder: str | Path | None = None) -> Path:
     _prune(folder)
     jax.config.update("jax_compilation_cache_dir", str(folder))
     compilation_cache.reset_cache()  # JAX keeps the folder that it has begun to use
+    jax.config.update(
+        "jax_persistent_cache_enable_xla_caches", "none"
+    )  # their folder is a part of the names of programs
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
     jax.config.update("jax_persistent_cache_min_entry_size_bytes", -1)
     return folder

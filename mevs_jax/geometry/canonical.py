@@ -29,6 +29,7 @@ from mevs_jax.arguments import numbers
 from mevs_jax.arrays import AnyArray, AnyVector, ByContent
 from mevs_jax.beliefs.entropy import DEPTH_SCALE, DEPTH_STEP
 from mevs_jax.geometry.cameras import ViewCamera, in_sphere, look_at_origin, pixel_directions
+from mevs_jax.geometry.doubts import doubt_of
 from mevs_jax.geometry.source_view import MARGIN, DepthImage, Window, why_empty, window_of
 from mevs_jax.geometry.sphere import Sphere
 
@@ -72,6 +73,7 @@ class CanonicalView(ByContent):
         in_image: share of the object's sphere that is inside the source image, from 0 to 1.
         unknown: share of the pixels of the object's sphere that are not `known`, from 0 to 1: outside the source image, without a
             measured depth, or hidden from the source.
+        doubt: what is wrong with the source, its camera or the object's sphere by what it shows; empty if nothing was noticed.
     """
 
     depth: Float[np.ndarray, "resolution resolution"]
@@ -80,6 +82,7 @@ class CanonicalView(ByContent):
     direction: Float[np.ndarray, " 3"]
     in_image: float
     unknown: float
+    doubt: str = ""
 
     @property
     def image(self) -> Float[np.ndarray, "resolution resolution"]:
@@ -142,7 +145,9 @@ def convert(
     if not depth.any():
         raise ValueError(why_empty(window))
     depth = np.round(depth * DEPTH_SCALE) * DEPTH_STEP  # to the bit as the data set's views are read
-    return CanonicalView(depth, known, pose, direction, float(in_image), share_of_sphere(~known, camera))
+    unknown = share_of_sphere(~known, camera)
+    doubt = doubt_of(image, window) if towards is None else ""
+    return CanonicalView(depth, known, pose, direction, float(in_image), unknown, doubt)
 
 
 def share_of_sphere(pixels: Bool[np.ndarray, "side side"], camera: ViewCamera) -> float:
@@ -159,7 +164,7 @@ def combined(views: Sequence[CanonicalView], camera: ViewCamera) -> CanonicalVie
     known = np.any([view.known for view in views], axis=0)
     depth = np.where(np.isfinite(depths), depths, np.float32(0)).astype(np.float32)
     unknown, in_image = share_of_sphere(~known, camera), max(view.in_image for view in views)
-    return replace(views[0], depth=depth, known=known, unknown=unknown, in_image=in_image)
+    return replace(views[0], depth=depth, known=known, unknown=unknown, in_image=in_image, doubt=views[-1].doubt)
 
 
 @partial(jax.jit, static_argnames=("camera", "most_steps"))

@@ -16,6 +16,10 @@ from mevs_jax.arguments import numbers
 from mevs_jax.arrays import AnyArray, AnyVector, ByContent
 from mevs_jax.geometry.sphere import Sphere, upright
 
+_FIELDS = 1.0, 158.0
+"""Smallest and largest field of view of a depth camera, in degrees."""
+_LEAST_ACROSS = 8
+"""Pixels of the source across the object's sphere."""
 MARGIN = 0.02
 """Points up to this far outside the unit sphere belong to the object, since depth is measured with noise."""
 
@@ -47,7 +51,7 @@ class DepthImage(ByContent):
         if np.ma.isMaskedArray(self.depth):
             raise ValueError("depth is a masked array, whose mask would be lost; give depth.filled(numpy.nan)")
         _check_images(np.asarray(self.depth), None if self.mask is None else np.asarray(self.mask))
-        checked_intrinsics(self.K)
+        _check_camera(checked_intrinsics(self.K), np.shape(self.depth))
         checked_pose(self.pose)
         if self.floor is not None:
             _finite(self.floor, "floor", ())
@@ -111,6 +115,12 @@ def window_of(image: DepthImage, sphere: Sphere, grid: int) -> Window:
         )
     size = np.shape(image.depth)[::-1]
     spans = _sphere_in_image(-eye @ axes, K, size)
+    across = 2 * min(K[0, 0], K[1, 1]) / math.sqrt(distance**2 - 1)
+    if across < _LEAST_ACROSS:
+        raise ValueError(
+            f"the object's sphere is only {across:.1f} pixels across in the image, and {_LEAST_ACROSS} are needed; move the "
+            "camera closer, take a larger image, or check K and the radius"
+        )
     steps = [-(-(last - first) // grid) for first, last in spans]
     (columns, rows) = (slice(first, last, step) for (first, last), step in zip(spans, steps, strict=True))
     samples, marks = np.full((grid, grid), np.nan, np.float32), np.ones((grid, grid), bool)
@@ -180,6 +190,21 @@ def checked_intrinsics(intrinsics: AnyArray) -> np.ndarray:
             f"got {K.tolist()}"
         )
     return K
+
+
+def _check_camera(K: Float[np.ndarray, "3 3"], shape: tuple[int, ...]) -> None:
+    """Refuses intrinsics that no depth camera has whose images are of a shape (height, width)."""
+    size = np.array(shape[::-1])
+    across = np.rad2deg(2 * np.arctan(size / 2 / K[[0, 1], [0, 1]]))
+    of = f"for an image of {size[0]}×{size[1]} pixels; give K of this resolution"
+    if not _FIELDS[0] < across.min() <= across.max() < _FIELDS[1]:
+        raise ValueError(
+            f"K has a field of view of {across[0]:.3g}° by {across[1]:.3g}° {of}, with fx and fy in pixels"
+        )
+    if (K[:2, 2] < -0.5).any() or (K[:2, 2] > size - 0.5).any():
+        raise ValueError(
+            f"K has its principal point ({K[0, 2]:g}, {K[1, 2]:g}) outside, {of}; give whole images, with a mask, not parts"
+        )
 
 
 def checked_pose(T_world_camera: AnyArray) -> np.ndarray:

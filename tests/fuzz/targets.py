@@ -23,6 +23,7 @@ from mevs_jax.trained import UnreadableSystem, load, save
 from mevs_jax.trained.arrays import DESCRIPTION, WEIGHTS
 from mevs_jax.trained.writing import hash_of
 from tests.data_pipeline.objects import making
+from tests.fuzz.operators import changed
 from tests.mevs_jax.trained import making as systems
 from tests.train.weights import making as weights
 from train.weights.files import read_state_dict
@@ -268,12 +269,12 @@ _PIECES = [
 
 
 @st.composite
-def mutated(draw: st.DrawFn, name: str) -> bytes:
-    """Returns an input of a reader with up to eight mutations."""
+def mutated(draw: st.DrawFn, name: str, most: int = 8) -> bytes:
+    """Returns an input of a reader with up to eight mutations, or another number of them."""
     content = bytearray(draw(st.sampled_from(starts(name))))
-    for _ in range(draw(st.integers(1, 8))):
+    for _ in range(draw(st.integers(1, most))):
         at = draw(st.integers(0, max(len(content) - 1, 0)))
-        kind = draw(st.integers(0, 5))
+        kind = draw(st.integers(0, 8))
         if kind == 0:  # one bit
             content[at : at + 1] = bytes(byte ^ (1 << draw(st.integers(0, 7))) for byte in content[at : at + 1])
         elif kind == 1:  # cut off the end
@@ -283,6 +284,8 @@ def mutated(draw: st.DrawFn, name: str) -> bytes:
         elif kind == 3:  # a part again, or a part of elsewhere
             start = draw(st.integers(0, max(len(content) - 1, 0)))
             content[at:at] = content[start : start + draw(st.integers(1, 60))]
+        elif kind > 5:  # what knows the formats is drawn as often as what does not
+            content = bytearray(draw(changed(bytes(content))))
         else:
             piece = draw(st.sampled_from(_PIECES) if kind == 4 else st.binary(min_size=1, max_size=8))
             content[at : at + draw(st.integers(0, len(piece)))] = piece

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 import mevs_jax
+from mevs_jax.agent.looking import Frames
 
 WORDS = (None, "a", [], {})
 NUMBERS = (*WORDS, float("nan"))
@@ -29,6 +30,7 @@ WRONG: dict[str, tuple[Any, ...]] = {
     "K": WORDS,
     "T_world_camera": WORDS,
     "mask": ("a", np.full((32, 32), "a"), np.full((32, 32), -1), np.full((32, 32), 0.01)),
+    "mask of Frames": ("a", np.full((1, 32, 32), "a"), np.full((1, 32, 32), -1), np.full((1, 32, 32), 0.01)),
     "floor": ("a", [], float("nan")),
     "depth of observe_view": (*WORDS, np.full((32, 32), np.nan)),
     "pose": WORDS,
@@ -48,12 +50,14 @@ def calls(system: Any, agent: Any, image: tuple[Any, ...], view: tuple[Any, ...]
     sphere = {"center": (0, 0, 0), "radius": 1.0}
     mesh = np.eye(3), np.array([[0, 1, 2]])
     depth, K, pose = image
+    recorded = {"depth": depth[None], "K": K, "T_world_camera": pose[None], "center": (0, 0, 0), "radius": 1.0}
     made: dict[str, Callable[[Any], Any]] = {
         "points": agent.reset_from_points,
         "depth": lambda value: agent.observe(value, K, pose),
         "K": lambda value: agent.observe(depth, value, pose),
         "T_world_camera": lambda value: agent.observe(depth, K, value),
         "depth of observe_view": lambda value: agent.observe_view(value, view[1]),
+        "mask of Frames": lambda value: Frames.of(recorded | {"mask": value}).image(0),
         "pose": lambda value: agent.observe_view(view[0], value),
         "mark_failed": agent.mark_failed,
         "path": mevs_jax.load,

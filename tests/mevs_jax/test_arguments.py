@@ -85,7 +85,7 @@ REFUSED = {
         views=6, abstractions=[Abstraction(8, 0.4, 0, (8,))], rngs=nnx.Rngs(0)
     ),
     "points have shape": lambda: making_agent().reset_from_points(np.zeros((9, 2))),
-    f"max_candidates must be from 1 to {MOST_CANDIDATES}, got 20000": lambda: making_agent(max_candidates=20_000),
+    f"max_candidates must be from 1 to {MOST_CANDIDATES}, got 200000": lambda: making_agent(max_candidates=200_000),
     "seed must be a whole number of 32 bits": lambda: making_agent(seed=2**40),
     "count must be at least 1, got 0": lambda: making.system().log_probabilities(jnp.zeros(4), 0),
     "max_views must be from 1 to 512, got 0": lambda: export(making.system(), "x", max_views=0),

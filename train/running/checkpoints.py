@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import logging
 import shutil
+import sys
 from copy import deepcopy
 from pathlib import Path
 from types import TracebackType
@@ -23,6 +24,16 @@ from train.running.preemption import interrupts_held
 
 for _name in ("absl", "asyncio"):  # Orbax logs every step, and the errors of its threads, which it raises as well
     logging.getLogger(_name).setLevel(logging.CRITICAL)
+_say_unraisable = sys.unraisablehook
+
+
+def _say(lost: sys.UnraisableHookArgs) -> None:
+    """Prints what Python cannot raise, but not that threads of TensorStore answer a save that has failed, which is said once."""
+    if not (lost.exc_type is RuntimeError and str(lost.exc_value) == "Event loop is closed"):
+        _say_unraisable(lost)
+
+
+sys.unraisablehook = _say
 
 
 def _placed(leaf: Any) -> Any:

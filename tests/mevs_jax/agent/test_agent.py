@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import resource
 from dataclasses import replace
 from functools import cache
 
@@ -16,6 +17,7 @@ from mevs_jax.agent import Agent, load_history, replay
 from mevs_jax.agent.candidates import candidates_of, pose_towards
 from mevs_jax.agent.looking import Frames, look_at_frames
 from mevs_jax.beliefs.fusing import running_sum
+from mevs_jax.geometry.viewpoints import fibonacci_sphere
 from mevs_jax.selection.loop import ViewTable, by_attention, select_from_table
 from tests.mevs_jax.trained import making
 
@@ -322,6 +324,23 @@ def test_candidates_may_be_any_poses(classifier):
     assert agent.decide(candidates=near[None]).reason == "nothing reachable"  # it was seen from there
     with pytest.raises(ValueError, match="make it with max_candidates=200"):
         agent.decide(candidates=np.repeat(around[:1], 200, axis=0))
+
+
+def test_of_many_candidates_the_cheapest_from_each_direction_are_compared(classifier):
+    every = fibonacci_sphere(20_000)
+    poses = pose_towards(every, CENTER, 0.9, UP)
+    agent = Agent(classifier, "farthest", stop=2, max_candidates=20_000, gain_per_cost=1e-6)
+    agent.reset(center=CENTER, radius=RADIUS, yaw=0.0)
+    agent.observe_view(making.depth_of_ball(classifier.viewpoints[0]), pose_at(*classifier.viewpoints[0].tolist()))
+    cost = np.random.default_rng(0).uniform(size=len(every))
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    step = agent.decide(candidates=poses, cost=cost, reachable=every[:, 2] > 0)
+    assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 200_000  # in kB
+    np.testing.assert_array_equal(step.T_world_camera, poses[step.index])
+    assert every[step.index, 2] > 0
+    angles = np.arccos(np.clip(every @ classifier.viewpoints[0], -1, 1))
+    assert angles[step.index] > angles[every[:, 2] > 0].max() - 0.15
+    assert np.mean(cost[every @ every[step.index] > np.cos(0.05)] < cost[step.index]) < 0.3
 
 
 @pytest.mark.parametrize("policy", ["information_gain", "farthest", "predicted_entropy"])

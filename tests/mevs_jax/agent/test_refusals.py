@@ -52,6 +52,17 @@ def test_a_view_taken_again_is_no_new_evidence(system):
         agent.observe(*_camera(shot(system, 9)))
 
 
+def test_another_image_from_the_same_pose_is_refused(system, agent):
+    depth, pose = shot(system, 2)
+    agent.observe(depth, K, pose)
+    with pytest.raises(
+        ValueError, match=r"depth is another than that of image 0, taken from there, at \d+% of the object's"
+    ):
+        agent.observe(depth - 0.4 * RADIUS, K, pose)
+    noise = np.random.default_rng(0).normal(0, 0.02 * RADIUS, depth.shape).astype(np.float32)
+    assert agent.observe(depth + noise, K, pose).images == 2
+
+
 def _camera(taken):
     return taken[0], K, taken[1]
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import shutil
 import subprocess
 import sys
 
@@ -52,3 +53,16 @@ def test_the_oldest_programs_go_first(tmp_path):
         os.utime(tmp_path / name, (1000 - age, 1000 - age))
     _prune(tmp_path, 250)
     assert sorted(path.name for path in tmp_path.iterdir()) == ["a-cache", "b-cache", "notes.txt"]
+
+
+def test_a_copied_folder_is_used(tmp_path):
+    given = {name: value for name, value in os.environ.items() if name != "JAX_COMPILATION_CACHE_DIR"}
+    for folder in ("own", "copy"):
+        command = [sys.executable, "-c", SECOND, str(tmp_path / folder)]
+        assert subprocess.run(command, capture_output=True, env=given, timeout=300).returncode == 0
+        kept = sorted(path.name for path in (tmp_path / folder).glob("*-cache"))
+        if folder == "own":
+            shutil.copytree(tmp_path / "own", tmp_path / "copy")
+            before = kept
+    assert before
+    assert kept == before

@@ -5,6 +5,8 @@ from __future__ import annotations
 import json
 import shutil
 import signal
+import subprocess
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -150,3 +152,32 @@ def test_an_interrupt_waits_for_the_checkpoint(tmp_path, monkeypatch):
         np.testing.assert_array_equal(restored[0]["weights"], state["weights"])
     with pytest.raises(KeyboardInterrupt):
         signal.raise_signal(signal.SIGINT)
+
+
+FILL = """
+import sys
+from pathlib import Path
+import jax.numpy as jnp
+from data_pipeline.files import why_not_written
+from train.running.checkpoints import Checkpoints
+try:
+    with Checkpoints(Path(sys.argv[1])) as checkpoints:
+        checkpoints.save("latest", 1, {str(at): jnp.arange(300_000.0) * at for at in range(20)}, {"epoch": 1})
+except Exception as error:
+    print(why_not_written(error), file=sys.stderr)
+"""
+
+
+def test_a_full_disk_is_one_sentence(tmp_path):
+    """On a disk of 3 MB. The threads that write answer later, when nothing listens any more."""
+    disk = tmp_path / "disk"
+    disk.mkdir()
+    if subprocess.run(["mount", "-t", "tmpfs", "-o", "size=3m", "tmpfs", disk], capture_output=True).returncode:
+        pytest.skip("only root may mount a small disk")
+    try:
+        ended = subprocess.run([sys.executable, "-c", FILL, str(disk)], capture_output=True, text=True, timeout=300)
+    finally:
+        subprocess.run(["umount", "-l", disk], check=True)
+    assert ended.stderr.splitlines() == [
+        "cannot write: the disk is full; free some space, and the same command goes on"
+    ]

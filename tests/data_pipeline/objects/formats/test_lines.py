@@ -13,7 +13,19 @@ from data_pipeline.objects.formats import parse_mesh
 from data_pipeline.objects.formats.text import number, numbers, whole_number
 from data_pipeline.objects.mesh import normalise
 from data_pipeline.objects.recipes import read_mesh
-from tests.data_pipeline.objects.making import BOX_AREA, area, box, check, extent, obj, off, ply, stl, triangles_of
+from tests.data_pipeline.objects.making import (
+    BOX_AREA,
+    area,
+    box,
+    check,
+    extent,
+    obj,
+    off,
+    ply,
+    stl,
+    triangles_of,
+    u_profile,
+)
 
 BOX = box()
 TETRAHEDRON = (
@@ -216,3 +228,10 @@ def test_thin_faces_have_an_area():
     thin = np.array([[0, 0, 0], [1e5, 0, 0], [0, 1, 0]]) + 3e5
     assert len(normalise(thin, np.array([[0, 1, 2]]), "sheet").faces) == 1
     assert len(normalise(np.float32(thin), np.array([[0, 1, 2]]), "sheet").faces) == 1
+
+
+def test_a_vertex_too_few_is_not_called_a_file_that_is_cut_short():
+    lines = off(*u_profile()).decode().splitlines()
+    assert "its 16 vertices end within the line '8 7 6 5 4 3 2 1 0'" in refused(
+        "\n".join(lines[:9] + lines[10:]), ".off"
+    )
