@@ -18,7 +18,7 @@ import numpy as np
 from jaxtyping import Float
 
 from mevs_jax.agent.candidates import candidates_of, costs_of, mask_of, near_object, pose_towards
-from mevs_jax.agent.present import Present, check_shown, sphere_of
+from mevs_jax.agent.present import Present, check_new, check_shown, sphere_of
 from mevs_jax.agent.programs import Programs
 from mevs_jax.agent.records import Belief, History, Reason, Step, plain
 from mevs_jax.arguments import number, numbers, whole
@@ -295,7 +295,8 @@ class Agent:
             bool(np.isfinite(placed).all()) and bool(placed[:3, 3].any()),
             "pose is not finite, or at the object's centre",
         )
-        check_shown(image, self.system, placed, self.history)
+        check_shown(image, self.system)
+        check_new(image, placed, self.history)
         unknown = share_of_sphere(np.isnan(image), self.system.description.camera)
         told = self.system.description.told_unknown
         _check(told or unknown <= 0.5, f"{unknown:.0%} of the object's sphere is unknown; this system needs half of it")

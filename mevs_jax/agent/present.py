@@ -84,7 +84,8 @@ class Present:
         """A new image as the data set's camera would have taken it; raises `ValueError` if it shows too little of the object, or
         something else than an image of before from there."""
         view = convert(image, self.sphere, system.description.camera)
-        check_shown(view.image, system, self.placed(system, view), history)
+        check_shown(view.image, system)
+        check_new(view.image, self.placed(system, view), history)
         if system.description.told_unknown:
             return view
         if view.in_image < LEAST:
@@ -166,17 +167,18 @@ class Present:
         return again, again.with_parts(system, image, newest)
 
 
-def check_shown(
-    depth: Float[np.ndarray, "side side"], system: TrainedSystem, pose: Float[np.ndarray, "4 4"], history: History
-) -> None:
-    """Raises `ValueError` for an image of the data set's camera that shows next to nothing of the object, or something else than
-    an image of before from the same direction."""
+def check_shown(depth: Float[np.ndarray, "side side"], system: TrainedSystem) -> None:
+    """Raises `ValueError` for an image of the data set's camera that shows next to nothing of the object."""
     shown, pixels = int((depth > 0).sum()), int(in_sphere(system.description.camera, len(depth)).sum())
     if shown < _LEAST_PIXELS * pixels:
         raise ValueError(
             f"depth shows the object at only {shown} of the {pixels} pixels of its sphere; aim the camera at its center, move "
             "closer, or check the mask"
         )
+
+
+def check_new(depth: Float[np.ndarray, "side side"], pose: Float[np.ndarray, "4 4"], history: History) -> None:
+    """Raises `ValueError` for an image that shows something else than one of before from the same direction."""
     for number, (before, at) in enumerate(zip(history.depths, history.poses, strict=True)):
         apart = np.linalg.norm(at[:3, 3] / np.linalg.norm(at[:3, 3]) - pose[:3, 3] / np.linalg.norm(pose[:3, 3]))
         both = (before > 0) & (depth > 0)  # masks may show one part after the other
