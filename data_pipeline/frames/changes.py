@@ -238,7 +238,7 @@ def fitted(family: Family, said: Geometry, pairs: Int[np.ndarray, "pairs 2"]) ->
         weight = 1 / (1 + (right / np.median(np.abs(right)).clip(1e-6)) ** 2)
         normal = (slope * weight[:, None]).T @ slope
         damping = 1e-6 * np.trace(normal) * np.eye(family.numbers)
-        step = np.linalg.solve(normal + damping, (slope * weight[:, None]).T @ right)
+        step = np.linalg.lstsq(normal + damping, (slope * weight[:, None]).T @ right)[0]
         numbers = numbers - step
         if widest == _WIDEST[-1] and np.abs(step).max() < _CONVERGED:
             break

@@ -31,6 +31,12 @@ _FEWEST = 0.6
 """Share of points that agree between the nearest images of a sound recording, at least."""
 _DEPTHS = (0.05, 50.0)
 """Metres between which the middle of all depths is plausible."""
+_FITTED = 112
+"""Pairs of images by which a fault's size is estimated."""
+_REPEATED = 0.05
+"""Share of the images that may be copies, or have the pose of the one before."""
+_CHANGED = 0.03
+"""Share of the pixels that change in images of a camera that stands still, by noise at edges, at most."""
 _LEVEL = np.cos(np.radians(10))
 
 
@@ -120,16 +126,13 @@ def _plain(recording: Recording, said: Geometry) -> list[Finding]:
         raise DataError("there is one image; faults of poses and intrinsics show between two")
     still = np.isclose(poses[1:], poses[:-1], atol=1e-9).all(axis=(1, 2))
     same = np.array([np.array_equal(one, other) for one, other in zip(said.depth[1:], said.depth[:-1], strict=True)])
-    if still.all() and not same.all():
-        found.append(Finding("one pose for all images", "the images differ: give each its own pose"))
-    elif (stale := int((still & ~same).sum())) > 0.02 * len(poses):
-        found.append(
-            Finding(
-                "stale poses",
-                f"{stale} images have the pose of the image before, to the last digit, and show something else",
-            )
-        )
-    if (stale := int((same & ~still).sum())) > 0.02 * len(poses):
+    if still.any() and _changed(said, still) > _CHANGED:
+        if still.all():
+            found.append(Finding("one pose for all images", "the images differ: give each its own pose"))
+        elif (stale := int(still.sum())) > _REPEATED * len(poses):
+            what = f"{stale} images have the pose of the image before, to the last digit, and show something else"
+            found.append(Finding("stale poses", what))
+    if (stale := int((same & ~still).sum())) > _REPEATED * len(poses):
         found.append(Finding("stale images", f"{stale} images are copies of the image before, with another pose"))
     if times is not None and (stale := int((np.diff(times) <= 0).sum())):
         found.append(Finding("stale times", f"{stale} images have a time that is not after that of the image before"))
@@ -137,6 +140,16 @@ def _plain(recording: Recording, said: Geometry) -> list[Finding]:
         unit = "millimetres were read as metres" if middle > _DEPTHS[1] else "metres were read as millimetres"
         found.append(Finding("implausible depth", f"the images show things {middle:.3g} m away: perhaps {unit}"))
     return found
+
+
+def _changed(said: Geometry, still: np.ndarray) -> float:
+    """Share of the pixels that changed since the camera took its pose, in the median image of those that have an old pose."""
+    first = np.maximum.accumulate(np.where(np.r_[True, ~still], np.arange(len(still) + 1), 0))
+    images = np.flatnonzero(still) + 1
+    now, before = (said.depth[chosen, ::2, ::2] for chosen in (images, first[images]))
+    both = (now > 0) & (before > 0)
+    changed = both & (np.abs(now - before) > 2 * NEAR * before)
+    return float(np.median(changed.sum(axis=(1, 2)) / np.maximum(both.sum(axis=(1, 2)), 1)))
 
 
 def _level(said: Geometry, pairs: np.ndarray) -> Level:
@@ -171,9 +184,10 @@ def _other_reading(said: Geometry, pairs: np.ndarray) -> list[Finding]:
     for change in discrete(said):
         if gain := gain_of(change.geometry):
             readings.append((gain, change.name, change.advice))
+    some = np.random.default_rng(0).permutation(pairs)[:_FITTED]
     if max((gain for gain, *_ in readings), default=0.0) < 0.1:  # none that undoes a fault without a size
         for family in FAMILIES:
-            numbers = fitted(family, said, pairs[::3])
+            numbers = fitted(family, said, some)
             if (np.abs(numbers) > family.least).any() and (gain := gain_of(family.change(said, numbers))):
                 readings.append((gain, family.name, family.advice(said, numbers)))
     if not readings:
