@@ -59,14 +59,14 @@ def test_steps_on_many_devices_equal_those_on_one(data):
 
 @pytest.mark.slow
 def test_a_job_that_is_killed_within_epochs_ends_with_the_same_weights(data, tmp_path):
-    """By SIGKILL, at steps apart from the checkpoints; at most so many steps as lie between two are done again."""
+    """By SIGKILL, at steps apart from the checkpoints. The newest of them may not be written yet, but then the one before is."""
     every, kills = 3, (2, 5, 7, 14, 17, 25)
     statistics = load_statistics(data)
     for at in kills:
         done = work(data=data, devices=1, out=tmp_path / "killed", stop_at=at, by=int(signal.SIGKILL), every=every)
         assert done.returncode == -signal.SIGKILL, done.stderr
         with Checkpoints(tmp_path / "killed") as checkpoints:
-            assert at - checkpoints.latest_step("latest") <= every + 1  # one save may have been under way
+            assert at - checkpoints.latest_step("latest") < 2 * every
     assert work(data=data, devices=1, out=tmp_path / "killed", stop_at=10**6, every=every).returncode == 0
     task = quick_tasks(statistics)[1]
     assert work(data=data, devices=1, out=tmp_path / "whole", stop_at=10**6).returncode == 0
