@@ -34,8 +34,8 @@ class OptimiserConfig:
     epoch_steps: int = 0
     """least number of steps of an epoch: where there are few objects, each gives more views than `epoch_views`"""
     checkpoint_steps: int = 1000
-    """steps between two checkpoints within an epoch; a job that is killed repeats fewer than twice so many, since the last may not be
-    written yet; 0: none within an epoch"""
+    """steps between two checkpoints within an epoch. The last may not be written yet when a job is killed, which then repeats
+    fewer than twice so many. 0: none within an epoch"""
     validation_views: int = 0
     """views of each validation object that are evaluated after an epoch; 0: all"""
     method: Literal["adam", "muon"] = "adam"
