@@ -92,6 +92,7 @@ def _on_each(function: Callable[..., Array], mapped: tuple[int | None, ...], dev
     def share(axis: int | None) -> PartitionSpec:
         return PartitionSpec() if axis is None else PartitionSpec(*[None] * axis, "devices")
 
-    mesh = AbstractMesh((devices,), ("devices",), (AxisType.Auto,))
+    device = getattr(jax.sharding.get_abstract_mesh(), "abstract_device", None)  # of a GPU that is not here
+    mesh = AbstractMesh((devices,), ("devices",), (AxisType.Auto,), **({"abstract_device": device} if device else {}))
     result = share(None if set(mapped) == {None} else 0)
     return jax.shard_map(function, mesh=mesh, in_specs=tuple(map(share, mapped)), out_specs=result, check_vma=False)

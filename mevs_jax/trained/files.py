@@ -17,8 +17,6 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-import jax
-
 from mevs_jax.gallery.matching import SIDE
 from mevs_jax.plain import from_plain
 from mevs_jax.policies.registry import POLICIES
@@ -170,10 +168,7 @@ def _sound(folder: Path) -> Iterator[None]:
         raise
     except (ValueError, TypeError, LookupError, AttributeError, ArithmeticError, RecursionError, MemoryError) as error:
         reason = (str(error).strip() or type(error).__name__).splitlines()[0][:300]
-        problem = f"{folder} is not a trained system that can be read ({reason})"
-        if kept := getattr(jax.config, "jax_compilation_cache_dir", None):  # its programs may be under wrong names
-            raise UnreadableSystem(f"{problem}; delete the compiled programs in {kept}, or export it again") from error
-        raise _unreadable(problem) from error
+        raise _unreadable(f"{folder} is not a trained system that can be read ({reason})") from error
 
 
 def _read_description(folder: Path) -> tuple[Description, Any]:

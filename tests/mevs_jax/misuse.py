@@ -35,7 +35,7 @@ WRONG: dict[str, tuple[Any, ...]] = {
     "depth of observe_view": (*WORDS, np.full((32, 32), np.nan)),
     "pose": WORDS,
     "reachable": ("a", [None], [1.5], 99),
-    "cost": ("a", [None] * 12, len),
+    "cost": ("a", [None] * 12, lambda pose: "a"),
     "candidates": ("a", 3, [None], {}),
     "mark_failed": NUMBERS,
     "first": ("a", 0.5, 12, -1),
