@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -84,7 +84,7 @@ def scene_in(
     planes = planes_in(surfaces)
     upwards = upward_of(planes, recording.T_world_camera) if up is None else upright(up)[2]
     if masks is None:
-        return objects_in(surfaces, planes, upwards, floor)
+        return objects_in(surfaces, recording, planes, upwards, floor)
     return objects_by_masks(
         surfaces, recording, masks, upwards, ground_of(surfaces, planes, upwards) if floor is None else floor
     )
@@ -93,12 +93,15 @@ def scene_in(
 def look_at_scene(system: TrainedSystem, recording: Recording, scene: Scene, **options: Any) -> list[Sight]:
     """Recognises every object, from what all images together show of it from the system's viewpoints.
 
+    The images are there already, so no walk ends before its budget, and an answer is sure by what all its views say.
+
     Args:
         system: that is told what is unknown.
         recording, scene: of `scene_in`.
         options: of `mevs_jax.Agent`.
     """
-    agent, seen = system.agent(**options), []
+    stop, seen = options.pop("stop", 0.95), []
+    agent = system.agent(**options, stop=2.0)
     if not system.description.told_unknown:
         raise ValueError(
             "this system is not told which pixels are unknown, which a scene needs; train one with five channels"
@@ -106,6 +109,8 @@ def look_at_scene(system: TrainedSystem, recording: Recording, scene: Scene, **o
     for number, sphere in enumerate(scene.spheres):
         try:
             walk = look_at_views(agent, sphere, views_of(scene, recording, number, system))
+            if walk.beliefs[-1].known and walk.confidence >= stop:
+                walk = replace(walk, reason="sure")
         except ShowsTooLittle:
             walk = None
         seen.append(Sight(sphere, walk))

@@ -33,6 +33,8 @@ _NEAR = 3.0
 """Cells between neighbouring points of one thing."""
 _FLAT = 2.5
 """Cells from a plane within which points belong to it."""
+_COLUMNS, _GOES_ON = 40, 0.1
+"""Places below an object that are looked at, and metres that no image has shown there from which on it may go on."""
 _LEAST = 60
 """Points of the smallest object."""
 GROUND, PIECE = -1, -2
@@ -61,11 +63,16 @@ class Scene:
 
 
 def objects_in(
-    surfaces: Surfaces, planes: list[Plane], up: Float[np.ndarray, " 3"], floor: float | None = None
+    surfaces: Surfaces,
+    recording: Recording,
+    planes: list[Plane],
+    up: Float[np.ndarray, " 3"],
+    floor: float | None = None,
 ) -> Scene:
     """Finds what stands on the ground: clusters of points, of which boards such as table tops are cut from what touches them.
 
     Args:
+        recording: what the surfaces are made of.
         planes: of the surfaces.
         up: (3,) unit vector.
         floor: height of the ground along it; by default that of the lowest large level plane.
@@ -96,7 +103,7 @@ def objects_in(
         labels[cluster] = own
         count += own == count
     labels[free & (labels < 0)] = PIECE
-    return _named(surfaces, labels, up, floor, len(boards))
+    return _named(surfaces, recording, labels, up, floor, len(boards))
 
 
 def objects_by_masks(
@@ -128,10 +135,12 @@ def objects_by_masks(
         seen = np.flatnonzero((pixel >= 0) & (np.abs(measured - z) < 2 * surfaces.cell))
         votes[seen, np.searchsorted(known, mask.ravel()[pixel[seen]])] += 1
     labels = known[votes.argmax(axis=1)].astype(int) - 1
-    return _named(surfaces, np.where(votes.any(axis=1), labels, GROUND), up, floor, 0)
+    return _named(surfaces, recording, np.where(votes.any(axis=1), labels, GROUND), up, floor, 0)
 
 
-def _named(surfaces: Surfaces, labels: np.ndarray, up: np.ndarray, floor: float, boards: int) -> Scene:
+def _named(
+    surfaces: Surfaces, recording: Recording, labels: np.ndarray, up: np.ndarray, floor: float, boards: int
+) -> Scene:
     """The scene of labelled points, of which the first labels are of boards: without pieces that are too small."""
     sizes = np.bincount(labels[labels >= 0])
     kept = np.flatnonzero(sizes >= _LEAST)
@@ -140,13 +149,46 @@ def _named(surfaces: Surfaces, labels: np.ndarray, up: np.ndarray, floor: float,
     renamed = np.full(len(sizes), PIECE)
     renamed[kept] = np.arange(len(kept))
     labels = np.where(labels < 0, labels, renamed[labels])
-    spheres = []
+    spheres, tree = [], cKDTree(surfaces.points)
     for number, old in enumerate(kept):
         shown = surfaces.points[labels == number]
         if old < boards:  # its legs may be hidden
             shown = np.concatenate([shown, shown + np.outer(floor - shown @ up, up)])
+        elif (further := _hidden_below(shown, surfaces, tree, recording, up, floor)) > _GOES_ON:
+            shown = np.concatenate([shown, shown[_lowest(shown @ up)] - further * up])
         spheres.append(Sphere(*estimate_sphere(shown, up=up), up))
     return Scene(surfaces, labels, tuple(spheres), up, floor, int(np.sum((sizes > 0) & (sizes < _LEAST))))
+
+
+def _lowest(heights: Float[np.ndarray, " points"]) -> Bool[np.ndarray, " points"]:
+    """Which points are of the lowest part of an object."""
+    bottom, top = np.quantile(heights, [0.02, 0.98])
+    return heights < bottom + max(0.1 * (top - bottom), 0.02)
+
+
+def _hidden_below(
+    shown: Float[np.ndarray, "points 3"],
+    surfaces: Surfaces,
+    tree: cKDTree,
+    recording: Recording,
+    up: Float[np.ndarray, " 3"],
+    floor: float,
+) -> float:
+    """How far below an object no image has shown what is there, in metres: it may go on there, as the back of a chair does."""
+    low = shown[_lowest(shown @ up)]
+    low = low[:: max(1, len(low) // _COLUMNS)]
+    depths = np.arange(2 * surfaces.cell, float(np.min(low @ up)) - floor, surfaces.cell)
+    if not len(depths):
+        return 0.0
+    points = (low[:, None] - depths[:, None] * up).reshape(-1, 3)
+    hidden = np.isinf(tree.query(points, distance_upper_bound=1.5 * surfaces.cell)[0])
+    for depth, K, pose in zip(recording.depth, recording.K, recording.T_world_camera, strict=True):
+        left = np.flatnonzero(hidden)
+        _, z, measured = projected(points[left], depth, K, pose)
+        hidden[left[measured > z + surfaces.cell]] = False
+    columns = hidden.reshape(len(low), -1)
+    runs = np.where(columns.all(axis=1), len(depths), (~columns).argmax(axis=1))
+    return float(np.median(runs)) * surfaces.cell
 
 
 def ground_of(surfaces: Surfaces, planes: list[Plane], up: Float[np.ndarray, " 3"]) -> float:

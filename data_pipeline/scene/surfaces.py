@@ -85,7 +85,9 @@ def fuse(recording: Recording) -> Surfaces:
     if not len(mesh.vertex.positions):
         raise DataError("no surface was seen by enough images; record more of them, or check their poses")
     points, normals = (array.numpy().astype(float) for array in (mesh.vertex.positions, mesh.vertex.normals))
-    return Surfaces(points, normals, mesh.triangle.indices.numpy(), cell)
+    order = np.lexsort(points.T)  # that of Open3D differs by run
+    faces = np.argsort(order)[mesh.triangle.indices.numpy()]
+    return Surfaces(points[order], normals[order], faces[np.lexsort(faces.T)], cell)
 
 
 def without_edges(depth: Float[np.ndarray, "height width"]) -> Float[np.ndarray, "height width"]:
@@ -111,24 +113,36 @@ def projected(
 
 def planes_in(surfaces: Surfaces) -> list[Plane]:
     """The largest planes, by random triples of points."""
-    open3d = load_open3d()
-    open3d.utility.random.seed(0)
-    left, planes = np.random.default_rng(0).permutation(len(surfaces.points))[:_SAMPLE], []
+    random, planes = np.random.default_rng(0), []
+    left = random.permutation(len(surfaces.points))[:_SAMPLE]
     for _ in range(_PLANES):
         if len(left) < 100:
             break
-        cloud = open3d.geometry.PointCloud(open3d.utility.Vector3dVector(surfaces.points[left]))
-        (*normal, _), near = cloud.segment_plane(2 * surfaces.cell, 3, _TRIES)
-        turned = surfaces.normals[left[near]] @ np.array(normal)
+        normal, near = _largest_plane(surfaces.points[left], 2 * surfaces.cell, random)
+        turned = surfaces.normals[left[near]] @ normal
         sign = np.sign(turned.sum())
         chosen = left[near][sign * turned > _ALIGNED]
         if len(chosen) >= 3:
             points = surfaces.points[chosen]
             exact = np.linalg.svd(points - points.mean(axis=0), full_matrices=False)[2][2]
-            exact *= np.sign(exact @ np.array(normal)) * sign
+            exact *= np.sign(exact @ normal) * sign
             planes.append((exact, float(np.median(points @ exact)), len(chosen)))
         left = np.delete(left, near)
     return planes
+
+
+def _largest_plane(
+    points: Float[np.ndarray, "points 3"], within: float, random: np.random.Generator
+) -> tuple[Float[np.ndarray, " 3"], Int[np.ndarray, " members"]]:
+    """The normal of the plane through three of the points that most others are near, and those; Open3D's differs by run."""
+    first, second, third = points[random.integers(len(points), size=(3, _TRIES))]
+    normals = np.cross(second - first, third - first)
+    normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
+    heights = np.sum(normals * first, axis=1)
+    parts = np.array_split(np.arange(_TRIES), _TRIES // 50)
+    counts = np.concatenate([(np.abs(points @ normals[some].T - heights[some]) < within).sum(axis=0) for some in parts])
+    best = counts.argmax()
+    return normals[best], np.flatnonzero(np.abs(points @ normals[best] - heights[best]) < within)
 
 
 def upward_of(planes: list[Plane], poses: Float[np.ndarray, "frames 4 4"]) -> Float[np.ndarray, " 3"]:
