@@ -403,7 +403,7 @@ class Agent:
         belief = self._current.belief
         if belief is None:
             return ""
-        enough = belief.evidence >= _ENOUGH or not self.system.description.told_unknown
+        enough = (belief.evidence >= _ENOUGH or not self.system.description.told_unknown) and not belief.doubt
         target = None if self._target is None else float(belief.probabilities[self._target])
         sure = (belief.confidence if target is None else max(target, 1 - target)) >= self.stop and enough
         spent = belief.images >= self.max_views

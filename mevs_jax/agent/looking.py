@@ -87,6 +87,8 @@ def look(
 ) -> Walk:
     """Recognises a mesh: renders it from the views that the agent chooses.
 
+    Which way the mesh faces is not known. A system whose policy needs a yaw is told 0, as if it faced as training objects do.
+
     Args:
         system: from `mevs_jax.load`.
         vertices: corners, z up, in any unit; centre and size are taken from the mesh.
@@ -108,7 +110,9 @@ def look(
     known = 1.0
     if metres is not None:
         known = radius * number(metres, "metres must be positive, or None", lambda one: 0 < one < np.inf)
-    agent.reset(center=(0.0, 0.0, 0.0), radius=known, yaw=0.0, true_size=metres is not None)
+    unposed = system.parts.fusion and system.can_run(agent.policy, posed=False)
+    yaw = None if unposed else 0.0
+    agent.reset(center=(0.0, 0.0, 0.0), radius=known, yaw=yaw, true_size=metres is not None)
 
     def take(index: int) -> Belief:
         pose = np.asarray(look_at_origin(jnp.asarray(system.viewpoints[index]) * camera.distance))

@@ -35,7 +35,7 @@ class Belief(ByContent):
         images: number of images seen, which the budget counts.
         strangeness: share of the known objects that look less strange after as many views, in [0, 1]; NaN if it is not measured.
         known: False if the object is stranger than the agent's limit `unknown`, or most likely of the class of unknown objects.
-        evidence: how much of the object was seen, in views that show all of its sphere.
+        evidence: how much of the object's sphere was seen, known background included, in views that show all of it.
         unseen: share of the object's sphere that the latest view does not show, in [0, 1]; a view may be combined from images.
         pose: of the most likely object, if it is an enrolled one.
         doubt: what is wrong with the latest image, its camera or the sphere, by what it shows; empty if nothing was noticed.

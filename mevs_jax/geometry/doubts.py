@@ -76,7 +76,8 @@ def doubt_of(image: DepthImage, window: Window) -> str:
     left, right, top, bottom = window.limits
     edge = np.minimum(number - left, right - number) < 2 * step, np.minimum(number - top, bottom - number) < 2 * step
     ends = inside & (edge[0][None, :] | edge[1][:, None])
-    whole = looks.any() and np.mean(hidden[looks & (depth == depth)]) < _HIDDEN and ends.sum() < 3
+    within = ((number >= left) & (number <= right))[None, :] & ((number >= top) & (number <= bottom))[:, None]
+    whole = looks.any() and np.mean(hidden[looks & within]) < _HIDDEN and ends.sum() < 3
     return _of_outline(points[inside], eye) if inside.any() and whole else ""
 
 
