@@ -20,11 +20,16 @@ EXAMPLES = Path(__file__).resolve().parents[2] / "examples"
         pytest.param("depth_camera", " views: sure", marks=pytest.mark.slow),
         pytest.param("gymnasium_ppo", "| PPO − random | +0.0 ", marks=pytest.mark.slow),
         pytest.param("own_encoder", "validation accuracy", marks=pytest.mark.slow),
+        pytest.param("stable_baselines", "PPO  ", marks=pytest.mark.slow),
     ],
 )
 def test_an_example_runs(name, said, whole, tmp_path):
+    if name == "stable_baselines":
+        for package in ("gymnasium", "stable_baselines3"):
+            pytest.importorskip(package, reason="it needs gymnasium and stable_baselines3, which brings PyTorch")
     arguments = {
         "own_policy": [str(whole)],
+        "stable_baselines": [str(whole), "2000"],
         "own_encoder": [str(whole), str(tmp_path)],
         "gymnasium_ppo": [str(whole), "--updates", "2", "--episodes", "16", "--networks", "2"],
     }
@@ -78,6 +83,7 @@ def test_all_examples_are_run():
     assert {path.stem for path in EXAMPLES.glob("*.py")} == {
         "own_policy",
         "own_encoder",
+        "stable_baselines",
         "load_and_ask",
         "depth_camera",
         "gymnasium_ppo",
