@@ -12,10 +12,10 @@ unexport PYTHONDONTWRITEBYTECODE
 
 .PHONY: demo test test-all lint bench docs wheel clean
 
-demo: $(READY)  ## environment; the system of the package looks at a chair; data, networks, evaluation, report
+demo: $(READY)  ## environment; the system of the package looks at a table; data, networks, evaluation, report
 	@mkdir -p $(dir $(OUT))
-	$(BIN)/mevs look --mesh chair --draw $(OUT)-chair.png
-	@echo "A picture of it: $(OUT)-chair.png"
+	$(BIN)/mevs look --mesh table --draw $(OUT)-table.png
+	@echo "A picture of it: $(OUT)-table.png"
 	$(BIN)/mevs run --preset small --out $(OUT)
 
 test: lint  ## format, lint, types, and the tests that are not marked slow
