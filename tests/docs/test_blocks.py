@@ -19,7 +19,8 @@ from data_pipeline.objects.mesh import normalise
 from eval.checks.camera import Shot, cast_shot
 from mevs_jax.cli.commands import ALIASES, COMMANDS
 from mevs_jax.cli.parsing import parse, tool_options
-from tests.data_pipeline.frames.forms import bop
+from tests.data_pipeline.frames.forms import bop, seven_scenes
+from tests.data_pipeline.scene.test_scene import FLOOR, THINGS, recorded
 
 ROOT = Path(__file__).resolve().parents[2]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
@@ -119,6 +120,9 @@ def test_documented_python_runs(page, whole, tmp_path, monkeypatch):
     piece = furniture("chair", 900)
     piece.export(tmp_path / "chair.obj")
     bop(tmp_path / "ycbv" / "test" / "000048")
+    if page == "scene.md":
+        room = recorded([*FLOOR, *(box for thing in THINGS.values() for box in thing)], frames=48)
+        seven_scenes(tmp_path / "scan", room.depth, room.T_world_camera, room.K[0])
     (path,) = (one for one in PAGES if one.name == page)
     world = world_of(page, whole)
     for number, block in enumerate(re.findall(r"```python\n(.*?)```", path.read_text(), re.DOTALL)):

@@ -96,10 +96,10 @@ def _read(lines: list[str], vertex_count: int, face_count: int, width: int, kept
         at = torn[0] - int(begin[torn[0]] % width > 0)  # the line before has too few
         line = f"the line {quoted(lines[at])} has {counts[at]} numbers instead of {width}"
         raise ValueError(f"{line}, as one of its {vertex_count} vertices")
-    if used and end[-1] > vertex_count * width:
-        raise ValueError(f"its {vertex_count} vertices end within the line {quoted(lines[used - 1])}")
     if used > len(lines):
         raise cut_short(f"{int(ends[-1]) // width if len(ends) else 0} of {vertex_count} vertices are there")
+    if used and end[-1] > vertex_count * width:
+        raise ValueError(f"its {vertex_count} vertices end within the line {quoted(lines[used - 1])}")
     vertices = numbers(lines[:used])[0].reshape(-1, width)[:, :kept]
     corners, sizes, after = _faces(lines[used:], face_count)
     if len(sizes) < face_count:

@@ -55,9 +55,13 @@ def npz(folder: Path) -> Path:
     return folder / "frames.npz"
 
 
-def seven_scenes(folder: Path) -> Path:
+def seven_scenes(
+    folder: Path, depths: np.ndarray | None = None, at: np.ndarray | None = None, K: np.ndarray = K
+) -> Path:
+    """The ball, or other images at other poses."""
     folder.mkdir(exist_ok=True)
-    for number, (depth, pose) in enumerate(zip(depth_and_mask()[0], poses(), strict=True)):
+    depths, at = depth_and_mask()[0] if depths is None else depths, poses() if at is None else at
+    for number, (depth, pose) in enumerate(zip(depths, at, strict=True)):
         write_png(folder / f"frame-{number:06d}.depth.png", depth, 0.001, unknown=65535 if number else 0)
         np.savetxt(folder / f"frame-{number:06d}.pose.txt", pose)
     np.savetxt(folder / "camera-intrinsics.txt", K)
