@@ -55,7 +55,7 @@ class _Watched(Progress):
         while not self._ended.wait(min(SECONDS_BETWEEN_LINES, _SECONDS_BETWEEN_STATES)):
             lines = [line_of(task, self.unit) for task in self.tasks if task.started and not task.finished]
             if _status is not None:
-                with suppress(OSError, DataError):  # it is told by the work itself if nothing can be written
+                with suppress(OSError, DataError):  # the work itself fails with a message then
                     write_bytes(_status, json.dumps({"time": time.time(), "lines": lines}).encode(), durable=False)
             if self._in_lines and time.monotonic() - said >= SECONDS_BETWEEN_LINES:
                 said = time.monotonic()

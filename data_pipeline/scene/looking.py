@@ -96,7 +96,7 @@ def look_at_scene(system: TrainedSystem, recording: Recording, scene: Scene, **o
     The images are there already, so no walk ends before its budget, and an answer is sure by what all its views say.
 
     Args:
-        system: that is told what is unknown.
+        system: one whose networks receive a mask of the unknown pixels.
         recording, scene: of `scene_in`.
         options: of `mevs_jax.Agent`.
     """

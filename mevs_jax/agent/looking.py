@@ -87,7 +87,7 @@ def look(
 ) -> Walk:
     """Recognises a mesh: renders it from the views that the agent chooses.
 
-    Which way the mesh faces is not known. A system whose policy needs a yaw is told 0, as if it faced as training objects do.
+    Which way the mesh faces is not known. For a system whose policy needs a yaw, it is assumed to be 0, that of training objects.
 
     Args:
         system: from `mevs_jax.load`.

@@ -18,7 +18,7 @@ import numpy as np
 
 from mevs_jax.arguments import whole
 from mevs_jax.environment.gymnasium import (
-    begin,
+    begin_episode,
     check_begun,
     check_rules,
     check_views,
@@ -52,6 +52,7 @@ class ActiveRecognitionEnv(ap_gym.ActiveClassificationEnv):
     """
 
     metadata: dict[str, Any] = {"render_modes": []}  # noqa: RUF012  # as Gymnasium declares it
+    _state: EnvironmentState
 
     def __init__(self, environment: ActiveRecognition):
         check_rules(environment)
@@ -73,9 +74,7 @@ class ActiveRecognitionEnv(ap_gym.ActiveClassificationEnv):
             ValueError: for an index outside its range.
         """
         super().reset(seed=seed)
-        index, start = drawn(self.environment, self.np_random, (), options)
-        self._state, observation = begin(self.environment, index, start)
-        return in_numpy(observation), {"index": int(index)}
+        return begin_episode(self, options)
 
     def _step(self, action: Any, prediction: Any) -> tuple[dict, float, bool, bool, dict[str, Any], np.int64]:
         self._state, observation, done, info, target = _move(self.environment, self._state, np.int32(action))

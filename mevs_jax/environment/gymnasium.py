@@ -48,6 +48,7 @@ class ViewSelectionEnv(gymnasium.Env):
     """
 
     metadata: dict[str, Any] = {"render_modes": ["ansi", "rgb_array"], "render_fps": 2}  # noqa: RUF012  # as Gymnasium declares it
+    _state: EnvironmentState
 
     def __init__(self, environment: ActiveRecognition, render_mode: str | None = None):
         check_rules(environment)
@@ -68,10 +69,8 @@ class ViewSelectionEnv(gymnasium.Env):
             ValueError: for an index outside its range.
         """
         super().reset(seed=seed)
-        index, start = drawn(self.environment, self.np_random, (), options)
-        self._state, observation = begin(self.environment, index, start)
-        self._seen = in_numpy(observation)
-        return self._seen, {"index": int(index)}
+        self._seen, info = begin_episode(self, options)
+        return self._seen, info
 
     def step(self, action: Any) -> tuple[dict, float, bool, bool, dict[str, Any]]:
         """Scores the belief, moves the camera and returns (observation, reward, terminated, truncated, info).
@@ -172,6 +171,13 @@ def drawn(
     return found[0], found[1]
 
 
+def begin_episode(env: Any, options: dict[str, Any] | None) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Begins an episode of an environment for one; its observation and `info`."""
+    index, start = drawn(env.environment, env.np_random, (), options)
+    env._state, observation = _begin(env.environment, index, start)
+    return in_numpy(observation), {"index": int(index)}
+
+
 def check_begun(env: Any) -> None:
     """Raises `ResetNeeded` before the first `reset`."""
     if not hasattr(env, "_state"):
@@ -202,7 +208,7 @@ def _play(environment: ActiveRecognition, state: EnvironmentState, view: jax.Arr
     return environment.step(jax.random.key(0), state, action)
 
 
-begin = jax.jit(start_of)
+_begin = jax.jit(start_of)
 _played = jax.jit(_play)
 
 for name, home, single in (

@@ -153,7 +153,6 @@ def _largest_normalised_backward(epsilon: float, residuals: tuple[Array, ...], c
     slope = factor * inverse * of_scale / count
     row = jnp.arange(x.shape[1], dtype=jnp.int32)[None, :, None]
     first = jnp.min(jnp.where(x == extreme[:, None], row, x.shape[1]), axis=1)
-    # The barrier keeps the compiler from recomputing `first` for every row.
     chosen = row == jax.lax.optimization_barrier(first)[:, None]
     of_x = jnp.where(chosen, (cotangent * factor)[:, None], 0.0) - (factor * of_bias / count - mean * slope) - x * slope
     return of_x, of_scale, of_bias

@@ -19,11 +19,11 @@ from pathlib import Path
 
 import numpy as np
 import trimesh
-from hypothesis import HealthCheck, Phase, given, seed, settings
+from hypothesis import given, seed
 
 from data_pipeline.errors import DataError, EmptyMesh
 from data_pipeline.objects.formats import parse_mesh
-from tests.fuzz.targets import mutated
+from tests.fuzz.targets import generated, mutated
 
 FORMATS = ("off", "obj", "stl", "ply", "glb", "dae", "3mf")
 Read = Callable[[bytes, str], np.ndarray]
@@ -109,13 +109,7 @@ def count(suffix: str, inputs: int, start: int, keep: Path) -> dict[str, Counter
     found: dict[str, Counter[str]] = {name: Counter() for name, (_, reads) in READERS.items() if suffix in reads}
 
     @seed(start)
-    @settings(
-        max_examples=inputs,
-        deadline=None,
-        database=None,
-        phases=[Phase.generate],
-        suppress_health_check=list(HealthCheck),
-    )
+    @generated(inputs)
     @given(mutated(suffix, 2))
     def check(content: bytes) -> None:
         for name, counted in found.items():

@@ -15,9 +15,9 @@ import time
 from pathlib import Path
 from typing import Any
 
-from hypothesis import HealthCheck, Phase, given, seed, settings
+from hypothesis import given, seed
 
-from tests.fuzz.targets import TARGETS, mutated
+from tests.fuzz.targets import TARGETS, generated, mutated
 
 SECONDS, MEGABYTES = 10.0, 2000
 
@@ -27,13 +27,7 @@ def fuzz(name: str, inputs: int, start: int, last: Path, result: Any) -> None:
     done, longest = 0, 0.0
 
     @seed(start)
-    @settings(
-        max_examples=inputs,
-        deadline=None,
-        database=None,
-        phases=[Phase.generate],
-        suppress_health_check=list(HealthCheck),
-    )
+    @generated(inputs)
     @given(mutated(name))
     def check(content: bytes) -> None:
         nonlocal done, longest

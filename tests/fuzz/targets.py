@@ -12,6 +12,7 @@ from functools import cache
 from pathlib import Path
 
 import numpy as np
+from hypothesis import HealthCheck, Phase, settings
 from hypothesis import strategies as st
 
 from data_pipeline.errors import DataError, EmptyMesh
@@ -290,3 +291,14 @@ def mutated(draw: st.DrawFn, name: str, most: int = 8) -> bytes:
             piece = draw(st.sampled_from(_PIECES) if kind == 4 else st.binary(min_size=1, max_size=8))
             content[at : at + draw(st.integers(0, len(piece)))] = piece
     return bytes(content)
+
+
+def generated(inputs: int) -> settings:
+    """Settings of a test of so many new inputs, none of which is kept or made smaller."""
+    return settings(
+        max_examples=inputs,
+        deadline=None,
+        database=None,
+        phases=[Phase.generate],
+        suppress_health_check=list(HealthCheck),
+    )
