@@ -18,12 +18,12 @@ import numpy as np
 import tyro
 
 from benchmarks.reporting import RESULTS, Row, Table, keep, machine_name, refuse
-from data_pipeline.objects.formats import MESH_SUFFIXES
 from data_pipeline.objects.mesh import Mesh, normalise
 from data_pipeline.objects.recipes import MeshFile
 from data_pipeline.objects.sources import furniture10, load_object
 from eval.checks.camera import SIZES, agreements, milliseconds, summary
 from mevs_jax import ViewCamera
+from mevs_jax.meshes import MESH_SUFFIXES
 
 DISTANCES = (2.0, 1.5, 3.0, 4.0, 5.0, 6.0)
 AGREEMENT = Table(

@@ -10,10 +10,9 @@ import sys
 
 import mevs_jax
 from data_pipeline.objects.furniture import furniture
-from data_pipeline.objects.recipes import read_mesh
 
 piece = furniture("desk", 900)  # which no system was trained on
-mesh = read_mesh(sys.argv[1]) if len(sys.argv) > 1 else (piece.vertices, piece.faces)
+mesh = mevs_jax.read_mesh(sys.argv[1]) if len(sys.argv) > 1 else (piece.vertices, piece.faces)
 
 system = mevs_jax.load(sys.argv[2] if len(sys.argv) > 2 else "furniture10")
 walk = mevs_jax.look(system, *mesh, stop=0.95)

@@ -53,6 +53,7 @@ from mevs_jax.geometry.viewpoints import nested_lattice as nested_lattice
 from mevs_jax.geometry.viewpoints import platonic_solid as platonic_solid
 from mevs_jax.geometry.viewpoints import ring_lattice as ring_lattice
 from mevs_jax.geometry.viewpoints import viewpoint_lattice as viewpoint_lattice
+from mevs_jax.meshes.reading import read_mesh as read_mesh
 from mevs_jax.models import Abstraction as Abstraction
 from mevs_jax.models import PointNet2 as PointNet2
 from mevs_jax.models import Recogniser as Recogniser

@@ -12,8 +12,8 @@ from data_pipeline.dataset.statistics import SUMMARY, load_statistics
 from data_pipeline.differences import differences, in_words
 from data_pipeline.errors import DataError, Unreadable
 from data_pipeline.files import as_read, read_json
-from data_pipeline.objects.formats import Up
 from mevs_jax.geometry.viewpoints import ViewGraph
+from mevs_jax.meshes import Up
 
 
 @dataclass(frozen=True)

@@ -14,9 +14,9 @@ from data_pipeline.errors import DataError
 from data_pipeline.objects.downloads import ARCHIVES, download, download_folder, local
 from data_pipeline.objects.folders import list_folder
 from data_pipeline.objects.mesh import SOURCE_SPLITS, ObjectSource
-from data_pipeline.objects.names import shown
 from data_pipeline.objects.sources import PROCEDURAL, Reading, mesh_zip, open_source, together
 from data_pipeline.progress import console
+from mevs_jax.meshes.reading import shown
 
 
 def open_objects(config: DataConfig) -> ObjectSource:

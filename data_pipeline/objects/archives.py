@@ -23,10 +23,10 @@ from pathlib import Path, PurePosixPath
 import numpy as np
 
 from data_pipeline.errors import Damage, DataError, reason_of
-from data_pipeline.objects.formats import MESH_SUFFIXES, Up
 from data_pipeline.objects.layout import Found, Listing
-from data_pipeline.objects.names import kind_of_ignored, shown, unread_reason
-from data_pipeline.objects.recipes import read_with
+from data_pipeline.objects.names import kind_of_ignored, unread_reason
+from mevs_jax.meshes import MESH_SUFFIXES, Up
+from mevs_jax.meshes.reading import read_with, shown
 
 LARGEST_MEMBER = 256 << 20
 """Largest unpacked size of a member in bytes. A small archive can declare, and unpack to, any size."""

@@ -9,10 +9,11 @@ from pathlib import Path, PurePosixPath
 
 from data_pipeline.errors import DataError
 from data_pipeline.files import short_hash
-from data_pipeline.objects.formats import MESH_SUFFIXES, Up
 from data_pipeline.objects.layout import Found, Listing
-from data_pipeline.objects.names import kind_of_ignored, shown, unread_reason
+from data_pipeline.objects.names import kind_of_ignored, unread_reason
 from data_pipeline.objects.recipes import MeshFile, Unreadable, stamp_of
+from mevs_jax.meshes import MESH_SUFFIXES, Up
+from mevs_jax.meshes.reading import shown
 
 _MOST_VISITS = 32
 """How often one folder is entered that several links lead to. Links that lead to one another would have n! paths."""

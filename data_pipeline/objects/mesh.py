@@ -7,21 +7,13 @@ from typing import Protocol, runtime_checkable
 
 import numpy as np
 
-from data_pipeline.errors import DamagedMesh, EmptyMesh, naming
-from data_pipeline.objects.formats.polygons import check_indices
-from mevs_jax.geometry.faces import have_area
+from mevs_jax.meshes.reading import surface_of
 
 MODELNET10_CLASSES = ("bathtub", "bed", "chair", "desk", "dresser", "monitor", "night_stand", "sofa", "table", "toilet")
 """The classes of ModelNet10 and of furniture10, in alphabetical order, which is the order of labels."""
 UNKNOWN_OBJECT = "unknown object"
 """The class of objects that belong to no other class. Equal to that of `mevs_jax.trained.description`, which imports JAX."""
 SOURCE_SPLITS = ("train", "test")
-
-LARGEST_COORDINATE = 1e30
-"""Coordinates beyond this would overflow float32 when they are squared."""
-
-SMALLEST_RADIUS = 1e-150
-"""Meshes smaller than this are a single point, whose size cannot be normalised."""
 
 
 @dataclass(frozen=True)
@@ -79,47 +71,13 @@ class ObjectSource:
     said: tuple[str, ...] = ()
 
 
-def surface_of(vertices: np.ndarray, faces: np.ndarray, where: str) -> tuple[np.ndarray, np.ndarray]:
-    """Returns the vertices, float64, and faces of a mesh without vertices that no face uses and faces without area.
-
-    Raises:
-        As `normalise`.
-    """
-    vertices, faces = np.asarray(vertices, np.float64), np.asarray(faces, np.int64)
-    if len(vertices) == 0:
-        raise EmptyMesh("mesh has no faces")
-    if len(faces) == 0:
-        raise EmptyMesh(f"mesh has no faces: it is a point cloud of {len(vertices)} points")
-    with naming(where):
-        check_indices(faces, len(vertices))
-    vertices, faces = _used(vertices, faces)
-    if not np.isfinite(vertices).all():
-        bad = f"{int((~np.isfinite(vertices).all(axis=1)).sum())} vertices that are not finite (NaN or infinite)"
-        raise DamagedMesh(f"{where} has {bad}; repair it or take it away")
-    if np.abs(vertices).max() > LARGEST_COORDINATE:
-        raise DamagedMesh(f"{where} has coordinates beyond {LARGEST_COORDINATE:g}; repair it or take it away")
-    if np.ptp(vertices, axis=0).max() < SMALLEST_RADIUS:
-        raise EmptyMesh("mesh is a single point")
-    seen = have_area(vertices, faces)
-    if not seen.any():
-        raise EmptyMesh("mesh has no area: all its faces are degenerate")
-    return _used(vertices, faces[seen])
-
-
-def _used(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    used, compact = np.unique(faces, return_inverse=True)
-    return vertices[used], compact.reshape(faces.shape)
-
-
 def normalise(vertices: np.ndarray, faces: np.ndarray, where: str) -> Mesh:
     """Returns the mesh centred on its bounding box and scaled into the unit sphere.
 
     Vertices that no face uses and faces without area are removed before. `where` names the mesh in error messages.
 
     Raises:
-        DamagedMesh: if a coordinate that a face uses is not finite or too large, or a face refers to a vertex that does not
-            exist.
-        EmptyMesh: if there are no faces, or none has an area.
+        DamagedMesh, EmptyMesh: as `surface_of`.
     """
     vertices, faces = surface_of(vertices, faces, where)
     low, high = vertices.min(axis=0), vertices.max(axis=0)

@@ -2,24 +2,12 @@
 
 from __future__ import annotations
 
-import os
 from collections import Counter
 from pathlib import PurePosixPath
 
-from data_pipeline.objects.formats import MESH_SUFFIXES, UNREAD_SUFFIXES
+from mevs_jax.meshes import MESH_SUFFIXES, UNREAD_SUFFIXES
 
 _PACKED = (".gz", ".bz2", ".xz", ".zst")
-
-
-def shown(name: str) -> str:
-    """Returns a path as printable text: bytes that are not UTF-8 and control characters become escapes such as `\\xfc`."""
-    try:
-        name.encode()
-    except UnicodeEncodeError:
-        name = os.fsencode(name).decode("utf-8", "backslashreplace")
-    if name.isprintable():
-        return name
-    return "".join(c if c.isprintable() else c.encode("unicode_escape").decode("ascii") for c in name)
 
 
 def plain_class(name: str) -> str:

@@ -6,22 +6,19 @@ import hashlib
 import os
 import re
 import urllib.parse
-from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass
-from pathlib import Path, PurePosixPath
+from pathlib import Path
 from typing import ClassVar
 
 import numpy as np
 
-from data_pipeline.errors import Damage, DamagedMesh, EmptyMesh, naming
-from data_pipeline.objects.formats import MESH_SUFFIXES, Up, parse_mesh
-from data_pipeline.objects.mesh import Recipe, surface_of
-from data_pipeline.objects.names import shown
+from data_pipeline.errors import DamagedMesh
+from data_pipeline.objects.mesh import Recipe
+from mevs_jax.meshes import Up
+from mevs_jax.meshes.reading import content_of_file, read_with, shown
 
 _BUFFER = re.compile(rb'"uri"\s*:\s*"([^"]+\.bin)"', re.IGNORECASE)
-LARGEST_FILE = 2 << 30
-"""Largest size in bytes of a mesh file that is read."""
 
 
 @dataclass(frozen=True)
@@ -94,7 +91,7 @@ class MeshFile:
         return digest.hexdigest()
 
     def load(self) -> tuple[np.ndarray, np.ndarray]:
-        return read_with(_content, self.path, shown(self.path), self.up)
+        return read_with(content_of_file, self.path, shown(self.path), self.up)
 
 
 @dataclass(frozen=True)
@@ -124,63 +121,6 @@ class Turned:
 def identity_of(recipe: Recipe) -> str:
     """Returns what tells meshes of one name apart: the content of a file, the version of a shape, or nothing."""
     return str(getattr(recipe, "identity", "") or getattr(recipe, "stamp", ""))
-
-
-def read_mesh(path: str | Path, up: Up = "auto") -> tuple[np.ndarray, np.ndarray]:
-    """Returns the vertices (n, 3), z up, and triangles (m, 3) of a mesh file, of which all triangles have an area.
-
-    Args:
-        path: a file of one of the formats of `data_pipeline.objects.formats`.
-        up: which axis of the file is up.
-
-    Raises:
-        DataError: if it is not a mesh that can be read.
-    """
-    if Path(path).suffix.lower() not in MESH_SUFFIXES:
-        known = f"a mesh that is read here ({', '.join(MESH_SUFFIXES)})"
-        raise DamagedMesh(f"{shown(str(path))} has no suffix of {known}; convert it to one of them")
-    where = shown(str(path))
-    try:
-        return surface_of(*MeshFile(str(path), up=up).load(), where)
-    except EmptyMesh as reason:
-        raise DamagedMesh(f"{where} cannot be used: {reason}; choose a mesh with faces") from reason
-
-
-def read_with(content_of: Callable[[str], bytes], path: str, where: str, up: Up) -> tuple[np.ndarray, np.ndarray]:
-    """Returns the vertices (n, 3), z up, and triangles (m, 3) of a mesh file, which may need others of its folder.
-
-    Args:
-        content_of: returns the content of a file by its path, or raises `Damage`.
-        path: of the mesh file.
-        where: its name for error messages.
-        up: which axis of the file is up.
-
-    Raises:
-        DamagedMesh: if it, or a file that it needs, cannot be read.
-    """
-    folder = path.removesuffix(os.path.basename(path))
-
-    def sibling(name: str) -> bytes:
-        with naming(f"{where} needs {shown(name)!r}, which"):
-            inside = PurePosixPath(name.replace("\\", "/"))
-            if inside.is_absolute() or ".." in inside.parts or ":" in name:
-                raise Damage("is outside of its folder; put both into one folder, or export as .glb")
-            return content_of(f"{folder}{inside}")
-
-    with naming(where):
-        content = content_of(path)
-    return parse_mesh(content, PurePosixPath(path).suffix.lower(), where, up=up, sibling=sibling)
-
-
-def _content(path: str) -> bytes:
-    try:
-        if os.path.getsize(path) > LARGEST_FILE:
-            raise Damage(f"is larger than {LARGEST_FILE >> 30} GB; export a simpler mesh")
-        return Path(path).read_bytes()
-    except OSError as error:
-        raise Damage(f"cannot be read: {error.strerror}") from error
-    except ValueError as error:  # a name with a NUL character
-        raise Damage(f"cannot be read: {error}") from error
 
 
 def stamp_of(status: os.stat_result) -> str:

@@ -19,7 +19,6 @@ from pathlib import Path, PurePosixPath
 from data_pipeline.errors import DataError
 from data_pipeline.objects.archives import list_zip
 from data_pipeline.objects.folders import list_folder
-from data_pipeline.objects.formats import AXIS_DECLARED, MESH_SUFFIXES, Up
 from data_pipeline.objects.layout import (
     SPLIT_FOLDERS,
     Found,
@@ -39,10 +38,12 @@ from data_pipeline.objects.mesh import (
     ObjectSource,
     normalise,
 )
-from data_pipeline.objects.names import kind_of_ignored, plain_class, say_ignored, shown
-from data_pipeline.objects.recipes import FamilyPiece, FurniturePiece, Stranger, Turned, read_mesh
+from data_pipeline.objects.names import kind_of_ignored, plain_class, say_ignored
+from data_pipeline.objects.recipes import FamilyPiece, FurniturePiece, Stranger, Turned
 from data_pipeline.objects.splits import SAME_OBJECTS, divide
 from data_pipeline.objects.voxels import voxel_archive
+from mevs_jax.meshes import AXIS_DECLARED, MESH_SUFFIXES, Up
+from mevs_jax.meshes.reading import read_mesh, shown
 
 _LAID_OUT = "<class>/train/*.off and <class>/test/*.off"
 

@@ -14,7 +14,7 @@ import numpy as np
 
 from data_pipeline.errors import Damage, DataError, EmptyMesh, naming, reason_of
 from data_pipeline.objects.mesh import MODELNET10_CLASSES, SOURCE_SPLITS, ObjectEntry, ObjectSource
-from data_pipeline.objects.names import shown
+from mevs_jax.meshes.reading import shown
 
 FEWEST_VOXELS = 5
 """Grids with fewer occupied cells are treated as empty."""

@@ -16,7 +16,6 @@ from data_pipeline.capture.casting import capture
 from data_pipeline.dataset.inputs import metric_depth
 from data_pipeline.dataset.reality import RealityAugmentation, realistic_views
 from data_pipeline.errors import DataError, EmptyMesh, reason_of
-from data_pipeline.objects.formats import Up
 from data_pipeline.objects.mesh import Mesh
 from data_pipeline.objects.sources import load_object, objects_to_test
 from data_pipeline.progress import progress_bar
@@ -27,6 +26,7 @@ from mevs_jax.enrolment import enrol
 from mevs_jax.gallery.matching import YAWS
 from mevs_jax.geometry.cameras import ViewCamera
 from mevs_jax.geometry.source_view import DepthImage
+from mevs_jax.meshes import Up
 from mevs_jax.selection.loop import ViewTable
 from mevs_jax.trained import TrainedSystem
 from mevs_jax.trained.usable import BELIEF_ORACLE

@@ -13,7 +13,6 @@ from data_pipeline.capture.casting import DEPTH_SCALE
 from data_pipeline.dataset.inputs import metric_depth
 from data_pipeline.errors import DataError, EmptyMesh, reason_of
 from data_pipeline.files import digest_of, short_hash, write_npz
-from data_pipeline.objects.formats import Up
 from data_pipeline.objects.mesh import Mesh, ObjectEntry
 from data_pipeline.objects.sources import load_object, objects_to_test
 from data_pipeline.progress import console, progress_bar
@@ -21,6 +20,7 @@ from eval.checks.scenes import CONDITIONS, UPPER, Condition, Placed, reachable_i
 from eval.checks.transfer import STRANGER, matched
 from eval.checks.walks import BASELINE, AccuracyRow, Observer, Walker, Walks, with_interval
 from eval.numbers.confidence import stops_of
+from mevs_jax.meshes import Up
 from mevs_jax.selection.loop import ViewTable
 from mevs_jax.trained import TrainedSystem
 from train.results.records import named

@@ -13,7 +13,6 @@ from jaxtyping import Float, Int
 from data_pipeline.capture.casting import capture, rig_at
 from data_pipeline.dataset.inputs import metric_depth
 from data_pipeline.errors import DataError, EmptyMesh, reason_of
-from data_pipeline.objects.formats import Up
 from data_pipeline.objects.mesh import ObjectSource
 from data_pipeline.objects.names import plain_class
 from data_pipeline.objects.sources import load_object, objects_to_test
@@ -24,6 +23,7 @@ from eval.checks.walks import BASELINE, AccuracyRow, Observer, Walker, Walks, ro
 from eval.numbers.confidence import stops_of
 from eval.numbers.metrics import Stop
 from eval.system import USABLE
+from mevs_jax.meshes import Up
 from mevs_jax.selection.loop import ViewTable
 from mevs_jax.trained import TrainedSystem
 from mevs_jax.trained.description import UNKNOWN_OBJECT

@@ -207,17 +207,16 @@ def _say_and_end(error: Exception) -> None:
     if missing and missing.split(".")[0] not in ("mevs_jax", "data_pipeline", "train", "eval"):
         _fail(f"the package {missing} is not installed; install the study's packages: pip install -e '.[study]'")
     from mevs_jax.cli.failure import Unusable
+    from mevs_jax.errors import DataError
 
-    if isinstance(error, Unusable):
+    if isinstance(error, Unusable | DataError):
         _fail(str(error))
     if not has_checkout():
         if isinstance(error, OSError | MemoryError):
             _fail(f"{getattr(error, 'filename', None) or 'the command'}: {getattr(error, 'strerror', None) or error}")
         return
-    from data_pipeline.errors import DataError, Diverged
+    from data_pipeline.errors import Diverged
 
-    if isinstance(error, DataError):
-        _fail(str(error))
     if isinstance(error, Diverged):
         _fail(str(error), 3)
     from data_pipeline.files import why_not_written

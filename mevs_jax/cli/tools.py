@@ -1,4 +1,4 @@
-"""Tools for trained systems: `mevs look`, `mevs export`. They need the library alone, except to read meshes and runs."""
+"""Tools for trained systems: `mevs look`, `enrol`, `export`. They need the library alone, except to read recordings and runs."""
 
 from __future__ import annotations
 
@@ -170,17 +170,19 @@ def as_json(walk: Walk, name: str) -> dict[str, Any]:
 
 
 def read_mesh(path: Path, up: str) -> tuple[np.ndarray, np.ndarray]:
-    """Vertices and triangles of a mesh file, by the study's readers, or of a built-in piece of furniture."""
+    """Vertices and triangles of a mesh file, or of a built-in piece of furniture, which the study makes."""
+    import mevs_jax
     from mevs_jax.cli.main import has_checkout
 
-    if not has_checkout():
-        raise Unusable("meshes are read by a checkout of the project, not by the package alone; give --depth instead")
-    from data_pipeline.objects.mesh import MODELNET10_CLASSES
-    from data_pipeline.objects.recipes import FurniturePiece, read_mesh
+    if not path.exists() and not path.suffix:
+        if not has_checkout():
+            raise Unusable(f"{path} is no file; built-in furniture comes with a checkout of the project alone")
+        from data_pipeline.objects.mesh import MODELNET10_CLASSES
+        from data_pipeline.objects.recipes import FurniturePiece
 
-    if str(path) in MODELNET10_CLASSES and not path.exists():
-        return FurniturePiece(str(path), _UNSEEN).load()
-    return read_mesh(path, up)  # type: ignore[arg-type]
+        if str(path) in MODELNET10_CLASSES:
+            return FurniturePiece(str(path), _UNSEEN).load()
+    return mevs_jax.read_mesh(path, up)  # type: ignore[arg-type]
 
 
 def frames_in(path: Path, options: RecordingOptions) -> tuple[Frames, tuple[str, ...]]:

@@ -5,6 +5,8 @@ from __future__ import annotations
 import json
 import re
 import shlex
+import subprocess
+import sys
 from functools import cache, partial
 from pathlib import Path
 
@@ -127,6 +129,16 @@ def test_documented_python_runs(page, whole, tmp_path, monkeypatch):
     world = world_of(page, whole)
     for number, block in enumerate(re.findall(r"```python\n(.*?)```", path.read_text(), re.DOTALL)):
         exec(compile(block, f"{page}, block {number}", "exec"), world)
+
+
+@pytest.mark.slow
+def test_the_first_block_needs_the_library_alone(tmp_path):
+    furniture("chair", 900).export(tmp_path / "chair.obj")
+    without = (
+        'import sys; sys.modules |= dict.fromkeys(("data_pipeline", "train", "eval", "trimesh", "open3d", "PIL"))\n'
+    )
+    block = re.search(r"```python\n(.*?)```", (ROOT / "README.md").read_text(), re.DOTALL)[1]
+    subprocess.run([sys.executable, "-c", without + block], cwd=tmp_path, check=True)
 
 
 def test_documented_json_and_yaml_can_be_read():

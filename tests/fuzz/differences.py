@@ -22,7 +22,7 @@ import trimesh
 from hypothesis import given, seed
 
 from data_pipeline.errors import DataError, EmptyMesh
-from data_pipeline.objects.formats import parse_mesh
+from mevs_jax.meshes import parse_mesh
 from tests.fuzz.targets import generated, mutated
 
 FORMATS = ("off", "obj", "stl", "ply", "glb", "dae", "3mf")

@@ -16,10 +16,10 @@ from hypothesis import HealthCheck, Phase, settings
 from hypothesis import strategies as st
 
 from data_pipeline.errors import DataError, EmptyMesh
-from data_pipeline.objects.formats import parse_mesh
 from data_pipeline.objects.mesh import normalise
 from data_pipeline.objects.sources import mesh_zip
 from data_pipeline.objects.voxels import voxel_archive
+from mevs_jax.meshes import parse_mesh
 from mevs_jax.trained import UnreadableSystem, load, save
 from mevs_jax.trained.arrays import DESCRIPTION, WEIGHTS
 from mevs_jax.trained.writing import hash_of

@@ -17,7 +17,7 @@ import numpy as np
 from safetensors import deserialize
 
 from data_pipeline.errors import DataError, reason_of
-from data_pipeline.objects.names import shown
+from mevs_jax.meshes.reading import shown
 from train.weights.pickle_format import LONGEST_NAME, MOST_BYTES, BoundedReader, Tensor, WeightsUnpickler
 
 LARGEST_FILE = 1 << 30

@@ -13,8 +13,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from data_pipeline.objects.formats import parse_mesh
 from data_pipeline.objects.sources import open_source
+from mevs_jax.meshes import parse_mesh
 
 Polygons = Sequence[Sequence[int]]
 

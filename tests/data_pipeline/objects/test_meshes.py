@@ -9,11 +9,11 @@ import pytest
 import trimesh
 
 from data_pipeline.errors import DamagedMesh, DataError, EmptyMesh
-from data_pipeline.objects.formats import parse_mesh
 from data_pipeline.objects.furniture import CLASSES, VARIANTS, furniture
 from data_pipeline.objects.mesh import normalise
 from data_pipeline.objects.sources import load_object, open_source
 from data_pipeline.objects.voxels import VoxelGrid
+from mevs_jax.meshes import parse_mesh
 from tests.data_pipeline.objects.making import members, opened, write
 
 CUBE = trimesh.creation.box((1, 1, 1))

@@ -11,9 +11,9 @@ import pytest
 import trimesh
 
 from data_pipeline.objects.archives import ZipMember
-from data_pipeline.objects.formats import parse_mesh
 from data_pipeline.objects.mesh import normalise
 from data_pipeline.objects.voxels import FEWEST_VOXELS, voxel_archive
+from mevs_jax.meshes import parse_mesh
 from tests.conftest import beside_the_checkout
 from tests.data_pipeline.objects.making import area, extent
 

@@ -11,13 +11,14 @@ import pytest
 
 import mevs_jax
 from data_pipeline.errors import DataError
-from data_pipeline.objects.recipes import FurniturePiece, read_mesh
+from data_pipeline.objects.recipes import FurniturePiece
 from data_pipeline.objects.sources import objects_to_test
 from eval.checks.promise import auroc, promises, strangers
 from eval.checks.transfer import STRANGER, Transfer, check_transfer, matched
 from eval.checks.walks import Walker, Walks
 from mevs_jax.beliefs.strangeness import Strangeness
 from mevs_jax.cli.checks import transfer_text
+from mevs_jax.meshes.reading import read_mesh
 from mevs_jax.selection.loop import ViewTable
 from tests.mevs_jax.trained import making
 from train.results.records import as_json, from_json

@@ -13,9 +13,9 @@ from xml.etree.ElementTree import Element
 
 import numpy as np
 
-from data_pipeline.errors import Damage, EmptyMesh
-from data_pipeline.objects.formats.markup import parse_markup
-from data_pipeline.objects.formats.polygons import (
+from mevs_jax.errors import Damage, EmptyMesh
+from mevs_jax.meshes.markup import parse_markup
+from mevs_jax.meshes.polygons import (
     check_indices,
     fan_triangles,
     merged,
@@ -23,7 +23,7 @@ from data_pipeline.objects.formats.polygons import (
     strip_triangles,
     triangulate,
 )
-from data_pipeline.objects.formats.text import numbers, whole_number
+from mevs_jax.meshes.text import numbers, whole_number
 
 MOST_CORNERS, MOST_COPIES = 50_000_000, 10_000
 """Largest numbers of corners of polygons and of meshes in a scene, all copies counted. A small file can declare any number."""

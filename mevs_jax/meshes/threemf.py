@@ -13,10 +13,10 @@ from xml.etree.ElementTree import Element
 
 import numpy as np
 
-from data_pipeline.errors import Damage, EmptyMesh
-from data_pipeline.objects.formats.markup import parse_markup
-from data_pipeline.objects.formats.polygons import check_indices, merged, moved
-from data_pipeline.objects.formats.text import number, whole_number
+from mevs_jax.errors import Damage, EmptyMesh
+from mevs_jax.meshes.markup import parse_markup
+from mevs_jax.meshes.polygons import check_indices, merged, moved
+from mevs_jax.meshes.text import number, whole_number
 
 _NAMESPACES = "http://schemas.microsoft.com/3dmanufacturing/"
 _CORE = f"{{{_NAMESPACES}core/2015/02}}"

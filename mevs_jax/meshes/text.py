@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from data_pipeline.errors import Damage
+from mevs_jax.errors import Damage
 
 _NUMBER = re.compile(r"[+-]?((\d+\.?\d*|\.\d+)(e[+-]?\d+)?|inf(inity)?)", re.IGNORECASE | re.ASCII)
 """What all readers take for a number; `float` also reads `2_0` and digits of other scripts."""

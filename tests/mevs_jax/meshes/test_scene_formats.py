@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from data_pipeline.errors import DamagedMesh, EmptyMesh
-from data_pipeline.objects.formats import parse_mesh
 from data_pipeline.objects.mesh import normalise
 from data_pipeline.objects.recipes import MeshFile
+from mevs_jax.meshes import parse_mesh
 from tests.data_pipeline.objects.making import (
     BOX_AREA,
     Glb,
@@ -196,6 +196,6 @@ def test_small_files_that_unfold_without_end_are_refused(monkeypatch):
         b"<library_visual_scenes>", f"<library_nodes>{levels}</library_nodes><library_visual_scenes>".encode()
     )
     bomb = bomb.replace(b'<instance_geometry url="#g"/></node>\n', b'<instance_node url="#l0"/></node>\n')
-    monkeypatch.setattr("data_pipeline.objects.formats.dae.MOST_COPIES", 500)
+    monkeypatch.setattr("mevs_jax.meshes.dae.MOST_COPIES", 500)
     with pytest.raises(DamagedMesh, match="unfolds to more than 500 meshes"):
         parse_mesh(bomb, ".dae", "bomb.dae")

@@ -6,7 +6,7 @@ from typing import NoReturn
 from xml.etree import ElementTree
 from xml.parsers import expat
 
-from data_pipeline.errors import Damage
+from mevs_jax.errors import Damage
 
 
 def parse_markup(content: bytes) -> tuple[ElementTree.Element, dict[str, str]]:

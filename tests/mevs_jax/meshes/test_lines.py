@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 
 from data_pipeline.errors import DamagedMesh, EmptyMesh
-from data_pipeline.objects.formats import parse_mesh
-from data_pipeline.objects.formats.text import number, numbers, whole_number
 from data_pipeline.objects.mesh import normalise
-from data_pipeline.objects.recipes import read_mesh
+from mevs_jax.meshes import parse_mesh
+from mevs_jax.meshes.reading import read_mesh
+from mevs_jax.meshes.text import number, numbers, whole_number
 from tests.data_pipeline.objects.making import (
     BOX_AREA,
     area,

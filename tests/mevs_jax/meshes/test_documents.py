@@ -11,9 +11,9 @@ import numpy as np
 import pytest
 
 from data_pipeline.errors import DamagedMesh, EmptyMesh
-from data_pipeline.objects.formats import parse_mesh
 from data_pipeline.objects.mesh import normalise
 from data_pipeline.objects.recipes import MeshFile
+from mevs_jax.meshes import parse_mesh
 from tests.data_pipeline.objects.making import (
     BOX_AREA,
     Glb,

@@ -3,16 +3,25 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from importlib import import_module
+from typing import Any
 
-import mapbox_earcut
 import numpy as np
 
-from data_pipeline.errors import Damage
-from data_pipeline.objects.formats.text import starts_of
+from mevs_jax.errors import Damage
+from mevs_jax.meshes.text import starts_of
 
 MOST_WORK = 600_000_000
 """Largest sum of squared numbers of corners of the concave polygons of a file. Ear clipping needs time in proportion to it if a
 polygon crosses itself; this is a few seconds."""
+
+
+def library(name: str, what: str) -> Any:
+    """Returns a package that reads a part of some files, which the extra `mesh` installs; raises `Damage` without it."""
+    try:
+        return import_module(name)
+    except ImportError as error:
+        raise Damage(f"has {what}, which need the package {name}: pip install 'mevs-jax[mesh]'") from error
 
 
 def check_indices(indices: np.ndarray, vertex_count: int) -> None:
@@ -104,7 +113,9 @@ def _clipped(vertices: np.ndarray, polygon: np.ndarray, fan: np.ndarray) -> np.n
         flat = flat / np.abs(flat).max()
     if not np.isfinite(flat).all():
         return fan
-    ears = mapbox_earcut.triangulate_float64(np.ascontiguousarray(flat), np.array([len(polygon)], np.uint32))
+    ears = library("mapbox_earcut", "concave polygons").triangulate_float64(
+        np.ascontiguousarray(flat), np.array([len(polygon)], np.uint32)
+    )
     if len(ears) == 0:
         return fan
     filled = np.full(fan.shape, polygon[0])

@@ -20,9 +20,9 @@ from typing import Any
 
 import numpy as np
 
-from data_pipeline.errors import Damage, DamagedMesh, EmptyMesh, cut_short
-from data_pipeline.objects.formats.polygons import check_indices, fan_triangles, merged, moved, strip_triangles
-from data_pipeline.objects.formats.text import is_filler
+from mevs_jax.errors import Damage, DamagedMesh, EmptyMesh, cut_short
+from mevs_jax.meshes.polygons import check_indices, fan_triangles, library, merged, moved, strip_triangles
+from mevs_jax.meshes.text import is_filler
 
 _COMPONENTS = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
 _WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT2": 4, "MAT3": 9, "MAT4": 16}
@@ -254,11 +254,10 @@ class _Reader:
         return vertices
 
     def _draco(self, draco: Any, entry: Any) -> tuple[np.ndarray, np.ndarray]:
-        import DracoPy
-
+        draco_py = library("DracoPy", "Draco meshes")
         content, _ = self.view(draco["bufferView"])
         try:
-            mesh = DracoPy.decode(bytes(content))
+            mesh = draco_py.decode(bytes(content))
         except Exception as error:  # DracoPy raises exceptions of its own and of Cython's
             raise Damage(f"has a Draco mesh that cannot be decoded ({error}); export it again") from error
         vertices = np.asarray(mesh.points)

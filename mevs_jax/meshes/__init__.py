@@ -18,14 +18,14 @@ from typing import Any, Literal
 
 import numpy as np
 
-from data_pipeline.errors import Damage, DamagedMesh, DataError, EmptyMesh, kind_and_reason_of, naming
-from data_pipeline.objects.formats.dae import parse_dae
-from data_pipeline.objects.formats.gltf import parse_gltf
-from data_pipeline.objects.formats.obj import parse_obj
-from data_pipeline.objects.formats.off import parse_off
-from data_pipeline.objects.formats.ply import parse_ply
-from data_pipeline.objects.formats.stl import parse_stl
-from data_pipeline.objects.formats.threemf import parse_3mf
+from mevs_jax.errors import Damage, DamagedMesh, DataError, EmptyMesh, kind_and_reason_of, naming
+from mevs_jax.meshes.dae import parse_dae
+from mevs_jax.meshes.gltf import parse_gltf
+from mevs_jax.meshes.obj import parse_obj
+from mevs_jax.meshes.off import parse_off
+from mevs_jax.meshes.ply import parse_ply
+from mevs_jax.meshes.stl import parse_stl
+from mevs_jax.meshes.threemf import parse_3mf
 
 MESH_SUFFIXES = (".off", ".obj", ".stl", ".ply", ".glb", ".gltf", ".dae", ".3mf")
 

@@ -10,8 +10,8 @@ import pytest
 import trimesh
 
 from data_pipeline.errors import DamagedMesh, EmptyMesh
-from data_pipeline.objects.formats import MESH_SUFFIXES, parse_mesh
 from data_pipeline.objects.mesh import normalise
+from mevs_jax.meshes import MESH_SUFFIXES, parse_mesh
 from tests.data_pipeline.objects.making import (
     BOX_AREA,
     U_AREA,
@@ -356,6 +356,6 @@ def test_flat_meshes_and_lines_beside_faces():
 
 
 def test_polygons_that_would_take_minutes_are_refused(monkeypatch):
-    monkeypatch.setattr("data_pipeline.objects.formats.polygons.MOST_WORK", 1000)
+    monkeypatch.setattr("mevs_jax.meshes.polygons.MOST_WORK", 1000)
     with pytest.raises(DamagedMesh, match="concave polygons of up to 40 corners, too many to cut"):
         parse_mesh(off(np.random.default_rng(0).random((40, 3)), [list(range(40))]), ".off", "tangle.off")

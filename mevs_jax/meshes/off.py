@@ -7,9 +7,9 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from data_pipeline.errors import Damage, EmptyMesh, cut_short
-from data_pipeline.objects.formats.polygons import triangulate
-from data_pipeline.objects.formats.text import (
+from mevs_jax.errors import Damage, EmptyMesh, cut_short
+from mevs_jax.meshes.polygons import triangulate
+from mevs_jax.meshes.text import (
     is_filler,
     lines_of,
     number,

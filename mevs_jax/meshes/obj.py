@@ -6,9 +6,9 @@ import re
 
 import numpy as np
 
-from data_pipeline.errors import Damage, EmptyMesh, cut_short
-from data_pipeline.objects.formats.polygons import triangulate
-from data_pipeline.objects.formats.text import WHOLE, columns, numbers, quoted, text_of, without_comments
+from mevs_jax.errors import Damage, EmptyMesh, cut_short
+from mevs_jax.meshes.polygons import triangulate
+from mevs_jax.meshes.text import WHOLE, columns, numbers, quoted, text_of, without_comments
 
 _VERTEX = re.compile(r"^[^\S\n]*v(?:[^\S\n]+(.*))?$", re.MULTILINE)
 _FACE = re.compile(r"^[^\S\n]*fo?(?:[^\S\n]+(.*))?$", re.MULTILINE)

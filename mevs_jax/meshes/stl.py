@@ -7,8 +7,8 @@ import re
 
 import numpy as np
 
-from data_pipeline.errors import Damage, cut_short
-from data_pipeline.objects.formats.text import columns, is_filler, lines_of, quoted, text_of
+from mevs_jax.errors import Damage, cut_short
+from mevs_jax.meshes.text import columns, is_filler, lines_of, quoted, text_of
 
 _TRIANGLE = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
 _KINDS = {

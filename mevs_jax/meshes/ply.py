@@ -9,9 +9,9 @@ from typing import Any
 
 import numpy as np
 
-from data_pipeline.errors import Damage, EmptyMesh, cut_short
-from data_pipeline.objects.formats.polygons import check_indices, strip_triangles, triangulate
-from data_pipeline.objects.formats.text import is_filler, lines_of, numbers, quoted, starts_of, whole_number
+from mevs_jax.errors import Damage, EmptyMesh, cut_short
+from mevs_jax.meshes.polygons import check_indices, strip_triangles, triangulate
+from mevs_jax.meshes.text import is_filler, lines_of, numbers, quoted, starts_of, whole_number
 
 _TYPES = {
     "char": "i1", "int8": "i1", "uchar": "u1", "uint8": "u1", "short": "i2", "int16": "i2", "ushort": "u2", "uint16": "u2",
