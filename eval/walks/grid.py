@@ -14,6 +14,7 @@ chunks nor devices nor cores change a result.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 
 import flax.struct
@@ -29,7 +30,7 @@ from mevs_jax.policies.base import Knowledge, Policy, as_tree
 from mevs_jax.policies.registry import PolicyRecord
 from mevs_jax.selection.loop import ViewTable
 from mevs_jax.selection.walks import every_walk, walks_around
-from train.running.over_objects import over_objects
+from train.running.over_objects import over_objects, programs_at_once
 
 THRESHOLDS = (0.5, 0.6, 0.7, 0.8, 0.9, 0.95, 0.99)
 FIRST_MV, LAST_MV = 2, 9
@@ -154,7 +155,8 @@ def run_grid(
         found = over_objects(results_of_object, objects, *shared, at_once=at_once, draws=own, max_views=max_views)
         return jax.tree.map(lambda leaf: jnp.asarray(leaf.swapaxes(0, 1)), found)
 
-    return {policy.name: results(policy) for policy in policies}
+    with ThreadPoolExecutor(programs_at_once()) as pool:  # a program is compiled on one core
+        return dict(zip([policy.name for policy in policies], pool.map(results, policies), strict=True))
 
 
 def results_of_object(

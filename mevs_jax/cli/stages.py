@@ -60,6 +60,8 @@ def _train(call: Invocation, start: StartingWeights | None, mesh: Mesh | None = 
 
 def data(call: Invocation) -> None:
     """The data set."""
+    from data_pipeline.dataset.sheet import draw_objects
+    from data_pipeline.distributed import is_first
     from data_pipeline.errors import DataError
     from eval.training import make_data
 
@@ -68,6 +70,11 @@ def data(call: Invocation) -> None:
     statistics = make_data(call.settings, call.out, call.options.beam)
     counts = ", ".join(f"{sum(of.values())} {split}" for split, of in statistics.counts.items())
     print(f"Data set: {counts} objects of {len(statistics.classes)} classes, {statistics.views} views each")
+    if is_first():
+        print(f"A picture of them: {draw_objects(call.out / 'data', statistics)}")
+        print(
+            "On it, each object should be whole and stand upright along its arrow; sizes should be of one unit (--dataset.up)"
+        )
 
 
 def train(call: Invocation) -> None:
