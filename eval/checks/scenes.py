@@ -150,11 +150,7 @@ def views_in(
     from scipy.spatial.transform import Rotation  # imported late: it takes a fifth of a second
 
     random = np.random.default_rng(seed)
-    offset, factor = np.zeros(3), 1.0
-    if condition.sphere:
-        offset = random.normal(size=3)
-        offset *= condition.sphere * np.cbrt(random.random()) / np.linalg.norm(offset)
-        factor = 1 + condition.sphere * random.uniform(-1, 1)
+    offset, factor = _errors_of_sphere(condition.sphere, random)
     yaw = Rotation.from_rotvec([0, 0, random.uniform(0, 2 * np.pi) if condition.turned else 0.0]).as_matrix()
     source = replace(_CAMERA, distance=camera.distance)
     poses = np.asarray(cameras_at(viewpoints.astype(np.float32), distance=source.distance).pose, float)
@@ -194,6 +190,15 @@ def views_in(
             if "pixel" not in str(error):  # not that the image shows nothing of the object
                 raise
     return found
+
+
+def _errors_of_sphere(most: float, random: np.random.Generator) -> tuple[Float[np.ndarray, " 3"], float]:
+    """How far the believed centre is off, in radii, and the factor of the believed radius."""
+    if not most:
+        return np.zeros(3), 1.0
+    offset = random.normal(size=3)
+    offset *= most * np.cbrt(random.random()) / np.linalg.norm(offset)
+    return offset, 1 + most * random.uniform(-1, 1)
 
 
 def _seen(

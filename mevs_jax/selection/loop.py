@@ -136,9 +136,7 @@ def select_views(
     max_views: int,
     fuse: Fuse = sum_of_logits,
 ) -> Episode:
-    """Observes one object view by view until the confidence reaches `threshold` or `max_views` views are seen.
-
-    The loop also ends when no reachable view is left.
+    """Observes one object view by view until the confidence reaches `threshold`, `max_views` are seen, or none is left to reach.
 
     Args:
         key: PRNG key for policies that draw at random.
