@@ -12,7 +12,16 @@ from datetime import timedelta
 from pathlib import Path
 
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, ProgressColumn, Task, TextColumn, TimeRemainingColumn
+from rich.progress import (
+    BarColumn,
+    MofNCompleteColumn,
+    Progress,
+    ProgressColumn,
+    Task,
+    TaskID,
+    TextColumn,
+    TimeRemainingColumn,
+)
 from rich.text import Text
 
 from data_pipeline.errors import DataError
@@ -44,6 +53,11 @@ class _Watched(Progress):
         self._writer.start()
         super().start()
 
+    def advance(self, task_id: TaskID, advance: float = 1) -> None:
+        super().advance(task_id, advance)
+        if advance and self._tasks[task_id].fields["note"] == COMPILING:
+            self.update(task_id, note="")
+
     def stop(self) -> None:
         self._ended.set()
         if self._writer.is_alive():
@@ -63,6 +77,8 @@ class _Watched(Progress):
                     console.print(line)
 
 
+COMPILING = "compiling …"
+"""Note of a task whose program is compiled at its first call; it is removed when the task advances."""
 SECONDS_BETWEEN_LINES = 30.0
 _SECONDS_BETWEEN_STATES = 5.0
 _status: Path | None = None
@@ -85,12 +101,13 @@ def watched(out: Path) -> Iterator[None]:
 
 def line_of(task: Task, unit: str) -> str:
     """How far a task is, how fast, and how much longer it takes, in one line."""
+    if (note := task.fields.get("note")) == COMPILING:
+        return f"{task.description}: {note}"
     said = f"{task.description}: {task.completed:,.0f} of {task.total or 0:,.0f} {unit} ({task.percentage:.0f} %)"
     if task.speed:
         said += f", {task.speed:,.1f} {unit}/s"
     if task.time_remaining is not None:
         said += f", {timedelta(seconds=round(task.time_remaining))} left"
-    note = task.fields.get("note")
     return f"{said}, {note}" if note else said
 
 

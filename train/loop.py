@@ -30,7 +30,7 @@ from data_pipeline.differences import differences, in_words
 from data_pipeline.distributed import is_first
 from data_pipeline.errors import DataError, Diverged
 from data_pipeline.files import as_read, check_of_file, keep_checks, keep_json
-from data_pipeline.progress import console, progress_bar
+from data_pipeline.progress import COMPILING, console, progress_bar
 from train.optimiser import learning_rate
 from train.results.finite import all_finite, not_finite
 from train.results.identity import config_of, content_of
@@ -126,7 +126,9 @@ def _train(training: _Training, begin: Callable[[], None] | None) -> None:
         log, lead = MetricsLog(training.folder, training.step), Lead()
         batches = train_batches(training.data, task.batches, first_step=training.step)
         views, total = config.batch_size, epoch_steps * config.epochs
-        line = bar.add_task(f"Training {task.name}", total=total * views, completed=training.step * views, note="")
+        line = bar.add_task(
+            f"Training {task.name}", total=total * views, completed=training.step * views, note=COMPILING
+        )
         while not training.is_finished:
             started = time.perf_counter()
             while training.step < (training.epoch + 1) * epoch_steps:

@@ -18,7 +18,7 @@ from jax.sharding import Mesh
 
 from data_pipeline.dataset.batches import train_batches
 from data_pipeline.errors import DataError
-from data_pipeline.progress import console, progress_bar
+from data_pipeline.progress import COMPILING, console, progress_bar
 from train.loop import weighted_means
 from train.many.members import Group, Together
 from train.many.trainers import TRAINERS, Batches, Trainer, Way, way_for
@@ -69,7 +69,7 @@ def train_members(
 
         views = optimiser.batch_size * (count if group.own_batches else 1)
         total, done = epoch_steps * optimiser.epochs * views, of.step * views
-        line = bar.add_task(f"{title}: {group.task.name}", total=total, completed=done, note="")
+        line = bar.add_task(f"{title}: {group.task.name}", total=total, completed=done, note=COMPILING)
         while of.epoch < optimiser.epochs and (training := of.training(optimiser.patience)).any():
             started = time.perf_counter()
             trainer.begin(training)

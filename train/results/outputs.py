@@ -15,7 +15,7 @@ import numpy as np
 from data_pipeline.dataset.batches import evaluation_batches
 from data_pipeline.dataset.builder import open_split
 from data_pipeline.distributed import from_all, own_share
-from data_pipeline.progress import progress_bar
+from data_pipeline.progress import COMPILING, progress_bar
 from train.results.finite import check_outputs
 from train.running.devices import local_mesh, parameter_sharding, place, place_on
 from train.step import Batch, Task
@@ -67,7 +67,7 @@ def network_outputs(
     objects, given = len(own), own if len(own) else chosen[:1]
     batches = evaluation_batches(data, split, points=task.batches.points, images=task.batches.images, chosen=given)
     with progress_bar("objects") as bar:
-        line = bar.add_task(f"Evaluating {task.name} on {split} objects", total=objects, note="")
+        line = bar.add_task(f"Evaluating {task.name} on {split} objects", total=objects, note=COMPILING)
         out = []
         while chunk := list(islice(batches, mesh.size)):
             filled = [*chunk, *chunk[:1] * (mesh.size - len(chunk))]

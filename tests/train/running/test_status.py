@@ -10,7 +10,7 @@ import pytest
 
 from data_pipeline import progress
 from data_pipeline.lock import NAME, locked
-from data_pipeline.progress import STATUS, progress_bar, watched
+from data_pipeline.progress import COMPILING, STATUS, line_of, progress_bar, watched
 from mevs_jax.cli.failure import Unusable
 from mevs_jax.cli.parsing import tool_options
 from mevs_jax.cli.stages import status
@@ -24,7 +24,11 @@ def test_a_run_is_watched_while_it_works(tmp_path, monkeypatch):
     log = {"step": 1000, "epoch": 2, "train/loss": 0.5, "val/loss": 0.25}
     (trained / "metrics.jsonl").write_text(json.dumps(log) + "\nhalf a li")
     with locked(tmp_path, "mevs train"), watched(tmp_path), progress_bar("views") as bar:
-        bar.advance(bar.add_task("Training classifier", total=400, note="val loss 0.6"), 100)
+        line = bar.add_task("Training classifier", total=400, note=COMPILING)
+        assert line_of(bar.tasks[0], "views") == "Training classifier: compiling …"
+        bar.advance(line, 100)
+        assert line_of(bar.tasks[0], "views").startswith("Training classifier: 100 of 400 views (25 %)")
+        bar.update(line, note="val loss 0.6")
         until = time.monotonic() + 20
         while not (tmp_path / STATUS).exists() or len(found := list(status_of(tmp_path))) < 3:
             assert time.monotonic() < until
