@@ -19,7 +19,7 @@ from mpl_toolkits.mplot3d.art3d import Poly3DCollection
 import mevs_jax
 from data_pipeline.objects.furniture import furniture
 from mevs_jax.agent.looking import Walk
-from mevs_jax.geometry.triangles import unit_triangles
+from mevs_jax.geometry.triangles import centred_triangles
 
 INK, GREY, MARK, LIGHT = "#1b2a41", "#6b7785", "#c1440e", "#c9d1da"
 PIECE = ("table", 900)
@@ -116,7 +116,7 @@ def main() -> None:
     FigureCanvasAgg(figure)
     grid = figure.add_gridspec(2, count + 2, width_ratios=[1] * count + [2.1, 2.7], height_ratios=(1.5, 1))
     draw_views(figure, grid, walk, system)
-    triangles = unit_triangles(piece.vertices, piece.faces)
+    triangles, _ = centred_triangles(piece.vertices, piece.faces)
     draw_cameras(figure.add_subplot(grid[:, count], projection="3d"), walk, system, triangles)
     draw_curves(figure.add_subplot(grid[:, count + 1]))
     figure.savefig(Path(__file__).with_name("overview.png"), dpi=80, facecolor="white")

@@ -28,7 +28,7 @@ def images_of_mesh(
 
     Raises:
         ImportError: without the package embreex.
-        ValueError: as of `unit_triangles`.
+        ValueError: as of `centred_triangles`.
     """
     triangles, radius = centred_triangles(vertices, faces)
     try:

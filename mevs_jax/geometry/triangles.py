@@ -9,21 +9,16 @@ from mevs_jax.arguments import numbers
 from mevs_jax.geometry.faces import have_area
 
 
-def unit_triangles(
+def centred_triangles(
     vertices: Float[np.ndarray, "vertices 3"], faces: Int[np.ndarray, "faces 3"]
-) -> Float[np.ndarray, "faces 3 3"]:
-    """Triangles of a mesh, centred on its bounding box and scaled into the unit sphere, as the data sets are.
+) -> tuple[Float[np.ndarray, "faces 3 3"], float]:
+    """Triangles of a mesh, centred on its bounding box and scaled into the unit sphere; and the radius before.
 
     Faces without area are left out.
 
     Raises:
         ValueError: for a mesh without faces, with indices out of range, with corners that are not finite, or without an area.
     """
-    return centred_triangles(vertices, faces)[0]
-
-
-def centred_triangles(vertices: np.ndarray, faces: np.ndarray) -> tuple[Float[np.ndarray, "faces 3 3"], float]:
-    """`unit_triangles`, and the distance of the furthest corner from the centre."""
     vertices, faces = numbers(vertices), np.asarray(faces)
     if vertices.ndim != 2 or vertices.shape[1] != 3 or faces.ndim != 2 or faces.shape[1] != 3 or not len(faces):
         raise ValueError(
