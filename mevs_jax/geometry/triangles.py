@@ -3,18 +3,16 @@
 from __future__ import annotations
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float
 
 from mevs_jax.arguments import numbers
 from mevs_jax.geometry.faces import have_area
 
 
-def centred_triangles(
-    vertices: Float[np.ndarray, "vertices 3"], faces: Int[np.ndarray, "faces 3"]
-) -> tuple[Float[np.ndarray, "faces 3 3"], float]:
+def centred_triangles(vertices: np.ndarray, faces: np.ndarray) -> tuple[Float[np.ndarray, "faces 3 3"], float]:
     """Triangles of a mesh, centred on its bounding box and scaled into the unit sphere; and the radius before.
 
-    Faces without area are left out.
+    Faces without area are left out. Arguments are of any shape and type, since a caller's mistakes are named here.
 
     Raises:
         ValueError: for a mesh without faces, with indices out of range, with corners that are not finite, or without an area.
