@@ -65,6 +65,9 @@ def _of_depth(said: Geometry) -> Iterator[Change]:
         "it is measured along each pixel's ray: divide it by the length of (x, y, 1) of the pixel",
         replace(said, along_ray=True),
     )
+    with np.errstate(divide="ignore"):
+        inverse = np.where(said.depth > 0, 1 / said.depth, said.depth)
+    yield Change("inverse depth", "take 1 / depth of each measured pixel", replace(said, depth=inverse))
     for factor in (0.001, 0.1, 0.2, 0.25, 4.0, 5.0, 10.0, 1000.0):
         advice = f"multiply depth by {factor:g} (--depth-unit), or divide the poses' translations by it"
         yield Change("another unit of depth", advice, replace(said, scale=factor))

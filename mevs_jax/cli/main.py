@@ -11,6 +11,7 @@ import platform
 import select
 import signal
 import sys
+import warnings
 import zlib
 from contextlib import redirect_stdout
 from importlib.util import find_spec
@@ -184,6 +185,12 @@ def _keep_compiled() -> None:
     except (OSError, RuntimeError):  # no home, or none that can be written to
         return
     if os.access(folder, os.W_OK):
+        from mevs_jax.deploy.entries import check_entries
+
+        with warnings.catch_warnings(record=True) as said:
+            check_entries(folder)
+        for warning in said:
+            print(f"Note: {warning.message}", file=sys.stderr)
         os.environ["JAX_COMPILATION_CACHE_DIR"] = str(folder)
         os.environ.setdefault("JAX_COMPILATION_CACHE_MAX_SIZE", str(_COMPILED_BYTES))
         os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0.2")

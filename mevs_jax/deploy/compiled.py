@@ -9,6 +9,8 @@ from pathlib import Path
 import jax
 from jax.experimental.compilation_cache import compilation_cache
 
+from mevs_jax.deploy.entries import check_entries
+
 LARGEST = 512 * 2**20
 """Size in bytes above which the oldest programs in the folder are removed."""
 
@@ -19,7 +21,8 @@ def keep_compiled(folder: str | Path | None = None) -> Path:
     Changes JAX's settings for the whole process (its persistent compilation cache). Programs of other versions of JAX, or for
     other devices, are kept under other names.
 
-    A folder that JAX already uses, by `JAX_COMPILATION_CACHE_DIR` for example, is kept.
+    A folder that JAX already uses, by `JAX_COMPILATION_CACHE_DIR` for example, is kept. Programs that are damaged, or another's,
+    are removed with a warning.
 
     Args:
         folder: by default `mevs_jax/compiled` in the user's cache, `$XDG_CACHE_HOME` or `~/.cache`.
@@ -34,6 +37,7 @@ def keep_compiled(folder: str | Path | None = None) -> Path:
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
     _prune(folder)
+    check_entries(folder)
     jax.config.update("jax_compilation_cache_dir", str(folder))
     compilation_cache.reset_cache()  # JAX keeps the folder that it has begun to use
     jax.config.update(

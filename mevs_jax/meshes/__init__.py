@@ -42,7 +42,7 @@ AXIS_DECLARED = (".glb", ".gltf", ".dae")
 Up = Literal["auto", "z", "y"]
 """Which axis of a file is up: the one its format declares, else z (`auto`), or always z or y."""
 
-_TO_Z_UP = {"x": np.array([[0.0, -1, 0], [0, 0, -1], [1, 0, 0]]), "y": np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])}
+TO_Z_UP = {"x": np.array([[0.0, -1, 0], [0, 0, -1], [1, 0, 0]]), "y": np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])}
 """Rotations that turn x or y up into z up, as COLLADA's and glTF's axes are defined."""
 
 _OWN_READERS: dict[str, tuple[str, Callable[[bytes], tuple[np.ndarray, np.ndarray]]]] = {
@@ -87,7 +87,7 @@ def parse_mesh(
                 vertices, triangles, axis = _foreign(content, suffix, sibling)
         except (MemoryError, RecursionError) as error:
             raise Damage("is too large or too deeply nested to be read; export a simpler mesh") from error
-    turn = _TO_Z_UP.get(axis if up == "auto" else up)
+    turn = TO_Z_UP.get(axis if up == "auto" else up)
     if turn is not None:
         with np.errstate(all="ignore"):  # vertices that no face uses may be NaN
             vertices = vertices @ turn.T

@@ -1,8 +1,8 @@
 """What other readers make of mutated meshes: `python -m tests.fuzz.differences [--inputs 2000] [format …]`.
 
-Each input is read by the project and by trimesh, and by Open3D where it reads the format. What both say is one of few kinds, by
-the reason where one refuses. They are counted, with an input of each kind kept in a folder. Two readers agree if they have the
-same triangles, as points in space in any order; triangles without area do not count.
+Each input is read by the project and by trimesh, Open3D and assimp where they read the format. What both say is one of few
+kinds, by the reason where one refuses. They are counted, with inputs of each kind kept in a folder. Two readers agree if they
+have the same surface: its area, and the first and second moments of its points, so that a polygon may be cut into any triangles.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ import trimesh
 from hypothesis import given, seed
 
 from data_pipeline.errors import DataError, EmptyMesh
-from mevs_jax.meshes import parse_mesh
+from mevs_jax.meshes import TO_Z_UP, parse_mesh
 from tests.fuzz.targets import generated, mutated
 
 FORMATS = ("off", "obj", "stl", "ply", "glb", "dae", "3mf")
@@ -47,6 +47,24 @@ def _by_open3d(content: bytes, suffix: str) -> np.ndarray:
     return np.asarray(mesh.vertices)[np.asarray(mesh.triangles)]
 
 
+def _by_assimp(content: bytes, suffix: str) -> np.ndarray:
+    import assimp_py
+
+    with tempfile.NamedTemporaryFile(suffix=f".{suffix}") as file:
+        Path(file.name).write_bytes(content)
+        scene = assimp_py.import_file(
+            file.name,
+            assimp_py.Process_Triangulate | assimp_py.Process_PreTransformVertices | assimp_py.Process_SortByPType,
+        )
+    parts = [(np.reshape(mesh.vertices, (-1, 3)), np.asarray(mesh.indices)) for mesh in scene.meshes]
+    corners = np.concatenate([vertices[indices] for vertices, indices in parts if indices.size % 3 == 0]).reshape(
+        -1, 3, 3
+    )
+    declared = re.search(rb"([XYZ])_UP", content) if suffix == "dae" else None
+    axis = declared[1].decode().lower() if declared else "y"
+    return corners if suffix != "dae" or axis == "y" else corners @ TO_Z_UP["y"].T @ TO_Z_UP.get(axis, np.eye(3))
+
+
 def _ours(content: bytes, suffix: str) -> np.ndarray:
     vertices, faces = parse_mesh(content, f".{suffix}", "it", up="z")
     return vertices[faces]
@@ -55,21 +73,21 @@ def _ours(content: bytes, suffix: str) -> np.ndarray:
 READERS: dict[str, tuple[Read, tuple[str, ...]]] = {
     "trimesh": (_by_trimesh, FORMATS if find_spec("lxml") else FORMATS[:-1]),
     "Open3D": (_by_open3d, ("off", "obj", "stl", "glb")),
+    "assimp": (_by_assimp, FORMATS if find_spec("assimp_py") else ()),
 }
-"""Readers and what they read. trimesh needs lxml for 3MF. Open3D ends its process by a signal at some damaged PLY."""
+"""Readers and what they read. trimesh needs lxml for 3MF, and assimp the package assimp-py. Open3D ends its process by a signal
+at some damaged PLY."""
 
 
-def _shape(corners: np.ndarray) -> np.ndarray | None:
-    """Sorted triangles with an area, by six digits; None for numbers that are not finite."""
+def _surface(corners: np.ndarray) -> np.ndarray | None:
+    """Area, centre and second moments of a surface; None for none, or numbers that are not finite."""
     corners = np.asarray(corners, np.float64).reshape(-1, 3, 3)
-    if not np.isfinite(corners).all():
-        return None
     with np.errstate(all="ignore"):
-        area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
-        kept = corners[area > 1e-9 * max(1e-30, float(np.abs(corners).max(initial=0)) ** 2)]
-        size = max(1e-30, float(np.abs(kept).max(initial=0)))
-        centres = np.round(kept.mean(axis=1) / size, 5) + 0.0
-    return centres[np.lexsort(centres.T)]
+        area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1) / 2
+        whole, sums = area.sum(), corners.sum(axis=1)
+        squares = np.einsum("tki,tkj->tij", corners, corners) + np.einsum("ti,tj->tij", sums, sums)
+        moments = np.concatenate([area @ sums / 3, (area @ squares.reshape(-1, 9)) / 12]) / whole
+    return np.concatenate([[whole], moments]) if whole > 0 and np.isfinite(moments).all() else None
 
 
 def _said(error: BaseException) -> str:
@@ -81,27 +99,25 @@ def _said(error: BaseException) -> str:
 def compare(content: bytes, suffix: str, other: Read) -> str:
     """The kind of what the project and another reader make of an input."""
     mine = theirs = None
-    why = ""
+    why = "nothing with an area"
     try:
-        mine = _shape(_ours(content, suffix))
+        mine = _surface(_ours(content, suffix))
     except (DataError, EmptyMesh) as error:
         why = _said(error)
     try:
-        theirs = _shape(other(content, suffix))
+        theirs = _surface(other(content, suffix))
     except BaseException as error:  # other readers raise anything
         if isinstance(error, KeyboardInterrupt):
             raise
-    if mine is None or not len(mine):
-        return (
-            "both refuse"
-            if theirs is None or not len(theirs)
-            else f"refused here, read there: {why or 'nothing with an area'}"
-        )
-    if theirs is None or not len(theirs):
+    if mine is None:
+        return "both refuse" if theirs is None else f"refused here, read there: {why}"
+    if theirs is None:
         return "read here, refused there"
-    if len(mine) == len(theirs):
-        return "the same" if np.allclose(mine, theirs, atol=2e-5) else "other places"
-    return "more triangles here" if len(mine) > len(theirs) else "fewer triangles here"
+    if np.allclose(mine, theirs, rtol=1e-4, atol=1e-4 * np.abs(mine).max()):
+        return "the same"
+    if np.isclose(mine[0], theirs[0], rtol=1e-4):
+        return "as much, elsewhere"
+    return "more here" if mine[0] > theirs[0] else "less here"
 
 
 def count(suffix: str, inputs: int, start: int, keep: Path) -> dict[str, Counter[str]]:

@@ -192,6 +192,10 @@ def _dae() -> list[bytes]:
     return [making.dae(*BOX), making.dae(*U, "X_UP"), making.dae(*BOX, "Y_UP", "0 1 0 0 1 0 0 0 0 0 2 0 0 0 0 1")]
 
 
+def _3mf() -> list[bytes]:
+    return [making.threemf(*BOX), making.threemf(*U, "2 0 0 0 1 0 0 0 1 0 0 0"), making.threemf(*U, named=False)]
+
+
 def _zip() -> list[bytes]:
     small = making.members()
     kinds = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED, zipfile.ZIP_BZIP2, zipfile.ZIP_LZMA)
@@ -246,7 +250,7 @@ TARGETS = {
     "ply": Target(_mesh(".ply"), _ply),
     "glb": Target(_mesh(".glb"), _glb),
     "dae": Target(_mesh(".dae"), _dae),
-    "3mf": Target(_mesh(".3mf"), lambda: [making.threemf(*BOX), making.threemf(*U, "2 0 0 0 1 0 0 0 1 0 0 0")]),
+    "3mf": Target(_mesh(".3mf"), _3mf),
     "zip": Target(_file(_read_zip, ".zip"), _zip),
     "npz": Target(_file(_read_npz, ".npz"), _npz),
     "pth": Target(_file(_read_weights, ".pth"), _pth),

@@ -194,7 +194,7 @@ def dae(
 </COLLADA>""".encode()
 
 
-def threemf(vertices: np.ndarray, faces: Polygons, transform: str = "") -> bytes:
+def threemf(vertices: np.ndarray, faces: Polygons, transform: str = "", named: bool = True) -> bytes:
     core = "http://schemas.microsoft.com/3dmanufacturing/core/2015/02"
     points = "".join(f'<vertex x="{x}" y="{y}" z="{z}"/>' for x, y, z in vertices)
     corners = "".join(f'<triangle v1="{a}" v2="{b}" v3="{c}"/>' for a, b, c in triangles_of(faces))
@@ -204,7 +204,11 @@ def threemf(vertices: np.ndarray, faces: Polygons, transform: str = "") -> bytes
         f'<?xml version="1.0"?><model unit="millimeter" xmlns="{core}"><resources><object id="1" type="model">{mesh}</object>'
         f'</resources><build><item objectid="1"{given}/></build></model>'
     )
-    return zipped({"3D/3dmodel.model": model.encode()})
+    there = '<Relationship Id="a" Target="/3D/3dmodel.model" Type="http://schemas.microsoft.com/3dmanufacturing/2013/01/3dmodel"/>'
+    rels = (
+        f'<Relationships xmlns="http://schemas.openxmlformats.org/package/2006/relationships">{there}</Relationships>'
+    )
+    return zipped({"3D/3dmodel.model": model.encode(), **({"_rels/.rels": rels.encode()} if named else {})})
 
 
 def zipped(members: dict[str, bytes], method: int = zipfile.ZIP_DEFLATED) -> bytes:

@@ -89,6 +89,10 @@ def intrinsics(change):
     return lambda one: replace(one, K=np.stack([change(K) for K in one.K]))
 
 
+def stretched(fx, fy):
+    return intrinsics(lambda K: K * [[fx, 1, 1], [1, fy, 1], [1, 1, 1]])
+
+
 def swapped(poses):
     """Quaternions that were written w, x, y, z and read as x, y, z, w."""
     changed = poses.copy()
@@ -138,6 +142,7 @@ FAULTS = {
         "by 1000",
     ),
     "depth along rays": (depth(along_rays), "depth along the rays", "divide it"),
+    "1 / depth": (depth(lambda them: 1 / them), "inverse depth", "take 1 / depth"),
     "inverse poses": (poses(np.linalg.inv), "inverse poses", "invert them"),
     "a left-handed world": (
         poses(lambda them: MIRROR @ them @ MIRROR),
@@ -158,6 +163,26 @@ FAULTS = {
     "rolled by 90°": (turned(Rotation.from_euler("z", 90, degrees=True).as_matrix()), "cameras rolled by", "-90"),
     "axes of OpenGL": (turned(np.diag([1.0, -1, -1])), "axes of OpenGL", "z backwards"),
     "depth a tenth too far": (depth(lambda them: 1.1 * them), "scale of depth", "multiply depth by 0.9"),
+    "depth a tenth too near": (depth(lambda them: 0.9 * them), "scale of depth", "multiply depth by 1.1"),
+    "images upside down": (depth(lambda them: them[:, ::-1]), "images flipped upside down", "flip"),
+    "images turned by 180°": (depth(lambda them: them[:, ::-1, ::-1]), "images rotated by 180°", "flip"),
+    "focal lengths a tenth too short": (
+        intrinsics(lambda K: K * [[0.9, 1, 1], [1, 0.9, 1], [1, 1, 1]]),
+        "focal length",
+        "by 1.111",
+    ),
+    "fy 1.3 times fx": (stretched(1, 1.3), "focal length", "fx is to be"),
+    "principal point aside": (
+        intrinsics(lambda K: K + np.outer((4, 0, 0), (0, 0, 1))),
+        "principal point",
+        "by -4.0 pixels",
+    ),
+    "cameras turned aside": (
+        turned(Rotation.from_euler("y", 5, degrees=True).as_matrix()),
+        "hand–eye error",
+        "calibrate",
+    ),
+    "cameras too near": (turned(np.eye(3), (0, 0, 0.1)), "hand–eye error", "0.10"),
     "transposed images": (depth(lambda them: np.swapaxes(them, 1, 2)), "transposed images", "swap rows and columns"),
     "images flipped": (depth(lambda them: them[:, :, ::-1]), "images flipped left-right", "flip"),
     "stale poses": (poses(held), "stale poses", "30 images"),
@@ -171,7 +196,19 @@ FAULTS = {
 }
 
 
-ESTIMATED = {"fx a fifth too long", "a hand–eye error", "stale images", "stale times", "cx and cy swapped"}
+ESTIMATED = {
+    "focal lengths a tenth too short",
+    "fy 1.3 times fx",
+    "principal point aside",
+    "cameras turned aside",
+    "cameras too near",
+    "depth a tenth too near",
+    "fx a fifth too long",
+    "a hand–eye error",
+    "stale images",
+    "stale times",
+    "cx and cy swapped",
+}
 """Which take some seconds each, since the sizes of faults are estimated."""
 
 

@@ -6,8 +6,12 @@ import os
 import shutil
 import subprocess
 import sys
+import zlib
+
+import pytest
 
 from mevs_jax.deploy.compiled import _prune
+from mevs_jax.deploy.entries import DamagedProgramsWarning, check_entries
 
 PROGRAM = """
 import jax, jax.numpy as jnp
@@ -66,3 +70,43 @@ def test_a_copied_folder_is_used(tmp_path):
             before = kept
     assert before
     assert kept == before
+
+
+TWO = """
+import sys, warnings, jax, jax.numpy as jnp
+from mevs_jax import keep_compiled
+with warnings.catch_warnings(record=True) as said:
+    warnings.simplefilter("always")
+    keep_compiled(sys.argv[1])
+    one = jax.jit(lambda x: jnp.sin(x) @ x)(jnp.ones((5, 5)))
+    other = jax.jit(lambda x: jnp.cos(x) @ x)(jnp.ones((5, 5)))
+print(f"{float(one[0, 0]):.4f} {float(other[0, 0]):.4f}", [str(warning.message).partition(" in ")[0] for warning in said])
+"""
+
+
+@pytest.mark.parametrize("damage", ["swapped", "cut"])
+def test_programs_that_are_not_as_they_were_written_are_compiled_again(damage, tmp_path):
+    given = {name: value for name, value in os.environ.items() if name != "JAX_COMPILATION_CACHE_DIR"}
+
+    def said() -> str:
+        command = [sys.executable, "-c", TWO, str(tmp_path)]
+        return subprocess.run(command, capture_output=True, text=True, env=given, timeout=300, check=True).stdout
+
+    right = "4.2074 2.7015 "
+    assert said() == f"{right}[]\n"
+    one, other = sorted(tmp_path.glob("jit__lambda*-cache"))  # of one name, so that only their checks differ
+    contents = one.read_bytes(), other.read_bytes()
+    for path, content in zip((other, one), contents, strict=True):
+        path.write_bytes(content if damage == "swapped" else content[:-20])
+    assert said() == f"{right}['2 compiled programs']\n"
+    assert said() == f"{right}[]\n"
+
+
+@pytest.mark.parametrize("content", [b"", b"no program", b"\x78\x9c", zlib.compress(b"the program jit_other")])
+def test_files_that_were_damaged_before_they_were_known(content, tmp_path):
+    (tmp_path / "jit_one-0-cache").write_bytes(content)
+    (tmp_path / "jit_two-0-cache").write_bytes(zlib.compress(b"the program jit_two"))
+    (tmp_path / "checks.json").write_bytes(b"{")
+    with pytest.warns(DamagedProgramsWarning, match="^1 compiled programs"):
+        check_entries(tmp_path)
+    assert [path.name for path in tmp_path.glob("*-cache")] == ["jit_two-0-cache"]
