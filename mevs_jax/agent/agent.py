@@ -64,7 +64,7 @@ class Agent:
         system: from `mevs_jax.load`.
         policy: `best`, a name of `system.policies`, or a function `(key, state, scene) -> scores` as in `mevs_jax.POLICIES`. A
             function is compiled once for all agents, so what it refers to must not change.
-        stop: calibrated probability of the most likely class from which on the agent is sure, in (0, 1]; above 1 it never is.
+        stop: calibrated probability of the most likely class from which on the agent is sure, in (0, 1]; 2: it never is.
         max_views: the budget: largest number of images of an object, views that are taken again included.
         unknown: an object that is stranger than this share of the known objects is an `unknown object`, in (0, 1]; None: never.
             By default 0.95, or None for a system that has a class of unknown objects, or that cannot tell them.
@@ -98,7 +98,9 @@ class Agent:
 
     def __post_init__(self) -> None:
         _check(isinstance(self.system, TrainedSystem), f"system must be from mevs_jax.load, got {self.system!r:.80}")
-        self.stop = number(self.stop, "stop must be a probability above 0", lambda stop: stop > 0)
+        self.stop = number(
+            self.stop, "stop must be a probability above 0, as 0.95, or 2 for never", lambda stop: 0 < stop <= 2
+        )
         self.max_views = whole(self.max_views, f"max_views must be from 1 to {MOST_VIEWS}", 1, MOST_VIEWS)
         can_tell = self.system.parts.strangeness is not None
         if self.unknown == "default":

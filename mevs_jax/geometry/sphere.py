@@ -49,7 +49,8 @@ class Sphere(ByContent):
         object.__setattr__(self, "radius", radius)
         upright(self.up)
         if self.yaw is not None:
-            object.__setattr__(self, "yaw", number(self.yaw, "yaw must be a finite angle in radians, or None"))
+            rule = "yaw must be an angle in radians, within two turns, or None"
+            object.__setattr__(self, "yaw", number(self.yaw, rule, lambda yaw: abs(yaw) <= 4 * np.pi))
 
     @cached_property
     def position(self) -> Float[np.ndarray, " 3"]:

@@ -153,6 +153,7 @@ def test_frames_that_cannot_be_used_are_left_out_by_name(system):
 
 REFUSED = {
     "stop must be a probability": {"stop": 0.0},
+    "stop must be a probability above 0, as 0.95": {"stop": 95},
     "max_views must be from 1": {"max_views": 0},
     r"unknown must be in \(0, 1\]": {"unknown": 1.5},
     "gain_per_cost must be at least 0": {"gain_per_cost": -1.0},
@@ -178,7 +179,8 @@ def test_calls_that_cannot_be_are_refused(system):
         "center must be three finite numbers": {"center": (0, 0), "radius": 1},
         "radius must be positive": {"center": (0, 0, 0), "radius": -1},
         "up must be a direction": {"center": (0, 0, 0), "radius": 1, "up": (0, 0, 0)},
-        "yaw must be a finite angle": {"center": (0, 0, 0), "radius": 1, "yaw": np.nan},
+        "yaw must be an angle in radians": {"center": (0, 0, 0), "radius": 1, "yaw": np.nan},
+        "yaw must be an angle in radians, within two turns": {"center": (0, 0, 0), "radius": 1, "yaw": 300},
     }.items():
         with pytest.raises(ValueError, match=message):
             agent.reset(**options)
