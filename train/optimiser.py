@@ -34,8 +34,8 @@ class OptimiserConfig:
     epoch_steps: int = 0
     """least number of steps of an epoch: where there are few objects, each gives more views than `epoch_views`"""
     checkpoint_steps: int = 1000
-    """steps between two checkpoints within an epoch. The last may not be written yet when a job is killed, which then repeats
-    fewer than twice so many. 0: none within an epoch"""
+    """the most steps that a killed job repeats. A checkpoint is begun after every half as many, and the one before is written by
+    then. 0: none within an epoch"""
     validation_views: int = 0
     """views of each validation object that are evaluated after an epoch; 0: all"""
     method: Literal["adam", "muon"] = "adam"
@@ -58,7 +58,7 @@ class OptimiserConfig:
 
     def saves_after(self, step: int, epoch_steps: int) -> bool:
         """Returns whether a checkpoint is due after so many steps of all epochs, which is not the end of one."""
-        return bool(self.checkpoint_steps and step % epoch_steps and step % self.checkpoint_steps == 0)
+        return bool(self.checkpoint_steps and step % epoch_steps and step % max(1, self.checkpoint_steps // 2) == 0)
 
     def shifted(self, number: int) -> OptimiserConfig:
         """Returns the settings of seed number `number`, counted from these."""

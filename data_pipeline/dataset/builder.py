@@ -13,6 +13,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
+import jax
 import numpy as np
 
 from data_pipeline.capture.settings import CaptureConfig, check_camera
@@ -65,11 +66,16 @@ def _write_shards(
     if beam is not None:
         write_by_beam(parts, write, beam)
         return
+    written = 0
     with progress_bar("objects") as bar:
         task = bar.add_task("Writing shards", total=sum(len(part.entries) for part in parts), note="")
         for part in claimed(parts, folder):
-            write(part)
+            written += write(part)
             bar.advance(task, len(part.entries))
+    shares = by_all({str(jax.process_index()): f"{len(own_share(len(source.entries)))} objects, {written} shards"})
+    if len(shares) > 1:
+        said = "; ".join(f"process {number}: {share}" for number, share in shares.items())
+        console.print(f"Captured and written by {said}")
 
 
 def _finish(

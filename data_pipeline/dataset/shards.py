@@ -145,8 +145,8 @@ def _example_of(entry: ObjectEntry, captures: Path, rig: Rig, backend: str) -> d
 _rig_for = functools.cache(rig_for)
 
 
-def write_part(part: Part, folder: Path, classes: tuple[str, ...], config: CaptureConfig, captures: Path) -> None:
-    """Writes a shard and then its index, unless both are there and of the same captures.
+def write_part(part: Part, folder: Path, classes: tuple[str, ...], config: CaptureConfig, captures: Path) -> bool:
+    """Writes a shard and then its index, unless both are there and of the same captures; returns whether it has written.
 
     Raises:
         Diverged: if the entropies of an object are not finite.
@@ -156,7 +156,7 @@ def write_part(part: Part, folder: Path, classes: tuple[str, ...], config: Captu
     path = part.shard(folder)
     about = about_index(part.index(folder))
     if about.get("made_of") == made_of and path.exists() and about["check"].startswith(f"{path.stat().st_size}:"):
-        return
+        return False
     from array_record.python.array_record_module import ArrayRecordWriter
     from tensorflow_datasets.core.example_serializer import ExampleSerializer
 
@@ -187,6 +187,7 @@ def write_part(part: Part, folder: Path, classes: tuple[str, ...], config: Captu
     write_index(
         part.index(folder), whole | {"label": whole["label"].astype(np.int32)}, {"made_of": made_of, "check": check}
     )
+    return True
 
 
 def claimed(parts: Sequence[Part], folder: Path) -> Iterable[Part]:

@@ -6,8 +6,10 @@ averaging), after the epoch that is best on validation data.
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any, Generic, TypeVar
 
 import jax
@@ -18,11 +20,17 @@ from flax import nnx
 from jax.sharding import PartitionSpec
 from jaxtyping import Array, Float, Int
 
+from data_pipeline.distributed import agreed, is_first
 from data_pipeline.errors import Diverged
+from data_pipeline.files import npz_bytes
+from data_pipeline.progress import console
 from train.many.seeds import shared_equally
 from train.many.trainers import way_for
 from train.results.finite import all_finite, not_finite
+from train.results.identity import why
+from train.results.kept import check_kept, keep
 from train.running.devices import DATA, local_mesh
+from train.running.preemption import Preempted, Preemption
 
 Data = TypeVar("Data")
 Validate = Callable[[nnx.State], dict[str, float]]
@@ -92,6 +100,7 @@ def fit_together(
     loss_of: Callable[..., Float[Array, ""]],
     each: Sequence[Fitting],
     rate_option: str = "the learning rate",
+    kept: Path | None = None,
 ) -> list[Fitted]:
     """Returns for each network the averaged weights of its best epoch, and its losses of every epoch; each ends as it does alone.
 
@@ -102,38 +111,85 @@ def fit_together(
         config: of all networks; each has a seed of its own.
         loss_of: weights, a batch, a key and what `Fitting.given` holds to the mean loss.
         rate_option: the option that sets the learning rate, for messages.
+        kept: file for the state at the end, or after the epoch in which SIGTERM came; from which it goes on. None: none is kept.
 
     Raises:
         Diverged: if after an epoch a loss or an averaged weight of any network is infinite or NaN.
+        Preempted: after SIGTERM, once the state is saved.
     """
-    samples = len(jax.tree.leaves(each[0].data)[0])
-    start, epoch = _epoch_of(config, loss_of, samples)
+    start, epoch = _epoch_of(config, loss_of, len(jax.tree.leaves(each[0].data)[0]))
     finite = jax.jit(all_finite)
     fixed = [(jax.tree.map(jnp.asarray, one.data), one.given) for one in each]
-    epochs = _Epochs(epoch, [start(one.parameters) for one in each], fixed)
-    best = [one.parameters for one in each]
-    histories: list[list[dict[str, float]]] = [[] for _ in each]
-    least = [float("inf")] * len(each)
-    for number in range(config.epochs):
-        losses = epochs.run([jax.random.fold_in(jax.random.key(one.seed), number) for one in each])
-        for index, one in enumerate(each):
-            mean = epochs.mean_weights(index)
-            found = one.validate(mean) if one.validate else {}
-            histories[index].append({"train": float(losses[index]), **found})
-            bad = [f"loss {which!r} is" for which in not_finite(histories[index][-1])]
-            if bad or not finite(mean):
-                raise Diverged(
-                    f"the {one.name} diverged in epoch {number + 1} of {config.epochs}: its {(bad or ['weights are'])[0]} not "
-                    f"finite; nothing of it is saved; repeat the command with a lower {rate_option} "
-                    f"({config.learning_rate:g} in this run)"
-                )
-            if not one.validate or sum(found.values()) < least[index]:
-                best[index], least[index] = mean, sum(found.values())
-    return list(zip(best, histories, strict=True))
+    of = _Progress([start(one.parameters) for one in each], [one.parameters for one in each])
+    if kept is not None:
+        of = of.stored_in(kept)
+    done, epochs = len(of.histories[0]), _Epochs(epoch, of.carries, fixed)
+    if done == config.epochs:
+        return list(zip(of.best, of.histories, strict=True))
+    with Preemption(handles=kept is not None) as preemption:
+        for number in range(done, config.epochs):
+            losses = epochs.run([jax.random.fold_in(jax.random.key(one.seed), number) for one in each])
+            for index, one in enumerate(each):
+                mean = epochs.carry(index)[2]
+                found = one.validate(mean) if one.validate else {}
+                of.histories[index].append({"train": float(losses[index]), **found})
+                bad = [f"loss {which!r} is" for which in not_finite(of.histories[index][-1])]
+                if bad or not finite(mean):
+                    raise Diverged(
+                        f"the {one.name} diverged in epoch {number + 1} of {config.epochs}: its {(bad or ['weights are'])[0]} "
+                        f"not finite; nothing of it is saved; repeat the command with a lower {rate_option} "
+                        f"({config.learning_rate:g} in this run)"
+                    )
+                if not one.validate or sum(found.values()) < of.least[index]:
+                    of.best[index], of.least[index] = mean, sum(found.values())
+            asked = kept is not None and preemption.after_step()
+            if kept is not None and (asked or number + 1 == config.epochs):
+                of.carries = [epochs.carry(index) for index in range(len(each))]
+                of.store(kept)
+            if asked:
+                raise Preempted(f"{each[0].name} was asked to end after epoch {number + 1} of {config.epochs}")
+    return list(zip(of.best, of.histories, strict=True))
 
 
 _Carry = tuple[Any, Any, Any, Array]
 """Weights, moments, running mean of the weights, number of steps."""
+
+
+@dataclass
+class _Progress:
+    """How far networks are that are trained together: states, averaged weights of the best epochs, losses of all epochs."""
+
+    carries: list[_Carry]
+    best: list[nnx.State]
+    least: list[float] = field(init=False)
+    histories: list[list[dict[str, float]]] = field(init=False)
+
+    def __post_init__(self) -> None:
+        self.least, self.histories = [float("inf")] * len(self.best), [[] for _ in self.best]
+
+    def store(self, path: Path) -> None:
+        arrays = {
+            str(number): np.asarray(leaf) for number, leaf in enumerate(jax.tree.leaves((self.carries, self.best)))
+        }
+        if is_first():
+            keep(path, npz_bytes(**arrays, numbers=np.array(json.dumps([self.least, self.histories]))))
+
+    def stored_in(self, path: Path) -> _Progress:
+        """Returns the progress stored in a file; this one if there is none, or it is damaged."""
+        if not agreed(path.exists()):
+            return self
+        leaves, structure = jax.tree.flatten((self.carries, self.best))
+        try:
+            check_kept(path)
+            with np.load(path) as stored:
+                found = _Progress(
+                    *jax.tree.unflatten(structure, [jnp.asarray(stored[str(n)]) for n in range(len(leaves))])
+                )
+                found.least, found.histories = json.loads(str(stored["numbers"]))
+        except Exception as error:  # the content of a damaged file decides which
+            console.print(f"{path} cannot be read ({why(error)}), so this training begins again", markup=False)
+            return self
+        return found
 
 
 def _epoch_of(config: AveragedConfig, loss_of: Callable[..., Array], samples: int) -> tuple[Callable, Callable]:
@@ -196,11 +252,11 @@ class _Epochs:
         self._carries = [carry for carry, _ in done]
         return [loss for _, loss in done]
 
-    def mean_weights(self, index: int) -> nnx.State:
-        """The averaged weights of a network."""
+    def carry(self, index: int) -> _Carry:
+        """The state of a network."""
         if self._at_once:
-            return jax.tree.map(lambda leaf: leaf[index], self._carries[2])
-        return self._carries[index][2]
+            return jax.tree.map(lambda leaf: leaf[index], self._carries)
+        return self._carries[index]
 
 
 def _stacked(trees: Sequence[Any]) -> Any:

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any, Generic, TypeVar
 
 import flax.struct
@@ -258,7 +259,7 @@ class Lesson:
     name: str = "view policy"
 
 
-def train_policies(config: PolicyConfig, lessons: Sequence[Lesson]) -> list[Trained]:
+def train_policies(config: PolicyConfig, lessons: Sequence[Lesson], folder: Path | None = None) -> list[Trained]:
     """Returns for each lesson the policy after all rounds, and its losses by round and epoch.
 
     The policies are trained together (`fit_together`).
@@ -266,11 +267,13 @@ def train_policies(config: PolicyConfig, lessons: Sequence[Lesson]) -> list[Trai
     Args:
         config: of all policies; each lesson has a seed of its own.
         lessons: all with as many objects, views and parts.
+        folder: where the state is kept after every round and after SIGTERM, from which the training goes on; None for nowhere.
 
     Raises:
         Diverged: if a loss or a weight is infinite or NaN.
+        Preempted: after SIGTERM, once the state is saved.
     """
-    return in_rounds(config, lessons, _gather, _fit)
+    return in_rounds(config, lessons, folder, _gather, _fit)
 
 
 Samples = TypeVar("Samples")
@@ -298,11 +301,13 @@ class Round(Generic[Samples]):
 
 Gather = Callable[[Seen, ViewPolicy | None, Any, tuple[int, int]], Samples]
 """What new walks on some objects tell, by the network of the round before; the numbers of round and part seed them."""
-Fit = Callable[[Any, Sequence[Round[Samples]]], list[tuple[ViewPolicy, list[dict[str, float]]]]]
-"""Networks of the best epoch, or of the last without validation samples, and their losses by epoch."""
+Fit = Callable[[Any, Sequence[Round[Samples]], Path | None], list[tuple[ViewPolicy, list[dict[str, float]]]]]
+"""Networks of the best epoch, or of the last without validation samples, and their losses by epoch; kept in a file if given."""
 
 
-def in_rounds(config: Any, lessons: Sequence[Lesson], gather: Gather[Samples], fit: Fit[Samples]) -> list[Trained]:
+def in_rounds(
+    config: Any, lessons: Sequence[Lesson], folder: Path | None, gather: Gather[Samples], fit: Fit[Samples]
+) -> list[Trained]:
     """Returns for each lesson the network after all rounds. Every round gathers samples, and trains on those of all rounds."""
     configs = [replace(config, seed=lesson.seed) for lesson in lessons]
     untrained = [_untrained(own, lesson) for own, lesson in zip(configs, lessons, strict=True)]
@@ -320,7 +325,8 @@ def in_rounds(config: Any, lessons: Sequence[Lesson], gather: Gather[Samples], f
             samples = joined(train[index]), joined(check[index]) if check[index] else None
             name = f"{lesson.name}, round {number + 1} of {config.rounds},"
             rounds.append(Round(name, own, untrained[index], guide, *samples))
-        for index, (network, history) in enumerate(fit(config, rounds)):
+        kept = None if folder is None else folder / f"round_{number + 1}.npz"
+        for index, (network, history) in enumerate(fit(config, rounds, kept)):
             networks[index] = network
             histories[index].append(history)
             last = ", ".join(f"{name} {value:.4f}" for name, value in history[-1].items())
@@ -335,7 +341,9 @@ def _untrained(config: PolicyConfig, lesson: Lesson) -> ViewPolicy:
     return new_policy(config, data.logits.shape[-1], fusion.posed, cloud)
 
 
-def _fit(config: PolicyConfig, rounds: Sequence[Round[Choices]]) -> list[tuple[ViewPolicy, list[dict[str, float]]]]:
+def _fit(
+    config: PolicyConfig, rounds: Sequence[Round[Choices]], kept: Path | None
+) -> list[tuple[ViewPolicy, list[dict[str, float]]]]:
     """Trains networks from the same random weights in every round."""
     structure = nnx.graphdef(rounds[0].untrained)
 
@@ -358,7 +366,7 @@ def _fit(config: PolicyConfig, rounds: Sequence[Round[Choices]]) -> list[tuple[V
         )
         for one in rounds
     ]
-    fitted = fit_together(config, loss_of, fittings, "--learned.policy.learning-rate")
+    fitted = fit_together(config, loss_of, fittings, "--learned.policy.learning-rate", kept)
     return [(nnx.merge(structure, best), history) for best, history in fitted]
 
 

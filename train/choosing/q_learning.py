@@ -14,6 +14,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
+from pathlib import Path
 
 import flax.struct
 import jax
@@ -138,9 +139,11 @@ def _exploring(
     return jnp.where(jax.random.bernoulli(whether, share), any_view, greedy(key, state, scene))
 
 
-def train_by_q_learning(config: QLearningConfig, lessons: Sequence[Lesson]) -> list[Trained]:
+def train_by_q_learning(
+    config: QLearningConfig, lessons: Sequence[Lesson], folder: Path | None = None
+) -> list[Trained]:
     """Returns a network for each lesson, as `train_policies` does, for use with `by="state"`."""
-    return in_rounds(config, lessons, _gather, _fit)
+    return in_rounds(config, lessons, folder, _gather, _fit)
 
 
 def _gather(seen: Seen, guide: ViewPolicy | None, config: QLearningConfig, number: tuple[int, int]) -> Transitions:
@@ -154,7 +157,7 @@ def _gather(seen: Seen, guide: ViewPolicy | None, config: QLearningConfig, numbe
 
 
 def _fit(
-    config: QLearningConfig, rounds: Sequence[Round[Transitions]]
+    config: QLearningConfig, rounds: Sequence[Round[Transitions]], kept: Path | None
 ) -> list[tuple[ViewPolicy, list[dict[str, float]]]]:
     """Trains networks from the weights of their targets, those of the round before.
 
@@ -176,5 +179,5 @@ def _fit(
         target = nnx.state(one.before or one.untrained)
         validate = None if one.check is None else mean_losses(partial(error, target=target), one.check, 256)
         fittings.append(Fitting(one.config.seed, target, one.train, validate, one.name, (target,)))
-    fitted = fit_together(config, loss_of, fittings, "--learned.q-learning.learning-rate")
+    fitted = fit_together(config, loss_of, fittings, "--learned.q-learning.learning-rate", kept)
     return [(nnx.merge(structure, best), history) for best, history in fitted]

@@ -9,6 +9,7 @@ Folders within a run's folder: `learned/turned/` (data), `learned/seed_0/` with 
 
 from __future__ import annotations
 
+import shutil
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import cache, cached_property, partial
@@ -25,6 +26,8 @@ from data_pipeline.capture.viewpoints import is_file
 from data_pipeline.dataset.batches import fold_of
 from data_pipeline.dataset.builder import DataConfig, open_split, prepare
 from data_pipeline.dataset.statistics import SUMMARY, DatasetStatistics, load_statistics
+from data_pipeline.distributed import is_first
+from data_pipeline.files import digest_of
 from data_pipeline.progress import console
 from mevs_jax.beliefs.fusing import CalibratedFusion
 from mevs_jax.models import Recogniser, ViewPolicy
@@ -47,6 +50,7 @@ from train.results.identity import identity_of, made_by, stamp_of
 from train.results.kept import kept_array
 from train.results.networks import is_stored, trained_once
 from train.results.outputs import Ask, network_outputs
+from train.results.records import as_json
 from train.tasks.entropy import EntropyConfig, EntropyTask
 from train.tasks.recogniser import RecogniserTask
 from train.tasks.size import check_sizes, used_size
@@ -368,15 +372,20 @@ class PolicyJob:
     lesson: Callable[[], Lesson]
 
 
+UNFINISHED = "unfinished"
+"""Folder of the state of a training that goes on."""
+
+
 def trained_policies(jobs: Sequence[PolicyJob]) -> list[ViewPolicy]:
     """Returns the policies of some jobs, which differ in seeds alone; those that are not stored are trained together."""
     waiting = [job for job in jobs if not is_stored(job.folder, job.identity)]
 
     def train(some: Sequence[PolicyJob]) -> list[Trained]:
         config, lessons = some[0].config, [job.lesson() for job in some]
+        folder = some[0].folder / UNFINISHED / digest_of([as_json(job.identity) for job in some])[:12]
         if isinstance(config, QLearningConfig):
-            return train_by_q_learning(config, lessons)
-        return train_policies(config, lessons)
+            return train_by_q_learning(config, lessons, folder)
+        return train_policies(config, lessons, folder)
 
     together = cache(lambda: train(waiting))
 
@@ -385,7 +394,10 @@ def trained_policies(jobs: Sequence[PolicyJob]) -> list[ViewPolicy]:
         policy, histories = together()[waiting.index(job)] if known else train([job])[0]
         return policy, {"rounds": histories}
 
-    return [trained_once(job.folder, job.identity, job.untrained, partial(made, job)) for job in jobs]
+    trained = [trained_once(job.folder, job.identity, job.untrained, partial(made, job)) for job in jobs]
+    for job in jobs if is_first() else ():
+        shutil.rmtree(job.folder / UNFINISHED, ignore_errors=True)
+    return trained
 
 
 def train_recognisers(each: Sequence[Stages]) -> None:

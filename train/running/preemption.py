@@ -44,10 +44,10 @@ class Preemption:
     _steps = 0
     """Steps of all trainings of this process. JAX agrees on one that is larger than any so far."""
 
-    def __init__(self) -> None:
+    def __init__(self, handles: bool = True) -> None:
         self.asked = False
         # Only the main thread receives signals; with several processes, JAX handles SIGTERM.
-        self._handles = jax.process_count() == 1 and threading.current_thread() is threading.main_thread()
+        self._handles = handles and jax.process_count() == 1 and threading.current_thread() is threading.main_thread()
 
     def __enter__(self) -> Preemption:
         if self._handles:
