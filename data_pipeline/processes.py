@@ -34,11 +34,16 @@ def usable_cpus() -> int:
     return os.cpu_count() or 1
 
 
-def _end_with_parent() -> None:
-    parent = multiprocessing.parent_process()
-    assert parent is not None
-    parent.join()
-    os._exit(1)
+def end_with_parent() -> None:
+    """Lets a thread end this process once the one that started it is gone; a parent that is killed cannot."""
+
+    def wait() -> None:
+        parent = multiprocessing.parent_process()
+        assert parent is not None
+        parent.join()
+        os._exit(1)
+
+    threading.Thread(target=wait, daemon=True).start()
 
 
 _TASK = "task"
@@ -56,7 +61,7 @@ def _begin(notes: Path) -> None:
     """Starts a worker process."""
     global _task
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent handles Ctrl-C and ends its workers
-    threading.Thread(target=_end_with_parent, daemon=True).start()  # a parent that is killed cannot
+    end_with_parent()
     note = FileIO(notes / str(os.getpid()), "w")
     _task = *pickle.loads((notes / _TASK).read_bytes()), note
 

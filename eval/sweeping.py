@@ -19,15 +19,23 @@ from eval.runs import tasks
 from eval.settings import Settings
 from train.choosing.stages import Stages
 from train.many.members import Member, SweepTask
+from train.many.study import study_of
 from train.many.sweep import sweep
 from train.results.identity import config_of
 
 
-def train_sweep(settings: Settings, out: Path, mesh: jax.sharding.Mesh | None = None) -> tuple[Path, list[Member]]:
-    """Trains many configurations of one network together; returns the folder of the sweep and its members."""
+def train_sweep(
+    settings: Settings, out: Path, mesh: jax.sharding.Mesh | None = None
+) -> tuple[Path, Path, list[Member]]:
+    """Trains many configurations of one network; returns the folders of the sweep and of the best network, and the members.
+
+    They are trained together, or as a study, in jobs that several processes may share.
+    """
     name, data = settings.sweep.network, out / "data"
-    statistics = load_statistics(data)
+    statistics, trials = load_statistics(data), settings.sweep.trials
     task: SweepTask
+    if trials and (name == "recogniser" or jax.process_count() > 1):
+        raise DataError("--sweep.trials is for the classifier and the entropy predictor, and without --distributed")
     if name == "recogniser":
         check_same_data(settings.dataset, data)
         study = Stages(settings.learned, settings.dataset, out, settings.learned.seed)
@@ -35,15 +43,21 @@ def train_sweep(settings: Settings, out: Path, mesh: jax.sharding.Mesh | None = 
         task, data, statistics = study.task(), study.turned, study.statistics
     else:
         task = tasks(settings, statistics)[("classifier", "entropy").index(name)]
-    folder = out / "sweep" / name
-    members = sweep(task, data, statistics, folder, settings.sweep, mesh)
+    folder = out / "sweep" / (f"{name}_study" if trials else name)
+    if trials:
+        job, members = study_of(task, data, statistics, folder, settings.sweep, mesh)
+    else:
+        job, members = folder, sweep(task, data, statistics, folder, settings.sweep, mesh)
     if is_first():
         write_sweep_report(members, folder)
-    return folder, members
+    return folder, job / "network", members
 
 
-def adopt(settings: Settings, out: Path) -> tuple[Path, Settings]:
+def adopt(settings: Settings, out: Path, made: Path) -> tuple[Path, Settings]:
     """Makes the best network of a finished sweep that of the run.
+
+    Args:
+        made: its folder.
 
     Returns:
         Its folder, and the settings with the hyper-parameters that it was trained with.
@@ -52,7 +66,7 @@ def adopt(settings: Settings, out: Path) -> tuple[Path, Settings]:
         DataError: if the run has another such network already.
     """
     name = settings.sweep.network
-    made, there = out / "sweep" / name / "network", out / name
+    there = out / name
     if name == "recogniser":
         there = Stages(settings.learned, settings.dataset, out, settings.learned.seed).recogniser_folder()
     if not made.exists():

@@ -36,6 +36,9 @@ class OptimiserConfig:
     checkpoint_steps: int = 1000
     """the most steps that a killed job repeats. A checkpoint is begun after every half as many, and the one before is written by
     then. 0: none within an epoch"""
+    reading_workers: int = 0
+    """processes that read batches for training, validation and evaluation; 0: threads of the process that trains, which suffices
+    for a CPU"""
     validation_views: int = 0
     """views of each validation object that are evaluated after an epoch; 0: all"""
     method: Literal["adam", "muon"] = "adam"

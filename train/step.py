@@ -55,7 +55,9 @@ class Hyperparameters:
 
 def view_batches(config: OptimiserConfig, **what: Any) -> ViewBatches:
     """Returns the batches of a training; `what` views hold is as in `ViewBatches`."""
-    return ViewBatches(config.batch_size, config.views_per_object, seed=config.data_seed, **what)
+    return ViewBatches(
+        config.batch_size, config.views_per_object, seed=config.data_seed, workers=config.reading_workers, **what
+    )
 
 
 @runtime_checkable

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import jax
 import numpy as np
@@ -65,7 +67,7 @@ class ValidationSet:
         self._task, self._data, self._counts = task, data, index < objects
         self._part = slice(index, None, processes) if self._counts else slice(1)
         self._class_weights = class_weights_of(task, statistics)
-        first = next(self._read_objects())
+        first = next(self._read_objects(workers=0))
         of_an_object = len(first["label"])
         most = -(-objects // processes) * of_an_object  # of any process
         # Views of an object stay on a device where they belong together.
@@ -81,8 +83,9 @@ class ValidationSet:
     def __iter__(self) -> Iterator[WeightedBatch]:
         return self._read() if self._kept is None else iter(self._kept)
 
-    def _read_objects(self) -> Iterator[dict[str, np.ndarray]]:
-        return validation_batches(self._data, self._task.batches, self._task.optimiser.validation_views, self._part)
+    def _read_objects(self, **changed: Any) -> Iterator[dict[str, np.ndarray]]:
+        batches, views = replace(self._task.batches, **changed), self._task.optimiser.validation_views
+        return validation_batches(self._data, batches, views, self._part)
 
     def _read(self) -> Iterator[WeightedBatch]:
         waiting: list[dict[str, np.ndarray]] = []

@@ -10,7 +10,8 @@ and validation. The option `ViewBatches.validation_by` reproduces this, to show 
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import signal
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -21,7 +22,7 @@ import numpy as np
 
 from data_pipeline.dataset.builder import open_split
 from data_pipeline.dataset.index import read_index
-from data_pipeline.processes import usable_cpus
+from data_pipeline.processes import end_with_parent, usable_cpus
 
 
 @dataclass(frozen=True)
@@ -38,6 +39,7 @@ class ViewBatches:
         validation_by: `object`, without leakage; or `view`, to train also on views of the validation objects, except for a share
             of every object's views (`views_aside`).
         balanced: repeat the objects of rarer classes in an epoch, so that all classes have the same weight.
+        workers: number of processes that read; 0 for threads of this process. Batches are the same.
     """
 
     batch_size: int
@@ -48,6 +50,7 @@ class ViewBatches:
     fold: tuple[int, int] | None = None
     validation_by: Literal["object", "view"] = "object"
     balanced: bool = False
+    workers: int = 0
 
     def __post_init__(self) -> None:
         if self.fold is not None and self.validation_by == "view":
@@ -175,7 +178,7 @@ def validation_splits(config: ViewBatches) -> tuple[str, ...]:
 def validation_batches(
     folder: Path, config: ViewBatches, views: int, part: slice = slice(None)
 ) -> Iterator[dict[str, np.ndarray]]:
-    """Yields the validation views, one object per batch.
+    """Returns an iterator over the validation views, one object per batch.
 
     If validation is by object, different objects contribute different views, so that every view of the lattice is used. If it
     is by view, an object contributes views that are held out.
@@ -184,20 +187,56 @@ def validation_batches(
         views: number of views of each object (by view: their held-out share); 0 for all of them.
         part: which of the objects; all by default.
     """
-    by_object = config.validation_by == "object"
     read = _keys_read(config.points, config.images)
-    objects = open_split(folder, "val", read) if by_object else _TrainingObjects(folder, config)
-    for index in range(len(objects))[part]:
-        example = objects[index]
-        count = len(example["entropy"])
-        if by_object:
-            wanted = min(views or count, count)
-            keep = (np.arange(wanted) * count // wanted + index) % count if views else np.arange(count)
-        else:
-            aside = views_aside(count, index, config.seed)
-            keep = aside[: max(1, round(VIEWS_ASIDE * views))] if views else aside
-        random = np.random.default_rng([config.seed, index])
-        yield views_of_example(example, keep, points=config.points, images=config.images, random=random)
+    objects = open_split(folder, "val", read) if config.validation_by == "object" else _TrainingObjects(folder, config)
+    positions = range(len(objects))[part]
+    return _read(
+        _mapped(positions, partial(_validation_views, objects=objects, config=config, views=views)), config.workers
+    )
+
+
+def _validation_views(index: int, objects: Any, config: ViewBatches, views: int) -> dict[str, np.ndarray]:
+    """Returns the validation views of the object at a position."""
+    example = objects[index]
+    count = len(example["entropy"])
+    if config.validation_by == "object":
+        wanted = min(views or count, count)
+        keep = (np.arange(wanted) * count // wanted + index) % count if views else np.arange(count)
+    else:
+        aside = views_aside(count, index, config.seed)
+        keep = aside[: max(1, round(VIEWS_ASIDE * views))] if views else aside
+    random = np.random.default_rng([config.seed, index])
+    return views_of_example(example, keep, points=config.points, images=config.images, random=random)
+
+
+def _mapped(positions: Sequence[int], function: Callable[[int], dict[str, np.ndarray]]) -> Any:
+    """Returns a Grain data set of a function of positions."""
+    import grain  # imported late: it takes a sixth of a second
+
+    return grain.MapDataset.source(positions).map(function)
+
+
+def _begin_worker(index: int, count: int) -> None:
+    """Called in a new process that reads. The process that trains is told to end, and ends it."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    signal.signal(signal.SIGTERM, signal.SIG_IGN)
+    end_with_parent()
+
+
+def _read(stream: Any, workers: int) -> Iterator[dict[str, np.ndarray]]:
+    """Returns an iterator over a Grain data set, which is read ahead by threads, or by so many processes."""
+    import grain
+
+    threads = 1 if workers else min(16, max(1, usable_cpus() // 2))
+    read = stream.to_iter_dataset(grain.ReadOptions(num_threads=threads, prefetch_buffer_size=16))
+    if workers:
+        from absl import flags
+
+        if not flags.FLAGS.is_parsed():  # of the command line, which has none of Abseil's; Grain asks for some
+            flags.FLAGS.mark_as_parsed()
+        options = grain.MultiprocessingOptions(num_workers=workers, per_worker_buffer_size=4)
+        read = read.mp_prefetch(options, worker_init_fn=_begin_worker)
+    return iter(read)
 
 
 def _join(elements: list[dict[str, np.ndarray]]) -> dict[str, np.ndarray]:
@@ -224,7 +263,7 @@ def steps_per_epoch(objects: int, config: ViewBatches) -> int:
 def train_batches(
     folder: Path, config: ViewBatches, *, first_step: int = 0, whole: bool = False
 ) -> Iterator[dict[str, np.ndarray]]:
-    """Returns an endless iterator over this process's part of each batch from step `first_step` on, prefetched by threads.
+    """Returns an endless iterator over this process's part of each batch from step `first_step` on, read ahead.
 
     Args:
         whole: whether this process's part is all of a batch, as where processes train networks of their own.
@@ -237,7 +276,7 @@ def train_batches(
     if per_batch % processes:
         share = f"{per_batch} objects per batch cannot be shared by {processes} processes"
         raise ValueError(f"{share}; choose another batch size")
-    import grain  # imported late: it takes a sixth of a second
+    import grain
 
     # The order is drawn anew for every epoch, and a batch may contain objects of two successive epochs.
     objects = _TrainingObjects(folder, config)
@@ -250,9 +289,7 @@ def train_batches(
     )
     # The parts of all processes, concatenated, are the batch that a single process would read.
     parts = stream.batch(per_batch // processes, batch_fn=_join)[index::processes]
-    threads = min(16, max(1, usable_cpus() // 2))
-    options = grain.ReadOptions(num_threads=threads, prefetch_buffer_size=16)
-    return iter(parts[first_step:].to_iter_dataset(options))
+    return _read(parts[first_step:], config.workers)
 
 
 def evaluation_batches(
@@ -263,18 +300,25 @@ def evaluation_batches(
     images: str | None = None,
     seed: int = 0,
     chosen: np.ndarray | None = None,
+    workers: int = 0,
 ) -> Iterator[dict[str, np.ndarray]]:
-    """Yields all views of the objects of a split, one object per batch, in the order of the shards; equal at every call.
+    """Returns an iterator over all views of the objects of a split, always the same: one object per batch, as in the shards.
 
     Batches are those of `views_of_example`, with the key `position`: the position of the object in the split, for each view.
 
     Args:
         chosen: positions of the objects; all by default.
+        workers: number of processes that read; 0 for threads of this process.
     """
     source = open_split(folder, split, _keys_read(points, images))
-    for index in range(len(source)) if chosen is None else map(int, chosen):
-        example = source[index]
-        views = np.arange(len(example["entropy"]))
-        random = np.random.default_rng([seed, index])
-        batch = views_of_example(example, views, points=points, images=images, random=random)
-        yield batch | {"position": np.full(len(views), index, np.int32)}
+    positions = range(len(source)) if chosen is None else [int(position) for position in chosen]
+    views = partial(_all_views, source=source, points=points, images=images, seed=seed)
+    return _read(_mapped(positions, views), workers)
+
+
+def _all_views(index: int, source: Any, points: int, images: str | None, seed: int) -> dict[str, np.ndarray]:
+    """Returns all views of the object at a position."""
+    example = source[index]
+    views, random = np.arange(len(example["entropy"])), np.random.default_rng([seed, index])
+    batch = views_of_example(example, views, points=points, images=images, random=random)
+    return batch | {"position": np.full(len(views), index, np.int32)}

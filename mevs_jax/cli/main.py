@@ -82,7 +82,7 @@ def _run(name: str, arguments: list[str]) -> None:
             _run_silently(call, command)
             return
     check_output(call.out)
-    if not command.locks:
+    if not command.locks or (name == "sweep" and call.settings.sweep.trials):  # whose jobs have locks of their own
         _run_in(call, command)
         return
     with locked(call.out, " ".join(["mevs", *call.arguments])), watched(call.out):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import nullcontext
 from functools import partial
 from typing import TYPE_CHECKING
 
@@ -87,20 +88,23 @@ def train(call: Invocation) -> None:
 def sweep(call: Invocation) -> None:
     """A sweep over one network's hyperparameters."""
     from data_pipeline.distributed import is_first
+    from data_pipeline.lock import locked
     from eval import sweeping
     from train.many.sweep import best_of
 
-    folder, members = sweeping.train_sweep(call.settings, call.out)
+    folder, network, members = sweeping.train_sweep(call.settings, call.out)
     best = best_of(members)
     print(
         f"Best of {len(members)}: validation loss {best.loss:.4f} with learning rate {best.learning_rate:.2e}, weight decay "
         f"{best.weight_decay:.2e}, dropout {best.dropout:.2f}, augmentation {best.augmentation:.2f}"
     )
-    print(f"All of them: {folder / 'members.md'}; the best network: {folder / 'network'}")
+    print(f"All of them: {folder / 'members.md'}; the best network: {network}")
     if call.options.adopt:
-        there, settings = sweeping.adopt(call.settings, call.out)
-        if is_first():
-            keep_adopted(call, settings)
+        # Processes that share a study hold the locks of their jobs alone.
+        with locked(call.out, "mevs sweep --adopt") if call.settings.sweep.trials else nullcontext():
+            there, settings = sweeping.adopt(call.settings, call.out, network)
+            if is_first():
+                keep_adopted(call, settings)
         print(f"The run has it now: {there}")
 
 

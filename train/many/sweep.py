@@ -48,6 +48,9 @@ class SweepConfig:
     """the network to train; the recogniser is that of mevs study learned"""
     members: int = 16
     """number of configurations, drawn from the ranges by a Sobol sequence"""
+    trials: int = 0
+    """instead of drawing all at once: a study of Optuna of at least so many configurations, in jobs of `members` each; other
+    processes that give the same command share it (extra optuna)"""
     learning_rate: Range = (3e-4, 1e-2)
     """range of the learning rate, uniform in its logarithm"""
     weight_decay: Range = (1e-4, 1e-1)
@@ -97,29 +100,35 @@ def drawn_of(config: SweepConfig, task: SweepTask) -> list[dict[str, float]]:
     """Returns configurations drawn from the ranges by a Sobol sequence."""
     if config.members < 1:
         raise DataError(f"--sweep.members {config.members} is too few; it must be at least 1")
-    ranges = {"learning_rate": config.learning_rate, "weight_decay": config.weight_decay}
-    for name, (low, high) in ranges.items():
-        if not 0 < low <= high:
-            raise DataError(f"--sweep.{name.replace('_', '-')} {low} {high} must be a range above 0, smaller end first")
-    shares = {"dropout": config.dropout, "augmentation": config.augmentation}
-    for name, (low, high) in shares.items():
-        if not 0 <= low <= high <= 1 or (name == "dropout" and high == 1):
-            limits = "[0, 1)" if name == "dropout" else "[0, 1]"
-            raise DataError(f"--sweep.{name} {low} {high} must be a range within {limits}, smaller end first")
+    ranges, swept = ranges_of(config), names_of(task)
     from scipy.stats import qmc  # imported late: it takes a third of a second
 
-    low, high = np.array([*(np.log(pair) for pair in ranges.values()), *shares.values()]).T
+    low, high = np.array([np.log(pair) if name in LOGARITHMIC else pair for name, pair in ranges.items()]).T
     drawn = qmc.Sobol(len(low), seed=config.seed).random_base2(int(np.ceil(np.log2(config.members))))
-    places, names = low + drawn[: config.members] * (high - low), (*ranges, *shares)
-    swept = names_of(task)
     return [
         {
-            name: float(np.exp(value) if name in ranges else value)
-            for name, value in zip(names, place, strict=True)
+            name: float(np.exp(value) if name in LOGARITHMIC else value)
+            for name, value in zip(ranges, place, strict=True)
             if name in swept
         }
-        for place in places
+        for place in low + drawn[: config.members] * (high - low)
     ]
+
+
+LOGARITHMIC = ("learning_rate", "weight_decay")
+"""Hyper-parameters that are drawn uniformly in their logarithms."""
+
+
+def ranges_of(config: SweepConfig) -> dict[str, Range]:
+    """Returns the ranges from which configurations are drawn, by hyper-parameter; raises `DataError` if one is not valid."""
+    ranges = {name: getattr(config, name) for name in (*LOGARITHMIC, "dropout", "augmentation")}
+    for name, (low, high) in ranges.items():
+        if name in LOGARITHMIC and not 0 < low <= high:
+            raise DataError(f"--sweep.{name.replace('_', '-')} {low} {high} must be a range above 0, smaller end first")
+        if name not in LOGARITHMIC and (not 0 <= low <= high <= 1 or (name == "dropout" and high == 1)):
+            limits = "[0, 1)" if name == "dropout" else "[0, 1]"
+            raise DataError(f"--sweep.{name} {low} {high} must be a range within {limits}, smaller end first")
+    return ranges
 
 
 def names_of(task: SweepTask) -> tuple[str, ...]:
@@ -217,10 +226,10 @@ def sweep(
     """
     members = draw_members(config, task)
     identity = as_read(
-        {"task": content_on(task, statistics), "sweep": _identity(config, task), "data": statistics.fingerprint}
+        {"task": content_on(task, statistics), "sweep": identity_of_sweep(config, task), "data": statistics.fingerprint}
     )
     check_config(folder, identity, "a sweep made")
-    if (made := _finished(folder)) is not None:
+    if (made := finished_members(folder)) is not None:
         return made
     mesh = mesh or device_mesh()
     wait_for_all("a sweep begins")
@@ -256,9 +265,9 @@ def csv_of_epochs(of: Together) -> str:
     return text.getvalue()
 
 
-def _identity(config: SweepConfig, task: SweepTask) -> dict[str, Any]:
+def identity_of_sweep(config: SweepConfig, task: SweepTask) -> dict[str, Any]:
     """What a sweep's `config.json` holds of its settings; what was added since version 0.1 and is off is left out."""
-    later = ("grid", "list", "seeds", "halving")
+    later = ("grid", "list", "seeds", "halving", "trials")
     default = asdict(SweepConfig())
     found = {name: value for name, value in asdict(config).items() if name not in later or value != default[name]}
     return found | ({"list": list_of(Path(config.list), task)} if config.list else {})
@@ -270,7 +279,7 @@ def best_of(members: Sequence[Member]) -> Member:
     return min(by_configurations(members)[min(means, key=means.__getitem__)], key=lambda member: member.loss)
 
 
-def _finished(folder: Path) -> list[Member] | None:
+def finished_members(folder: Path) -> list[Member] | None:
     """Returns the members of a finished sweep; None if it has to go on, or `members.json` is damaged."""
     path = folder / "members.json"
     if not agreed(path.exists()):

@@ -93,11 +93,11 @@ IN_A_SUMMARY = {"epoch", "best_loss", "best_epoch", "best", "seconds", "steps", 
 def content_of(task: Any) -> dict[str, Any]:
     """Returns a task as JSON keeps it; what was added since version 0.1 and is off is left out, as it was then.
 
-    So are `epoch_steps`, which matters for few objects alone (see `train.loop.content_on`), and `checkpoint_steps`, which changes
-    no weight.
+    So are `epoch_steps`, which matters for few objects alone (see `train.loop.content_on`), and `checkpoint_steps` and
+    `reading_workers`, which change no weight.
     """
     content = as_read(asdict(task))
-    for name in ("epoch_steps", "checkpoint_steps"):
+    for name in ("epoch_steps", "checkpoint_steps", "reading_workers"):
         content["optimiser"].pop(name)
     return {
         name: value

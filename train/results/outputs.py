@@ -65,7 +65,8 @@ def network_outputs(
     chosen = np.arange(len(open_split(data, split))) if chosen is None else chosen
     own = chosen[own_share(len(chosen))]
     objects, given = len(own), own if len(own) else chosen[:1]
-    batches = evaluation_batches(data, split, points=task.batches.points, images=task.batches.images, chosen=given)
+    what = {"points": task.batches.points, "images": task.batches.images, "workers": task.batches.workers}
+    batches = evaluation_batches(data, split, chosen=given, **what)
     with progress_bar("objects") as bar:
         line = bar.add_task(f"Evaluating {task.name} on {split} objects", total=objects, note=COMPILING)
         out = []

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import multiprocessing
+import os
+import signal
 from dataclasses import replace
 from itertools import islice
 
@@ -112,3 +115,25 @@ def test_evaluation_batches_hold_every_view_and_never_change(data):
     assert len(a) == 10
     assert all(equal(x, y) for x, y in zip(a, b, strict=True))
     np.testing.assert_array_equal(a[0]["view"], np.arange(8))
+
+
+@pytest.mark.slow
+def test_processes_that_read_give_the_same_batches(data):
+    """For training from a later step, for validation of a part, and for evaluation; SIGTERM to all of them stops no reading."""
+    by_processes = replace(BATCHES, workers=2)
+    streams = [train_batches(data, config, first_step=3) for config in (BATCHES, by_processes)]
+    for number in range(8):
+        assert equal(*(next(stream) for stream in streams))
+        if number == 1:
+            children = multiprocessing.active_children()
+            assert len(children) == 2
+            for child in children:
+                os.kill(child.pid, signal.SIGTERM)
+    parts = [list(validation_batches(data, config, 3, slice(1, None, 2))) for config in (BATCHES, by_processes)]
+    assert len(parts[0]) == 5
+    assert all(map(equal, *parts))
+    tests = [list(evaluation_batches(data, "test", points=20, workers=workers)) for workers in (0, 2)]
+    assert len(tests[1]) == 10
+    assert all(map(equal, *tests))
+    streams[1].close()
+    assert all(not child.is_alive() for child in children)

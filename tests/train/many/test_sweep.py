@@ -274,7 +274,7 @@ def test_a_halved_sweep_trains_the_best_to_the_end_is_shown_and_adopted(out, tmp
     entropy = replace(SETTINGS.entropy, optimiser=replace(SETTINGS.entropy.optimiser, epochs=4))
     config = SweepConfig(grid=("learning-rate=1e-7,1e-3,1e-6,3e-6",), halving=True)
     settings = replace(SETTINGS, entropy=entropy, sweep=config)
-    folder, members = train_sweep(settings, tmp_path)
+    folder, network, members = train_sweep(settings, tmp_path)
     assert [one.epochs for one in members] == [1, 4, 1, 2]
     assert best_of(members) is members[1]
     table, best = (folder / "members.md").read_text().splitlines(), min(members, key=lambda member: member.loss)
@@ -285,7 +285,7 @@ def test_a_halved_sweep_trains_the_best_to_the_end_is_shown_and_adopted(out, tmp
     rows = metrics_of(folder)
     assert len(rows) == sum(one.epochs for one in members)
     assert {"member", "epoch", "train/loss", "val/loss"} <= set(rows[0])
-    there, adopted = adopt(settings, tmp_path)
+    there, adopted = adopt(settings, tmp_path, network)
     assert there == tmp_path / "entropy"
     assert adopted.entropy.optimiser.learning_rate == 1e-3
     assert replace(adopted.entropy, optimiser=entropy.optimiser) == entropy
@@ -296,11 +296,11 @@ def test_a_halved_sweep_trains_the_best_to_the_end_is_shown_and_adopted(out, tmp
         there,
     )
     assert summary["best_loss"] == members[1].loss  # nothing is trained again
-    assert adopt(settings, tmp_path) == (there, adopted)
+    assert adopt(settings, tmp_path, network) == (there, adopted)
     (there / "config.json").write_text((there / "config.json").read_text().replace("0.001", "0.002"))
     (there / "checks.json").unlink()
     with pytest.raises(DataError, match="holds another network; delete it"):
-        adopt(settings, tmp_path)
+        adopt(settings, tmp_path, network)
 
 
 @pytest.mark.slow
@@ -309,9 +309,9 @@ def test_the_recogniser_is_swept_too(turned, data, tmp_path):
     shutil.copytree(data, tmp_path / "data")
     shutil.copytree(turned, tmp_path / "learned" / "turned")
     settings = replace(TINY, sweep=SweepConfig(network="recogniser", grid=("learning-rate=1e-4,1e-3",)))
-    _, members = train_sweep(settings, tmp_path)
+    _, network, members = train_sweep(settings, tmp_path)
     assert len(members) == 2
-    there, adopted = adopt(settings, tmp_path)
+    there, adopted = adopt(settings, tmp_path, network)
     assert there == tmp_path / "learned" / "seed_0" / "recogniser"
     assert adopted.learned.recogniser.optimiser.learning_rate == best_of(members).learning_rate
     study = Stages(adopted.learned, adopted.dataset, tmp_path, 0)
