@@ -7,9 +7,11 @@ shards; all later stages read them from there.
 from __future__ import annotations
 
 import functools
+import operator
+import pickle
 import shutil
 from collections.abc import Sequence
-from dataclasses import asdict
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +20,7 @@ import numpy as np
 
 from data_pipeline.capture.settings import CaptureConfig, check_camera
 from data_pipeline.capture.viewpoints import identified, viewpoints_of
-from data_pipeline.capture.workers import capture_all
+from data_pipeline.capture.workers import capture_all, left_out_of
 from data_pipeline.dataset.beam import beam_options, capture_by_beam, write_by_beam
 from data_pipeline.dataset.config import DataConfig as DataConfig
 from data_pipeline.dataset.config import check_viewpoints, identity_of
@@ -26,11 +28,20 @@ from data_pipeline.dataset.origin import changes_between, state_of
 from data_pipeline.dataset.origin import open_objects as open_objects
 from data_pipeline.dataset.proof import CAPTURES, SOURCE_STATE, damage_of_settings, found_in, state_before
 from data_pipeline.dataset.proof import open_split as open_split
-from data_pipeline.dataset.shards import Part, claimed, drop_others, finish_shards, parts_of, write_part
-from data_pipeline.dataset.statistics import SUMMARY, DatasetStatistics, load_statistics, statistics_of
+from data_pipeline.dataset.shards import (
+    Part,
+    claimed,
+    drop_others,
+    finish_shards,
+    largest_of,
+    parts_of,
+    tally_of,
+    write_part,
+)
+from data_pipeline.dataset.statistics import SUMMARY, DatasetStatistics, Tally, load_statistics
 from data_pipeline.distributed import agreed, by_all, is_first, own_share, wait_for_all
 from data_pipeline.errors import DataError
-from data_pipeline.files import check_of_file, keep_checks, keep_json
+from data_pipeline.files import check_of_file, keep_checks, keep_json, write_bytes
 from data_pipeline.objects.mesh import SOURCE_SPLITS, ObjectEntry, ObjectSource
 from data_pipeline.progress import console, progress_bar
 
@@ -56,58 +67,121 @@ def split_objects(entries: Sequence[ObjectEntry], validation_share: float, seed:
     return split
 
 
-def _write_shards(
-    parts: list[Part], source: ObjectSource, config: CaptureConfig, captures: Path, folder: Path, beam: Any
-) -> None:
-    """Writes all shards, which the processes share; `beam` are pipeline options or None."""
-    write = functools.partial(
-        write_part, folder=folder.absolute(), classes=source.classes, config=config, captures=captures.absolute()
-    )
-    if beam is not None:
-        write_by_beam(parts, write, beam)
-        return
-    written = 0
+@dataclass(frozen=True)
+class _Plan:
+    """What a data set will hold.
+
+    Attributes:
+        source: the source; without its objects where others list them.
+        left_out: names of the objects left out with the reasons, by split of the source.
+        parts: the shards; without their objects there.
+    """
+
+    source: ObjectSource
+    left_out: dict[str, dict[str, str]]
+    parts: list[Part]
+
+
+_PLAN = "plan"
+"""File of the plan that a worker of a pipeline has made."""
+
+
+def _planned(config: DataConfig, source: ObjectSource, left_out: dict[str, str]) -> _Plan:
+    """Returns the shards of the objects that are not left out."""
+    kept = [entry for entry in source.entries if entry.name not in left_out]
+    split = split_objects(kept, config.validation_share, config.seed)
+    _check_classes(config, source, split, left_out)
+    return _Plan(source, _reasons(source, left_out), parts_of(split, config.capture))
+
+
+def _begin_shards(parts: list[Part], folder: Path) -> None:
+    """Removes what belongs to no shard, and whatever a data set that is made again has."""
+    damaged = (folder / SUMMARY).exists()
+    (folder / SUMMARY).unlink(missing_ok=True)
+    drop_others([] if damaged else parts, folder)
+
+
+def _write_shards(plan: _Plan, config: CaptureConfig, folder: Path) -> Tally:
+    """Writes all shards, which the processes share; returns what statistics need, by their indices."""
+    written, classes = 0, plan.source.classes
     with progress_bar("objects") as bar:
-        task = bar.add_task("Writing shards", total=sum(len(part.entries) for part in parts), note="")
-        for part in claimed(parts, folder):
-            written += write(part)
-            bar.advance(task, len(part.entries))
-    shares = by_all({str(jax.process_index()): f"{len(own_share(len(source.entries)))} objects, {written} shards"})
+        task = bar.add_task("Writing shards", total=sum(part.objects for part in plan.parts), note="")
+        for part in claimed(plan.parts, folder):
+            written += write_part(part, folder, classes, config, folder / CAPTURES)
+            bar.advance(task, part.objects)
+    objects = len(own_share(len(plan.source.entries)))
+    shares = by_all({str(jax.process_index()): f"{objects} objects, {written} shards"})
     if len(shares) > 1:
         said = "; ".join(f"process {number}: {share}" for number, share in shares.items())
         console.print(f"Captured and written by {said}")
+    wait_for_all("shards are there")
+    largest = max(largest_of(part, folder) for part in plan.parts)
+    return functools.reduce(operator.add, (tally_of(part, largest, folder, len(classes)) for part in plan.parts))
 
 
-def _finish(
-    parts: list[Part],
-    source: ObjectSource,
-    left_out: dict[str, str],
-    config: DataConfig,
-    folder: Path,
-    state: dict[str, str] | None,
-) -> None:
+def _plan_in_worker(config: DataConfig, folder: Path) -> list[Part]:
+    """Returns the shards; stores the plan, without objects, and the state of the source for all others."""
+    source = open_objects(config)
+    plan = _planned(config, source, left_out_of(source.entries, folder / CAPTURES))
+    _begin_shards(plan.parts, folder)
+    if (state := state_of(config)) is not None:
+        keep_json(folder / SOURCE_STATE, state)
+    slim = _Plan(replace(source, entries=()), plan.left_out, [replace(part, entries=()) for part in plan.parts])
+    write_bytes(folder / _PLAN, pickle.dumps(slim))
+    return plan.parts
+
+
+def _plan_of(folder: Path) -> _Plan:
+    return pickle.loads((folder / _PLAN).read_bytes())
+
+
+def _write_in_worker(part: Part, config: CaptureConfig, folder: Path) -> Part:
+    write_part(part, folder, _plan_of(folder).source.classes, config, folder / CAPTURES)
+    return replace(part, entries=())
+
+
+def _make_by_beam(config: DataConfig, folder: Path, options: Any) -> tuple[_Plan, Tally]:
+    """Makes captures and shards by pipelines."""
+    captures, capture = folder / CAPTURES, config.capture
+    capture_by_beam(functools.partial(_entries_of, config), capture, captures, options, config.skip_damaged)
+    tally = write_by_beam(
+        functools.partial(_plan_in_worker, config, folder),
+        functools.partial(_write_in_worker, config=capture, folder=folder),
+        functools.partial(_classes_of, folder),
+        folder,
+        options,
+    )
+    plan = _plan_of(folder)
+    (folder / _PLAN).unlink()
+    return plan, tally
+
+
+def _entries_of(config: DataConfig) -> Sequence[ObjectEntry]:
+    return open_objects(config).entries
+
+
+def _classes_of(folder: Path) -> int:
+    return len(_plan_of(folder).source.classes)
+
+
+def _finish(plan: _Plan, tally: Tally, config: DataConfig, folder: Path, state: dict[str, str] | None) -> None:
     """Stores what is known of the whole data set, once all shards are there."""
-    index, checks = finish_shards(parts, folder, source.classes, config.capture)
-    counts = {
-        split: dict(zip(source.classes, np.bincount(of["label"], minlength=len(source.classes)).tolist(), strict=True))
-        for split, of in index.items()
-    }
-    viewpoints = viewpoints_of(config.capture)
-    statistics = statistics_of(
-        index,
-        classes=list(source.classes),
-        counts=counts,
-        left_out=_reasons(source, left_out),
+    source, viewpoints = plan.source, viewpoints_of(config.capture)
+    checks = finish_shards(plan.parts, folder, source.classes, config.capture)
+    statistics = tally.statistics(
+        source.classes,
+        left_out=plan.left_out,
         viewpoints=viewpoints.points.tolist(),
         neighbours=None if viewpoints.neighbours is None else [list(pair) for pair in viewpoints.neighbours],
         capture=asdict(identified(config.capture)),
         source=source.name,
         notes=source.notes,
     )
-    made_with = folder / "config.json"
-    keep_checks(folder, checks | {made_with.name: check_of_file(made_with)}, only=True)
+    made_with, of_source = folder / "config.json", folder / SOURCE_STATE
     if state is not None:
-        keep_json(folder / SOURCE_STATE, state)
+        keep_json(of_source, state)
+    more = [made_with, of_source] if of_source.exists() else [made_with]
+    keep_checks(folder, checks | {path.name: check_of_file(path) for path in more}, only=True)
     keep_json(folder / SUMMARY, statistics.content())
     shutil.rmtree(folder / CAPTURES, ignore_errors=True)
 
@@ -207,7 +281,11 @@ def prepare(config: DataConfig, folder: Path, beam: str | None = None) -> Datase
 
 def _made(config: DataConfig, folder: Path, identity: dict[str, Any], beam: Any) -> DatasetStatistics:
     """Makes the data set and returns its statistics. Several processes share the captures, and then the shards."""
-    captures, made_with = folder / CAPTURES, folder / "config.json"
+    if beam is not None:
+        folder.mkdir(parents=True, exist_ok=True)
+        keep_json(folder / "config.json", identity)
+        _finish(*_make_by_beam(config, folder.absolute(), beam), config, folder, None)
+        return load_statistics(folder)
     if not is_first():
         wait_for_all("the source is there")
     source, state = open_objects(config), state_of(config)
@@ -217,26 +295,16 @@ def _made(config: DataConfig, folder: Path, identity: dict[str, Any], beam: Any)
         console.print(f"{config.source}: {sentence}", markup=False)
     if is_first():
         folder.mkdir(parents=True, exist_ok=True)
-        keep_json(made_with, identity)
+        keep_json(folder / "config.json", identity)
     wait_for_all("captures begin")
-    if beam is None:  # several processes share the objects
-        own = [source.entries[index] for index in own_share(len(source.entries))]
-        left_out = by_all(capture_all(own, config.capture, captures, skip_damaged=config.skip_damaged))
-    else:
-        left_out = capture_by_beam(source.entries, config.capture, captures, beam, skip_damaged=config.skip_damaged)
-    split = split_objects(
-        [entry for entry in source.entries if entry.name not in left_out], config.validation_share, config.seed
-    )
-    _check_classes(config, source, split, left_out)
-    parts = parts_of(split, config.capture)
+    own = [source.entries[index] for index in own_share(len(source.entries))]
+    left_out = by_all(capture_all(own, config.capture, folder / CAPTURES, skip_damaged=config.skip_damaged))
+    plan = _planned(config, source, left_out)
     if is_first():
-        damaged = (folder / SUMMARY).exists()
-        (folder / SUMMARY).unlink(missing_ok=True)
-        drop_others([] if damaged else parts, folder)
+        _begin_shards(plan.parts, folder)
     wait_for_all("shards begin")
-    _write_shards(parts, source, config.capture, captures, folder, beam)
-    wait_for_all("shards are there")
+    tally = _write_shards(plan, config.capture, folder)
     if is_first():
-        _finish(parts, source, left_out, config, folder, state)
+        _finish(plan, tally, config, folder, state)
     wait_for_all("a data set is made")
     return load_statistics(folder)

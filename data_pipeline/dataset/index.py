@@ -82,9 +82,9 @@ def read_index(folder: Path, split: str, *columns: str) -> dict[str, Any]:
     return _made_of_records(folder, split, columns)
 
 
-def read_parts(paths: list[Path]) -> dict[str, Any]:
-    """Returns all columns of the indices of some shards, joined."""
-    return _read(paths, ())
+def read_parts(paths: list[Path], *columns: str) -> dict[str, Any]:
+    """Returns columns of the indices of some shards, joined."""
+    return _read(paths, columns)
 
 
 def _read(paths: list[Path], columns: tuple[str, ...]) -> dict[str, Any]:

@@ -26,7 +26,7 @@ from data_pipeline.capture.settings import CaptureConfig
 from data_pipeline.capture.workers import capture_entry, capture_path, say_damaged
 from data_pipeline.dataset.index import INDEX, about_index, index_path, read_parts, write_index
 from data_pipeline.dataset.proof import SHARDS
-from data_pipeline.dataset.statistics import SPLITS
+from data_pipeline.dataset.statistics import SPLITS, Tally
 from data_pipeline.errors import Diverged, reason_of
 from data_pipeline.files import PARTIAL, check_of_file, short_hash
 from data_pipeline.objects.mesh import ObjectEntry
@@ -48,11 +48,16 @@ _MOST_OBJECTS = 4096
 
 @dataclass(frozen=True)
 class Part:
-    """The objects of shard `number` of the `of` shards of a split, in the order of the records."""
+    """The objects of shard `number` of the `of` shards of a split, in the order of the records.
+
+    Attributes:
+        objects: their number, also where `entries` is left out.
+    """
 
     split: str
     number: int
     of: int
+    objects: int
     entries: tuple[ObjectEntry, ...]
 
     @property
@@ -77,7 +82,9 @@ def parts_of(split: dict[str, list[ObjectEntry]], config: CaptureConfig) -> list
         ordered = sorted(split[name], key=lambda entry: hashlib.md5((name + entry.name).encode()).digest())
         of = -(-len(ordered) // most)
         ends = [len(ordered) * number // of for number in range(of + 1)]
-        parts += [Part(name, at, of, tuple(ordered[ends[at] : ends[at + 1]])) for at in range(of)]
+        for at in range(of):
+            own = tuple(ordered[ends[at] : ends[at + 1]])
+            parts.append(Part(name, at, of, len(own), own))
     return parts
 
 
@@ -212,18 +219,30 @@ def drop_others(parts: Sequence[Part], folder: Path) -> None:
                 path.unlink()
 
 
+def largest_of(part: Part, folder: Path) -> float:
+    """Returns the largest entropy of a shard of the training split in bits; 0 for other splits."""
+    if part.split != "train":
+        return 0.0
+    return float(np.max(read_parts([part.index(folder)], "entropy")["entropy"]))
+
+
+def tally_of(part: Part, largest: float, folder: Path, classes: int) -> Tally:
+    """Returns what the statistics need of a shard, by its index."""
+    return Tally.of(part.split, read_parts([part.index(folder)], "label", "entropy", "points"), classes, largest)
+
+
 def finish_shards(
     parts: Sequence[Part], folder: Path, classes: tuple[str, ...], config: CaptureConfig
-) -> tuple[dict[str, dict[str, Any]], dict[str, str]]:
-    """Writes what TFDS has to know of the shards; returns the columns of the index by split, and the checks of all files."""
+) -> dict[str, str]:
+    """Writes what TFDS has to know of the shards; returns the checks of all files."""
     import tensorflow_datasets as tfds
 
     shutil.rmtree(folder / _CLAIMS, ignore_errors=True)
-    by_split = {name: [part for part in parts if part.split == name] for name in SPLITS}
     infos = []
-    for name, members in by_split.items():
-        lengths = [len(part.entries) for part in members]
+    for name in SPLITS:
+        members = [part for part in parts if part.split == name]
         size = sum(part.shard(folder).stat().st_size for part in members)
+        lengths = [part.objects for part in members]
         infos.append(tfds.core.SplitInfo(name=name, shard_lengths=lengths, num_bytes=size))
     where = parts[0].shard(folder).parent
     tfds.folder_dataset.write_metadata(
@@ -240,4 +259,4 @@ def finish_shards(
     others = [path for path in where.iterdir() if path.suffix in (".json", ".txt")]
     for path in (*others, *(part.index(folder) for part in parts)):
         checks[path.relative_to(folder).as_posix()] = check_of_file(path)
-    return {name: read_parts([part.index(folder) for part in own]) for name, own in by_split.items()}, checks
+    return checks

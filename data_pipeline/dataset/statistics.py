@@ -1,9 +1,9 @@
-"""Statistics of a data set: its summary file, and how it is computed from the index."""
+"""Statistics of a data set: its summary file, and how it is computed from the indices of shards."""
 
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -100,36 +100,90 @@ class DatasetStatistics:
         return CaptureConfig(**self.capture)
 
 
-def statistics_of(index: dict[str, dict[str, Any]], **rest: Any) -> DatasetStatistics:
-    """Returns the statistics of the objects in an index (`data_pipeline.dataset.index`), by split.
+@dataclass
+class Tally:
+    """What statistics are computed from, added up over shards. All but the largest entropy, which is known before, are integers,
+    so that the order of the shards does not matter.
 
-    Args:
-        rest: the fields that do not depend on views.
+    Attributes:
+        largest: the largest entropy of the training split.
+        objects: numbers of objects, (splits, classes).
+        histograms: of normalised entropies, (splits, 50).
+        entropies: sums over the training objects of each class, (classes, views), in units of 2⁻³² bit.
+        squares: sum of all squared entropies of training objects, in units of 2⁻²⁶ bit².
+        points: how many views of each class show 0, 1, … points, (classes, points).
     """
-    # Sorted by name, so that floating-point sums do not depend on the order of the records.
-    order = {split: sorted(range(len(of["name"])), key=of["name"].__getitem__) for split, of in index.items()}
-    entropies = {split: of["entropy"][order[split]] for split, of in index.items()}
-    labels, points = (index["train"][column][order["train"]] for column in ("label", "points"))
-    largest = float(np.max(entropies["train"])) or 1.0
-    normalised = {split: members / largest for split, members in entropies.items()}
-    train = normalised["train"]
-    members = [labels == label for label in range(len(rest["classes"]))]
-    return DatasetStatistics(
-        entropy_max=largest,
-        entropy_mean=float(train.mean()),
-        entropy_std=float(train.std()),
-        entropy_histograms={
-            split: np.histogram(np.minimum(values, 1), 50, (0, 1))[0].tolist() for split, values in normalised.items()
-        },
-        mean_map=train.mean(axis=0).tolist(),
-        class_mean_maps=[train[own].mean(axis=0).tolist() if own.any() else [0.0] * train.shape[1] for own in members],
-        points_mean=float(points.mean()),
-        points_std=float(points.std()),
-        points_by_class=[
-            np.percentile(points[own], (5, 25, 50, 75, 95)).tolist() if own.any() else [0.0] * 5 for own in members
-        ],
-        **rest,
-    )
+
+    largest: float
+    objects: np.ndarray
+    histograms: np.ndarray
+    entropies: np.ndarray
+    squares: int
+    points: np.ndarray
+
+    @classmethod
+    def of(cls, split: str, index: Mapping[str, Any], classes: int, largest: float) -> Tally:
+        """Returns that of the objects in an index (`data_pipeline.dataset.index`) of a split."""
+        labels, entropy, at = index["label"], index["entropy"], SPLITS.index(split)
+        objects, histograms = np.zeros((len(SPLITS), classes), np.int64), np.zeros((len(SPLITS), 50), np.int64)
+        objects[at] = np.bincount(labels, minlength=classes)
+        histograms[at] = np.histogram(np.minimum(entropy / np.float32(largest or 1), 1), 50, (0, 1))[0]
+        trained = [labels == label if split == "train" else np.zeros(len(labels), bool) for label in range(classes)]
+        exact = entropy.astype(np.float64) if split == "train" else np.zeros_like(entropy, np.float64)
+        units, most = np.rint(exact * 2**32).astype(np.int64), int(index["points"].max()) + 1
+        return cls(
+            largest,
+            objects,
+            histograms,
+            np.stack([units[own].sum(axis=0) for own in trained]),
+            int(np.rint(exact**2 * 2**26).astype(np.int64).sum()),
+            np.stack([np.bincount(index["points"][own].ravel(), minlength=most) for own in trained]),
+        )
+
+    def __add__(self, other: Tally) -> Tally:
+        most = max(self.points.shape[1], other.points.shape[1])
+        points = (np.pad(of.points, ((0, 0), (0, most - of.points.shape[1]))) for of in (self, other))
+        sums = (
+            getattr(self, name) + getattr(other, name) for name in ("objects", "histograms", "entropies", "squares")
+        )
+        return Tally(self.largest, *sums, sum(points))  # type: ignore[arg-type]
+
+    def statistics(self, classes: Sequence[str], **rest: Any) -> DatasetStatistics:
+        """Returns the statistics; `rest` are the fields that do not depend on views."""
+        largest, of_class = self.largest or 1.0, self.objects[SPLITS.index("train")]
+        views = self.entropies.shape[1]
+        maps = self.entropies / 2**32 / largest
+        mean = float(maps.sum() / of_class.sum() / views)
+        square = self.squares / 2**26 / largest**2 / of_class.sum() / views
+        values, points = np.arange(self.points.shape[1]), self.points.sum(axis=0)
+        mean_points = float(values @ points / points.sum())
+        return DatasetStatistics(
+            classes=list(classes),
+            counts={
+                split: dict(zip(classes, row.tolist(), strict=True))
+                for split, row in zip(SPLITS, self.objects, strict=True)
+            },
+            entropy_max=largest,
+            entropy_mean=mean,
+            entropy_std=max(0.0, square - mean**2) ** 0.5,
+            entropy_histograms=dict(zip(SPLITS, self.histograms.tolist(), strict=True)),
+            mean_map=(maps.sum(axis=0) / of_class.sum()).tolist(),
+            class_mean_maps=(maps / np.maximum(of_class, 1)[:, None]).tolist(),
+            points_mean=mean_points,
+            points_std=float((((values - mean_points) ** 2) @ points / points.sum()) ** 0.5),
+            points_by_class=[_percentiles(own, (5, 25, 50, 75, 95)) for own in self.points],
+            **rest,
+        )
+
+
+def _percentiles(counts: np.ndarray, shares: Sequence[float]) -> list[float]:
+    """Returns percentiles of the values 0, 1, … that occur so often, as `np.percentile`; zeros if there are none."""
+    ends = np.cumsum(counts)
+    if not ends[-1]:
+        return [0.0] * len(shares)
+    place = np.array(shares) / 100 * (ends[-1] - 1)
+    below, above = (np.searchsorted(ends, at, side="right") for at in (np.floor(place), np.ceil(place)))
+    return (below + (place - np.floor(place)) * (above - below)).tolist()
 
 
 def load_statistics(folder: Path) -> DatasetStatistics:
