@@ -18,6 +18,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 from data_pipeline.capture.settings import CaptureConfig
@@ -25,9 +26,11 @@ from data_pipeline.dataset.batches import ViewBatches, steps_per_epoch, train_ba
 from data_pipeline.dataset.builder import DataConfig, prepare
 from data_pipeline.dataset.index import read_index
 from data_pipeline.dataset.statistics import load_statistics
-from mevs_jax import bootstrap_means
+from eval.walks.grid import run_grid
+from mevs_jax import ViewGraph, ViewTable, bootstrap_means, fibonacci_sphere
+from mevs_jax.policies import policy_record
 
-CLASSES, SIDE = 10, 6
+CLASSES, SIDE, VIEWS = 10, 6, 4
 BATCHES = ViewBatches(256, 2, images="depth", balanced=True)
 CELLS = 16
 """Numbers of views, policies or thresholds in a table whose means are resampled."""
@@ -45,7 +48,7 @@ def make_source(folder: Path, objects: int) -> Path:
 
 
 def make_data(folder: Path, objects: int) -> None:
-    capture = CaptureConfig(views=4, resolution=8)
+    capture = CaptureConfig(views=VIEWS, resolution=8)
     prepare(DataConfig(source=str(folder / f"{objects}.npz"), capture=capture), folder / str(objects))
 
 
@@ -71,8 +74,24 @@ def resample(folder: Path, objects: int) -> None:
     jax.block_until_ready(jax.jit(jax.vmap(lambda cell: bootstrap_means(jax.random.key(0), cell)))(table))
 
 
+def evaluate(folder: Path, objects: int) -> None:
+    """Walks from every start view by two policies on made-up tables, and what the whole grid is at each threshold."""
+    random, shape = np.random.default_rng(0), (objects, VIEWS, CLASSES)
+    tables = ViewTable(
+        jnp.asarray(random.normal(0, 2, shape), jnp.float32),
+        jnp.asarray(random.random((objects, VIEWS, VIEWS)), jnp.float32),
+        jnp.asarray(random.random((objects, VIEWS)), jnp.float32),
+        jnp.asarray(np.arange(objects) % CLASSES, jnp.int32),
+    )
+    graph, policies = (
+        ViewGraph.from_points(fibonacci_sphere(VIEWS)),
+        map(policy_record, ("random", "predicted_entropy")),
+    )
+    jax.block_until_ready(run_grid(jax.random.key(0), tables, graph, None, tuple(policies), max_views=VIEWS))
+
+
 STAGES: dict[str, Callable[[Path, int], object]] = {
-    one.__name__: one for one in (make_data, know_labels, begin, read_epoch, resample)
+    one.__name__: one for one in (make_data, know_labels, begin, read_epoch, evaluate, resample)
 }
 
 

@@ -7,7 +7,7 @@ import json
 import os
 import platform
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
@@ -61,7 +61,7 @@ def _is_running(job: dict[str, Any]) -> bool:
 def _job_in(file: int) -> dict[str, Any]:
     """Returns what an open lock says about the job that holds it; empty if that cannot be read."""
     try:
-        content = json.loads(os.pread(file, 10_000, 0))
+        content = json.loads(os.pread(file, 1_000_000, 0))
     except (OSError, ValueError):
         return {}
     return content if isinstance(content, dict) else {}
@@ -110,13 +110,14 @@ def _take(out: Path, path: Path) -> int:
 
 
 @contextmanager
-def locked(out: Path, command: str) -> Iterator[None]:
+def locked(out: Path, command: str, hosts: Sequence[str] = ()) -> Iterator[None]:
     """Holds the lock of the run directory `out`. A lock whose process is gone is taken over.
 
     Where the file system has no locks, the file's content decides; the process is then looked for, if it is of this machine.
 
     Args:
         command: what this job is, for the message to another one.
+        hosts: machines of all its processes, if they are several.
 
     Raises:
         DataError: if another job holds the lock; the message names its host, process and command.
@@ -130,6 +131,7 @@ def locked(out: Path, command: str) -> Iterator[None]:
             "started": _started(os.getpid()),
             "command": command,
             "since": time.strftime("%Y-%m-%d %H:%M:%S"),
+            "hosts": list(hosts),
         }
         os.ftruncate(file, 0)
         os.pwrite(file, json.dumps(job).encode(), 0)

@@ -74,10 +74,12 @@ def _run(name: str, arguments: list[str]) -> None:
         if is_asked(call.options):  # nothing is written for it
             plan(call)
             return
+    hosts: list[str] = []
     if getattr(call.options, "distributed", False):
-        from data_pipeline.distributed import is_first, join_processes
+        from data_pipeline.distributed import hosts_of_all, is_first, join_processes
 
         join_processes()  # before anything is computed
+        hosts = hosts_of_all()
         if not is_first():  # which speaks, keeps the settings, and holds the lock of the run directory
             _run_silently(call, command)
             return
@@ -85,7 +87,7 @@ def _run(name: str, arguments: list[str]) -> None:
     if not command.locks or (name == "sweep" and call.settings.sweep.trials):  # whose jobs have locks of their own
         _run_in(call, command)
         return
-    with locked(call.out, " ".join(["mevs", *call.arguments])), watched(call.out):
+    with locked(call.out, " ".join(["mevs", *call.arguments]), hosts), watched(call.out):
         _run_in(call, command)
 
 

@@ -89,8 +89,9 @@ def test_two_processes_evaluate_as_one_does(whole, tmp_path):
 @pytest.mark.slow
 def test_two_processes_make_the_data_set_that_one_makes(data, tmp_path):
     one, both = data, tmp_path / "data"
-    (said, _), _ = killed_and_finished(both / "captures", "data", "--preset", "tiny", "--out", str(tmp_path))
+    (said, told), _ = killed_and_finished(both / "captures", "data", "--preset", "tiny", "--out", str(tmp_path))
     assert "\nData set: " in "\n" + said
+    assert told.count("process 1: ") == 1
     assert files_in(both) == files_in(one)
     for name in files_in(one):
         assert (both / name).read_bytes() == (one / name).read_bytes(), name

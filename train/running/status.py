@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import time
+from collections import Counter
 from collections.abc import Iterator
 from contextlib import suppress
 from datetime import timedelta
 from pathlib import Path
+from typing import Any
 
 from data_pipeline.errors import Unreadable
 from data_pipeline.files import read_json
@@ -26,13 +28,23 @@ def status_of(out: Path) -> Iterator[str]:
     if job is None:
         yield "no job is running"
     else:
-        yield f"{job.get('command')}: process {job.get('pid')} on {job.get('host')}, since {job.get('since')}"
+        yield f"{job.get('command')}: {_process(job)}, since {job.get('since')}"
+        if hosts := Counter(job.get("hosts", ())):
+            each = ", ".join(f"{host} ({count})" for host, count in hosts.items())
+            yield f"{hosts.total()} processes on {len(hosts)} hosts: {each}"
         with suppress(FileNotFoundError, Unreadable):  # it has not said anything yet
             state = read_json(out / STATUS)
             yield from (f"{line} ({_ago(state['time'])})" for line in state["lines"])
+    for part in sorted(out.glob("sweep/*_study/job_*")):
+        if (job := job_of(part)) is not None:
+            yield f"{part.relative_to(out)}: {_process(job)}, since {job.get('since')}"
     for depth in range(1, 4):
         for latest in sorted(out.glob("*/" * depth + "latest")):
             yield f"{latest.parent.relative_to(out)}: {_of_network(latest.parent)}"
+
+
+def _process(job: dict[str, Any]) -> str:
+    return f"process {job.get('pid')} on {job.get('host')}"
 
 
 def _of_network(folder: Path) -> str:

@@ -45,6 +45,15 @@ def test_a_run_is_watched_while_it_works(tmp_path, monkeypatch):
     assert list(status_of(tmp_path)) == ["no job is running", network]
 
 
+def test_all_machines_of_a_job_are_named(tmp_path):
+    job = tmp_path / "sweep" / "entropy_study" / "job_0004"
+    job.mkdir(parents=True)
+    with locked(tmp_path, "mevs train", ["a", "a", "b"]), locked(job, "a job of a study"):
+        _, hosts, study = status_of(tmp_path)
+    assert hosts == "3 processes on 2 hosts: a (2), b (1)"
+    assert study.startswith(f"sweep/entropy_study/job_0004: process {os.getpid()} on ")
+
+
 def test_a_job_that_was_killed_does_not_run(tmp_path, monkeypatch):
     with locked(tmp_path, "mevs train"):
         left = (tmp_path / NAME).read_text()
