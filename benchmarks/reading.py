@@ -1,7 +1,7 @@
 """How fast views are read: by threads or processes, and in other forms of records. The tables of reading in docs/scaling.md.
 
-`python -m benchmarks.reading FOLDER` makes a small data set of 40 views of 224×224 pixels in FOLDER. It prints views a second, and
-a second of CPU time. That is of this process and of those that read, without their start: the difference between a longer and a
+`python -m benchmarks.reading FOLDER` makes a small data set of 40 views of 224×224 pixels in FOLDER. It prints views a second,
+also of CPU time. That is of this process and of those that read, without their start: the difference between a longer and a
 shorter stream.
 """
 
