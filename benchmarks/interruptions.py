@@ -114,8 +114,8 @@ def task_of(data: Path) -> ClassifierTask:
     return replace(task, optimiser=replace(task.optimiser, **changed))
 
 
-def training(folder: Path, orders: list[int], kills: int) -> str:
-    """Trains the classifier; returns what came out."""
+def killed_training(folder: Path, orders: list[int], kills: int) -> tuple[list[int], list[int], float]:
+    """Trains the classifier; returns before which steps it was killed, how many were repeated, and how far weights are apart."""
     whole, killed = (folder / f"{name}_{'_'.join(map(str, orders))}" for name in ("trained", "killed"))
     for out in (whole, killed):
         shutil.rmtree(out, ignore_errors=True)
@@ -137,12 +137,13 @@ def training(folder: Path, orders: list[int], kills: int) -> str:
     ended(start("training", killed, orders[-1], -1))
     states = [jax.tree.leaves(nnx.state(train.loop.load_best(task, out))) for out in (whole, killed)]
     apart = max(float(np.max(np.abs(np.asarray(one) - np.asarray(other)))) for one, other in zip(*states, strict=True))
-    epoch = steps // EPOCHS
-    within = sum(bool(stop % epoch) for stop in stops)
-    return (
-        f"{kills} kills in {steps} steps, {within} of them within an epoch of {epoch} steps: at most {max(repeated)} steps "
-        f"repeated (allowed {EVERY}); weights differ by at most {apart:.2g}"
-    )
+    return stops, repeated, apart
+
+
+def training(folder: Path, orders: list[int], kills: int) -> str:
+    stops, repeated, apart = killed_training(folder, orders, kills)
+    most = f"at most {max(repeated)} steps repeated of {EVERY} that may be"
+    return f"{kills} kills before steps {stops}: {most}; weights differ by at most {apart:.2g}"
 
 
 def make(out: Path, processes: int) -> None:
