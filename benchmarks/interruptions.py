@@ -17,9 +17,11 @@ import shutil
 import signal
 import sys
 import time
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from subprocess import PIPE, Popen
+from typing import Any
 
 import jax
 import numpy as np
@@ -28,7 +30,7 @@ from flax import nnx
 import data_pipeline.dataset.shards
 import train.loop
 from data_pipeline.dataset.statistics import load_statistics
-from data_pipeline.distributed import join_processes
+from data_pipeline.distributed import is_lost_process, join_processes
 from data_pipeline.files import files_in
 from eval.runs import tasks
 from eval.settings import TINY
@@ -110,29 +112,31 @@ def data(folder: Path, orders: list[int], kills: int) -> str:
 def task_of(data: Path) -> ClassifierTask:
     task = tasks(TINY, load_statistics(data))[0]
     assert isinstance(task, ClassifierTask)
-    changed = {"epochs": EPOCHS, "patience": 0, "learning_rate": 1e-4, "checkpoint_steps": EVERY}
-    return replace(task, optimiser=replace(task.optimiser, **changed))
+    slow = replace(task.optimiser, epochs=EPOCHS, patience=0, learning_rate=1e-4, checkpoint_steps=EVERY)
+    return replace(task, optimiser=slow)
 
 
 def killed_training(folder: Path, orders: list[int], kills: int) -> tuple[list[int], list[int], float]:
     """Trains the classifier; returns before which steps it was killed, how many were repeated, and how far weights are apart."""
-    whole, killed = (folder / f"{name}_{'_'.join(map(str, orders))}" for name in ("trained", "killed"))
-    for out in (whole, killed):
-        shutil.rmtree(out, ignore_errors=True)
+    whole, killed = folder / f"trained_{orders[0]}", folder / f"killed_{'_'.join(map(str, orders))}"
+    shutil.rmtree(killed, ignore_errors=True)
     if not (folder / "data" / "summary.json").exists():
         ended(start("data", folder, 1))
     draw, task = random.Random(str(orders)), task_of(folder / "data")
-    ended(start("training", whole, orders[0], -1))
+    if not (whole / "summary.json").exists():
+        ended(start("training", whole, orders[0], -1))
     steps = json.loads((whole / "summary.json").read_text())["steps"]
     stops = sorted(draw.sample(range(2, steps), kills))
     repeated = []
     for number, stop in enumerate(stops):
-        jobs = start("training", killed, orders[number * len(orders) // kills], stop)
-        while all(job.poll() is None for job in jobs):
-            time.sleep(0.01)
-        codes = [job.poll() for job in jobs]
-        assert -signal.SIGKILL in codes, [job.communicate() for job in jobs]
-        kill(jobs)
+        codes: list[int | None] = []
+        while -signal.SIGKILL not in codes:
+            assert set(codes) <= {None, 75}, codes
+            jobs = start("training", killed, orders[number * len(orders) // kills], stop)
+            while all(job.poll() is None for job in jobs):
+                time.sleep(0.01)
+            codes = [job.poll() for job in jobs]
+            kill(jobs)
         repeated.append(stop - max((int(path.name) for path in steps_saved(killed / "latest") or ()), default=0))
     ended(start("training", killed, orders[-1], -1))
     states = [jax.tree.leaves(nnx.state(train.loop.load_best(task, out))) for out in (whole, killed)]
@@ -159,19 +163,25 @@ def fit(out: Path, processes: int, stop: int) -> None:
         join_processes()
     read, data = train.loop.train_batches, out.parent / "data"
 
-    def batches(*arguments, first_step: int = 0):
+    def batches(*arguments: Any, first_step: int = 0) -> Iterator[Any]:
         for number, batch in enumerate(read(*arguments, first_step=first_step), first_step):
             if number == stop and jax.process_index() == processes - 1:
                 os.kill(os.getpid(), signal.SIGKILL)
             yield batch
 
-    train.loop.train_batches = batches
-    train.loop.fit(task_of(data), data, load_statistics(data), out)
+    train.loop.train_batches = batches  # type: ignore[assignment]
+    try:
+        train.loop.fit(task_of(data), data, load_statistics(data), out)
+    except Exception as error:
+        if not is_lost_process(error):
+            raise
+        os._exit(75)  # as `mevs train`: on a machine that is busy, processes may not find each other in time
 
 
 if __name__ == "__main__":
     if sys.argv[1] == "--one":
-        {"data": make, "training": fit}[sys.argv[2]](Path(sys.argv[3]), *map(int, sys.argv[4:]))
+        work: Any = {"data": make, "training": fit}[sys.argv[2]]
+        work(Path(sys.argv[3]), *map(int, sys.argv[4:]))
     else:
         folder = Path(sys.argv[2])
         print({"data": data, "training": training}[sys.argv[1]](folder, list(map(int, sys.argv[3:])) or [1], 20))

@@ -12,7 +12,9 @@ import resource
 import sys
 import time
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from PIL import Image
@@ -73,6 +75,11 @@ def encoded(view: np.ndarray, form: str) -> bytes:
     return buffer.getvalue()
 
 
+def read(source: Any, objects: int) -> None:
+    for index in range(objects):
+        source[index]
+
+
 def decode(files: list[bytes]) -> None:
     for one in files:
         np.asarray(Image.open(io.BytesIO(one)))
@@ -81,14 +88,14 @@ def decode(files: list[bytes]) -> None:
 def forms(folder: Path) -> None:
     """Bytes of a view, and views that a core decodes in a second, of depth (16 bits) and shaded images (8 bits)."""
     for key in ("depth", "image"):
-        source, objects = open_split(folder, "train", ("entropy", key)), range(8)
-        views = [view for index in objects for view in source[index][key]]
-        used = seconds_of(lambda source=source, objects=objects: [source[index] for index in objects])
+        source = open_split(folder, "train", ("entropy", key))
+        views = [view for index in range(8) for view in source[index][key]]
+        used = seconds_of(partial(read, source, 8))
         print(f"{key}, record of all views (raw, zstd): {len(views) / used:,.0f} views/s")
         for form in ("PNG", "JPEG") if key == "image" else ("PNG",):
             files = [encoded(view, form) for view in views]
-            used, size = seconds_of(lambda files=files: decode(files)), sum(map(len, files)) / len(files)
-            print(f"{key}, {form}: {size:,.0f} bytes a view, {len(views) / used:,.0f} views/s")
+            used, mean = seconds_of(partial(decode, files)), sum(map(len, files)) / len(files)
+            print(f"{key}, {form}: {mean:,.0f} bytes a view, {len(views) / used:,.0f} views/s")
     shards = [*folder.glob("shards/*/*/*.array_record*")]
     objects = sum(len(open_split(folder, split)) for split in ("train", "val", "test"))
     size = sum(path.stat().st_size for path in shards) / objects / VIEWS

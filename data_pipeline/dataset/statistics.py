@@ -142,11 +142,15 @@ class Tally:
 
     def __add__(self, other: Tally) -> Tally:
         most = max(self.points.shape[1], other.points.shape[1])
-        points = (np.pad(of.points, ((0, 0), (0, most - of.points.shape[1]))) for of in (self, other))
-        sums = (
-            getattr(self, name) + getattr(other, name) for name in ("objects", "histograms", "entropies", "squares")
+        own, others = (np.pad(of.points, ((0, 0), (0, most - of.points.shape[1]))) for of in (self, other))
+        return Tally(
+            self.largest,
+            self.objects + other.objects,
+            self.histograms + other.histograms,
+            self.entropies + other.entropies,
+            self.squares + other.squares,
+            own + others,
         )
-        return Tally(self.largest, *sums, sum(points))  # type: ignore[arg-type]
 
     def statistics(self, classes: Sequence[str], **rest: Any) -> DatasetStatistics:
         """Returns the statistics; `rest` are the fields that do not depend on views."""

@@ -74,14 +74,14 @@ def study_of(
             members = []
         _tell(study, trials, members, config.seeds)
     jobs = sorted({folder / trial.user_attrs[_JOB] for trial in study.get_trials() if _JOB in trial.user_attrs})
-    found = {job: members for job in jobs if (members := finished_members(job))}
+    found = {job: made for job in jobs if (made := finished_members(job))}
     if not found:
         raise Diverged(
             f"every trial of the study in {folder} diverged; lower --sweep.learning-rate, and delete {folder}"
         )
-    every = [member for members in found.values() for member in members]
+    every = [member for made in found.values() for member in made]
     best = best_of(every)
-    return next(job for job, members in found.items() if best in members), every
+    return next(job for job, made in found.items() if best in made), every
 
 
 def _open(task: SweepTask, statistics: DatasetStatistics, folder: Path, config: SweepConfig) -> Any:
@@ -131,7 +131,7 @@ def _jobs(study: Any, folder: Path, config: SweepConfig, task: SweepTask) -> Ite
                 if _JOB not in trial.user_attrs:  # its process was killed before it had a job
                     study.tell(trial.number, state=TrialState.FAIL)
             jobs = {trial.user_attrs[_JOB] for trial in running if _JOB in trial.user_attrs}
-            held = next((job for name in sorted(jobs) if (job := _taken(folder / name)) is not None), None)
+            held = next((own for name in sorted(jobs) if (own := _taken(folder / name)) is not None), None)
             if held is None and len(study.get_trials()) < config.trials:
                 name = _ask(study, config, task)
                 held = _taken(folder / name)

@@ -65,8 +65,8 @@ def network_outputs(
     chosen = np.arange(len(open_split(data, split))) if chosen is None else chosen
     own = chosen[own_share(len(chosen))]
     objects, given = len(own), own if len(own) else chosen[:1]
-    what = {"points": task.batches.points, "images": task.batches.images, "workers": task.batches.workers}
-    batches = evaluation_batches(data, split, chosen=given, **what)
+    of = task.batches
+    batches = evaluation_batches(data, split, points=of.points, images=of.images, chosen=given, workers=of.workers)
     with progress_bar("objects") as bar:
         line = bar.add_task(f"Evaluating {task.name} on {split} objects", total=objects, note=COMPILING)
         out = []
