@@ -121,11 +121,15 @@ def test_stored_entropies_are_the_librarys(data):
     np.testing.assert_allclose(view_entropies(stored), example["entropy"])
 
 
-def test_beam_makes_the_same_files(data, tmp_path):
-    """Beam's own local runner, where Beam is installed."""
+PORTABLE = "--runner=PortableRunner --job_endpoint=embed --environment_type=LOOPBACK"
+
+
+@pytest.mark.parametrize("runner", ["--runner=DirectRunner", pytest.param(PORTABLE, marks=pytest.mark.slow)])
+def test_beam_makes_the_same_files(runner, data, tmp_path):
+    """Beam's own local runner and a portable one, where Beam is installed."""
     pytest.importorskip("apache_beam", reason="Apache Beam is an optional extra: pip install -e '.[beam]'")
     folder = tmp_path / "data"
-    by_beam, alone = prepare(CONFIG, folder, beam="--runner=DirectRunner"), load_statistics(data)
+    by_beam, alone = prepare(CONFIG, folder, beam=runner), load_statistics(data)
     assert by_beam == alone
     assert files_in(folder) == files_in(data)
     for name in files_in(data):
