@@ -3,6 +3,7 @@
 from mevs_jax.agent import Agent as Agent
 from mevs_jax.agent import Belief as Belief
 from mevs_jax.agent import History as History
+from mevs_jax.agent import SceneAgent as SceneAgent
 from mevs_jax.agent import Step as Step
 from mevs_jax.agent import Walk as Walk
 from mevs_jax.agent import load_history as load_history

@@ -18,18 +18,16 @@ import numpy as np
 from jaxtyping import Float
 
 from mevs_jax.agent.candidates import candidates_of, costs_of, mask_of, near_object, pose_towards
-from mevs_jax.agent.present import Present, check_new, check_shown, sphere_of
+from mevs_jax.agent.present import Present, check_new, own_view, sphere_of
 from mevs_jax.agent.programs import Programs
 from mevs_jax.agent.records import Belief, History, Reason, Step, plain
 from mevs_jax.arguments import number, numbers, whole
 from mevs_jax.arrays import AnyArray, AnyVector
 from mevs_jax.beliefs.strangeness import STRANGE
 from mevs_jax.geometry.canonical import convert, share_of_sphere
-from mevs_jax.geometry.inputs import check_depth
 from mevs_jax.geometry.source_view import DepthImage
 from mevs_jax.geometry.sphere import Sphere
 from mevs_jax.policies.base import Policy
-from mevs_jax.trained.situation import Candidates
 from mevs_jax.trained.system import TrainedSystem
 
 _ENOUGH = 0.15
@@ -261,6 +259,11 @@ class Agent:
         return self._add(view.image, of.placed(self.system, view), view.unknown, begun, view.doubt)
 
     @property
+    def belief(self) -> Belief | None:
+        """The latest of the present object; None before its first view."""
+        return self._current.belief
+
+    @property
     def sphere(self) -> Sphere:
         """Where the present object is, as it is given or estimated by now."""
         return self._current.sphere
@@ -283,21 +286,10 @@ class Agent:
             depth: in radii of the object along the optical axis, 0 where nothing is hit, NaN where it is unknown what is there.
             pose: from the camera to the object's frame, whose unit is the radius.
         """
-        begun, of, side = time.perf_counter(), self._current, self.system.description.camera.resolution
+        begun, of = time.perf_counter(), self._current
         self._check_budget()
         _check(of.points is None, "an object of unknown size is seen by observe alone, in metres")
-        check_depth(depth, self.system.description.camera)
-        image, placed = np.array(depth, np.float32), numbers(pose).astype(np.float32)
-        _check(
-            image.shape == (side, side) and placed.shape == (4, 4),
-            f"depth or pose has another shape: this system's camera takes images ({side}, {side}) at poses (4, 4), "
-            f"got {image.shape} and {placed.shape}",
-        )
-        _check(
-            bool(np.isfinite(placed).all()) and bool(placed[:3, 3].any()),
-            "pose is not finite, or at the object's centre",
-        )
-        check_shown(image, self.system)
+        image, placed = own_view(depth, pose, self.system)
         check_new(image, placed, self.history)
         unknown = share_of_sphere(np.isnan(image), self.system.description.camera)
         told = self.system.description.told_unknown
@@ -372,9 +364,10 @@ class Agent:
         if candidates is not None and number:
             most = max(self.size, self.max_candidates or 0)
             where, kept, allowed = near_object(self.system, of.sphere, poses, allowed, costs, most, self.size)
-        reason, index, gains = self._reason(), -1, np.zeros(0)
+        reason, index, gains = self.reason, -1, np.zeros(0)
         if not reason:
-            at, gains = self._choose(where, allowed[kept], costs[kept])
+            prices = self.gain_per_cost * np.where(np.isfinite(costs), costs, 0.0)
+            at, gains = of.choose(self.system, where, allowed[kept], prices[kept], self.key)
             index = int(kept[at]) if at >= 0 else -1
             if index < 0:
                 reason = "nothing reachable" if of.belief is None or of.belief.known else "unknown object"
@@ -390,18 +383,21 @@ class Agent:
         self.history.events.append(event | {"step": plain(step)})
         return step
 
-    def _choose(self, where: Candidates, allowed: np.ndarray, costs: np.ndarray) -> tuple[int, np.ndarray]:
-        """The best of the allowed candidates, −1 without one, and the expected gains."""
-        of, number = self._current, len(costs)
-        wide = np.zeros((2, self.size), np.float32)
-        wide[0, :number], wide[1, :number] = allowed, self.gain_per_cost * np.where(np.isfinite(costs), costs, 0.0)
-        chosen = of.programs.choose(
-            self.system.parts, of.memory, where, of.has_failed(where), wide[0] > 0, wide[1], self.key
-        )
-        index, gains = jax.device_get(chosen)
-        return int(index), gains
+    @_one_at_a_time
+    def gains(self, candidates: AnyArray) -> Float[np.ndarray, " candidates"]:
+        """Expected gain of each pose in nats, as `Step.expected_gain`; before the first view, log of the number of classes.
 
-    def _reason(self) -> Reason:
+        Args:
+            candidates: poses as of `decide`, at most `max_candidates` or 1024.
+
+        Returns:
+            Gains, NaN where none are known; 0 from where a view was taken or failed, or the object cannot be seen.
+        """
+        return self._current.gains(self.system, numbers(candidates), self.size, self.key)
+
+    @property
+    def reason(self) -> Reason:
+        """Why `decide` would end by what was seen so far; empty if it would not."""
         belief = self._current.belief
         if belief is None:
             return ""

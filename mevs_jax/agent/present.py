@@ -4,14 +4,19 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
 
+import jax
 import numpy as np
 from jaxtyping import Bool, Float
 
+from mevs_jax.agent.candidates import near_object
 from mevs_jax.agent.programs import Programs
 from mevs_jax.agent.records import Belief, History
+from mevs_jax.arguments import numbers
+from mevs_jax.arrays import AnyArray
 from mevs_jax.gallery.pose import ObjectPose, object_pose
 from mevs_jax.geometry.cameras import in_sphere
 from mevs_jax.geometry.canonical import CanonicalView, combined, convert
+from mevs_jax.geometry.inputs import check_depth
 from mevs_jax.geometry.source_view import DepthImage
 from mevs_jax.geometry.sphere import Sphere, estimate_sphere, upright
 from mevs_jax.trained.situation import REPEATED, SAME, Candidates, Memory
@@ -31,6 +36,8 @@ _ASIDE = 0.5
 """Largest angle in radians between directions of images that are seen together."""
 _OTHER, _CHANGED = 0.2, 0.4
 """Radii by which depth of the same direction is another, and the share of the pixels at which it may be."""
+_LEAST_GAIN = 1e-6
+"""Nats of a view that is expected to say nothing, since estimates may be below 0."""
 _AT_VIEWPOINT = 1e-5
 """Poses that differ by less, in radii, are the same to rounding. Sampling of a cloud has ties, which rounding would decide."""
 
@@ -79,6 +86,35 @@ class Present:
         """Which candidates could not be reached although they were chosen, or gave a part of another view."""
         failed = np.reshape([*self.failed, *self.merged], (-1, 3))
         return (np.asarray(where.directions) @ failed.T > np.cos(float(where.same))).any(axis=1)
+
+    def choose(
+        self,
+        system: TrainedSystem,
+        where: Candidates,
+        allowed: Bool[np.ndarray, " some"],
+        prices: Float[np.ndarray, " some"],
+        key: jax.Array,
+    ) -> tuple[int, Float[np.ndarray, " candidates"]]:
+        """The best candidate that is allowed, −1 without one, and the expected gains; prices are in units of scores."""
+        wide = np.zeros((2, len(where.directions)), np.float32)
+        wide[0, : len(allowed)], wide[1, : len(allowed)] = allowed, prices
+        failed = self.has_failed(where)
+        chosen = self.programs.choose(system.parts, self.memory, where, failed, wide[0] > 0, wide[1], key)
+        index, gains = jax.device_get(chosen)
+        return int(index), gains
+
+    def gains(
+        self, system: TrainedSystem, poses: Float[np.ndarray, "poses 4 4"], size: int, key: jax.Array
+    ) -> Float[np.ndarray, " poses"]:
+        """`Agent.gains`, for candidates in arrays of a length `size`."""
+        number = len(poses)
+        where, _, useful = near_object(system, self.sphere, poses, np.ones(number, bool), np.zeros(number), size, size)
+        gains = np.full(number, np.log(len(system.classes)))
+        if self.belief is not None:
+            gains = np.maximum(self.choose(system, where, useful, np.zeros(number), key)[1][:number], _LEAST_GAIN)
+        seen = np.asarray(self.memory.directions)[: int(self.memory.count)]
+        gone = self.has_failed(where) | (np.asarray(where.directions) @ seen.T > np.cos(float(where.same))).any(axis=1)
+        return np.where(useful & ~gone[:number], gains, 0.0)
 
     def seen(self, system: TrainedSystem, image: DepthImage, history: History) -> CanonicalView:
         """A new image as the data set's camera would have taken it; raises `ValueError` if it shows too little of the object, or
@@ -175,6 +211,22 @@ def check_shown(depth: Float[np.ndarray, "side side"], system: TrainedSystem) ->
             f"depth shows the object at only {shown} of the {pixels} pixels of its sphere; aim the camera at its center, move "
             "closer, or check the mask"
         )
+
+
+def own_view(depth: AnyArray, pose: AnyArray, system: TrainedSystem) -> tuple[np.ndarray, np.ndarray]:
+    """A view that the data set's camera has taken, and its pose, in float32; raises `ValueError` if they cannot be."""
+    check_depth(depth, system.description.camera)
+    image, placed = np.array(depth, np.float32), numbers(pose).astype(np.float32)
+    side = system.description.camera.resolution
+    if image.shape != (side, side) or placed.shape != (4, 4):
+        raise ValueError(
+            f"depth or pose has another shape: this system's camera takes images ({side}, {side}) at poses (4, 4), "
+            f"got {image.shape} and {placed.shape}"
+        )
+    if not (np.isfinite(placed).all() and placed[:3, 3].any()):
+        raise ValueError("pose is not finite, or at the object's centre")
+    check_shown(image, system)
+    return image, placed
 
 
 def check_new(depth: Float[np.ndarray, "side side"], pose: Float[np.ndarray, "4 4"], history: History) -> None:

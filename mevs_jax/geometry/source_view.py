@@ -18,7 +18,7 @@ from mevs_jax.geometry.sphere import Sphere, upright
 
 _FIELDS = 1.0, 158.0
 """Smallest and largest field of view of a depth camera, in degrees."""
-_LEAST_ACROSS = 8
+LEAST_ACROSS = 8
 """Pixels of the source across the object's sphere."""
 MARGIN = 0.02
 """Points up to this far outside the unit sphere belong to the object, since depth is measured with noise."""
@@ -116,9 +116,9 @@ def window_of(image: DepthImage, sphere: Sphere, grid: int) -> Window:
     size = np.shape(image.depth)[::-1]
     spans = _sphere_in_image(-eye @ axes, K, size)
     across = 2 * min(K[0, 0], K[1, 1]) / math.sqrt(distance**2 - 1)
-    if across < _LEAST_ACROSS:
+    if across < LEAST_ACROSS:
         raise ValueError(
-            f"the object's sphere is only {across:.1f} pixels across in the image, and {_LEAST_ACROSS} are needed; move the "
+            f"the object's sphere is only {across:.1f} pixels across in the image, and {LEAST_ACROSS} are needed; move the "
             "camera closer, take a larger image, or check K and the radius"
         )
     steps = [-(-(last - first) // grid) for first, last in spans]
