@@ -1,7 +1,8 @@
-"""The scene: an arm of seven joints with a camera at its wrist, a table, and an object on it."""
+"""The scene: an arm of seven joints with a camera at its wrist, a table, and objects on it."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import mujoco
@@ -18,6 +19,9 @@ PLACE = np.array([0.5, 0.0])
 """Where the object stands on the table, in front of the arm."""
 HOME = np.array([0.0, -0.6, 0.0, -2.2, 0.0, 1.9, 0.8])
 """Joint angles where nothing is near."""
+
+_COLOURS = ((0.85, 0.55, 0.25), (0.35, 0.55, 0.75), (0.55, 0.7, 0.4), (0.75, 0.45, 0.55), (0.6, 0.55, 0.75))
+"""Of the objects, in order."""
 
 # Lengths, axes and ranges of the joints are those of a Franka Emika Panda; its shape is simplified to capsules.
 _LINKS = (
@@ -38,7 +42,7 @@ class Scene:
 
     Attributes:
         model, data: of MuJoCo.
-        center: (3,) centre of the object in the world, in metres.
+        center: (3,) centre of the object in the world, in metres, or of all objects.
         K: (3, 3) intrinsics of the depth camera, with the centres of pixels at whole numbers.
     """
 
@@ -64,16 +68,24 @@ def make_scene(mesh: Mesh) -> Scene:
     """
     vertices = mesh.vertices.astype(float) * RADIUS
     center = np.array([*PLACE, -vertices[:, 2].min()])
-    specification = mujoco.MjSpec.from_string(_xml(center))
-    specification.add_mesh(
-        name="object", uservert=vertices.reshape(-1).tolist(), userface=mesh.faces.reshape(-1).tolist()
-    )
-    for mesh_of in specification.meshes:
-        mesh_of.inertia = mujoco.mjtMeshInertia.mjMESH_INERTIA_SHELL  # furniture is not always closed
-    body = specification.body("object")
-    body.add_geom(
-        name="object", type=mujoco.mjtGeom.mjGEOM_MESH, meshname="object", rgba=[0.85, 0.55, 0.25, 1], contype=0
-    )
+    return scene_of([(vertices + center, mesh.faces)], center)
+
+
+def scene_of(shapes: Sequence[tuple[np.ndarray, np.ndarray]], center: Float[np.ndarray, " 3"]) -> Scene:
+    """Returns a scene with some objects on the table, whose top is at height 0.
+
+    Args:
+        shapes: vertices (n, 3) in the world, in metres, and faces (m, 3) of each.
+        center: of all of them.
+    """
+    specification = mujoco.MjSpec.from_string(_xml())
+    for number, (vertices, faces) in enumerate(shapes):
+        name = f"object{number}"
+        mesh = specification.add_mesh(name=name, uservert=vertices.reshape(-1).tolist(), userface=faces.reshape(-1).tolist())
+        mesh.inertia = mujoco.mjtMeshInertia.mjMESH_INERTIA_SHELL  # furniture is not always closed
+        specification.worldbody.add_geom(
+            name=name, type=mujoco.mjtGeom.mjGEOM_MESH, meshname=name, rgba=[*_COLOURS[number % len(_COLOURS)], 1], contype=0
+        )
     model = specification.compile()
     data = mujoco.MjData(model)
     data.qpos[:] = HOME
@@ -83,8 +95,8 @@ def make_scene(mesh: Mesh) -> Scene:
     return Scene(model, data, center, K)
 
 
-def _xml(center: np.ndarray) -> str:
-    """The scene without the object's mesh. Of the arm, only what hits the table or the object counts as a collision."""
+def _xml() -> str:
+    """The scene without objects. Of the arm, only what hits the table or an object counts as a collision."""
     arm, closing = "", ""
     for number, (place, turn, (low, high), capsule, radius) in enumerate(_LINKS, 1):
         arm += (
@@ -114,7 +126,6 @@ def _xml(center: np.ndarray) -> str:
     <light pos="0.3 -1 2" dir="0 0.4 -1" castshadow="false"/>
     <geom name="table" type="box" pos="0.35 0 -0.02" size="0.6 0.6 0.02" rgba="0.75 0.72 0.68 1" contype="0" conaffinity="1"/>
     <geom type="cylinder" pos="0 0 0.08" size="0.07 0.08" rgba="0.3 0.33 0.36 1" contype="0" conaffinity="0"/>
-    <body name="object" pos="{center[0]} {center[1]} {center[2]}"/>
     {arm}{camera}{closing}
     <camera name="outside" pos="1.15 -1.05 0.9" xyaxes="0.78 0.63 0 -0.32 0.39 0.86" fovy="40"/>
   </worldbody>
