@@ -56,11 +56,7 @@ class DepthCamera:
 
         The camera sees the middle square, 480×480 of its 640×480 pixels; at its sides everything is unknown.
         """
-        self._renderer.enable_depth_rendering()
-        self._renderer.update_scene(self.scene.data, "depth")
-        depth = self._renderer.render().astype(np.float32)
-        self._renderer.disable_depth_rendering()
-        depth[depth > _FARTHEST] = 0
+        depth = self.perfect()
         side = (WIDTH - HEIGHT) // 2
         square = depth[:, side:-side]
         if self.config.kind != "none":
@@ -74,6 +70,15 @@ class DepthCamera:
         measured[:, side:-side] = square
         measured[depth == 0] = np.inf
         return measured
+
+    def perfect(self) -> Float[np.ndarray, "height width"]:
+        """Depth in metres without errors, 0 where nothing is near."""
+        self._renderer.enable_depth_rendering()
+        self._renderer.update_scene(self.scene.data, "depth")
+        depth = self._renderer.render().astype(np.float32)
+        self._renderer.disable_depth_rendering()
+        depth[depth > _FARTHEST] = 0
+        return depth
 
     def picture(self, camera: str) -> np.ndarray:
         """What a camera of the scene shows, (height, width, 3) uint8."""

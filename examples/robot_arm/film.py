@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -10,7 +11,6 @@ from PIL import Image, ImageDraw, ImageFont
 
 from examples.robot_arm.arm import Arm
 from examples.robot_arm.camera import DepthCamera
-from examples.robot_arm.looking import Looked, Recognition
 from examples.robot_arm.scene import Scene
 
 SIZE = (720, 360)
@@ -19,17 +19,34 @@ _ARM, _IMAGE = (0, 0, 480, 360), (492, 12, 708, 174)
 _INK, _FAINT, _BAR, _BEST = (30, 35, 40), (120, 128, 136), (150, 175, 205), (220, 120, 40)
 
 
-def write_film(found: Recognition, scene: Scene, camera: DepthCamera, classes: Sequence[str], path: Path) -> None:
+@dataclass(frozen=True)
+class Shot:
+    """A look, as the film shows it.
+
+    Attributes:
+        title: what is seen.
+        passed: joint angles on the way there.
+        depth: the image, in metres.
+        bars: what is believed after it: a name, a probability, and whether its bar stands out.
+    """
+
+    title: str
+    passed: list[np.ndarray]
+    depth: np.ndarray
+    bars: list[tuple[str, float, bool]]
+
+
+def write_film(shots: Sequence[Shot], scene: Scene, camera: DepthCamera, path: Path) -> None:
     """Writes a GIF, whose last frame stays for three seconds."""
     frames, times, arm = [], [], Arm(scene)
-    shown: Looked | None = None
-    for number, look in enumerate(found.looks):
-        for at, angles in enumerate(look.passed):
+    for number, shot in enumerate(shots):
+        for angles in shot.passed[:-1]:
             arm.place(angles)
-            there = at == len(look.passed) - 1
-            shown = look if there else shown
-            frames.append(_frame(camera.picture("outside"), shown, classes, _title(number, found, there)))
-            times.append(900 if there else 70)
+            before = shots[number - 1] if number else None
+            frames.append(_frame(camera.picture("outside"), before, f"moving to view {number + 1}"))
+        arm.place(shot.passed[-1])
+        frames.append(_frame(camera.picture("outside"), shot, shot.title))
+        times += [70] * (len(shot.passed) - 1) + [900]
     times[-1] = 3000
     palette = _palette(frames)
     images = [frame.quantize(palette=palette, dither=Image.Dither.NONE) for frame in frames]
@@ -48,29 +65,22 @@ def _palette(frames: list[Image.Image]) -> Image.Image:
     return sheet.quantize(160, dither=Image.Dither.NONE)
 
 
-def _title(number: int, found: Recognition, there: bool) -> str:
-    if there and number == len(found.looks) - 1:
-        return f"{found.name}: {found.reason} after {len(found.looks)} view{'s' * (len(found.looks) > 1)}"
-    return f"view {number + 1}" if there else f"moving to view {number + 1}"
-
-
-def _frame(picture: np.ndarray, look: Looked | None, classes: Sequence[str], title: str) -> Image.Image:
+def _frame(picture: np.ndarray, shot: Shot | None, title: str) -> Image.Image:
     frame = Image.new("RGB", SIZE, "white")
     frame.paste(Image.fromarray(picture).resize((_ARM[2], _ARM[3])), (0, 0))
     draw, font, small = ImageDraw.Draw(frame), ImageFont.load_default(14), ImageFont.load_default(11)
     draw.text((12, 10), title, fill=_INK, font=font)
-    if look is None:
+    if shot is None:
         draw.rectangle(_IMAGE, outline=_FAINT)
         return frame
-    size = (_IMAGE[2] - _IMAGE[0], _IMAGE[3] - _IMAGE[1])
-    frame.paste(_depth_picture(look.depth).resize(size, Image.Resampling.NEAREST), _IMAGE[:2])
-    belief = look.belief
-    labels = np.argsort(-belief.probabilities)[:7]
+    image = _depth_picture(shot.depth)
+    image.thumbnail((_IMAGE[2] - _IMAGE[0], _IMAGE[3] - _IMAGE[1]), Image.Resampling.NEAREST)
+    frame.paste(image, _IMAGE[:2])
     draw.text((492, 184), "what the agent believes", fill=_FAINT, font=small)
-    for row, label in enumerate(labels):
-        top, share = 204 + 21 * row, float(belief.probabilities[label])
-        draw.text((492, top), classes[label], fill=_INK, font=small)
-        draw.rectangle((570, top, 570 + int(100 * share), top + 13), fill=_BEST if label == belief.label else _BAR)
+    for row, (name, share, best) in enumerate(shot.bars):
+        top = 204 + 21 * row
+        draw.text((492, top), name[:14], fill=_INK, font=small)
+        draw.rectangle((580, top, 580 + int(90 * share), top + 13), fill=_BEST if best else _BAR)
         draw.text((676, top), f"{100 * share:.0f} %", fill=_INK, font=small)
     return frame
 

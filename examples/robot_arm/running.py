@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 import json
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from itertools import product
 
@@ -18,8 +18,8 @@ from data_pipeline.objects.recipes import FurniturePiece
 from eval.numbers.comparison import intervals
 from examples.robot_arm.arm import Arm, Reach
 from examples.robot_arm.camera import DepthCamera
-from examples.robot_arm.film import write_film
-from examples.robot_arm.looking import recognise
+from examples.robot_arm.film import Shot, write_film
+from examples.robot_arm.looking import Recognition, recognise
 from examples.robot_arm.scene import RADIUS, Scene, make_scene
 from mevs_jax.agent import Agent
 from mevs_jax.markdown import markdown_table
@@ -59,8 +59,18 @@ def show(agent: Agent, options: argparse.Namespace) -> None:
         views = f"{len(walk.looks)} view{'s' * (len(walk.looks) != 1)}"
         print(f"{walk.name} after {views} ({walk.reason}), {walk.radians:.1f} rad of joint motion after the first")
         if options.film and walk.looks:
-            write_film(walk, scene, camera, agent.system.classes, options.film)
+            shots = [shot_of(number, walk, agent.system.classes) for number in range(len(walk.looks))]
+            write_film(shots, scene, camera, options.film)
             print(f"Film: {options.film}")
+
+
+def shot_of(number: int, walk: Recognition, classes: Sequence[str]) -> Shot:
+    """A look as the film shows it, with the likeliest classes."""
+    look, count = walk.looks[number], len(walk.looks)
+    end = f"{walk.name}: {walk.reason} after {count} view{'s' * (count > 1)}"
+    labels = np.argsort(-look.belief.probabilities)[:7]
+    bars = [(classes[label], float(look.belief.probabilities[label]), label == look.belief.label) for label in labels]
+    return Shot(end if number == count - 1 else f"view {number + 1}", look.passed, look.depth, bars)
 
 
 def study(agents: dict[str, Agent], options: argparse.Namespace) -> None:

@@ -81,10 +81,16 @@ def scene_of(shapes: Sequence[tuple[np.ndarray, np.ndarray]], center: Float[np.n
     specification = mujoco.MjSpec.from_string(_xml())
     for number, (vertices, faces) in enumerate(shapes):
         name = f"object{number}"
-        mesh = specification.add_mesh(name=name, uservert=vertices.reshape(-1).tolist(), userface=faces.reshape(-1).tolist())
+        mesh = specification.add_mesh(
+            name=name, uservert=vertices.reshape(-1).tolist(), userface=faces.reshape(-1).tolist()
+        )
         mesh.inertia = mujoco.mjtMeshInertia.mjMESH_INERTIA_SHELL  # furniture is not always closed
         specification.worldbody.add_geom(
-            name=name, type=mujoco.mjtGeom.mjGEOM_MESH, meshname=name, rgba=[*_COLOURS[number % len(_COLOURS)], 1], contype=0
+            name=name,
+            type=mujoco.mjtGeom.mjGEOM_MESH,
+            meshname=name,
+            rgba=[*_COLOURS[number % len(_COLOURS)], 1],
+            contype=0,
         )
     model = specification.compile()
     data = mujoco.MjData(model)

@@ -26,10 +26,15 @@ from mevs_jax.trained.system import TrainedSystem
 
 MOST_POSES = 1024
 """Largest number of candidates."""
-_CELLS = 64
+_STEP = 128
+"""Their number is rounded up to a multiple of this, so that scenes of several sizes share compiled programs."""
+_CELLS = 96
 """Of the grid, along each side of the cube around all objects."""
 _SAMPLES = 24
 """Points of the disc across an object, whose rays are followed to a camera."""
+_ANY_VIEW = 0.1
+"""Share of the entropy of an object's belief that any new view counts for besides its expected gain, which holds if the object is
+one of those known: how much a view says about that is not predicted."""
 _LEAST = 0.1
 """Share of an object's sphere below which an image is not worth anything for it."""
 
@@ -45,6 +50,7 @@ class SceneAgent:
         spheres: where the objects are; at least one.
         max_views: the budget: largest number of images of the scene.
         true_size: whether radii are those of real objects, as of `Agent.reset`.
+        max_candidates: largest number of candidates of `decide`, at most 1024; by default at least those of `poses`.
         options: `stop`, `unknown`, `gain_per_cost`, `distance` of `mevs_jax.Agent`.
 
     Attributes:
@@ -62,13 +68,19 @@ class SceneAgent:
         *,
         max_views: int = 16,
         true_size: bool = True,
+        max_candidates: int | None = None,
         **options: Any,
     ) -> None:
         self.spheres = tuple(spheres)
         if not self.spheres or not all(isinstance(sphere, Sphere) for sphere in self.spheres):
             raise ValueError(f"spheres must be at least one mevs_jax.Sphere, got {spheres!r:.80}")
-        given = {"max_views": max_views, "max_candidates": MOST_POSES} | options
-        self.agents = tuple(Agent(system, "information_gain", **given) for _ in self.spheres)
+        if max_candidates is None:
+            number = len(system.viewpoints) * (len(self.spheres) + 1)
+            max_candidates = min(-(-number // _STEP) * _STEP, MOST_POSES)
+        rule = f"max_candidates must be from 1 to {MOST_POSES}"
+        self.max_candidates = whole(max_candidates, rule, 1, MOST_POSES)
+        options |= {"max_views": max_views, "max_candidates": self.max_candidates}
+        self.agents = tuple(Agent(system, "information_gain", **options) for _ in self.spheres)
         for agent, sphere in zip(self.agents, self.spheres, strict=True):
             agent.begin(sphere, true_size=true_size)
         self.max_views = self.agents[0].max_views
@@ -111,7 +123,7 @@ class SceneAgent:
         around = agent.system.description.camera.distance * self._reach
         directions = agent.system.viewpoints.astype(float) @ self.spheres[0].rotation.T
         everything = pose_towards(directions, self._middle, around, self.spheres[0].axis)
-        return np.concatenate([everything, *(one.poses for one in self.agents)])[:MOST_POSES]
+        return np.concatenate([everything, *(one.poses for one in self.agents)])
 
     def observe(
         self,
@@ -251,8 +263,11 @@ class SceneAgent:
         """
         begun = time.perf_counter()
         poses = self.poses if candidates is None else numbers(candidates)
-        if poses.ndim != 3 or poses.shape[1:] != (4, 4) or not 0 < len(poses) <= MOST_POSES:
-            raise ValueError(f"candidates must be 1 to {MOST_POSES} poses (candidates, 4, 4), got shape {poses.shape}")
+        if poses.ndim != 3 or poses.shape[1:] != (4, 4) or not 0 < len(poses) <= self.max_candidates:
+            raise ValueError(
+                f"candidates must be 1 to {self.max_candidates} poses (candidates, 4, 4), got shape {poses.shape}; "
+                f"up to {MOST_POSES} fit a scene that is made with max_candidates"
+            )
         if (wrong := first_wrong_pose(poses)) is not None:
             raise ValueError(f"candidate {wrong[0]}: {wrong[1]}")
         some = range(len(self.spheres)) if objects is None else objects
@@ -277,10 +292,13 @@ class SceneAgent:
         return Step(poses[index], direction, index, float(gains[index]), False, "", elapsed)
 
     def _gains(self, number: int, poses: Float[np.ndarray, "poses 4 4"]) -> Float[np.ndarray, " poses"]:
-        """Expected gain of a view from some poses for one object, by the share of it that would be seen."""
-        gains, shares = np.zeros(len(poses)), self.shares(number, poses)
+        """What a view from some poses is worth for one object, in nats, by the share of it that would be seen."""
+        gains, shares, belief = np.zeros(len(poses)), self.shares(number, poses), self.beliefs[number]
         if (seen := shares >= _LEAST).any():
             gains[seen] = self.agents[number].gains(poses[seen])
+        if belief is not None:
+            entropy = -np.sum(belief.probabilities * np.log(np.maximum(belief.probabilities, 1e-12)))
+            gains += np.where(gains > 0, _ANY_VIEW * entropy, 0.0)
         return gains * shares
 
 
