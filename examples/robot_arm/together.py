@@ -94,7 +94,7 @@ def look_around(table: Table, system: TrainedSystem, way: Way, stop: float, seed
     arm, agent, random = Arm(table.scene), begun(), np.random.default_rng(seed)
     arm.place(HOME)
     names, sure, closed = ["unknown object"] * len(table.names), [False] * len(table.names), set[int]()
-    right, shots, eyes, focus, looks = [], list[Shot](), [table.scene.camera_pose[:3, 3]], -1, 0
+    right, shots, eyes, focus, looks = list[int](), list[Shot](), [table.scene.camera_pose[:3, 3]], -1, 0
     while len(right) < MOST_VIEWS:
         left = [one for one, decided in enumerate(sure) if not decided and one not in closed]
         if not left:

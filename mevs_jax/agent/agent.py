@@ -55,8 +55,8 @@ def _one_at_a_time(call: Any) -> Any:
 class Agent:
     """Recognises one object after another: `reset`, then `observe` and `decide` in turn until `Step.done`.
 
-    Calls from several threads wait for each other, so two cameras may show it the same object. For two objects at once, make two
-    agents, which share their programs.
+    Calls from several threads wait for each other, so two cameras may show it the same object. `SceneAgent` is for
+    several objects.
 
     Args:
         system: from `mevs_jax.load`.

@@ -227,7 +227,7 @@ class SceneAgent:
         self, number: int, samples: Float[np.ndarray, "poses samples 3"], eyes: Float[np.ndarray, "poses 1 3"]
     ) -> Bool[np.ndarray, "poses samples"]:
         """Whether rays from points of an object to cameras pass cells that hold another object."""
-        others = np.delete(self._held, number, axis=0).any(axis=0)
+        others = np.asarray(np.delete(self._held, number, axis=0).any(axis=0))
         hidden = np.zeros(samples.shape[:2], bool)
         if not others.any():
             return hidden
