@@ -51,6 +51,8 @@ def test_an_example_runs(name, said, whole, tmp_path):
         (["--study", "--each", "0"], "--each"),
         (["--film", "x.mp4"], "must be a .gif"),
         (["--film", "none/x.gif"], "folder that exists"),
+        (["--table", "none"], "none"),
+        (["--table", ".", "--objects", "0"], "--objects"),
     ],
 )
 def test_what_the_arm_cannot_use_is_a_sentence(arguments, said, tmp_path, monkeypatch, capsys):
