@@ -166,7 +166,8 @@ def _parse_binary(content: bytes) -> tuple[np.ndarray, np.ndarray]:
     end = 3 + vertex_count * stride
     if min(vertex_count, face_count) < 0 or end > len(words):
         raise cut_short("its counts are not all there")
-    vertices = _cartesian(words[3:end].view(">f4").reshape(-1, stride)[:, :width].astype(np.float64))
+    with np.errstate(invalid="ignore"):  # NaN, which is refused if a face uses it
+        vertices = _cartesian(words[3:end].view(">f4").reshape(-1, stride)[:, :width].astype(np.float64))
     corners: list[int] = []
     sizes: list[int] = []
     values, at = words[end:].tolist(), 0

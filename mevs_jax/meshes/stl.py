@@ -40,7 +40,8 @@ def _corners(content: bytes) -> np.ndarray:
     there = (len(content) - 84) // 50
     if there < count:
         raise cut_short(f"{there} of {count} triangles are there")
-    if is_filler(content[84 + 50 * count :]):
+    attributes = np.frombuffer(content, _TRIANGLE, count, offset=84)["attribute"]
+    if is_filler(content[84 + 50 * count :]) and not attributes.any():  # else a byte may be one too many, and moves all
         return _of_binary(content, count)
     raise Damage(f"is not a readable .stl mesh: it declares {count} triangles and holds more; export it again")
 

@@ -72,11 +72,11 @@ def _ours(content: bytes, suffix: str) -> np.ndarray:
 
 READERS: dict[str, tuple[Read, tuple[str, ...]]] = {
     "trimesh": (_by_trimesh, FORMATS if find_spec("lxml") else FORMATS[:-1]),
-    "Open3D": (_by_open3d, ("off", "obj", "stl", "glb")),
-    "assimp": (_by_assimp, FORMATS if find_spec("assimp_py") else ()),
+    "Open3D": (_by_open3d, ("obj", "stl", "glb")),
+    "assimp": (_by_assimp, ("off", "obj", "stl", "glb", "dae", "3mf") if find_spec("assimp_py") else ()),
 }
 """Readers and what they read. trimesh needs lxml for 3MF, and assimp the package assimp-py. Open3D ends its process by a signal
-at some damaged PLY."""
+at some damaged OFF and PLY, assimp at some PLY."""
 
 
 def _surface(corners: np.ndarray) -> np.ndarray | None:

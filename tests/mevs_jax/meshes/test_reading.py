@@ -10,7 +10,7 @@ import pytest
 
 import mevs_jax
 from mevs_jax.errors import DataError
-from tests.data_pipeline.objects.making import U_AREA, area, box, obj, off, u_profile
+from tests.data_pipeline.objects.making import U_AREA, area, box, obj, off, stl, u_profile
 
 READ = """
 import sys, mevs_jax
@@ -44,3 +44,15 @@ def test_the_axis_that_is_up(up, size, tmp_path):
 def test_what_cannot_be_read_is_said(name, reason, tmp_path):
     with pytest.raises(DataError, match=rf"{name} .*{reason}"):
         mevs_jax.read_mesh(tmp_path / name)
+
+
+def test_a_byte_too_many_in_a_binary_stl_is_noticed(tmp_path):
+    """Also where the last byte of the file looks like what fills one up."""
+    sound = stl(*box())
+    for at, filler in ((len(sound), b"\0\n"), (200, b"\0")):
+        (tmp_path / "box.stl").write_bytes(sound[:at] + filler + sound[at:])
+        if at == len(sound):
+            assert area(*mevs_jax.read_mesh(tmp_path / "box.stl")) == pytest.approx(22)
+        else:
+            with pytest.raises(DataError, match="declares 12 triangles and holds more"):
+                mevs_jax.read_mesh(tmp_path / "box.stl")
