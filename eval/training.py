@@ -17,6 +17,7 @@ from eval.runs import BY_VIEW, tasks
 from eval.settings import Settings
 from train.loop import check_launch, fit
 from train.planning.plan import plan_of, planned_statistics
+from train.planning.targets import Target
 from train.results.chance import warn_of_chance
 from train.running.devices import Layout, check_batch, device_mesh
 from train.step import Task
@@ -78,12 +79,18 @@ def say_trained(task: Task, summary: dict[str, Any], statistics: DatasetStatisti
 
 
 def plan_training(
-    settings: Settings, out: Path, start: StartingWeights | None, layout: Layout, objects: int | None = None
+    settings: Settings,
+    out: Path,
+    start: StartingWeights | None,
+    layout: Layout,
+    objects: int | None = None,
+    target: Target | None = None,
 ) -> dict[str, Any]:
     """Returns what `train` would do on these devices, as values that JSON can hold; nothing is trained.
 
     Args:
         objects: number of training objects of a data set that is not made yet; None for the run's own data set.
+        target: devices of the layout, which are not here, to compile the training steps for.
 
     Raises:
         DataError: if there is no data set, or `train` would refuse to begin.
@@ -103,7 +110,7 @@ def plan_training(
             for task, name, weights in trainings(settings, statistics, start)
             if check_launch(task, statistics, out / name, weights, layout)
         ]
-    return plan_of(waiting, statistics, layout, made)
+    return plan_of(waiting, statistics, layout, made, target)
 
 
 def train_by_view(settings: Settings, out: Path, start: StartingWeights | None = None) -> None:

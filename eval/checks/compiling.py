@@ -100,11 +100,14 @@ def grown(now: CompileCheck, before: CompileCheck) -> list[str]:
             said.append(f"{name} was compiled before, and is not now ({now.refused[name]})")
         elif name in now.programs:
             new = now.programs[name]
-            compared = ("moves", old.traffic_bytes, new.traffic_bytes), ("holds", old.peak_bytes, new.peak_bytes)
+            compared = (
+                ("moves", old.contents.traffic_bytes, new.contents.traffic_bytes),
+                ("holds", old.peak_bytes, new.peak_bytes),
+            )
             said += [
                 f"{name} {does} {after:.3g} bytes instead of {earlier:.3g} ({after / earlier - 1:+.0%})"
                 for does, earlier, after in compared
-                if earlier and after and after > GROWTH * earlier
+                if after > GROWTH * earlier > 0
             ]
     return said
 

@@ -24,11 +24,10 @@ from mevs_jax.points.ops import ball_query, farthest_point_sample
 from mevs_jax.policies.registry import POLICIES
 from mevs_jax.rendering import march, render_depth, render_mesh
 from mevs_jax.selection.loop import ViewTable
-from train.planning.compile import Program, shapes_on
-from train.planning.costs import views_like
+from train.planning.compile import Program, shapes_on, training_program
 from train.planning.plan import planned_statistics
 from train.running.devices import DATA, MODEL
-from train.step import Task, abstract_state, train_step_of
+from train.step import Task
 from train.tasks.recogniser import RecogniserTask
 
 Make = Callable[[Mesh], Program]
@@ -61,14 +60,7 @@ def _training(settings: Settings, task_of: Callable[[Any], Task]) -> Make:
         unit = math.lcm(mesh.shape[DATA] * config.parts, config.parts * task.group, config.views_per_object)
         batch = unit * -(-config.batch_size // unit)
         task = replace(task, optimiser=replace(config, batch_size=batch))  # type: ignore[type-var]
-        structure, state = abstract_state(task)
-        whole, split = NamedSharding(mesh, PartitionSpec()), NamedSharding(mesh, PartitionSpec(DATA))
-        given = (
-            shapes_on(whole, state),
-            shapes_on(split, views_like(task, statistics, batch)),
-            shapes_on(whole, task.hyperparameters),
-        )
-        return Program(train_step_of(task, structure, 1000), given, donated=(0,))
+        return training_program(task, statistics, mesh)
 
     return make
 

@@ -395,7 +395,7 @@ def compiling(options: CompileOptions) -> None:
 
 def compile_text(found: CompileCheck) -> str:
     """What became of programs, for a terminal."""
-    titles = ("program", "compiled in", "peak memory", "arithmetic", "traffic", "FLOP/B", "at least")
+    titles = ("program", "compiled in", "peak memory", "arithmetic", "traffic", "FLOP/B", "at least", "kernels")
     rows = [titles, *(_compiled_row(name, program) for name, program in found.programs.items())]
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
     made_with = ", ".join(f"{package} {version}" for package, version in found.made_with.items())
@@ -419,9 +419,10 @@ def _compiled_row(name: str, program: Compiled) -> tuple[str, ...]:
         f"{program.compile_seconds:.1f} s",
         scaled(program.peak_bytes, "B"),
         scaled(program.flop, "FLOP"),
-        "–" if program.traffic_bytes is None else scaled(program.traffic_bytes, "B"),
-        "–" if program.flop_per_byte is None else f"{program.flop_per_byte:.3g}",
+        scaled(program.contents.traffic_bytes, "B"),
+        f"{program.flop_per_byte:.3g}",
         f"{1e3 * program.least_seconds:.3g} ms",
+        f"{program.contents.kernels}",
     )
 
 

@@ -164,6 +164,8 @@ class TrainOptions(WithNetworks, WithOthers):
     """print what this command would do, or why it cannot, and train nothing (docs/scaling.md)"""
     plan_devices: Annotated[int | None, _arg("N", "those that are here")] = None
     """with --plan: devices to plan for, of all processes together"""
+    plan_target: Annotated[str | None, _arg("DEVICES")] = None
+    """with --plan: plan for these, and ask XLA's compiler for them: gpu:h100, or a slice of TPUs, as tpu:v5e:8x8"""
     plan_processes: Annotated[int | None, _arg("N", "1")] = None
     """with --plan --distributed: processes to plan for"""
     plan_objects: Annotated[int | None, _arg("N", "the run's data set")] = None

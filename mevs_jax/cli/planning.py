@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 from mevs_jax.cli.failure import Unusable
@@ -13,13 +14,16 @@ if TYPE_CHECKING:
     from train.running.devices import Layout
 
 
+_OPTIONS = ("plan_devices", "plan_target", "plan_processes", "plan_objects")
+
+
 def is_asked(options: Any) -> bool:
     """Whether options of `mevs train` ask for a plan.
 
     Raises:
         Unusable: if they are those of a plan, without `--plan`.
     """
-    given = [name for name in ("plan_devices", "plan_processes", "plan_objects") if getattr(options, name) is not None]
+    given = [name for name in _OPTIONS if getattr(options, name) is not None]
     given += ["json"] * options.json
     if given and not options.plan:
         raise Unusable(f"--{given[0].replace('_', '-')} is for a plan; add --plan, or leave it out")
@@ -39,8 +43,16 @@ def plan(call: Invocation) -> None:
         raise Unusable(
             f"a plan is of one training, and --seeds is {call.settings.seeds}; add --seeds 1 to plan for each"
         )
+    target = None
+    if options.plan_target is not None:
+        from train.planning.targets import Target
+
+        target = Target.of(options.plan_target)
+        if options.plan_devices not in (None, number := len(target.devices())):
+            raise Unusable(f"{target.name} has {number} devices, and --plan-devices is {options.plan_devices}; leave that out")
+        options = replace(options, plan_devices=number)
     layout = layout_of(options)
-    found = training.plan_training(call.settings, call.out, weights_of(call), layout, options.plan_objects)
+    found = training.plan_training(call.settings, call.out, weights_of(call), layout, options.plan_objects, target)
     print(json.dumps(found) if options.json else plan_text(found))
 
 
@@ -82,20 +94,22 @@ def plan_text(found: dict[str, Any]) -> str:
     if not networks:
         return "\n".join([*lines, "All networks are trained already."])
     rows = [("", *(network["network"] for network in networks))]
-    rows += [(title, *(show(network) for network in networks)) for title, show in _rows(data["made"])]
+    asked = networks[0]["compiled_bytes"] is not None
+    rows += [(title, *(show(network) for network in networks)) for title, show in _rows(data["made"], asked)]
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
     lines += ["  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip() for row in rows]
     lines += ["", "Memory is counted from shapes, and is of one device; operations are XLA's count (docs/scaling.md)."]
     return "\n".join([*lines, *(f"Note: {note}." for note in found["notes"])])
 
 
-def _rows(measured: bool) -> list[tuple[str, Any]]:
+def _rows(measured: bool, compiled: bool) -> list[tuple[str, Any]]:
     return [
         ("batch", lambda n: _views(n["batch_views"], n["batch_objects"])),
         ("  of a process", lambda n: _views(n["process_views"], n["process_objects"])),
         ("  of a device", lambda n: _views(n["device_views"], n["device_objects"])),
         ("  in parts", lambda n: f"{n['parts']}"),
         ("steps", lambda n: f"{n['epoch_steps']:,} an epoch, {n['steps']:,} in {n['epochs']} epochs"),
+        *[("memory of a device, compiled", lambda n: _bytes(n["compiled_bytes"]))] * compiled,
         ("memory of a device", lambda n: _bytes(n["device_bytes"])),
         ("  weights, moments", lambda n: f"{_bytes(n['state_bytes'])} (weights {_bytes(n['weights_bytes'])})"),
         ("  gradients", lambda n: _bytes(n["gradients_bytes"])),

@@ -12,10 +12,14 @@ from typing import Any
 
 import jax
 import numpy as np
-from jax.sharding import Sharding
+from jax.sharding import Mesh, NamedSharding, PartitionSpec, Sharding
 
+from data_pipeline.dataset.statistics import DatasetStatistics
+from train.planning.costs import views_like
 from train.planning.hlo import Contents
 from train.planning.targets import Target
+from train.running.devices import DATA, parameter_sharding
+from train.step import Task, abstract_state, train_step_of
 
 
 @dataclass(frozen=True)
@@ -43,6 +47,18 @@ def shapes_on(where: Sharding, tree: Any) -> Any:
     return jax.tree.map(of, tree)
 
 
+def training_program(task: Task, statistics: DatasetStatistics, mesh: Mesh) -> Program:
+    """Returns the step of a training that the devices of a mesh share."""
+    structure, state = abstract_state(task)
+    split, whole = NamedSharding(mesh, PartitionSpec(DATA)), NamedSharding(mesh, PartitionSpec())
+    given = (
+        jax.tree.map(lambda leaf, where: shapes_on(where, leaf), state, parameter_sharding(mesh, state)),
+        shapes_on(split, views_like(task, statistics, task.optimiser.batch_size)),
+        shapes_on(whole, task.hyperparameters),
+    )
+    return Program(train_step_of(task, structure, 1000), given, donated=(0,))
+
+
 @dataclass(frozen=True)
 class Compiled:
     """A compiled program. All figures are of one device, and count the body of a loop once.
@@ -51,18 +67,18 @@ class Compiled:
         compile_seconds: that tracing and compiling took.
         peak_bytes: the most memory that it needs at one time.
         flop: floating-point operations; for a GPU those before it was compiled, without those of kernels.
-        traffic_bytes: bytes that its operations read and write; None for a GPU, of which XLA does not count them.
-        contents: what it sends, calls and repeats.
-        flop_per_byte: arithmetic intensity.
+        accessed_bytes: that its operations read and write by XLA's count, which includes a TPU's vector memory; None for a GPU.
+        contents: what it moves, starts, sends and repeats.
+        flop_per_byte: arithmetic for each byte of traffic with the device's memory.
         least_seconds: that it needs at the chip's peak rates.
     """
 
     compile_seconds: float
     peak_bytes: int
     flop: float
-    traffic_bytes: float | None
+    accessed_bytes: float | None
     contents: Contents
-    flop_per_byte: float | None
+    flop_per_byte: float
     least_seconds: float
 
 
@@ -81,15 +97,15 @@ def compile_for(target: Target, program: Program) -> Compiled:
     seconds = time.perf_counter() - before
     counted = compiled.cost_analysis()
     flop = float(_flop_of(lowered) if counted is None else counted.get("flops", 0.0))
-    traffic = None if counted is None else float(counted["bytes accessed"])
+    contents = Contents.of(compiled.as_text())
     return Compiled(
         compile_seconds=seconds,
         peak_bytes=int(compiled.memory_analysis().peak_memory_in_bytes),
         flop=flop,
-        traffic_bytes=traffic,
-        contents=Contents.of(compiled.as_text()),
-        flop_per_byte=flop / traffic if traffic else None,
-        least_seconds=max(flop / target.chip.flop, (traffic or 0.0) / target.chip.bandwidth),
+        accessed_bytes=None if counted is None else float(counted["bytes accessed"]),
+        contents=contents,
+        flop_per_byte=flop / max(contents.traffic_bytes, 1),
+        least_seconds=max(flop / target.chip.flop, contents.traffic_bytes / target.chip.bandwidth),
     )
 
 

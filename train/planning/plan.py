@@ -24,8 +24,11 @@ from data_pipeline.dataset.config import DataConfig
 from data_pipeline.dataset.proof import folder_of_shards
 from data_pipeline.dataset.statistics import SPLITS, DatasetStatistics
 from data_pipeline.errors import DataError
+from data_pipeline.progress import console
 from train.loop import check_training, steps_of_an_epoch
+from train.planning.compile import compile_for, training_program
 from train.planning.costs import bytes_of, flop_of, memory_of, views_like
+from train.planning.targets import Target, mesh_of
 from train.running.devices import Layout
 from train.step import Task
 
@@ -53,6 +56,7 @@ class NetworkPlan:
         inputs_bytes: views of a batch on a device.
         activations_bytes, view_activations_bytes: what the forward pass keeps for the backward pass: of a device, of a view.
         device_bytes: state, gradients, inputs and activations.
+        compiled_bytes: memory of a device by XLA's compiler for it; None if it was not asked.
         step_flop, device_flop: floating-point operations of a step by XLA's count, on all devices and on one.
         record_bytes: mean size of an object's record in storage.
         epoch_bytes, process_epoch_bytes: bytes read from storage in an epoch, by all processes and by one.
@@ -78,6 +82,7 @@ class NetworkPlan:
     activations_bytes: int
     view_activations_bytes: int
     device_bytes: int
+    compiled_bytes: int | None
     step_flop: float
     device_flop: float
     record_bytes: float
@@ -87,8 +92,10 @@ class NetworkPlan:
     validation_bytes: int
 
     @classmethod
-    def of(cls, task: Task, statistics: DatasetStatistics, layout: Layout, record_bytes: float) -> NetworkPlan:
-        """Returns the plan of a network.
+    def of(
+        cls, task: Task, statistics: DatasetStatistics, layout: Layout, record_bytes: float, target: Target | None = None
+    ) -> NetworkPlan:
+        """Returns the plan of a network; the compiler of a target is asked too.
 
         Raises:
             DataError: if it cannot be trained so.
@@ -115,6 +122,7 @@ class NetworkPlan:
             device_bytes=sum(
                 memory[name] for name in ("state_bytes", "gradients_bytes", "inputs_bytes", "activations_bytes")
             ),
+            compiled_bytes=None if target is None else _compiled(target, task, statistics, layout),
             step_flop=flop * layout.data,
             device_flop=flop / layout.model,
             record_bytes=record_bytes,
@@ -123,6 +131,12 @@ class NetworkPlan:
             validation_views=validation,
             validation_bytes=validation * bytes_of(views_like(task, statistics, 1)),
         )
+
+
+def _compiled(target: Target, task: Task, statistics: DatasetStatistics, layout: Layout) -> int:
+    mesh = mesh_of(target.devices(), layout.model)
+    with console.status(f"Compiling the training step of the {task.name} for {target.name}"):
+        return compile_for(target, training_program(task, statistics, mesh)).peak_bytes
 
 
 def planned_statistics(config: DataConfig, objects: int) -> DatasetStatistics:
@@ -194,13 +208,18 @@ def notes_on(task: Task, statistics: DatasetStatistics) -> list[str]:
 
 
 def plan_of(
-    tasks: Sequence[Task], statistics: DatasetStatistics, layout: Layout, data: Path | None = None
+    tasks: Sequence[Task],
+    statistics: DatasetStatistics,
+    layout: Layout,
+    data: Path | None = None,
+    target: Target | None = None,
 ) -> dict[str, Any]:
     """Returns the plan of a launch as values that JSON can hold.
 
     Args:
         tasks: the networks to train.
         data: folder of the data set; None if it is not made yet.
+        target: what else to compile each training step for; its devices are those of the layout.
 
     Raises:
         DataError: if one of them cannot be trained so; all are checked before any is looked at closer.
@@ -217,6 +236,6 @@ def plan_of(
             "views": statistics.views,
             "resolution": camera.resolution,
         },
-        "networks": [asdict(NetworkPlan.of(task, statistics, layout, record)) for task in tasks],
+        "networks": [asdict(NetworkPlan.of(task, statistics, layout, record, target)) for task in tasks],
         "notes": [note for task in tasks for note in notes_on(task, statistics)],
     }

@@ -156,6 +156,6 @@ _WITHOUT_A_HOST = {
 """What libtpu asks of the host of a TPU, and else complains about; it changes nothing that is compiled."""
 
 
-def mesh_of(devices: list[Any]) -> Mesh:
-    """Returns the mesh of devices over which a batch is split, as training has it."""
-    return Mesh(np.array(devices).reshape(-1, 1), (DATA, MODEL))
+def mesh_of(devices: list[Any], model: int = 1) -> Mesh:
+    """Returns the mesh of devices over which a batch is split, as training has it; `model` devices share one copy of the weights."""
+    return Mesh(np.array(devices).reshape(-1, model), (DATA, MODEL))
