@@ -49,7 +49,9 @@ def plan(call: Invocation) -> None:
 
         target = Target.of(options.plan_target)
         if options.plan_devices not in (None, number := len(target.devices())):
-            raise Unusable(f"{target.name} has {number} devices, and --plan-devices is {options.plan_devices}; leave that out")
+            raise Unusable(
+                f"{target.name} has {number} devices, and --plan-devices is {options.plan_devices}; leave that out"
+            )
         options = replace(options, plan_devices=number)
     layout = layout_of(options)
     found = training.plan_training(call.settings, call.out, weights_of(call), layout, options.plan_objects, target)

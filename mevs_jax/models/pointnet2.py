@@ -147,6 +147,21 @@ def _map(function: Callable, clouds: Any, at_once: int) -> Any:
     return jax.lax.map(function, clouds, batch_size=None if symbolic else at_once)
 
 
+def _centres(
+    clouds: Float[Array, "clouds points 3"], k: int, first: bool, at_once: int | None = None
+) -> Float[Array, "clouds {k} 3"]:
+    """The centres of a level, `at_once` clouds at a time or all together.
+
+    Centres are in the order in which farthest-point sampling chose them. Sampled again, they are chosen in the same order, also
+    among equal distances. So the first of them are the centres of the next level.
+    """
+    if not first and k <= clouds.shape[1]:
+        return clouds[:, :k]
+    sample = partial(farthest_point_sample, k=k)
+    chosen = jax.vmap(sample)(clouds) if at_once is None else _map(sample, clouds, at_once)
+    return jnp.take_along_axis(clouds, chosen[..., None], axis=1)
+
+
 def _abstract(
     points: Float[Array, "points 3"],
     features: Float[Array, "points channels"],
@@ -258,8 +273,7 @@ class PointNet2(TrainedByCall):
             raise ValueError("PointNet2 needs a key for its dropout in training")
         coordinates, features = clouds[..., :3], clouds[..., 3:].astype(dtype)
         for level, perceptron in zip(self.levels, self.perceptrons, strict=True):
-            chosen = jax.vmap(farthest_point_sample, in_axes=(0, None))(coordinates, level.centres)
-            centres = jnp.take_along_axis(coordinates, chosen[..., None], axis=1)
+            centres = _centres(coordinates, level.centres, level is self.levels[0])
             neighbours = jax.vmap(partial(ball_query, radius=level.radius, k=level.samples))(coordinates, centres)
             kernel = perceptron.linear[0].kernel[...]
             passed = jax.vmap(_passed, in_axes=(0, 0, None))(coordinates, features, kernel)
@@ -290,10 +304,8 @@ class PointNet2(TrainedByCall):
         memory (64 clouds of the thesis's size take 2 GB)."""
         points, features = clouds[..., :3], clouds[..., 3:].astype(self.dtype or clouds.dtype)
         for level, perceptron in zip(self.levels, self.perceptrons, strict=True):
-            sample = partial(farthest_point_sample, k=level.centres)
             at_once = 4 if points.shape[1] <= LARGE else 1  # four larger clouds leave the cache
-            chosen = _map(sample, points, at_once) if in_cache else jax.vmap(sample)(points)
-            centres = jnp.take_along_axis(points, chosen[..., None], axis=1)
+            centres = _centres(points, level.centres, level is self.levels[0], at_once if in_cache else None)
             pieces = _pieces(level) if in_cache else 1
             abstract = partial(_abstract, level=level, layers=perceptron.folded(), pieces=pieces)
             features = _map(lambda cloud, of=abstract: of(*cloud), (points, features, centres), 1 if in_cache else 64)

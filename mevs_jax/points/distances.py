@@ -20,3 +20,8 @@ def square(x: Array) -> Array:
 def squared_distance(dx: Array, dy: Array, dz: Array) -> Array:
     """dx² + dy² + dz², summed in this order."""
     return (square(dx) + square(dy)) + square(dz)
+
+
+def only_finite(coordinates: Array, fill: float) -> Array:
+    """The coordinates, `fill` in place of those that are infinite or NaN, whose squares `square` takes for 0."""
+    return jnp.where(jnp.isfinite(coordinates), coordinates, fill)

@@ -15,7 +15,7 @@ from jax.experimental import pallas as pl
 from jax.experimental.pallas import triton
 from jaxtyping import Array, Float, Int
 
-from mevs_jax.points.distances import squared_distance
+from mevs_jax.points.distances import only_finite, squared_distance
 
 _CENTRES, _CHUNK = 16, 128  # of a ball query: centres per block, points per step
 
@@ -25,33 +25,32 @@ def _power_of_two(count: int) -> int:
     return 1 << (count - 1).bit_length()
 
 
-def _columns(points: Float[Array, "points 3"], count: int, fill: float) -> Float[Array, "3 count"]:
-    """Coordinates along the first axis, and points padded to `count` with the value `fill`."""
-    return jnp.pad(points, ((0, count - points.shape[0]), (0, 0)), constant_values=fill).T
+def _coordinates(points: Any, index: Array, fill: float) -> list[Array]:
+    """Each coordinate of the points of these numbers; `fill` where there is no such point."""
+    return [triton.load(points.at[index, axis], mask=index < points.shape[0], other=fill) for axis in range(3)]
 
 
 def farthest_point_sample(points: Float[Array, "points 3"], k: int, *, interpret: bool = False) -> Int[Array, " {k}"]:
     """`points.ops.farthest_point_sample` for at most `ops.LARGEST_OF_KERNEL` points; `interpret` runs it slowly on any device."""
-    count = points.shape[0]
-    columns = _columns(points, _power_of_two(count), 0.0)
+    warps = min(32, max(4, _power_of_two(points.shape[0]) // 512))
     return pl.pallas_call(
-        partial(_sample, count=count, k=k),
+        partial(_sample, k=k),
         out_shape=jax.ShapeDtypeStruct((k,), jnp.int32),
-        compiler_params=triton.CompilerParams(num_warps=min(32, max(4, columns.shape[1] // 512)), num_stages=1),
+        compiler_params=triton.CompilerParams(num_warps=warps, num_stages=1),
         interpret=interpret,
         name="farthest_point_sample",
-    )(columns)
+    )(points)
 
 
-def _sample(points: Any, chosen: Any, *, count: int, k: int) -> None:
+def _sample(points: Any, chosen: Any, *, k: int) -> None:
     """Kernel of `farthest_point_sample`: writes the k indices to `chosen`."""
-    x, y, z = (points[axis, :] for axis in range(3))
-    index = jnp.arange(x.shape[0], dtype=jnp.int32)
-    nearest = jnp.where(index < count, jnp.inf, -1.0).astype(x.dtype)
+    index = jnp.arange(_power_of_two(points.shape[0]), dtype=jnp.int32)
+    x, y, z = _coordinates(points, index, 0.0)
+    nearest = jnp.where(index < points.shape[0], jnp.inf, -1.0).astype(x.dtype)
 
     def step(i: Array, carry: tuple[Array, Array]) -> tuple[Array, Array]:
         nearest, last = carry
-        here = [points[axis, last] for axis in range(3)]
+        here = [points[last, axis] for axis in range(3)]
         nearest = jnp.minimum(nearest, squared_distance(x - here[0], y - here[1], z - here[2]))
         last = jnp.argmax(nearest).astype(jnp.int32)  # the first among equals
         chosen[i] = last
@@ -78,18 +77,14 @@ def ball_query(
         compiler_params=triton.CompilerParams(num_warps=4, num_stages=1),
         interpret=interpret,
         name="ball_query",
-    )(
-        _columns(points, -(-points.shape[0] // _CHUNK) * _CHUNK, jnp.inf),
-        _columns(centres, blocks * _CENTRES, 0.0),
-        squared_radius.reshape(1),
-    )
+    )(points, centres, squared_radius.reshape(1))
     return found[: centres.shape[0], :k]
 
 
 def _query(points: Any, centres: Any, squared_radius: Any, found: Any, *, k: int) -> None:
     """Kernel of `ball_query`: writes the indices of one block of centres to `found`."""
     rows = pl.program_id(0) * _CENTRES + jnp.arange(_CENTRES, dtype=jnp.int32)
-    centre = [triton.load(centres.at[axis, rows])[:, None] for axis in range(3)]
+    centre = [only_finite(axis, -jnp.inf)[:, None] for axis in _coordinates(centres, rows, 0.0)]
     limit = squared_radius[0]
 
     def keep(slot: Array, index: Array, kept: Array) -> None:
@@ -98,20 +93,21 @@ def _query(points: Any, centres: Any, squared_radius: Any, found: Any, *, k: int
 
     def unfilled(carry: tuple[Array, Array, Array]) -> Array:
         start, counts, _ = carry
-        return (start < points.shape[1]) & (jnp.min(counts) < k)
+        return (start < points.shape[0]) & (jnp.min(counts) < k)
 
     def chunk(carry: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
         start, counts, first = carry
         index = start + jnp.arange(_CHUNK, dtype=jnp.int32)
-        offset = [triton.load(points.at[axis, index])[None, :] - centre[axis] for axis in range(3)]
+        point = [only_finite(axis, jnp.inf)[None, :] for axis in _coordinates(points, index, jnp.inf)]
+        offset = [a - b for a, b in zip(point, centre, strict=True)]
         hit = squared_distance(*offset) < limit
         slot = counts[:, None] + jnp.cumsum(hit.astype(jnp.int32), axis=1) - 1
         keep(slot, index[None, :], hit & (slot < k))
-        first = jnp.minimum(first, jnp.min(jnp.where(hit, index[None, :], points.shape[1]), axis=1))
+        first = jnp.minimum(first, jnp.min(jnp.where(hit, index[None, :], points.shape[0]), axis=1))
         return start + _CHUNK, counts + jnp.sum(hit.astype(jnp.int32), axis=1), first
 
-    none = (jnp.zeros(_CENTRES, jnp.int32), jnp.full(_CENTRES, points.shape[1], jnp.int32))
+    none = (jnp.zeros(_CENTRES, jnp.int32), jnp.full(_CENTRES, points.shape[0], jnp.int32))
     _, counts, first = jax.lax.while_loop(unfilled, chunk, (jnp.int32(0), *none))
     slot = jnp.broadcast_to(jnp.arange(_power_of_two(k), dtype=jnp.int32)[None, :], (_CENTRES, _power_of_two(k)))
-    filler = jnp.where(first < points.shape[1], first, 0)
+    filler = jnp.where(first < points.shape[0], first, 0)
     keep(slot, filler[:, None], (slot >= counts[:, None]) & (slot < k))

@@ -22,7 +22,7 @@ from mevs_jax.arguments import check, whole
 from mevs_jax.arrays import AnyArray
 from mevs_jax.points import farthest
 from mevs_jax.points.bits import WORD, bits_until, select_bit, set_bits
-from mevs_jax.points.distances import square, squared_distance
+from mevs_jax.points.distances import only_finite, square, squared_distance
 from mevs_jax.points.lowered import with_kernels
 
 LARGEST_OF_KERNEL = 16_384
@@ -117,9 +117,6 @@ def ball_query(
     _check_cloud("ball_query", points)
     _check_cloud("ball_query", centres)
     points, centres = (jax.lax.stop_gradient(jnp.asarray(array)) for array in (points, centres))
-    # A point that is not finite is no neighbour of any centre, and a centre that is not finite has none.
-    points = jnp.where(jnp.isfinite(points), points, jnp.inf)
-    centres = jnp.where(jnp.isfinite(centres), centres, -jnp.inf)
     squared_radius = square(jax.lax.stop_gradient(jnp.asarray(radius, points.dtype)))
     if points.dtype != jnp.float32:
         return _query_of_array(points, centres, squared_radius, k)
@@ -170,6 +167,8 @@ def _hits(
     points: Float[Array, "points 3"], centres: Float[Array, "centres 3"], squared_radius: Float[Array, ""]
 ) -> UInt32[Array, "centres words"]:
     """Which points are within the radius of each centre, one bit each."""
+    # A point that is not finite is no neighbour of any centre, and a centre that is not finite has none.
+    points, centres = only_finite(points, jnp.inf), only_finite(centres, -jnp.inf)
     padded = jnp.pad(points, ((0, -points.shape[0] % WORD), (0, 0)), constant_values=jnp.inf)
     # The points of a word form a column, so that the sum over bits is vectorised over words.
     x, y, z = (padded[:, axis].reshape(-1, WORD).T for axis in range(3))

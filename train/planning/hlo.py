@@ -16,7 +16,17 @@ _COLLECTIVES = ("all-reduce", "all-gather", "reduce-scatter", "all-to-all", "col
 _OF_THE_HOST = ("infeed", "outfeed", "send", "recv")
 _COUNTERS = {"parameter", "get-tuple-element", "constant", "compare", "copy", "bitcast", "fusion"}
 """What the condition of a loop of known length consists of."""
-_NOTHING = {"parameter", "constant", "bitcast", "tuple", "get-tuple-element", "while", "call", "conditional", "after-all"}
+_NOTHING = {
+    "parameter",
+    "constant",
+    "bitcast",
+    "tuple",
+    "get-tuple-element",
+    "while",
+    "call",
+    "conditional",
+    "after-all",
+}
 """Operations for which nothing is started, or what they call."""
 _SLICES = {"slice", "dynamic-slice", "gather"}
 
@@ -141,7 +151,7 @@ def _scheduled(text: str, computations: _Computations) -> set[str]:
         found.add(name)
         for one in computations.get(name, {}).values():
             if one.operation in ("while", "call", "conditional"):
-                called = re.findall(r"(?:body|condition|to_apply|computation)s?=\{?([^=}]*)", one.line)
+                called = re.findall(r"(?:body|condition|to_apply|_computations?)=(\{[^}]*\}|[^,\s]*)", one.line)
                 waiting += set(re.findall(r"[\w.\-]+", " ".join(called))) & computations.keys() - found
     return found
 

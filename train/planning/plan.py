@@ -93,7 +93,12 @@ class NetworkPlan:
 
     @classmethod
     def of(
-        cls, task: Task, statistics: DatasetStatistics, layout: Layout, record_bytes: float, target: Target | None = None
+        cls,
+        task: Task,
+        statistics: DatasetStatistics,
+        layout: Layout,
+        record_bytes: float,
+        target: Target | None = None,
     ) -> NetworkPlan:
         """Returns the plan of a network; the compiler of a target is asked too.
 

@@ -157,5 +157,5 @@ _WITHOUT_A_HOST = {
 
 
 def mesh_of(devices: list[Any], model: int = 1) -> Mesh:
-    """Returns the mesh of devices over which a batch is split, as training has it; `model` devices share one copy of the weights."""
+    """Returns the mesh of devices over which a batch is split, as training has it; `model` of them share the weights."""
     return Mesh(np.array(devices).reshape(-1, model), (DATA, MODEL))

@@ -177,12 +177,26 @@ def test_kernels_give_the_same_indices(kind, points, k, radius, samples, random)
     clouds = clouds_of(kind, random, 2, points)
     chosen = jax.vmap(lambda cloud: point_kernels.farthest_point_sample(cloud, k, interpret=True))(clouds)
     centres = np.concatenate([clouds[:, : points // 2], np.full((2, 1, 3), 9, np.float32)], axis=1)
+    marred = clouds.copy()
+    marred[1, 3], centres[1, 2], centres[0, 1, 2] = np.nan, np.inf, np.nan
     within = jnp.square(jnp.float32(radius))
     ask = lambda p, c: point_kernels.ball_query(p, c, within, samples, interpret=True)  # noqa: E731
-    groups = jax.vmap(ask)(clouds, centres)
-    for cloud, centre, indices, group in zip(clouds, centres, chosen, groups, strict=True):
+    groups = jax.vmap(ask)(marred, centres)
+    for cloud, indices in zip(clouds, chosen, strict=True):
         np.testing.assert_array_equal(indices, numpy_rules.farthest_point_sample(cloud, k))
-        np.testing.assert_array_equal(group, numpy_rules.ball_query(cloud, centre, radius, samples))
+    for cloud, centre, group in zip(marred, centres, groups, strict=True):
+        with np.errstate(invalid="ignore"):
+            np.testing.assert_array_equal(group, numpy_rules.ball_query(cloud, centre, radius, samples))
+
+
+@pytest.mark.parametrize("kind", ["random", "lattice", "duplicates", "one_point"])
+def test_points_in_the_order_of_sampling_are_sampled_in_this_order(kind, random):
+    """So PointNet++ samples once, and takes the first centres for its next level: the same places, whatever their numbers."""
+    clouds = clouds_of(kind, random, 25, 60)
+    clouds[::5, 7] = np.nan
+    for cloud in clouds:
+        centres = cloud[sample(cloud, 40)]
+        np.testing.assert_array_equal(centres[sample(centres, 16)], centres[:16])
 
 
 def test_gpus_and_tpus_run_the_kernels_and_nothing_else_does():

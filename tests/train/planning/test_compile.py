@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib.util
+from dataclasses import replace
 
 import jax
 import jax.numpy as jnp
@@ -27,11 +28,11 @@ def compiled(function, *arguments):
 def test_figures_are_those_of_the_program():
     found = compiled(lambda a, b: a @ b, jnp.zeros((64, 32)), jnp.zeros((32, 16)))
     assert found.flop == 2 * 64 * 32 * 16
-    assert found.traffic_bytes == 4 * (64 * 32 + 32 * 16 + 64 * 16)
-    assert found.flop_per_byte == found.flop / found.traffic_bytes
-    assert found.least_seconds == found.traffic_bytes / HERE.chip.bandwidth  # longer than the arithmetic takes
+    assert found.accessed_bytes == found.contents.traffic_bytes == 4 * (64 * 32 + 32 * 16 + 64 * 16)
+    assert found.flop_per_byte == found.flop / found.accessed_bytes
+    assert found.least_seconds == found.accessed_bytes / HERE.chip.bandwidth  # longer than the arithmetic takes
     assert found.peak_bytes >= 4 * (64 * 32 + 32 * 16 + 64 * 16)
-    assert found.contents == Contents({}, found.contents.custom_calls, 0, 0, 0)
+    assert found.contents == replace(found.contents, collectives={}, kernels=1, loops=0, open_loops=0, host_transfers=0)
 
 
 def test_loops_are_told_by_whether_their_length_is_known():
@@ -81,10 +82,53 @@ def test_contents_of_a_program_for_several_devices():
     assert Contents.of(TEXT) == Contents(
         collectives={"all-reduce": Collective(2, 4 * 64 * 3 + 4 * 8), "all-gather": Collective(1, 2 * 16 + 4)},
         custom_calls={"GatherScatterIndicesBitpacked": 1, "xla_ffi_python_cpu_callback": 1},
+        kernels=11,
+        traffic_bytes=Contents.of(TEXT).traffic_bytes,
         loops=2,
         open_loops=1,
         host_transfers=3,
     )
+
+
+MEMORY = """HloModule jit_step, is_scheduled=true
+
+%fused.1 (param_0.1: f32[100,64], param_1.1: s32[]) -> f32[1,64] {
+  %param_0.1 = f32[100,64]{1,0:T(8,128)} parameter(0)
+  %param_1.1 = s32[]{:T(128)S(6)} parameter(1)
+  %constant.1 = s32[]{:T(128)} constant(0)
+  ROOT %dynamic-slice.1 = f32[1,64]{1,0:T(8,128)} dynamic-slice(%param_0.1, %param_1.1, %constant.1), dynamic_slice_sizes={1,64}
+}
+
+%body.1 (arg: (f32[8,64], s32[])) -> (f32[8,64], s32[]) {
+  %arg = (f32[8,64]{1,0:T(8,128)}, s32[]{:T(128)S(6)}) parameter(0)
+  %x = f32[8,64]{1,0:T(8,128)} get-tuple-element(%arg), index=0
+  %i = s32[]{:T(128)S(6)} get-tuple-element(%arg), index=1
+  %copy.1 = f32[8,64]{0,1:T(8,128)} copy(%x)
+  ROOT %tuple.1 = (f32[8,64]{0,1:T(8,128)}, s32[]{:T(128)S(6)}) tuple(%copy.1, %i)
+}
+
+ENTRY %main.1 (p: f32[100,64], i: s32[]) -> f32[8,64] {
+  %p = f32[100,64]{1,0:T(8,128)} parameter(0)
+  %i.1 = s32[]{:T(128)S(6)} parameter(1)
+  %fusion.1 = f32[1,64]{1,0:T(8,128)S(1)} fusion(%p, %i.1), kind=kLoop, calls=%fused.1
+  %slice-start.1 = ((f32[100,64]{1,0:T(8,128)}), f32[8,64]{1,0:T(8,128)S(1)}, s32[]{:S(2)}) slice-start(%p), slice={[0:8], [0:64]}
+  %slice-done.1 = f32[8,64]{1,0:T(8,128)S(1)} slice-done(%slice-start.1)
+  %copy-start.1 = (f32[8,64]{1,0:T(8,128)}, f32[8,64]{1,0:T(8,128)S(1)}, u32[]{:S(2)}) copy-start(%slice-done.1)
+  %copy-done.1 = f32[8,64]{1,0:T(8,128)} copy-done(%copy-start.1)
+  %tuple.2 = (f32[8,64]{1,0:T(8,128)}, s32[]{:T(128)S(6)}) tuple(%copy-done.1, %i.1)
+  %while.1 = (f32[8,64]{1,0:T(8,128)}, s32[]{:T(128)S(6)}) while(%tuple.2), condition=%none, body=%body.1
+  ROOT %out = f32[8,64]{1,0:T(8,128)} get-tuple-element(%while.1), index=0
+}
+"""
+
+
+def test_traffic_is_with_the_device_s_memory():
+    """Slices, not what they are cut from; nothing for vector memory; rows of 64 numbers fill tiles of 128."""
+    of_slice, padded = 4 * 64, 4 * 8 * 128
+    found = Contents.of(MEMORY)
+    # The fusion reads a row; a slice is fetched, and written back; the loop copies an array to another order, of 64 rows.
+    assert found.traffic_bytes == of_slice + 4 * 8 * 64 + padded + padded + 4 * 64 * 128
+    assert found.kernels == 4
 
 
 @pytest.mark.parametrize(
@@ -117,4 +161,4 @@ def test_a_tpu_that_is_not_here():
     split = jax.sharding.NamedSharding(mesh, jax.sharding.PartitionSpec("data"))
     found = compile_for(target, Program(jnp.sum, shapes_on(split, (jnp.zeros((8, 128)),))))
     assert found.contents.collectives["all-reduce"].bytes == 4
-    assert found.traffic_bytes
+    assert found.contents.traffic_bytes
