@@ -78,11 +78,10 @@ def _training(settings: Settings, task_of: Callable[[Any], Task]) -> Make:
 
 def _with(settings: Settings, **optimiser: Any) -> Settings:
     """The settings with other ones of both optimisers."""
-    changed = {
-        name: replace(of, optimiser=replace(of.optimiser, **optimiser))
-        for name, of in (("classifier", settings.classifier), ("entropy", settings.entropy))
-    }
-    return replace(settings, **changed)
+    classifier, entropy = (
+        replace(of, optimiser=replace(of.optimiser, **optimiser)) for of in (settings.classifier, settings.entropy)
+    )
+    return replace(settings, classifier=classifier, entropy=entropy)  # type: ignore[arg-type]
 
 
 def _network(settings: Settings, which: int, **optimiser: Any) -> Make:

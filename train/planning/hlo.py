@@ -87,7 +87,7 @@ class Contents:
             if name == "while":
                 loops.append(instruction.line)
         targets = Counter(re.findall(r'custom_call_target="([^"]+)"', text))
-        started = [
+        started: list[int] = [
             _traffic_of(one, computations[name], computations)
             for name in _scheduled(text, computations)
             for one in computations[name].values()
@@ -112,10 +112,11 @@ def bytes_of_shape(shape: str, *, in_memory: bool = False) -> int:
         shape: the type.
         in_memory: count what lies in the device's memory alone, with what a TPU adds to fill its tiles.
     """
-    return sum(_bytes_of_array(*array, in_memory) for array in _SHAPE.findall(shape))
+    return sum(_bytes_of_array(array, in_memory) for array in _SHAPE.findall(shape))
 
 
-def _bytes_of_array(kind: str, extents: str, order: str, placed: str, in_memory: bool) -> int:
+def _bytes_of_array(array: tuple[str, str, str, str], in_memory: bool) -> int:
+    kind, extents, order, placed = array
     size = [int(extent) for extent in extents.split(",") if extent]
     if in_memory and "S(" in placed:
         return 0

@@ -83,7 +83,9 @@ def test_programs_are_chosen_by_how_their_names_begin():
         "ball-query",
         *("decide", "decide-expected-views", "decide-fused", "decide-exported"),
     ]
-    with pytest.raises(DataError, match="--only stroll: there is no such program; they are farthest-points, ball-query"):
+    with pytest.raises(
+        DataError, match="--only stroll: there is no such program; they are farthest-points, ball-query"
+    ):
         chosen_programs(["ball", "stroll"])
 
 
