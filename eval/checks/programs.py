@@ -61,15 +61,15 @@ def _on_one(function: Callable[..., Any], arguments: Callable[[], Any]) -> Make:
     return make
 
 
-def _training(settings: Settings, task_of: Callable[[Any], Task]) -> Make:
-    """A training step, its batch as in the settings, or the next larger one that the devices can share."""
+def _training(settings: Settings, task_of: Callable[[Any], Task], each: int = 1) -> Make:
+    """A training step, its batch as in the settings, or the next larger one of `each` view a device that devices can share."""
 
     def make(mesh: Mesh) -> Program:
         statistics = planned_statistics(settings.dataset, 10**6)
         task = task_of(statistics)
         config = task.optimiser
         unit = math.lcm(mesh.shape[DATA] * config.parts, config.parts * task.group, config.views_per_object)
-        batch = unit * -(-config.batch_size // unit)
+        batch = unit * -(-max(config.batch_size, each * mesh.shape[DATA]) // unit)
         task = replace(task, optimiser=replace(config, batch_size=batch))  # type: ignore[type-var]
         return training_program(task, statistics, mesh)
 
@@ -84,10 +84,10 @@ def _with(settings: Settings, **optimiser: Any) -> Settings:
     return replace(settings, classifier=classifier, entropy=entropy)  # type: ignore[arg-type]
 
 
-def _network(settings: Settings, which: int, **optimiser: Any) -> Make:
+def _network(settings: Settings, which: int, each: int = 1, **optimiser: Any) -> Make:
     """The training step of the classifier (0) or of PointNet++ (1)."""
     settings = _with(settings, **optimiser)
-    return _training(settings, lambda statistics: tasks(settings, statistics)[which])
+    return _training(settings, lambda statistics: tasks(settings, statistics)[which], each)
 
 
 def _seeds(settings: Settings, which: int, seeds: int) -> Make:
@@ -256,7 +256,7 @@ PROGRAMS: dict[str, Make] = {
     "train-entropy-small-seeds": _seeds(SMALL, 1, 4),
     "train-recogniser-small": _training(SMALL, _recogniser),
     "train-classifier": _network(THESIS, 0),
-    "train-classifier-bfloat16": _network(THESIS, 0, compute="bfloat16", batch_size=1024),
+    "train-classifier-bfloat16": _network(THESIS, 0, 16, compute="bfloat16"),
     "train-entropy": _network(THESIS, 1),
     "train-entropy-bfloat16": _network(THESIS, 1, compute="bfloat16"),
 }
