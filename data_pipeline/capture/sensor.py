@@ -38,7 +38,7 @@ class SensorConfig:
     """magnitude of all errors: 0 for none, 1 as published, more for a worse sensor"""
     distance: float = 1.0
     """metres from the camera to the object's centre: errors grow with it"""
-    radius: float | None = None
+    radius: float | Array | None = None
     """metres of the object's radius; None: so many that the sensor is as many radii away as the camera of the images. Of a small
     object far away, errors are larger in radii"""
 
@@ -124,7 +124,7 @@ def sense(
     strength = jnp.asarray(config.strength if strength is None else strength, jnp.float32)
     keys = dict(zip(("across", "along", "mix", "mixed", "lost", "dark"), jax.random.split(key, 6), strict=True))
     near = config.distance / camera.distance  # the radius of an object that looks as large from there
-    scale = config.radius or near  # metres in a radius
+    scale = near if config.radius is None else config.radius  # metres in a radius
     shift = config.distance - camera.distance * scale
     metres, angle = jnp.where(depth > 0, depth * scale + shift, 0.0), _angle(depth, camera)
     sensor = REALSENSE

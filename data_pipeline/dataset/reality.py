@@ -84,7 +84,7 @@ def realistic_views(
     camera: ViewCamera,
     config: RealityAugmentation,
     views: int = 1,
-    radius: float | None = None,
+    radius: float | Array | None = None,
 ) -> tuple[Float[Array, "batch side side"], Float[Array, "batch 4 4"]]:
     """Returns a batch of stored views with the errors that `config` describes.
 
@@ -122,7 +122,7 @@ def as_in_reality(
     camera: ViewCamera,
     config: RealityAugmentation,
     kind: Kind,
-    radius: float | None = None,
+    radius: float | Array | None = None,
 ) -> tuple[Float[Array, "side side"], Float[Array, "4 4"]]:
     """Returns a depth image with the errors that `config` describes, and the pose around the believed centre.
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
+from pathlib import Path
 from typing import NamedTuple
 
 import jax
@@ -16,13 +17,14 @@ from data_pipeline.capture.casting import capture
 from data_pipeline.dataset.inputs import metric_depth
 from data_pipeline.dataset.reality import RealityAugmentation, realistic_views
 from data_pipeline.errors import DataError, EmptyMesh, reason_of
+from data_pipeline.files import short_hash
 from data_pipeline.objects.mesh import Mesh
 from data_pipeline.objects.sources import load_object, objects_to_test
 from data_pipeline.progress import progress_bar
 from eval.checks.agent import STOPS
 from eval.checks.promise import PromiseRow, Strangers, promises, strangers
 from eval.checks.walks import BASELINE, AccuracyRow, Observer, Walker, Walks, rows_of
-from mevs_jax.enrolment import enrol
+from mevs_jax.enrolment import alike, enrol
 from mevs_jax.gallery.matching import YAWS
 from mevs_jax.geometry.cameras import ViewCamera
 from mevs_jax.geometry.source_view import DepthImage
@@ -30,6 +32,8 @@ from mevs_jax.meshes import Up
 from mevs_jax.selection.loop import ViewTable
 from mevs_jax.trained import TrainedSystem
 from mevs_jax.trained.usable import BELIEF_ORACLE
+from train.results.identity import identity_of
+from train.results.kept import kept_record
 from train.tasks.matcher import turned_rig
 
 VIEWS = (1, 2, 3, 4)
@@ -102,6 +106,8 @@ class Measured:
         policies: accuracy among them, and gain over random views.
         poses: of random views.
         promises, unknown_objects: where a third of the objects is not enrolled.
+        twins: pairs of objects that look alike to a depth camera (`mevs_jax.enrolment.alike`).
+        unknown_without_twins: as `unknown_objects`, without unknown objects whose twin is enrolled.
     """
 
     condition: str
@@ -110,6 +116,8 @@ class Measured:
     poses: list[PoseRow]
     promises: list[PromiseRow]
     unknown_objects: Strangers | None
+    twins: list[list[str]]
+    unknown_without_twins: Strangers | None
 
 
 @dataclass(frozen=True)
@@ -134,6 +142,7 @@ class Seen(NamedTuple):
 def study_instances(
     system: TrainedSystem,
     data: str,
+    to: Path,
     *,
     up: Up = "auto",
     metres: float = 1.0,
@@ -147,6 +156,7 @@ def study_instances(
     Args:
         system: that objects are enrolled with, as `objects`.
         data: meshes, as of `mevs check transfer`; their classes do not matter.
+        to: folder where the result of each condition is kept, so that a study that was interrupted goes on from there.
         up: upward axis of the meshes.
         metres: in one unit of the files.
         sizes: numbers of objects to enrol, drawn at random; all that there are, besides.
@@ -180,9 +190,25 @@ def study_instances(
         for condition in conditions:
             for some in [*chosen, np.arange(len(meshes))]:
                 named = {list(meshes)[place]: list(meshes.values())[place] for place in some}
-                measured.append(_measure(system, named, condition, yaws, seed))
+                measured.append(_kept(to, system, named, condition, yaws, seed))
                 bar.advance(line)
     return Instances(system.name, data, list(meshes), left_out, measured)
+
+
+def _kept(
+    to: Path, system: TrainedSystem, meshes: dict[str, Mesh], condition: Condition, yaws: int, seed: int
+) -> Measured:
+    arrays = [*jax.tree.leaves(system.parts)]
+    for mesh in meshes.values():
+        arrays += [mesh.vertices, mesh.faces, np.float64(mesh.radius)]
+    made_by = short_hash(b"".join(np.asarray(array).tobytes() for array in arrays))
+    identity = identity_of(
+        "instances", condition=condition, objects=[*meshes], yaws=yaws, seed=seed, policies=POLICIES, made_by=made_by
+    )
+    name = f"{condition.name.replace(',', '').replace(' ', '_')}-{len(meshes)}.json"
+    return kept_record(
+        to / "conditions" / name, Measured, identity, lambda: _measure(system, meshes, condition, yaws, seed)
+    )
 
 
 def _measure(system: TrainedSystem, meshes: dict[str, Mesh], condition: Condition, yaws: int, seed: int) -> Measured:
@@ -203,15 +229,20 @@ def _measure(system: TrainedSystem, meshes: dict[str, Mesh], condition: Conditio
     place = np.where(known, np.cumsum(known) - 1, -1)[labels]
     some = enrol({names[index]: shapes[names[index]] for index in enrolled}, system, true_size=condition.sized)
     fewer = _by_object(
-        _walks(some, _tables(some, seen, place, condition), (BASELINE, "information_gain"), 8), len(names)
+        _walks(some, _tables(some, seen, place, condition), (BASELINE, "information_gain"), max(VIEWS)), len(names)
     )
+    twins = [list(pair) for pair in alike(everything)]
+    with_twin = {one for pair in twins for one, other in (pair, pair[::-1]) if other in some.classes}
+    alone = known | ~np.isin(names, [*with_twin])
     return Measured(
         condition=condition.name,
         enrolled=len(names),
         policies=rows_of(walks, VIEWS),
         poses=_poses(everything, tables, labels, np.array([one.yaw for one in seen])),
-        promises=promises(fewer["information_gain"], known, STOPS, (1, 2, 4, 8)),
+        promises=promises(fewer["information_gain"], known, STOPS, (1, 2, 4)),
         unknown_objects=strangers(fewer[BASELINE], known),
+        twins=twins,
+        unknown_without_twins=strangers(fewer[BASELINE].some(alone), known[alone]),
     )
 
 
@@ -220,24 +251,19 @@ def seen_with_errors(system: TrainedSystem, condition: Condition, mesh: Mesh, ya
     depth = jnp.asarray(capture(mesh, turned_rig(camera, system.viewpoints, yaw)).depth)
     if not condition.errors:
         return Seen(np.asarray(metric_depth(depth)), mesh.radius, yaw)
-    real = _realistic(key, depth, jnp.asarray(system.poses), camera, condition.reality, _about(mesh.radius))
+    real = _realistic(key, depth, jnp.asarray(system.poses), camera, condition.reality, mesh.radius)
     off = float(jax.random.uniform(jax.random.fold_in(key, 1), minval=-0.05, maxval=0.05))
     return Seen(np.asarray(real), mesh.radius * (1 + off), yaw)
 
 
-def _about(radius: float) -> float | None:
-    """A radius within 20 % of one in metres, so that programs are shared; None if it is unknown."""
-    return float(1.4 ** np.round(np.log(radius) / np.log(1.4))) if radius > 0 else None
-
-
-@partial(jax.jit, static_argnames=("camera", "reality", "radius"))
+@partial(jax.jit, static_argnames=("camera", "reality"))
 def _realistic(
     key: jax.Array,
     depth: jax.Array,
     poses: jax.Array,
     camera: ViewCamera,
     reality: RealityAugmentation,
-    radius: float | None,
+    radius: float | jax.Array,
 ) -> jax.Array:
     return realistic_views(key, {"depth": depth, "pose": poses}, camera, reality, len(depth), radius)[0]
 
@@ -255,8 +281,7 @@ def _shape(
     depth = capture(mesh, rig).depth
     reality = replace(condition.reality, sphere=0.0, unseen=0.0)
     key = jax.random.key(int(random.integers(2**31)))
-    about = _about(mesh.radius)
-    real = np.asarray(_realistic(key, jnp.asarray(depth), jnp.asarray(rig.poses), camera, reality, about))
+    real = np.asarray(_realistic(key, jnp.asarray(depth), jnp.asarray(rig.poses), camera, reality, mesh.radius))
     poses = rig.poses.astype(float)
     poses[:, :3, 3] *= mesh.radius
     return [

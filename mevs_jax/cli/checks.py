@@ -106,7 +106,7 @@ def instances(options: InstancesOptions) -> None:
     import warnings
 
     from data_pipeline.files import write_json
-    from eval.checks.instances import study_instances
+    from eval.checks.instances import CONDITIONS, study_instances
     from mevs_jax.cli.tools import load_system
     from mevs_jax.enrolment import AlikeWarning
     from mevs_jax.geometry.cameras import ViewCamera
@@ -115,6 +115,11 @@ def instances(options: InstancesOptions) -> None:
 
     if options.shapes < 40:
         raise Unusable(f"--shapes must be at least 40, got {options.shapes}")
+    names = options.conditions or tuple(one.name for one in CONDITIONS)
+    if unknown := set(names) - {one.name for one in CONDITIONS}:
+        known = ", ".join(f'"{one.name}"' for one in CONDITIONS)
+        raise Unusable(f"--conditions knows {known}, not {min(unknown)!r}")
+    conditions = [one for one in CONDITIONS if one.name in names]
     system = options.system
     if options.fit:
         config = MatcherConfig(shapes=options.shapes, calibration_shapes=options.shapes // 4)
@@ -125,16 +130,16 @@ def instances(options: InstancesOptions) -> None:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", AlikeWarning)
         settings = {name: getattr(options, name) for name in ("up", "metres", "sizes")}
-        found = study_instances(load_system(system), options.data, **settings)
+        found = study_instances(load_system(system), options.data, options.to, conditions=conditions, **settings)
     write_json(options.to / "instances.json", as_json(found))
     print(instances_text(found))
 
 
-def instances_text(found: Instances) -> str:
+def instances_text(study: Instances) -> str:
     """The figures of `study_instances`, for a terminal."""
-    lines = [f"left out: {name}: {reason}" for name, reason in found.left_out.items()]
+    lines = [f"left out: {name}: {reason}" for name, reason in study.left_out.items()]
     lines.append(f"{'enrolled from':<22}{'objects':>8}{'policy':>18}{'1':>8}{'2':>8}{'3':>8}{'4 views':>9}  gain at 2")
-    for one in found.measured:
+    for one in study.measured:
         for policy in dict.fromkeys(row.policy for row in one.policies):
             rows = [row for row in one.policies if row.policy == policy]
             right = "".join(f"{100 * row.accuracy:>8.1f}" for row in rows)
@@ -152,8 +157,12 @@ def instances_text(found: Instances) -> str:
             f"  a third not enrolled, stop 0.95, up to 4 views: sure {100 * (sure.sure or 0):.0f} %, of these wrong {wrong} %; "
             f"unknown {100 * (sure.refused or 0):.0f} %; of the others sure {100 * (sure.strangers_sure or 0):.1f} %"
         )
-        for row in one.unknown_objects.after if one.unknown_objects else []:
-            lines.append(f"  AUROC of unknown objects after {row.views}: {row.auroc:.3f}")
+        for what, found in (("", one.unknown_objects), (" without twins", one.unknown_without_twins)):
+            lines += [
+                f"  AUROC of unknown objects{what} after {row.views}: {row.auroc:.3f}"
+                for row in (found.after if found else ())
+            ]
+        lines += [f"  twins: {' and '.join(pair)}" for pair in one.twins]
     return "\n".join(lines)
 
 

@@ -307,6 +307,8 @@ class InstancesOptions:
     """metres in one unit of the files: the errors of cameras depend on the size of objects"""
     sizes: Annotated[tuple[int, ...], _arg("N ...", "all")] = ()
     """numbers of objects to enrol, besides all"""
+    conditions: Annotated[tuple[str, ...], _arg("NAME ...", "all")] = ()
+    """what to measure, such as mesh, "mesh, true size", or "3 images"; each is kept in TO/conditions"""
     fit: Flag = False
     """first learn the system that objects are enrolled with, from procedural shapes, and write it into TO/objects"""
     shapes: Annotated[int, _arg("N", "1000")] = 1000

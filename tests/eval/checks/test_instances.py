@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import warnings
+from functools import partial
 
 import numpy as np
 import pytest
 
 from data_pipeline.errors import DataError
+from eval.checks import instances
 from eval.checks.instances import Condition, study_instances
 from mevs_jax.cli.checks import instances_text
 from mevs_jax.enrolment import AlikeWarning
@@ -25,23 +27,25 @@ def test_objects_in_another_unit_are_refused(tmp_path):
         piece = furniture(name, 40)
         write_off(tmp_path / name / f"{name}.off", 100 * piece.vertices, piece.faces)
     with pytest.raises(DataError, match=r"metres large, .* such as --metres 0\.01 for centimetres"):
-        study_instances(load("objects"), str(tmp_path))
+        study_instances(load("objects"), str(tmp_path), tmp_path)
 
 
 @pytest.mark.slow
-def test_objects_are_measured_from_meshes_and_from_images(matcher, tmp_path):  # noqa: F811
+def test_objects_are_measured_from_meshes_and_from_images(matcher, tmp_path, monkeypatch):  # noqa: F811
     from data_pipeline.objects.furniture import furniture
 
     for number, name in enumerate(("chair", "bathtub", "table", "toilet")):
-        (tmp_path / name).mkdir()
-        furniture(name, 40 + number).export(tmp_path / name / f"{name}.ply")
-    (tmp_path / "chair" / "broken.ply").write_text("ply")
+        (tmp_path / "meshes" / name).mkdir(parents=True)
+        furniture(name, 40 + number).export(tmp_path / "meshes" / name / f"{name}.ply")
+    (tmp_path / "meshes" / "chair" / "broken.ply").write_text("ply")
     conditions = [Condition("mesh, perfect views", errors=False), Condition("3 images", frames=3, sized=True)]
+    system, meshes = objects_system(matcher, CAMERA, views=12), str(tmp_path / "meshes")
+    study = partial(study_instances, system, meshes, tmp_path, sizes=(3, 4), yaws=1)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", AlikeWarning)
-        found = study_instances(
-            objects_system(matcher, CAMERA, views=12), str(tmp_path), sizes=(3, 4), conditions=conditions, yaws=1
-        )
+        found = study(conditions=conditions)
+    monkeypatch.setattr(instances, "_measure", None)  # everything is kept
+    assert study(conditions=conditions) == found
     assert len(found.objects) == 4
     assert [*found.left_out] == ["broken"] or len(found.left_out) == 1
     assert [(one.condition, one.enrolled) for one in found.measured] == [
