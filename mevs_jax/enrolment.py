@@ -28,6 +28,9 @@ OBJECTS = "objects"
 Shape = tuple[AnyArray, AnyArray] | Frames | Sequence[DepthImage]
 """A mesh, as vertices (n, 3) and faces (m, 3); or depth images of the object."""
 
+_EQUAL = 1e-3
+"""Equal objects are those whose images differ by less than this, as `alike` has it."""
+
 
 class AlikeWarning(UserWarning):
     """Two enrolled objects look alike to a depth camera."""
@@ -79,10 +82,12 @@ def enrol(
         np.concatenate([np.asarray(gallery.radii), radii]),
     )
     system_now = _with(known, together, (*known.classes[:-1], *objects))
+    equal = alike(system_now, _EQUAL)
     for one, other in alike(system_now):
         if {one, other} & set(objects):
+            how = "are equal" if (one, other) in equal else "look alike"
             warnings.warn(
-                f"{one} and {other} look alike to a depth camera: an answer between them is hardly ever sure. Enrol one "
+                f"{one} and {other} {how} to a depth camera: an answer between them is hardly ever sure. Enrol one "
                 "of them, or distinguish them by other means",
                 AlikeWarning,
                 stacklevel=2,
@@ -140,7 +145,8 @@ def _images(shape: Any, camera: ViewCamera, up: AnyVector) -> tuple[UInt8[np.nda
     if parts and all(isinstance(part, DepthImage) for part in parts):
         if any(image.mask is None and image.floor is None for image in parts):
             raise ValueError("an image needs a mask or a floor, to tell the object from the rest")
-        sphere = Sphere(*estimate_sphere(np.concatenate([_above(image, up) for image in parts]), up=up), up)
+        points = [_above(image, number, up) for number, image in enumerate(parts, 1)]
+        sphere = Sphere(*estimate_sphere(np.concatenate(points), up=up), up)
         return images_of_frames(parts, sphere, camera), sphere.radius
     if len(parts) != 2 or any(isinstance(part, DepthImage) for part in parts):
         raise ValueError(
@@ -152,11 +158,11 @@ def _images(shape: Any, camera: ViewCamera, up: AnyVector) -> tuple[UInt8[np.nda
     return images_of_mesh(vertices, faces, camera)
 
 
-def _above(frame: DepthImage, up: AnyVector) -> Float[np.ndarray, "points 3"]:
+def _above(frame: DepthImage, number: int, up: AnyVector) -> Float[np.ndarray, "points 3"]:
     """The points of the object in an image."""
     points = frame.points()
     if not len(points):
-        raise ValueError("an image has no measured depth within its mask")
+        raise ValueError(f"frame {number} has no measured depth within its mask; leave it out, or mend its mask")
     if frame.floor is None:
         return points
     return points[points @ upright(up)[2] >= frame.floor]

@@ -24,7 +24,7 @@ from data_pipeline.progress import progress_bar
 from eval.checks.agent import STOPS
 from eval.checks.promise import PromiseRow, Strangers, promises, strangers
 from eval.checks.walks import BASELINE, AccuracyRow, Observer, Walker, Walks, rows_of
-from mevs_jax.enrolment import alike, enrol
+from mevs_jax.enrolment import alike, enrol, remove
 from mevs_jax.gallery.matching import YAWS
 from mevs_jax.geometry.cameras import ViewCamera
 from mevs_jax.geometry.source_view import DepthImage
@@ -227,7 +227,7 @@ def _measure(system: TrainedSystem, meshes: dict[str, Mesh], condition: Conditio
     enrolled = np.sort(random.permutation(len(names))[: -(-2 * len(names) // 3)])
     known = np.isin(np.arange(len(names)), enrolled)
     place = np.where(known, np.cumsum(known) - 1, -1)[labels]
-    some = enrol({names[index]: shapes[names[index]] for index in enrolled}, system, true_size=condition.sized)
+    some = remove(everything, [name for name, is_known in zip(names, known, strict=True) if not is_known])
     fewer = _by_object(
         _walks(some, _tables(some, seen, place, condition), (BASELINE, "information_gain"), max(VIEWS)), len(names)
     )

@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any
 
 HERE = Path(__file__).parent
-NOTEBOOKS = ("look_at_one_object", "write_a_policy", "thesis_main_table")
+NOTEBOOKS = ("look_at_one_object", "write_a_policy", "enrol_five_objects", "thesis_main_table")
 DOTS_PER_INCH = 96
 
 

@@ -1,8 +1,9 @@
-"""`python -m examples.robot_arm [--object chair] [--film walk.gif] [--study] [--system PATH] [--table FOLDER]`.
+"""`python -m examples.robot_arm [--object chair] [--film walk.gif] [--study] [--find NAME --among NAME=FILE ...] [--table FOLDER]`.
 
 Without options an arm recognises one piece of furniture that no network was trained on. `--study` compares ways to choose views
-on fifty of them, from three first views each, under the same reachability. `--table` enrols the meshes of a folder and recognises
-some of them that stand on the table together; with `--study`, it compares ways to choose on many tables.
+on fifty of them, from three first views each, under the same reachability. `--find` looks for one of your objects: they are
+enrolled from their meshes, and stand on the table one after another. `--table` enrols the meshes of a folder and recognises some
+of them that stand on the table together; with `--study`, it compares ways to choose on many tables.
 """
 
 from __future__ import annotations
@@ -34,6 +35,8 @@ def main() -> None:
     add("--views", type=int, default=4, help="most views of an object (4)")
     add("--stop", type=float, default=0.95, help="calibrated probability at which to stop (0.95)")
     add("--film", type=Path, help="write a film of it, as .gif")
+    add("--among", nargs="+", default=(), metavar="NAME=FILE", help="meshes of objects to enrol, for --find")
+    add("--find", metavar="NAME", help="the object of --among that is looked for")
     add("--study", action="store_true", help="compare ways to choose, on many objects")
     add("--each", type=int, default=5, help="objects of each class in the study (5)")
     add("--to", type=Path, help="write the study's figures into this .json")
@@ -44,6 +47,8 @@ def main() -> None:
     options = parser.parse_args()
     if min(options.each, options.objects, options.tables) < 1 or options.seed < 0:
         parser.error("--each, --objects and --tables must be at least 1, and --seed at least 0")
+    if (options.find is None) != (not options.among):
+        parser.error("--find NAME needs --among NAME=FILE ..., and --among needs --find")
     options.system = options.system or ("objects" if options.table else "furniture10")
     for path, suffix in ((options.film, ".gif"), (options.to, ".json")):
         if path is not None and (path.suffix.lower() != suffix or not path.parent.is_dir()):
@@ -51,7 +56,10 @@ def main() -> None:
     try:
         import mujoco
 
-        act = _table(options) if options.table else _furniture(options, parser)
+        if options.find is not None:
+            act = _find(options)
+        else:
+            act = _table(options) if options.table else _furniture(options, parser)
         mujoco.GLContext(64, 64).free()
     except ImportError as error:
         parser.error(f"this example needs MuJoCo ({error}): pip install mujoco")
@@ -94,6 +102,17 @@ def _table(options: argparse.Namespace) -> Callable[[], None]:
     shapes = {name: (mesh.vertices * mesh.radius, mesh.faces) for name, mesh in meshes.items()}
     system = mevs_jax.enrol(shapes, options.system)
     return partial(together.study_tables if options.study else together.show_table, meshes, system, options)
+
+
+def _find(options: argparse.Namespace) -> Callable[[], None]:
+    from examples.robot_arm import running
+    from examples.robot_arm.looking import NEAR, agent_of
+
+    objects = running.meshes_of(options.among)
+    system = mevs_jax.enrol({name: (mesh.vertices, mesh.faces) for name, mesh in objects.items()}, true_size=False)
+    agent = agent_of(system, "information_gain" + NEAR, options.views, options.stop, options.find)
+    agent.warm_up()
+    return partial(running.find, agent, objects, options)
 
 
 if __name__ == "__main__":

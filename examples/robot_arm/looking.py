@@ -67,15 +67,17 @@ def nearest(key: Any, state: Any, scene: Any) -> Any:
     return jnp.zeros(len(scene.graph.points))
 
 
-def agent_of(system: TrainedSystem, policy: str, views: int, stop: float) -> Agent:
+def agent_of(system: TrainedSystem, policy: str, views: int, stop: float, target: str | None = None) -> Agent:
     """Returns an agent by the name of a row of the study: `nearest`, or a policy of the system, with `NEAR` if motion costs.
+
+    With a `target`, nothing but whether the object is this one matters.
 
     Raises:
         ValueError: for a policy that the system does not have, or an option out of its range.
     """
     chosen: Any = nearest if policy == "nearest" else policy.removesuffix(NEAR)
     price = 1.0 if policy == "nearest" else NATS_PER_RADIAN * policy.endswith(NEAR)
-    return Agent(system, chosen, gain_per_cost=price, stop=stop, max_views=views, distance=DISTANCE)
+    return Agent(system, chosen, gain_per_cost=price, stop=stop, max_views=views, distance=DISTANCE, target=target)
 
 
 def recognise(
@@ -96,7 +98,8 @@ def recognise(
     """
     arm = Arm(scene)
     arm.place(HOME)
-    agent.reset(center=scene.center, radius=RADIUS, yaw=0.0, true_size=False)
+    yaw = 0.0 if agent.target is None else None  # of enrolled objects, it is found
+    agent.reset(center=scene.center, radius=RADIUS, yaw=yaw, true_size=False)
     seen: list[Looked] = []
     while True:
         begun = time.perf_counter()

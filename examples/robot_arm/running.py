@@ -7,14 +7,15 @@ import json
 import sys
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import replace
 from itertools import product
 
 import numpy as np
 
 from data_pipeline.capture.sensor import Kind
 from data_pipeline.objects.furniture import CLASSES
-from data_pipeline.objects.mesh import normalise
-from data_pipeline.objects.recipes import FurniturePiece
+from data_pipeline.objects.mesh import Mesh, normalise
+from data_pipeline.objects.recipes import FurniturePiece, read_mesh
 from eval.numbers.comparison import intervals
 from examples.robot_arm.arm import Arm, Reach
 from examples.robot_arm.camera import DepthCamera
@@ -22,6 +23,7 @@ from examples.robot_arm.film import Shot, write_film
 from examples.robot_arm.looking import Recognition, recognise
 from examples.robot_arm.scene import RADIUS, Scene, make_scene
 from mevs_jax.agent import Agent
+from mevs_jax.geometry.sphere import turned
 from mevs_jax.markdown import markdown_table
 
 POLICIES = ("random", "nearest", "best", "information_gain", "information_gain, near")
@@ -32,12 +34,26 @@ HELD_OUT = 1_000_000
 """Seeds from here on are those of test objects; networks are trained on others."""
 
 
+def unknown_piece(kind: str, seed: int) -> Mesh:
+    """A piece of furniture that no network was trained on."""
+    return normalise(*FurniturePiece(kind, HELD_OUT + seed).load(), kind)
+
+
+def meshes_of(objects: Sequence[str]) -> dict[str, Mesh]:
+    """Meshes by name from NAME=FILE; raises `ValueError` for anything else."""
+    found = {}
+    for one in objects:
+        name, equals, path = one.partition("=")
+        if not (name and equals and path):
+            raise ValueError(f"{one!r} is not NAME=FILE, as in --among mug=mug.obj")
+        found[name] = normalise(*read_mesh(path), name)
+    return found
+
+
 @contextmanager
-def on_the_table(
-    kind: str, seed: int, agent: Agent, sensor: Kind
-) -> Iterator[tuple[Scene, DepthCamera, Reach, np.ndarray]]:
-    """A piece of furniture that no network was trained on: scene, camera, what the arm reaches, views it can begin with."""
-    scene = make_scene(normalise(*FurniturePiece(kind, HELD_OUT + seed).load(), kind))
+def on_the_table(mesh: Mesh, agent: Agent, sensor: Kind) -> Iterator[tuple[Scene, DepthCamera, Reach, np.ndarray]]:
+    """An object on the table: scene, camera, what the arm reaches, views it can begin with."""
+    scene = make_scene(mesh)
     camera, arm = DepthCamera(scene, sensor), Arm(scene)
     agent.reset(center=scene.center, radius=RADIUS, yaw=0.0, true_size=False)
     reach = arm.reach(agent.poses)
@@ -47,7 +63,8 @@ def on_the_table(
 
 def show(agent: Agent, options: argparse.Namespace) -> None:
     """Recognises one object, and films it."""
-    with on_the_table(options.object, options.seed, agent, options.sensor) as (scene, camera, reach, firsts):
+    piece = unknown_piece(options.object, options.seed)
+    with on_the_table(piece, agent, options.sensor) as (scene, camera, reach, firsts):
         print(f"{len(firsts)} of {len(reach.angles)} viewpoints can be reached")
         if not len(firsts):
             return
@@ -73,13 +90,34 @@ def shot_of(number: int, walk: Recognition, classes: Sequence[str]) -> Shot:
     return Shot(end if number == count - 1 else f"view {number + 1}", look.passed, look.depth, bars)
 
 
+def find(agent: Agent, objects: dict[str, Mesh], options: argparse.Namespace) -> None:
+    """Looks for the agent's target among objects that stand on the table one after another, at random yaws."""
+    random = np.random.default_rng(options.seed)
+    for number, name in enumerate(random.permutation([*objects]), 1):
+        turned_mesh = replace(
+            objects[name], vertices=objects[name].vertices @ turned(random.uniform(0, 2 * np.pi)).T.astype(np.float32)
+        )
+        with on_the_table(turned_mesh, agent, options.sensor) as (scene, camera, reach, firsts):
+            if not len(firsts):
+                print(f"object {number} ({name}): no viewpoint can be reached")
+                continue
+            camera.begin(options.seed + number)
+            walk = recognise(agent, scene, camera, reach, int(firsts[0]))
+        wanted = agent.system.classes.index(agent.target or "")
+        said = f"{100 * walk.looks[-1].belief.probabilities[wanted]:.1f} %" if walk.looks else "not seen"
+        print(f"object {number} ({name}): {agent.target} {said} after {len(walk.looks)} views ({walk.reason})")
+        if walk.name == agent.target and walk.reason == "sure":
+            return
+    print(f"{agent.target} was not found")
+
+
 def study(agents: dict[str, Agent], options: argparse.Namespace) -> None:
     """Compares policies by objects recognised, views, and joint motion."""
     rows: dict[str, list[list[float]]] = {name: [] for name in agents}
     reached = []
     for label, seed in product(range(len(CLASSES)), range(options.each)):
         kind = CLASSES[label]
-        with on_the_table(kind, seed, agents["best"], options.sensor) as (scene, camera, reach, firsts):
+        with on_the_table(unknown_piece(kind, seed), agents["best"], options.sensor) as (scene, camera, reach, firsts):
             reached.append(len(firsts))
             if not len(firsts):
                 sys.exit(f"no viewpoint of {kind} {seed} can be reached")

@@ -179,6 +179,8 @@ class Frames(ByContent):
             raise ValueError("center and radius of the object belong together; give both, or neither and a mask")
         elif mask is not None:
             shown = [DepthImage(*one).points() for one in zip(depth, K, poses, mask, strict=True)]
+            if not any(map(len, shown)):
+                raise ValueError("no image has measured depth within its mask; the mask must be of the object's pixels")
             center, radius = estimate_sphere(np.concatenate(shown), up=up)
         else:
             raise ValueError(

@@ -9,8 +9,7 @@ How strong the errors are differs from object to object and is not known, so the
 squared difference of its views (a Student t distribution). The power does not grow in proportion to the number of views, since
 errors of one object are not independent across views: what a gallery does not know of an object is missing from each of them.
 
-Some views cannot be predicted as exactly as others: small errors of the sphere and of the yaw change the image more. So a squared
-difference is divided by the one that such errors make, besides those of the sensor.
+What a wrong sphere and yaw explain of the differences, in all views alike, does not count; see `mevs_jax.gallery.errors`.
 """
 
 from __future__ import annotations
@@ -24,6 +23,8 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int, UInt8
 
 from mevs_jax.arrays import AnyArray
+from mevs_jax.gallery.errors import ERRORS, HELD, KEPT, gram_of, matrix_of, parted, slopes, unexplained
+from mevs_jax.geometry.cameras import look_at_origin
 
 SIDE = 16
 """Pixels of the images of a gallery, along each side."""
@@ -44,9 +45,6 @@ WEIGHTS = np.repeat(np.array([1.0, 0.5], np.float32), SIDE**2)
 """Weights of the depth of a pixel, which is from 0 to 1, and of the share of it that shows the object."""
 ALIKE = 0.25
 """Objects look alike if the squared white difference of their images is less than this on average."""
-_OFF, _TURNED = 0.02, 0.05
-"""Standard deviations of errors that remain: of the sphere's centre along each axis and of its radius, in radii; of the yaw, in
-radians, as hypotheses are 10° apart."""
 _IMPOSSIBLE = 1e6
 """Squared difference of hypotheses that are ruled out."""
 _LEAST = 0.01
@@ -54,8 +52,8 @@ _LEAST = 0.01
 
 
 def comparisons(objects: int) -> int:
-    """How many numbers are kept of a view: for each object, one for each yaw and one for its size; and what the view shows."""
-    return objects * (YAWS + 1) + 1
+    """How many numbers are kept of a view: for each object, `KEPT` for each yaw and one for its size; and what the view shows."""
+    return objects * (YAWS * KEPT + 1) + 1
 
 
 def grid_directions() -> Float[np.ndarray, "cells 3"]:
@@ -64,6 +62,12 @@ def grid_directions() -> Float[np.ndarray, "cells 3"]:
     azimuth = 2 * np.pi * np.arange(YAWS) / YAWS
     flat, up = np.cos(elevation), np.broadcast_to(np.sin(elevation), (HEIGHTS, YAWS))
     return np.stack([flat * np.cos(azimuth), flat * np.sin(azimuth), up], axis=-1).reshape(-1, 3)
+
+
+def grid_rotations() -> Float[Array, "heights yaws 3 3"]:
+    """Rotations of the cameras of a gallery, to the object."""
+    cameras = jax.vmap(look_at_origin)(jnp.asarray(grid_directions(), jnp.float32))
+    return cameras[:, :3, :3].reshape(HEIGHTS, YAWS, 3, 3)
 
 
 def small_image(
@@ -142,12 +146,16 @@ class Evidence:
     """What the views of a walk say of each hypothesis.
 
     Attributes:
-        apart: (objects, yaws) mean squared white difference.
+        apart: (objects, yaws) mean squared white difference that no common error of the views explains.
+        square, lean, gram: (objects, yaws, …) what this follows from, as means over views; see `mevs_jax.gallery.errors`.
         size: (objects,) squared deviation of the logarithm of the radius, in standard deviations; 1 where a size is not known.
         count: number of views, each by the share of its image that is known.
     """
 
     apart: Float[Array, "objects yaws"]
+    square: Float[Array, "objects yaws"]
+    lean: Float[Array, "objects yaws errors"]
+    gram: Float[Array, "objects yaws pairs"]
     size: Float[Array, " objects"]
     count: Float[Array, ""]
 
@@ -165,7 +173,7 @@ class Gallery:
         matcher: compares views.
         images: (objects, heights, yaws, pixels) from each direction of the grid, as `stored_image`.
         features: (objects, heights, yaws, features) the same, projected.
-        variations: (objects, heights, yaws) mean square by which features differ for a slightly wrong sphere and yaw.
+        slopes: (objects, heights, yaws, errors, features) how features change with a wrong sphere and yaw.
         radii: (objects,) in metres; 0 where the true size is not known.
         symmetries: (objects,) number of yaws at which each looks alike.
     """
@@ -173,7 +181,7 @@ class Gallery:
     matcher: Matcher
     images: UInt8[Array, "objects heights yaws pixels"]
     features: Float[Array, "objects heights yaws features"]
-    variations: Float[Array, "objects heights yaws"]
+    slopes: Float[Array, "objects heights yaws errors features"]
     radii: Float[Array, " objects"]
     symmetries: Int[Array, " objects"]
 
@@ -182,14 +190,14 @@ class Gallery:
         """The gallery of some images."""
         project = jnp.asarray(WEIGHTS[:, None]) * matcher.projection
         features = jnp.zeros((0, HEIGHTS, YAWS, project.shape[1]))
-        variations = features[..., 0]
+        changes = jnp.zeros((0, HEIGHTS, YAWS, ERRORS, project.shape[1]))
         if len(images):
             filled = [_filled(one) for one in images]
             features = jnp.stack([one @ project for one in filled])
-            variations = jnp.stack([_variation(*pair, project) for pair in zip(filled, features, strict=True)])
+            changes = jnp.stack([slopes(one, grid_rotations()) @ project for one in filled])
         symmetries = jnp.array([symmetry_of(one) for one in np.asarray(features)], jnp.int32)
         sizes = jnp.asarray(radii, jnp.float32)
-        return cls(matcher, jnp.asarray(images, jnp.uint8), features, variations, sizes, symmetries)
+        return cls(matcher, jnp.asarray(images, jnp.uint8), features, changes, sizes, symmetries)
 
     def compared(
         self,
@@ -198,8 +206,8 @@ class Gallery:
         distance: float,
         radius: Float[AnyArray, ""],
     ) -> Float[Array, " comparisons"]:
-        """What is kept of a view: for each object, its squared differences from the prediction at each yaw, and from its size;
-        and, last, the share of the image that is known.
+        """What is kept of a view: for each object, its differences from the prediction at each yaw (square, lean and gram), and
+        from its size; and, last, the share of the image that is known.
 
         Differences are white: a square is about 1 on average if the hypothesis is right. Pixels that are unknown in the view are
         left out, and the others count more in their place. Where only the prediction is unknown, `Matcher.unseen` counts.
@@ -224,13 +232,18 @@ class Gallery:
         both = known * (unknown == 0)
         white = (both * (predicted / STEPS - image)) @ (WEIGHTS[:, None] * self.matcher.projection)
         seen, share = jnp.mean(both, axis=-1), jnp.mean(known)
-        expected = 1 + interpolated(self.variations[..., None], direction)[..., 0]
-        apart = jnp.mean(jnp.square(white), axis=-1) / (expected * jnp.maximum(seen, _LEAST))
-        apart += (1 - seen / jnp.maximum(share, _LEAST)) * (self.matcher.unseen - apart)
+        shape = (*self.slopes.shape[:3], -1)
+        slope = interpolated(self.slopes.reshape(shape), direction).reshape(*seen.shape, *self.slopes.shape[3:])
+        scale = jnp.maximum(seen, _LEAST)
+        square = jnp.mean(jnp.square(white), axis=-1) / scale
+        lean = jnp.einsum("oyf,oyef->oye", white, slope) / white.shape[-1] / jnp.sqrt(scale)[..., None]
+        common = seen / jnp.maximum(share, _LEAST)
+        square += (1 - common) * (self.matcher.unseen - square)
+        apart = jnp.concatenate([square[..., None], common[..., None] * lean, gram_of(slope)], axis=-1)
         told = (self.radii > 0) & (jnp.asarray(radius) > 0)
         ratio = jnp.where(told, radius, 1.0) / jnp.where(told, self.radii, 1.0)
         size = jnp.where(told, jnp.square(jnp.log(ratio) / self.matcher.size), 1.0)
-        return jnp.append(jnp.concatenate([apart, size[:, None]], axis=1).reshape(-1), share)
+        return jnp.append(jnp.concatenate([apart.reshape(len(size), -1), size[:, None]], axis=1).reshape(-1), share)
 
     def evidence(
         self, compared: Float[Array, "views comparisons"], present: Bool[Array, " views"], posed: bool
@@ -241,9 +254,11 @@ class Gallery:
         """
         shares = jnp.where(present, jnp.maximum(compared[:, -1], _LEAST), 0.0)
         count = jnp.maximum(jnp.sum(shares), _LEAST)
-        values = compared[:, :-1].reshape(-1, len(self.radii), YAWS + 1)
-        apart = jnp.einsum("v,voy->oy", shares / count, values[..., :-1])
-        return Evidence(apart + jnp.where(posed & (jnp.arange(YAWS) > 0), _IMPOSSIBLE, 0.0), values[0, :, -1], count)
+        values = compared[:, :-1].reshape(len(compared), len(self.radii), -1)
+        kept = values[..., :-1].reshape(*values.shape[:2], YAWS, KEPT)
+        square, lean, gram = parted(jnp.einsum("v,voyk->oyk", shares / count, kept))
+        square += jnp.where(posed & (jnp.arange(YAWS) > 0), _IMPOSSIBLE, 0.0)
+        return Evidence(unexplained(square, lean, gram, count), square, lean, gram, values[0, :, -1], count)
 
     def hypotheses(self, evidence: Evidence) -> Float[Array, "objects yaws"]:
         """Log-probabilities of objects and yaws, if the object is none unknown."""
@@ -266,7 +281,8 @@ class Gallery:
 
         Each of the likeliest hypotheses is taken to be true in turn: it says what a camera at a candidate would see, and so what
         the belief would become. As in Denzler and Brown (2002), over objects and yaws; exact but for the errors of the view, of
-        which is assumed that they are as large as the best hypothesis' so far, where views can be predicted as exactly.
+        which is assumed that they are as large as the best hypothesis' so far, and for those of the sphere, which are assumed
+        to be the likeliest.
 
         Args:
             evidence: of the views so far.
@@ -277,15 +293,26 @@ class Gallery:
         flat = self.hypotheses(evidence).reshape(-1)
         now, index = jax.lax.top_k(flat, min(MOST_HYPOTHESES, flat.size))
         now = jax.nn.log_softmax(now)
-        before = evidence.apart.reshape(-1)[index]
-        known = jnp.concatenate([self.features, self.variations[..., None]], axis=-1)
-        seen = _seen(known, directions, index // YAWS, index % YAWS)
-        seen, expected = seen[..., :-1], 1 + seen[..., -1]
-        products = jnp.einsum("cmf,cnf->cmn", seen, seen) / seen.shape[-1]
-        squares = jnp.diagonal(products, axis1=1, axis2=2)
-        apart = jnp.maximum(squares[:, :, None] + squares[:, None, :] - 2 * products, 0.0)
-        apart = (apart + jnp.min(before) * expected[:, :, None]) / expected[:, None, :]
-        apart = (count * before + apart) / (count + 1)
+        square, lean, gram = (
+            part.reshape(flat.size, -1)[index] * count for part in (evidence.square, evidence.lean, evidence.gram)
+        )
+        least = jnp.min(evidence.apart)
+        known = jnp.concatenate([self.features[..., None, :], self.slopes], axis=-2)
+        known = _seen(known.reshape(*known.shape[:3], -1), directions, index // YAWS, index % YAWS)
+        known = known.reshape(*known.shape[:2], 1 + ERRORS, -1)
+        features, slope = known[:, :, 0], known[:, :, 1:]
+        # What a view would show if a hypothesis were true, with the error of the sphere that its views so far speak for.
+        off = jnp.linalg.solve(matrix_of(gram) + HELD * jnp.eye(ERRORS), lean[..., None])[..., 0]
+        image = features - jnp.einsum("me,cmef->cmf", off, slope)
+        apart = image[:, :, None] - features[:, None]
+        more_lean = -jnp.einsum("cmnf,cnef->cmne", apart, slope) / features.shape[-1]
+        more_square = jnp.mean(jnp.square(apart), axis=-1) + least
+        apart = unexplained(
+            (square[:, 0] + more_square) / (count + 1),
+            (lean + more_lean) / (count + 1),
+            ((gram + gram_of(slope)) / (count + 1))[:, None],
+            count + 1,
+        )
         likelihood = self.matcher.likelihood(apart, count + 1, objects)
         after = jax.nn.log_softmax(likelihood - 0.5 * evidence.size[index // YAWS], axis=-1)
         answer = index // YAWS if target is None else index // YAWS == target
@@ -323,38 +350,6 @@ def _filled(images: UInt8[AnyArray, "heights yaws pixels"]) -> Float[Array, "hei
     values = jnp.where(known, images, 0) / STEPS
     mean = jnp.sum(values, axis=(0, 1)) / jnp.maximum(jnp.sum(known, axis=(0, 1)), 1)
     return jnp.where(known, values, mean)
-
-
-def _variation(
-    images: Float[Array, "heights yaws pixels"],
-    features: Float[Array, "heights yaws features"],
-    project: Float[Array, "pixels features"],
-) -> Float[Array, "heights yaws"]:
-    """Mean square of the change of features by errors with the standard deviations `_OFF` and `_TURNED`."""
-    turned = (jnp.roll(features, -1, axis=1) - jnp.roll(features, 1, axis=1)) * (YAWS / (4 * jnp.pi))
-    moved = jnp.einsum("hycp,pf->hycf", _changes(images), project)
-    return jnp.mean(_TURNED**2 * jnp.square(turned) + _OFF**2 * jnp.sum(jnp.square(moved), axis=2), axis=-1)
-
-
-def _changes(images: Float[Array, "*grid pixels"]) -> Float[Array, "*grid 4 pixels"]:
-    """Derivatives of small images by the place of the object, to the right, down and forwards in radii, and by its log size.
-
-    To first order, for a camera two radii away whose image the object's sphere touches.
-    """
-    both = images.reshape(*images.shape[:-1], 2, SIDE, SIDE)  # depth, and share
-    padded = jnp.pad(both, [(0, 0)] * (both.ndim - 2) + [(1, 1), (1, 1)], mode="edge")
-    across = (padded[..., 1:-1, 2:] - padded[..., 1:-1, :-2]) / 2
-    down = (padded[..., 2:, 1:-1] - padded[..., :-2, 1:-1]) / 2
-    at = jnp.arange(SIDE) - (SIDE - 1) / 2
-    outwards, focal = across * at + down * at[:, None], SIDE / 2 / math.tan(math.pi / 6)
-    near, share = both[..., :1, :, :], both[..., 1:, :, :]
-    nothing = jnp.zeros_like(share)
-    nearer, deeper = (
-        jnp.concatenate([-share / 2, nothing], axis=-3),
-        jnp.concatenate([near - share / 2, nothing], axis=-3),
-    )
-    each = -focal / 2 * across, -focal / 2 * down, outwards / 2 + nearer, -outwards + deeper
-    return jnp.stack([one.reshape(images.shape) for one in each], axis=-2)
 
 
 def interpolated(grid: Array, direction: Float[Array, " 3"]) -> Float[Array, "objects yaws numbers"]:

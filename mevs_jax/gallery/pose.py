@@ -40,7 +40,8 @@ def object_pose(yaws: Float[np.ndarray, " yaws"], symmetry: int, sphere: Sphere)
     around = 2 * np.pi * np.arange(number) / number
     mean = np.sum(probability * np.exp(1j * symmetry * around))
     length = 0.0 if symmetry == number else min(abs(mean), 1.0)
-    spread = min(np.sqrt(-2 * np.log(length)) / symmetry, np.pi) if length > 1e-6 else np.pi
+    step = 2 * np.pi / number / np.sqrt(12)  # deviation of what lies between two of the yaws
+    spread = min(np.hypot(np.sqrt(2 * np.log(1 / length)) / symmetry, step), np.pi) if length > 1e-6 else np.pi
     equal = (np.angle(mean) + 2 * np.pi * np.arange(symmetry)) / symmetry
     likeliest = around[probability.argmax()]
     yaw = equal[np.cos(equal - likeliest).argmax()] if length > 1e-6 else likeliest

@@ -9,6 +9,8 @@ from pathlib import Path
 import pytest
 from PIL import Image
 
+from data_pipeline.objects.furniture import furniture
+
 EXAMPLES = Path(__file__).resolve().parents[2] / "examples"
 
 
@@ -50,6 +52,8 @@ def test_an_example_runs(name, said, whole, tmp_path):
         (["--seed", "-1"], "--seed"),
         (["--study", "--each", "0"], "--each"),
         (["--film", "x.mp4"], "must be a .gif"),
+        (["--find", "mug"], "--find NAME needs --among"),
+        (["--find", "mug", "--among", "mug"], "'mug' is not NAME=FILE"),
         (["--film", "none/x.gif"], "folder that exists"),
         (["--table", "none"], "none"),
         (["--table", ".", "--objects", "0"], "--objects"),
@@ -79,6 +83,24 @@ def test_an_arm_recognises_an_object_on_its_table(tmp_path):
     assert "monitor after " in ended.stdout
     with Image.open(tmp_path / "film.gif") as film:
         assert film.n_frames >= 10
+
+
+@pytest.mark.slow
+def test_an_arm_finds_the_object_that_is_wanted(tmp_path):
+    """Of three enrolled ones; the others are not taken for it."""
+    pytest.importorskip("mujoco", reason="MuJoCo is not installed: pip install mujoco")
+    given = []
+    for name in ("table", "toilet", "chair"):
+        furniture(name, 40).export(tmp_path / f"{name}.ply")
+        given.append(f"{name}={tmp_path / name}.ply")
+    command = [sys.executable, "-m", "examples.robot_arm", "--find", "chair", "--among", *given]
+    ended = subprocess.run(command, capture_output=True, text=True, timeout=600, cwd=EXAMPLES.parent)
+    if "MuJoCo cannot draw here" in ended.stderr:
+        pytest.skip("MuJoCo cannot draw here: the system has no libEGL (libegl1)")
+    assert ended.returncode == 0, ended.stderr
+    last = ended.stdout.splitlines()[-1]
+    assert "(chair): chair " in last
+    assert last.endswith("(sure)")
 
 
 def test_all_examples_are_run():

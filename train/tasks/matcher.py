@@ -26,6 +26,7 @@ from data_pipeline.capture.casting import Rig, capture, rig_at
 from data_pipeline.dataset.reality import RealityAugmentation, realistic_views
 from data_pipeline.objects.mesh import ObjectEntry
 from data_pipeline.objects.sources import furniture_families, load_object, strangers
+from mevs_jax.gallery.errors import ERRORS, KEPT, parted, slopes, unexplained
 from mevs_jax.gallery.matching import (
     HEIGHTS,
     PIXELS,
@@ -34,6 +35,7 @@ from mevs_jax.gallery.matching import (
     YAWS,
     Gallery,
     Matcher,
+    grid_rotations,
     interpolated,
     small_image,
 )
@@ -140,13 +142,21 @@ def fit_projection(shapes: Iterator[Sighted], features: int) -> Float[Array, "pi
     """What makes differences between views and their predictions white, where different shapes differ most beside them.
 
     This is Fisher's linear discriminant: the leading generalised eigenvectors of the covariances of differences between images of
-    two shapes, and of differences between an image and what is predicted of the same shape.
+    two shapes, and of differences between an image and what is predicted of the same shape, without what a common error of the
+    sphere explains of them.
     """
 
     @jax.jit
     def differences(gallery: Array, yaw: Array, images: Array, known: Array, directions: Array) -> Array:
-        predicted = jax.vmap(lambda direction: interpolated(gallery[None], direction)[0, yaw] / STEPS)(directions)
-        return jnp.where(known, images - predicted, 0.0) * WEIGHTS
+        stored = gallery / STEPS
+        changes = slopes(stored, grid_rotations()).reshape(1, HEIGHTS, YAWS, -1)
+        each = jax.vmap(lambda grid, direction: interpolated(grid, direction)[0, yaw], (None, 0))
+        predicted, slope = each(stored[None], directions), each(changes, directions).reshape(len(images), ERRORS, -1)
+        apart = jnp.where(known, images - predicted, 0.0) * WEIGHTS
+        slope = jnp.where(known[:, None], slope, 0.0) * WEIGHTS
+        held = jnp.mean(jnp.square(apart)) * jnp.eye(ERRORS)
+        flat = slope.transpose(1, 0, 2).reshape(ERRORS, -1)
+        return apart - jnp.einsum("e,vep->vp", jnp.linalg.solve(flat @ flat.T + held, flat @ apart.reshape(-1)), slope)
 
     products, images, count = np.zeros((PIXELS, PIXELS)), [], 0
     random = np.random.default_rng(0)
@@ -172,10 +182,10 @@ class _Walks(NamedTuple):
 def calibrated(matcher: Matcher, shapes: Sequence[Sighted], seed: int) -> Matcher:
     """The matcher with powers of likelihoods and odds of unknown objects as shapes that it was not fitted on need them."""
     gallery = Gallery.of(matcher, np.stack([one.gallery for one in shapes]), np.zeros(len(shapes)))
-    apart, shows = _tables(gallery, shapes)
-    wrong = apart.min(axis=-1)[~np.eye(len(shapes), dtype=bool)[:, None].repeat(shows.shape[1], axis=1)]
+    kept, shows = _tables(gallery, shapes)
+    wrong = kept[..., 0].min(axis=-1)[~np.eye(len(shapes), dtype=bool)[:, None].repeat(shows.shape[1], axis=1)]
     matcher = replace(matcher, unseen=jnp.float32(np.quantile(wrong, _QUANTILE)))
-    walks = [*_some_walks(apart, shows, seed)]
+    walks = [*_some_walks(kept, shows, seed)]
 
     def power(x: np.ndarray) -> float:
         return float(np.mean([_known_loss(_with_power(matcher, x), walk) for walk in walks]))
@@ -193,18 +203,22 @@ def calibrated(matcher: Matcher, shapes: Sequence[Sighted], seed: int) -> Matche
 
 
 def _tables(gallery: Gallery, shapes: Sequence[Sighted]) -> tuple[np.ndarray, np.ndarray]:
-    """Squared differences (shapes, views, objects, yaws) of all views of all shapes, and what each view shows."""
+    """What is kept (shapes, views, objects, yaws, kept) of all views of all shapes, and what each view shows."""
 
     @jax.jit
     def of_shape(gallery: Gallery, images: Array, known: Array, directions: Array) -> Array:
         return jax.lax.map(lambda view: gallery.compared_image(*view), (images, known, directions))
 
-    found = [of_shape(gallery, one.images, one.known.astype(np.float32), one.directions) for one in shapes]
-    values = np.stack([np.asarray(one) for one in found])
-    return values[..., :-1].reshape(*values.shape[:2], len(shapes), YAWS + 1)[..., :-1], values[..., -1]
+    kept, shows = [], []
+    for one in shapes:
+        values = np.asarray(of_shape(gallery, one.images, one.known.astype(np.float32), one.directions))
+        by_object = values[:, :-1].reshape(len(values), len(shapes), -1)[..., :-1]
+        kept.append(by_object.reshape(*by_object.shape[:2], YAWS, KEPT).astype(np.float16))  # there are many
+        shows.append(values[:, -1])
+    return np.stack(kept), np.stack(shows)
 
 
-def _some_walks(apart: np.ndarray, shows: np.ndarray, seed: int) -> Iterator[_Walks]:
+def _some_walks(kept: np.ndarray, shows: np.ndarray, seed: int) -> Iterator[_Walks]:
     """Random views of all shapes, of which some are enrolled."""
     random, (shapes, views) = np.random.default_rng(seed), shows.shape
     for share, count in product(_ENROLLED, _VIEWS):
@@ -212,10 +226,19 @@ def _some_walks(apart: np.ndarray, shows: np.ndarray, seed: int) -> Iterator[_Wa
         label = np.full(shapes, -1)
         label[enrolled] = np.arange(len(enrolled))
         seen = np.argsort(random.random((shapes, views)), axis=1)[:, :count]
-        some = np.take_along_axis(apart[:, :, enrolled], seen[..., None, None], axis=1)
         weights = np.take_along_axis(shows, seen, axis=1)
         total = weights.sum(axis=1)
-        yield _Walks(np.einsum("sv,svoy->soy", weights / total[:, None], some), total, label)
+        apart = [
+            _unexplained(kept[shape, views][:, enrolled], weights[shape] / total[shape], total[shape])
+            for shape, views in enumerate(seen)
+        ]
+        yield _Walks(np.stack(apart), total, label)
+
+
+@jax.jit
+def _unexplained(kept: Array, weights: Array, total: Array) -> Array:
+    """`Evidence.apart` of a walk."""
+    return unexplained(*parted(jnp.einsum("v,voyk->oyk", weights, kept)), total)
 
 
 def _with_power(matcher: Matcher, x: np.ndarray) -> Matcher:

@@ -172,7 +172,7 @@ def test_objects_come_and_go(known: TrainedSystem, shapes, tmp_path: Path) -> No
 
 def test_equal_objects_are_named(blank: TrainedSystem, shapes) -> None:
     turned = shapes["tall"][0][:, [1, 0, 2]] * [1, -1, 1]
-    with pytest.warns(AlikeWarning, match="tall and turned look alike"):
+    with pytest.warns(AlikeWarning, match="tall and turned are equal to a depth camera"):
         both = enrol({"tall": shapes["tall"], "turned": (turned, shapes["tall"][1])}, blank)
     assert alike(both) == [("tall", "turned")]
     larger = enrol({"tall": shapes["tall"], "larger": (2 * turned, shapes["tall"][1])}, blank)
@@ -187,7 +187,7 @@ def test_what_cannot_be_enrolled_is_said(known: TrainedSystem, blank: TrainedSys
         "new: a mesh needs vertices": {"new": (vertices[:, :2], faces)},
         "new: the triangles must be indices": {"new": (vertices, faces + 1000)},
         "new: the mesh has no area": {"new": (vertices, faces[:, [0, 0, 0]])},
-        "new: an image has no measured depth": {"new": [empty]},
+        "new: frame 1 has no measured depth": {"new": [empty]},
         "new: an image needs a mask or a floor": {"new": [bare]},
         "new: an object is a mesh": {"new": []},
         "there is an object 'tall' already": {"tall": (vertices, faces)},

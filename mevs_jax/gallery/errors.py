@@ -1,0 +1,116 @@
+"""Errors that all views of an object share: those of its believed sphere and of its yaw.
+
+A sphere that is off moves and scales all images of an object in one way. So a difference between views and predictions that some
+error of the sphere explains says little against a hypothesis, and one that no *common* error explains says much. Images change
+about linearly with small errors; the error is then found by least squares, with a prior, from what is kept of each view. Let `r`
+be the features by which a view differs from a prediction, and `J` their slopes by the errors. A view keeps the mean of `r²`
+(its square), the means of `r J` (its lean) and of `J Jᵀ` (the gram). These add up over views.
+"""
+
+from __future__ import annotations
+
+import math
+from itertools import combinations_with_replacement
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from mevs_jax.arrays import AnyArray
+
+DEVIATIONS = np.array([0.015, 0.015, 0.015, 0.02, 0.05], np.float32)
+"""Of the sphere's centre along the object's axes, in radii; of the logarithm of its radius; of the yaw in radians, as hypotheses
+are 10° apart."""
+ERRORS = len(DEVIATIONS)
+PAIRS = np.array([*combinations_with_replacement(range(ERRORS), 2)])
+"""The entries of a symmetric matrix of errors that are kept."""
+KEPT = 1 + ERRORS + len(PAIRS)
+"""Numbers that are kept of a view and a hypothesis: square, lean and gram."""
+HELD = 0.05
+"""Squared difference of features, as a mean over them, that an error by its standard deviation costs."""
+
+
+def slopes(
+    images: Float[AnyArray, "heights yaws pixels"], rotations: Float[AnyArray, "heights yaws 3 3"]
+) -> Float[Array, "heights yaws errors pixels"]:
+    """How small images of an object change with errors in the order of `DEVIATIONS`, by these.
+
+    Args:
+        images: from all directions.
+        rotations: of their cameras, to the object.
+    """
+    images = jnp.asarray(images)
+    changes = _changes(images)
+    moved = jnp.einsum("hyac,hycp->hyap", jnp.asarray(rotations, jnp.float32), changes[:, :, :3])
+    yaws = images.shape[1]
+    turned = (jnp.roll(images, -1, axis=1) - jnp.roll(images, 1, axis=1)) * (yaws / (4 * jnp.pi))
+    return jnp.concatenate([moved, changes[:, :, 3:], turned[:, :, None]], axis=2) * DEVIATIONS[:, None]
+
+
+def _changes(images: Float[Array, "*grid pixels"]) -> Float[Array, "*grid 4 pixels"]:
+    """Derivatives of small images by the place of the object, to the right, down and forwards in radii, and by its log size.
+
+    To first order, for a camera two radii away whose image the object's sphere touches.
+    """
+    side = math.isqrt(images.shape[-1] // 2)
+    both = images.reshape(*images.shape[:-1], 2, side, side)  # depth, and share
+    padded = jnp.pad(both, [(0, 0)] * (both.ndim - 2) + [(1, 1), (1, 1)], mode="edge")
+    across = (padded[..., 1:-1, 2:] - padded[..., 1:-1, :-2]) / 2
+    down = (padded[..., 2:, 1:-1] - padded[..., :-2, 1:-1]) / 2
+    at = jnp.arange(side) - (side - 1) / 2
+    outwards, focal = across * at + down * at[:, None], side / 2 / math.tan(math.pi / 6)
+    near, share = both[..., :1, :, :], both[..., 1:, :, :]
+    nothing = jnp.zeros_like(share)
+    nearer, deeper = (
+        jnp.concatenate([-share / 2, nothing], axis=-3),
+        jnp.concatenate([near - share / 2, nothing], axis=-3),
+    )
+    each = -focal / 2 * across, -focal / 2 * down, outwards / 2 + nearer, -outwards + deeper
+    return jnp.stack([one.reshape(images.shape) for one in each], axis=-2)
+
+
+def gram_of(slope: Float[Array, "*batch errors features"]) -> Float[Array, "*batch pairs"]:
+    """The means of products of slopes, over features."""
+    first, second = PAIRS.T
+    return jnp.einsum("...pf,...pf->...p", slope[..., first, :], slope[..., second, :]) / slope.shape[-1]
+
+
+def parted(kept: Float[Array, "*batch kept"]) -> tuple[Array, Array, Array]:
+    """Square, lean and gram."""
+    return kept[..., 0], kept[..., 1 : 1 + ERRORS], kept[..., 1 + ERRORS :]
+
+
+def matrix_of(gram: Float[Array, "*batch pairs"]) -> Float[Array, "*batch errors errors"]:
+    first, second = PAIRS.T
+    empty = jnp.zeros((*gram.shape[:-1], ERRORS, ERRORS))
+    return empty.at[..., first, second].set(gram).at[..., second, first].set(gram)
+
+
+def unexplained(
+    square: Float[Array, "*batch"],
+    lean: Float[Array, "*batch errors"],
+    gram: Float[Array, "*other pairs"],
+    count: float | Float[AnyArray, ""],
+) -> Float[Array, "*batch"]:
+    """The mean squared difference of features that is left when the likeliest common error is taken away, with its cost.
+
+    Args:
+        square, lean: means over views.
+        gram: means over views; its shape must broadcast to that of `square`.
+        count: number of views.
+    """
+    # By Cholesky's decomposition, written out: libraries call a routine for each of many tiny matrices.
+    entry = {(int(b), int(a)): gram[..., place] for place, (a, b) in enumerate(PAIRS)}
+    lower: dict[tuple[int, int], Array] = {}
+    solved: list[Array] = []
+    left = square
+    for row in range(ERRORS):
+        for column in range(row):
+            rest = sum((lower[row, k] * lower[column, k] for k in range(column)), jnp.zeros(()))
+            lower[row, column] = (entry[row, column] - rest) / lower[column, column]
+        rest = sum((lower[row, k] ** 2 for k in range(row)), jnp.zeros(()))
+        lower[row, row] = jnp.sqrt(jnp.maximum(entry[row, row] - rest, 0.0) + HELD / count)
+        rest = sum((lower[row, k] * solved[k] for k in range(row)), jnp.zeros(()))
+        solved.append((lean[..., row] - rest) / lower[row, row])
+        left = left - solved[-1] ** 2
+    return jnp.maximum(left, 0.0)
