@@ -297,16 +297,20 @@ class Gallery:
             part.reshape(flat.size, -1)[index] * count for part in (evidence.square, evidence.lean, evidence.gram)
         )
         least = jnp.min(evidence.apart)
-        known = jnp.concatenate([self.features[..., None, :], self.slopes], axis=-2)
-        known = _seen(known.reshape(*known.shape[:3], -1), directions, index // YAWS, index % YAWS)
-        known = known.reshape(*known.shape[:2], 1 + ERRORS, -1)
-        features, slope = known[:, :, 0], known[:, :, 1:]
+        features, slope = (
+            _seen(grid.reshape(*grid.shape[:3], -1), directions, index // YAWS, index % YAWS)
+            for grid in (self.features, self.slopes)
+        )
+        slope = slope.reshape(*features.shape[:2], ERRORS, -1)
         # What a view would show if a hypothesis were true, with the error of the sphere that its views so far speak for.
         off = jnp.linalg.solve(matrix_of(gram) + HELD * jnp.eye(ERRORS), lean[..., None])[..., 0]
         image = features - jnp.einsum("me,cmef->cmf", off, slope)
-        apart = image[:, :, None] - features[:, None]
-        more_lean = -jnp.einsum("cmnf,cnef->cmne", apart, slope) / features.shape[-1]
-        more_square = jnp.mean(jnp.square(apart), axis=-1) + least
+        number = features.shape[-1]
+        squares = [jnp.sum(jnp.square(one), axis=-1) / number for one in (image, features)]
+        products = jnp.einsum("cmf,cnf->cmn", image, features) / number
+        more_square = squares[0][:, :, None] + squares[1][:, None] - 2 * products + least
+        own = jnp.einsum("cnf,cnef->cne", features, slope)[:, None]
+        more_lean = (own - jnp.einsum("cmf,cnef->cmne", image, slope)) / number
         apart = unexplained(
             (square[:, 0] + more_square) / (count + 1),
             (lean + more_lean) / (count + 1),

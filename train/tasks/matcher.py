@@ -190,7 +190,7 @@ def calibrated(matcher: Matcher, shapes: Sequence[Sighted], seed: int) -> Matche
     def power(x: np.ndarray) -> float:
         return float(np.mean([_known_loss(_with_power(matcher, x), walk) for walk in walks]))
 
-    start, limits = np.array([1.6, 0.3, 0.0, -1.0]), [(-5, 5), (-2, 2), (-1, 1), (-4, 2)]
+    start, limits = np.array([1.6, 0.3, 0.0, -1.0]), [(-5, 5), (-2, 2), (-0.25, 0.25), (-4, 2)]
     found = minimize(power, start, method="Nelder-Mead", bounds=limits, options={"maxiter": 300}).x
     matcher = _with_power(matcher, found)
     inputs, unknown = (np.concatenate(arrays) for arrays in zip(*map(_stranger_inputs, walks), strict=True))
