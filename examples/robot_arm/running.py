@@ -12,10 +12,11 @@ from itertools import product
 
 import numpy as np
 
+import mevs_jax
 from data_pipeline.capture.sensor import Kind
 from data_pipeline.objects.furniture import CLASSES
 from data_pipeline.objects.mesh import Mesh, normalise
-from data_pipeline.objects.recipes import FurniturePiece, read_mesh
+from data_pipeline.objects.recipes import FurniturePiece
 from eval.numbers.comparison import intervals
 from examples.robot_arm.arm import Arm, Reach
 from examples.robot_arm.camera import DepthCamera
@@ -46,7 +47,7 @@ def meshes_of(objects: Sequence[str]) -> dict[str, Mesh]:
         name, equals, path = one.partition("=")
         if not (name and equals and path):
             raise ValueError(f"{one!r} is not NAME=FILE, as in --among mug=mug.obj")
-        found[name] = normalise(*read_mesh(path), name)
+        found[name] = normalise(*mevs_jax.read_mesh(path), name)
     return found
 
 

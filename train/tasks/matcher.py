@@ -26,7 +26,7 @@ from data_pipeline.capture.casting import Rig, capture, rig_at
 from data_pipeline.dataset.reality import RealityAugmentation, realistic_views
 from data_pipeline.objects.mesh import ObjectEntry
 from data_pipeline.objects.sources import furniture_families, load_object, strangers
-from mevs_jax.gallery.errors import ERRORS, KEPT, parted, slopes, unexplained
+from mevs_jax.gallery.errors import KEPT, parted, unexplained
 from mevs_jax.gallery.matching import (
     HEIGHTS,
     PIXELS,
@@ -35,7 +35,6 @@ from mevs_jax.gallery.matching import (
     YAWS,
     Gallery,
     Matcher,
-    grid_rotations,
     interpolated,
     small_image,
 )
@@ -142,21 +141,13 @@ def fit_projection(shapes: Iterator[Sighted], features: int) -> Float[Array, "pi
     """What makes differences between views and their predictions white, where different shapes differ most beside them.
 
     This is Fisher's linear discriminant: the leading generalised eigenvectors of the covariances of differences between images of
-    two shapes, and of differences between an image and what is predicted of the same shape, without what a common error of the
-    sphere explains of them.
+    two shapes, and of differences between an image and what is predicted of the same shape.
     """
 
     @jax.jit
     def differences(gallery: Array, yaw: Array, images: Array, known: Array, directions: Array) -> Array:
-        stored = gallery / STEPS
-        changes = slopes(stored, grid_rotations()).reshape(1, HEIGHTS, YAWS, -1)
-        each = jax.vmap(lambda grid, direction: interpolated(grid, direction)[0, yaw], (None, 0))
-        predicted, slope = each(stored[None], directions), each(changes, directions).reshape(len(images), ERRORS, -1)
-        apart = jnp.where(known, images - predicted, 0.0) * WEIGHTS
-        slope = jnp.where(known[:, None], slope, 0.0) * WEIGHTS
-        held = jnp.mean(jnp.square(apart)) * jnp.eye(ERRORS)
-        flat = slope.transpose(1, 0, 2).reshape(ERRORS, -1)
-        return apart - jnp.einsum("e,vep->vp", jnp.linalg.solve(flat @ flat.T + held, flat @ apart.reshape(-1)), slope)
+        predicted = jax.vmap(lambda direction: interpolated(gallery[None], direction)[0, yaw] / STEPS)(directions)
+        return jnp.where(known, images - predicted, 0.0) * WEIGHTS
 
     products, images, count = np.zeros((PIXELS, PIXELS)), [], 0
     random = np.random.default_rng(0)
