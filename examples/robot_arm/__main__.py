@@ -1,4 +1,4 @@
-"""`python -m examples.robot_arm [--object chair] [--film walk.gif] [--study] [--find NAME --among NAME=FILE ...] [--table FOLDER]`.
+"""`python -m examples.robot_arm [--object chair] [--film walk.gif] [--study] [--find NAME --among NAME=FILE …] [--table DIR]`.
 
 Without options an arm recognises one piece of furniture that no network was trained on. `--study` compares ways to choose views
 on fifty of them, from three first views each, under the same reachability. `--find` looks for one of your objects: they are
@@ -56,10 +56,7 @@ def main() -> None:
     try:
         import mujoco
 
-        if options.find is not None:
-            act = _find(options)
-        else:
-            act = _table(options) if options.table else _furniture(options, parser)
+        act = _act(options, parser)
         mujoco.GLContext(64, 64).free()
     except ImportError as error:
         parser.error(f"this example needs MuJoCo ({error}): pip install mujoco")
@@ -71,6 +68,12 @@ def main() -> None:
         act()
     except DataError as error:
         parser.error(str(error))
+
+
+def _act(options: argparse.Namespace, parser: argparse.ArgumentParser) -> Callable[[], None]:
+    if options.find is not None:
+        return _find(options)
+    return _table(options) if options.table else _furniture(options, parser)
 
 
 def _furniture(options: argparse.Namespace, parser: argparse.ArgumentParser) -> Callable[[], None]:
