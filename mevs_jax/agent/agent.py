@@ -29,6 +29,7 @@ from mevs_jax.geometry.source_view import DepthImage
 from mevs_jax.geometry.sphere import Sphere
 from mevs_jax.policies.base import Policy
 from mevs_jax.trained.system import TrainedSystem
+from mevs_jax.trained.usable import NOTHING_ENROLLED
 
 _ENOUGH = 0.15
 """How much of the object must have been seen before the agent is sure, in views that show all of its sphere."""
@@ -122,7 +123,7 @@ class Agent:
         shaded = self.system.description.image.content == "image"
         _check(not shaded, "this system reads shaded images, which a depth camera does not give; train one on depth")
         enrolled = self.system.parts.gallery is None or len(self.system.classes) > 1
-        _check(enrolled, "no objects are enrolled in this system; mevs_jax.enrol returns one that knows yours")
+        _check(enrolled, NOTHING_ENROLLED)
         self._turn = RLock()
         self.size = max(len(self.system.viewpoints), size)
         self._resets, self.key = 0, jax.random.key(self.seed)

@@ -119,7 +119,6 @@ def instances(options: InstancesOptions) -> None:
     if unknown := set(names) - {one.name for one in CONDITIONS}:
         known = ", ".join(f'"{one.name}"' for one in CONDITIONS)
         raise Unusable(f"--conditions knows {known}, not {min(unknown)!r}")
-    conditions = [one for one in CONDITIONS if one.name in names]
     system = options.system
     if options.fit:
         config = MatcherConfig(shapes=options.shapes, calibration_shapes=options.shapes // 4)
@@ -130,7 +129,13 @@ def instances(options: InstancesOptions) -> None:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", AlikeWarning)
         settings = {name: getattr(options, name) for name in ("up", "metres", "sizes")}
-        found = study_instances(load_system(system), options.data, options.to, conditions=conditions, **settings)
+        found = study_instances(
+            load_system(system),
+            options.data,
+            options.to,
+            conditions=[one for one in CONDITIONS if one.name in names],
+            **settings,
+        )
     write_json(options.to / "instances.json", as_json(found))
     print(instances_text(found))
 

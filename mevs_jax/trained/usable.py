@@ -123,11 +123,17 @@ def why_not(structure: Structure, policy: str | Policy, posed: bool, with_entrop
     )  # one of this name may be registered later
 
 
+NOTHING_ENROLLED = "no objects are enrolled in this system; mevs_jax.enrol returns one that knows yours"
+"""Why neither an agent nor a policy can use a system such as `objects`, before objects are enrolled."""
+
+
 @lru_cache(maxsize=512)
 def _why_not(
     structure: Structure, policy: str | Policy, registered: Hashable, posed: bool, with_entropy: bool
 ) -> str | None:
     description, most = structure.description, 2
+    if len(description.classes) == 1:  # that of unknown objects
+        return NOTHING_ENROLLED
 
     def trial(leaves: Any) -> Any:
         parts = jax.tree.unflatten(structure.tree, leaves)

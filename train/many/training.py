@@ -31,9 +31,9 @@ from train.validation import MOST_KEPT, ValidationSet, WeightedBatch
 def train_members(
     group: Group, folder: Path, mesh: Mesh, title: str, way: Way | None = None, *, halving: bool = False
 ) -> tuple[Together, Any]:
-    """Trains all members; returns their results, and the weights and statistics of each one's best epoch on the host.
+    """Trains all members, from their last checkpoint on if there is one.
 
-    A training that SIGTERM ended resumes after its last step, one that was interrupted otherwise after its last checkpoint.
+    Returns their results, and the weights and statistics of each one's best epoch, on the host.
 
     Args:
         group: the members.
@@ -86,9 +86,8 @@ def train_members(
             if halving and of.epoch in {max(1, optimiser.epochs // share) for share in (8, 4, 2)}:
                 of.halve()
             best, still = min(member.loss for member in of.members), of.training(optimiser.patience).sum()
-            console.print(
-                f"{title}, epoch {of.epoch}/{optimiser.epochs}: {still} still train, best val loss {best:.4f}"
-            )
+            said = f"{still} still train, best val loss {best:.4f}"
+            console.print(f"{title}, epoch {of.epoch}/{optimiser.epochs}: {said}")
             save_and_end_if_asked(started)
     return of, on_host(trainer.saved()[1])
 

@@ -170,6 +170,12 @@ def test_objects_come_and_go(known: TrainedSystem, shapes, tmp_path: Path) -> No
     assert "tall, plain, knob" in (tmp_path / "objects" / "README.md").read_text()
 
 
+def test_a_system_without_objects_runs_no_policy(blank: TrainedSystem) -> None:
+    assert not blank.can_run("information_gain", posed=False)
+    with pytest.raises(ValueError, match="no objects are enrolled in this system"):
+        blank.agent()
+
+
 def test_equal_objects_are_named(blank: TrainedSystem, shapes) -> None:
     turned = shapes["tall"][0][:, [1, 0, 2]] * [1, -1, 1]
     with pytest.warns(AlikeWarning, match="tall and turned are equal to a depth camera"):
