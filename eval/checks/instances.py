@@ -342,3 +342,34 @@ def _poses(
         right: Bool[np.ndarray, " walks"] = off[counted] <= _WITHIN
         rows.append(PoseRow(count, float(right.mean()) if counted.any() else np.nan, len(set(labels[counted]))))
     return rows
+
+
+def instances_text(study: Instances) -> str:
+    """The figures of `study_instances`, for a terminal."""
+    lines = [f"left out: {name}: {reason}" for name, reason in study.left_out.items()]
+    lines.append(f"{'enrolled from':<22}{'objects':>8}{'policy':>18}{'1':>8}{'2':>8}{'3':>8}{'4 views':>9}  gain at 2")
+    for one in study.measured:
+        for policy in dict.fromkeys(row.policy for row in one.policies):
+            rows = [row for row in one.policies if row.policy == policy]
+            right = "".join(f"{100 * row.accuracy:>8.1f}" for row in rows)
+            low, high = (100 * limit for limit in rows[1].gain_interval)
+            lines.append(
+                f"{one.condition:<22}{one.enrolled:>8}{policy:>18}{right}   {100 * rows[1].gain:+.1f} [{low:+.1f}, {high:+.1f}]"
+            )
+        yaw = ", ".join(f"{100 * row.right:.0f}" for row in one.poses)
+        lines.append(
+            f"  yaw within 10°: {yaw} % after 1, 2, 3, 4 random views ({one.poses[0].objects} objects not round)"
+        )
+        sure = next(row for row in one.promises if (row.stop, row.views) == (0.95, 4))
+        wrong = "–" if sure.wrong is None else f"{100 * sure.wrong:.1f}"
+        lines.append(
+            f"  a third not enrolled, stop 0.95, up to 4 views: sure {100 * (sure.sure or 0):.0f} %, of these wrong {wrong} %; "
+            f"unknown {100 * (sure.refused or 0):.0f} %; of the others sure {100 * (sure.strangers_sure or 0):.1f} %"
+        )
+        for what, found in (("", one.unknown_objects), (" without twins", one.unknown_without_twins)):
+            lines += [
+                f"  AUROC of unknown objects{what} after {row.views}: {row.auroc:.3f}"
+                for row in (found.after if found else ())
+            ]
+        lines += [f"  twins: {' and '.join(pair)}" for pair in one.twins]
+    return "\n".join(lines)

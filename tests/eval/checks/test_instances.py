@@ -10,8 +10,7 @@ import pytest
 
 from data_pipeline.errors import DataError
 from eval.checks import instances
-from eval.checks.instances import Condition, study_instances
-from mevs_jax.cli.checks import instances_text
+from eval.checks.instances import Condition, instances_text, study_instances
 from mevs_jax.enrolment import AlikeWarning
 from mevs_jax.trained import load
 from tests.eval.checks.test_transfer import write_off
