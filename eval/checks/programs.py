@@ -162,12 +162,14 @@ def _of_agent(step: Literal["see", "choose"], of: Callable[[], TrainedSystem], p
         system = of()
         programs, parts, side = Programs(system, policy, True, 8), system.parts, system.description.camera.resolution
         views = len(system.viewpoints)
-        if step == "see":
-            seen = (*_shapes((side, side), (4, 4), ()), programs.temperatures(parts))
-            return _on_one(programs.steps.see_view, lambda: (parts, programs.blank(), *seen))(mesh)
-        flags = np.zeros(views, bool)
-        asked = candidates_of(system, None, views), flags, flags, np.zeros(views, np.float32), jax.random.key(0)
-        return _on_one(programs.steps.choose_next, lambda: (parts, programs.blank(), *asked))(mesh)
+        function: Callable[..., Any] = programs.steps.see_view
+        asked: tuple[Any, ...] = (*_shapes((side, side), (4, 4), ()), programs.temperatures(parts))
+        if step == "choose":
+            function, flags = programs.steps.choose_next, np.zeros(views, bool)
+            asked = candidates_of(system, None, views), flags, flags, np.zeros(views, np.float32), jax.random.key(0)
+        # A flat list, since lowering rebuilds records with descriptions in place of arrays, which type checks refuse.
+        leaves, tree = jax.tree.flatten((parts, programs.blank(), *asked))
+        return _on_one(lambda *leaves: function(*tree.unflatten(leaves)), lambda: tuple(leaves))(mesh)
 
     return make
 
