@@ -169,7 +169,7 @@ def _of_agent(step: Literal["see", "choose"], of: Callable[[], TrainedSystem], p
             asked = candidates_of(system, None, views), flags, flags, np.zeros(views, np.float32), jax.random.key(0)
         # A flat list, since lowering rebuilds records with descriptions in place of arrays, which type checks refuse.
         leaves, tree = jax.tree.flatten((parts, programs.blank(), *asked))
-        return _on_one(lambda *leaves: function(*tree.unflatten(leaves)), lambda: tuple(leaves))(mesh)
+        return _on_one(lambda *leaves: function(*jax.tree.unflatten(tree, leaves)), lambda: tuple(leaves))(mesh)
 
     return make
 
