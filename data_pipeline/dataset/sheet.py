@@ -13,16 +13,14 @@ from data_pipeline.dataset.proof import open_split
 from data_pipeline.dataset.statistics import DatasetStatistics
 from data_pipeline.files import write_bytes
 
-SHEET = "objects.png"
-"""File name of the picture in the folder of a data set."""
 _ACROSS, _DOWN = 8, 40
 """The most objects of a class, and classes, on the picture."""
 _FROM = np.array([0.7, -0.5, 0.5])
 """Direction from which objects are shown: from in front and a little above, where there is such a view."""
 
 
-def draw_objects(folder: Path, statistics: DatasetStatistics) -> Path:
-    """Draws the first training objects of each class, with their upward directions and sizes; returns the path of the picture."""
+def draw_objects(folder: Path, statistics: DatasetStatistics, path: Path) -> None:
+    """Draws the first training objects of each class in the data set of `folder`, with their upward directions and sizes."""
     from matplotlib.figure import Figure  # late: it takes half a second
 
     index = read_index(folder, "train", "label", "extent")
@@ -46,8 +44,7 @@ def draw_objects(folder: Path, statistics: DatasetStatistics) -> Path:
             axis.text(0.5, -0.04, size, fontsize=6, ha="center", va="top", transform=axis.transAxes)
     picture = BytesIO()
     figure.savefig(picture, dpi=110)
-    write_bytes(folder / SHEET, picture.getvalue())
-    return folder / SHEET
+    write_bytes(path, picture.getvalue())
 
 
 def _up_in_image(pose: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, " 2"]:

@@ -72,7 +72,8 @@ def data(call: Invocation) -> None:
     counts = ", ".join(f"{sum(of.values())} {split}" for split, of in statistics.counts.items())
     print(f"Data set: {counts} objects of {len(statistics.classes)} classes, {statistics.views} views each")
     if is_first():
-        print(f"A picture of them: {draw_objects(call.out / 'data', statistics)}")
+        draw_objects(call.out / "data", statistics, call.out / "objects.png")
+        print(f"A picture of them: {call.out / 'objects.png'}")
         print(
             "On it, each object should be whole and stand upright along its arrow; sizes should be of one unit (--dataset.up)"
         )

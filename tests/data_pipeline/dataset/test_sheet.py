@@ -15,7 +15,7 @@ def test_each_object_is_shown_with_its_size_and_upward_direction(data, tmp_path,
     statistics, drawn = load_statistics(data), []
     monkeypatch.setattr(Figure, "savefig", lambda figure, *_, **__: drawn.append(figure))
     monkeypatch.setattr("data_pipeline.dataset.sheet.write_bytes", lambda *_: None)
-    draw_objects(data, statistics)
+    draw_objects(data, statistics, tmp_path / "objects.png")
     shown = [axis for axis in drawn[0].axes if axis.images]
     assert len(shown) == statistics.objects_of(["train"])
     assert [axis.get_title(loc="left") for axis in drawn[0].axes[::8]] == statistics.classes
