@@ -106,7 +106,7 @@ class Study:
         (out / "entropy").mkdir(parents=True)
         (out / "entropy" / "summary.json").touch()
 
-    def _trained(self, config: Any, lessons: Any) -> list[tuple[nnx.Module, list]]:
+    def _trained(self, config: Any, lessons: Any, folder: Path) -> list[tuple[nnx.Module, list]]:
         (lesson,) = lessons
         given = lesson.parts, lesson.validation
         self.fitted_on.append((lesson.name, given))
