@@ -217,7 +217,7 @@ def _mapped(positions: Sequence[int], function: Callable[[int], dict[str, np.nda
 
 
 def _begin_worker(index: int, count: int) -> None:
-    """Called in a new process that reads. The process that trains is told to end, and ends it."""
+    """Prepares a reading process: it leaves signals to the training process, and ends with it."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     signal.signal(signal.SIGTERM, signal.SIG_IGN)
     end_with_parent()

@@ -33,17 +33,24 @@ def check_entries(folder: Path) -> None:
             DamagedProgramsWarning,
             stacklevel=3,
         )
-    atexit.register(_removed, folder)
+    atexit.register(_removed, folder, only_new=True)
 
 
-def _removed(folder: Path) -> int:
-    """Removes what is not as it was written, remembers the rest, and returns how many were removed."""
+def _removed(folder: Path, only_new: bool = False) -> int:
+    """Removes what is not as it was written, remembers the rest, and returns how many were removed.
+
+    Args:
+        only_new: whether those that are remembered are not read again, as where they were checked when the process began.
+    """
     known: dict[str, str] = {}
     with suppress(OSError, ValueError):
         read = json.loads((folder / _RECORD).read_text())
         known = read if isinstance(read, dict) else {}
     found, removed = {}, 0
     for path in folder.glob("*-cache"):
+        if only_new and path.name in known:
+            found[path.name] = known[path.name]
+            continue
         with suppress(OSError):  # another process may have removed it
             content = path.read_bytes()
             check = f"{len(content)}:{zlib.crc32(content):08x}"
