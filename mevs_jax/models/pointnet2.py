@@ -17,16 +17,16 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 from flax import nnx
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Float
 
 from mevs_jax.arguments import check, whole
 from mevs_jax.arrays import AnyArray
 from mevs_jax.models.batch_norm import BatchNorm
 from mevs_jax.models.calling import TrainedByCall
+from mevs_jax.models.neighbours import Layer, first_layer, infer, largest_by_kernel, largest_of_neighbours, suits_kernel
 from mevs_jax.models.product import product
 from mevs_jax.points.farthest import LARGE
 from mevs_jax.points.ops import ball_query, farthest_point_sample
-from mevs_jax.points.taking import take_rows
 
 
 @dataclass(frozen=True)
@@ -83,20 +83,9 @@ class Perceptron(nnx.Module):
                 x = jax.nn.relu(norm(x, train=True, momentum=momentum))
         return self.norm[last].largest(x, momentum=momentum)
 
-    def folded(self) -> list[tuple[Array, Array]]:
-        """Weights and bias of each layer, including batch norm by its running statistics."""
-        layers = []
-        for linear, norm in zip(self.linear, self.norm, strict=True):
-            factor, bias = norm.folded()
-            layers.append((linear.kernel[...] * factor, bias))
-        return layers
-
-
-def _infer(layers: list[tuple[Array, Array]], x: Array) -> Array:
-    """Applies folded layers, each followed by ReLU."""
-    for kernel, bias in layers:
-        x = jax.nn.relu(product(x, kernel) + bias).astype(x.dtype)
-    return x
+    def layers(self) -> list[Layer]:
+        """The layers in inference, with batch norm by its running statistics."""
+        return [(linear.kernel[...], *norm.folded()) for linear, norm in zip(self.linear, self.norm, strict=True)]
 
 
 def _passes_first(kernel: Float[Array, "inputs outputs"]) -> bool:
@@ -123,19 +112,13 @@ def _placed(points: Float[Array, "points 3"], kernel: Float[Array, "inputs outpu
     return jnp.matmul(points, kernel[:3], precision=jax.lax.Precision.HIGHEST)
 
 
-def _first_layer(
-    passed: Float[Array, "points columns"],
-    centres: Float[Array, "centres 3"],
-    neighbours: Int[Array, "centres samples"],
-    kernel: Float[Array, "inputs outputs"],
-) -> Float[Array, "centres samples outputs"]:
-    """The first layer of every neighbour: its offset from the centre and its features, times the weights `kernel`."""
-    taken = take_rows(passed, neighbours.reshape(-1)).reshape(*neighbours.shape, -1)
+def _offsets(
+    centres: Float[Array, "centres 3"], kernel: Float[Array, "inputs outputs"], columns: int
+) -> tuple[Float[Array, "centres columns"], Float[Array, "columns outputs"] | None]:
+    """What to subtract from the columns that are gathered for a centre, and the weights that are then left to apply."""
     if _passes_first(kernel):
-        return taken - _placed(centres, kernel)[:, None]
-    columns = passed.shape[-1]
-    gathered = taken - jnp.pad(centres, ((0, 0), (0, columns - 3)))[:, None]
-    return product(gathered.reshape(-1, columns), kernel[:columns]).reshape(*gathered.shape[:-1], -1)
+        return _placed(centres, kernel), None
+    return jnp.pad(centres, ((0, 0), (0, columns - 3))), kernel[:columns]
 
 
 def _map(function: Callable, clouds: Any, at_once: int) -> Any:
@@ -168,21 +151,22 @@ def _abstract(
     centres: Float[Array, "centres 3"],
     *,
     level: Abstraction,
-    layers: list[tuple[Array, Array]],
+    layers: list[Layer],
     pieces: int,
 ) -> Float[Array, "centres outputs"]:
     """One level of one cloud in inference, in equal pieces of its centres."""
     neighbours = ball_query(points, centres, level.radius, level.samples)
-    kernel, bias = layers[0]
+    (kernel, *normalised), *others = layers
     passed = _passed(points, features, kernel)
+    offsets, left = _offsets(centres, kernel, passed.shape[-1])
+    flat = [*([] if left is None else [left]), *normalised, *(array for layer in others for array in layer)]
+    if pieces == 1 and suits_kernel(level.samples, level.layers, features.dtype):
+        return largest_by_kernel(int(left is None), passed, offsets, neighbours, *flat)
 
     def some(piece: tuple[Array, Array]) -> Array:
-        x = _first_layer(passed, *piece, kernel) + bias
-        x = x.reshape(-1, x.shape[-1])
-        x = _infer(layers[1:], jax.nn.relu(x).astype(features.dtype))
-        return jnp.max(x.reshape(*piece[1].shape, -1), axis=1)
+        return largest_of_neighbours(passed, *piece, *flat, k=int(left is None), dtype=features.dtype)
 
-    split = jax.tree.map(lambda array: array.reshape(pieces, -1, array.shape[-1]), (centres, neighbours))
+    split = jax.tree.map(lambda array: array.reshape(pieces, -1, array.shape[-1]), (offsets, neighbours))
     return jax.lax.map(some, split).reshape(level.centres, -1)
 
 
@@ -268,7 +252,7 @@ class PointNet2(TrainedByCall):
         clouds = points.reshape(-1, *points.shape[-2:])
         if not train:
             embedded = self._embed(clouds)
-            return self.out(_infer(self.head.folded(), embedded).astype(points.dtype)).reshape(*batch, self.views)
+            return self.out(infer(self.head.layers(), embedded).astype(points.dtype)).reshape(*batch, self.views)
         if key is None:
             raise ValueError("PointNet2 needs a key for its dropout in training")
         coordinates, features = clouds[..., :3], clouds[..., 3:].astype(dtype)
@@ -277,7 +261,8 @@ class PointNet2(TrainedByCall):
             neighbours = jax.vmap(partial(ball_query, radius=level.radius, k=level.samples))(coordinates, centres)
             kernel = perceptron.linear[0].kernel[...]
             passed = jax.vmap(_passed, in_axes=(0, 0, None))(coordinates, features, kernel)
-            x = jax.vmap(_first_layer, in_axes=(0, 0, 0, None))(passed, centres, neighbours, kernel)
+            offsets, left = jax.vmap(partial(_offsets, columns=passed.shape[-1]), (0, None), (0, None))(centres, kernel)
+            x = jax.vmap(first_layer, in_axes=(0, 0, 0, None))(passed, offsets, neighbours, left)
             features = perceptron.largest(x.astype(dtype), momentum=momentum, passed=1)
             coordinates = centres
         everything = jnp.concatenate([coordinates.astype(dtype), features], axis=-1)
@@ -307,8 +292,8 @@ class PointNet2(TrainedByCall):
             at_once = 4 if points.shape[1] <= LARGE else 1  # four larger clouds leave the cache
             centres = _centres(points, level.centres, level is self.levels[0], at_once if in_cache else None)
             pieces = _pieces(level) if in_cache else 1
-            abstract = partial(_abstract, level=level, layers=perceptron.folded(), pieces=pieces)
+            abstract = partial(_abstract, level=level, layers=perceptron.layers(), pieces=pieces)
             features = _map(lambda cloud, of=abstract: of(*cloud), (points, features, centres), 1 if in_cache else 64)
             points = centres
         everything = jnp.concatenate([points.astype(features.dtype), features], axis=-1)
-        return jnp.max(_infer(self.whole.folded(), everything), axis=1)
+        return jnp.max(infer(self.whole.layers(), everything), axis=1)

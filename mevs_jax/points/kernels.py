@@ -1,7 +1,8 @@
 """Point operations as Pallas kernels for one GPU, with the results of `mevs_jax.points.ops`; `lowered` selects them.
 
-They are fast for two reasons that a compiler of array programs does not find: a cloud's distances stay in the registers of one
-block during all of farthest-point sampling, and a ball query stops as soon as its slots are full.
+They are fast for reasons that a compiler of array programs does not find: a cloud's distances stay in the registers of one block
+during all of farthest-point sampling; a ball query stops as soon as its slots are full; and what layers say of a centre's
+neighbours is never written to memory, only its maximum.
 """
 
 from __future__ import annotations
@@ -18,6 +19,7 @@ from jaxtyping import Array, Float, Int
 from mevs_jax.points.distances import only_finite, squared_distance
 
 _CENTRES, _CHUNK = 16, 128  # of a ball query: centres per block, points per step
+_COLUMNS = 64  # of the last layer on neighbours, at a time
 
 
 def _power_of_two(count: int) -> int:
@@ -111,3 +113,51 @@ def _query(points: Any, centres: Any, squared_radius: Any, found: Any, *, k: int
     slot = jnp.broadcast_to(jnp.arange(_power_of_two(k), dtype=jnp.int32)[None, :], (_CENTRES, _power_of_two(k)))
     filler = jnp.where(first < points.shape[0], first, 0)
     keep(slot, filler[:, None], (slot >= counts[:, None]) & (slot < k))
+
+
+def largest_of_neighbours(
+    passed: Float[Array, "points columns"],
+    offsets: Float[Array, "centres columns"],
+    neighbours: Int[Array, "centres samples"],
+    *layers: Array,
+    k: int,
+    interpret: bool = False,
+) -> Float[Array, "centres outputs"]:
+    """`models.neighbours.largest_of_neighbours`, one block a centre; `interpret` runs it slowly on any device."""
+    centres, outputs = neighbours.shape[0], layers[-1].shape[0]
+    return pl.pallas_call(
+        partial(_largest, k=k),
+        out_shape=jax.ShapeDtypeStruct((centres, outputs), passed.dtype),
+        grid=(centres,),
+        compiler_params=triton.CompilerParams(num_warps=8, num_stages=1),
+        interpret=interpret,
+        name="largest_of_neighbours",
+    )(passed, offsets, neighbours, *layers)
+
+
+def _largest(passed: Any, offsets: Any, neighbours: Any, *layers_and_found: Any, k: int) -> None:
+    """Kernel of `largest_of_neighbours`: writes the maxima of one centre to `found`."""
+    *layers, found = layers_and_found
+    centre, count = pl.program_id(0), passed.shape[1]
+    columns = jnp.arange(max(16, _power_of_two(count)), dtype=jnp.int32)  # a product takes at least 16
+    kept = columns < count
+    rows = neighbours[centre, :]
+    x = triton.load(passed.at[rows[:, None], columns[None, :]], mask=kept[None, :] & (rows >= 0)[:, None], other=0.0)
+    x -= triton.load(offsets.at[centre, columns], mask=kept, other=0.0)[None, :]
+    if k:
+        factor, bias, *layers = layers
+        x = jnp.maximum(x * factor[:][None, :] + bias[:][None, :], 0)
+
+    def layer(x: Array, first: int, of: Array) -> Array:
+        kernel, factor, bias = layers[first : first + 3]
+        number = jnp.arange(x.shape[1], dtype=jnp.int32)[:, None]
+        inside = (number < kernel.shape[0]) & (of >= 0)[None, :]
+        x = pl.dot(x, triton.load(kernel.at[number, of[None, :]], mask=inside, other=0.0))
+        return jnp.maximum(x * factor[of][None, :] + bias[of][None, :], 0)
+
+    last = len(layers) - 3
+    for first in range(0, last, 3):
+        x = layer(x, first, jnp.arange(layers[first + 1].shape[0], dtype=jnp.int32))
+    for start in range(0, found.shape[1], _COLUMNS):
+        of = start + jnp.arange(min(_COLUMNS, found.shape[1]), dtype=jnp.int32)
+        triton.store(found.at[centre, of], jnp.max(layer(x, last, of), axis=0))

@@ -18,6 +18,7 @@ from jax.core import ShapedArray
 from jax.extend.core import Primitive
 from jax.interpreters import batching, mlir, xla
 from jax.sharding import AbstractMesh, AxisType, PartitionSpec
+from jax.typing import DTypeLike
 from jaxtyping import Array
 
 _KERNELS = {"cuda": "mevs_jax.points.kernels", "tpu": "mevs_jax.points.mosaic"}
@@ -25,20 +26,25 @@ _KERNELS = {"cuda": "mevs_jax.points.kernels", "tpu": "mevs_jax.points.mosaic"}
 
 
 def with_kernels(
-    name: str, arrays: Callable[..., Array], *, arrays_on_tpu: Callable[..., Array] | None = None
+    name: str,
+    arrays: Callable[..., Array],
+    *,
+    arrays_on_tpu: Callable[..., Array] | None = None,
+    dtype: DTypeLike = jnp.int32,
 ) -> Callable[..., Array]:
     """Returns an operation, a function of arrays and, by name, of a number `k` and the shape of its result.
 
-    The result is of int32, and no gradient passes.
+    No gradient passes.
 
     Args:
         name: of the operation, and of its kernels in the modules that have one.
         arrays: the operation as an array program.
         arrays_on_tpu: the same for a TPU, where that is another program.
+        dtype: of the result.
     """
     primitive = Primitive(name)
     primitive.def_impl(partial(xla.apply_primitive, primitive))
-    primitive.def_abstract_eval(lambda *_, shape, **__: ShapedArray(shape, jnp.int32))
+    primitive.def_abstract_eval(lambda *_, shape, **__: ShapedArray(shape, dtype))
 
     def batched(given: Sequence[Array], mapped: Sequence[int | None], *, k: int, shape: tuple, axes: tuple) -> Any:
         count = next(array.shape[axis] for array, axis in zip(given, mapped, strict=True) if axis is not None)

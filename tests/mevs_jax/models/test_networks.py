@@ -191,8 +191,8 @@ def test_directions_stand_in_the_place_of_the_normals(random):
     np.testing.assert_allclose(found, nothing, rtol=1e-5, atol=1e-6)
     assert embedded.shape == (1024,)
     hidden = embedded
-    for weights, bias in network.head.folded():
-        hidden = jax.nn.relu(hidden @ weights + bias)
+    for weights, factor, bias in network.head.layers():
+        hidden = jax.nn.relu(hidden @ weights * factor + bias)
     np.testing.assert_allclose(network.out(hidden), found, rtol=1e-4, atol=1e-6)
     seen = outputs(network, np.concatenate([cloud, directions], axis=1))
     assert np.abs(np.asarray(seen - nothing)).max() > 1e-3
