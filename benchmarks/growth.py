@@ -78,9 +78,9 @@ def evaluate(folder: Path, objects: int) -> None:
     """Walks from every start view by two policies on made-up tables, and what the whole grid is at each threshold."""
     random, shape = np.random.default_rng(0), (objects, VIEWS, CLASSES)
     tables = ViewTable(
-        jnp.asarray(random.normal(0, 2, shape), jnp.float32),
-        jnp.asarray(random.random((objects, VIEWS, VIEWS)), jnp.float32),
-        jnp.asarray(random.random((objects, VIEWS)), jnp.float32),
+        jnp.asarray(2 * random.standard_normal(shape, np.float32)),
+        jnp.asarray(random.random((objects, VIEWS, VIEWS), np.float32)),
+        jnp.asarray(random.random((objects, VIEWS), np.float32)),
         jnp.asarray(np.arange(objects) % CLASSES, jnp.int32),
     )
     graph, policies = (

@@ -153,7 +153,9 @@ def run_grid(
         own = policy.draws(draws)
         shared, at_once = (key, as_tree(policy.score), graph, knowledge, reachable), min(256, most // (starts * own))
         found = over_objects(results_of_object, objects, *shared, at_once=at_once, draws=own, max_views=max_views)
-        return jax.tree.map(lambda leaf: jnp.asarray(leaf.swapaxes(0, 1)), found)
+        leaves, structure = jax.tree.flatten(found)
+        del found  # with many objects, results are large: each array is freed once it is on the device
+        return jax.tree.unflatten(structure, [jnp.asarray(leaves.pop(0).swapaxes(0, 1)) for _ in range(len(leaves))])
 
     with ThreadPoolExecutor(programs_at_once()) as pool:  # a program is compiled on one core
         return dict(zip([policy.name for policy in policies], pool.map(results, policies), strict=True))

@@ -21,7 +21,7 @@ from data_pipeline.processes import usable_cpus
 
 _MOST_AT_ONCE = 16
 """The most programs side by side, because each needs memory of its own."""
-_CHUNKS_IN_PROGRAM = 64
+_CHUNKS_IN_PROGRAM = 8
 """The most chunks in one call of a program, whose objects and results are on the device together."""
 
 
@@ -71,16 +71,16 @@ def over_objects(
     parts = [firsts[number] for number in own] or [0]  # a process without a part still needs shapes
     if min(threads, len(parts)) > 1:
         run = _run.lower(*program, given(parts[0])).compile()  # once, not by every thread
+    leaves: list[np.ndarray] = []
     with ThreadPoolExecutor(threads) as pool:
-        done = list(pool.map(lambda first: jax.device_get(run(given(first))), parts))
-
-    def joined(*leaves: np.ndarray) -> np.ndarray:
-        found = np.stack(leaves)
-        if by_all:
-            found = from_all(found[: len(own)], len(firsts))
-        return found.reshape(-1, *found.shape[2:])[:count]
-
-    return jax.tree.map(joined, *done)
+        for place, part in enumerate(pool.map(lambda first: jax.device_get(run(given(first))), parts)):
+            some, structure = jax.tree.flatten(part)
+            leaves = leaves or [np.empty((len(parts), *leaf.shape), leaf.dtype) for leaf in some]
+            for leaf, values in zip(leaves, some, strict=True):  # each part is freed once it has its place
+                leaf[place] = values
+    if by_all:
+        leaves = [from_all(leaf[: len(own)], len(firsts)) for leaf in leaves]
+    return jax.tree.unflatten(structure, [leaf.reshape(-1, *leaf.shape[2:])[:count] for leaf in leaves])
 
 
 def _mesh() -> Mesh:
