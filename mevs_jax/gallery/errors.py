@@ -80,12 +80,6 @@ def parted(kept: Float[Array, "*batch kept"]) -> tuple[Array, Array, Array]:
     return kept[..., 0], kept[..., 1 : 1 + ERRORS], kept[..., 1 + ERRORS :]
 
 
-def matrix_of(gram: Float[Array, "*batch pairs"]) -> Float[Array, "*batch errors errors"]:
-    first, second = PAIRS.T
-    empty = jnp.zeros((*gram.shape[:-1], ERRORS, ERRORS))
-    return empty.at[..., first, second].set(gram).at[..., second, first].set(gram)
-
-
 def unexplained(
     square: Float[Array, "*batch"],
     lean: Float[Array, "*batch errors"],
@@ -99,18 +93,36 @@ def unexplained(
         gram: means over views; its shape must broadcast to that of `square`.
         count: number of views.
     """
-    # By Cholesky's decomposition, written out: libraries call a routine for each of many tiny matrices.
+    return jnp.maximum(square - sum(one**2 for one in _reduced(lean, gram, count)[1]), 0.0)
+
+
+def likeliest(
+    lean: Float[Array, "*batch errors"], gram: Float[Array, "*batch pairs"], count: float | Float[AnyArray, ""]
+) -> Float[Array, "*batch errors"]:
+    """The common error that `unexplained` takes away, in standard deviations."""
+    lower, reduced = _reduced(lean, gram, count)
+    found: dict[int, Array] = {}
+    for row in reversed(range(ERRORS)):
+        rest = sum((lower[k, row] * found[k] for k in range(row + 1, ERRORS)), jnp.zeros(()))
+        found[row] = (reduced[row] - rest) / lower[row, row]
+    return jnp.stack([found[row] for row in range(ERRORS)], axis=-1)
+
+
+def _reduced(
+    lean: Float[Array, "*batch errors"], gram: Float[Array, "*other pairs"], count: float | Float[AnyArray, ""]
+) -> tuple[dict[tuple[int, int], Array], list[Array]]:
+    """The entries of `L`, where `L Lᵀ` is the gram with the cost of errors (Cholesky), and those of `L⁻¹ lean`."""
+    # Written out: libraries call a routine for each of many tiny matrices. On a CPU, that of JAX also waits for threads that are
+    # needed to run it, so that two programs side by side may wait for ever.
     entry = {(int(b), int(a)): gram[..., place] for place, (a, b) in enumerate(PAIRS)}
     lower: dict[tuple[int, int], Array] = {}
-    solved: list[Array] = []
-    left = square
+    reduced: list[Array] = []
     for row in range(ERRORS):
         for column in range(row):
             rest = sum((lower[row, k] * lower[column, k] for k in range(column)), jnp.zeros(()))
             lower[row, column] = (entry[row, column] - rest) / lower[column, column]
         rest = sum((lower[row, k] ** 2 for k in range(row)), jnp.zeros(()))
         lower[row, row] = jnp.sqrt(jnp.maximum(entry[row, row] - rest, 0.0) + HELD / count)
-        rest = sum((lower[row, k] * solved[k] for k in range(row)), jnp.zeros(()))
-        solved.append((lean[..., row] - rest) / lower[row, row])
-        left = left - solved[-1] ** 2
-    return jnp.maximum(left, 0.0)
+        rest = sum((lower[row, k] * reduced[k] for k in range(row)), jnp.zeros(()))
+        reduced.append((lean[..., row] - rest) / lower[row, row])
+    return lower, reduced

@@ -23,7 +23,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int, UInt8
 
 from mevs_jax.arrays import AnyArray
-from mevs_jax.gallery.errors import ERRORS, HELD, KEPT, gram_of, matrix_of, parted, slopes, unexplained
+from mevs_jax.gallery.errors import ERRORS, KEPT, gram_of, likeliest, parted, slopes, unexplained
 from mevs_jax.geometry.cameras import look_at_origin
 
 SIDE = 16
@@ -303,7 +303,7 @@ class Gallery:
         )
         slope = slope.reshape(*features.shape[:2], ERRORS, -1)
         # What a view would show if a hypothesis were true, with the error of the sphere that its views so far speak for.
-        off = jnp.linalg.solve(matrix_of(gram) + HELD * jnp.eye(ERRORS), lean[..., None])[..., 0]
+        off = likeliest(lean, gram, 1.0)
         image = features - jnp.einsum("me,cmef->cmf", off, slope)
         number = features.shape[-1]
         squares = [jnp.sum(jnp.square(one), axis=-1) / number for one in (image, features)]
