@@ -54,6 +54,14 @@ def read_frames(
     return stacked(kept, notes, known)
 
 
+def is_recording(path: Path) -> bool:
+    """Whether a file or folder looks like a recording that `read_frames` reads."""
+    if path.is_dir():
+        content = "scene_camera.json", "depth.txt", "frame-*.depth.png", "*.pcd"
+        return is_bag(path) or any(any(path.glob(form)) for form in content)
+    return path.suffix.lower() == ".npz" or is_bag(path)
+
+
 def _split(path: str) -> tuple[Path, str]:
     """A path, and the number of an object or the topics after #."""
     before, _, after = path.rpartition("#")

@@ -139,6 +139,8 @@ class DataOptions(WithViews, WithOthers):
 
     beam: Annotated[str | None, _arg("OPTIONS")] = None
     """use Apache Beam with these pipeline options, as --beam=--runner=DirectRunner (docs/scaling.md)"""
+    frames: Annotated[Path | None, _arg("FOLDER")] = None
+    """make the data set of recorded objects: posed depth images FOLDER/CLASS/OBJECT, fused into meshes (docs/frames.md)"""
 
 
 @dataclass(frozen=True)

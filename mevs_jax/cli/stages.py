@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 from contextlib import nullcontext
+from dataclasses import replace
 from functools import partial
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 from mevs_jax.cli.failure import Unusable
@@ -68,7 +70,10 @@ def data(call: Invocation) -> None:
 
     if call.options.beam and call.options.distributed:
         raise DataError("--beam has workers of its own; leave out --distributed")
-    statistics = make_data(call.settings, call.out, call.options.beam)
+    settings = call.settings
+    if call.options.frames is not None:
+        settings = replace(settings, dataset=replace(settings.dataset, source=str(_recorded(call))))
+    statistics = make_data(settings, call.out, call.options.beam)
     counts = ", ".join(f"{sum(of.values())} {split}" for split, of in statistics.counts.items())
     print(f"Data set: {counts} objects of {len(statistics.classes)} classes, {statistics.views} views each")
     if is_first():
@@ -77,6 +82,21 @@ def data(call: Invocation) -> None:
         print(
             "On it, each object should be whole and stand upright along its arrow; sizes should be of one unit (--dataset.up)"
         )
+
+
+def _recorded(call: Invocation) -> Path:
+    """The folder of meshes that recordings are fused into."""
+    from data_pipeline.errors import DataError
+    from data_pipeline.objects.recorded import meshes_of_recordings
+
+    if call.options.data is not None or call.options.distributed:
+        raise DataError("--frames makes the data set alone, by one process; leave out --data and --distributed")
+    made = meshes_of_recordings(call.options.frames, call.out / "meshes")
+    for one in made:
+        for note in one.left_out:
+            print(f"Note: {one.mesh}: {note}")
+    print(f"Fused {sum(one.images for one in made)} images into {len(made)} meshes: {call.out / 'meshes'}")
+    return call.out / "meshes"
 
 
 def train(call: Invocation) -> None:

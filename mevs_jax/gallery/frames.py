@@ -43,15 +43,24 @@ def images_of_frames(
     Raises:
         ValueError: if nothing of the object is in a frame.
     """
+    field = fused(frames, sphere)
+    poses = np.asarray(camera.around(grid_directions()).pose).reshape(HEIGHTS, YAWS, 4, 4)
+    rows = [_images(field, jnp.asarray(row), camera) for row in poses]
+    return np.asarray(jnp.stack(rows)).reshape(HEIGHTS, YAWS, PIXELS)
+
+
+def fused(frames: Sequence[DepthImage], sphere: Sphere) -> Float[Array, "grid grid grid"]:
+    """The signed distance from an object's surface in units of a band around it, from −1 to 1, in the cube around its sphere.
+
+    It is positive outside, and NaN where no image has shown what is. Arguments and errors as of `images_of_frames`.
+    """
     total, weight = jnp.zeros((GRID,) * 3), jnp.zeros((GRID,) * 3)
     for number, frame in enumerate(frames, 1):
         depth, K, pose, floor = _prepared(frame, sphere)
         total, weight, hits = _fused(total, weight, depth, K, pose, floor)
         if not int(hits):
             raise ValueError(f"frame {number} shows nothing inside the object's sphere")
-    poses = np.asarray(camera.around(grid_directions()).pose).reshape(HEIGHTS, YAWS, 4, 4)
-    rows = [_images(total, weight, jnp.asarray(row), camera) for row in poses]
-    return np.asarray(jnp.stack(rows)).reshape(HEIGHTS, YAWS, PIXELS)
+    return jnp.where(weight > 0, total / jnp.maximum(weight, 1), jnp.nan)
 
 
 def _prepared(frame: DepthImage, sphere: Sphere) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.float32]:
@@ -105,13 +114,9 @@ def _fused(
 
 @partial(jax.jit, static_argnames="camera")
 def _images(
-    total: Float[Array, "grid grid grid"],
-    weight: Float[Array, "grid grid grid"],
-    poses: Float[Array, "cameras 4 4"],
-    camera: ViewCamera,
+    field: Float[Array, "grid grid grid"], poses: Float[Array, "cameras 4 4"], camera: ViewCamera
 ) -> UInt8[Array, "cameras pixels"]:
     """What cameras would see of the grid, as a gallery holds it."""
-    field = jnp.where(weight > 0, total / jnp.maximum(weight, 1), jnp.nan)
     return jax.lax.map(lambda pose: stored_image(_seen(field, pose, camera), camera.distance), poses)
 
 

@@ -10,6 +10,7 @@ import pytest
 from mevs_jax.trained import load, save
 from tests.cli.conftest import ended
 from tests.data_pipeline.frames import forms
+from tests.data_pipeline.objects.test_recorded import recorded
 from tests.eval.checks import test_frames as rooms
 from tests.mevs_jax.gallery.conftest import CAMERA, matcher  # noqa: F401
 from tests.mevs_jax.trained import making
@@ -112,3 +113,25 @@ def test_a_recording_is_checked_and_its_fault_named(at_once, refuses, tmp_path):
     assert "room.npz: inverse poses: they are world to camera: invert them" in refuses(*check)
     assert "no two cameras look the same way" in refuses("check", "frames", forms.seven_scenes(tmp_path / "scan"))
     assert "check.txt is no .png" in refuses(*check, "--draw", tmp_path / "check.txt")
+
+
+@pytest.mark.slow
+def test_a_data_set_is_made_of_recordings(tmp_path, at_once):
+    for number in range(6):
+        path = tmp_path / "in" / ("ball", "globe")[number % 2] / f"{number}.npz"
+        recorded(path, radius=np.array((1.2 + number / 20) * forms.RADIUS))
+    command = (
+        "data",
+        "--preset",
+        "tiny",
+        "--frames",
+        tmp_path / "in",
+        "--out",
+        tmp_path / "run",
+        "--dataset.split",
+        0.7,
+    )
+    said = ended(at_once(*command))
+    assert "Fused 18 images into 6 meshes" in said
+    assert said.count("1 of 4 images do not show the object") == 6
+    assert "objects of 2 classes" in said
