@@ -101,9 +101,7 @@ def realistic_views(
         in, around the believed centre.
     """
     depth, poses = metric_depth(batch["depth"]), batch["pose"]
-    either, of_objects, of_views = jax.random.split(key, 3)
-    objects = jnp.repeat(jax.random.split(of_objects, len(depth) // views), views)
-    keys = jax.random.split(of_views, len(depth))
+    either, objects, keys = keys_of(key, len(depth), views)
 
     def by(kind: Kind) -> Callable[[], tuple[Array, Array]]:
         one = partial(as_in_reality, camera=camera, config=config, kind=kind, radius=radius)
@@ -112,6 +110,21 @@ def realistic_views(
     if config.sensor == "any":
         return jax.lax.cond(jax.random.bernoulli(either), by("structured-light"), by("stereo"))
     return by(config.sensor)()
+
+
+def keys_of(key: Array, images: int, views: int) -> tuple[Array, Array, Array]:
+    """The keys of a batch of images: of its sensor, and for each image of its object and its own."""
+    either, of_objects, of_views = jax.random.split(key, 3)
+    objects = jnp.repeat(jax.random.split(of_objects, images // views), views)
+    return either, objects, jax.random.split(of_views, images)
+
+
+def sphere_error(of_object: Array, config: RealityAugmentation) -> tuple[Float[Array, "3"], Float[Array, ""]]:
+    """The believed centre of an object less the true one, and the believed radius, in true radii."""
+    amount, _, where, size = jax.random.split(of_object, 4)
+    strength = config.strength * jax.random.uniform(amount)
+    offset = jax.random.ball(where, 3) * strength * config.sphere
+    return offset, 1 + strength * config.sphere * jax.random.uniform(size, minval=-1.0)
 
 
 def as_in_reality(
@@ -133,7 +146,7 @@ def as_in_reality(
         pose: camera to object.
     """
     hide, cut, noise = jax.random.split(key, 3)
-    amount, surface, where, size = jax.random.split(of_object, 4)
+    amount, surface, _, _ = jax.random.split(of_object, 4)
     depth, pose = jnp.asarray(depth, jnp.float32), jnp.asarray(pose, jnp.float32)
     strength = config.strength * jax.random.uniform(amount)
     depth = hidden(hide, depth, jnp.minimum(strength * config.hidden, 0.9))
@@ -147,8 +160,7 @@ def as_in_reality(
         unknown |= unseen_part(jax.random.fold_in(noise, 1), in_sphere(camera, len(depth)), config.unseen)
         unknown |= (sensed == 0) & jax.random.bernoulli(jax.random.fold_in(noise, 2), _BARE)
     depth = jnp.asarray(jax.lax.optimization_barrier(jnp.where(unknown, jnp.nan, sensed)))
-    offset = jax.random.ball(where, 3) * strength * config.sphere
-    factor = 1 + strength * config.sphere * jax.random.uniform(size, minval=-1.0)
+    offset, factor = sphere_error(of_object, config)
     believed = pose[:3, 3] - offset
     believed = look_at_origin(camera.distance * believed / jnp.linalg.norm(believed))
     depth = around_another_sphere(depth, pose, camera, offset, factor)
@@ -235,17 +247,26 @@ def around_another_sphere(
         factor: believed radius in true radii.
     """
     side, distance = len(depth), camera.distance
-    pinhole = camera.at(jnp.eye(4), side)
-    towards = (pose[:3, 3] - offset) / factor
+    towards, turned, rays, old, pixel, inside = seen_anew(side, pose, camera, offset, factor)
     away = jnp.linalg.norm(towards)  # in believed radii
-    turned = look_at_origin(towards)[:3, :3]
-    rays = pixel_directions(pinhole) * jnp.stack([distance / away, distance / away, jnp.float32(1)])
-    old = rays @ (pose[:3, :3].T @ turned).T  # in the old camera's frame
-    pixel = jnp.floor(old[..., :2] / old[..., 2:] * pinhole.focal_length + side / 2).astype(jnp.int32)
-    inside = jnp.all((pixel >= 0) & (pixel < side), axis=-1) & (old[..., 2] > 0)
-    pixel = jnp.clip(pixel, 0, side - 1)
     sampled = jnp.where(inside, depth[pixel[..., 1], pixel[..., 0]], 0.0)
     along = sampled / old[..., 2] / factor  # new depth, from where the camera is
     point = rays * along[..., None] + turned.T @ towards  # from the believed centre, in the new camera's axes
     kept = (sampled > 0) & (jnp.linalg.norm(point, axis=-1) < 1 + MARGIN)  # as in `mevs_jax.canonical_view`
     return jnp.where(jnp.isnan(sampled), jnp.nan, jnp.where(kept, along + distance - away, 0.0))
+
+
+def seen_anew(
+    side: int, pose: Float[Array, "4 4"], camera: ViewCamera, offset: Float[Array, "3"], factor: float | Array
+) -> tuple[Array, ...]:
+    """The camera's place around a wrong centre, its axes and rays there; for each ray that of the old camera, the pixel there
+    (column and row), and whether the old image has it."""
+    pinhole = camera.at(jnp.eye(4), side)
+    towards = (pose[:3, 3] - offset) / factor
+    turned = look_at_origin(towards)[:3, :3]
+    nearer = camera.distance / jnp.linalg.norm(towards)
+    rays = pixel_directions(pinhole) * jnp.stack([nearer, nearer, jnp.float32(1)])
+    old = rays @ (pose[:3, :3].T @ turned).T  # in the old camera's frame
+    pixel = jnp.floor(old[..., :2] / old[..., 2:] * pinhole.focal_length + side / 2).astype(jnp.int32)
+    inside = jnp.all((pixel >= 0) & (pixel < side), axis=-1) & (old[..., 2] > 0)
+    return towards, turned, rays, old, jnp.clip(pixel, 0, side - 1), inside
