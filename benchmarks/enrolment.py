@@ -28,7 +28,8 @@ from data_pipeline.objects.mesh import Mesh
 from data_pipeline.objects.sources import load_object, objects_to_test
 from eval.checks.instances import CONDITIONS, VIEWS, Seen, seen_with_errors
 from eval.checks.walks import Observer, beliefs_along
-from mevs_jax.gallery.matching import STEPS, WEIGHTS, interpolated, small_image
+from mevs_jax.gallery.grid import STEPS, interpolated
+from mevs_jax.gallery.matching import WEIGHTS, small_image
 from mevs_jax.trained import TrainedSystem
 from train.tasks.matcher import MatcherConfig, kinds_in_turn, sighted, turned_rig
 

@@ -228,12 +228,14 @@ class Agent:
         *,
         mask: AnyArray | None = None,
         floor: float | None = None,
+        image: AnyArray | None = None,
     ) -> Belief:
         """Adds a view of the object, taken from anywhere, by any depth camera.
 
         Args:
             depth, K, T_world_camera: as of `DepthImage`, whose `pose` is that of the camera at the time of the image.
             mask, floor: as of `DepthImage`; without, all that is inside the object's sphere belongs to it.
+            image: colours at the depth's pixels, as of `DepthImage`; a system that does not compare colours leaves them out.
 
         Returns:
             The belief after this view.
@@ -241,7 +243,7 @@ class Agent:
         Raises:
             ValueError: for an input that cannot be used, or beyond `max_views`.
         """
-        return self.see(DepthImage(depth, K, T_world_camera, mask, floor))
+        return self.see(DepthImage(depth, K, T_world_camera, mask, floor, image))
 
     @_one_at_a_time
     def see(self, image: DepthImage) -> Belief:
@@ -251,13 +253,11 @@ class Agent:
         if of.points is None:
             view = of.with_parts(self.system, image, of.seen(self.system, image, self.history))
         else:
-            has_edge = image.mask is not None or image.floor is not None
-            _check(
-                has_edge, "an object of unknown size needs a mask of its pixels or a floor, to be told from the rest"
-            )
+            edge = "an object of unknown size needs a mask of its pixels or a floor, to be told from the rest"
+            _check(image.mask is not None or image.floor is not None, edge)
             of, view = of.refined(self.system, image.copy(), self.history)
             self._object = of
-        return self._add(view.image, of.placed(self.system, view), view.unknown, begun, view.doubt)
+        return self._add((view.image, view.colours), of.placed(self.system, view), view.unknown, begun, view.doubt)
 
     @property
     def belief(self) -> Belief | None:
@@ -280,32 +280,37 @@ class Agent:
         return self.sphere.radius
 
     @_one_at_a_time
-    def observe_view(self, depth: Float[np.ndarray, "side side"], pose: Float[np.ndarray, "4 4"]) -> Belief:
+    def observe_view(
+        self,
+        depth: Float[np.ndarray, "side side"],
+        pose: Float[np.ndarray, "4 4"],
+        colours: Float[np.ndarray, "side side 3"] | None = None,
+    ) -> Belief:
         """Adds a view that the system's own camera has taken, as it is in the data set.
 
         Args:
             depth: in radii of the object along the optical axis, 0 where nothing is hit, NaN where it is unknown what is there.
             pose: from the camera to the object's frame, whose unit is the radius.
+            colours: at the same pixels from 0 to 1, NaN where unknown.
         """
         begun, of = time.perf_counter(), self._current
         self._check_budget()
         _check(of.points is None, "an object of unknown size is seen by observe alone, in metres")
-        image, placed = own_view(depth, pose, self.system)
+        image, placed, seen = own_view(depth, pose, self.system, colours)
         check_new(image, placed, self.history)
         unknown = share_of_sphere(np.isnan(image), self.system.description.camera)
-        told = self.system.description.told_unknown
-        _check(told or unknown <= 0.5, f"{unknown:.0%} of the object's sphere is unknown; this system needs half of it")
-        return self._add(image, placed, unknown, begun)
+        enough = self.system.description.told_unknown or unknown <= 0.5
+        _check(enough, f"{unknown:.0%} of the object's sphere is unknown; this system needs half of it")
+        return self._add((image, seen), placed, unknown, begun)
 
     def _check_budget(self) -> None:
-        _check(
-            self._current.belief is None or self._current.belief.images < self.max_views,
-            f"the budget of {self.max_views} views is spent; call reset, or make the agent with max_views above it",
-        )
+        left = self._current.belief is None or self._current.belief.images < self.max_views
+        spent = f"the budget of {self.max_views} views is spent; call reset, or make the agent with max_views above it"
+        _check(left, spent)
 
-    def _add(self, depth: np.ndarray, pose: np.ndarray, unseen: float, begun: float, doubt: str = "") -> Belief:
-        of = self._current
-        of.memory, said = of.programs.see(self.system.parts, of.memory, depth, pose, of.known_radius)
+    def _add(self, seen: tuple[Any, Any], pose: np.ndarray, unseen: float, begun: float, doubt: str = "") -> Belief:
+        of, (depth, colours) = self._current, seen
+        of.memory, said = of.programs.see(self.system.parts, of.memory, depth, pose, of.known_radius, colours)
         (probabilities, strangeness, yaws), count, slot = jax.device_get((said, of.memory.count, of.memory.latest))
         label = int(probabilities.argmax())
         of.shown[int(slot)] = 1 - unseen
@@ -324,9 +329,7 @@ class Agent:
             doubt=doubt,
             latency_ms=1e3 * (time.perf_counter() - begun),
         )
-        self.history.depths.append(depth)
-        self.history.poses.append(pose)
-        self.history.events.append({"call": "observe", "belief": plain(belief)})
+        self.history.add(depth, pose, colours, plain(belief))
         of.belief = belief
         return belief
 
@@ -430,10 +433,8 @@ class Agent:
         if pose is None or np.shape(pose) != (4, 4):
             raise ValueError("mark_failed needs a step that has a pose, or a pose (4, 4)")
         away = pose[:3, 3] - of.sphere.position
-        _check(
-            bool(np.isfinite(away).all() and np.linalg.norm(away) > 1e-9),
-            "mark_failed needs a pose of finite numbers, away from the object's centre",
-        )
+        usable = bool(np.isfinite(away).all() and np.linalg.norm(away) > 1e-9)
+        _check(usable, "mark_failed needs a pose of finite numbers, away from the object's centre")
         of.failed.append(of.towards(pose) @ of.sphere.rotation)
         self.history.events.append({"call": "mark_failed", "direction": of.failed[-1].tolist()})
 

@@ -18,11 +18,13 @@ from mevs_jax.agent.present import LEAST, check_shown
 from mevs_jax.agent.records import Belief, History, Reason, Step
 from mevs_jax.arguments import number, numbers, whole
 from mevs_jax.arrays import ByContent
+from mevs_jax.gallery.meshes import caster_of, painted, seen_of
 from mevs_jax.geometry.cameras import ViewCamera, look_at_origin
 from mevs_jax.geometry.canonical import share_of_sphere
 from mevs_jax.geometry.source_view import DepthImage
 from mevs_jax.geometry.sphere import Sphere, estimate_sphere
 from mevs_jax.geometry.triangles import centred_triangles
+from mevs_jax.meshes.paint import Paint
 from mevs_jax.rendering.depth import pad_triangles, render_depth
 from mevs_jax.trained.system import TrainedSystem
 
@@ -83,6 +85,7 @@ def look(
     *,
     first: int | None = None,
     metres: float | None = None,
+    paint: Paint | None = None,
     **options: Any,
 ) -> Walk:
     """Recognises a mesh: renders it from the views that the agent chooses.
@@ -95,6 +98,7 @@ def look(
         faces: (faces, 3) indices of corners.
         first: index of the first view; by default the agent chooses it.
         metres: in one unit of the mesh, for a system that uses sizes; None if the size of the object is unknown.
+        paint: colours of the faces, for a system that compares them.
         options: of `mevs_jax.Agent`.
 
     Raises:
@@ -114,9 +118,13 @@ def look(
     yaw = None if unposed else 0.0
     agent.reset(center=(0.0, 0.0, 0.0), radius=known, yaw=yaw, true_size=metres is not None)
 
+    colours = paint.on(vertices, faces) if paint and system.description.colour else None
+    cast = caster_of(triangles) if colours else None
+
     def take(index: int) -> Belief:
         pose = np.asarray(look_at_origin(jnp.asarray(system.viewpoints[index]) * camera.distance))
-        return agent.observe_view(np.asarray(_depth(padded, jnp.asarray(pose), camera)), pose)
+        seen = painted(colours, *seen_of(cast, pose[None], camera)[1:])[0] if colours and cast else None
+        return agent.observe_view(np.asarray(_depth(padded, jnp.asarray(pose), camera)), pose, seen)
 
     return _walk(agent, agent.decide().index if first is None else first, take, agent.decide)
 
@@ -153,6 +161,7 @@ class Frames(ByContent):
         sphere: of the object.
         mask: (frames, height, width) True at the object's pixels, or None.
         floor: height of the supporting surface in the world along the object's upward direction, or None.
+        images: (frames, height, width, 3) colours at the depth's pixels, as of `DepthImage`, or None.
     """
 
     depth: Shaped[np.ndarray, "frames height width"]
@@ -161,10 +170,11 @@ class Frames(ByContent):
     sphere: Sphere
     mask: np.ndarray | None = None
     floor: float | None = None
+    images: np.ndarray | None = None
 
     @classmethod
     def of(cls, stored: dict[str, np.ndarray]) -> Frames:
-        """Frames from arrays by name: depth, K, T_world_camera; optionally center, radius, up, yaw, mask, floor.
+        """Frames from arrays by name: depth, K, T_world_camera; optionally center, radius, up, yaw, mask, floor, image.
 
         `K` may be one matrix for all frames. Without `center` and `radius`, they are estimated from the pixels in `mask`.
 
@@ -186,12 +196,18 @@ class Frames(ByContent):
             raise ValueError(
                 "center and radius of the object are needed, or a mask of its pixels to estimate them from"
             )
-        return cls(depth, K, poses, Sphere(center, radius, up, yaw), mask, _number(stored, "floor"))
+        images = stored.get("image")
+        if images is not None and np.shape(images) != (*depth.shape, 3):
+            raise ValueError(
+                f"image must be {(*depth.shape, 3)}, colours at the depth's pixels, got {np.shape(images)}"
+            )
+        return cls(depth, K, poses, Sphere(center, radius, up, yaw), mask, _number(stored, "floor"), images)
 
     def image(self, index: int) -> DepthImage:
         """One of them; raises `ValueError` if it cannot be used."""
         mask = None if self.mask is None else self.mask[index]
-        return DepthImage(self.depth[index], self.K[index], self.T_world_camera[index], mask, self.floor)
+        image = None if self.images is None else self.images[index]
+        return DepthImage(self.depth[index], self.K[index], self.T_world_camera[index], mask, self.floor, image)
 
     def shown(self, least: float = 0.0) -> Bool[np.ndarray, " frames"]:
         """Which of them show some points within the object's sphere.
@@ -229,7 +245,8 @@ class Frames(ByContent):
         """Some of them."""
         mask = None if self.mask is None else self.mask[chosen]
         depth, K, poses = self.depth[chosen], self.K[chosen], self.T_world_camera[chosen]
-        return Frames(depth, K, poses, self.sphere, mask, self.floor)
+        images = None if self.images is None else self.images[chosen]
+        return Frames(depth, K, poses, self.sphere, mask, self.floor, images)
 
 
 def read_arrays(path: Path) -> dict[str, np.ndarray]:
@@ -375,4 +392,5 @@ def replay(history: History, agent: Agent) -> list[Belief]:
     if not isinstance(options, dict) or not required <= set(options) <= {*required, "up", "yaw", "true_size"}:
         raise ValueError(f"the history has other options of its object than Agent.reset: {options!r:.80}")
     agent.reset(**options)
-    return [agent.observe_view(depth, pose) for depth, pose in zip(history.depths, history.poses, strict=True)]
+    views = zip(history.depths, history.poses, history.colours, strict=True)
+    return [agent.observe_view(*view) for view in views]

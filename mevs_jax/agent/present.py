@@ -16,6 +16,7 @@ from mevs_jax.arrays import AnyArray
 from mevs_jax.gallery.pose import ObjectPose, object_pose
 from mevs_jax.geometry.cameras import in_sphere
 from mevs_jax.geometry.canonical import CanonicalView, combined, convert
+from mevs_jax.geometry.colours import colours_of
 from mevs_jax.geometry.inputs import check_depth
 from mevs_jax.geometry.source_view import DepthImage
 from mevs_jax.geometry.sphere import Sphere, estimate_sphere, upright
@@ -196,9 +197,12 @@ class Present:
         views = [again.with_parts(system, one, convert(one, again.sphere, camera)) for one in self.images]
         poses = [again.placed(system, one) for one in views]
         for one, pose in zip(views, poses, strict=True):
-            again.memory, _ = self.programs.see(system.parts, again.memory, one.image, pose, again.known_radius)
+            again.memory, _ = self.programs.see(
+                system.parts, again.memory, one.image, pose, again.known_radius, one.colours
+            )
             again.shown[int(again.memory.latest)] = 1 - one.unknown
         history.depths[:], history.poses[:] = [one.image for one in views], poses
+        history.colours[:] = [one.colours for one in views]
         history.options["reset"] |= {"center": center.tolist(), "radius": float(radius)}
         return again, again.with_parts(system, image, newest)
 
@@ -213,8 +217,10 @@ def check_shown(depth: Float[np.ndarray, "side side"], system: TrainedSystem) ->
         )
 
 
-def own_view(depth: AnyArray, pose: AnyArray, system: TrainedSystem) -> tuple[np.ndarray, np.ndarray]:
-    """A view that the data set's camera has taken, and its pose, in float32; raises `ValueError` if they cannot be."""
+def own_view(
+    depth: AnyArray, pose: AnyArray, system: TrainedSystem, colours: AnyArray | None = None
+) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
+    """A view that the data set's camera has taken, its pose and colours, in float32; raises `ValueError` if they cannot be."""
     check_depth(depth, system.description.camera)
     image, placed = np.array(depth, np.float32), numbers(pose).astype(np.float32)
     side = system.description.camera.resolution
@@ -225,8 +231,11 @@ def own_view(depth: AnyArray, pose: AnyArray, system: TrainedSystem) -> tuple[np
         )
     if not (np.isfinite(placed).all() and placed[:3, 3].any()):
         raise ValueError("pose is not finite, or at the object's centre")
+    seen = None if colours is None else colours_of(colours, "colours")
+    if seen is not None and seen.shape != (side, side, 3):
+        raise ValueError(f"colours must be ({side}, {side}, 3), got {seen.shape}")
     check_shown(image, system)
-    return image, placed
+    return image, placed, seen
 
 
 def check_new(depth: Float[np.ndarray, "side side"], pose: Float[np.ndarray, "4 4"], history: History) -> None:

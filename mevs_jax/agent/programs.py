@@ -54,13 +54,14 @@ class Steps:
         pose: Float[Array, "4 4"],
         radius: Float[Array, ""],
         temperatures: Float[Array, " counts"],
+        colours: Float[Array, "side side 3"] | None = None,
     ) -> tuple[Memory, tuple[Array, Array, Array]]:
         """The memory after a view; calibrated probabilities, strangeness, and log-probabilities of the yaws of each object of a
         gallery.
 
         The radius is in metres, NaN if the size is unknown. The last of the temperatures holds for more views.
         """
-        seen = observe(parts, depth, pose, radius, self.description, self.entropy)
+        seen = observe(parts, depth, pose, radius, self.description, self.entropy, colours)
         direction = pose[:3, 3] / jnp.linalg.norm(pose[:3, 3])
         memory = remember(memory, seen, direction, fusion_of(parts, self.posed))
         at = jnp.clip(memory.count, 1, len(temperatures)) - 1
@@ -150,9 +151,20 @@ class Programs:
         self._see = _see(replace(self.steps, policy="", registered=None, target=None))  # the same for all policies
         self.choose = _choose(self.steps)
 
-    def see(self, parts: Parts, memory: Memory, depth: np.ndarray, pose: np.ndarray, radius: float) -> Any:
-        """`Steps.see_view`, compiled, with the temperatures of the policy."""
-        return self._see(parts, memory, depth, pose, np.float32(radius), self.temperatures(parts))
+    def see(
+        self,
+        parts: Parts,
+        memory: Memory,
+        depth: np.ndarray,
+        pose: np.ndarray,
+        radius: float,
+        colours: np.ndarray | None = None,
+    ) -> Any:
+        """`Steps.see_view`, compiled, with the temperatures of the policy. Colours are used where the system compares them."""
+        given = [np.float32(radius), self.temperatures(parts)]
+        if self.steps.description.colour:  # one program, with or without
+            given.append(np.full((*depth.shape, 3), np.nan, np.float32) if colours is None else colours)
+        return self._see(parts, memory, depth, pose, *given)
 
     def temperatures(self, parts: Parts) -> Float[Array, " counts"]:
         """The temperatures of the policy's walks; those of random ones for a policy without its own."""

@@ -91,6 +91,7 @@ class History(ByContent):
             the expected `gains` of all candidates, and their `directions` in the object's frame if they were given.
         depths: (views, side, side) the images that the networks received, in radii; those of parts are combined.
         poses: (views, 4, 4) their poses in the object's frame.
+        colours: (views, side, side, 3) their colours, from 0 to 1, NaN where unknown; None for an image without.
     """
 
     system: str
@@ -98,6 +99,7 @@ class History(ByContent):
     events: list[dict[str, Any]] = field(default_factory=list)
     depths: list[np.ndarray] = field(default_factory=list)
     poses: list[np.ndarray] = field(default_factory=list)
+    colours: list[np.ndarray | None] = field(default_factory=list)
 
     __hash__ = None  # type: ignore[assignment]  # it changes
 
@@ -111,11 +113,19 @@ class History(ByContent):
         """The belief after each view, as plain values."""
         return [event["belief"] for event in self.events if event["call"] == "observe"]
 
+    def add(self, depth: np.ndarray, pose: np.ndarray, colours: np.ndarray | None, belief: dict[str, Any]) -> None:
+        """Adds a view, and the belief after it."""
+        self.depths.append(depth)
+        self.poses.append(pose)
+        self.colours.append(colours)
+        self.events.append({"call": "observe", "belief": belief})
+
     def save(self, path: str | Path) -> None:
         """Writes the history into one `.npz` file, which `load_history` reads. Nothing in it is executed when it is read."""
         path = Path(path)
         text = json.dumps({"system": self.system, "options": self.options, "events": self.events}, default=float)
         side = self.depths[0].shape if self.depths else (0, 0)
+        colours: dict[str, Any] = {f"colours_{at}": one for at, one in enumerate(self.colours) if one is not None}
         content = io.BytesIO()
         np.savez_compressed(
             content,
@@ -123,6 +133,7 @@ class History(ByContent):
             text=np.array(text),
             depths=np.stack(self.depths) if self.depths else np.zeros((0, *side), np.float32),
             poses=np.stack(self.poses) if self.poses else np.zeros((0, 4, 4), np.float32),
+            **colours,
         )
         path.parent.mkdir(parents=True, exist_ok=True)
         made = path.with_name(f".{path.name}.{os.getpid()}")
@@ -148,6 +159,8 @@ def load_history(path: str | Path) -> History:
             text = json.loads(str(stored["text"]))
             history = History(text["system"], dict(text["options"]), list(text["events"]))
             depths, poses = np.asarray(stored["depths"], np.float32), np.asarray(stored["poses"], np.float32)
+            names = [f"colours_{number}" for number in range(len(depths))]
+            history.colours = [np.asarray(stored[name], np.float32) if name in stored else None for name in names]
     except FileNotFoundError:
         raise
     except Exception as error:  # the content of a damaged file decides which

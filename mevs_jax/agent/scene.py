@@ -133,6 +133,7 @@ class SceneAgent:
         *,
         labels: AnyArray | None = None,
         floor: float | None = None,
+        image: AnyArray | None = None,
     ) -> tuple[Belief | None, ...]:
         """Adds an image, as a view of every object that it shows.
 
@@ -141,7 +142,7 @@ class SceneAgent:
             labels: (height, width) whole numbers, as a detector gives them: 1 + number of the object that a pixel shows, 0 for
                 none. By default a point belongs to the sphere that it is in; where several overlap, to the one with the smallest
                 squared distance less squared radius.
-            floor: as of `DepthImage`.
+            floor, image: as of `DepthImage`.
 
         Returns:
             `beliefs`. Why an object was not seen is in `left_out`.
@@ -149,11 +150,11 @@ class SceneAgent:
         Raises:
             ValueError: for an input that cannot be used, or beyond `max_views`.
         """
-        image = DepthImage(depth, K, T_world_camera, None, floor).copy()
+        frame = DepthImage(depth, K, T_world_camera, None, floor, image).copy()
         if self.images >= self.max_views:
             raise ValueError(f"the budget of {self.max_views} images is spent; make the scene with max_views above it")
-        rows, columns = np.nonzero(image.measured)
-        points, named = image.points(), None if labels is None else self._named(labels, image)
+        rows, columns = np.nonzero(frame.measured)
+        points, named = frame.points(), None if labels is None else self._named(labels, frame)
         powers = np.stack([_power(points, sphere) for sphere in self.spheres])
         if named is None:
             is_object = powers.min(axis=0) <= 0
@@ -165,19 +166,19 @@ class SceneAgent:
         left_out = dict[int, str]()
         for number, agent in enumerate(self.agents):
             others = (powers[number] <= 0) & (owner >= 0) & (owner != number)
-            seen = np.array(image.depth)
+            seen = np.array(frame.depth)
             seen[rows[others], columns[others]] = 0  # what is there of this object is unknown
             mask = None
             if named is not None:
                 mask = named == number
                 mask[rows[others], columns[others]] = True
             try:
-                agent.see(replace(image, depth=seen, mask=mask))
+                agent.see(replace(frame, depth=seen, mask=mask))
             except ValueError as error:  # it does not show this object, or something that cannot be
                 left_out[number] = str(error)
             cells = self._cells(points[(powers[number] <= 0) & (owner == number)])
             self._held[number][tuple(cells.T)] = True
-        self._K, self._size = np.asarray(image.K, float), np.shape(image.depth)
+        self._K, self._size = np.asarray(frame.K, float), np.shape(frame.depth)
         self.left_out.append(left_out)
         return self.beliefs
 

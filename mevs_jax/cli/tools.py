@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from data_pipeline.frames.recording import Recording
     from mevs_jax.agent import Frames, Walk
     from mevs_jax.cli.options import EnrolOptions, ExportOptions, LookOptions, ReadingOptions, RecordingOptions
+    from mevs_jax.meshes.paint import Paint
     from mevs_jax.trained import TrainedSystem
 
 
@@ -52,9 +53,7 @@ def look(options: LookOptions) -> None:
     given = _agent_options(options)
     try:
         if mesh is not None:
-            from mevs_jax.agent import look as look_at_mesh
-
-            walk = look_at_mesh(system, *mesh, first=options.first, metres=options.metres or None, **given)
+            walk = _look_at_mesh(system, mesh, options, given)
         else:
             from mevs_jax.agent.present import LEAST
 
@@ -157,6 +156,15 @@ def _look_at_frames(
     return look_at_frames(agent, frames, first=first, usable=usable)
 
 
+def _look_at_mesh(
+    system: TrainedSystem, mesh: tuple[np.ndarray, np.ndarray], options: LookOptions, given: dict[str, Any]
+) -> Walk:
+    from mevs_jax.agent import look
+
+    paint = paint_of(options.mesh, *mesh) if options.mesh is not None and system.description.colour else None
+    return look(system, *mesh, first=options.first, metres=options.metres or None, paint=paint, **given)
+
+
 def as_json(walk: Walk, name: str) -> dict[str, Any]:
     """A walk as values that JSON can hold."""
     return {
@@ -183,6 +191,22 @@ def read_mesh(path: Path, up: str) -> tuple[np.ndarray, np.ndarray]:
         if str(path) in MODELNET10_CLASSES:
             return FurniturePiece(str(path), _UNSEEN).load()
     return mevs_jax.read_mesh(path, up)  # type: ignore[arg-type]
+
+
+def paint_of(path: Path, vertices: np.ndarray, faces: np.ndarray) -> Paint | None:
+    """The colours of a mesh file, if it has some that can be read; says what is missing."""
+    from mevs_jax.meshes.paint import read_paint
+
+    if not path.is_file():  # a built-in piece of furniture
+        return None
+    try:
+        paint = read_paint(path, vertices, faces)
+    except (ValueError, ImportError) as error:
+        print(f"Note: {error}; {path.name} is compared by its shape alone", file=sys.stderr)
+        return None
+    for note in () if paint is None else paint.notes:
+        print(f"Note: {note}", file=sys.stderr)
+    return paint
 
 
 def frames_in(path: Path, options: RecordingOptions) -> tuple[Frames, tuple[str, ...]]:
@@ -327,7 +351,9 @@ def _shape_of(path: Path, options: EnrolOptions) -> Any:
             raise Unusable(f"{path}: {error}") from error
     refuse_recording_options(options, f"the mesh {path}")
     vertices, faces = read_mesh(path, options.up)
-    return vertices * (options.metres or 1.0), faces
+    paint = paint_of(path, vertices, faces)
+    shape = vertices * (options.metres or 1.0), faces
+    return shape if paint is None else (*shape, paint)
 
 
 def export(options: ExportOptions) -> None:

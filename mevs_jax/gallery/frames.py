@@ -14,8 +14,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, UInt8
 
-from mevs_jax.gallery.matching import HEIGHTS, PIXELS, SIDE, YAWS, grid_directions, stored_image
+from mevs_jax.gallery.colours import stored_colours
+from mevs_jax.gallery.grid import HEIGHTS, SIDE, YAWS, grid_directions
+from mevs_jax.gallery.matching import stored_image
 from mevs_jax.geometry.cameras import ViewCamera, pixel_directions
+from mevs_jax.geometry.canonical import colours_from
 from mevs_jax.geometry.source_view import DepthImage
 from mevs_jax.geometry.sphere import Sphere, upright
 
@@ -32,8 +35,8 @@ _RESOLUTION = 2 * SIDE
 
 def images_of_frames(
     frames: Sequence[DepthImage], sphere: Sphere, camera: ViewCamera
-) -> UInt8[np.ndarray, "heights yaws pixels"]:
-    """Returns the images of an object for a gallery, from depth images of it.
+) -> tuple[UInt8[np.ndarray, "heights yaws pixels"], UInt8[np.ndarray, "heights yaws colours"] | None]:
+    """Returns the images of an object for a gallery, from depth images of it; and those of its colours if an image has some.
 
     Args:
         frames: at least one.
@@ -45,8 +48,14 @@ def images_of_frames(
     """
     field = fused(frames, sphere)
     poses = np.asarray(camera.around(grid_directions()).pose).reshape(HEIGHTS, YAWS, 4, 4)
-    rows = [_images(field, jnp.asarray(row), camera) for row in poses]
-    return np.asarray(jnp.stack(rows)).reshape(HEIGHTS, YAWS, PIXELS)
+    depths = np.stack([np.asarray(_depths(field, jnp.asarray(row), camera)) for row in poses])
+    stored = jax.jit(jax.vmap(lambda depth: stored_image(depth, camera.distance)))
+    images = np.stack([np.asarray(stored(row)) for row in depths])
+    if all(frame.image is None for frame in frames):
+        return images, None
+    apart = 2 * _BAND / GRID
+    coloured = [colours_from(frames, row, pose, camera, sphere, apart) for row, pose in zip(depths, poses, strict=True)]
+    return images, np.stack([np.asarray(stored_colours(row)) for row in coloured])
 
 
 def fused(frames: Sequence[DepthImage], sphere: Sphere) -> Float[Array, "grid grid grid"]:
@@ -113,11 +122,11 @@ def _fused(
 
 
 @partial(jax.jit, static_argnames="camera")
-def _images(
+def _depths(
     field: Float[Array, "grid grid grid"], poses: Float[Array, "cameras 4 4"], camera: ViewCamera
-) -> UInt8[Array, "cameras pixels"]:
-    """What cameras would see of the grid, as a gallery holds it."""
-    return jax.lax.map(lambda pose: stored_image(_seen(field, pose, camera), camera.distance), poses)
+) -> Float[Array, "cameras side side"]:
+    """What cameras would see of the grid; see `_seen`."""
+    return jax.lax.map(lambda pose: _seen(field, pose, camera), poses)
 
 
 def _seen(

@@ -14,8 +14,6 @@ What a wrong sphere and yaw explain of the differences, in all views alike, does
 
 from __future__ import annotations
 
-import math
-
 import flax.struct
 import jax
 import jax.numpy as jnp
@@ -23,22 +21,12 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int, UInt8
 
 from mevs_jax.arrays import AnyArray
+from mevs_jax.gallery.colours import ColourEvidence, Colours, small_colours
 from mevs_jax.gallery.errors import ERRORS, KEPT, gram_of, likeliest, parted, slopes, unexplained
-from mevs_jax.geometry.cameras import look_at_origin
+from mevs_jax.gallery.grid import HEIGHTS, SIDE, STEPS, UNKNOWN, YAWS, foreseen, grid_rotations, interpolated, of_walks
 
-SIDE = 16
-"""Pixels of the images of a gallery, along each side."""
 PIXELS = 2 * SIDE**2
 """Numbers of an image: the depth of each pixel, and the share of it that shows the object."""
-STEPS, UNKNOWN = 254, 255
-"""A stored number of 1, and one that is not known."""
-YAWS, HEIGHTS = 36, 13
-"""The grid of directions: azimuths, which are the yaws of the hypotheses too; and elevations from −90° to 90°."""
-_NEAR_POLE = math.radians(89.9)
-"""Elevation of the highest and lowest images: at a pole itself, no direction in an image is upwards."""
-_POLE = -math.pi / 2
-"""Azimuth from which a camera near the upper pole has the same image as one at it, and the negative of that at the lower one; see
-`mevs_jax.geometry.cameras.look_at_origin`."""
 MOST_HYPOTHESES = 64
 """The likeliest hypotheses, which the expected gain of a view is computed from."""
 WEIGHTS = np.repeat(np.array([1.0, 0.5], np.float32), SIDE**2)
@@ -51,23 +39,12 @@ _LEAST = 0.01
 """Smallest share of an image that counts as known."""
 
 
-def comparisons(objects: int) -> int:
-    """How many numbers are kept of a view: for each object, `KEPT` for each yaw and one for its size; and what the view shows."""
-    return objects * (YAWS * KEPT + 1) + 1
+def comparisons(objects: int, colour: bool = False) -> int:
+    """How many numbers are kept of a view: for each object, `KEPT` for each yaw and one for its size; and what the view shows.
 
-
-def grid_directions() -> Float[np.ndarray, "cells 3"]:
-    """Unit vectors from an object to the cameras of its gallery, azimuths within elevations."""
-    elevation = np.linspace(-np.pi / 2, np.pi / 2, HEIGHTS).clip(-_NEAR_POLE, _NEAR_POLE)[:, None]
-    azimuth = 2 * np.pi * np.arange(YAWS) / YAWS
-    flat, up = np.cos(elevation), np.broadcast_to(np.sin(elevation), (HEIGHTS, YAWS))
-    return np.stack([flat * np.cos(azimuth), flat * np.sin(azimuth), up], axis=-1).reshape(-1, 3)
-
-
-def grid_rotations() -> Float[Array, "heights yaws 3 3"]:
-    """Rotations of the cameras of a gallery, to the object."""
-    cameras = jax.vmap(look_at_origin)(jnp.asarray(grid_directions(), jnp.float32))
-    return cameras[:, :3, :3].reshape(HEIGHTS, YAWS, 3, 3)
+    Where colours are compared, there is one more for each object at each yaw, and the share of the image that has them.
+    """
+    return objects * (YAWS * KEPT + 1) + 1 + colour * (objects * YAWS + 1)
 
 
 def small_image(
@@ -119,7 +96,7 @@ class Matcher:
 
     def power(self, count: Float[AnyArray, "*walks"], objects: int) -> Float[Array, "*walks"]:
         """Of the likelihood of a walk of `count` views, among so many objects."""
-        return jnp.exp(self.heat @ _numbers(count, objects))
+        return jnp.exp(self.heat @ of_walks(count, objects))
 
     def likelihood(
         self, apart: Float[AnyArray, "..."], count: Float[AnyArray, "*walks"], objects: int
@@ -132,7 +109,7 @@ class Matcher:
         apart: Float[AnyArray, "*walks"], count: Float[AnyArray, "*walks"], objects: int
     ) -> Float[Array, "..."]:
         """What the odds of an unknown object depend on, in the order of `stranger`, from the best hypothesis' difference."""
-        return jnp.concatenate([_numbers(count, objects), jnp.log(jnp.asarray(apart) + 1e-6)[None]])
+        return jnp.concatenate([of_walks(count, objects), jnp.log(jnp.asarray(apart) + 1e-6)[None]])
 
     def strange_odds(
         self, apart: Float[AnyArray, "*walks"], count: Float[AnyArray, "*walks"], objects: int
@@ -150,6 +127,7 @@ class Evidence:
         square, lean, gram: (objects, yaws, …) what this follows from, as means over views; see `mevs_jax.gallery.errors`.
         size: (objects,) squared deviation of the logarithm of the radius, in standard deviations; 1 where a size is not known.
         count: number of views, each by the share of its image that is known.
+        colours: what their colours say; None if they are not compared.
     """
 
     apart: Float[Array, "objects yaws"]
@@ -158,11 +136,7 @@ class Evidence:
     gram: Float[Array, "objects yaws pairs"]
     size: Float[Array, " objects"]
     count: Float[Array, ""]
-
-
-def _numbers(count: Float[AnyArray, "*walks"], objects: int) -> Float[Array, "..."]:
-    views = jnp.log(jnp.asarray(count, jnp.float32))
-    return jnp.stack(jnp.broadcast_arrays(jnp.float32(1), views, jnp.log(jnp.float32(max(objects, 1)))))
+    colours: ColourEvidence | None = None
 
 
 @flax.struct.dataclass
@@ -176,6 +150,7 @@ class Gallery:
         slopes: (objects, heights, yaws, errors, features) how features change with a wrong sphere and yaw.
         radii: (objects,) in metres; 0 where the true size is not known.
         symmetries: (objects,) number of yaws at which each looks alike.
+        colours: of the objects; None if they are not compared.
     """
 
     matcher: Matcher
@@ -184,9 +159,16 @@ class Gallery:
     slopes: Float[Array, "objects heights yaws errors features"]
     radii: Float[Array, " objects"]
     symmetries: Int[Array, " objects"]
+    colours: Colours | None = None
 
     @classmethod
-    def of(cls, matcher: Matcher, images: UInt8[AnyArray, "objects heights yaws pixels"], radii: AnyArray) -> Gallery:
+    def of(
+        cls,
+        matcher: Matcher,
+        images: UInt8[AnyArray, "objects heights yaws pixels"],
+        radii: AnyArray,
+        colours: Colours | None = None,
+    ) -> Gallery:
         """The gallery of some images."""
         project = jnp.asarray(WEIGHTS[:, None]) * matcher.projection
         features = jnp.zeros((0, HEIGHTS, YAWS, project.shape[1]))
@@ -197,7 +179,7 @@ class Gallery:
             changes = jnp.stack([slopes(one, grid_rotations()) @ project for one in filled])
         symmetries = jnp.array([symmetry_of(one) for one in np.asarray(features)], jnp.int32)
         sizes = jnp.asarray(radii, jnp.float32)
-        return cls(matcher, jnp.asarray(images, jnp.uint8), features, changes, sizes, symmetries)
+        return cls(matcher, jnp.asarray(images, jnp.uint8), features, changes, sizes, symmetries, colours)
 
     def compared(
         self,
@@ -205,6 +187,7 @@ class Gallery:
         direction: Float[Array, " 3"],
         distance: float,
         radius: Float[AnyArray, ""],
+        colours: Float[Array, "side side 3"] | None = None,
     ) -> Float[Array, " comparisons"]:
         """What is kept of a view: for each object, its differences from the prediction at each yaw (square, lean and gram), and
         from its size; and, last, the share of the image that is known.
@@ -217,8 +200,13 @@ class Gallery:
             direction: unit vector from the object to the camera.
             distance: of the camera, in radii.
             radius: of the object in metres; NaN if it is unknown.
+            colours: of the view, as of `small_colours`, if it has some.
         """
-        return self.compared_image(*small_image(depth, distance), direction, radius)
+        shape = self.compared_image(*small_image(depth, distance), direction, radius)
+        if self.colours is None:
+            return shape
+        seen = jnp.full((SIDE, SIDE, 3), jnp.nan) if colours is None else small_colours(colours)
+        return jnp.concatenate([shape, self.colours.compared(seen, direction, len(self.radii))])
 
     def compared_image(
         self,
@@ -252,24 +240,39 @@ class Gallery:
 
         A view counts by what it shows.
         """
-        shares = jnp.where(present, jnp.maximum(compared[:, -1], _LEAST), 0.0)
+        objects = len(self.radii)
+        own = comparisons(objects)
+        shares = jnp.where(present, jnp.maximum(compared[:, own - 1], _LEAST), 0.0)
         count = jnp.maximum(jnp.sum(shares), _LEAST)
-        values = compared[:, :-1].reshape(len(compared), len(self.radii), -1)
+        values = compared[:, : own - 1].reshape(len(compared), objects, -1)
         kept = values[..., :-1].reshape(*values.shape[:2], YAWS, KEPT)
         square, lean, gram = parted(jnp.einsum("v,voyk->oyk", shares / count, kept))
         square += jnp.where(posed & (jnp.arange(YAWS) > 0), _IMPOSSIBLE, 0.0)
-        return Evidence(unexplained(square, lean, gram, count), square, lean, gram, values[0, :, -1], count)
+        colours = ColourEvidence.of(compared[:, own:], present) if self.colours else None
+        return Evidence(unexplained(square, lean, gram, count), square, lean, gram, values[0, :, -1], count, colours)
+
+    def likelihood(self, evidence: Evidence) -> Float[Array, "objects yaws"]:
+        """Logarithm of the likelihood of objects at yaws, by all that is compared."""
+        objects = len(self.radii)
+        found = self.matcher.likelihood(evidence.apart, evidence.count, objects) - 0.5 * evidence.size[:, None]
+        if self.colours and evidence.colours:
+            found += self.colours.matcher.likelihood(evidence.colours.apart, evidence.colours.count, objects)
+        return found
 
     def hypotheses(self, evidence: Evidence) -> Float[Array, "objects yaws"]:
         """Log-probabilities of objects and yaws, if the object is none unknown."""
-        likelihood = self.matcher.likelihood(evidence.apart, evidence.count, len(self.radii))
-        return jax.nn.log_softmax(likelihood - 0.5 * evidence.size[:, None], axis=(0, 1))
+        return jax.nn.log_softmax(self.likelihood(evidence), axis=(0, 1))
 
     def beliefs(self, evidence: Evidence) -> Float[Array, " classes"]:
         """Log-probabilities of the objects and, last, of an unknown object."""
-        hypotheses = self.hypotheses(evidence)
+        hypotheses, objects = self.hypotheses(evidence), len(self.radii)
         best = jnp.argmax(hypotheses)
-        odds = self.matcher.strange_odds(evidence.apart.reshape(-1)[best], evidence.count, len(self.radii))
+        apart = evidence.apart.reshape(-1)[best]
+        odds = self.matcher.strange_odds(apart, evidence.count, objects)
+        if self.colours and evidence.colours:
+            colours, count = evidence.colours.apart.reshape(-1)[best], evidence.colours.count
+            either = self.colours.matcher.strange_odds(apart, colours, count, objects)
+            odds = jnp.where(count > 0, either, odds)
         odds += 0.5 * (evidence.size[best // YAWS] - 1)
         known = jax.scipy.special.logsumexp(hypotheses, axis=1) + jax.nn.log_sigmoid(-odds)
         return jnp.append(known, jax.nn.log_sigmoid(odds))
@@ -298,7 +301,7 @@ class Gallery:
         )
         least = jnp.min(evidence.apart)
         features, slope = (
-            _seen(grid.reshape(*grid.shape[:3], -1), directions, index // YAWS, index % YAWS)
+            foreseen(grid.reshape(*grid.shape[:3], -1), directions, index // YAWS, index % YAWS)
             for grid in (self.features, self.slopes)
         )
         slope = slope.reshape(*features.shape[:2], ERRORS, -1)
@@ -318,6 +321,8 @@ class Gallery:
             count + 1,
         )
         likelihood = self.matcher.likelihood(apart, count + 1, objects)
+        if self.colours and evidence.colours:
+            likelihood += self.colours.expected(evidence.colours, directions, index, objects)
         after = jax.nn.log_softmax(likelihood - 0.5 * evidence.size[index // YAWS], axis=-1)
         answer = index // YAWS if target is None else index // YAWS == target
         same = (answer[:, None] == answer).astype(jnp.float32)
@@ -354,45 +359,3 @@ def _filled(images: UInt8[AnyArray, "heights yaws pixels"]) -> Float[Array, "hei
     values = jnp.where(known, images, 0) / STEPS
     mean = jnp.sum(values, axis=(0, 1)) / jnp.maximum(jnp.sum(known, axis=(0, 1)), 1)
     return jnp.where(known, values, mean)
-
-
-def interpolated(grid: Array, direction: Float[Array, " 3"]) -> Float[Array, "objects yaws numbers"]:
-    """Values of a grid in a direction, for an object at each yaw: interpolated between four directions of the grid."""
-    height, azimuth = _place(direction)
-    below, up = _between(height, HEIGHTS - 1)
-    rows = (1 - up) * grid[:, below] + up * grid[:, jnp.minimum(below + 1, HEIGHTS - 1)]
-    before, along = _between(azimuth, YAWS)
-    at = before - jnp.arange(YAWS)
-    return (1 - along) * rows[:, at % YAWS] + along * rows[:, (at + 1) % YAWS]
-
-
-def _seen(
-    grid: Float[Array, "objects heights yaws features"],
-    directions: Float[Array, "candidates 3"],
-    objects: Int[Array, " hypotheses"],
-    yaws: Int[Array, " hypotheses"],
-) -> Float[Array, "candidates hypotheses features"]:
-    """`interpolated` of some hypotheses, in some directions."""
-    height, azimuth = _place(directions)
-    (below, up), (before, along) = _between(height, HEIGHTS - 1), _between(azimuth, YAWS)
-    at = before[:, None] - yaws
-
-    def row(level: Array) -> Array:
-        first, second = (grid[objects[None], level[:, None], (at + step) % YAWS] for step in (0, 1))
-        return first + along[:, None, None] * (second - first)
-
-    lower, upper = row(below), row(jnp.minimum(below + 1, HEIGHTS - 1))
-    return lower + up[:, None, None] * (upper - lower)
-
-
-def _place(direction: Float[Array, "*batch 3"]) -> tuple[Float[Array, "*batch"], Float[Array, "*batch"]]:
-    """Elevation and azimuth of directions, in steps of the grid."""
-    height = (jnp.arcsin(jnp.clip(direction[..., 2], -1, 1)) / jnp.pi + 0.5) * (HEIGHTS - 1)
-    azimuth = jnp.arctan2(direction[..., 1], direction[..., 0])
-    azimuth = jnp.where(jnp.abs(direction[..., 2]) > 1 - 1e-6, _POLE * jnp.sign(direction[..., 2]), azimuth)
-    return height, azimuth * (YAWS / (2 * jnp.pi))
-
-
-def _between(place: Array, most: int) -> tuple[Array, Array]:
-    whole = jnp.clip(jnp.floor(place), -most, most)
-    return whole.astype(jnp.int32), place - whole

@@ -14,6 +14,7 @@ from jaxtyping import Bool, Float
 
 from mevs_jax.arguments import numbers
 from mevs_jax.arrays import AnyArray, AnyVector, ByContent
+from mevs_jax.geometry.colours import colours_of
 from mevs_jax.geometry.sphere import Sphere, upright
 
 _FIELDS = 1.0, 158.0
@@ -36,6 +37,8 @@ class DepthImage(ByContent):
         mask: (height, width) True at the pixels of the object. The others are known not to be the object.
         floor: height of the supporting surface in the world along the object's upward direction, in metres; what lies below is
             not the object. It should be a little above the true height, by the depth camera's error.
+        image: (height, width, 3) red, green and blue at the depth's pixels, uint8 or floating from 0 to 1, for systems that
+            compare colours.
 
     Raises:
         ValueError: for arrays that no depth image, intrinsics or pose can be; the message says what to check.
@@ -46,6 +49,7 @@ class DepthImage(ByContent):
     pose: AnyArray
     mask: AnyArray | None = None
     floor: float | None = None
+    image: AnyArray | None = None
 
     def __post_init__(self) -> None:
         if np.ma.isMaskedArray(self.depth):
@@ -55,11 +59,17 @@ class DepthImage(ByContent):
         checked_pose(self.pose)
         if self.floor is not None:
             _finite(self.floor, "floor", ())
+        if self.image is not None and np.shape(colours_of(self.image, "image")) != (*np.shape(self.depth), 3):
+            raise ValueError(
+                f"image has shape {np.shape(self.image)}, depth {np.shape(self.depth)}; give the colours of the depth's pixels, "
+                "so register the colour camera's image to the depth first"
+            )
 
     def copy(self) -> DepthImage:
         """An image that does not change when a driver writes the next one into the same arrays."""
         mask = None if self.mask is None else np.array(self.mask)
-        return DepthImage(np.array(self.depth), np.array(self.K), np.array(self.pose), mask, self.floor)
+        image = None if self.image is None else np.array(self.image)
+        return DepthImage(np.array(self.depth), np.array(self.K), np.array(self.pose), mask, self.floor, image)
 
     @property
     def measured(self) -> Bool[np.ndarray, "height width"]:

@@ -36,3 +36,15 @@ def centred_triangles(vertices: np.ndarray, faces: np.ndarray) -> tuple[Float[np
     corners = corners - (low + high) / 2
     radius = np.linalg.norm(corners, axis=-1).max()
     return (corners / radius).astype(np.float32), float(radius)
+
+
+def weights_of_corners(
+    points: Float[np.ndarray, "points 3"], triangles: Float[np.ndarray, "points 3 3"]
+) -> Float[np.ndarray, "points 3"]:
+    """Weights of the corners of triangles whose sums are the points nearest to some points, in the planes of the triangles."""
+    first, second = triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0]
+    normal, point = np.cross(first, second), points - triangles[:, 0]
+    area = np.maximum(np.einsum("pk,pk->p", normal, normal), 1e-30)
+    last = np.stack([np.cross(point, second), np.cross(first, point)], axis=1)
+    last = np.einsum("pek,pk->pe", last, normal) / area[:, None]
+    return np.concatenate([1 - last.sum(axis=1, keepdims=True), last], axis=1)

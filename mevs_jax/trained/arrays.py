@@ -13,7 +13,9 @@ from flax import nnx
 
 from mevs_jax.beliefs.fusing import CalibratedFusion
 from mevs_jax.beliefs.strangeness import LEVELS, Strangeness
-from mevs_jax.gallery.matching import HEIGHTS, PIXELS, YAWS, Gallery, Matcher
+from mevs_jax.gallery.colours import COLOURS, NUMBERS, ColourMatcher, Colours
+from mevs_jax.gallery.grid import HEIGHTS, YAWS
+from mevs_jax.gallery.matching import PIXELS, Gallery, Matcher
 from mevs_jax.models.expected_views import ExpectedViews
 from mevs_jax.policies.base import Knowledge
 from mevs_jax.trained.description import Description
@@ -29,6 +31,7 @@ _MOST_DEGREE = 16
 def arrays_of(parts: Parts) -> dict[str, Any]:
     """All arrays by names joined with dots; those of a network by their place in it."""
     known, fusion, gallery = parts.knowledge, parts.fusion.get("posed"), parts.gallery
+    colours = gallery and gallery.colours
     if known is not None and (known.order is None or known.by_pose is not None):
         raise ValueError("the knowledge of a trained system is an order of its viewpoints and a class × view table")
     return _flat(
@@ -52,6 +55,8 @@ def arrays_of(parts: Parts) -> dict[str, Any]:
             "size": parts.size,
             "gallery": gallery and {"images": gallery.images, "radii": gallery.radii},
             "matcher": gallery and dict(vars(gallery.matcher)),
+            "colours": colours and {"images": colours.images, "objects": colours.objects},
+            "colour_matcher": colours and dict(vars(colours.matcher)),
             QUANTILES: parts.strangeness and parts.strangeness.quantiles,
         },
     )
@@ -137,13 +142,13 @@ def parts_of(description: Description, arrays: dict[str, np.ndarray]) -> Parts:
         knowledge=_knowledge(take, classes, viewpoints, expected),
         temperatures=_temperatures(take),
         strangeness=Strangeness(take.take(QUANTILES, (None, LEVELS))) if QUANTILES in arrays else None,
-        gallery=_gallery(take, classes - 1) if of.kind == "gallery" else None,
+        gallery=_gallery(take, classes - 1, of.colour) if of.kind == "gallery" else None,
     )
     take.finish()
     return parts
 
 
-def _gallery(take: _Arrays, objects: int) -> Gallery:
+def _gallery(take: _Arrays, objects: int, colour: bool) -> Gallery:
     matcher = Matcher(
         projection=take.take("matcher.projection", (PIXELS, None)),
         floor=take.positive("matcher.floor", ()),
@@ -153,7 +158,23 @@ def _gallery(take: _Arrays, objects: int) -> Gallery:
         size=take.positive("matcher.size", ()),
     )
     images = take.take("gallery.images", (objects, HEIGHTS, YAWS, PIXELS), np.uint8)
-    return Gallery.of(matcher, images, take.take("gallery.radii", (objects,)))
+    radii = take.take("gallery.radii", (objects,))
+    return Gallery.of(matcher, images, radii, _colours(take, objects) if colour else None)
+
+
+def _colours(take: _Arrays, objects: int) -> Colours:
+    matcher = ColourMatcher(
+        projection=take.take("colour_matcher.projection", (NUMBERS, None)),
+        floor=take.positive("colour_matcher.floor", ()),
+        heat=take.take("colour_matcher.heat", (3,)),
+        stranger=take.take("colour_matcher.stranger", (5,)),
+        unseen=take.positive("colour_matcher.unseen", ()),
+    )
+    coloured = len(take.arrays.get("colours.objects", ()))
+    which = take.take("colours.objects", (coloured,), np.int32)
+    if len(np.unique(which)) < coloured or not ((which >= 0) & (which < objects)).all():
+        raise ValueError(f"colours.objects in {WEIGHTS} are not different objects of the {objects} there are")
+    return Colours.of(matcher, take.take("colours.images", (coloured, HEIGHTS, YAWS, COLOURS), np.uint8), which)
 
 
 def _fusion(of: Description, take: _Arrays) -> dict[str, CalibratedFusion]:

@@ -82,8 +82,8 @@ from the object's centre, z up in the image.
 
 ## Limits
 
-* Objects are distinguished by their shape, and by their size where it is known; colour is not used. Some objects look alike to
-  a depth camera: `mevs_jax.enrolment.alike` names them.
+* Objects are distinguished by their shape, by their size where it is known{colour}.
+  Some objects look alike: `mevs_jax.enrolment.alike` names them.
 * Objects are upright. Their yaw may be unknown, a tilt may not.
 * Confidence is calibrated on procedural shapes of other kinds.
 """
@@ -94,7 +94,8 @@ def model_card(description: Description, size: int) -> str:
     of, sizes = description, description.size
     if of.kind == "gallery":
         *objects, unknown = of.classes
-        known = {"objects": ", ".join(objects) or "none yet", "unknown": unknown, "camera": of.camera}
+        colour = ", and by their colours where images have some" if of.colour else "; colour is not used"
+        known = {"colour": colour, "objects": ", ".join(objects) or "none yet", "unknown": unknown, "camera": of.camera}
         made = ", ".join(f"{name} {version}" for name, version in of.made_with.items())
         return _GALLERY.format(**known, megabytes=size / 1e6, versions=made)
     told = "* Size: the object's radius, where it is given, from {0.smallest:g} to {0.largest:g} m.\n"

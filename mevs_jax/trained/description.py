@@ -96,6 +96,7 @@ class Description:
         made_by: hash of what the system was made from: data set, networks, evaluation.
         made_with: versions of packages.
         evaluation: figures of its own evaluation, on test objects.
+        colour: whether images may have colours, for a gallery; those without are compared by depth alone.
     """
 
     form: int
@@ -117,6 +118,7 @@ class Description:
     cloud: CloudInput | None = None
     view_policies: dict[str, ViewPolicyShape] = field(default_factory=dict)
     evaluation: dict[str, Any] = field(default_factory=dict)
+    colour: bool = False
 
     @property
     def told_unknown(self) -> bool:
@@ -131,7 +133,7 @@ class Description:
     @property
     def features(self) -> int:
         """Length of what is kept of each view for the fusion."""
-        return comparisons(len(self.classes) - 1) if self.encoder is None else 8 * self.encoder.width
+        return comparisons(len(self.classes) - 1, self.colour) if self.encoder is None else 8 * self.encoder.width
 
     @property
     def unknown_class(self) -> int | None:

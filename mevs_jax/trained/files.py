@@ -17,7 +17,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from mevs_jax.gallery.matching import SIDE
+from mevs_jax.gallery.grid import SIDE
 from mevs_jax.plain import from_plain
 from mevs_jax.policies.registry import POLICIES
 from mevs_jax.trained.arrays import DESCRIPTION, WEIGHTS, parts_of
@@ -212,6 +212,7 @@ def check(description: Description) -> None:
         or not (of.encoder or of.fusion or of.pose or of.entropy or of.view_policies),
         "a system has an encoder, or is a gallery": gallery == (of.encoder is None),
         "the camera's resolution is no multiple of that of a gallery": not gallery or camera.resolution % SIDE == 0,
+        "nothing but a gallery compares colours": gallery or not of.colour,
         f"there are more than {MOST_CLASSES} classes": len(classes) <= MOST_CLASSES,
         "depth and normals have 4 or 5 channels": of.image.content != "depth_and_normals"
         or of.image.channels in (4, 5),

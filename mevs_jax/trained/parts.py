@@ -135,6 +135,7 @@ def observe(
     radius: Float[Array, ""],
     of: Description,
     with_entropy: bool = True,
+    colours: Float[Array, "side side 3"] | None = None,
 ) -> Observation:
     """What the networks compute from one view.
 
@@ -145,10 +146,11 @@ def observe(
         radius: of the object in metres; NaN if it is unknown.
         of: the description of the system.
         with_entropy: whether predicted entropies are needed, if it has them.
+        colours: of the surface at the same pixels, from 0 to 1, NaN where unknown; None if there are none.
     """
     direction = pose[:3, 3] / jnp.linalg.norm(pose[:3, 3])
     if parts.gallery is not None:
-        compared = parts.gallery.compared(depth, direction, of.camera.distance, radius)
+        compared = parts.gallery.compared(depth, direction, of.camera.distance, radius, colours)
         evidence = parts.gallery.evidence(compared[None], jnp.ones(1, bool), posed=False)
         return Observation(parts.gallery.beliefs(evidence), features=compared)
     features, as_it_is = features_of(parts, depth, radius, of)

@@ -152,6 +152,7 @@ class TrainedSystem:
         depth: Float[AnyArray, "side side"],
         pose: Float[AnyArray, "4 4"],
         radius: float | Float[AnyArray, ""] = np.nan,
+        colours: Float[AnyArray, "side side 3"] | None = None,
     ) -> Observation:
         """What the networks compute from one view, taken by the camera `description.camera`.
 
@@ -161,6 +162,7 @@ class TrainedSystem:
             depth: along the optical axis, in radii of the object; 0 where nothing is hit.
             pose: from the camera to the object's frame: origin at its centre, z up, unit the radius.
             radius: of the object in metres, for a system that uses it (`description.size`); NaN if it is unknown.
+            colours: at the same pixels, for a system that compares them (`description.colour`); NaN where unknown.
 
         Raises:
             ValueError: for a depth image of another size, of whole numbers, or not in radii; for no pose, or a radius that is not
@@ -180,7 +182,8 @@ class TrainedSystem:
                 f"from any camera's image with mevs_jax.canonical_view"
             )
         given = (jnp.asarray(array, jnp.float32) for array in (depth, pose, radius))
-        return _observe(self.parts, *given, self.description)
+        lit = jnp.asarray(colours, jnp.float32) if colours is not None and self.description.colour else None
+        return _observe(self.parts, *given, self.description, colours=lit)
 
     def calibrated_as(self, policy: str, posed: bool = True) -> str:
         """The policy whose temperatures are those of a policy's walks.

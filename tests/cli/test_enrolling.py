@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from PIL import Image
 
 import mevs_jax
 from data_pipeline.objects.furniture.solids import box, joined
@@ -58,3 +59,21 @@ def test_what_cannot_be_enrolled_is_said(objects, tmp_path, refuses, given, sent
     if "--system" not in words:
         words += ["--system", str(objects / "blank")]
     assert sentence in refuses("enrol", *words, "--to", tmp_path / "to")
+
+
+def test_textures_are_read_and_what_is_missing_is_said(at_once, tmp_path):
+    square = "v -1 0 0\nv 1 0 0\nv 1 0 2\nv -1 0 2\nv 0 1 1\nvt 0 0\nvt 1 0\nvt 1 1\nvt 0 1\nusemtl print\n"
+    faces = "f 1/1 2/2 3/3 4/4\nf 1/1 2/2 5/3\nf 4/4 3/3 5/2\n"
+    for name, colour in (("red", (200, 20, 20)), ("blue", (20, 20, 200))):
+        (tmp_path / f"{name}.obj").write_text(f"mtllib {name}.mtl\n{square}{faces}")
+        (tmp_path / f"{name}.mtl").write_text(f"newmtl print\nmap_Kd {name}.png\n")
+        if name == "red":
+            Image.new("RGB", (4, 4), colour).save(tmp_path / f"{name}.png")
+    given = [f"{name}={tmp_path / name}.obj" for name in ("red", "blue")]
+    out = at_once("enrol", *given, "--metres", 0.1, "--to", tmp_path / "known")
+    ended(out)
+    assert "blue.obj needs 'blue.png', which is not beside it" in out.stderr
+    colours = mevs_jax.load(tmp_path / "known").parts.gallery.colours
+    assert np.asarray(colours.objects).tolist() == [0]
+    seen = ended(at_once("look", "--system", tmp_path / "known", "--mesh", tmp_path / "red.obj", "--metres", 0.1))
+    assert "red" in seen.splitlines()[-1]

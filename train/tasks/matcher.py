@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 from functools import partial
 from importlib.metadata import version
 from itertools import product
-from typing import NamedTuple
+from typing import NamedTuple, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -26,18 +26,10 @@ from data_pipeline.capture.casting import Rig, capture, rig_at
 from data_pipeline.dataset.reality import RealityAugmentation, realistic_views
 from data_pipeline.objects.mesh import ObjectEntry
 from data_pipeline.objects.sources import furniture_families, load_object, strangers
+from mevs_jax.gallery.colours import ColourMatcher
 from mevs_jax.gallery.errors import KEPT, parted, unexplained
-from mevs_jax.gallery.matching import (
-    HEIGHTS,
-    PIXELS,
-    STEPS,
-    WEIGHTS,
-    YAWS,
-    Gallery,
-    Matcher,
-    interpolated,
-    small_image,
-)
+from mevs_jax.gallery.grid import HEIGHTS, STEPS, YAWS, interpolated
+from mevs_jax.gallery.matching import PIXELS, WEIGHTS, Gallery, Matcher, small_image
 from mevs_jax.gallery.meshes import images_of_mesh
 from mevs_jax.geometry.cameras import ViewCamera
 from mevs_jax.geometry.sphere import turned
@@ -46,6 +38,7 @@ from mevs_jax.trained.description import FORM, UNKNOWN_OBJECT, DataDescription, 
 from mevs_jax.trained.parts import Parts
 from mevs_jax.trained.system import TrainedSystem
 
+AnyMatcher = TypeVar("AnyMatcher", Matcher, ColourMatcher)
 _SPLITS = ("train", "val")
 _RIDGE = 1e-5
 """Added to variances of differences, which are of images from 0 to 1."""
@@ -81,6 +74,7 @@ class Sighted(NamedTuple):
         yaw: of the shape in its views, as the nearest of the gallery's.
         images, known: of the views, as `small_image`.
         directions: from the shape to the cameras, as they are believed.
+        hit: which pixels of the views show the shape.
     """
 
     gallery: UInt8[np.ndarray, "heights yaws pixels"]
@@ -88,6 +82,7 @@ class Sighted(NamedTuple):
     images: Float[np.ndarray, "views pixels"]
     known: Bool[np.ndarray, "views pixels"]
     directions: Float[np.ndarray, "views 3"]
+    hit: Bool[np.ndarray, "views side side"] = np.zeros((0, 0, 0), bool)
 
 
 def kinds_in_turn(split: str, count: int, seed: int) -> list[ObjectEntry]:
@@ -110,12 +105,12 @@ def sighted(entries: Sequence[ObjectEntry], config: MatcherConfig, camera: ViewC
     poses = camera.around(directions).pose
 
     @jax.jit
-    def seen(key: Array, depth: Array) -> tuple[Array, Array, Array]:
+    def seen(key: Array, depth: Array) -> tuple[Array, ...]:
         batch = {"depth": depth, "pose": poses}
         real, placed = realistic_views(key, batch, camera, config.reality, config.views)
         images, known = jax.vmap(partial(small_image, distance=camera.distance))(real)
         away = placed[:, :3, 3]
-        return images, known > 0, away / jnp.linalg.norm(away, axis=1, keepdims=True)
+        return images, known > 0, away / jnp.linalg.norm(away, axis=1, keepdims=True), real > 0
 
     random = np.random.default_rng(seed)
     for number, entry in enumerate(entries):
@@ -123,7 +118,7 @@ def sighted(entries: Sequence[ObjectEntry], config: MatcherConfig, camera: ViewC
         yaw = random.uniform(0, 2 * np.pi)
         depth = capture(mesh, turned_rig(camera, directions, yaw)).depth
         found = map(np.asarray, seen(jax.random.fold_in(jax.random.key(seed), number), jnp.asarray(depth)))
-        images, _ = images_of_mesh(mesh.vertices, mesh.faces, camera)
+        images, _, _ = images_of_mesh(mesh.vertices, mesh.faces, camera)
         yield Sighted(images, round(yaw * YAWS / (2 * np.pi)) % YAWS, *found)
 
 
@@ -162,7 +157,7 @@ def fit_projection(shapes: Iterator[Sighted], features: int) -> Float[Array, "pi
     return jnp.asarray(axes, jnp.float32)
 
 
-class _Walks(NamedTuple):
+class Walks(NamedTuple):
     """Evidence from walks around shapes, of which some are enrolled, and which of those each shape is; −1 for none."""
 
     apart: Float[np.ndarray, "walks objects yaws"]
@@ -173,27 +168,32 @@ class _Walks(NamedTuple):
 def calibrated(matcher: Matcher, shapes: Sequence[Sighted], seed: int) -> Matcher:
     """The matcher with powers of likelihoods and odds of unknown objects as shapes that it was not fitted on need them."""
     gallery = Gallery.of(matcher, np.stack([one.gallery for one in shapes]), np.zeros(len(shapes)))
-    kept, shows = _tables(gallery, shapes)
+    kept, shows = tables(gallery, shapes)
     wrong = kept[..., 0].min(axis=-1)[~np.eye(len(shapes), dtype=bool)[:, None].repeat(shows.shape[1], axis=1)]
     matcher = replace(matcher, unseen=jnp.float32(np.quantile(wrong, _QUANTILE)))
-    walks = [*_some_walks(kept, shows, seed)]
+    walks = [*some_walks(kept, shows, seed)]
 
     def power(x: np.ndarray) -> float:
-        return float(np.mean([_known_loss(_with_power(matcher, x), walk) for walk in walks]))
+        return float(np.mean([_known_loss(with_power(matcher, x), walk) for walk in walks]))
 
     start, limits = np.array([1.6, 0.3, 0.0, -1.0]), [(-5, 5), (-2, 2), (-0.25, 0.25), (-4, 2)]
     found = minimize(power, start, method="Nelder-Mead", bounds=limits, options={"maxiter": 300}).x
-    matcher = _with_power(matcher, found)
+    matcher = with_power(matcher, found)
     inputs, unknown = (np.concatenate(arrays) for arrays in zip(*map(_stranger_inputs, walks), strict=True))
+    return replace(matcher, stranger=jnp.asarray(fit_odds(inputs, unknown), jnp.float32))
+
+
+def fit_odds(inputs: Float[np.ndarray, "walks numbers"], unknown: Bool[np.ndarray, " walks"]) -> np.ndarray:
+    """Coefficients of the log-odds of what is unknown, by logistic regression in which both sorts have the same weight."""
     weights = np.where(unknown, 0.5 / unknown.mean(), 0.5 / (1 - unknown.mean()))
 
     def loss(x: np.ndarray) -> float:
         return float(np.mean(weights * np.logaddexp(0, np.where(unknown, -1, 1) * (inputs @ x))))
 
-    return replace(matcher, stranger=jnp.asarray(minimize(loss, np.zeros(4)).x, jnp.float32))
+    return minimize(loss, np.zeros(inputs.shape[1])).x
 
 
-def _tables(gallery: Gallery, shapes: Sequence[Sighted]) -> tuple[np.ndarray, np.ndarray]:
+def tables(gallery: Gallery, shapes: Sequence[Sighted]) -> tuple[np.ndarray, np.ndarray]:
     """What is kept (shapes, views, objects, yaws, kept) of all views of all shapes, and what each view shows."""
 
     @jax.jit
@@ -209,7 +209,7 @@ def _tables(gallery: Gallery, shapes: Sequence[Sighted]) -> tuple[np.ndarray, np
     return np.stack(kept), np.stack(shows)
 
 
-def _some_walks(kept: np.ndarray, shows: np.ndarray, seed: int) -> Iterator[_Walks]:
+def some_walks(kept: np.ndarray, shows: np.ndarray, seed: int) -> Iterator[Walks]:
     """Random views of all shapes, of which some are enrolled."""
     random, (shapes, views) = np.random.default_rng(seed), shows.shape
     for share, count in product(_ENROLLED, _VIEWS):
@@ -223,38 +223,41 @@ def _some_walks(kept: np.ndarray, shows: np.ndarray, seed: int) -> Iterator[_Wal
             _unexplained(kept[shape, views][:, enrolled], weights[shape] / total[shape], total[shape])
             for shape, views in enumerate(seen)
         ]
-        yield _Walks(np.stack(apart), total, label)
+        yield Walks(np.stack(apart), total, label)
 
 
 @jax.jit
 def _unexplained(kept: Array, weights: Array, total: Array) -> Array:
-    """`Evidence.apart` of a walk."""
-    return unexplained(*parted(jnp.einsum("v,voyk->oyk", weights, kept)), total)
+    """`Evidence.apart` of a walk; colours, of which a square alone is kept, have no common error."""
+    mean = jnp.einsum("v,voyk->oyk", weights, kept)
+    return unexplained(*parted(mean), total) if mean.shape[-1] == KEPT else mean[..., 0]
 
 
-def _with_power(matcher: Matcher, x: np.ndarray) -> Matcher:
+def with_power(matcher: AnyMatcher, x: np.ndarray) -> AnyMatcher:
     return replace(matcher, heat=jnp.asarray(x[:3], jnp.float32), floor=jnp.float32(np.exp(x[3])))
 
 
-def _log_probabilities(matcher: Matcher, walks: _Walks) -> Float[np.ndarray, "walks objects"]:
+def _log_probabilities(matcher: Matcher, walks: Walks) -> Float[np.ndarray, "walks objects"]:
     """Of the objects, if each is one of those enrolled."""
     likelihood = np.asarray(matcher.likelihood(walks.apart, walks.shown, walks.apart.shape[1]))
     return np.asarray(log_softmax(logsumexp(likelihood, axis=2), axis=1))
 
 
-def _known_loss(matcher: Matcher, walks: _Walks) -> float:
+def _known_loss(matcher: Matcher, walks: Walks) -> float:
     known = walks.label >= 0
     return float(-_log_probabilities(matcher, walks)[known, walks.label[known]].mean())
 
 
-def _stranger_inputs(walks: _Walks) -> tuple[np.ndarray, np.ndarray]:
+def _stranger_inputs(walks: Walks) -> tuple[np.ndarray, np.ndarray]:
     """What the odds of an unknown object depend on, and whether it is one."""
     best = walks.apart.min(axis=(1, 2))
     return np.asarray(Matcher.strangeness(best, walks.shown, walks.apart.shape[1]), float).T, walks.label < 0
 
 
-def objects_system(matcher: Matcher, camera: ViewCamera, views: int = 40) -> TrainedSystem:
-    """The system that objects are enrolled with: without any yet."""
+def objects_system(
+    matcher: Matcher, camera: ViewCamera, views: int = 40, colours: ColourMatcher | None = None
+) -> TrainedSystem:
+    """The system that objects are enrolled with: without any yet. It compares colours if it is given a matcher of them."""
     points = fibonacci_sphere(views)
     nothing = np.zeros((0, HEIGHTS, YAWS, PIXELS), np.uint8)
     parts = Parts(
@@ -263,7 +266,7 @@ def objects_system(matcher: Matcher, camera: ViewCamera, views: int = 40) -> Tra
         neighbours=jnp.asarray(hull_edges(points)),
         single=jnp.float32(1),
         temperatures={"random": jnp.ones(1)},
-        gallery=Gallery.of(matcher, nothing, np.zeros(0)),
+        gallery=Gallery.of(matcher, nothing, np.zeros(0), None if colours is None else colours.blank()),
     )
     description = Description(
         form=FORM,
@@ -278,5 +281,6 @@ def objects_system(matcher: Matcher, camera: ViewCamera, views: int = 40) -> Tra
         data=DataDescription("enrolled objects", "", {"enrolled": 0}),
         made_by=hashlib.sha256(np.asarray(matcher.projection).tobytes()).hexdigest()[:16],
         made_with={name: version(name) for name in ("jax", "mevs-jax")},
+        colour=colours is not None,
     )
     return TrainedSystem(description, parts, "objects")

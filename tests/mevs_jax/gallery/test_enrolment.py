@@ -14,7 +14,8 @@ from data_pipeline.objects.mesh import normalise
 from mevs_jax.agent import Frames
 from mevs_jax.enrolment import AlikeWarning, alike, enrol, remove, rename
 from mevs_jax.gallery.frames import images_of_frames
-from mevs_jax.gallery.matching import UNKNOWN, YAWS, small_image
+from mevs_jax.gallery.grid import UNKNOWN, YAWS
+from mevs_jax.gallery.matching import small_image
 from mevs_jax.gallery.meshes import images_of_mesh
 from mevs_jax.geometry.cameras import cameras_at
 from mevs_jax.geometry.source_view import DepthImage
@@ -56,7 +57,8 @@ def walk(system: TrainedSystem, shape, yaw: float, radius: float = 1.0, **option
 
 
 def test_the_images_of_a_mesh_are_those_that_the_data_sets_camera_takes(shapes) -> None:
-    images, radius = images_of_mesh(*shapes["knob"], CAMERA)
+    images, colours, radius = images_of_mesh(*shapes["knob"], CAMERA)
+    assert colours is None
     assert radius == pytest.approx(normalise(*shapes["knob"], "knob").radius, rel=1e-6)
     for height, yaw in ((6, 0), (8, 13), (3, 30)):
         elevation, azimuth = np.pi * (height / 12 - 0.5), 2 * np.pi * yaw / YAWS
@@ -121,13 +123,13 @@ def test_a_few_depth_images_do_instead_of_a_mesh(blank: TrainedSystem, shapes) -
 
 
 def test_images_of_frames_are_those_of_the_mesh_where_it_was_seen(shapes) -> None:
-    of_mesh, _ = images_of_mesh(*shapes["knob"], CAMERA)
+    of_mesh, *_ = images_of_mesh(*shapes["knob"], CAMERA)
     sphere = Sphere((0.3, -0.2, 0.5), 0.2)
-    all_around = images_of_frames(frames_of(shapes["knob"], np.vstack([AROUND, -AROUND]), 0.2), sphere, CAMERA)
+    all_around, _ = images_of_frames(frames_of(shapes["knob"], np.vstack([AROUND, -AROUND]), 0.2), sphere, CAMERA)
     shown = all_around != UNKNOWN
     assert shown.mean() > 0.97
     assert np.abs(all_around[shown] / 254 - of_mesh[shown] / 254).mean() < 0.03
-    one = images_of_frames(frames_of(shapes["knob"], AROUND[:1], 0.2), sphere, CAMERA)
+    one, _ = images_of_frames(frames_of(shapes["knob"], AROUND[:1], 0.2), sphere, CAMERA)
     from_there, from_behind = (one[10, 0] == UNKNOWN).mean(), (one[4, 18] == UNKNOWN).mean()
     assert from_there < 0.05 < 0.1 < from_behind
 
@@ -143,7 +145,7 @@ def test_what_lies_below_the_floor_is_not_the_object(shapes) -> None:
         for image in frames_of(shape, AROUND[:3], radius)
     ]
     sphere = Sphere((0.3, -0.2, 0.5), radius)
-    box_alone = images_of_frames(images, sphere, CAMERA)
+    box_alone, _ = images_of_frames(images, sphere, CAMERA)
     wide = box_alone[8, 0, 256:].reshape(16, 16)
     assert (wide[:, :2] == 0).all()  # where the plate would be
     assert (wide > 200).any()

@@ -15,20 +15,13 @@ from data_pipeline.objects.mesh import normalise
 from mevs_jax.agent.looking import look
 from mevs_jax.enrolment import enrol
 from mevs_jax.gallery.errors import DEVIATIONS, ERRORS, HELD, KEPT, likeliest, parted, slopes, unexplained
+from mevs_jax.gallery.grid import HEIGHTS, SIDE, STEPS, UNKNOWN, YAWS, grid_directions, grid_rotations, interpolated
 from mevs_jax.gallery.matching import (
-    HEIGHTS,
     PIXELS,
-    SIDE,
-    STEPS,
-    UNKNOWN,
     WEIGHTS,
-    YAWS,
     Gallery,
     Matcher,
     differences_by_turn,
-    grid_directions,
-    grid_rotations,
-    interpolated,
     small_image,
     stored_image,
     symmetry_of,

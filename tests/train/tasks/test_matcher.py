@@ -8,7 +8,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from mevs_jax.gallery.matching import HEIGHTS, PIXELS, STEPS, WEIGHTS, YAWS, Gallery, Matcher, grid_directions
+from mevs_jax.gallery.grid import HEIGHTS, STEPS, YAWS, grid_directions
+from mevs_jax.gallery.matching import PIXELS, WEIGHTS, Gallery, Matcher
 from mevs_jax.geometry.cameras import ViewCamera
 from train.tasks.matcher import Sighted, calibrated, fit_projection, kinds_in_turn, objects_system
 
