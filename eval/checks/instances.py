@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -15,25 +15,29 @@ from jaxtyping import Bool, Float, Int
 
 from data_pipeline.capture.casting import capture
 from data_pipeline.dataset.inputs import metric_depth
+from data_pipeline.dataset.light import LightConfig
 from data_pipeline.dataset.reality import RealityAugmentation, realistic_views
 from data_pipeline.errors import DataError, EmptyMesh, reason_of
 from data_pipeline.files import short_hash
-from data_pipeline.objects.mesh import Mesh
+from data_pipeline.objects.mesh import Mesh, ObjectEntry
+from data_pipeline.objects.recipes import MeshFile
 from data_pipeline.objects.sources import load_object, objects_to_test
 from data_pipeline.progress import progress_bar
 from eval.checks.agent import STOPS
 from eval.checks.promise import PromiseRow, Strangers, promises, strangers
 from eval.checks.walks import BASELINE, AccuracyRow, Observer, Walker, Walks, rows_of
 from mevs_jax.enrolment import alike, enrol, remove
-from mevs_jax.gallery.matching import YAWS
+from mevs_jax.gallery.grid import YAWS
 from mevs_jax.geometry.cameras import ViewCamera
 from mevs_jax.geometry.source_view import DepthImage
 from mevs_jax.meshes import Up
+from mevs_jax.meshes.paint import Paint, read_paint
 from mevs_jax.selection.loop import ViewTable
 from mevs_jax.trained import TrainedSystem
 from mevs_jax.trained.usable import BELIEF_ORACLE
 from train.results.identity import identity_of
 from train.results.kept import kept_record
+from train.tasks.colours import lit_views
 from train.tasks.matcher import turned_rig
 
 VIEWS = (1, 2, 3, 4)
@@ -57,6 +61,8 @@ class Condition:
         sized: whether the objects' true size is known, with the error of the sphere.
         errors: whether views, and the images that objects are enrolled from, have the errors of real ones.
         distance: metres from the sensor to the objects, whose size is true.
+        compared: what is compared: depth, or colours of objects that have them, or both.
+        light: how strongly it changes from view to view, in standard deviations of what systems are fitted with.
     """
 
     name: str
@@ -65,6 +71,8 @@ class Condition:
     sized: bool = False
     errors: bool = True
     distance: float = 0.6
+    compared: Literal["depth", "both", "colours"] = "depth"
+    light: float = 1.0
 
     @property
     def reality(self) -> RealityAugmentation:
@@ -73,6 +81,13 @@ class Condition:
         return RealityAugmentation(
             strength, sphere=0.05, floor=0.0, hidden=0.0, unseen=self.unseen, distance=self.distance
         )
+
+    @property
+    def lights(self) -> LightConfig:
+        """How the light changes from view to view."""
+        usual = LightConfig()
+        changing = ("exposure", "balance", "tone", "gloss", "noise")
+        return replace(usual, **{name: self.light * getattr(usual, name) for name in changing})
 
 
 CONDITIONS = (
@@ -83,6 +98,10 @@ CONDITIONS = (
     Condition("3 images", frames=3),
     Condition("8 images", frames=8),
     Condition("20 images", frames=20),
+    Condition("mesh, colours alone", compared="colours"),
+    Condition("mesh, depth and colours", compared="both"),
+    Condition("mesh, depth and colours, strong light", compared="both", light=2.0),
+    Condition("mesh, depth and colours, true size", compared="both", sized=True),
 )
 """Views have the errors of real images, but for the first; an object's yaw is never known."""
 
@@ -131,12 +150,17 @@ class Instances:
     measured: list[Measured]
 
 
+Painted = tuple[Mesh, Paint | None]
+"""An object, and its colours if it has some that are compared."""
+
+
 class Seen(NamedTuple):
     """Views of an object at a random yaw, with errors."""
 
     depth: Float[np.ndarray, "views side side"]
     radius: float
     yaw: float
+    colours: Float[np.ndarray, "views side side 3"] | None = None
 
 
 def study_instances(
@@ -168,16 +192,19 @@ def study_instances(
         DataError: if fewer than 3 objects can be used, or one has an impossible size.
     """
     source, left_out = objects_to_test(data, up), dict[str, str]()
-    meshes: dict[str, Mesh] = {}
+    meshes: dict[str, Painted] = {}
+    coloured = any(condition.compared != "depth" for condition in conditions)
     for entry in source.entries:
         try:
             mesh = load_object(entry)
-            meshes[entry.name] = replace(mesh, radius=mesh.radius * metres)
+            paint = _paint_of(entry, mesh) if coloured else None
+            left_out |= {f"colours of {entry.name}": note for note in (paint.notes if paint else ())}
+            meshes[entry.name] = replace(mesh, radius=mesh.radius * metres), paint
         except (DataError, EmptyMesh) as error:
             left_out[entry.name] = reason_of(error)
     if len(meshes) < 3:
         raise DataError(f"{data} has {len(meshes)} objects that can be used, and 3 are needed")
-    for name, mesh in meshes.items():
+    for name, (mesh, _) in meshes.items():
         if mesh.radius < _RADII[0] or mesh.radius > _RADII[1]:
             raise DataError(
                 f"{name} would be {2 * mesh.radius:.3g} metres large, and the errors of cameras depend on sizes; say how many "
@@ -195,12 +222,17 @@ def study_instances(
     return Instances(system.name, data, list(meshes), left_out, measured)
 
 
+def _paint_of(entry: ObjectEntry, mesh: Mesh) -> Paint | None:
+    return read_paint(entry.recipe.path, mesh.vertices, mesh.faces) if isinstance(entry.recipe, MeshFile) else None
+
+
 def _kept(
-    to: Path, system: TrainedSystem, meshes: dict[str, Mesh], condition: Condition, yaws: int, seed: int
+    to: Path, system: TrainedSystem, meshes: dict[str, Painted], condition: Condition, yaws: int, seed: int
 ) -> Measured:
     arrays = [*jax.tree.leaves(system.parts)]
-    for mesh in meshes.values():
+    for mesh, paint in meshes.values():
         arrays += [mesh.vertices, mesh.faces, np.float64(mesh.radius)]
+        arrays += [] if paint is None or condition.compared == "depth" else [paint.colours, paint.uv, *paint.textures]
     made_by = short_hash(b"".join(np.asarray(array).tobytes() for array in arrays))
     identity = identity_of(
         "instances", condition=condition, objects=[*meshes], yaws=yaws, seed=seed, policies=POLICIES, made_by=made_by
@@ -211,17 +243,19 @@ def _kept(
     )
 
 
-def _measure(system: TrainedSystem, meshes: dict[str, Mesh], condition: Condition, yaws: int, seed: int) -> Measured:
+def _measure(system: TrainedSystem, meshes: dict[str, Painted], condition: Condition, yaws: int, seed: int) -> Measured:
     names, camera = list(meshes), system.description.camera
     random, see = np.random.default_rng([seed, len(names)]), partial(seen_with_errors, system, condition)
     seen = [
-        see(mesh, random.uniform(0, 2 * np.pi), jax.random.key(int(random.integers(2**31))))
-        for mesh in meshes.values()
+        see(mesh, random.uniform(0, 2 * np.pi), jax.random.key(int(random.integers(2**31))), paint)
+        for mesh, paint in meshes.values()
         for _ in range(yaws)
     ]
-    shapes = {name: _shape(mesh, condition, camera, random) for name, mesh in meshes.items()}
+    shapes = {name: _shape(*mesh, condition, camera, random) for name, mesh in meshes.items()}
     labels = np.repeat(np.arange(len(names)), yaws)
     everything = enrol(shapes, system, true_size=condition.sized)
+    if condition.compared == "colours":
+        everything = _without_shape(everything)
     tables = _tables(everything, seen, labels, condition)
     walks = _by_object(_walks(everything, tables, POLICIES, max(VIEWS)), len(names))
     enrolled = np.sort(random.permutation(len(names))[: -(-2 * len(names) // 3)])
@@ -246,14 +280,30 @@ def _measure(system: TrainedSystem, meshes: dict[str, Mesh], condition: Conditio
     )
 
 
-def seen_with_errors(system: TrainedSystem, condition: Condition, mesh: Mesh, yaw: float, key: jax.Array) -> Seen:
+def _without_shape(system: TrainedSystem) -> TrainedSystem:
+    """A system of enrolled objects that compares their colours alone: the likelihood of shapes has no power."""
+    gallery = system.parts.gallery
+    assert gallery is not None
+    matcher = replace(gallery.matcher, heat=jnp.array([-30.0, 0.0, 0.0]))
+    parts = replace(system.parts, gallery=replace(gallery, matcher=matcher))
+    return TrainedSystem(system.description, parts, system.name)
+
+
+def seen_with_errors(
+    system: TrainedSystem, condition: Condition, mesh: Mesh, yaw: float, key: jax.Array, paint: Paint | None = None
+) -> Seen:
     camera = system.description.camera
     depth = jnp.asarray(capture(mesh, turned_rig(camera, system.viewpoints, yaw)).depth)
     if not condition.errors:
         return Seen(np.asarray(metric_depth(depth)), mesh.radius, yaw)
     real = _realistic(key, depth, jnp.asarray(system.poses), camera, condition.reality, mesh.radius)
     off = float(jax.random.uniform(jax.random.fold_in(key, 1), minval=-0.05, maxval=0.05))
-    return Seen(np.asarray(real), mesh.radius * (1 + off), yaw)
+    colours = None
+    if paint is not None and condition.compared != "depth":
+        triangles, given = mesh.vertices[mesh.faces], (yaw, key, camera, condition.reality, condition.lights)
+        lit = lit_views(triangles, [paint.on(mesh.vertices, mesh.faces)], system.viewpoints, *given)[0]
+        colours = np.where((real > 0)[..., None], lit, np.nan)
+    return Seen(np.asarray(real), mesh.radius * (1 + off), yaw, colours)
 
 
 @partial(jax.jit, static_argnames=("camera", "reality"))
@@ -269,11 +319,12 @@ def _realistic(
 
 
 def _shape(
-    mesh: Mesh, condition: Condition, camera: ViewCamera, random: np.random.Generator
-) -> tuple[np.ndarray, np.ndarray] | list[DepthImage]:
+    mesh: Mesh, paint: Paint | None, condition: Condition, camera: ViewCamera, random: np.random.Generator
+) -> Any:
     """What an object is enrolled from: its mesh in metres, or depth images from around it, above the level of its centre."""
     if not condition.frames:
-        return mesh.vertices * mesh.radius, mesh.faces
+        shape = mesh.vertices * mesh.radius, mesh.faces
+        return shape if paint is None or condition.compared == "depth" else (*shape, paint)
     directions = random.normal(size=(50 * condition.frames, 3))
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
     directions = _spread(directions[directions[:, 2] > _LEVEL], condition.frames)
@@ -302,7 +353,7 @@ def _spread(directions: Float[np.ndarray, "all 3"], count: int) -> Float[np.ndar
 def _tables(system: TrainedSystem, seen: Sequence[Seen], labels: np.ndarray, condition: Condition) -> ViewTable:
     observer = Observer(system)
     for one in seen:
-        observer.add(one.depth, one.radius if condition.sized else np.nan)
+        observer.add(one.depth, one.radius if condition.sized else np.nan, one.colours)
     return observer.tables(labels)
 
 

@@ -71,14 +71,21 @@ class Observer:
 
     def __init__(self, system: TrainedSystem, like: Observer | None = None) -> None:
         self._poses, self._seen = jnp.asarray(system.poses), list[Observation]()
-        self._of_object: Any = like._of_object if like else jax.jit(jax.vmap(system.observe, in_axes=(0, 0, None)))
+        self._of_object: Any = like._of_object if like else jax.jit(jax.vmap(system.observe, in_axes=(0, 0, None, 0)))
 
-    def add(self, depth: Float[np.ndarray, "views side side"], radius: float = np.nan) -> None:
+    def add(
+        self,
+        depth: Float[np.ndarray, "views side side"],
+        radius: float = np.nan,
+        colours: Float[np.ndarray, "views side side 3"] | None = None,
+    ) -> None:
         """Adds the views of an object, in radii, 0 where nothing is hit, NaN where unknown; `radius` is in metres or NaN.
+
+        Colours are as of `TrainedSystem.observe`.
 
         A view that shows nothing, which an agent would refuse, is no evidence: its logits are 0.
         """
-        seen = self._of_object(jnp.asarray(depth, jnp.float32), self._poses, jnp.float32(radius))
+        seen = self._of_object(jnp.asarray(depth, jnp.float32), self._poses, jnp.float32(radius), colours)
         shows = jnp.asarray((depth > 0).any(axis=(1, 2)))
         self._seen.append(replace(seen, logits=jnp.where(shows[:, None], seen.logits, 0.0)))
 

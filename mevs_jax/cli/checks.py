@@ -108,9 +108,8 @@ def instances(options: InstancesOptions) -> None:
     from eval.checks.instances import CONDITIONS, instances_text, study_instances
     from mevs_jax.cli.tools import load_system
     from mevs_jax.enrolment import AlikeWarning
-    from mevs_jax.geometry.cameras import ViewCamera
     from train.results.records import as_json
-    from train.tasks.matcher import MatcherConfig, fit_matcher, objects_system
+    from train.tasks.colours import objects_fitted
 
     if options.shapes < 40:
         raise Unusable(f"--shapes must be at least 40, got {options.shapes}")
@@ -121,9 +120,7 @@ def instances(options: InstancesOptions) -> None:
     conditions = [one for one in CONDITIONS if one.name in names]
     system = options.system
     if options.fit:
-        config = MatcherConfig(shapes=options.shapes, calibration_shapes=options.shapes // 4)
-        camera = ViewCamera(resolution=64)
-        objects_system(fit_matcher(config, camera), camera).save(options.to / "objects")
+        objects_fitted(options.shapes).save(options.to / "objects")
         system = str(options.to / "objects")
         print(f"Trained system: {(options.to / 'objects').absolute()}")
     with warnings.catch_warnings():
