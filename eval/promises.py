@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from data_pipeline.dataset.builder import open_objects
+from data_pipeline.dataset.origin import objects_named
 from data_pipeline.errors import DataError
 from data_pipeline.files import write_json
 from data_pipeline.objects.sources import load_object
@@ -56,11 +56,9 @@ def agent_promises(run: Run, system_folder: Path) -> AgentPromises:
     if min(config.objects, config.shots, config.calls, config.max_views) < 1:
         raise DataError("--agent.objects, --agent.max-views, --agent.shots and --agent.calls must be at least 1")
     system, tables = load_system(system_folder), run.tables("test")
-    entries = {entry.name: entry for entry in open_objects(dataset).entries}
     chosen = np.unique(np.linspace(0, len(tables.names) - 1, config.objects).astype(int))
-    if missing := [tables.names[index] for index in chosen if tables.names[index] not in entries]:
-        raise DataError(f"{dataset.source} has no object {missing[0]!r}; pass the --data from which {run.out} was made")
-    meshes = [(load_object(entries[tables.names[index]]), int(tables.labels[index])) for index in chosen]
+    entries = objects_named(dataset, [tables.names[index] for index in chosen])
+    meshes = [(load_object(entry), int(tables.labels[index])) for entry, index in zip(entries, chosen, strict=True)]
     policies = [name for name in USABLE if name in system.policies]
     walks = compare_walks(system, run.data, config, policies)
     stops = {

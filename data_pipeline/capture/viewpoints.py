@@ -186,7 +186,9 @@ def viewpoints_of(config: CaptureConfig) -> OwnViewpoints:
     path = Path(config.lattice.removeprefix(FILE)).expanduser()
     found = read_viewpoints(path)
     if len(found.points) != config.views:
-        raise DataError(f"{path} has {len(found.points)} viewpoints, and --views is {config.views}; leave --views out")
+        raise DataError(
+            f"{path} has {len(found.points)} viewpoints, and --views or --dataset.capture.views is {config.views}; leave it out"
+        )
     return found
 
 

@@ -13,7 +13,7 @@ from data_pipeline.dataset.config import DataConfig
 from data_pipeline.errors import DataError
 from data_pipeline.objects.downloads import ARCHIVES, download, download_folder, local
 from data_pipeline.objects.folders import list_folder
-from data_pipeline.objects.mesh import SOURCE_SPLITS, ObjectSource
+from data_pipeline.objects.mesh import SOURCE_SPLITS, ObjectEntry, ObjectSource
 from data_pipeline.objects.sources import PROCEDURAL, Reading, mesh_zip, open_source, together
 from data_pipeline.progress import console
 from mevs_jax.meshes.reading import shown
@@ -33,6 +33,16 @@ def open_objects(config: DataConfig) -> ObjectSource:
         return _open_first(config)
     _check_apart((config.source, *config.more))
     return together([_open_first(_alone(config, data), keep_splits=True) for data in (config.source, *config.more)])
+
+
+def objects_named(config: DataConfig, names: Sequence[str]) -> list[ObjectEntry]:
+    """Returns the objects of these names, of which a data set has views; raises `DataError` if one is there no more."""
+    entries = {entry.name: entry for entry in open_objects(config).entries}
+    if gone := [name for name in names if name not in entries]:
+        raise DataError(
+            f"{config.source} has the object {gone[0]!r} no more; put it back, or make a run in another --out"
+        )
+    return [entries[name] for name in names]
 
 
 def _check_apart(every: Sequence[str]) -> None:

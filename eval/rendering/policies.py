@@ -18,7 +18,8 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from data_pipeline.capture.casting import DEPTH_SCALE
-from data_pipeline.dataset.builder import DataConfig, open_objects, open_split
+from data_pipeline.dataset.builder import DataConfig, open_split
+from data_pipeline.dataset.origin import objects_named
 from data_pipeline.dataset.statistics import DatasetStatistics
 from data_pipeline.errors import DataError
 from data_pipeline.files import npz_of, write_npz
@@ -182,13 +183,12 @@ def ascend_objects(dataset: DataConfig, statistics: DatasetStatistics, out: Path
             "--rendering.objects and --rendering.faces must be at least 1, --rendering.starts at least 2 and "
             "--rendering.resolution at least 8"
         )
-    entries = {entry.name: entry for entry in open_objects(dataset).entries}
     names = objects_of(out / "data", "test", statistics)[0]
     folder, chosen = _folder(out, statistics, config), chosen_objects(config, len(names))
-    for at in chosen:
-        if names[at] not in entries:
-            raise DataError(f"{dataset.source} has no object {names[at]!r}; pass the --data from which {out} was made")
-    jobs = [(int(at), entries[names[at]]) for at in chosen if not npz_of(folder, names[at]).exists()]
+    entries = objects_named(dataset, [names[at] for at in chosen])
+    jobs = [
+        (int(at), entry) for at, entry in zip(chosen, entries, strict=True) if not npz_of(folder, entry.name).exists()
+    ]
     if jobs:
         require_open3d()
     given = out / "data", statistics, folder, config

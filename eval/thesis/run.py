@@ -13,7 +13,8 @@ import numpy as np
 from flax import nnx
 
 from data_pipeline.capture.viewpoints import is_file
-from data_pipeline.dataset.builder import open_objects, prepare
+from data_pipeline.dataset.builder import prepare
+from data_pipeline.dataset.origin import objects_named
 from data_pipeline.dataset.statistics import report_left_out
 from data_pipeline.errors import DataError
 from data_pipeline.files import json_of, read_json
@@ -141,13 +142,15 @@ def _ascents(settings: Settings, tables: LatticeTables, classes: list[str]) -> A
     runs, starts, resolution = thesis.ascent_runs, thesis.ascent_starts, thesis.ascent_resolution
     if (missing := why_no_open3d()) is not None:
         return AscentTimes(runs, starts, resolution, missing)
-    meshes = {}
-    entries = {entry.name: entry for entry in open_objects(settings.dataset).entries}
+    wanted: dict[str, list[str]] = {}
     for label, name in enumerate(classes):
         members = np.flatnonzero(tables.labels == label)
         evenly = np.unique(np.linspace(0, len(members) - 1, min(runs, len(members))).round().astype(int))
         if len(members):
-            meshes[name] = [load_object(entries[tables.names[members[at]]]) for at in evenly]
+            wanted[name] = [tables.names[members[at]] for at in evenly]
+    found = objects_named(settings.dataset, [one for names in wanted.values() for one in names])
+    entries = {entry.name: entry for entry in found}
+    meshes = {name: [load_object(entries[one]) for one in names] for name, names in wanted.items()}
     volume, mesh = (time_ascent(METHODS[name], meshes, starts, resolution) for name in ("volume", "mesh"))
     return AscentTimes(runs, starts, resolution, volume=volume, mesh=mesh)
 

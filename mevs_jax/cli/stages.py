@@ -68,7 +68,7 @@ def data(call: Invocation) -> None:
     from data_pipeline.errors import DataError
     from eval.training import make_data
 
-    if call.options.beam and call.options.distributed:
+    if call.options.beam is not None and call.options.distributed:
         raise DataError("--beam has workers of its own; leave out --distributed")
     settings = call.settings
     if call.options.frames is not None:

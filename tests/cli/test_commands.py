@@ -94,7 +94,7 @@ def weights_for_another(root: Path) -> list:
 
 
 def weights_that_are_none(root: Path) -> list:
-    fitting = {"width": "64", "channels": "3", "stem": "convolution"}
+    fitting = {"width": "64", "depth": "18", "channels": "3", "stem": "convolution"}
     options = [word for name, value in fitting.items() for word in (f"--classifier.network.{name}", value)]
     return [*weights_for_another(root), *options]
 
@@ -113,7 +113,7 @@ def weights_that_are_none(root: Path) -> list:
         (no_archive, r"--archive .*ModelNet10.zip cannot be read: No such file"),
         (
             weights_for_another,
-            r"as its stem, this one has width 8, 1 channels and the stem \w+; use --preset thesis",
+            r"as its stem, this one has width 8, depth 10, 1 channels and the stem \w+; use --preset thesis",
         ),
         (weights_that_are_none, r"resnet18.pth is not a file of weights that can be read safely"),
     ],

@@ -82,9 +82,7 @@ def train_members(
                 if asked or optimiser.saves_after(of.step, epoch_steps):
                     started = save_and_end_if_asked(started)
             bar.advance(line, lead.end() * views)
-            _finish_epoch(of, training, trainer, batches, epoch_steps, optimiser.patience)
-            if halving and of.epoch in {max(1, optimiser.epochs // share) for share in (8, 4, 2)}:
-                of.halve()
+            _finish_epoch(of, training, trainer, batches, group, halving)
             best, still = min(member.loss for member in of.members), of.training(optimiser.patience).sum()
             said = f"{still} still train, best val loss {best:.4f}"
             console.print(f"{title}, epoch {of.epoch}/{optimiser.epochs}: {said}")
@@ -93,14 +91,17 @@ def train_members(
 
 
 def _finish_epoch(
-    of: Together, training: np.ndarray, trainer: Trainer, batches: _Batches, epoch_steps: int, patience: int
+    of: Together, training: np.ndarray, trainer: Trainer, batches: _Batches, group: Group, halving: bool
 ) -> None:
-    """Validates the members that are training, and keeps the weights of those that are better than before."""
-    means = {name: sums / epoch_steps for name, sums in trainer.sums().items()}
+    """Validates the members that are training, keeps the weights of those that are better than before, and drops the worse half
+    if it is time for that."""
+    optimiser, means = group.task.optimiser, {name: sums / group.epoch_steps for name, sums in trainer.sums().items()}
     with np.errstate(invalid="ignore"):  # of members that have stopped
         checked = weighted_means([trainer.evaluate(*given) for given in batches.validation(trainer.places)])
     of.epoch += 1
-    trainer.keep(of.after_epoch(training, means, checked, trainer.finite(), patience))
+    trainer.keep(of.after_epoch(training, means, checked, trainer.finite(), optimiser.patience))
+    if halving and of.epoch in {max(1, optimiser.epochs // share) for share in (8, 4, 2)}:
+        of.halve()
 
 
 class _Batches:

@@ -54,11 +54,12 @@ def starting_weights(files: tuple[Path, ...], network: ResNetConfig, encoder: st
         raise DataError(
             f"--pretrained weights are those of a ResNet, not of --encoder {encoder}; leave one of them out"
         )
-    if (network.width, network.channels, network.stem) != (64, 3, "convolution"):
+    if network.depth < 18 or (network.width, network.channels, network.stem) != (64, 3, "convolution"):
         raise DataError(
-            "--pretrained weights fit a ResNet of width 64 with 3 input channels and a convolution as its stem, this one has "
-            f"width {network.width}, {network.channels} channels and the stem {network.stem}; use --preset thesis, or "
-            "--classifier.network.width 64 --classifier.network.channels 3 --classifier.network.stem convolution"
+            "--pretrained weights fit a ResNet of width 64 and depth 18 or 34 with 3 input channels and a convolution as its "
+            f"stem, this one has width {network.width}, depth {network.depth}, {network.channels} channels and the stem "
+            f"{network.stem}; use --preset thesis, or --classifier.network.width 64 --classifier.network.depth 18 "
+            "--classifier.network.channels 3 --classifier.network.stem convolution"
         )
     return weights_from_torch(files, network.depth)
 

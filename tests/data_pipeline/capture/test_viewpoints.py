@@ -149,7 +149,7 @@ def test_cameras_stand_where_the_file_says(tmp_path):
     (tmp_path / "a.json").write_text(json.dumps(DIRECTIONS))
     config = CaptureConfig(views=5, lattice=f"{FILE}{tmp_path / 'a.json'}", resolution=8)
     np.testing.assert_allclose(rig_for(config).poses[:, :3, 3], 2 * np.sign(DIRECTIONS), atol=1e-6)
-    with pytest.raises(DataError, match="has 5 viewpoints, and --views is 6; leave --views out"):
+    with pytest.raises(DataError, match=r"has 5 viewpoints, and --views or --dataset.capture.views is 6; leave it out"):
         viewpoints_of(replace(config, views=6))
     assert viewpoints_of(CaptureConfig(views=10)).points.tolist() == fibonacci_sphere(10).tolist()
     with pytest.raises(ValueError, match="unknown lattice 'spiral': it is one of golden_angle"):

@@ -167,11 +167,18 @@ def test_a_detectors_masks_say_what_is_one_object(recording, scene):
         scene_in(recording, masks=masks[:, 1:])
 
 
-def test_without_ground_or_objects_there_is_one_sentence(recording):
-    with pytest.raises(DataError, match="nothing stands on the ground"):
+def test_without_ground_or_objects_there_is_one_sentence_whose_advice_works(recording, scene):
+    with pytest.raises(DataError, match=r"nothing stands on the ground; .*, or record more images"):
         scene_in(recorded(FLOOR, frames=4))
-    with pytest.raises(DataError, match="--upward"):
-        scene_in(replace(recording, T_world_camera=recording.T_world_camera @ np.diag([-1.0, -1, 1, 1])))
+    overhead = recording.T_world_camera @ np.diag([-1.0, -1, 1, 1])
+    turned = replace(recording, depth=recording.depth[:, ::-1, ::-1], T_world_camera=overhead)
+    with pytest.raises(DataError, match="says which way is up; give --upward X Y Z"):
+        scene_in(turned)
+    aside = np.linalg.svd(scene.up[None])[2][1]
+    with pytest.raises(DataError, match="that objects could stand on; give its height along --upward, --floor H"):
+        scene_in(recording, up=scene.up + aside)
+    assert len(scene_in(turned, up=scene.up).spheres) == len(scene.spheres)
+    assert len(scene_in(recording, up=scene.up + 0.01 * aside, floor=scene.floor).spheres) == len(scene.spheres)
 
 
 def test_the_command_lists_objects(recording, at_once, refuses, tmp_path):  # noqa: F811

@@ -73,7 +73,9 @@ def test_a_network_of_another_shape_refuses_them(weights):
         weights_from_torch((weights,), 18).put(untrained(lambda: ResNet(depth=18, stem="patches", rngs=nnx.Rngs(0))))
 
 
-@pytest.mark.parametrize("other", [{"width": 32}, {"channels": 4, "standardise": False}, {"stem": "patches"}])
+@pytest.mark.parametrize(
+    "other", [{"width": 32}, {"depth": 10}, {"channels": 4, "standardise": False}, {"stem": "patches"}]
+)
 def test_settings_that_they_cannot_fit_are_refused_before_anything_is_read(other):
     with pytest.raises(DataError, match=r"--pretrained weights fit a ResNet of width 64 .* a convolution as its stem"):
         starting_weights((Path("absent.pth"),), replace(ResNetConfig(depth=18), **other))
