@@ -36,6 +36,9 @@ def plain(**rest): return nnx.List([])
 def odd(classes, channels): ...
 def three(**rest): return Net(3, rest["channels"], 0, rest["rngs"])
 def scores(key, state, scene): return scene.graph.distances[state.view]
+def plain_odd(key): return key
+def few(key, state, scene): return scene.graph.distances[state.view][:2]
+def fails(key, state, scene): return scene.no_such_field
 """
 """Functions that are no encoders, and a policy."""
 SPLITS = {"train": (0, 1, 2), "test": (3, 4)}
@@ -95,6 +98,7 @@ def given(matcher, tmp_path_factory) -> dict[str, Path]:  # noqa: F811
     made["list"].write_text("learning-rate,dropout\n1e-3,0.1\n")
     made["no_list"].write_text("learning-rate\n")
     made["text"].write_text("hello")
+    made["text"].with_name("text.txt.py").write_text("hello")
     made["own"].write_text(ENCODER + OTHERS)
     write(made["hollow"], members() | {"mug/train/flat.off": off(box()[0], [])})
     save(making.system("sized"), made["sized"])

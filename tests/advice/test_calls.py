@@ -23,11 +23,12 @@ from eval.checks.compiling import CompileCheck, grown
 from eval.learned.measure import check_parts
 from eval.runs import tasks
 from eval.settings import TINY
-from mevs_jax import read_mesh
+from mevs_jax import ViewGraph, canonical_view, fibonacci_sphere, read_mesh
 from mevs_jax.environment.pure import ActiveRecognition
 from tests.advice.listing import matched
 from tests.data_pipeline.frames import bagging, forms, test_bags
 from tests.data_pipeline.objects.making import box, dae, glb, members, obj, off, ply, stl, threemf, write, zipped
+from tests.mevs_jax.geometry.test_canonical import CAMERA, data_set_shot
 from tests.mevs_jax.trained import making
 from tests.reference.evaluation import some_statistics, some_tables
 from train.loop import load_best
@@ -52,6 +53,44 @@ def test_a_mesh_that_is_exported_again(suffix, tmp_path):
         read_mesh(path, "z")
     path.write_bytes(whole)
     assert len(read_mesh(path, "z")[1]) == 12
+
+
+SHOT = data_set_shot()
+RIGHT = {"depth": np.full((64, 64), 2.0, np.float32), "K": SHOT.K, "T_world_camera": SHOT.T_world_camera}
+GIVEN = [
+    ("convert it, for example depth.astype(np.float32) / 1000 from millimetres",
+     "depth", RIGHT["depth"].astype(np.uint16) * 1000, lambda depth: depth.astype(np.float32) / 1000),
+    ("check the units of depth (metres), the pose and the mask", "depth", RIGHT["depth"] * 1000, lambda depth: depth / 1000),
+    ("depth is a masked array, whose mask would be lost; give depth.filled(numpy.nan)",
+     "depth", np.ma.masked_less(RIGHT["depth"], 1), lambda depth: depth.filled(np.nan)),
+    ("give True for the pixels of the object and False for the others",
+     "mask", np.full((64, 64), 7), lambda mask: mask == 7),
+    ("in pixels with positive fx and fy; check that it is not transposed", "K", SHOT.K.T, np.transpose),
+    ("for an image of …×… pixels; give K of this resolution", "K", SHOT.K * [[4], [4], [1]], lambda K: K / [[4], [4], [1]]),
+    ("is …, not (0, 0, 0, 1); check that the matrix is not transposed", "T_world_camera", SHOT.T_world_camera.T, np.transpose),
+    ("take scale and shear out of the pose",
+     "T_world_camera", SHOT.T_world_camera @ np.diag([2.0, 2, 2, 1]), lambda pose: pose @ np.diag([0.5, 0.5, 0.5, 1])),
+    ("so it mirrors; use right-handed axes (x right, y down, z forward)",
+     "T_world_camera", SHOT.T_world_camera @ np.diag([1.0, 1, -1, 1]), lambda pose: pose @ np.diag([1.0, 1, -1, 1])),
+    ("check center, T_world_camera (camera → world, not its inverse) and K", "center", (0.0, 0.0, 50.0), lambda _: SHOT.center),
+    ("inside its sphere of radius … m; check the poses' units (metres), or give a smaller radius", "radius", 2.5, lambda _: 1.0),
+]  # fmt: skip
+"""What is said of an argument of `canonical_view`, the argument, and what makes of it what is asked for."""
+
+
+@pytest.mark.parametrize(("told", "name", "wrong", "mend"), GIVEN)
+def test_an_image_that_is_given_as_it_is_asked_for(told, name, wrong, mend):
+    options = RIGHT | {"center": SHOT.center, "radius": 1.0, "camera": CAMERA}
+    refused(told, lambda: canonical_view(**options | {name: wrong}))
+    assert canonical_view(**options | {name: mend(wrong)}).depth.any()
+
+
+def test_viewpoints_of_other_lengths_and_twice():
+    points = 3 * fibonacci_sphere(8)
+    refused("viewpoints must be unit vectors: divide each by its length", lambda: ViewGraph.from_points(points))
+    twice = np.concatenate([points, points[:1]]) / 3
+    refused("two viewpoints coincide: remove one of them", lambda: ViewGraph.from_points(twice))
+    assert len(ViewGraph.from_points(twice[:-1]).points) == 8
 
 
 def test_a_bag_without_a_camera(tmp_path):
