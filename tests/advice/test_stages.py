@@ -24,6 +24,7 @@ from tests.advice.listing import found
 BEGINS = "the work begins"
 WORK = (
     "data_pipeline.dataset.builder.capture_all",
+    "data_pipeline.objects.recorded.meshes_of_recordings",
     "eval.training.prepare",
     "eval.training.fit",
     "eval.training.plan_of",
@@ -97,6 +98,8 @@ FOLLOWED = [
      "run --out gs://bucket/run", RUN),
     ("cannot write to … (…); choose another --out", "run --out {chair}/run", RUN),
     ("--beam has workers of its own; leave out --distributed", "data --beam= --distributed --out {to}", "data --out {to}"),
+    ("--frames makes the data set alone, by one process; leave out --data and --distributed",
+     "data --frames {scan} --data {set} --out {to}", "data --frames {scan} --out {to}"),
     # networks
     ("--pretrained weights are those of a ResNet, not of --encoder …; leave one of them out",
      RUN + "--pretrained {weights} --encoder {own}:net", RUN + "--encoder {own}:net"),
