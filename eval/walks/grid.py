@@ -1,9 +1,10 @@
-"""The thesis's grid, a program for each policy: objects × start views × draws × backbones × thresholds × limits on views.
+"""The thesis's grid: objects × start views × draws × backbones × thresholds × limits on views, for each policy.
 
 The views of a walk depend on neither the confidence threshold (CT) nor the limit on views (MV). So each object is
 walked once from each start view up to the largest MV, and every cell is computed from that walk. The cells of a
-policy share their random draws, all policies share their start views, and all differences are paired. A policy that
-does not use the belief walks once for all backbones: `vmap` does this by itself, because only the logits have an axis
+policy share their random draws, all policies share their start views, and all differences are paired. Policies share a
+program, which takes much less time to compile than one for each. With several backbones each policy has its own: one that
+does not use the belief then walks once for all backbones. `vmap` does this by itself, because only the logits have an axis
 of backbones.
 
 Objects are processed in chunks, which bounds the memory; several devices, or the cores of a CPU, share them. The random
@@ -21,12 +22,13 @@ import flax.struct
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.tree_util import Partial
 from jaxtyping import Array, Bool, Float, Int
 
 from mevs_jax.arrays import AnyArray
 from mevs_jax.beliefs.metrics import is_right
 from mevs_jax.geometry.viewpoints import ViewGraph
-from mevs_jax.policies.base import Knowledge, Policy, as_tree
+from mevs_jax.policies.base import Knowledge, Policy, Scene, SelectionState, as_tree
 from mevs_jax.policies.registry import PolicyRecord
 from mevs_jax.selection.loop import ViewTable
 from mevs_jax.selection.walks import every_walk, walks_around
@@ -149,16 +151,35 @@ def run_grid(
     objects, starts = (np.arange(len(tables.label)), tables), len(graph.points)
     most = _WALKS_IN_CACHE if jax.default_backend() == "cpu" else _WALKS_AT_ONCE
 
-    def results(policy: PolicyRecord) -> Results:
-        own = policy.draws(draws)
-        shared, at_once = (key, as_tree(policy.score), graph, knowledge, reachable), min(256, most // (starts * own))
-        found = over_objects(results_of_object, objects, *shared, at_once=at_once, draws=own, max_views=max_views)
-        leaves, structure = jax.tree.flatten(found)
-        del found  # with many objects, results are large: each array is freed once it is on the device
-        return jax.tree.unflatten(structure, [jnp.asarray(leaves.pop(0).swapaxes(0, 1)) for _ in range(len(leaves))])
+    programs: dict[tuple[int, str], list[PolicyRecord]] = {}
+    for policy in policies:
+        alone = policy.name if tables.logits.shape[1] > 1 else ""
+        programs.setdefault((policy.draws(draws), alone), []).append(policy)
+
+    def results(group: list[PolicyRecord]) -> dict[str, Results]:
+        own, every = group[0].draws(draws), tuple(as_tree(policy.score) for policy in group)
+        at_once, found = min(256, most // (starts * own)), {}
+        for number, policy in enumerate(group):
+            score = Partial(_one_of, jnp.int32(number), every) if len(every) > 1 else every[0]
+            shared = key, score, graph, knowledge, reachable
+            got = over_objects(results_of_object, objects, *shared, at_once=at_once, draws=own, max_views=max_views)
+            leaves, structure = jax.tree.flatten(got)
+            del got  # with many objects, results are large: each array is freed once it is on the device
+            placed = [jnp.asarray(leaves.pop(0).swapaxes(0, 1)) for _ in range(len(leaves))]
+            found[policy.name] = jax.tree.unflatten(structure, placed)
+        return found
 
     with ThreadPoolExecutor(programs_at_once()) as pool:  # a program is compiled on one core
-        return dict(zip([policy.name for policy in policies], pool.map(results, policies), strict=True))
+        found = {name: result for group in pool.map(results, programs.values()) for name, result in group.items()}
+    return {policy.name: found[policy.name] for policy in policies}
+
+
+def _one_of(
+    number: Int[Array, ""], policies: tuple[Policy, ...], key: Array, state: SelectionState, scene: Scene
+) -> Float[Array, " views"]:
+    """The scores of one of several policies, which is known when the program runs."""
+    branches = [lambda *given, policy=policy: jnp.asarray(policy(*given), jnp.float32) for policy in policies]
+    return jax.lax.switch(number, branches, key, state, scene)
 
 
 def results_of_object(
