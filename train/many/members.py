@@ -146,8 +146,8 @@ class Group:
     def initial_states(self) -> list[TrainState]:
         """Returns the states with which the members begin when trained alone.
 
-        They are not made by a compiled program, which would round some weights otherwise: after a few hundred steps that is
-        enough to make it another training.
+        They are made one by one: another program would round some weights otherwise, and after a few hundred steps that is enough
+        to make it another training.
         """
         states = (
             initial_state(self.task, member.seed, self.start_of(index)) for index, member in enumerate(self.members)
