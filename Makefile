@@ -16,7 +16,7 @@ demo: $(READY)  ## environment; the system of the package looks at a table; data
 	@mkdir -p $(dir $(OUT))
 	$(BIN)/mevs look --mesh table --draw $(OUT)-table.png
 	@echo "A picture of it: $(OUT)-table.png"
-	$(BIN)/mevs run --preset small --out $(OUT)
+	$(BIN)/mevs run --preset demo --out $(OUT)
 
 test: lint  ## format, lint, types, and the tests that are not marked slow
 	$(PYTEST) -m "not slow"

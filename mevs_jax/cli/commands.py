@@ -189,7 +189,7 @@ _OLD_OPTIONS = {
     "--thesis.climbing-": "--thesis.ascent-",
 }
 
-HELP = """usage: mevs COMMAND [--out DIR] [--preset small|best|thesis|tiny] [OPTIONS] [SETTINGS]
+HELP = """usage: mevs COMMAND [--out DIR] [--preset demo|small|best|thesis|tiny] [OPTIONS] [SETTINGS]
 
 Where should a camera look next? Trains the networks of maximum entropy viewpoint selection and
 measures how much choosing the next view helps.
@@ -206,7 +206,7 @@ studies, checks, drawings:
 common options:
   --out DIR               where everything is written (default runs/<preset>); a run continues there
   --preset NAME           small (default): 64×64 views and narrow networks, for a CPU; best, thesis:
-                          for an accelerator; tiny: to see it all work in minutes
+                          for an accelerator; demo: that of `make demo`; tiny: to see it all work
   --data PATH             furniture10 (default, built in), furniture10-families (more various),
                           modelnet10 or modelnet40 (downloaded), a folder <class>/{{train,test}}/
                           of .off, .obj, .stl, .ply, .gltf, .glb, .dae or .3mf, a zip of that

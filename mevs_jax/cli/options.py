@@ -8,7 +8,7 @@ from typing import Annotated, Any, Literal
 
 import tyro
 
-Preset = Literal["small", "best", "thesis", "tiny"]
+Preset = Literal["demo", "small", "best", "thesis", "tiny"]
 
 
 def _arg(metavar: str, default: str = "") -> Any:
@@ -27,7 +27,7 @@ class Options:
 
     out: Annotated[Path | None, _arg("DIR", "runs/PRESET")] = None
     """folder of the run: everything is written there, and a run continues there"""
-    preset: Annotated[Preset | None, _arg("small|best|thesis|tiny", "that of the run, or small")] = None
+    preset: Annotated[Preset | None, _arg("demo|small|best|thesis|tiny", "that of the run, or small")] = None
     """defaults of all settings; a run that was begun keeps its own (run.json)"""
     print_config: Flag = False
     """print the resolved configuration as JSON and stop"""
