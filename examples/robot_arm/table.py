@@ -6,6 +6,7 @@ import sys
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
+from pathlib import PurePosixPath
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -91,7 +92,8 @@ def meshes_of(data: str, metres: float) -> dict[str, Mesh]:
         raise DataError(
             f"{data} has {len(found)} objects of {low:.2f} to {high:.2f} m, and 2 are needed; check --metres"
         )
-    return found
+    short = {PurePosixPath(name).stem: mesh for name, mesh in found.items()}
+    return short if len(short) == len(found) else found
 
 
 @contextmanager

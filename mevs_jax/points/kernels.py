@@ -152,7 +152,7 @@ def _largest(passed: Any, offsets: Any, neighbours: Any, *layers_and_found: Any,
         kernel, factor, bias = layers[first : first + 3]
         number = jnp.arange(x.shape[1], dtype=jnp.int32)[:, None]
         inside = (number < kernel.shape[0]) & (of >= 0)[None, :]
-        x = pl.dot(x, triton.load(kernel.at[number, of[None, :]], mask=inside, other=0.0))
+        x = jnp.dot(x, triton.load(kernel.at[number, of[None, :]], mask=inside, other=0.0))
         return jnp.maximum(x * factor[of][None, :] + bias[of][None, :], 0)
 
     last = len(layers) - 3
