@@ -13,7 +13,7 @@ from jaxtyping import Float, UInt8
 
 from mevs_jax.agent.looking import Frames
 from mevs_jax.arrays import AnyArray, AnyVector
-from mevs_jax.gallery.frames import images_of_frames
+from mevs_jax.gallery.frames import images_of_frames, refined
 from mevs_jax.gallery.matching import ALIKE, Gallery, differences_by_turn
 from mevs_jax.gallery.meshes import images_of_mesh
 from mevs_jax.geometry.cameras import ViewCamera
@@ -157,7 +157,7 @@ def _images(
         if any(image.mask is None and image.floor is None for image in parts):
             raise ValueError("an image needs a mask or a floor, to tell the object from the rest")
         points = [_above(image, number, up) for number, image in enumerate(parts, 1)]
-        sphere = Sphere(*estimate_sphere(np.concatenate(points), up=up), up)
+        sphere = refined(Sphere(*estimate_sphere(np.concatenate(points), up=up), up), parts)
         return *images_of_frames(parts, sphere, camera), sphere.radius
     if len(parts) not in (2, 3) or any(isinstance(part, DepthImage) for part in parts):
         raise ValueError(

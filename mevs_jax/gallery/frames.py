@@ -20,7 +20,7 @@ from mevs_jax.gallery.matching import stored_image
 from mevs_jax.geometry.cameras import ViewCamera, pixel_directions
 from mevs_jax.geometry.canonical import colours_from
 from mevs_jax.geometry.source_view import DepthImage
-from mevs_jax.geometry.sphere import Sphere, upright
+from mevs_jax.geometry.sphere import Sphere, estimate_sphere, upright
 
 GRID = 64
 """Cells of the grid along each side of the object's sphere."""
@@ -31,6 +31,8 @@ _STEPS = 2 * GRID
 _SHADE = 0.1
 """Radii of what is unknown in front of a surface, from which on it may be hidden."""
 _RESOLUTION = 2 * SIDE
+_MARGIN, _FEWEST = 1.1, 8
+"""Radii of a sphere that is refined, and cells of a surface that this takes."""
 
 
 def images_of_frames(
@@ -70,6 +72,16 @@ def fused(frames: Sequence[DepthImage], sphere: Sphere) -> Float[Array, "grid gr
         if not int(hits):
             raise ValueError(f"frame {number} shows nothing inside the object's sphere")
     return jnp.where(weight > 0, total / jnp.maximum(weight, 1), jnp.nan)
+
+
+def refined(sphere: Sphere, frames: Sequence[DepthImage]) -> Sphere:
+    """The sphere of what images show together; `sphere` is that of all of their points, of which errors make it too large."""
+    around = Sphere(sphere.position, _MARGIN * sphere.radius, sphere.up)
+    cells = np.argwhere(np.asarray(fused(frames, around)) <= 0)
+    if len(cells) < _FEWEST:
+        return sphere
+    places = ((cells + 0.5) * (2 / GRID) - 1) * around.radius
+    return Sphere(*estimate_sphere(around.position + places @ upright(sphere.up), up=sphere.up), sphere.up)
 
 
 def _prepared(frame: DepthImage, sphere: Sphere) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.float32]:

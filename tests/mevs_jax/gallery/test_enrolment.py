@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -13,13 +14,13 @@ from data_pipeline.objects.furniture.solids import box, cylinder, joined
 from data_pipeline.objects.mesh import normalise
 from mevs_jax.agent import Frames
 from mevs_jax.enrolment import AlikeWarning, alike, enrol, remove, rename
-from mevs_jax.gallery.frames import images_of_frames
+from mevs_jax.gallery.frames import images_of_frames, refined
 from mevs_jax.gallery.grid import UNKNOWN, YAWS
 from mevs_jax.gallery.matching import small_image
 from mevs_jax.gallery.meshes import images_of_mesh
 from mevs_jax.geometry.cameras import cameras_at
 from mevs_jax.geometry.source_view import DepthImage
-from mevs_jax.geometry.sphere import Sphere
+from mevs_jax.geometry.sphere import Sphere, estimate_sphere
 from mevs_jax.trained import TrainedSystem
 from tests.mevs_jax.gallery.conftest import CAMERA
 from train.tasks.matcher import turned_rig
@@ -120,6 +121,24 @@ def test_a_few_depth_images_do_instead_of_a_mesh(blank: TrainedSystem, shapes) -
     given = Frames.of(stacked | {"center": sphere.position, "radius": np.array(0.2)})
     again = enrol({"knob": given}, blank)
     assert float(again.parts.gallery.radii[0]) == pytest.approx(0.2)
+
+
+def test_errors_of_single_images_do_not_make_an_object_larger(shapes, random) -> None:
+    """Clumps of pixels in front of or behind the object, each in one image, through which the other images see."""
+    frames = frames_of(shapes["tall"], np.vstack([AROUND, -AROUND]), 0.2)
+    points, given = [], []
+    for frame in frames:
+        depth = np.array(frame.depth)
+        rows, columns = np.nonzero(depth > 0)
+        for place in random.integers(len(rows), size=3):
+            depth[rows[place] : rows[place] + 3, columns[place] : columns[place] + 3] += random.choice([-0.06, 0.06])
+        given.append(replace(frame, depth=depth, mask=frame.mask & (depth > 0)))
+        points.append(given[-1].points())
+    found = Sphere(*estimate_sphere(np.concatenate(points)))
+    better = refined(found, given)
+    assert found.radius > 1.06 * 0.2
+    assert better.radius == pytest.approx(0.2, rel=0.05)
+    assert np.linalg.norm(better.position - (0.3, -0.2, 0.5)) < 0.5 * np.linalg.norm(found.position - (0.3, -0.2, 0.5))
 
 
 def test_images_of_frames_are_those_of_the_mesh_where_it_was_seen(shapes) -> None:
