@@ -18,6 +18,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int, UInt8
 
 from mevs_jax.arrays import AnyArray
+from mevs_jax.gallery.errors import ERRORS, gram_of, unexplained
 from mevs_jax.gallery.grid import HEIGHTS, SIDE, STEPS, UNKNOWN, YAWS, foreseen, interpolated, of_walks
 
 COLOURS = 3 * SIDE**2
@@ -29,6 +30,9 @@ _DARK = 0.08
 _RANGE = math.log(1 + 1 / _DARK)
 LEAST = 0.02
 """Smallest share of an image in which colours are compared."""
+_SHIFTS = np.array([0.3, 0.3, 0.03, 0.05, 0.05], np.float32)
+"""Standard deviations of what may be wrong in an image: shifts in pixels of small images, to the right and down; the logarithm of
+its size; yaw and elevation of the camera in radians. They are as many as `mevs_jax.gallery.errors.ERRORS`."""
 _SHOWN = 0.3
 """Share of an image whose colours the next view will show, about."""
 
@@ -131,12 +135,14 @@ class Colours:
         images: (coloured, heights, yaws, colours) of each object whose colours are known, as `stored_colours`.
         objects: (coloured,) which objects these are.
         features: (coloured, heights, yaws, features) the same, projected.
+        slopes: (coloured, heights, yaws, errors, features) how features change with `_SHIFTS`.
     """
 
     matcher: ColourMatcher
     images: UInt8[Array, "coloured heights yaws colours"]
     objects: Int[Array, " coloured"]
     features: Float[Array, "coloured heights yaws features"]
+    slopes: Float[Array, "coloured heights yaws errors features"]
 
     @classmethod
     def of(
@@ -144,9 +150,12 @@ class Colours:
     ) -> Colours:
         """The colours of some images."""
         stored = jnp.asarray(images, jnp.uint8)
-        features = [parted(*decoded(one))[0] @ matcher.projection for one in stored]
         nothing = jnp.zeros((0, HEIGHTS, YAWS, matcher.projection.shape[1]))
-        return cls(matcher, stored, jnp.asarray(objects, jnp.int32), jnp.stack(features) if features else nothing)
+        features, slopes = nothing, nothing[..., None, :].repeat(ERRORS, axis=-2)
+        if len(stored):
+            found = [_of_object(one, matcher.projection) for one in stored]
+            features, slopes = (jnp.stack(part) for part in zip(*found, strict=True))
+        return cls(matcher, stored, jnp.asarray(objects, jnp.int32), features, slopes)
 
     def with_more(self, images: Sequence[UInt8[AnyArray, "heights yaws colours"] | None], objects: int) -> Colours:
         """With more objects after those of before, some of them without colours."""
@@ -179,7 +188,11 @@ class Colours:
         known, apart = jnp.mean(~jnp.isnan(seen[..., 0])), jnp.full((objects, YAWS), self.matcher.unseen)
         if len(self.images):
             numbers, share = differences(self.images, seen, direction)
-            found = jnp.mean(jnp.square(numbers @ self.matcher.projection), axis=-1)
+            white = numbers @ self.matcher.projection
+            slope = interpolated(self.slopes.reshape(*self.slopes.shape[:3], -1), direction)
+            slope = slope.reshape(*white.shape[:2], ERRORS, -1)
+            lean = jnp.einsum("oyf,oyef->oye", white, slope) / white.shape[-1]
+            found = unexplained(jnp.mean(jnp.square(white), axis=-1), lean, gram_of(slope), 1.0)
             enough = jnp.clip(share / jnp.maximum(known, LEAST), 0, 1)
             apart = apart.at[self.objects].set(self.matcher.unseen + enough * (found - self.matcher.unseen))
         return jnp.append(apart.reshape(-1), known)
@@ -205,10 +218,16 @@ class Colours:
         same = self.objects == (hypotheses // YAWS)[:, None]
         at, coloured = jnp.argmax(same, axis=1), jnp.any(same, axis=1)
         before, count = evidence.apart.reshape(-1)[hypotheses], evidence.count
-        seen = foreseen(self.features, directions, at, hypotheses % YAWS)
+        seen, slope = (
+            foreseen(grid.reshape(*grid.shape[:3], -1), directions, at, hypotheses % YAWS)
+            for grid in (self.features, self.slopes)
+        )
+        slope = slope.reshape(*seen.shape[:2], ERRORS, -1)
         products = jnp.einsum("cmf,cnf->cmn", seen, seen) / seen.shape[-1]
-        squares = jnp.diagonal(products, axis1=1, axis2=2)
-        apart = jnp.maximum(squares[:, :, None] + squares[:, None, :] - 2 * products, 0.0) + jnp.min(before)
+        leans = jnp.einsum("cmf,cnef->cmne", seen, slope) / seen.shape[-1]
+        squares, own = jnp.diagonal(products, axis1=1, axis2=2), jnp.einsum("cnne->cne", leans)
+        square = jnp.maximum(squares[:, :, None] + squares[:, None, :] - 2 * products, 0.0)
+        apart = unexplained(square, leans - own[:, None], gram_of(slope)[:, None], 1.0) + jnp.min(before)
         apart = jnp.where(coloured[:, None] & coloured, apart, self.matcher.unseen)
         more = jnp.where(count > 0, _SHOWN, 0.0)
         apart = (count * before + more * apart) / jnp.maximum(count + more, LEAST)
@@ -219,6 +238,39 @@ def decoded(images: UInt8[Array, "*images colours"]) -> tuple[Float[Array, "*ima
     """Logarithms of stored colours, and which pixels have one."""
     pixels = images.reshape(*images.shape[:-1], SIDE**2, 3)
     return pixels * (_RANGE / STEPS), pixels[..., 0] != UNKNOWN
+
+
+@jax.jit
+def _of_object(
+    images: UInt8[Array, "heights yaws colours"], projection: Float[Array, "numbers features"]
+) -> tuple[Float[Array, "heights yaws features"], Float[Array, "heights yaws errors features"]]:
+    """`Colours.features` and `Colours.slopes` of an object."""
+    logs, known = decoded(images)
+    small = logs.reshape(*known.shape[:2], SIDE, SIDE, 3), known.reshape(*known.shape[:2], SIDE, SIDE)
+    down, across = (_slope(*small, axis) for axis in (2, 3))
+    turned, raised = _slope(*small, 1, wraps=True) * (YAWS / (2 * np.pi)), _slope(*small, 0) * ((HEIGHTS - 1) / np.pi)
+    at = (jnp.arange(SIDE) - (SIDE - 1) / 2)[:, None]
+    changes = jnp.stack([across, down, across * at + down * at[:, None], turned, raised], axis=2)
+    changes = changes.reshape(*known.shape[:2], ERRORS, SIDE**2, 3) * _SHIFTS[:, None, None]
+    slopes = parted(changes, jnp.broadcast_to(known[:, :, None], changes.shape[:-1]))[0]
+    return parted(logs, known)[0] @ projection, slopes @ projection
+
+
+def _slope(
+    logs: Float[Array, "heights yaws small small 3"],
+    known: Bool[Array, "heights yaws small small"],
+    axis: int,
+    wraps: bool = False,
+) -> Float[Array, "heights yaws small small 3"]:
+    """Derivative by steps along an axis: the mean of the differences from both neighbours, of those that are known."""
+    total, number = jnp.zeros_like(logs), jnp.zeros_like(logs)
+    places = jnp.arange(logs.shape[axis]).reshape(-1, *(1,) * (logs.ndim - axis - 1))
+    for step in (-1, 1):
+        inside = wraps | (places < logs.shape[axis] - 1 if step == 1 else places > 0)
+        both = (known & jnp.roll(known, -step, axis))[..., None] & inside
+        total += jnp.where(both, step * (jnp.roll(logs, -step, axis) - logs), 0.0)
+        number += both
+    return total / jnp.maximum(number, 1)
 
 
 def parted(

@@ -95,10 +95,10 @@ class PaintedShape(NamedTuple):
 
 
 def random_paint(random: np.random.Generator) -> Callable[[np.ndarray], np.ndarray]:
-    """A function from points in the unit sphere (n, 3) to their colours (n, 3): a plain colour, with patches, stripes, blobs and
-    fine print of other colours, each or none of them."""
+    """A function from points in the unit sphere (n, 3) to their colours (n, 3): a plain colour, with patches, stripes,
+    blobs, fine print and coarse pictures of other colours, each or none of them."""
     base = _colour(random)
-    layers = [_layer(random) for _ in range(random.choice([0, 1, 2, 3, 4], p=[0.15, 0.2, 0.25, 0.2, 0.2]))]
+    layers = [_layer(random) for _ in range(random.choice([0, 1, 2, 4, 8], p=[0.15, 0.2, 0.25, 0.2, 0.2]))]
     grain = random.normal(size=(4, 3)) * 5, random.uniform(0, 2 * np.pi, 4), random.uniform(0, 0.08)
 
     def paint(points: np.ndarray) -> np.ndarray:
@@ -112,7 +112,9 @@ def random_paint(random: np.random.Generator) -> Callable[[np.ndarray], np.ndarr
 
 
 def _colour(random: np.random.Generator) -> np.ndarray:
-    """A random colour; a third of them are about grey."""
+    """A random colour: a quarter of them are printing inks and their mixtures, a quarter are about grey."""
+    if random.random() < 0.25:
+        return random.choice([0.02, 0.9], 3) + random.uniform(0, 0.1, 3)
     grey = random.uniform(0.03, 0.97)
     saturation = random.choice([0.08, 0.5, 1.0]) * random.random(3)
     return np.clip(grey * (1 - saturation) + random.random(3) * saturation, 0, 1)
@@ -120,12 +122,13 @@ def _colour(random: np.random.Generator) -> np.ndarray:
 
 def _layer(random: np.random.Generator) -> tuple[Callable[[np.ndarray], np.ndarray], np.ndarray]:
     """Where a layer of paint is, and its colour."""
-    colour, sort = _colour(random), random.integers(4)
+    colour, sort = _colour(random), random.integers(5)
     axis, phase = random.normal(size=3), random.uniform(0, 2 * np.pi)
     low = random.uniform(-0.9, 0.5, 3)
     high = low + random.uniform(0.2, 1.2, 3) * np.where(random.random(3) < 0.3, 5, 1)
     waves, phases = random.normal(size=(5, 3)) * random.uniform(1.5, 5), random.uniform(0, 2 * np.pi, 5)
     fine, threshold = random.normal(size=(6, 3)) * 25, random.uniform(-0.5, 1)
+    cell, share = random.uniform(0.05, 0.3), random.uniform(0.2, 0.7)
 
     def inside(points: np.ndarray) -> np.ndarray:
         box = np.asarray(((points > low) & (points < high)).all(axis=1))
@@ -135,7 +138,10 @@ def _layer(random: np.random.Generator) -> tuple[Callable[[np.ndarray], np.ndarr
             return np.asarray(np.sin(points @ axis * 4 + phase) > threshold)
         if sort == 2:
             return np.asarray(np.sin(points @ waves.T + phases).sum(axis=1) > threshold)
-        return np.asarray(box & (np.sin(points @ fine.T + phases[0]).sum(axis=1) > 0))
+        if sort == 3:
+            return np.asarray(box & (np.sin(points @ fine.T + phases[0]).sum(axis=1) > 0))
+        scattered = np.sin(np.floor(points / cell) @ axis * 78.233) * 43758.5453
+        return np.asarray(box & (scattered % 1 < share))
 
     return inside, colour
 

@@ -13,7 +13,16 @@ from data_pipeline.objects.furniture.solids import box, joined
 from mevs_jax.agent import Frames
 from mevs_jax.agent.looking import replay
 from mevs_jax.enrolment import AlikeWarning, alike, enrol, remove
-from mevs_jax.gallery.colours import COLOURS, NUMBERS, ColourMatcher, decoded, differences, stored_colours
+from mevs_jax.gallery.colours import (
+    COLOURS,
+    NUMBERS,
+    ColourMatcher,
+    Colours,
+    decoded,
+    differences,
+    parted,
+    stored_colours,
+)
 from mevs_jax.gallery.grid import HEIGHTS, SIDE, YAWS, grid_directions
 from mevs_jax.gallery.meshes import caster_of, images_of_mesh, painted, seen_of
 from mevs_jax.geometry.source_view import DepthImage
@@ -104,6 +113,49 @@ def test_objects_without_colours_are_recognised_as_before(eyes, blank, shapes, b
     expected = np.asarray(plain.observe(depth, pose).logits)
     np.testing.assert_allclose(np.asarray(coloured.observe(depth, pose).logits), expected, atol=1e-4)
     np.testing.assert_allclose(np.asarray(plain.observe(depth, pose, colours=colours).logits), expected, atol=1e-6)
+
+
+def test_a_shift_of_an_image_by_a_third_of_a_pixel_hardly_counts(eyes: TrainedSystem) -> None:
+    def printed(right: float, down: float, size: float = 1.0) -> np.ndarray:
+        """A print that looks the same from everywhere, moved by some pixels."""
+        at = (np.arange(SIDE) - (SIDE - 1) / 2) / size
+        x, y = np.meshgrid(at - right, at - down)
+        return np.stack(
+            [0.5 + 0.3 * np.sin(0.5 * x), 0.5 + 0.3 * np.cos(0.4 * y), 0.5 + 0.3 * np.sin((x + y) / 3)], axis=-1
+        )
+
+    assert eyes.parts.gallery is not None
+    assert eyes.parts.gallery.colours is not None
+    still = np.broadcast_to(printed(0, 0), (HEIGHTS, YAWS, SIDE, SIDE, 3)).astype(np.float32)
+    matcher = eyes.parts.gallery.colours.matcher
+    colours = Colours.of(matcher, stored_colours(still)[None], np.arange(1))
+    step = 0.05
+    moves = [
+        (printed(step, 0), printed(-step, 0)),
+        (printed(0, step), printed(0, -step)),
+        (printed(0, 0, 1 + step), printed(0, 0, 1 - step)),
+    ]
+    for number, (more, less) in enumerate(moves):
+        change = (np.log(less / 0.08 + 1) - np.log(more / 0.08 + 1)) / (2 * step)  # of an image, as the camera moves
+        scaled = change * (0.3, 0.3, 0.03)[number]
+        expected = np.asarray(
+            parted(jnp.asarray(scaled.reshape(-1, 3)), jnp.ones(SIDE**2, bool))[0] @ matcher.projection
+        )
+        found = np.asarray(colours.slopes[0, 4, 7, number])
+        assert np.corrcoef(expected, found)[0, 1] > 0.95
+        np.testing.assert_allclose(np.linalg.norm(found), np.linalg.norm(expected), rtol=0.2)
+    np.testing.assert_allclose(colours.slopes[0, :, :, 3:], 0, atol=1e-4)  # all directions look the same
+
+    def apart(seen: np.ndarray) -> float:
+        return float(colours.compared(jnp.asarray(seen, jnp.float32), jnp.array([1.0, 0, 0]), 1)[0])
+
+    def plain(seen: np.ndarray) -> float:
+        numbers = differences(colours.images, jnp.asarray(seen, jnp.float32), jnp.array([1.0, 0, 0]))[0]
+        return float(jnp.mean(jnp.square(numbers @ matcher.projection)[0, 0]))
+
+    for move in ((0.3, 0.0), (0.0, -0.3), (0.2, 0.2)):
+        assert apart(printed(*move)) < 0.35 * plain(printed(*move))
+    assert apart(printed(5, 3)) > 0.4 * plain(printed(5, 3))  # another print
 
 
 def test_a_difference_is_that_of_a_slow_reference() -> None:
