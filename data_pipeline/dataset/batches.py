@@ -40,6 +40,7 @@ class ViewBatches:
             of every object's views (`views_aside`).
         balanced: repeat the objects of rarer classes in an epoch, so that all classes have the same weight.
         workers: number of processes that read; 0 for threads of this process. Batches are the same.
+        target: name of values of the views that are learned in place of their entropies (`target_path`); empty for entropies.
     """
 
     batch_size: int
@@ -51,6 +52,7 @@ class ViewBatches:
     validation_by: Literal["object", "view"] = "object"
     balanced: bool = False
     workers: int = 0
+    target: str = ""
 
     def __post_init__(self) -> None:
         if self.fold is not None and self.validation_by == "view":
@@ -137,12 +139,37 @@ def equally_often(objects: np.ndarray, labels: np.ndarray) -> np.ndarray:
     return np.concatenate([np.resize(objects[members == one], largest) for one in range(members.max() + 1)])
 
 
+def target_path(folder: Path, target: str, split: str) -> Path:
+    """Returns the file of the values of all views of a split, `array` (objects, views), in the order of the shards."""
+    return folder / "targets" / f"{target}_{split}.npz"
+
+
+class _Valued:
+    """Objects of a split with other values in place of their entropies."""
+
+    def __init__(self, objects: Any, path: Path):
+        with np.load(path) as stored:
+            self._objects, self._values = objects, stored["array"]
+
+    def __len__(self) -> int:
+        return len(self._objects)
+
+    def __getitem__(self, index: int) -> dict[str, Any]:
+        return self._objects[index] | {"entropy": self._values[index]}
+
+
+def _objects_of(folder: Path, split: str, config: ViewBatches) -> Any:
+    """Returns the objects of a split, with what views hold and what is learned of them."""
+    objects = open_split(folder, split, _keys_read(config.points, config.images))
+    return _Valued(objects, target_path(folder, config.target, split)) if config.target else objects
+
+
 class _TrainingObjects:
     """The objects of all training splits, concatenated; the key `trainable` lists the views that may be used for training."""
 
     def __init__(self, folder: Path, config: ViewBatches):
-        splits, read = training_splits(config), _keys_read(config.points, config.images)
-        self._sources, self._config = [open_split(folder, split, read) for split in splits], config
+        splits = training_splits(config)
+        self._sources, self._config = [_objects_of(folder, split, config) for split in splits], config
         self._kept = objects_kept(sum(map(len, self._sources)), config)
         if config.balanced:
             labels = np.concatenate([read_index(folder, split, "label")["label"] for split in splits])
@@ -187,8 +214,8 @@ def validation_batches(
         views: number of views of each object (by view: their held-out share); 0 for all of them.
         part: which of the objects; all by default.
     """
-    read = _keys_read(config.points, config.images)
-    objects = open_split(folder, "val", read) if config.validation_by == "object" else _TrainingObjects(folder, config)
+    by_object = config.validation_by == "object"
+    objects = _objects_of(folder, "val", config) if by_object else _TrainingObjects(folder, config)
     positions = range(len(objects))[part]
     return _read(
         _mapped(positions, partial(_validation_views, objects=objects, config=config, views=views)), config.workers

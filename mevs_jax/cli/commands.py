@@ -125,6 +125,12 @@ COMMANDS = {
         "studies:published_code",
         ("classifier", "evaluation"),
     ),
+    "study future-work": Command(
+        "other values to predict, other outputs and layers, as the thesis names them",
+        "StudyOptions",
+        "studies:future_work",
+        ("dataset", "classifier", "entropy", "evaluation"),
+    ),
     "check live": Command(
         "walk with the networks in the loop; compare with the view tables",
         "WithPolicies",

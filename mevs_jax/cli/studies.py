@@ -1,4 +1,4 @@
-"""Studies: `mevs study thesis`, `learned`, `rendering`, `published-code`."""
+"""Studies: `mevs study thesis`, `learned`, `rendering`, `published-code`, `future-work`."""
 
 from __future__ import annotations
 
@@ -37,3 +37,16 @@ def published_code(call: Invocation) -> None:
     training.train_by_view(call.settings, call.out, weights_of(call))
     evaluate(call)
     report(call)
+
+
+def future_work(call: Invocation) -> None:
+    """What the thesis names as future work."""
+    from eval.future.study import line_of, study_future_work
+
+    found = study_future_work(call.settings, call.out)
+    random = ", ".join(f"{100 * share:.1f}" for share in found.random)
+    views = " and ".join(map(str, found.counted))
+    print(f"{found.objects} test objects, after {views} views; 95 % intervals over objects; random views {random} %")
+    for row in found.rows:
+        print(line_of(row))
+    print(f"Best on validation objects: {found.best}. Table: {(call.out / 'future' / 'table.json').absolute()}")

@@ -129,9 +129,8 @@ def test_bad_input_gets_one_sentence_and_exit_code_2(tmp_path, make, message, re
 def test_unknown_words_are_refused_and_help_reads_well(tmp_path, refuses, at_once):
     assert "unknown command 'fly'" in refuses("fly")
     assert "unknown preset 'huge'" in refuses("run", "--preset", "huge")
-    assert "followed by one of thesis, learned, rendering, instances, published-code; none was given" in refuses(
-        "study"
-    )
+    studies = "thesis, learned, rendering, instances, published-code, future-work"
+    assert f"followed by one of {studies}; none was given" in refuses("study")
     assert "'fly' is none of them" in refuses("check", "fly")
     assert "no data set in" in refuses("train", "--out", tmp_path)
     assert "cannot join the other processes" in refuses("train", "--distributed", "--out", tmp_path)

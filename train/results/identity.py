@@ -31,6 +31,8 @@ VERSIONS = {
     "walks": 2,
     "decision": 1,
     "instances": 1,
+    "targets": 1,
+    "future": 1,
 }
 """The version of each kind of kept result: raised by one when its numbers change their meaning or are computed in another way.
 Results of before there were versions are of version 1."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import partial
-from typing import Literal
+from typing import Any, Literal
 
 import jax
 import jax.numpy as jnp
@@ -81,7 +81,7 @@ class EntropyTask:
     def hyperparameters(self) -> Hyperparameters:
         return Hyperparameters.of(self.optimiser, self.network_config.dropout, self.augmentation.strength)
 
-    def network(self, rngs: nnx.Rngs) -> PointNet2:
+    def network(self, rngs: nnx.Rngs) -> Any:
         shape = self.network_config
         return PointNet2(
             views=self.views,
@@ -105,7 +105,7 @@ class EntropyTask:
         return jnp.maximum(0.5 * 0.5 ** (samples // 20_000), 0.01)
 
     def loss(
-        self, network: PointNet2, batch: Batch, key: jax.Array, samples: jax.Array, hyper: Hyperparameters
+        self, network: Any, batch: Batch, key: jax.Array, samples: jax.Array, hyper: Hyperparameters
     ) -> tuple[jax.Array, Metrics]:
         augment, drop = jax.random.split(key)
         clouds = self.inputs(batch)
@@ -117,6 +117,6 @@ class EntropyTask:
         loss = jnp.mean(jnp.square(predicted - batch["entropy"] / self.entropy_max))
         return loss, {"loss": loss}
 
-    def evaluate(self, network: PointNet2, batch: Batch) -> Metrics:
+    def evaluate(self, network: Any, batch: Batch) -> Metrics:
         predicted = network(self.inputs(batch))
         return {"loss": jnp.mean(jnp.square(predicted - batch["entropy"] / self.entropy_max), axis=-1)}
