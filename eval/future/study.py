@@ -26,7 +26,7 @@ from eval.numbers.study import BASELINE, Setting
 from eval.runs import Run
 from eval.settings import Settings
 from eval.tables import ViewTables
-from eval.training import make_data, say_trained, train
+from eval.training import make_data, train
 from mevs_jax.arrays import AnyArray
 from mevs_jax.models import count_parameters
 from mevs_jax.policies.registry import policy_record
@@ -187,12 +187,8 @@ class Predictors:
 
     def trained(self, candidate: Candidate, number: int) -> tuple[EntropyTask, float]:
         """Trains a predictor; returns its task, and the seconds that training took."""
-        run, task, folder = self.run, self._task(candidate, number), self._folder(candidate, number)
-        there = (folder / "summary.json").exists()
-        rate = "--entropy.optimiser.learning-rate"
-        summary = fit(task, run.data, run.statistics, folder, rate_option=rate)
-        if not there:
-            say_trained(task, summary, run.statistics)
+        run, task, rate = self.run, self._task(candidate, number), "--entropy.optimiser.learning-rate"
+        summary = fit(task, run.data, run.statistics, self._folder(candidate, number), rate_option=rate)
         return task, summary["seconds"]
 
     def made_by(self, candidate: Candidate, number: int) -> str:
