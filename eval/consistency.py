@@ -13,6 +13,7 @@ from data_pipeline.errors import DataError
 from eval.run_file import NAME, plain
 from eval.settings import Settings
 from eval.walks.grid import FIRST_MV, GridConfig
+from mevs_jax.models.shapes import ENCODERS
 from train.own_code import named
 from train.results.identity import config_of
 from train.results.records import as_json
@@ -87,12 +88,14 @@ def _in_networks(
 
 def _in_network(was: dict[str, Any], wanted: dict[str, Any], name: str) -> dict[str, tuple[Any, Any]]:
     before, now = was.get("network_config", {}), wanted.pop("network")
-    if encoder := wanted.pop("encoder", ""):
+    if (encoder := wanted.pop("encoder", "")) in ENCODERS:
+        now = {"name": encoder}
+    elif encoder:
         now["module"], now["name"] = named(encoder)
-    if ("module" in before) != ("module" in now):
-        shown = (f"{network['module']}:{network['name']}" if "module" in network else "" for network in (before, now))
-        return {f"{name}.encoder": tuple(shown)}  # type: ignore[dict-item]
+    names = [[network.get(part) for part in ("module", "name")] for network in (before, now)]
+    if [part is None for part in names[0]] != [part is None for part in names[1]]:
+        return {f"{name}.encoder": tuple(":".join(filter(None, parts)) for parts in names)}  # type: ignore[dict-item]
     if "reality" in wanted and not wanted["reality"]["strength"]:
         wanted["reality"] = None
-    found = differences({"reality": None} | was, wanted | {"network_config": now}, name, shared=True)
+    found = differences({"reality": None, "frozen": False} | was, wanted | {"network_config": now}, name, shared=True)
     return {place.replace(".network_config", ".network"): pair for place, pair in found.items()}

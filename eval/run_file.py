@@ -11,6 +11,7 @@ from typing import Any
 from data_pipeline.errors import DataError, Unreadable
 from data_pipeline.files import CHECKS, as_read, checks_in, keep_json, read_json
 from eval.settings import PRESETS, Settings
+from mevs_jax.models.shapes import ENCODERS
 from mevs_jax.plain import from_plain
 
 NAME = "run.json"
@@ -54,7 +55,7 @@ def load_run(out: Path) -> RunFile | None:
 def save_run(out: Path, preset: str, settings: Settings, arguments: list[str]) -> None:
     """Writes `run.json`; a file that holds the same settings, and was written by the same versions, is left as it is."""
     content, path = as_read(configuration(preset, settings) | {"made_with": _made_with()}), out / NAME
-    if settings.classifier.encoder:
+    if settings.classifier.encoder and settings.classifier.encoder not in ENCODERS:
         content["encoder"] = _encoder(out, settings.classifier.encoder)
     if path.exists() and {name: value for name, value in read_json(path).items() if name in content} == content:
         return
@@ -67,7 +68,7 @@ def configuration(preset: str, settings: Settings) -> dict[str, Any]:
 
 
 def plain(settings: Settings) -> dict[str, Any]:
-    """All settings as nested dictionaries. With an encoder of the user's, those of the ResNet that it replaces are left out."""
+    """All settings as nested dictionaries. With another encoder, those of the ResNet that it replaces are left out."""
     content = asdict(settings)
     if settings.classifier.encoder:
         content["classifier"]["network"] = {"channels": settings.classifier.network.channels}

@@ -32,7 +32,7 @@ from eval.walks.ladder import ladder
 from mevs_jax.beliefs.calibration import fit_temperature
 from mevs_jax.beliefs.fusing import running_sum
 from mevs_jax.geometry.viewpoints import ViewGraph
-from mevs_jax.models.shapes import PointNet2Shape, ResNetShape
+from mevs_jax.models.shapes import EncoderShape, PointNet2Shape, ResNetShape
 from mevs_jax.policies.base import Knowledge
 from mevs_jax.trained import (
     CloudInput,
@@ -48,9 +48,11 @@ from mevs_jax.trained import (
     verify,
 )
 from mevs_jax.trained.description import FORM
-from train.results.identity import stamp_of, why_other_stamp
+from train.loop import RANDOM
+from train.results.identity import stamp_of, summary_of, why_other_stamp
 from train.tasks.classifier import ResNetConfig
 from train.tasks.entropy import EntropyTask
+from train.tasks.own_encoder import OwnEncoderConfig
 
 _USABLE = tuple(
     policy
@@ -183,14 +185,16 @@ def system_of_run(run: Run, evaluation: dict[str, Any], max_views: int, made_by:
     knowledge = learn(validation.logits, validation.labels)
     shape, cloud = pointnet2_shape(run.predict)
     network = run.classify.network_config
-    assert isinstance(network, ResNetConfig)  # of an encoder of the user's no system is made
+    assert not isinstance(network, OwnEncoderConfig)  # of an encoder of the user's no system is made
+    encoder = network if isinstance(network, EncoderShape) else resnet_shape(network, network.channels)
+    start = summary_of(run.out / "classifier")["start"]
     description = Description(
         form=FORM,
         kind="classifier",
         classes=tuple(statistics.classes),
         camera=view_camera(statistics.camera),
         image=ImageInput(run.classify.images, network.channels),
-        encoder=resnet_shape(network, network.channels),
+        encoder=encoder,
         best=walks.best,
         best_unposed=_WITHOUT_YAW,
         chosen_by="highest mean accuracy after 2 to 4 views on validation objects",
@@ -199,6 +203,7 @@ def system_of_run(run: Run, evaluation: dict[str, Any], max_views: int, made_by:
         made_with=versions_of(*MADE_WITH),
         entropy=shape,
         cloud=cloud,
+        start="" if start == RANDOM else start,
         evaluation=evaluation
         | {"validation_after_views": {name: after.tolist() for name, after in walks.after.items()}},
     )

@@ -80,8 +80,8 @@ def from_plain(kind: Any, content: Any, where: str) -> Any:
     if origin in (Union, types.UnionType):
         if content is None and type(None) in arguments:
             return None
-        (one,) = [argument for argument in arguments if argument is not type(None)]
-        return from_plain(one, content, where)
+        *others, last = [argument for argument in arguments if argument is not type(None)]
+        return from_plain(next((one for one in others if _has_all(one, content)), last), content, where)
     if origin is Literal:
         if not any(type(content) is type(argument) and content == argument for argument in arguments):
             raise ValueError(f"{where} is {content!r:.40}, not one of {', '.join(map(str, arguments))}")
@@ -95,6 +95,11 @@ def from_plain(kind: Any, content: Any, where: str) -> Any:
     if kind is not Any and type(content) is not kind:
         raise TypeError(f"{where} is {content!r:.40}, not of type {kind.__name__}")
     return content
+
+
+def _has_all(kind: type, content: Any) -> bool:
+    """Whether a dataclass has all entries of an object."""
+    return isinstance(content, dict) and set(content) <= {_key(one) for one in fields(kind)}
 
 
 def _array(kind: Any, content: Any, where: str) -> np.ndarray:

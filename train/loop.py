@@ -53,6 +53,9 @@ from train.step import Task, TrainState, abstract_state, evaluate_step_of, initi
 from train.validation import ValidationSet
 from train.weights.starting import StartingWeights
 
+RANDOM = "random weights"
+"""What a training started from without other weights, in its summary."""
+
 
 def fit(
     task: Task,
@@ -299,7 +302,7 @@ def summary_after(task: Task, progress: dict[str, Any], steps: int, start: Start
     encoder = getattr(task, "encoder", None)
     return progress | {
         "steps": steps,
-        "start": start.name if start else "random weights",
+        "start": start.name if start else RANDOM,
         "stopped_early": progress["epoch"] < task.optimiser.epochs,
         **({"encoder": encoder} if encoder else {}),
     }

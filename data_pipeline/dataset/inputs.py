@@ -26,14 +26,16 @@ def view_camera(camera: CaptureConfig) -> ViewCamera:
 def image_input(
     view: Integer[Array, "height width"], images: str, channels: int, camera: CaptureConfig
 ) -> Float[Array, "height width channels"]:
-    """Returns one stored view as an image in [0, 1], background 0, repeated over the channels.
+    """Returns one stored view as an image in [0, 1], background 0; depth and shaded images are repeated over the channels.
 
-    Depth is converted by `mevs_jax.geometry.inputs.depth_image`. A shaded image is divided by 255.
+    Depth is converted by `mevs_jax.geometry.inputs.depth_image` or `normal_image`. A shaded image is divided by 255.
 
     Args:
         view: stored depth or shaded image.
-        images: `depth` or `image`, the kind of `view`.
+        images: `depth` or `normals` for stored depth, or `image`.
     """
+    if images == "normals":
+        return inputs.normal_image(metric_depth(view), view_camera(camera))
     if images == "depth":
         return inputs.depth_image(metric_depth(view), view_camera(camera), channels)
     return jnp.repeat((view.astype(jnp.float32) / 255)[..., None], channels, axis=-1)

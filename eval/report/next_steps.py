@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from eval.report.html import ReportInputs, commands
+from mevs_jax.models.shapes import ENCODERS
 from train.results.chance import Chance
 
 RUN = "RUN"
@@ -31,7 +32,7 @@ def _steps(inputs: ReportInputs) -> list[tuple[str, str]]:
                 f"--classifier.optimiser.epochs {4 * inputs.settings['classifier']['optimiser']['epochs']} --out OTHER",
             )
         )
-    if not inputs.settings["classifier"]["encoder"]:
+    if inputs.settings["classifier"]["encoder"] in ("", *ENCODERS):
         steps += [
             (
                 "Recognise a mesh of your own with the networks of this run, and look at the walk in a browser:",

@@ -84,7 +84,7 @@ def _text(inputs: ReportInputs, walks: Walks) -> str:
         f"{kind}: {members.sum()} ({percent(members.mean())} %)" for kind, members in walks.kinds().items()
     )
     images = inputs.settings["classifier"]["images"]
-    received = "the depths of the same view" if images == "depth" else "the same image"
+    received = "the depths of the same view" if images != "image" else "the same image"
     return (
         f"<p>A <dfn>walk</dfn> is a series of views around one object, here of {walks.views.shape[1]}. The first view is given; "
         "then the policy “expected information gain” goes to the view whose expected gain is highest. The gain is negative if "

@@ -247,8 +247,10 @@ def reproduce(settings: Settings, preset: str, out: Path, pretrained: tuple[Path
     """
     if settings.evaluation.lowest_elevation > -90:
         raise DataError("mevs study thesis walks from every view; leave out --evaluation.lowest-elevation")
-    if settings.classifier.encoder:
-        raise DataError("mevs study thesis trains the thesis's own classifiers; leave out --classifier.encoder")
+    if settings.classifier.encoder or settings.classifier.frozen:
+        raise DataError(
+            "mevs study thesis trains the thesis's own classifiers; leave out --classifier.encoder and --classifier.frozen"
+        )
     if is_file(settings.dataset.capture.lattice):
         raise DataError("mevs study thesis has lattices of 10 and 40 views; leave out --dataset.capture.lattice file:…")
     check_evaluation(settings.evaluation)

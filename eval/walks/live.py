@@ -108,7 +108,7 @@ def _walk(
         assert tasks is not None
         (classify, predict), merge = tasks, partial(nnx.merge, copy=True)
         classifier, predictor = (merge(structure, state) for structure, state in zip(structures, states, strict=True))
-        image: dict[str, Array] = {classify.images: shown.images[view][None]}
+        image: dict[str, Array] = {classify.stored: shown.images[view][None]}
         cloud = {name: shown.clouds[name][view][None] for name in _CLOUD}
         return Observation(classifier(classify.inputs(image))[0], predictor(predict.inputs(cloud))[0])
 
@@ -163,7 +163,7 @@ def compare_with_tables(
     size, max_views = min(config.at_once, objects), min(config.max_views, views)
     walk = partial(walk_each, key, at_once=size, max_views=max_views)
     walks: dict[str, list[tuple[np.ndarray, np.ndarray]]] = {policy: [] for policy in policies}
-    points, images = networks.predict.network_config.points, networks.classify.images
+    points, images = networks.predict.network_config.points, networks.classify.stored
     batches = evaluation_batches(data, split, points=points, images=images, chosen=np.arange(objects))
     with progress_bar("objects") as bar:
         line = bar.add_task("Walking live", total=objects, note="")
@@ -192,4 +192,4 @@ def _agreement(parts: list[tuple[np.ndarray, np.ndarray]]) -> Agreement:
 
 
 def _captures(batch: dict[str, Any], networks: Networks) -> Captures:
-    return Captures(batch[networks.classify.images], {name: batch[name] for name in _CLOUD})
+    return Captures(batch[networks.classify.stored], {name: batch[name] for name in _CLOUD})

@@ -221,7 +221,8 @@ common options:
   --views N               candidate viewpoints around an object (default 40)
   --pretrained FILE ...   ImageNet weights for the classifiers: torchvision's .pth or .safetensors
   --policy FILE.py:NAME   a policy of your own, evaluated like all others (docs/own.md)
-  --encoder FILE.py:NAME  a network of your own as the classifier
+  --encoder NAME          another network as the classifier: efficientnet_lite0, vit_tiny_patch8,
+                          vit_tiny_patch16, or your own, FILE.py:NAME (docs/own.md)
   --seed N                seed of weights, training and random policies (default 0)
   --print-config          print the resolved configuration as JSON, and stop
 

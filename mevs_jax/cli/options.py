@@ -88,15 +88,17 @@ class WithWeights(WithSeed):
     """Commands that train classifiers."""
 
     pretrained: Annotated[tuple[Path, ...], _arg("FILE ...")] = ()
-    """ImageNet weights to start classifiers from: torchvision's resnet18 and resnet34, .pth or .safetensors"""
+    """ImageNet weights to start classifiers from: torchvision's resnet18 and resnet34, .pth or .safetensors; or
+    efficientnet_lite0, those of the installed extra `pretrained`, for --encoder efficientnet_lite0"""
 
 
 @dataclass(frozen=True)
 class WithNetworks(WithSeeds, WithWeights):
     """Commands that train the networks of a run."""
 
-    encoder: Annotated[str | None, _arg("MODULE:FUNCTION", "a ResNet")] = None
-    """train a network of your own as the classifier: module:function or path/to/file.py:function (docs/own.md)"""
+    encoder: Annotated[str | None, _arg("NAME", "a ResNet")] = None
+    """train another network as the classifier: efficientnet_lite0, vit_tiny_patch8, vit_tiny_patch16, or your own,
+    module:function or path/to/file.py:function (docs/own.md)"""
     seeds_at_once: Annotated[int, _arg("N", "0, all")] = 0
     """train at most N seeds together, which bounds memory"""
 

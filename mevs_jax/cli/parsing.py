@@ -170,13 +170,14 @@ def _check_views(arguments: list[str], capture: CaptureConfig) -> None:
 
 
 def _check_no_resnet(arguments: list[str], encoder: str) -> None:
-    """Raises `DataError` for settings of a ResNet beside an encoder of the user's, which has none of them but channels."""
+    """Raises `DataError` for settings of a ResNet beside another encoder, which has none of them but channels, if it is own."""
     from data_pipeline.errors import DataError
+    from mevs_jax.models.shapes import ENCODERS
 
     prefix = "--classifier.network."
     for argument in arguments:
         name = argument.split("=")[0].replace("_", "-")
-        if name.startswith(prefix) and name != f"{prefix}channels":
+        if name.startswith(prefix) and (name != f"{prefix}channels" or encoder in ENCODERS):
             raise DataError(
                 f"{name} is a setting of the ResNet, and the classifier is {encoder}; leave one of them out"
             )

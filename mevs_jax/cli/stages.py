@@ -24,27 +24,32 @@ def run(call: Invocation) -> None:
     from eval.consistency import check_seeds
     from eval.evaluation import policies_on
     from eval.walks.own_policies import load_policies
+    from mevs_jax.models.shapes import ENCODERS
     from train.own_code import load_own
 
     start, encoder = weights_of(call), call.settings.classifier.encoder
+    own = encoder and encoder not in ENCODERS
     load_policies(call.settings.policies)  # so that an error in a policy is found before anything is computed
-    if encoder:
+    if own:
         load_own(encoder, "--encoder")
     check_seeds(call.settings)
     training.check_batches(call.settings, call.out)
     policies_on(call.settings.policies, training.make_data(call.settings, call.out))
     _train(call, start)
     evaluate(call)
-    if not encoder:  # of which no trained system can be made
+    if not own:  # of which no trained system can be made
         print(f"Trained system: {stages.make_system(call.settings, call.out).absolute()}")
     report(call)
 
 
 def weights_of(call: Invocation) -> StartingWeights | None:
     """The weights of `--pretrained`, from which classifiers start."""
+    from data_pipeline.errors import DataError
     from train.tasks.classifier import starting_weights
 
     classifier = call.settings.classifier
+    if classifier.frozen and not call.options.pretrained:
+        raise DataError("--classifier.frozen trains the last layer on features of given weights; give --pretrained too")
     return starting_weights(call.options.pretrained, classifier.network, classifier.encoder)
 
 

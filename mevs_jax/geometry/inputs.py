@@ -96,6 +96,12 @@ def depth_and_normals(
     return jnp.concatenate([depth_image(metric, camera), normals, unknown][: channels - 2], axis=-1)
 
 
+def normal_image(depth: Float[AnyArray, "height width"], camera: ViewCamera) -> Float[Array, "height width 3"]:
+    """Returns the unit normals of `depth_and_normals` as an image in [0, 1], (normal + 1) / 2, and 0 where there is none."""
+    normals = depth_and_normals(depth, camera)[..., 1:]
+    return jnp.where(jnp.any(normals != 0, axis=-1, keepdims=True), (normals + 1) / 2, 0.0)
+
+
 def mirrored(images: Float[AnyArray, "*batch height width channels"]) -> Float[Array, "*batch height width channels"]:
     """Images of `depth_and_normals` of the mirror image of each object, from the mirrored direction."""
     flipped = jnp.asarray(images)[..., ::-1, :]

@@ -14,21 +14,11 @@ import jax.numpy as jnp
 from flax import nnx
 from jaxtyping import Array, Float
 
-from mevs_jax.arrays import AnyArray
 from mevs_jax.models.batch_norm import BatchNorm
-from mevs_jax.models.calling import TrainedByCall
 from mevs_jax.models.convolution import Convolution, pool
+from mevs_jax.models.image_encoder import ImageEncoder, normalised
 
 _BLOCKS = {10: (1, 1, 1, 1), 18: (2, 2, 2, 2), 34: (3, 4, 6, 3)}
-_IMAGENET_MEAN, _IMAGENET_STD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
-
-
-def _normalised(convolution: Convolution, norm: BatchNorm, x: Array, *, train: bool, momentum: float | Array) -> Array:
-    """A convolution and its batch norm; in inference, the norm is folded into the weights and a bias."""
-    if train:
-        return norm(convolution(x), train=True, momentum=momentum)
-    factor, bias = norm.folded()
-    return convolution(x, factor) + bias.astype(x.dtype)
 
 
 class BasicBlock(nnx.Module):
@@ -45,11 +35,11 @@ class BasicBlock(nnx.Module):
             self.shortcut_norm = BatchNorm(outputs)
 
     def __call__(self, x: Array, *, train: bool, momentum: float | Array) -> Array:
-        normalised = partial(_normalised, train=train, momentum=momentum)
-        out = jax.nn.relu(normalised(self.convolution1, self.norm1, x))
-        out = normalised(self.convolution2, self.norm2, out)
+        after = partial(normalised, train=train, momentum=momentum)
+        out = jax.nn.relu(after(self.convolution1, self.norm1, x))
+        out = after(self.convolution2, self.norm2, out)
         if self.projects:
-            x = normalised(self.shortcut, self.shortcut_norm, x)
+            x = after(self.shortcut, self.shortcut_norm, x)
         return jax.nn.relu(out + x)
 
 
@@ -73,7 +63,7 @@ class PatchStem(nnx.Module):
         return patches.reshape(batch, height // 4, width // 4, -1) @ self.layer.kernel[...].astype(x.dtype)
 
 
-class ResNet(TrainedByCall):
+class ResNet(ImageEncoder):
     """ResNet of basic blocks.
 
     Args:
@@ -106,10 +96,8 @@ class ResNet(TrainedByCall):
     ):
         if depth not in _BLOCKS:
             raise ValueError(f"ResNet needs depth 10, 18 or 34, got {depth}")
-        if standardise and channels != 3:
-            raise ValueError(f"ResNet can standardise images of 3 channels only, got {channels}")
-        self.depth, self.classes, self.channels, self.width = depth, classes, channels, width
-        self.standardise, self.dtype = standardise, dtype
+        super().__init__(channels, standardise)
+        self.depth, self.classes, self.width, self.dtype = depth, classes, width, dtype
         self.stages = _BLOCKS[depth]
         self.convolution: Convolution | PatchStem
         if stem == "convolution":
@@ -127,49 +115,14 @@ class ResNet(TrainedByCall):
         self.blocks = nnx.List(blocks)
         self.head = nnx.Linear(inputs, classes, rngs=rngs)
 
-    def features(
-        self,
-        images: Float[AnyArray, "*batch height width channels"],
-        *,
-        train: bool = False,
-        momentum: float | Array = 0.1,
-    ) -> Float[Array, "*batch features"]:
-        """The feature vector before the last layer, of length `8 * width`.
-
-        Raises:
-            ValueError: for images of integers.
-        """
-        images = jnp.asarray(images)
-        if not jnp.issubdtype(images.dtype, jnp.floating):
-            raise ValueError(
-                f"ResNet needs floating-point images in [0, 1], got {images.dtype}: divide 8-bit images by 255"
-            )
-        batch = images.shape[:-3]
-        x = images.reshape(-1, *images.shape[-3:])
-        if self.standardise:
-            x = (x - jnp.array(_IMAGENET_MEAN)) / jnp.array(_IMAGENET_STD)
+    def _features(self, x: Array, train: bool, momentum: float | Array) -> Float[Array, "batch features"]:
+        """Of length `8 * width`."""
         exact, x = x.dtype, x.astype(self.dtype or x.dtype)
         if isinstance(self.convolution, PatchStem):
             x = jax.nn.relu(self.norm(self.convolution(x), train=train, momentum=momentum))
         else:
-            x = jax.nn.relu(_normalised(self.convolution, self.norm, x, train=train, momentum=momentum))
+            x = jax.nn.relu(normalised(self.convolution, self.norm, x, train=train, momentum=momentum))
             x = pool(x)
         for block in self.blocks:
             x = block(x, train=train, momentum=momentum)
-        return jnp.mean(x, axis=(1, 2), dtype=exact).reshape(*batch, -1)
-
-    def __call__(
-        self,
-        images: Float[AnyArray, "*batch height width channels"],
-        *,
-        train: bool = False,
-        momentum: float | Array = 0.1,
-    ) -> Float[Array, "*batch classes"]:
-        """Logits of one image (height, width, channels) or of a batch.
-
-        Args:
-            images: the images, of any number of batch axes.
-            train: whether to normalise by the batch and update the running statistics.
-            momentum: weight of the new batch in the running statistics, in [0, 1].
-        """
-        return self.head(self.features(images, train=train, momentum=momentum))
+        return jnp.mean(x, axis=(1, 2), dtype=exact)

@@ -12,6 +12,7 @@ from mevs_jax.trained.description import Description
 _INPUTS = {
     "depth": "depth as (far − depth) / (far − near), background 0, where near and far bound the object's sphere",
     "depth_and_normals": "depth as (far − depth) / (far − near), and the unit normal in the camera's frame; background 0",
+    "normals": "the unit normal in the camera's frame as (normal + 1) / 2, background 0",
     "image": "grey levels in [0, 1], background 0",
 }
 _KINDS = {
@@ -40,7 +41,7 @@ agent = system.agent()
 from the object's centre, z up in the image.
 * Image: {image}; {channels}.
 {size}* Kind: {kind}.
-* Policy by default: `{of.best}` ({of.chosen_by}); with unknown yaw `{of.best_unposed}`.
+{start}* Policy by default: `{of.best}` ({of.chosen_by}); with unknown yaw `{of.best_unposed}`.
 * Weights: {megabytes:.1f} MB. Made with {versions}.
 
 {figures}## Limits
@@ -110,6 +111,7 @@ def model_card(description: Description, size: int) -> str:
         channels=f"{of.image.channels} channel{'s' * (of.image.channels > 1)}",
         size="" if sizes is None else told.format(sizes),
         kind=_KINDS[of.kind],
+        start=f"* Training began with {of.start}.\n" * bool(of.start),
         megabytes=size / 1e6,
         versions=", ".join(f"{name} {version}" for name, version in of.made_with.items()),
         figures=_figures(of) + _elsewhere(of),

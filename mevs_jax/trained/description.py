@@ -9,7 +9,7 @@ from typing import Any, Literal
 from mevs_jax.gallery.matching import comparisons
 from mevs_jax.geometry.cameras import ViewCamera
 from mevs_jax.geometry.inputs import SizeInput
-from mevs_jax.models.shapes import PointNet2Shape, PoseShape, ResNetShape, SetFusionShape, ViewPolicyShape
+from mevs_jax.models.shapes import EncoderShape, PointNet2Shape, PoseShape, ResNetShape, SetFusionShape, ViewPolicyShape
 
 FORM = 1
 """Version of the folder's form; a program reads this version alone."""
@@ -23,15 +23,15 @@ class ImageInput:
 
     Attributes:
         content: `depth`: (far − depth) / (far − near), where near and far bound the object's sphere, and 0 for background;
-            `depth_and_normals`: this and the unit normal in the camera's frame; `image`: grey levels, which a depth camera
-            does not give.
+            `depth_and_normals`: this and the unit normal in the camera's frame; `normals`: (normal + 1) / 2, 0 for
+            background; `image`: grey levels, which a depth camera does not give.
         channels: of the image; depth is repeated in all channels, except for `depth_and_normals`, which has 4, or 5 of which
             the last is 1 where it is unknown what is there.
         mirrored: whether the features of a view are means of those of its image and of the mirror image, which shows an object
             of the same class.
     """
 
-    content: Literal["depth", "depth_and_normals", "image"]
+    content: Literal["depth", "depth_and_normals", "normals", "image"]
     channels: int
     mirrored: bool = False
 
@@ -97,6 +97,7 @@ class Description:
         made_with: versions of packages.
         evaluation: figures of its own evaluation, on test objects.
         colour: whether images may have colours, for a gallery; those without are compared by depth alone.
+        start: what the classifier's weights were before its training, with the licence of what was trained by others.
     """
 
     form: int
@@ -104,7 +105,7 @@ class Description:
     classes: tuple[str, ...]
     camera: ViewCamera
     image: ImageInput
-    encoder: ResNetShape | None
+    encoder: ResNetShape | EncoderShape | None
     best: str
     best_unposed: str
     chosen_by: str
@@ -119,6 +120,7 @@ class Description:
     view_policies: dict[str, ViewPolicyShape] = field(default_factory=dict)
     evaluation: dict[str, Any] = field(default_factory=dict)
     colour: bool = False
+    start: str = ""
 
     @property
     def told_unknown(self) -> bool:
@@ -133,7 +135,7 @@ class Description:
     @property
     def features(self) -> int:
         """Length of what is kept of each view for the fusion."""
-        return comparisons(len(self.classes) - 1, self.colour) if self.encoder is None else 8 * self.encoder.width
+        return comparisons(len(self.classes) - 1, self.colour) if self.encoder is None else self.encoder.features
 
     @property
     def unknown_class(self) -> int | None:

@@ -18,6 +18,7 @@ from pathlib import Path
 from typing import Any
 
 from mevs_jax.gallery.grid import SIDE
+from mevs_jax.models.shapes import EncoderShape
 from mevs_jax.plain import from_plain
 from mevs_jax.policies.registry import POLICIES
 from mevs_jax.trained.arrays import DESCRIPTION, WEIGHTS, parts_of
@@ -217,6 +218,8 @@ def check(description: Description) -> None:
         "depth and normals have 4 or 5 channels": of.image.content != "depth_and_normals"
         or of.image.channels in (4, 5),
         "mirror images are of depth and normals": not of.image.mirrored or of.image.content == "depth_and_normals",
+        "the encoder is for images of another size": not isinstance(of.encoder, EncoderShape)
+        or of.encoder.resolution == camera.resolution,
         "encoder and image differ in their channels": of.encoder is None or of.encoder.channels == of.image.channels,
         "the size is impossible, or used by another kind than a recogniser": size is None
         or (of.fusion is not None and 0 < size.smallest < size.largest < 1e9 and 2 <= size.steps <= 1000),
@@ -232,7 +235,7 @@ def check(description: Description) -> None:
     for shape in (of.encoder, of.fusion, of.pose, of.entropy, *of.view_policies.values()):
         if shape is not None:
             _check_sizes(asdict(shape))
-    largest = [camera.resolution**2 * max(of.encoder.width if of.encoder else 1, of.image.channels)]
+    largest = [camera.resolution**2 * of.image.channels, of.encoder.outputs(camera.resolution) if of.encoder else 1]
     if of.entropy is not None:
         largest += [level.centres * level.samples * max(level.layers, default=1) for level in of.entropy.abstractions]
     if of.pose is not None:

@@ -14,7 +14,7 @@ from jaxtyping import Array, Float, Int
 from mevs_jax.beliefs.fusing import CalibratedFusion
 from mevs_jax.beliefs.strangeness import Strangeness
 from mevs_jax.gallery.matching import Gallery
-from mevs_jax.geometry.inputs import depth_and_normals, depth_image, mirrored, view_cloud
+from mevs_jax.geometry.inputs import depth_and_normals, depth_image, mirrored, normal_image, view_cloud
 from mevs_jax.models.expected_views import ExpectedViews
 from mevs_jax.models.pose import yaw_evidence
 from mevs_jax.policies.base import Knowledge, Observation
@@ -44,7 +44,7 @@ class Parts:
     """Everything of a trained system that is made of arrays.
 
     Attributes:
-        encoder: ResNet, from an image to features and logits; None for a gallery.
+        encoder: from an image to features and logits; None for a gallery.
         viewpoints: (views, 3) unit vectors from the object to the candidate cameras.
         neighbours: (views, views) True for neighbours on the view graph.
         entropy: PointNet++, from a cloud to the entropies of all views.
@@ -102,6 +102,8 @@ def image_of(depth: Float[Array, "side side"], of: Description) -> Float[Array, 
     """The input of the encoder for a depth image in radii, 0 where nothing is hit and NaN where unknown."""
     if of.image.content == "depth_and_normals":
         return depth_and_normals(depth, of.camera, of.image.channels)
+    if of.image.content == "normals":
+        return normal_image(depth, of.camera)
     return depth_image(depth, of.camera, of.image.channels)
 
 

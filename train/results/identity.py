@@ -105,7 +105,7 @@ def content_of(task: Any) -> dict[str, Any]:
     return {
         name: value
         for name, value in content.items()
-        if value or name not in ("reality", "size", "azimuths", "mirrored")
+        if value or name not in ("reality", "frozen", "size", "azimuths", "mirrored")
     }
 
 

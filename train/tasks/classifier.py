@@ -15,15 +15,16 @@ from flax import nnx
 from data_pipeline.capture.casting import CaptureConfig
 from data_pipeline.dataset.augment import ImageAugmentation, augment_image
 from data_pipeline.dataset.batches import ViewBatches
-from data_pipeline.dataset.inputs import image_input, view_camera
+from data_pipeline.dataset.inputs import image_input, metric_depth, view_camera
 from data_pipeline.dataset.reality import RealityAugmentation, realistic_views, used_reality
 from data_pipeline.errors import DataError
-from mevs_jax.geometry.inputs import depth_image
+from mevs_jax.geometry.inputs import depth_image, normal_image
 from mevs_jax.models import ResNet
+from mevs_jax.models.shapes import ENCODERS, EncoderShape
 from train.optimiser import OptimiserConfig
 from train.step import Batch, Hyperparameters, Metrics, view_batches
 from train.tasks.own_encoder import OwnEncoderConfig, own_encoder
-from train.weights.starting import StartingWeights, weights_from_torch
+from train.weights.starting import StartingWeights, weights_from_torch, weights_of_encoder
 
 
 @dataclass(frozen=True)
@@ -50,6 +51,8 @@ def starting_weights(files: tuple[Path, ...], network: ResNetConfig, encoder: st
     """
     if not files:
         return None
+    if encoder in ENCODERS:
+        return weights_of_encoder(files, encoder)
     if encoder:
         raise DataError(
             f"--pretrained weights are those of a ResNet, not of --encoder {encoder}; leave one of them out"
@@ -70,25 +73,50 @@ class ClassifierConfig:
 
     network: ResNetConfig = ResNetConfig()
     encoder: str = ""
-    """a network of your own instead of the ResNet: module:function or path/to/file.py:function (docs/own.md)"""
-    images: Literal["depth", "image"] = "depth"
-    """its input: depth, or the shaded image"""
+    """a network instead of the ResNet: efficientnet_lite0, vit_tiny_patch8, vit_tiny_patch16; or your own, module:function or
+    path/to/file.py:function (docs/own.md)"""
+    frozen: bool = False
+    """train the last layer alone, on the features of --pretrained weights"""
+    images: Literal["depth", "normals", "image"] = "depth"
+    """its input: depth; the surface normals, which are computed from depth, in three channels; or the shaded image"""
     augmentation: ImageAugmentation = ImageAugmentation()
     reality: RealityAugmentation = RealityAugmentation()
     optimiser: OptimiserConfig = OptimiserConfig(weight_decay=1e-4)
+
+
+def _encoder(config: ClassifierConfig, classes: int, resolution: int) -> OwnEncoderConfig | EncoderShape:
+    """The network that takes the ResNet's place."""
+    if config.encoder not in ENCODERS:
+        return own_encoder(config.encoder, classes, config.network.channels, resolution)
+    shape = EncoderShape(config.encoder, resolution)  # type: ignore[arg-type]
+    try:
+        nnx.eval_shape(lambda: shape.network(classes, nnx.Rngs(0)))
+    except ValueError as error:
+        raise DataError(f"--encoder {config.encoder}: {error}; choose another --dataset.capture.resolution") from error
+    return shape
+
+
+def with_frozen_features(network: nnx.Module) -> nnx.Module:
+    """Returns a network of which training changes the last layer alone: all other weights become statistics."""
+    for path, module in nnx.iter_modules(network):
+        for name, variable in list(vars(module).items()):
+            if type(variable) is nnx.Param and "head" not in path:
+                setattr(module, name, nnx.BatchStat(variable.get_value()))
+    return network
 
 
 @dataclass(frozen=True)
 class ClassifierTask:
     """Training of the classifier, or of a network of the user's in its place, by cross-entropy on single views."""
 
-    network_config: ResNetConfig | OwnEncoderConfig
+    network_config: ResNetConfig | OwnEncoderConfig | EncoderShape
     classes: int
-    images: Literal["depth", "image"]
+    images: Literal["depth", "normals", "image"]
     camera: CaptureConfig
     augmentation: ImageAugmentation
     optimiser: OptimiserConfig
     reality: RealityAugmentation | None = None
+    frozen: bool = False
     name: str = "classifier"
 
     @classmethod
@@ -98,22 +126,37 @@ class ClassifierTask:
         Raises:
             DataError: if the encoder cannot be loaded or used, or the errors of images are not valid, or are not for its images.
         """
-        network: ResNetConfig | OwnEncoderConfig = config.network
+        network: ResNetConfig | OwnEncoderConfig | EncoderShape = config.network
         if config.encoder:
             if config.optimiser.compute != "float32":
                 raise DataError(
                     f"--classifier.optimiser.compute {config.optimiser.compute} is for this project's own networks; an "
                     f"--encoder decides itself in which precision it computes: leave the option out"
                 )
-            network = own_encoder(config.encoder, classes, config.network.channels, camera.resolution)
+            network = _encoder(config, classes, camera.resolution)
+        if config.images == "normals" and network.channels != 3:
+            raise DataError("--classifier.images normals have three channels; give --classifier.network.channels 3 too")
+        if config.frozen and isinstance(network, OwnEncoderConfig):
+            raise DataError(
+                f"--classifier.frozen is for this project's own networks, not for {config.encoder}; leave it out"
+            )
         reality = used_reality(config.reality, "--classifier.reality")
         if reality and config.images != "depth":
-            raise DataError("--classifier.reality is for images of depth; leave out --classifier.images image")
-        return cls(network, classes, config.images, camera, config.augmentation, config.optimiser, reality)
+            raise DataError(
+                f"--classifier.reality is for images of depth; leave out --classifier.images {config.images}"
+            )
+        return cls(
+            network, classes, config.images, camera, config.augmentation, config.optimiser, reality, config.frozen
+        )
+
+    @property
+    def stored(self) -> Literal["depth", "image"]:
+        """The kind of stored views that its images are made of."""
+        return "image" if self.images == "image" else "depth"
 
     @property
     def batches(self) -> ViewBatches:
-        return view_batches(self.optimiser, images=self.images, validation_by=self.optimiser.validation_by)
+        return view_batches(self.optimiser, images=self.stored, validation_by=self.optimiser.validation_by)
 
     @property
     def group(self) -> int:
@@ -133,9 +176,15 @@ class ClassifierTask:
         return asdict(self.network_config) if isinstance(self.network_config, OwnEncoderConfig) else None
 
     def network(self, rngs: nnx.Rngs) -> Any:
+        network = self._network(rngs)
+        return with_frozen_features(network) if self.frozen else network
+
+    def _network(self, rngs: nnx.Rngs) -> Any:
         shape = self.network_config
         if isinstance(shape, OwnEncoderConfig):
             return shape.network(self.classes, self.camera.resolution, rngs)
+        if isinstance(shape, EncoderShape):
+            return shape.network(self.classes, rngs)
         return ResNet(
             depth=shape.depth,
             classes=self.classes,
@@ -150,7 +199,20 @@ class ClassifierTask:
     def inputs(self, batch: Batch) -> jax.Array:
         """Returns the images of a batch, (views, height, width, channels)."""
         convert = partial(image_input, images=self.images, channels=self.network_config.channels, camera=self.camera)
-        return jax.vmap(convert)(batch[self.images])
+        return jax.vmap(convert)(batch[self.stored])
+
+    def augmented(self, key: jax.Array, batch: Batch, strength: Any) -> jax.Array:
+        """Returns the images of a batch with augmentation; normals are those of augmented depth."""
+        key, reality = jax.random.split(key) if self.reality else (key, key)
+        if self.images == "normals":
+            images = metric_depth(batch["depth"])[..., None]
+        else:
+            images = self.realistic(reality, batch) if self.reality else self.inputs(batch)
+        keys = jax.random.split(key, len(images))
+        images = jax.vmap(augment_image, in_axes=(0, 0, None, None))(keys, images, self.augmentation, strength)
+        if self.images == "normals":
+            return jax.vmap(partial(normal_image, camera=view_camera(self.camera)))(images[..., 0])
+        return images
 
     def realistic(self, key: jax.Array, batch: Batch) -> jax.Array:
         """Returns the images of a batch with the errors of `reality`, (views, height, width, channels)."""
@@ -163,13 +225,7 @@ class ClassifierTask:
         self, network: Any, batch: Batch, key: jax.Array, samples: jax.Array, hyper: Hyperparameters
     ) -> tuple[jax.Array, Metrics]:
         del samples
-        key, reality = jax.random.split(key) if self.reality else (key, key)
-        images = self.realistic(reality, batch) if self.reality else self.inputs(batch)
-        keys = jax.random.split(key, len(images))
-        images = jax.vmap(augment_image, in_axes=(0, 0, None, None))(
-            keys, images, self.augmentation, hyper.augmentation
-        )
-        logits = network(images, train=True)
+        logits = network(self.augmented(key, batch, hyper.augmentation), train=not self.frozen)
         loss = jnp.mean(optax.softmax_cross_entropy_with_integer_labels(logits, batch["label"]))
         return loss, {"loss": loss, "accuracy": jnp.mean(jnp.argmax(logits, -1) == batch["label"])}
 
