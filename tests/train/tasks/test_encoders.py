@@ -20,6 +20,7 @@ from mevs_jax.geometry.inputs import depth_and_normals, normal_image
 from mevs_jax.models.shapes import EncoderShape
 from mevs_jax.trained import ImageInput, Network, TrainedSystem, load, save
 from tests.mevs_jax.trained import making
+from tests.train.tasks.test_own_encoder import ENCODER
 from train.loop import fit, load_best
 from train.tasks.classifier import ClassifierTask
 from train.weights.starting import weights_from_network
@@ -80,15 +81,22 @@ def test_a_system_of_it_is_read_as_it_was_written(name, tmp_path):
 
 
 def test_what_does_not_fit_is_refused(tmp_path):
-    capture = replace(TINY.dataset.capture, resolution=40)
-    with pytest.raises(
-        DataError, match=r"vit_tiny_patch16: patches of 16×16 .* choose another --dataset.capture.resolution"
-    ):
-        ClassifierTask.of(replace(TINY.classifier, encoder="vit_tiny_patch16"), 10, capture)
+    """And what is advised instead is not."""
+    capture, vit = TINY.dataset.capture, replace(TINY.classifier, encoder="vit_tiny_patch16")
+    with pytest.raises(DataError, match=r"vit_tiny_patch16: patches of 16×16 .* choose another --dataset.capture.res"):
+        ClassifierTask.of(vit, 10, replace(capture, resolution=40))
+    ClassifierTask.of(vit, 10, replace(capture, resolution=48))
     with pytest.raises(DataError, match=r"normals have three channels; give --classifier.network.channels 3"):
         task_of("", images="normals")
+    task_of("", images="normals", network=replace(TINY.classifier.network, channels=3))
     with pytest.raises(DataError, match=r"leave out --classifier.images normals"):
         task_of(images="normals", reality=replace(TINY.classifier.reality, strength=1.0))
+    (tmp_path / "nets.py").write_text(ENCODER)
+    with pytest.raises(
+        DataError, match=r"--classifier.frozen is for this project's own networks, not for .*leave it out"
+    ):
+        task_of(f"{tmp_path}/nets.py:net", frozen=True)
+    task_of(f"{tmp_path}/nets.py:net")
 
 
 def test_a_run_with_another_encoder_is_not_continued(data, tmp_path):
