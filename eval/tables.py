@@ -12,7 +12,7 @@ from jaxtyping import Int
 
 from data_pipeline.dataset.index import read_index
 from data_pipeline.dataset.statistics import DatasetStatistics
-from data_pipeline.errors import Diverged
+from data_pipeline.errors import DataError, Diverged
 from data_pipeline.files import npz_bytes
 from mevs_jax.selection.loop import ViewTable
 from train.results.kept import check_kept, keep
@@ -99,7 +99,16 @@ def save_view_tables(path: Path, tables: ViewTables) -> None:
 
 
 def load_view_tables(path: str | Path) -> ViewTables:
-    """Reads what `save_view_tables` wrote; raises `Unreadable` if the file is not as it was written."""
+    """Reads what `save_view_tables` wrote.
+
+    Raises:
+        DataError: if there is no such file.
+        Unreadable: if the file is not as it was written.
+    """
+    if not Path(path).is_file():
+        raise DataError(
+            f"{path} is no file of view tables, such as tables/val.npz or tables/test.npz in the folder of a run"
+        )
     check_kept(Path(path))
     with np.load(path) as stored:
         predicted = "predicted_entropy" if "predicted_entropy" in stored else "utility"  # its name in version 0.1

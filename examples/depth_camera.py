@@ -39,10 +39,10 @@ system = mevs_jax.load(sys.argv[1] if len(sys.argv) > 1 else "furniture10")
 agent = system.agent(stop=0.95)
 agent.warm_up()
 agent.reset(center=CENTER, radius=RADIUS, yaw=0.0)  # it faces as the training objects do; None if unknown
-step = agent.decide(reachable=above_floor)
+belief, step = None, agent.decide(reachable=above_floor)
 while (pose := step.T_world_camera) is not None:
     depth = take(pose)  # the robot moves its camera there
     belief = agent.observe(depth, K, pose)
     print(f"{belief.name}, {100 * belief.confidence:.1f} % ({belief.latency_ms:.0f} ms)")
     step = agent.decide(reachable=above_floor)
-print(f"{belief.name} after {belief.views} views: {step.reason}")
+print(step.reason, belief and f"{belief.name} after {belief.views} views")

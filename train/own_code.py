@@ -14,6 +14,7 @@ from typing import Any
 
 from data_pipeline.errors import DataError, kind_and_reason_of
 from data_pipeline.files import short_hash
+from mevs_jax.models.shapes import ENCODERS
 
 
 @dataclass(frozen=True)
@@ -65,7 +66,10 @@ def load_own(reference: str, option: str) -> OwnCode:
     """
     place, _, name = reference.rpartition(":")
     if not place or not name.isidentifier():
-        raise DataError(f"{option} {reference} is not of the form module:function or path/to/file.py:function")
+        built_in = f"{', '.join(ENCODERS)}, or " if option == "--encoder" else ""
+        raise DataError(
+            f"{option} {reference} is not {built_in}of the form module:function or path/to/file.py:function"
+        )
     if place.endswith(".py"):
         module, content = _from_file(Path(place).expanduser(), reference, option)
     else:

@@ -40,7 +40,7 @@ def live(call: Invocation) -> None:
 
 
 def agent(call: Invocation) -> None:
-    """Measures what an agent promises."""
+    """Measures how often an agent's sure answers are right."""
     from eval import stages
 
     found = stages.check_agent(call.settings, call.out)

@@ -57,7 +57,7 @@ COMMANDS = {
         "train the classifier and the entropy predictor", "TrainOptions", "stages:train", ("classifier", "entropy")
     ),
     "sweep": Command(
-        "train many configurations of one network (--sweep.network entropy) as one program",
+        "train many configurations of one network (the entropy predictor; --sweep.network) as one program",
         "SweepOptions",
         "stages:sweep",
         ("sweep", "classifier", "entropy", "learned"),
@@ -139,7 +139,7 @@ COMMANDS = {
         writes_run=False,
     ),
     "check agent": Command(
-        "what an agent promises, on test objects: walks, stopping, any camera, time",
+        "how often sure answers are right, on test objects; walks, any camera, time",
         "WithViews",
         "checks:agent",
         ("dataset", "agent"),

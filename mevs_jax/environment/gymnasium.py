@@ -29,6 +29,8 @@ NAME = "mevs_jax/ActiveRecognition-v0"
 """The name that the environments with predictions are registered under."""
 VIEW_SELECTION = "mevs_jax/ViewSelection-v0"
 """The name that `ViewSelectionEnv` is registered under."""
+_MOST = float(np.finfo(np.float32).max) / 2
+"""Largest number of an observation: a bound, as checkers ask for."""
 _SIDE = 96
 """Rows of a drawing, and columns of each of its halves."""
 
@@ -117,8 +119,8 @@ def observation_space(environment: ActiveRecognition) -> gymnasium.spaces.Dict:
     spaces = gymnasium.spaces
     tables = environment.tables
     parts: dict[str, gymnasium.Space] = {
-        "log_probabilities": spaces.Box(-np.inf, 0, (environment.classes,)),
-        "belief": spaces.Box(-np.inf, 0, (environment.classes,)),
+        "log_probabilities": spaces.Box(-_MOST, 0, (environment.classes,)),
+        "belief": spaces.Box(-_MOST, 0, (environment.classes,)),
         "view": spaces.Discrete(environment.views),
         "direction": spaces.Box(-1, 1, (3,)),
         "attempted": spaces.MultiBinary(environment.views),
@@ -129,7 +131,7 @@ def observation_space(environment: ActiveRecognition) -> gymnasium.spaces.Dict:
     optional = {"predicted_entropy": tables.predicted_entropy, "features": tables.features, "cloud": tables.clouds}
     for name, table in optional.items():
         if table is not None:
-            parts[name] = spaces.Box(-np.inf, np.inf, table.shape[2:])
+            parts[name] = spaces.Box(-_MOST, _MOST, table.shape[2:])
     return spaces.Dict(parts)
 
 

@@ -20,7 +20,7 @@ EXAMPLES = Path(__file__).resolve().parents[2] / "examples"
         pytest.param("own_policy", "opposite: ", marks=pytest.mark.slow),
         ("load_and_ask", "confident after "),
         pytest.param("depth_camera", " views: sure", marks=pytest.mark.slow),
-        pytest.param("gymnasium_ppo", "| PPO − random | +0.0 ", marks=pytest.mark.slow),
+        pytest.param("ppo", "| PPO − random | +0.0 ", marks=pytest.mark.slow),
         pytest.param("own_encoder", "validation accuracy", marks=pytest.mark.slow),
         pytest.param("stable_baselines", "PPO  ", marks=pytest.mark.slow),
     ],
@@ -33,7 +33,7 @@ def test_an_example_runs(name, said, whole, tmp_path):
         "own_policy": [str(whole)],
         "stable_baselines": [str(whole), "2000"],
         "own_encoder": [str(whole), str(tmp_path)],
-        "gymnasium_ppo": [str(whole), "--updates", "2", "--episodes", "16", "--networks", "2"],
+        "ppo": [str(whole), "--updates", "2", "--episodes", "16", "--networks", "2"],
     }
     command = [sys.executable, str(EXAMPLES / f"{name}.py"), *arguments.get(name, [])]
     ended = subprocess.run(command, capture_output=True, text=True, timeout=600)
@@ -110,5 +110,5 @@ def test_all_examples_are_run():
         "stable_baselines",
         "load_and_ask",
         "depth_camera",
-        "gymnasium_ppo",
+        "ppo",
     }

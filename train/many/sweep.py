@@ -17,7 +17,7 @@ from jax.sharding import Mesh
 from data_pipeline.dataset.statistics import DatasetStatistics
 from data_pipeline.distributed import agreed, is_first, wait_for_all
 from data_pipeline.errors import DataError, Diverged, Unreadable, reason_of
-from data_pipeline.files import as_read, keep_json, read_json, write_text
+from data_pipeline.files import as_read, keep_json, read_json, write_bytes
 from data_pipeline.progress import console
 from train.loop import content_on
 from train.many.members import (
@@ -33,6 +33,7 @@ from train.many.members import (
 from train.many.training import train_members
 from train.results.identity import why
 from train.results.networks import check_config
+from train.results.records import csv_of
 from train.running.devices import device_mesh
 from train.tasks.entropy import EntropyTask
 from train.tasks.recogniser import RecogniserTask
@@ -248,21 +249,22 @@ def sweep(
         )
     export_member(group, of, weights, of.members.index(best), folder / "network", mesh)
     if is_first():
-        write_text(folder / "epochs.csv", csv_of_epochs(of))
+        write_bytes(folder / "epochs.csv", csv_of_epochs(of))
         keep_json(folder / "members.json", [asdict(member) for member in of.members])
     wait_for_all("a sweep is written")
     return of.members
 
 
-def csv_of_epochs(of: Together) -> str:
+def csv_of_epochs(of: Together) -> bytes:
     """Returns a row for each member and epoch, with the metrics of training and validation."""
-    text = io.StringIO()
     names = dict.fromkeys(name for history in of.histories for entry in history for name in entry)
-    writer = csv.DictWriter(text, ["member", *names], lineterminator="\n")
-    writer.writeheader()
-    for number, history in enumerate(of.histories):
-        writer.writerows({"member": number} | entry for entry in history)
-    return text.getvalue()
+    return csv_of(
+        [
+            {"member": number} | {name: entry.get(name, "") for name in names}
+            for number, history in enumerate(of.histories)
+            for entry in history
+        ]
+    )
 
 
 def identity_of_sweep(config: SweepConfig, task: SweepTask) -> dict[str, Any]:

@@ -34,8 +34,6 @@ def test_the_environment_passes_the_checker_of_gymnasium(gym):
     env = gymnasium.make(gym.VIEW_SELECTION, environment=environment_of(), render_mode="rgb_array")
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        warnings.filterwarnings("ignore", message=".*A Box .* space m.*imum value is .*infinity")  # of logits
-        warnings.filterwarnings("ignore", message=".*we recommend using a symmetric and normalized space")
         check_env(env.unwrapped)
 
 

@@ -1,4 +1,4 @@
-"""PPO in the environment `ActiveRecognition`, beside other policies: `python examples/gymnasium_ppo.py [RUN]`.
+"""PPO in the environment `ActiveRecognition`, beside other policies: `python examples/ppo.py [RUN]`.
 
 RUN is a directory in which `mevs run` has been run (default: runs/demo). Policy networks learn by PPO (Schulman et al. 2017) on
 the validation objects, which the classifier was not trained on; the policy is their mean. It is evaluated on the test objects
