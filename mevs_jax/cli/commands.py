@@ -57,7 +57,7 @@ COMMANDS = {
         "train the classifier and the entropy predictor", "TrainOptions", "stages:train", ("classifier", "entropy")
     ),
     "sweep": Command(
-        "train many configurations of one network (the entropy predictor; --sweep.network) as one program",
+        "train many configurations of one network (entropy unless told) as one program",
         "SweepOptions",
         "stages:sweep",
         ("sweep", "classifier", "entropy", "learned"),
