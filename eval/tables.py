@@ -102,13 +102,11 @@ def load_view_tables(path: str | Path) -> ViewTables:
     """Reads what `save_view_tables` wrote.
 
     Raises:
-        DataError: if there is no such file.
+        DataError: for a folder.
         Unreadable: if the file is not as it was written.
     """
-    if not Path(path).is_file():
-        raise DataError(
-            f"{path} is no file of view tables, such as tables/val.npz or tables/test.npz in the folder of a run"
-        )
+    if Path(path).is_dir():
+        raise DataError(f"{path} is a folder, not a file of view tables; a run has tables/val.npz and tables/test.npz")
     check_kept(Path(path))
     with np.load(path) as stored:
         predicted = "predicted_entropy" if "predicted_entropy" in stored else "utility"  # its name in version 0.1
