@@ -15,6 +15,7 @@ import numpy as np
 import pytest
 
 from data_pipeline.dataset.statistics import DatasetStatistics
+from data_pipeline.errors import DataError
 from eval.numbers.comparison import class_mean, first_reaching
 from eval.numbers.study import entropy_errors, exactly_random, reachable_views, run_study, single_view
 from eval.tables import ViewTables, load_view_tables, save_view_tables
@@ -365,6 +366,8 @@ def test_only_a_mixture_may_answer_otherwise(study):
 def test_tables_are_saved_whole(tables, tmp_path):
     save_view_tables(tmp_path / "t.npz", tables)
     again = load_view_tables(tmp_path / "t.npz")
+    with pytest.raises(DataError, match="is a folder, not a file of view tables"):
+        load_view_tables(tmp_path)
     assert again.names == tables.names
     for name in ("labels", "logits", "predicted_entropy", "entropy"):
         np.testing.assert_array_equal(getattr(again, name), getattr(tables, name))
