@@ -45,4 +45,4 @@ while (pose := step.T_world_camera) is not None:
     belief = agent.observe(depth, K, pose)
     print(f"{belief.name}, {100 * belief.confidence:.1f} % ({belief.latency_ms:.0f} ms)")
     step = agent.decide(reachable=above_floor)
-print(step.reason, belief and f"{belief.name} after {belief.views} views")
+print(f"{belief.name} after {belief.views} views: {step.reason}" if belief else step.reason)

@@ -48,6 +48,7 @@ from tests.reference.leaks import (
     without_bootstrap,
 )
 from tests.reference.weights import untrained
+from train.loop import RANDOM
 from train.results.records import as_json
 
 SETTINGS = replace(TINY, evaluation=GridConfig(max_views=4, draws=1))
@@ -143,6 +144,7 @@ def run_with(change: str | None, out: Path) -> Run:
         patch.setattr(evaluation, "load_ascent_scores", lambda *_: None)
         patch.setattr(of_run, "load_best", lambda task, folder: trained[folder.name])
         patch.setattr(evaluation, "summary_of", lambda folder: {"best": {"accuracy": 0.5}})
+        patch.setattr(system, "summary_of", lambda folder: {"start": RANDOM})
         patch.setattr(of_run, "compute_view_tables", compute_view_tables)
         patch.setattr(promises, "compare_with_tables", compare_with_tables)
         patch.setattr(system, "save_system", lambda system, folder: setattr(run, "system", system))
@@ -332,6 +334,7 @@ def test_no_figure_of_test_objects_decides_what_a_system_uses(monkeypatch):
     monkeypatch.setattr(system, "run_grid", walk_grid_anyhow)
     on_validation = system.walk_validation(VALIDATION, STATISTICS.graph, 4)
     monkeypatch.setattr(system, "walk_validation", lambda *given: on_validation)
+    monkeypatch.setattr(system, "summary_of", lambda folder: {"start": RANDOM})
     monkeypatch.setattr(of_run.Run, "tables", lambda *_: VALIDATION)
     monkeypatch.setattr(of_run.Run, "classifier", lambda _: trained["classifier"])
     monkeypatch.setattr(of_run.Run, "predictor", lambda _: trained["entropy"])
