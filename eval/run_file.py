@@ -11,7 +11,6 @@ from typing import Any
 from data_pipeline.errors import DataError, Unreadable
 from data_pipeline.files import CHECKS, as_read, checks_in, keep_json, read_json
 from eval.settings import PRESETS, Settings
-from mevs_jax.models.shapes import ENCODERS
 from mevs_jax.plain import from_plain
 
 NAME = "run.json"
@@ -55,8 +54,8 @@ def load_run(out: Path) -> RunFile | None:
 def save_run(out: Path, preset: str, settings: Settings, arguments: list[str]) -> None:
     """Writes `run.json`; a file that holds the same settings, and was written by the same versions, is left as it is."""
     content, path = as_read(configuration(preset, settings) | {"made_with": _made_with()}), out / NAME
-    if settings.classifier.encoder and settings.classifier.encoder not in ENCODERS:
-        content["encoder"] = _encoder(out, settings.classifier.encoder)
+    if own := settings.classifier.own:
+        content["encoder"] = _encoder(out, own)
     if path.exists() and {name: value for name, value in read_json(path).items() if name in content} == content:
         return
     keep_json(path, content | {"arguments": arguments})

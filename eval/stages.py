@@ -24,7 +24,6 @@ from eval.settings import Settings
 from eval.system import make_run_system
 from eval.walks.live import Agreement
 from eval.walks.own_policies import load_policies
-from mevs_jax.models.shapes import ENCODERS
 
 
 def evaluate(settings: Settings, out: Path) -> Metrics:
@@ -39,7 +38,7 @@ def make_system(settings: Settings, out: Path) -> Path:
     Raises:
         DataError: if the run is not finished, its metrics are stale, or its classifier is an encoder of the user's own.
     """
-    if (encoder := settings.classifier.encoder) and encoder not in ENCODERS:
+    if encoder := settings.classifier.own:
         raise DataError(f"a trained system holds networks of this project, and the classifier of {out} is {encoder}")
     run = Run.of(settings, out)
     return make_run_system(run, load_metrics(run, None))

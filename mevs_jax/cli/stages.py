@@ -24,14 +24,12 @@ def run(call: Invocation) -> None:
     from eval.consistency import check_seeds
     from eval.evaluation import policies_on
     from eval.walks.own_policies import load_policies
-    from mevs_jax.models.shapes import ENCODERS
     from train.own_code import load_own
 
-    start, encoder = weights_of(call), call.settings.classifier.encoder
-    own = encoder and encoder not in ENCODERS
+    start, own = weights_of(call), call.settings.classifier.own
     load_policies(call.settings.policies)  # so that an error in a policy is found before anything is computed
     if own:
-        load_own(encoder, "--encoder")
+        load_own(own, "--encoder")
     check_seeds(call.settings)
     training.check_batches(call.settings, call.out)
     policies_on(call.settings.policies, training.make_data(call.settings, call.out))

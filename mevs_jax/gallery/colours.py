@@ -189,8 +189,7 @@ class Colours:
         if len(self.images):
             numbers, share = differences(self.images, seen, direction)
             white = numbers @ self.matcher.projection
-            slope = interpolated(self.slopes.reshape(*self.slopes.shape[:3], -1), direction)
-            slope = slope.reshape(*white.shape[:2], ERRORS, -1)
+            slope = interpolated(self.slopes, direction)
             lean = jnp.einsum("oyf,oyef->oye", white, slope) / white.shape[-1]
             found = unexplained(jnp.mean(jnp.square(white), axis=-1), lean, gram_of(slope), 1.0)
             enough = jnp.clip(share / jnp.maximum(known, LEAST), 0, 1)
@@ -218,11 +217,7 @@ class Colours:
         same = self.objects == (hypotheses // YAWS)[:, None]
         at, coloured = jnp.argmax(same, axis=1), jnp.any(same, axis=1)
         before, count = evidence.apart.reshape(-1)[hypotheses], evidence.count
-        seen, slope = (
-            foreseen(grid.reshape(*grid.shape[:3], -1), directions, at, hypotheses % YAWS)
-            for grid in (self.features, self.slopes)
-        )
-        slope = slope.reshape(*seen.shape[:2], ERRORS, -1)
+        seen, slope = (foreseen(grid, directions, at, hypotheses % YAWS) for grid in (self.features, self.slopes))
         products = jnp.einsum("cmf,cnf->cmn", seen, seen) / seen.shape[-1]
         leans = jnp.einsum("cmf,cnef->cmne", seen, slope) / seen.shape[-1]
         squares, own = jnp.diagonal(products, axis1=1, axis2=2), jnp.einsum("cnne->cne", leans)

@@ -53,7 +53,7 @@ def _between(place: Array, most: int) -> tuple[Array, Array]:
     return whole.astype(jnp.int32), place - whole
 
 
-def interpolated(grid: Array, direction: Float[Array, " 3"]) -> Float[Array, "objects yaws numbers"]:
+def interpolated(grid: Array, direction: Float[Array, " 3"]) -> Float[Array, "objects yaws *numbers"]:
     """Values of a grid in a direction, for an object at each yaw: interpolated between four directions of the grid."""
     height, azimuth = _place(direction)
     below, up = _between(height, HEIGHTS - 1)
@@ -64,22 +64,23 @@ def interpolated(grid: Array, direction: Float[Array, " 3"]) -> Float[Array, "ob
 
 
 def foreseen(
-    grid: Float[Array, "objects heights yaws features"],
+    grid: Float[Array, "objects heights yaws *features"],
     directions: Float[Array, "candidates 3"],
     objects: Int[Array, " hypotheses"],
     yaws: Int[Array, " hypotheses"],
-) -> Float[Array, "candidates hypotheses features"]:
+) -> Float[Array, "candidates hypotheses *features"]:
     """`interpolated` of some hypotheses, in some directions."""
     height, azimuth = _place(directions)
     (below, up), (before, along) = _between(height, HEIGHTS - 1), _between(azimuth, YAWS)
     at = before[:, None] - yaws
+    along, up = (share.reshape(-1, *(1,) * (grid.ndim - 2)) for share in (along, up))
 
     def row(level: Array) -> Array:
         first, second = (grid[objects[None], level[:, None], (at + step) % YAWS] for step in (0, 1))
-        return first + along[:, None, None] * (second - first)
+        return first + along * (second - first)
 
     lower, upper = row(below), row(jnp.minimum(below + 1, HEIGHTS - 1))
-    return lower + up[:, None, None] * (upper - lower)
+    return lower + up * (upper - lower)
 
 
 def of_walks(count: Float[AnyArray, "*walks"], objects: int) -> Float[Array, "..."]:

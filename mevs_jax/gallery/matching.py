@@ -220,8 +220,7 @@ class Gallery:
         both = known * (unknown == 0)
         white = (both * (predicted / STEPS - image)) @ (WEIGHTS[:, None] * self.matcher.projection)
         seen, share = jnp.mean(both, axis=-1), jnp.mean(known)
-        shape = (*self.slopes.shape[:3], -1)
-        slope = interpolated(self.slopes.reshape(shape), direction).reshape(*seen.shape, *self.slopes.shape[3:])
+        slope = interpolated(self.slopes, direction)
         scale = jnp.maximum(seen, _LEAST)
         square = jnp.mean(jnp.square(white), axis=-1) / scale
         lean = jnp.einsum("oyf,oyef->oye", white, slope) / white.shape[-1] / jnp.sqrt(scale)[..., None]
@@ -301,10 +300,8 @@ class Gallery:
         )
         least = jnp.min(evidence.apart)
         features, slope = (
-            foreseen(grid.reshape(*grid.shape[:3], -1), directions, index // YAWS, index % YAWS)
-            for grid in (self.features, self.slopes)
+            foreseen(grid, directions, index // YAWS, index % YAWS) for grid in (self.features, self.slopes)
         )
-        slope = slope.reshape(*features.shape[:2], ERRORS, -1)
         # What a view would show if a hypothesis were true, with the error of the sphere that its views so far speak for.
         off = likeliest(lean, gram, 1.0)
         image = features - jnp.einsum("me,cmef->cmf", off, slope)

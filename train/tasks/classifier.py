@@ -83,11 +83,16 @@ class ClassifierConfig:
     reality: RealityAugmentation = RealityAugmentation()
     optimiser: OptimiserConfig = OptimiserConfig(weight_decay=1e-4)
 
+    @property
+    def own(self) -> str:
+        """The encoder if it is of the user's own, which no trained system can be made of; empty for this project's networks."""
+        return "" if self.encoder in ENCODERS else self.encoder
+
 
 def _encoder(config: ClassifierConfig, classes: int, resolution: int) -> OwnEncoderConfig | EncoderShape:
     """The network that takes the ResNet's place."""
-    if config.encoder not in ENCODERS:
-        return own_encoder(config.encoder, classes, config.network.channels, resolution)
+    if config.own:
+        return own_encoder(config.own, classes, config.network.channels, resolution)
     shape = EncoderShape(config.encoder, resolution)  # type: ignore[arg-type]
     try:
         nnx.eval_shape(lambda: shape.network(classes, nnx.Rngs(0)))
