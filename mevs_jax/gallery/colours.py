@@ -18,7 +18,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int, UInt8
 
 from mevs_jax.arrays import AnyArray
-from mevs_jax.gallery.errors import ERRORS, gram_of, unexplained
+from mevs_jax.gallery.errors import details, gram_of, unexplained
 from mevs_jax.gallery.grid import HEIGHTS, SIDE, STEPS, UNKNOWN, YAWS, foreseen, interpolated, of_walks
 
 COLOURS = 3 * SIDE**2
@@ -30,9 +30,9 @@ _DARK = 0.08
 _RANGE = math.log(1 + 1 / _DARK)
 LEAST = 0.02
 """Smallest share of an image in which colours are compared."""
-_SHIFTS = np.array([0.3, 0.3, 0.03, 0.05, 0.05], np.float32)
+_DEVIATIONS = np.array([0.3, 0.3, 0.03, 0.05, 0.05, 0.35, 0.15], np.float32)
 """Standard deviations of what may be wrong in an image: shifts in pixels of small images, to the right and down; the logarithm of
-its size; yaw and elevation of the camera in radians. They are as many as `mevs_jax.gallery.errors.ERRORS`."""
+its size; yaw and elevation of the camera in radians; the logarithms of its exposure and of the exponent of its tone curve."""
 _SHOWN = 0.3
 """Share of an image whose colours the next view will show, about."""
 
@@ -69,15 +69,15 @@ class ColourMatcher:
         projection: (numbers, features) makes differences white.
         floor: () squared difference below which hypotheses are about equally good.
         heat: (3,) coefficients of the logarithm of the power of a walk's likelihood, of 1, log views and log objects.
-        stranger: (5,) coefficients of the log-odds that an object is none of those enrolled: of 1, log views, log objects, and
-            the logarithms of the best hypothesis' squared differences of depth and of colour.
+        stranger: (6,) coefficients of the log-odds that an object is none of those enrolled: of 1, log views, log objects, the
+            logarithms of the best hypothesis' squared differences of depth and of colour, and its object's `details` in colour.
         unseen: () the squared difference that counts where a colour is not known.
     """
 
     projection: Float[Array, "numbers features"]
     floor: Float[Array, ""]
     heat: Float[Array, " 3"]
-    stranger: Float[Array, " 5"]
+    stranger: Float[Array, " 6"]
     unseen: Float[Array, ""]
 
     def likelihood(
@@ -89,17 +89,15 @@ class ColourMatcher:
 
     @staticmethod
     def strangeness(
-        apart: Float[AnyArray, "*walks"], colours_apart: Float[AnyArray, "*walks"], count: AnyArray, objects: int
+        apart: Float[AnyArray, "*walks"],
+        colours_apart: Float[AnyArray, "*walks"],
+        detail: Float[AnyArray, "*walks"],
+        count: Float[AnyArray, "*walks"],
+        objects: int,
     ) -> Float[Array, "..."]:
-        """What the odds of an unknown object depend on, in the order of `stranger`, from the best hypothesis' differences."""
+        """What the odds of an unknown object depend on, in the order of `stranger`, from the best hypothesis."""
         both = jnp.log(jnp.stack([jnp.asarray(apart), jnp.asarray(colours_apart)]) + 1e-6)
-        return jnp.concatenate([of_walks(jnp.maximum(count, LEAST), objects), both])
-
-    def strange_odds(
-        self, apart: Float[AnyArray, "*walks"], colours_apart: Float[AnyArray, "*walks"], count: AnyArray, objects: int
-    ) -> Float[Array, "..."]:
-        """Log-odds that an object is none of those enrolled, by shape or by colour."""
-        return self.stranger @ self.strangeness(apart, colours_apart, count, objects)
+        return jnp.stack([*of_walks(jnp.maximum(count, LEAST), objects), *both, jnp.asarray(detail)])
 
     def blank(self) -> Colours:
         """No objects' colours yet."""
@@ -135,7 +133,8 @@ class Colours:
         images: (coloured, heights, yaws, colours) of each object whose colours are known, as `stored_colours`.
         objects: (coloured,) which objects these are.
         features: (coloured, heights, yaws, features) the same, projected.
-        slopes: (coloured, heights, yaws, errors, features) how features change with `_SHIFTS`.
+        slopes: (coloured, heights, yaws, errors, features) how features change with `_DEVIATIONS`.
+        details: (coloured,) how fine those of each are, as `mevs_jax.gallery.errors.details`.
     """
 
     matcher: ColourMatcher
@@ -143,6 +142,7 @@ class Colours:
     objects: Int[Array, " coloured"]
     features: Float[Array, "coloured heights yaws features"]
     slopes: Float[Array, "coloured heights yaws errors features"]
+    details: Float[Array, " coloured"]
 
     @classmethod
     def of(
@@ -151,11 +151,11 @@ class Colours:
         """The colours of some images."""
         stored = jnp.asarray(images, jnp.uint8)
         nothing = jnp.zeros((0, HEIGHTS, YAWS, matcher.projection.shape[1]))
-        features, slopes = nothing, nothing[..., None, :].repeat(ERRORS, axis=-2)
+        features, slopes = nothing, nothing[..., None, :].repeat(len(_DEVIATIONS), axis=-2)
         if len(stored):
             found = [_of_object(one, matcher.projection) for one in stored]
             features, slopes = (jnp.stack(part) for part in zip(*found, strict=True))
-        return cls(matcher, stored, jnp.asarray(objects, jnp.int32), features, slopes)
+        return cls(matcher, stored, jnp.asarray(objects, jnp.int32), features, slopes, details(slopes))
 
     def with_more(self, images: Sequence[UInt8[AnyArray, "heights yaws colours"] | None], objects: int) -> Colours:
         """With more objects after those of before, some of them without colours."""
@@ -195,6 +195,28 @@ class Colours:
             enough = jnp.clip(share / jnp.maximum(known, LEAST), 0, 1)
             apart = apart.at[self.objects].set(self.matcher.unseen + enough * (found - self.matcher.unseen))
         return jnp.append(apart.reshape(-1), known)
+
+    def strange_odds(
+        self,
+        evidence: ColourEvidence,
+        best: Int[Array, ""],
+        apart: Float[Array, ""],
+        by_shape: Float[Array, ""],
+        objects: int,
+    ) -> Float[Array, ""]:
+        """Log-odds that an object is none of those enrolled, by shape or by colour.
+
+        Args:
+            evidence: of the views so far.
+            best: the likeliest hypothesis.
+            apart: its difference of depth.
+            by_shape: the log-odds by shape alone, which count if no view or not this object has colours.
+            objects: number of objects.
+        """
+        this = self.objects == best // YAWS
+        inputs = evidence.apart.reshape(-1)[best], jnp.sum(jnp.where(this, self.details, 0.0)), evidence.count
+        odds = self.matcher.stranger @ self.matcher.strangeness(apart, *inputs, objects)
+        return jnp.where((evidence.count > 0) & jnp.any(this), odds, by_shape)
 
     def expected(
         self,
@@ -245,8 +267,9 @@ def _of_object(
     down, across = (_slope(*small, axis) for axis in (2, 3))
     turned, raised = _slope(*small, 1, wraps=True) * (YAWS / (2 * np.pi)), _slope(*small, 0) * ((HEIGHTS - 1) / np.pi)
     at = (jnp.arange(SIDE) - (SIDE - 1) / 2)[:, None]
-    changes = jnp.stack([across, down, across * at + down * at[:, None], turned, raised], axis=2)
-    changes = changes.reshape(*known.shape[:2], ERRORS, SIDE**2, 3) * _SHIFTS[:, None, None]
+    gained, colours = 1 - jnp.exp(-small[0]), jnp.maximum(_DARK * jnp.expm1(small[0]), 1e-3)
+    each = across, down, across * at + down * at[:, None], turned, raised, gained, gained * jnp.log(colours)
+    changes = jnp.stack(each, axis=2).reshape(*known.shape[:2], len(each), SIDE**2, 3) * _DEVIATIONS[:, None, None]
     slopes = parted(changes, jnp.broadcast_to(known[:, :, None], changes.shape[:-1]))[0]
     return parted(logs, known)[0] @ projection, slopes @ projection
 

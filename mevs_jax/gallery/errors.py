@@ -22,12 +22,12 @@ DEVIATIONS = np.array([0.015, 0.015, 0.015, 0.02, 0.05], np.float32)
 """Of the sphere's centre along the object's axes, in radii; of the logarithm of its radius; of the yaw in radians, as hypotheses
 are 10° apart."""
 ERRORS = len(DEVIATIONS)
-PAIRS = np.array([*combinations_with_replacement(range(ERRORS), 2)])
-"""The entries of a symmetric matrix of errors that are kept."""
-KEPT = 1 + ERRORS + len(PAIRS)
+KEPT = 1 + ERRORS + ERRORS * (ERRORS + 1) // 2
 """Numbers that are kept of a view and a hypothesis: square, lean and gram."""
 HELD = 0.05
 """Squared difference of features, as a mean over them, that an error by its standard deviation costs."""
+_CALM = 0.2
+"""Added to how much images change before the logarithm, since less does not matter."""
 
 
 def slopes(
@@ -69,9 +69,18 @@ def _changes(images: Float[Array, "*grid pixels"]) -> Float[Array, "*grid 4 pixe
     return jnp.stack([one.reshape(images.shape) for one in each], axis=-2)
 
 
+def details(slopes: Float[AnyArray, "objects heights yaws errors features"]) -> Float[Array, " objects"]:
+    """Logarithm of how much images of each object change with errors by standard deviations: mean squares, added up.
+
+    The finer the details of an object, the larger are the differences that the best prediction leaves.
+    """
+    squares = jnp.einsum("ohyef,ohyef->o", slopes, slopes) / np.prod([slopes.shape[axis] for axis in (1, 2, 4)])
+    return jnp.log(squares + _CALM)
+
+
 def gram_of(slope: Float[Array, "*batch errors features"]) -> Float[Array, "*batch pairs"]:
-    """The means of products of slopes, over features."""
-    first, second = PAIRS.T
+    """The means of products of slopes, over features: the upper half of a symmetric matrix, row by row."""
+    first, second = np.triu_indices(slope.shape[-2])
     return jnp.einsum("...pf,...pf->...p", slope[..., first, :], slope[..., second, :]) / slope.shape[-1]
 
 
@@ -102,10 +111,10 @@ def likeliest(
     """The common error that `unexplained` takes away, in standard deviations."""
     lower, reduced = _reduced(lean, gram, count)
     found: dict[int, Array] = {}
-    for row in reversed(range(ERRORS)):
-        rest = sum((lower[k, row] * found[k] for k in range(row + 1, ERRORS)), jnp.zeros(()))
+    for row in reversed(range(len(reduced))):
+        rest = sum((lower[k, row] * found[k] for k in range(row + 1, len(reduced))), jnp.zeros(()))
         found[row] = (reduced[row] - rest) / lower[row, row]
-    return jnp.stack([found[row] for row in range(ERRORS)], axis=-1)
+    return jnp.stack([found[row] for row in range(len(reduced))], axis=-1)
 
 
 def _reduced(
@@ -114,10 +123,12 @@ def _reduced(
     """The entries of `L`, where `L Lᵀ` is the gram with the cost of errors (Cholesky), and those of `L⁻¹ lean`."""
     # Written out: libraries call a routine for each of many tiny matrices. On a CPU, that of JAX also waits for threads that are
     # needed to run it, so that two programs side by side may wait for ever.
-    entry = {(int(b), int(a)): gram[..., place] for place, (a, b) in enumerate(PAIRS)}
+    errors = lean.shape[-1]
+    pairs = combinations_with_replacement(range(errors), 2)
+    entry = {(b, a): gram[..., place] for place, (a, b) in enumerate(pairs)}
     lower: dict[tuple[int, int], Array] = {}
     reduced: list[Array] = []
-    for row in range(ERRORS):
+    for row in range(errors):
         for column in range(row):
             rest = sum((lower[row, k] * lower[column, k] for k in range(column)), jnp.zeros(()))
             lower[row, column] = (entry[row, column] - rest) / lower[column, column]

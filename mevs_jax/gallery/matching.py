@@ -22,7 +22,7 @@ from jaxtyping import Array, Bool, Float, Int, UInt8
 
 from mevs_jax.arrays import AnyArray
 from mevs_jax.gallery.colours import ColourEvidence, Colours, small_colours
-from mevs_jax.gallery.errors import ERRORS, KEPT, gram_of, likeliest, parted, slopes, unexplained
+from mevs_jax.gallery.errors import ERRORS, KEPT, details, gram_of, likeliest, parted, slopes, unexplained
 from mevs_jax.gallery.grid import HEIGHTS, SIDE, STEPS, UNKNOWN, YAWS, foreseen, grid_rotations, interpolated, of_walks
 
 PIXELS = 2 * SIDE**2
@@ -81,8 +81,8 @@ class Matcher:
         projection: (pixels, features) makes differences of images white: of unit covariance.
         floor: () squared difference below which hypotheses are about equally good.
         heat: (3,) coefficients of the logarithm of the power of a walk's likelihood, of 1, log views and log objects.
-        stranger: (4,) coefficients of the log-odds that an object is none of those enrolled: of 1, log views, log objects, and
-            the logarithm of the best hypothesis' squared difference.
+        stranger: (5,) coefficients of the log-odds that an object is none of those enrolled: of 1, log views, log objects, the
+            logarithm of the best hypothesis' squared difference, and its object's `details`.
         unseen: () the squared difference that counts where a prediction is not known.
         size: () standard deviation of the logarithm of an object's measured radius.
     """
@@ -90,7 +90,7 @@ class Matcher:
     projection: Float[Array, "pixels features"]
     floor: Float[Array, ""]
     heat: Float[Array, " 3"]
-    stranger: Float[Array, " 4"]
+    stranger: Float[Array, " 5"]
     unseen: Float[Array, ""]
     size: Float[Array, ""]
 
@@ -106,16 +106,13 @@ class Matcher:
 
     @staticmethod
     def strangeness(
-        apart: Float[AnyArray, "*walks"], count: Float[AnyArray, "*walks"], objects: int
+        apart: Float[AnyArray, "*walks"],
+        detail: Float[AnyArray, "*walks"],
+        count: Float[AnyArray, "*walks"],
+        objects: int,
     ) -> Float[Array, "..."]:
-        """What the odds of an unknown object depend on, in the order of `stranger`, from the best hypothesis' difference."""
-        return jnp.concatenate([of_walks(count, objects), jnp.log(jnp.asarray(apart) + 1e-6)[None]])
-
-    def strange_odds(
-        self, apart: Float[AnyArray, "*walks"], count: Float[AnyArray, "*walks"], objects: int
-    ) -> Float[Array, "..."]:
-        """Log-odds that an object is none of those enrolled."""
-        return self.stranger @ self.strangeness(apart, count, objects)
+        """What the odds of an unknown object depend on, in the order of `stranger`, from the best hypothesis."""
+        return jnp.stack([*of_walks(count, objects), jnp.log(jnp.asarray(apart) + 1e-6), jnp.asarray(detail)])
 
 
 @flax.struct.dataclass
@@ -148,6 +145,7 @@ class Gallery:
         images: (objects, heights, yaws, pixels) from each direction of the grid, as `stored_image`.
         features: (objects, heights, yaws, features) the same, projected.
         slopes: (objects, heights, yaws, errors, features) how features change with a wrong sphere and yaw.
+        details: (objects,) how fine those of each are, as `mevs_jax.gallery.errors.details`.
         radii: (objects,) in metres; 0 where the true size is not known.
         symmetries: (objects,) number of yaws at which each looks alike.
         colours: of the objects; None if they are not compared.
@@ -157,6 +155,7 @@ class Gallery:
     images: UInt8[Array, "objects heights yaws pixels"]
     features: Float[Array, "objects heights yaws features"]
     slopes: Float[Array, "objects heights yaws errors features"]
+    details: Float[Array, " objects"]
     radii: Float[Array, " objects"]
     symmetries: Int[Array, " objects"]
     colours: Colours | None = None
@@ -179,7 +178,9 @@ class Gallery:
             changes = jnp.stack([slopes(one, grid_rotations()) @ project for one in filled])
         symmetries = jnp.array([symmetry_of(one) for one in np.asarray(features)], jnp.int32)
         sizes = jnp.asarray(radii, jnp.float32)
-        return cls(matcher, jnp.asarray(images, jnp.uint8), features, changes, sizes, symmetries, colours)
+        return cls(
+            matcher, jnp.asarray(images, jnp.uint8), features, changes, details(changes), sizes, symmetries, colours
+        )
 
     def compared(
         self,
@@ -266,12 +267,10 @@ class Gallery:
         """Log-probabilities of the objects and, last, of an unknown object."""
         hypotheses, objects = self.hypotheses(evidence), len(self.radii)
         best = jnp.argmax(hypotheses)
-        apart = evidence.apart.reshape(-1)[best]
-        odds = self.matcher.strange_odds(apart, evidence.count, objects)
+        apart, detail = evidence.apart.reshape(-1)[best], self.details[best // YAWS]
+        odds = self.matcher.stranger @ self.matcher.strangeness(apart, detail, evidence.count, objects)
         if self.colours and evidence.colours:
-            colours, count = evidence.colours.apart.reshape(-1)[best], evidence.colours.count
-            either = self.colours.matcher.strange_odds(apart, colours, count, objects)
-            odds = jnp.where(count > 0, either, odds)
+            odds = self.colours.strange_odds(evidence.colours, best, apart, odds, objects)
         odds += 0.5 * (evidence.size[best // YAWS] - 1)
         known = jax.scipy.special.logsumexp(hypotheses, axis=1) + jax.nn.log_sigmoid(-odds)
         return jnp.append(known, jax.nn.log_sigmoid(odds))

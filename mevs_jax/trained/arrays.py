@@ -153,7 +153,7 @@ def _gallery(take: _Arrays, objects: int, colour: bool) -> Gallery:
         projection=take.take("matcher.projection", (PIXELS, None)),
         floor=take.positive("matcher.floor", ()),
         heat=take.take("matcher.heat", (3,)),
-        stranger=take.take("matcher.stranger", (4,)),
+        stranger=take.take("matcher.stranger", (5,)),
         unseen=take.positive("matcher.unseen", ()),
         size=take.positive("matcher.size", ()),
     )
@@ -167,7 +167,7 @@ def _colours(take: _Arrays, objects: int) -> Colours:
         projection=take.take("colour_matcher.projection", (NUMBERS, None)),
         floor=take.positive("colour_matcher.floor", ()),
         heat=take.take("colour_matcher.heat", (3,)),
-        stranger=take.take("colour_matcher.stranger", (5,)),
+        stranger=take.take("colour_matcher.stranger", (6,)),
         unseen=take.positive("colour_matcher.unseen", ()),
     )
     coloured = len(take.arrays.get("colours.objects", ()))

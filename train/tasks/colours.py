@@ -216,7 +216,7 @@ def fit_colour_matcher(config: ColourConfig, matcher: Matcher, camera: ViewCamer
     """Learns a matcher of colours beside one of depth; takes about a second of one core for each shape."""
     train = painted_shapes(kinds_in_turn("train", config.shapes, seed), config, camera, seed)
     nothing = jnp.float32(1)
-    blank = ColourMatcher(fit_projection(train, config.features), nothing, jnp.zeros(3), jnp.zeros(5), nothing)
+    blank = ColourMatcher(fit_projection(train, config.features), nothing, jnp.zeros(3), jnp.zeros(6), nothing)
     val = [*painted_shapes(kinds_in_turn("val", config.calibration_shapes, seed), config, camera, seed + 1)]
     return calibrated(blank, matcher, val, seed)
 
@@ -268,13 +268,13 @@ def calibrated(colours: ColourMatcher, matcher: Matcher, shapes: Sequence[Painte
     gallery = Gallery.of(matcher, np.stack([one.shape.gallery for one in shapes]), np.zeros(len(shapes)))
     depth, shows = tables(gallery, [one.shape for one in shapes])
     depth, shows = depth.repeat(_PAINTS, axis=0).repeat(_PAINTS, axis=2), shows.repeat(_PAINTS, axis=0)
-    apart, coloured = _colour_tables(colours, shapes)
+    apart, coloured, details = _colour_tables(colours, shapes)
     wrong = apart.min(axis=-1)[~np.eye(len(apart), dtype=bool)[:, None].repeat(shows.shape[1], axis=1)]
     unseen = np.float32(np.quantile(wrong, _QUANTILE))
     colours = replace(colours, unseen=jnp.asarray(unseen))
     apart = np.where(coloured[..., None, None] > 0, apart, unseen)[..., None]
-    of_shapes = [*some_walks(depth, shows, seed)]
-    of_paints = [*some_walks(apart, np.maximum(coloured, 1e-3), seed)]
+    of_shapes = [*some_walks(depth, shows, details, seed)]
+    of_paints = [*some_walks(apart, np.maximum(coloured, 1e-3), details, seed)]
     by_shape = [np.asarray(matcher.likelihood(one.apart, one.shown, one.apart.shape[1])) for one in of_shapes]
 
     def joint(x: np.ndarray) -> Iterator[np.ndarray]:
@@ -293,15 +293,16 @@ def calibrated(colours: ColourMatcher, matcher: Matcher, shapes: Sequence[Painte
     found = minimize(loss, start, method="Nelder-Mead", bounds=limits, options={"maxiter": 200}).x
     inputs = []
     for both, *pair in zip(joint(found), of_shapes, of_paints, strict=True):
-        best = both.reshape(len(both), -1).argmax(axis=1)[:, None]
-        shape, paint = (np.take_along_axis(one.apart.reshape(len(best), -1), best, axis=1)[:, 0] for one in pair)
-        inputs.append(np.asarray(ColourMatcher.strangeness(shape, paint, pair[1].shown, both.shape[1]), float).T)
-    odds = fit_odds(np.concatenate(inputs), np.concatenate([one.label < 0 for one in of_paints]))
+        best = both.reshape(len(both), -1).argmax(axis=1)
+        shape, paint = (one.apart.reshape(len(best), -1)[np.arange(len(best)), best] for one in pair)
+        given = pair[1].details[best // YAWS], pair[1].shown, both.shape[1]
+        inputs.append(np.asarray(ColourMatcher.strangeness(shape, paint, *given), float).T)
+    odds = fit_odds([*zip(inputs, (one.label < 0 for one in of_paints), strict=True)])
     return replace(with_power(colours, found), stranger=jnp.asarray(odds, jnp.float32))
 
 
-def _colour_tables(matcher: ColourMatcher, shapes: Sequence[PaintedShape]) -> tuple[np.ndarray, np.ndarray]:
-    """Squared differences (objects, views, objects, yaws) of all views of all objects, and what each view shows."""
+def _colour_tables(matcher: ColourMatcher, shapes: Sequence[PaintedShape]) -> tuple[np.ndarray, np.ndarray, Array]:
+    """Squared differences (objects, views, objects, yaws) of all views of all objects, what each view shows, and details."""
     images = np.concatenate([one.colours for one in shapes])
     colours = Colours.of(matcher, images, np.arange(len(images)))
 
@@ -311,4 +312,4 @@ def _colour_tables(matcher: ColourMatcher, shapes: Sequence[PaintedShape]) -> tu
 
     found = [of_views(colours, seen, one.shape.directions) for one in shapes for seen in one.seen]
     values = np.stack([np.asarray(one) for one in found])
-    return values[..., :-1].reshape(*values.shape[:2], len(images), YAWS), values[..., -1]
+    return values[..., :-1].reshape(*values.shape[:2], len(images), YAWS), values[..., -1], colours.details

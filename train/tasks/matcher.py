@@ -128,7 +128,7 @@ def fit_matcher(config: MatcherConfig, camera: ViewCamera, seed: int = 0) -> Mat
     projection = fit_projection(train, config.features)
     val = [*sighted(kinds_in_turn("val", config.calibration_shapes, seed), config, camera, seed + 1)]
     nothing = jnp.float32(1)
-    blank = Matcher(projection, nothing, jnp.zeros(3), jnp.zeros(4), nothing, jnp.float32(config.size))
+    blank = Matcher(projection, nothing, jnp.zeros(3), jnp.zeros(5), nothing, jnp.float32(config.size))
     return calibrated(blank, val, seed)
 
 
@@ -158,10 +158,11 @@ def fit_projection(shapes: Iterator[Sighted], features: int) -> Float[Array, "pi
 
 
 class Walks(NamedTuple):
-    """Evidence from walks around shapes, of which some are enrolled, and which of those each shape is; −1 for none."""
+    """Evidence from walks around shapes; `details` of those that are enrolled, and which of them each shape is; −1 for none."""
 
     apart: Float[np.ndarray, "walks objects yaws"]
     shown: Float[np.ndarray, " walks"]
+    details: Float[np.ndarray, " objects"]
     label: Int[np.ndarray, " walks"]
 
 
@@ -171,7 +172,7 @@ def calibrated(matcher: Matcher, shapes: Sequence[Sighted], seed: int) -> Matche
     kept, shows = tables(gallery, shapes)
     wrong = kept[..., 0].min(axis=-1)[~np.eye(len(shapes), dtype=bool)[:, None].repeat(shows.shape[1], axis=1)]
     matcher = replace(matcher, unseen=jnp.float32(np.quantile(wrong, _QUANTILE)))
-    walks = [*some_walks(kept, shows, seed)]
+    walks = [*some_walks(kept, shows, gallery.details, seed)]
 
     def power(x: np.ndarray) -> float:
         return float(np.mean([_known_loss(with_power(matcher, x), walk) for walk in walks]))
@@ -179,13 +180,19 @@ def calibrated(matcher: Matcher, shapes: Sequence[Sighted], seed: int) -> Matche
     start, limits = np.array([1.6, 0.3, 0.0, -1.0]), [(-5, 5), (-2, 2), (-0.25, 0.25), (-4, 2)]
     found = minimize(power, start, method="Nelder-Mead", bounds=limits, options={"maxiter": 300}).x
     matcher = with_power(matcher, found)
-    inputs, unknown = (np.concatenate(arrays) for arrays in zip(*map(_stranger_inputs, walks), strict=True))
-    return replace(matcher, stranger=jnp.asarray(fit_odds(inputs, unknown), jnp.float32))
+    odds = fit_odds([_stranger_inputs(walk) for walk in walks])
+    return replace(matcher, stranger=jnp.asarray(odds, jnp.float32))
 
 
-def fit_odds(inputs: Float[np.ndarray, "walks numbers"], unknown: Bool[np.ndarray, " walks"]) -> np.ndarray:
-    """Coefficients of the log-odds of what is unknown, by logistic regression in which both sorts have the same weight."""
-    weights = np.where(unknown, 0.5 / unknown.mean(), 0.5 / (1 - unknown.mean()))
+def fit_odds(walks: Sequence[tuple[Float[np.ndarray, "walks numbers"], Bool[np.ndarray, " walks"]]]) -> np.ndarray:
+    """Coefficients of the log-odds of what is unknown, by logistic regression.
+
+    Args:
+        walks: what the odds depend on, and which are of unknown objects. In each gallery both sorts have the same weight; if
+            they had it in all of them together, the number of objects would tell how many are unknown.
+    """
+    inputs, unknown = (np.concatenate(arrays) for arrays in zip(*walks, strict=True))
+    weights = np.concatenate([np.where(one, 0.5 / one.mean(), 0.5 / (1 - one.mean())) for _, one in walks])
 
     def loss(x: np.ndarray) -> float:
         return float(np.mean(weights * np.logaddexp(0, np.where(unknown, -1, 1) * (inputs @ x))))
@@ -209,7 +216,7 @@ def tables(gallery: Gallery, shapes: Sequence[Sighted]) -> tuple[np.ndarray, np.
     return np.stack(kept), np.stack(shows)
 
 
-def some_walks(kept: np.ndarray, shows: np.ndarray, seed: int) -> Iterator[Walks]:
+def some_walks(kept: np.ndarray, shows: np.ndarray, details: Array, seed: int) -> Iterator[Walks]:
     """Random views of all shapes, of which some are enrolled."""
     random, (shapes, views) = np.random.default_rng(seed), shows.shape
     for share, count in product(_ENROLLED, _VIEWS):
@@ -223,7 +230,7 @@ def some_walks(kept: np.ndarray, shows: np.ndarray, seed: int) -> Iterator[Walks
             _unexplained(kept[shape, views][:, enrolled], weights[shape] / total[shape], total[shape])
             for shape, views in enumerate(seen)
         ]
-        yield Walks(np.stack(apart), total, label)
+        yield Walks(np.stack(apart), total, np.asarray(details)[enrolled], label)
 
 
 @jax.jit
@@ -250,8 +257,10 @@ def _known_loss(matcher: Matcher, walks: Walks) -> float:
 
 def _stranger_inputs(walks: Walks) -> tuple[np.ndarray, np.ndarray]:
     """What the odds of an unknown object depend on, and whether it is one."""
-    best = walks.apart.min(axis=(1, 2))
-    return np.asarray(Matcher.strangeness(best, walks.shown, walks.apart.shape[1]), float).T, walks.label < 0
+    apart = walks.apart.reshape(len(walks.label), -1)
+    detail = walks.details[apart.argmin(axis=1) // YAWS]
+    inputs = Matcher.strangeness(apart.min(axis=1), detail, walks.shown, walks.apart.shape[1])
+    return np.asarray(inputs, float).T, walks.label < 0
 
 
 def objects_system(

@@ -21,7 +21,7 @@ def matcher() -> Matcher:
     """Differences of images are reduced to 48 random numbers, in which errors of about 1 % are 1."""
     random = np.random.default_rng(0).normal(size=(PIXELS, 48))
     projection = jnp.asarray(np.linalg.qr(random)[0] * 8, jnp.float32)
-    heat, stranger = jnp.array([2.0, 0.3, 0.0]), jnp.array([-1.0, 0.0, 0.0, 2.0])
+    heat, stranger = jnp.array([2.0, 0.3, 0.0]), jnp.array([-1.0, 0.0, 0.0, 2.0, 0.0])
     one = jnp.float32(1)
     return Matcher(projection, 0.05 * one, heat, stranger, 4 * one, 0.05 * one)
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -16,6 +18,7 @@ from mevs_jax.enrolment import AlikeWarning, alike, enrol, remove
 from mevs_jax.gallery.colours import (
     COLOURS,
     NUMBERS,
+    ColourEvidence,
     ColourMatcher,
     Colours,
     decoded,
@@ -39,7 +42,7 @@ def eyes(matcher) -> TrainedSystem:
     random = np.random.default_rng(1).normal(size=(NUMBERS, 48))
     projection = np.linalg.qr(random)[0] * 12
     one = jnp.float32(1)
-    stranger = jnp.array([-6.0, 0.0, 0.0, 0.1, 3.0])
+    stranger = jnp.array([-6.0, 0.0, 0.0, 0.1, 3.0, 0.0])
     colours = ColourMatcher(
         jnp.asarray(projection, jnp.float32), 0.1 * one, jnp.array([2.0, 0.3, 0.0]), stranger, 4 * one
     )
@@ -106,6 +109,20 @@ def test_a_box_of_other_colours_is_unknown_and_the_same_without_them_is_not(cart
     assert odds[1] < 0.5
 
 
+def test_the_odds_of_an_unknown_object_count_details_where_its_colours_are_known(eyes, boxes, shapes) -> None:
+    gallery = enrol({"knob": shapes["knob"]}, enrol(boxes, eyes)).parts.gallery
+    colours = replace(gallery.colours, matcher=replace(gallery.colours.matcher, stranger=jnp.arange(1.0, 7.0)))
+    evidence, by_shape = ColourEvidence(jnp.full((3, YAWS), 0.3), jnp.float32(0.5)), jnp.float32(-2.0)
+    for number in range(2):
+        change = np.square(np.asarray(colours.slopes[number])).mean(axis=(0, 1, 3)).sum()
+        numbers = [1, np.log(0.5), np.log(3), np.log(0.2), np.log(0.3), np.log(change + 0.2)]
+        odds = colours.strange_odds(evidence, jnp.int32(number * YAWS + 5), jnp.float32(0.2), by_shape, 3)
+        assert float(odds) == pytest.approx(np.dot(numbers, np.arange(1, 7)), rel=1e-4)
+    assert float(colours.strange_odds(evidence, jnp.int32(2 * YAWS), jnp.float32(0.2), by_shape, 3)) == -2.0
+    unseen = replace(evidence, count=jnp.float32(0))
+    assert float(colours.strange_odds(unseen, jnp.int32(0), jnp.float32(0.2), by_shape, 3)) == -2.0
+
+
 def test_objects_without_colours_are_recognised_as_before(eyes, blank, shapes, boxes) -> None:
     plain, coloured = enrol(shapes, blank), enrol(shapes, eyes)
     pose = plain.poses[7]
@@ -115,7 +132,7 @@ def test_objects_without_colours_are_recognised_as_before(eyes, blank, shapes, b
     np.testing.assert_allclose(np.asarray(plain.observe(depth, pose, colours=colours).logits), expected, atol=1e-6)
 
 
-def test_a_shift_of_an_image_by_a_third_of_a_pixel_hardly_counts(eyes: TrainedSystem) -> None:
+def test_shifts_of_an_image_and_its_exposure_hardly_count(eyes: TrainedSystem) -> None:
     def printed(right: float, down: float, size: float = 1.0) -> np.ndarray:
         """A print that looks the same from everywhere, moved by some pixels."""
         at = (np.arange(SIDE) - (SIDE - 1) / 2) / size
@@ -134,17 +151,19 @@ def test_a_shift_of_an_image_by_a_third_of_a_pixel_hardly_counts(eyes: TrainedSy
         (printed(step, 0), printed(-step, 0)),
         (printed(0, step), printed(0, -step)),
         (printed(0, 0, 1 + step), printed(0, 0, 1 - step)),
+        (printed(0, 0) * np.exp(-step), printed(0, 0) * np.exp(step)),
+        (printed(0, 0) ** np.exp(-step), printed(0, 0) ** np.exp(step)),
     ]
-    for number, (more, less) in enumerate(moves):
+    for number, (more, less) in zip((0, 1, 2, 5, 6), moves, strict=True):
         change = (np.log(less / 0.08 + 1) - np.log(more / 0.08 + 1)) / (2 * step)  # of an image, as the camera moves
-        scaled = change * (0.3, 0.3, 0.03)[number]
+        scaled = change * (0.3, 0.3, 0.03, 0.05, 0.05, 0.35, 0.15)[number]
         expected = np.asarray(
             parted(jnp.asarray(scaled.reshape(-1, 3)), jnp.ones(SIDE**2, bool))[0] @ matcher.projection
         )
         found = np.asarray(colours.slopes[0, 4, 7, number])
         assert np.corrcoef(expected, found)[0, 1] > 0.95
         np.testing.assert_allclose(np.linalg.norm(found), np.linalg.norm(expected), rtol=0.2)
-    np.testing.assert_allclose(colours.slopes[0, :, :, 3:], 0, atol=1e-4)  # all directions look the same
+    np.testing.assert_allclose(colours.slopes[0, :, :, 3:5], 0, atol=1e-4)  # all directions look the same
 
     def apart(seen: np.ndarray) -> float:
         return float(colours.compared(jnp.asarray(seen, jnp.float32), jnp.array([1.0, 0, 0]), 1)[0])
@@ -153,9 +172,9 @@ def test_a_shift_of_an_image_by_a_third_of_a_pixel_hardly_counts(eyes: TrainedSy
         numbers = differences(colours.images, jnp.asarray(seen, jnp.float32), jnp.array([1.0, 0, 0]))[0]
         return float(jnp.mean(jnp.square(numbers @ matcher.projection)[0, 0]))
 
-    for move in ((0.3, 0.0), (0.0, -0.3), (0.2, 0.2)):
-        assert apart(printed(*move)) < 0.35 * plain(printed(*move))
-    assert apart(printed(5, 3)) > 0.4 * plain(printed(5, 3))  # another print
+    for image in (printed(0.3, 0.0), printed(0.0, -0.3), printed(0.2, 0.2), 0.7 * printed(0, 0), printed(0, 0) ** 1.2):
+        assert apart(image) < 0.28 * plain(image)
+    assert apart(printed(5, 3)) > 0.3 * plain(printed(5, 3))  # another print
 
 
 def test_a_difference_is_that_of_a_slow_reference() -> None:

@@ -215,14 +215,20 @@ def _beliefs_slowly(gallery: Gallery, compared: np.ndarray, posed: bool) -> tupl
         weights[:, 1:] = 0
     weights /= weights.sum()
     best = np.unravel_index(weights.argmax(), weights.shape)
-    odds = np.asarray(matcher.stranger) @ np.append(numbers, np.log(apart[best])) + (size[best[0]] - 1) / 2
+    change = np.square(np.asarray(gallery.slopes)[best[0]]).mean(axis=(0, 1, 3)).sum()
+    inputs = [*numbers, np.log(apart[best]), np.log(change + 0.2)]
+    odds = np.asarray(matcher.stranger) @ inputs + (size[best[0]] - 1) / 2
     unknown = 1 / (1 + np.exp(-odds))
     return np.append(weights.sum(axis=1) * (1 - unknown), unknown), weights
 
 
 @pytest.mark.parametrize("posed", [False, True])
 def test_beliefs_are_those_of_all_hypotheses(matcher: Matcher, posed: bool) -> None:
-    gallery = Gallery.of(matcher, np.zeros((4, HEIGHTS, YAWS, PIXELS), np.uint8), np.zeros(4))
+    images = (
+        np.random.default_rng(4).integers(0, 255, (4, HEIGHTS, YAWS, PIXELS)) * np.arange(4).reshape(4, 1, 1, 1) // 4
+    )
+    detailed = replace(matcher, stranger=jnp.array([-1.0, 0.2, 0.1, 2.0, -0.7]))
+    gallery = Gallery.of(detailed, images.astype(np.uint8), np.zeros(4))
     compared = _made_up(3, 4, seed=3)
     compared[:, -1] = [1.0, 0.4, 0.7]
     shown = jnp.concatenate([jnp.asarray(compared), jnp.full((2, compared.shape[1]), jnp.inf)])  # slots without a view

@@ -11,7 +11,7 @@ import pytest
 from mevs_jax.gallery.grid import HEIGHTS, STEPS, YAWS, grid_directions
 from mevs_jax.gallery.matching import PIXELS, WEIGHTS, Gallery, Matcher
 from mevs_jax.geometry.cameras import ViewCamera
-from train.tasks.matcher import Sighted, calibrated, fit_projection, kinds_in_turn, objects_system
+from train.tasks.matcher import Sighted, calibrated, fit_odds, fit_projection, kinds_in_turn, objects_system
 
 FEATURES = 6
 
@@ -58,7 +58,7 @@ def test_differences_become_white():
 def test_calibration_makes_probabilities_true_and_strangers_unknown():
     train, val, test = made_up(40, 0.03, 3), made_up(30, 0.03, 4), made_up(30, 0.03, 5)
     one = jnp.float32(1)
-    blank = Matcher(fit_projection(iter(train), FEATURES), one, jnp.zeros(3), jnp.zeros(4), one, 0.05 * one)
+    blank = Matcher(fit_projection(iter(train), FEATURES), one, jnp.zeros(3), jnp.zeros(5), one, 0.05 * one)
     matcher = calibrated(blank, val, 0)
     assert float(matcher.unseen) > 0
     assert float(matcher.stranger[3]) > 0.3  # the larger the difference, the stranger
@@ -81,6 +81,15 @@ def test_calibration_makes_probabilities_true_and_strangers_unknown():
     assert np.mean(strange[20:]) > np.mean(strange[:20]) + 0.25
 
 
+def test_how_many_are_unknown_in_a_gallery_says_nothing_of_its_size():
+    random, walks = np.random.default_rng(6), []
+    for objects, share in ((10, 0.95), (100, 0.6), (200, 0.2)):
+        unknown = random.random(4000) < share
+        apart = random.normal(np.where(unknown, 1.0, -1.0))
+        walks.append((np.stack([np.ones(4000), np.full(4000, np.log(objects)), apart], axis=1), unknown))
+    np.testing.assert_allclose(fit_odds(walks), [0, 0, 2], atol=0.2)
+
+
 def test_kinds_for_calibration_are_others_than_for_fitting():
     train, val = (
         {entry.name.rsplit("_", 2)[0] for entry in kinds_in_turn(split, 400, 0)} for split in ("train", "val")
@@ -91,7 +100,7 @@ def test_kinds_for_calibration_are_others_than_for_fitting():
 
 
 def test_a_system_without_objects_can_be_written(tmp_path):
-    matcher = Matcher(jnp.ones((PIXELS, 3)), jnp.float32(1), jnp.zeros(3), jnp.zeros(4), jnp.float32(1), jnp.float32(1))
+    matcher = Matcher(jnp.ones((PIXELS, 3)), jnp.float32(1), jnp.zeros(3), jnp.zeros(5), jnp.float32(1), jnp.float32(1))
     made = objects_system(matcher, ViewCamera(64))
     made.save(tmp_path / "objects")
     from mevs_jax import load
