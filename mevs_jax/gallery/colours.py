@@ -30,9 +30,10 @@ _DARK = 0.08
 _RANGE = math.log(1 + 1 / _DARK)
 LEAST = 0.02
 """Smallest share of an image in which colours are compared."""
-_DEVIATIONS = np.array([0.3, 0.3, 0.03, 0.05, 0.05, 0.35, 0.15], np.float32)
+_DEVIATIONS = np.array([0.3, 0.3, 0.03, 0.05, 0.05, 0.35, 0.15, 0.3, 0.3], np.float32)
 """Standard deviations of what may be wrong in an image: shifts in pixels of small images, to the right and down; the logarithm of
-its size; yaw and elevation of the camera in radians; the logarithms of its exposure and of the exponent of its tone curve."""
+its size; yaw and elevation of the camera in radians; the logarithms of its exposure and of the exponent of its tone curve; and by
+how much the logarithm of its exposure grows over half of the image, to the right and down, as light from one side makes it."""
 _SHOWN = 0.3
 """Share of an image whose colours the next view will show, about."""
 
@@ -268,7 +269,8 @@ def _of_object(
     turned, raised = _slope(*small, 1, wraps=True) * (YAWS / (2 * np.pi)), _slope(*small, 0) * ((HEIGHTS - 1) / np.pi)
     at = (jnp.arange(SIDE) - (SIDE - 1) / 2)[:, None]
     gained, colours = 1 - jnp.exp(-small[0]), jnp.maximum(_DARK * jnp.expm1(small[0]), 1e-3)
-    each = across, down, across * at + down * at[:, None], turned, raised, gained, gained * jnp.log(colours)
+    tone, aside, below = gained * jnp.log(colours), gained * at * (2 / SIDE), gained * at[:, None] * (2 / SIDE)
+    each = across, down, across * at + down * at[:, None], turned, raised, gained, tone, aside, below
     changes = jnp.stack(each, axis=2).reshape(*known.shape[:2], len(each), SIDE**2, 3) * _DEVIATIONS[:, None, None]
     slopes = parted(changes, jnp.broadcast_to(known[:, :, None], changes.shape[:-1]))[0]
     return parted(logs, known)[0] @ projection, slopes @ projection

@@ -132,7 +132,7 @@ def test_objects_without_colours_are_recognised_as_before(eyes, blank, shapes, b
     np.testing.assert_allclose(np.asarray(plain.observe(depth, pose, colours=colours).logits), expected, atol=1e-6)
 
 
-def test_shifts_of_an_image_and_its_exposure_hardly_count(eyes: TrainedSystem) -> None:
+def test_shifts_of_an_image_and_its_light_hardly_count(eyes: TrainedSystem) -> None:
     def printed(right: float, down: float, size: float = 1.0) -> np.ndarray:
         """A print that looks the same from everywhere, moved by some pixels."""
         at = (np.arange(SIDE) - (SIDE - 1) / 2) / size
@@ -154,9 +154,12 @@ def test_shifts_of_an_image_and_its_exposure_hardly_count(eyes: TrainedSystem) -
         (printed(0, 0) * np.exp(-step), printed(0, 0) * np.exp(step)),
         (printed(0, 0) ** np.exp(-step), printed(0, 0) ** np.exp(step)),
     ]
-    for number, (more, less) in zip((0, 1, 2, 5, 6), moves, strict=True):
+    across = np.linspace(-1, 1, 2 * SIDE + 1)[1::2]
+    for lit in (across[:, None], across[:, None, None]):
+        moves.append((printed(0, 0) * np.exp(-step * lit), printed(0, 0) * np.exp(step * lit)))
+    for number, (more, less) in zip((0, 1, 2, 5, 6, 7, 8), moves, strict=True):
         change = (np.log(less / 0.08 + 1) - np.log(more / 0.08 + 1)) / (2 * step)  # of an image, as the camera moves
-        scaled = change * (0.3, 0.3, 0.03, 0.05, 0.05, 0.35, 0.15)[number]
+        scaled = change * (0.3, 0.3, 0.03, 0.05, 0.05, 0.35, 0.15, 0.3, 0.3)[number]
         expected = np.asarray(
             parted(jnp.asarray(scaled.reshape(-1, 3)), jnp.ones(SIDE**2, bool))[0] @ matcher.projection
         )
