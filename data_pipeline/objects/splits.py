@@ -50,8 +50,8 @@ def divide(found: Sequence[Found], option: str, seed: int, where: str) -> list[F
 
 
 def _by_turns(found: Sequence[Found]) -> list[Found]:
-    """Each object for all splits, turned about the vertical axis by another angle in each place: a tenth of the places are for
-    validation, a tenth for tests."""
+    """Each object for all splits, turned about the vertical axis by another angle in each place: of ten places, one is for
+    validation and one for tests."""
     objects = sum(bool(one.class_name and one.recipe) for one in found)
     places = max(_LEAST_TURNS, -(-_ENOUGH // max(objects, 1)))
     splits = ["val" if at % 10 == 3 else "test" if at % 10 == 7 else "train" for at in range(places)]

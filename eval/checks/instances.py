@@ -34,14 +34,14 @@ from mevs_jax.meshes import Up
 from mevs_jax.meshes.paint import Paint, read_paint
 from mevs_jax.selection.loop import ViewTable
 from mevs_jax.trained import TrainedSystem
-from mevs_jax.trained.usable import BELIEF_ORACLE
+from mevs_jax.trained.usable import BELIEF_ORACLE, GAIN_ORACLE
 from train.results.identity import identity_of
 from train.results.kept import kept_record
 from train.tasks.colours import lit_views
 from train.tasks.matcher import turned_rig
 
 VIEWS = (1, 2, 3, 4)
-POLICIES = (BASELINE, "farthest", "information_gain", BELIEF_ORACLE)
+POLICIES = (BASELINE, "farthest", "information_gain", GAIN_ORACLE, BELIEF_ORACLE)
 _WITHIN = np.radians(10)
 """A yaw is right if it is off by at most this much."""
 _RADII = 0.003, 10.0

@@ -316,7 +316,7 @@ class InstancesOptions:
     fit: Flag = False
     """first learn the system that objects are enrolled with, from procedural shapes, and write it into TO/objects"""
     shapes: Annotated[int, _arg("N", "1000")] = 1000
-    """procedural shapes to learn from with --fit; a quarter as many of other kinds calibrate"""
+    """procedural shapes to learn from with --fit; a quarter as many others calibrate it, a twelfth its colours"""
     to: Annotated[Path, _arg("DIR", "runs/instances")] = Path("runs/instances")
     """folder for the figures (instances.json) and what is learned"""
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Literal
+
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
@@ -38,17 +40,14 @@ def gain_among(gallery: Gallery, posed: bool, target: int | None = None) -> Poli
     return gain
 
 
-def oracle_among(gallery: Gallery, posed: bool) -> Policy:
-    """Returns the label-free oracle: the view after which the belief is closest to the belief after all views.
-
-    See `mevs_jax.policies.oracles.belief_oracle`.
-    """
+def oracle_among(gallery: Gallery, posed: bool, by: Literal["belief", "gain"]) -> Policy:
+    """Returns an oracle without labels; see `mevs_jax.policies.oracles.fused_oracle`."""
 
     def believed(features: Array, points: Array, present: Array) -> Float[Array, " classes"]:
         del points
         return gallery.beliefs(gallery.evidence(features, present, posed))
 
-    return fused_oracle(believed)
+    return fused_oracle(believed, by=by)
 
 
 def evidence_of(gallery: Gallery, state: SelectionState, posed: bool) -> Evidence:

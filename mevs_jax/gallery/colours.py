@@ -122,7 +122,7 @@ class ColourEvidence:
         """What the views that are present say together, from `Colours.compared` of each."""
         shares = jnp.where(present, compared[:, -1], 0.0)
         count = jnp.sum(shares)
-        return cls((shares / jnp.maximum(count, LEAST) @ compared[:, :-1]).reshape(-1, YAWS), count)
+        return cls((shares / jnp.maximum(count, 1e-6) @ compared[:, :-1]).reshape(-1, YAWS), count)
 
 
 @flax.struct.dataclass
@@ -179,7 +179,7 @@ class Colours:
         self, seen: Float[Array, "side side 3"], direction: Float[Array, " 3"], objects: int
     ) -> Float[Array, " comparisons"]:
         """Squared differences of a view's colours from those predicted for each object at each yaw; and last, the share of the
-        image whose colours are known. Differences are white: a square is about 1 on average if the hypothesis is right.
+        image whose colours are known. Differences are white, and what `_DEVIATIONS` explain is taken away.
 
         Args:
             seen: `small_colours` of the view.

@@ -82,15 +82,15 @@ def pair_oracle(key: Array, state: SelectionState, scene: Scene) -> Float[Array,
     return jax.lax.cond(state.count % 2 == 1, best_partner, lambda: label_oracle(key, state, scene))
 
 
-def fused_oracle(fusion: Believed, *, by: Literal["belief", "label"] = "belief") -> Policy:
-    """Returns `belief_oracle` or `label_oracle` for beliefs computed by a learned fusion.
+def fused_oracle(fusion: Believed, *, by: Literal["belief", "label", "gain"] = "belief") -> Policy:
+    """Returns an oracle for beliefs computed by a learned fusion.
 
     Args:
         fusion: computes the belief from `Scene.features`, as a `mevs_jax.beliefs.fusing.CalibratedFusion`.
-        by: `belief` to approach the belief after all views, `label` to maximise the probability of the true class.
+        by: `belief` to approach the belief after all views, as `belief_oracle`; `label` to maximise the probability of the true
+            class, as `label_oracle`; `gain` to minimise the entropy of the belief: the gain that is found, not the expected one.
     """
-
-    return Partial(_by_label if by == "label" else _by_belief, fusion)
+    return Partial({"belief": _by_belief, "label": _by_label, "gain": _by_gain}[by], fusion)
 
 
 def _by_belief(fusion: Believed, key: Array, state: SelectionState, scene: Scene) -> Float[Array, " views"]:
@@ -100,6 +100,11 @@ def _by_belief(fusion: Believed, key: Array, state: SelectionState, scene: Scene
 
 def _by_label(fusion: Believed, key: Array, state: SelectionState, scene: Scene) -> Float[Array, " views"]:
     return _with_one_more(fusion, state, scene)[2][:, required(scene.label, "Scene.label")]
+
+
+def _by_gain(fusion: Believed, key: Array, state: SelectionState, scene: Scene) -> Float[Array, " views"]:
+    after = _with_one_more(fusion, state, scene)[2]
+    return jnp.sum(jnp.exp(after) * after, axis=-1)
 
 
 def _with_one_more(

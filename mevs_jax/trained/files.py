@@ -47,7 +47,7 @@ class UnreadableSystem(ValueError):
 
 
 def _unreadable(problem: str) -> UnreadableSystem:
-    return UnreadableSystem(f"{problem}; export the system again")
+    return UnreadableSystem(f"{problem}; export the system again, or enrol its objects again")
 
 
 def load(path: str | Path) -> TrainedSystem:

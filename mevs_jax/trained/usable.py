@@ -30,8 +30,8 @@ EXPECTED_VIEWS = "expected_views"
 
 INFORMATION_GAIN = "information_gain"
 """The registered policy, which is exact over the hypotheses of a gallery."""
-BELIEF_ORACLE = "belief_oracle"
-"""The registered policy; around enrolled objects, by the beliefs of the gallery."""
+BELIEF_ORACLE, GAIN_ORACLE = "belief_oracle", "gain_oracle"
+"""Around enrolled objects, by the beliefs of the gallery: the registered policy, and the view of the largest gain, once seen."""
 
 
 @dataclass(frozen=True)
@@ -78,8 +78,8 @@ def policy_of(description: Description, parts: Parts, name: str, posed: bool, ta
         return learned(parts.view_policies[network].module, parts.single, by=by)  # type: ignore[arg-type]
     if parts.gallery is not None and name == INFORMATION_GAIN:
         return gain_among(parts.gallery, posed, target)
-    if parts.gallery is not None and name == BELIEF_ORACLE:
-        return oracle_among(parts.gallery, posed)
+    if parts.gallery is not None and name in (BELIEF_ORACLE, GAIN_ORACLE):
+        return oracle_among(parts.gallery, posed, "belief" if name == BELIEF_ORACLE else "gain")
     if name == EXPECTED_VIEWS and parts.expected is not None:
         return expected_views
     if name not in POLICIES:

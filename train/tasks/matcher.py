@@ -267,7 +267,7 @@ def objects_system(
     matcher: Matcher, camera: ViewCamera, views: int = 40, colours: ColourMatcher | None = None
 ) -> TrainedSystem:
     """The system that objects are enrolled with: without any yet. It compares colours if it is given a matcher of them."""
-    points = fibonacci_sphere(views)
+    points, learned = fibonacci_sphere(views), jax.tree.leaves((matcher, colours))
     nothing = np.zeros((0, HEIGHTS, YAWS, PIXELS), np.uint8)
     parts = Parts(
         encoder=None,
@@ -288,7 +288,7 @@ def objects_system(
         best_unposed="information_gain",
         chosen_by="procedural shapes of kinds that nothing was fitted on",
         data=DataDescription("enrolled objects", "", {"enrolled": 0}),
-        made_by=hashlib.sha256(np.asarray(matcher.projection).tobytes()).hexdigest()[:16],
+        made_by=hashlib.sha256(b"".join(np.asarray(one).tobytes() for one in learned)).hexdigest()[:16],
         made_with={name: version(name) for name in ("jax", "mevs-jax")},
         colour=colours is not None,
     )

@@ -23,6 +23,38 @@ def test_without_shading_and_noise_light_is_a_gain_of_each_channel() -> None:
     assert np.ptp(gains[0, 0]) > 0.01
 
 
+def test_light_is_that_of_a_slow_reference() -> None:
+    """Pixel by pixel, with the random numbers of the same keys: shading, then highlight, gains, tone, and what a camera clips."""
+    random, light, side = np.random.default_rng(1), LightConfig(gloss=0.6, noise=0.05), 8
+    colours = random.uniform(0, 1, (side, side, 3)).astype(np.float32)
+    normals = random.normal((2, 0, 1), size=(side, side, 3))
+    normals = (normals / np.linalg.norm(normals, axis=-1, keepdims=True)).astype(np.float32)
+    pose = CAMERA.around(np.array([[0.8, 0, 0.6]], np.float32)).pose[0]
+    away = np.asarray(pose)[:3, 3] / np.linalg.norm(np.asarray(pose)[:3, 3])
+    for number in range(3):
+        key = jax.random.key(number)
+        bright, gains, curve, share, where, shine, grain, moved = jax.random.split(key, 8)
+        source = np.asarray(jax.random.normal(where, (3,))) + away + [0, 0, 1]
+        source /= np.linalg.norm(source)
+        half = (source + away) / np.linalg.norm(source + away)
+        directed, gloss = 0.8 * float(jax.random.uniform(share)), 0.6 * float(jax.random.uniform(shine))
+        noise, tone = np.asarray(jax.random.normal(grain, colours.shape)), float(jax.random.normal(curve))
+        exposure, balance = float(jax.random.normal(bright)), np.asarray(jax.random.normal(gains, (3,)))
+        expected = np.zeros_like(colours)
+        right, down = np.round(0.7 * np.asarray(jax.random.normal(moved, (2,)))).astype(int)[::-1]
+        for row in range(side):
+            for column in range(side):
+                facing = min(max(normals[row, column] @ source, 0), 1)
+                highlight = gloss * min(max(normals[row, column] @ half, 0), 1) ** 30
+                for channel in range(3):
+                    value = colours[row, column, channel] * (1 - directed + directed * facing) + highlight
+                    value = value * np.exp(0.35 * exposure + 0.15 * balance[channel])
+                    value = max(value, 1e-4) ** np.exp(0.15 * tone) + 0.05 * noise[row, column, channel]
+                    expected[(row + down) % side, (column + right) % side, channel] = min(max(value, 0), 1)
+        found = in_light(key, jnp.asarray(colours), jnp.asarray(normals), jnp.asarray(pose), light)
+        np.testing.assert_allclose(found, expected, atol=2e-5)
+
+
 def test_colours_are_where_the_depth_of_the_same_key_is() -> None:
     """Colours that are a code of the pixel's depth, around a wrong sphere."""
     poses = CAMERA.around(np.array([[1.0, 0, 0], [0, 0.8, 0.6]], np.float32)).pose

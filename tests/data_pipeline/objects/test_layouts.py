@@ -234,14 +234,14 @@ def test_one_object_a_class_is_trained_and_tested_on_from_other_directions(tmp_p
     with pytest.raises(DataError, match=r"class mug has 1 object, .* give --dataset.split 1 to") as caught:
         opened(root, split="0.8")
     source = opened(root, split=re.search(r"give --dataset.split (\S+)", str(caught.value))[1])
-    assert [len(of_split(source, split)) for split in ("train", "val", "test")] == [300, 2, 2]
-    assert len({entry.name for entry in source.entries}) == 304
+    assert [len(of_split(source, split)) for split in ("train", "val", "test")] == [800, 100, 100]
+    assert len({entry.name for entry in source.entries}) == 1000
     assert "these very objects" in source.notes[0]
     assert not source.left_out
     mugs = [entry for entry in source.entries if entry.label == 0]
-    assert len({entry.recipe.stamp for entry in mugs}) == 152  # of which captures are kept apart
+    assert len({entry.recipe.stamp for entry in mugs}) == 500  # of which captures are kept apart
     angles = sorted(entry.recipe.angle for entry in mugs)
-    np.testing.assert_allclose(angles, 2 * np.pi * np.arange(152) / 152)
+    np.testing.assert_allclose(angles, 2 * np.pi * np.arange(500) / 500)
     test = next(entry.recipe for entry in mugs if entry.split == "test")
     first, last = test.recipe.load()[0], test.load()[0]
     for before, after in zip(first, last, strict=True):

@@ -124,6 +124,36 @@ def test_other_formats_give_each_vertex_its_colour(tmp_path: Path, suffix: str) 
     np.testing.assert_allclose(paint.colours, colours[near][..., :3] / 255, atol=0.005)
 
 
+@pytest.mark.parametrize("named", ["print.png", "gone.png", ""])
+def test_a_texture_of_a_ply_is_read_or_not_known(tmp_path: Path, named: str) -> None:
+    Image.fromarray(QUARTERS).save(tmp_path / "print.png")
+    corners = [(-1, 0, -1, 0, 0), (1, 0, -1, 1, 0), (1, 0, 1, 1, 1), (-1, 0, 1, 0, 1)]
+    lines = [
+        "ply",
+        "format ascii 1.0",
+        *([f"comment TextureFile {named}"] if named else []),
+        "element vertex 4",
+        *(f"property float {name}" for name in ("x", "y", "z", "s", "t")),
+        "element face 2",
+        "property list uchar int vertex_indices",
+        "end_header",
+        *(" ".join(map(str, corner)) for corner in corners),
+        "3 0 1 2",
+        "3 0 2 3",
+    ]
+    path = tmp_path / "square.ply"
+    path.write_text("\n".join(lines) + "\n")
+    paint = read_paint(path, *read_mesh(path, "z"))
+    if named == "print.png":
+        assert paint is not None
+        weights = [[0.2, 0.2, 0.6], [0.25, 0.05, 0.7], [0.75, 0.2, 0.05], [0.3, 0.45, 0.25]]  # of the corners
+        found = paint.at(np.array([1, 0, 1, 0]), np.array(weights))
+        np.testing.assert_allclose(found, QUARTERS.reshape(4, 3) / 255, atol=1e-5)
+    else:
+        assert paint is None or np.isnan(paint.colours).all()
+        assert not named or (paint is not None and "'gone.png'" in paint.notes[0])
+
+
 def test_colours_of_collada_are_those_of_materials_alone(tmp_path: Path) -> None:
     box, path = trimesh.creation.box((1, 2, 3)), tmp_path / "box.dae"
     material = trimesh.visual.material.PBRMaterial(baseColorFactor=[51, 102, 153, 255])

@@ -212,7 +212,7 @@ def test_a_description_that_is_wrong_is_one_sentence(written, tmp_path, name):
     with pytest.raises(UnreadableSystem) as caught:
         load(damaged(folder, tmp_path, CHANGES[name]))
     assert "\n" not in str(caught.value)
-    assert str(caught.value).endswith("export the system again")
+    assert str(caught.value).endswith("export the system again, or enrol its objects again")
 
 
 def test_an_edited_description_and_other_versions_are_refused(written, tmp_path):
