@@ -81,7 +81,7 @@ def details(slopes: Float[AnyArray, "objects heights yaws errors features"]) -> 
 def gram_of(slope: Float[Array, "*batch errors features"]) -> Float[Array, "*batch pairs"]:
     """The means of products of slopes, over features: the upper half of a symmetric matrix, row by row."""
     first, second = np.triu_indices(slope.shape[-2])
-    return jnp.einsum("...pf,...pf->...p", slope[..., first, :], slope[..., second, :]) / slope.shape[-1]
+    return jnp.einsum("...af,...bf->...ab", slope, slope)[..., first, second] / slope.shape[-1]
 
 
 def parted(kept: Float[Array, "*batch kept"]) -> tuple[Array, Array, Array]:
