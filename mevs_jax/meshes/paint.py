@@ -211,8 +211,7 @@ def _part_of(mesh: Any, path: Path) -> list[_Part]:
     if visual.kind == "texture":
         material = visual.material
         own = material.baseColorTexture if hasattr(material, "baseColorTexture") else material.image
-        made = {".obj": own is not None and "file_path" not in own.info, ".ply": own is not None and own.format is None}
-        if made.get(path.suffix.lower(), False):
+        if own is not None and path.suffix.lower() in (".obj", ".ply") and own.format is None:
             own = None  # trimesh's own grey, where a material or its texture is missing
         factor, told = _factor_of(material, own, path), visual.vertex_attributes.get("color")
         if own is not None and visual.uv is not None:

@@ -277,8 +277,12 @@ def calibrated(colours: ColourMatcher, matcher: Matcher, shapes: Sequence[Painte
     of_paints = [*some_walks(apart, np.maximum(coloured, 1e-3), details, seed)]
     by_shape = [np.asarray(matcher.likelihood(one.apart, one.shown, one.apart.shape[1])) for one in of_shapes]
 
+    def weighed(x: np.ndarray) -> ColourMatcher:
+        # The power by the number of objects is not determined by what these shapes say: halves of them have opposite signs.
+        return with_power(colours, np.insert(x, 2, 0.0))
+
     def joint(x: np.ndarray) -> Iterator[np.ndarray]:
-        now = with_power(colours, np.insert(x, 2, 0.0))
+        now = weighed(x)
         for found, one in zip(by_shape, of_paints, strict=True):
             yield found + np.asarray(now.likelihood(one.apart, one.shown, one.apart.shape[1]))
 
@@ -289,7 +293,6 @@ def calibrated(colours: ColourMatcher, matcher: Matcher, shapes: Sequence[Painte
             losses.append(-objects[known, one.label[known]].mean())
         return float(np.mean(losses))
 
-    # The power by the number of objects is not determined by what these shapes say: halves of them have opposite signs.
     start, limits = np.array([1.0, 0.3, -1.0]), [(-5, 5), (-2, 2), (-8, 2)]
     found = minimize(loss, start, method="Nelder-Mead", bounds=limits, options={"maxiter": 200}).x
     inputs = []
@@ -299,7 +302,7 @@ def calibrated(colours: ColourMatcher, matcher: Matcher, shapes: Sequence[Painte
         given = pair[1].details[best // YAWS], pair[1].shown, both.shape[1]
         inputs.append(np.asarray(ColourMatcher.strangeness(shape, paint, *given), float).T)
     odds = fit_odds([*zip(inputs, (one.label < 0 for one in of_paints), strict=True)])
-    return replace(with_power(colours, np.insert(found, 2, 0.0)), stranger=jnp.asarray(odds, jnp.float32))
+    return replace(weighed(found), stranger=jnp.asarray(odds, jnp.float32))
 
 
 def _colour_tables(matcher: ColourMatcher, shapes: Sequence[PaintedShape]) -> tuple[np.ndarray, np.ndarray, Array]:
